@@ -24,12 +24,14 @@ pub(crate) enum Payload<'a> {
 pub(crate) fn read(
     payload: &Payload<'_>,
     namespace: u16,
-    frame: &mut FieldEncoder<'_, '_>,
+    frame: &mut FieldEncoder<'_>,
 ) -> Result<(), (Reason, String)> {
     match payload {
         Payload::Block(block) => {
             // Checked here, since a bad block would be an unreadable datagram for everybody.
-            check(block).map_err(|error| (Reason::Malformed, error.to_string()))?;
+            Fields::parse(block)
+                .and_then(|fields| fields.checked_bytes())
+                .map_err(|error| (Reason::Malformed, error.to_string()))?;
             frame.fields_block(block).map_err(|error| (Reason::TooBig, error.to_string()))
         }
         Payload::Ros(plan, bytes) => {
@@ -42,16 +44,21 @@ pub(crate) fn read(
     }
 }
 
-/// Appends the ROS message that a block of fields makes.
+/// Appends the ROS message that the fields make.
 pub(crate) fn write(
     plan: &Plan,
-    block: &[u8],
+    fields: Fields<'_>,
     out: &mut Vec<u8>,
 ) -> Result<(), (Reason, String)> {
-    let fields = Fields::parse(block)
-        .map_err(|error| (Reason::Malformed, error.to_string()))?;
     let mut source = FieldSource::new(fields);
     plan.write(&mut source, out).map_err(|error| (Reason::Mismatch, error.to_string()))
+}
+
+/// Appends the fields as they are, once it is sure that they can be read.
+pub(crate) fn copy(fields: &Fields<'_>, out: &mut Vec<u8>) -> Result<(), (Reason, String)> {
+    let block = fields.checked_bytes().map_err(|error| (Reason::Malformed, error.to_string()))?;
+    out.extend_from_slice(block);
+    Ok(())
 }
 
 /// Builtin type of a field, and whether it is an array.
@@ -63,21 +70,14 @@ pub(crate) fn shape(field: &Variant<'_>) -> (BuiltinType, bool) {
     }
 }
 
-fn check(block: &[u8]) -> Result<(), DecodeError> {
-    for field in Fields::parse(block)? {
-        field?;
-    }
-    Ok(())
-}
-
 /// A key frame that takes what a plan reads.
-struct FrameSink<'f, 'e, 'b> {
-    frame: &'f mut FieldEncoder<'e, 'b>,
+struct FrameSink<'f, 'm> {
+    frame: &'f mut FieldEncoder<'m>,
     /// That of the structures' TypeIds.
     namespace: u16,
 }
 
-impl Sink for FrameSink<'_, '_, '_> {
+impl Sink for FrameSink<'_, '_> {
     type Error = EncodeError;
 
     fn scalar(&mut self, value: Scalar<'_>) -> Result<(), EncodeError> {
@@ -94,7 +94,11 @@ impl Sink for FrameSink<'_, '_, '_> {
     }
 
     fn array(&mut self, element: BuiltinType, count: usize) -> Result<(), EncodeError> {
-        self.frame.array(element, count)
+        match element {
+            // Messages within a message of an array: structures by value.
+            BuiltinType::ExtensionObject => self.frame.inline_structures(count),
+            _ => self.frame.array(element, count),
+        }
     }
 
     fn element(&mut self, value: Scalar<'_>) -> Result<(), EncodeError> {

@@ -178,9 +178,13 @@ impl Router {
             }
             Role::Ours(_) => None,
         };
-        if let Some(held) = held {
+        if let Some(held) = held
+            && let Ok(fields) = Fields::parse(&held.fields)
+        {
+            let Held { source, status, arrived, .. } = held;
+            let sample = Sample { fields, source, status, arrived };
             // Counted and told like any other when the type does not fit.
-            let _verdict = self.deliver(topic, &held);
+            let _verdict = self.deliver(topic, &sample);
         }
         Ok(())
     }
@@ -461,23 +465,17 @@ impl Router {
             }
         };
         self.record_way(place.stamp, sent, now);
-        let sample = Held {
-            fields: fields.bytes().to_vec(),
+        let sample = Sample {
+            fields,
             source: place.stamp,
             status: message.header.status.unwrap_or_default(),
             arrived: now.utc,
         };
-        self.route(topic, fields, sample, (place, now))
+        self.route(topic, &sample, place, now)
     }
 
     /// Hands a sample on, or keeps it until its local type is known.
-    fn route(
-        &mut self,
-        topic: TopicId,
-        fields: Fields<'_>,
-        sample: Held,
-        (place, now): (Place, Now),
-    ) -> Verdict {
+    fn route(&mut self, topic: TopicId, sample: &Sample<'_>, place: Place, now: Now) -> Verdict {
         let typed = self.settings.local == Local::Fields;
         let Some(Topic { role: Role::Theirs(reader), plan, .. }) = self.topics.get_mut(&topic)
         else {
@@ -485,34 +483,36 @@ impl Router {
         };
         if typed || plan.is_some() {
             reader.delivered(place);
-            return self.deliver(topic, &sample);
+            return self.deliver(topic, sample);
         }
-        let ask = reader.asked.is_none_or(|asked| now.monotonic >= asked + ASK_AGAIN);
-        if ask {
+        if reader.asked.is_none_or(|asked| now.monotonic >= asked + ASK_AGAIN) {
             reader.asked = Some(now.monotonic);
+            let fields = sample.fields.clone();
             let shape = fields.filter_map(Result::ok).map(|field| fields::shape(&field)).collect();
             self.told.push_back(Output::Unbound { topic, shape });
         }
-        reader.held = (sample.fields.len() <= MAX_HELD).then_some(sample);
+        let fields = sample.fields.bytes();
+        reader.held = (fields.len() <= MAX_HELD).then(|| Held {
+            fields: fields.to_vec(),
+            source: sample.source,
+            status: sample.status,
+            arrived: sample.arrived,
+        });
         // Not yet a loss: the newest one waits. It is not told, since the port names topics without a type.
-        self.count(Some(topic), None, Reason::Untyped, 1, String::new);
-        Verdict::Drop(Reason::Untyped)
+        self.drop_one(Some(topic), None, Reason::Untyped, String::new)
     }
 
-    fn deliver(&mut self, topic: TopicId, sample: &Held) -> Verdict {
+    fn deliver(&mut self, topic: TopicId, sample: &Sample<'_>) -> Verdict {
         let mut payload = self.buffer();
-        let result = match self.topics.get(&topic).and_then(|entry| entry.plan.as_ref()) {
-            Some(plan) => fields::write(plan, &sample.fields, &mut payload),
-            None => {
-                payload.extend_from_slice(&sample.fields);
-                Ok(())
-            }
+        let written = match self.topics.get(&topic).and_then(|entry| entry.plan.as_ref()) {
+            Some(plan) => fields::write(plan, sample.fields.clone(), &mut payload),
+            None => fields::copy(&sample.fields, &mut payload),
         };
-        if let Err((reason, detail)) = result {
+        if let Err((reason, detail)) = written {
             self.recycle(payload);
             return self.drop_one(Some(topic), None, reason, || detail);
         }
-        let Held { source, status, arrived, .. } = *sample;
+        let Sample { source, status, arrived, .. } = *sample;
         self.push(topic, Item::Delivery(Delivery { topic, payload, source, status, arrived }))
     }
 
@@ -666,6 +666,14 @@ impl Router {
     fn buffer(&mut self) -> Vec<u8> {
         self.spare.pop().unwrap_or_default()
     }
+}
+
+/// A key frame's content on its way to the local side.
+struct Sample<'a> {
+    fields: Fields<'a>,
+    source: Option<Timestamp>,
+    status: u16,
+    arrived: Timestamp,
 }
 
 /// Writes the one NetworkMessage of a sample. The stamp of sending is patched in when it is polled.
