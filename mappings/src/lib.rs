@@ -1,1 +1,5 @@
-//! Placeholder of the skeleton.
+//! The names of the space, and the YAML that ties them to ROS topics and OPC UA nodes.
+
+mod topic;
+
+pub use topic::{Part, SpaceId, TopicError, TopicId};
