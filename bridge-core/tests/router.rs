@@ -1,5 +1,7 @@
 //! What a bridge does with samples, datagrams and time, seen from outside.
 
+#![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
+
 use std::net::SocketAddr;
 use std::num::NonZeroU16;
 use std::sync::Arc;

@@ -66,9 +66,11 @@ pub fn run<P: Program>() -> ExitCode {
         Err(usage) => {
             // Nobody is left to tell when stdout or stderr is closed.
             let _printed = usage.print();
-            return match usage.kind() {
-                ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => ExitCode::SUCCESS,
-                _ => FailureKind::Usage.into(),
+            let asked = [ErrorKind::DisplayHelp, ErrorKind::DisplayVersion];
+            return if asked.contains(&usage.kind()) {
+                ExitCode::SUCCESS
+            } else {
+                FailureKind::Usage.into()
             };
         }
     };

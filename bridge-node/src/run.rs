@@ -158,10 +158,11 @@ impl<P: Port> Shell<P> {
     }
 }
 
-const fn not_sent(error: SendError) -> Reason {
-    match error {
-        SendError::TooBig => Reason::TooBig,
-        _ => Reason::NotSent,
+fn not_sent(error: SendError) -> Reason {
+    if error == SendError::TooBig {
+        Reason::TooBig
+    } else {
+        Reason::NotSent
     }
 }
 
