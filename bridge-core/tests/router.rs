@@ -1,6 +1,11 @@
 //! What a bridge does with samples, datagrams and time, seen from outside.
 
-#![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
 
 use std::net::SocketAddr;
 use std::num::NonZeroU16;
