@@ -95,8 +95,8 @@ pub(crate) fn parse(text: &str) -> Result<Rc<Node>, Fault> {
     let mut builder = Builder::default();
     for event in Parser::new_from_str_with_options(text, options) {
         let (event, marks) = event.map_err(|error| syntax(text, &error))?;
-        let place = place(text, marks);
         if let Some(tag) = event.tag() {
+            let place = place(text, marks.tag_span().unwrap_or(marks));
             let message = format!("the tag `{}` is not read here", tag.original());
             return Err(fault(
                 place,
@@ -104,7 +104,7 @@ pub(crate) fn parse(text: &str) -> Result<Rc<Node>, Fault> {
                 Some("leave the tag out; the key says what its value is"),
             ));
         }
-        builder.event(event, place)?;
+        builder.event(event, place(text, marks))?;
     }
     Ok(builder.root.unwrap_or_else(|| {
         Rc::new(Node {

@@ -148,7 +148,7 @@ impl<'c> Bindings<'c> {
         subject: &Subject,
         findings: &mut Findings,
     ) -> Option<Found> {
-        let topic = required(&entry.topic, "topic", "a binding", owner, findings);
+        let topic = required(&entry.topic, "topic", "the binding", owner, findings);
         let topic =
             topic.and_then(|(text, place)| topic_name(text, place, space, subject, findings));
         let named = self.type_name(entry, owner, space, subject, findings);
@@ -235,9 +235,6 @@ impl<'c> Bindings<'c> {
             Ok(message_type) => return Some(Arc::clone(message_type)),
             Err(error) => error,
         };
-        let suggestion = Types::registry(dialect)
-            .suggest(name)
-            .map(|near| format!("did you mean `{near}`?"));
         let message = match error {
             DefinitionError::Unknown { .. } => {
                 format!("no definition of `{name}` is built in for {}", ros(dialect))
@@ -247,22 +244,30 @@ impl<'c> Bindings<'c> {
             | DefinitionError::TooBig { .. }
             | DefinitionError::Syntax { .. } => error.to_string(),
         };
-        // What is read from a ROS 1 topic brings its definition along; an origin that could not be read may be space 1.
-        if space == SpaceId::ROS1 && subject.origin.is_none_or(|origin| origin == space) {
-            let note = findings.warning(Code::UnknownMessageType, place, message);
-            let help =
-                "the publisher's connection header will bring it, and the field is checked then";
-            note.help(
-                suggestion.map_or_else(|| help.to_owned(), |near| format!("{near} Else {help}")),
-            );
+        // What is read from a ROS 1 topic brings its definition; an origin that could not be read may be space 1.
+        let read = space == SpaceId::ROS1 && subject.origin.is_none_or(|origin| origin == space);
+        let (note, why) = if read {
+            let why = "the publisher's connection header brings it, and the field is checked then";
+            (
+                findings.warning(Code::UnknownMessageType, place, message),
+                why,
+            )
         } else {
-            let note = findings.error(Code::UnknownMessageType, place, message);
             let why = match dialect {
                 Dialect::Ros1 => "what is written to ROS 1 must be known beforehand",
-                Dialect::Ros2 => "ROS 2 peers do not send definitions",
+                Dialect::Ros2 => {
+                    "ROS 2 peers do not send definitions, so only types built in can be bound"
+                }
             };
-            note.help(suggestion.map_or_else(|| why.to_owned(), |near| format!("{near} {why}")));
-        }
+            (
+                findings.error(Code::UnknownMessageType, place, message),
+                why,
+            )
+        };
+        note.help_with(|| match Types::registry(dialect).suggest(name) {
+            Some(near) => format!("did you mean `{near}`? If not: {why}"),
+            None => why.to_owned(),
+        });
         None
     }
 
@@ -455,7 +460,7 @@ fn compare(
                 "the variable is {told_type}, but `{}` of `{name}` is {found}",
                 one.path
             );
-            let help = format!("leave the variable's `type` out, or write  type: {found}");
+            let help = format!("leave the variable's `type` out, or write `type: {found}`");
             findings.error(Code::TypeDiffers, place, message).help(help);
         }
         several => {

@@ -52,7 +52,7 @@ pub(super) fn suggest_value_type(text: &str) -> Option<&'static str> {
         ("bytes", "ByteString"),
         ("uuid", "Guid"),
     ];
-    let name = text.strip_suffix("[]").unwrap_or(text);
+    let name = text.split('[').next().unwrap_or(text);
     let elsewhere = ELSEWHERE
         .iter()
         .find(|(other, _)| other.eq_ignore_ascii_case(name));
