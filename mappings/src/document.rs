@@ -249,7 +249,7 @@ impl Read for Queue {
 fn found(node: &Node) -> String {
     match &node.kind {
         Kind::Scalar(text) => format!("`{}`", short(text)),
-        kind => kind.name().to_owned(),
+        Kind::Null | Kind::List(_) | Kind::Map(_) => node.kind.name().to_owned(),
     }
 }
 

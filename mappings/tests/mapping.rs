@@ -1,5 +1,5 @@
 //! What a document without faults comes to, and that no text is too strange.
-#![expect(clippy::unwrap_used, clippy::indexing_slicing, reason = "test code")]
+#![expect(clippy::unwrap_used, reason = "test code")]
 
 use std::net::SocketAddr;
 use std::num::NonZeroU16;

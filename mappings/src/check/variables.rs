@@ -120,7 +120,7 @@ fn draft<'d>(
 
 /// How a finding calls a variable of which something is missing.
 fn title(entry: &VariableEntry) -> String {
-    match given(&entry.name).or(given(&entry.node)) {
+    match given(&entry.name).or_else(|| given(&entry.node)) {
         Some((text, _)) => format!("the variable `{}`", short(text)),
         None => "the variable".to_owned(),
     }
@@ -319,10 +319,10 @@ fn variable(
     let fields = bound
         .fields
         .unwrap_or_else(|| declared.map(only_field).into_iter().collect());
-    let value_type = declared.or(match fields.as_slice() {
-        [one] => Some(types::value_type(one)),
-        _ => None,
-    });
+    let value_type = match fields.as_slice() {
+        [one] => Some(declared.unwrap_or_else(|| types::value_type(one))),
+        _ => declared,
+    };
     let overflow = match given(&entry.queue) {
         Some((Queue::DropOldest(size), _)) => Overflow::DropOldest(NonZeroU16::new(*size)?),
         Some((Queue::KeepLatest, _)) | None => Overflow::KeepLatest,
