@@ -1,10 +1,5 @@
 //! What other implementations say: md5 sums, field lists, and messages they wrote. See `data/make.py`.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    reason = "test code"
-)]
+#![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
 
 mod support;
 
