@@ -184,6 +184,36 @@ fn types_that_contain_themselves_or_nest_without_end_are_refused() {
 }
 
 #[test]
+fn a_time_defined_by_itself_is_still_a_time() {
+    let registry = registry(
+        Dialect::Ros2,
+        &[
+            ("builtin_interfaces/Time", "Time again"),
+            ("t/T", "builtin_interfaces/Time at"),
+        ],
+    );
+    for type_name in ["t/T", "builtin_interfaces/Time"] {
+        let found = registry.get(&name(type_name)).unwrap();
+        assert_eq!(
+            found.leaves().first().unwrap().builtin,
+            BuiltinType::DateTime
+        );
+    }
+}
+
+#[test]
+fn a_text_of_very_many_fields_is_refused_where_the_limit_is_passed() {
+    let text: String = (0..5000).map(|field| format!("int8 f{field}\n")).collect();
+    let error = Registry::empty(Dialect::Ros1)
+        .add(&name("t/T"), &text)
+        .unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "`t/T` line 4097: more than 4096 fields: `int8 f4096`"
+    );
+}
+
+#[test]
 fn types_that_multiply_are_refused_before_they_are_built() {
     let mut registry = Registry::empty(Dialect::Ros2);
     registry.add(&name("t/L1"), "int8 x").unwrap();
