@@ -7,11 +7,11 @@ use std::sync::Arc;
 use md5::{Digest, Md5};
 use uadp::BuiltinType;
 
-use crate::definition::{Arity, Definition, FieldType, Primitive};
+use crate::definition::{Arity, Clock, Definition, FieldType, Number, Primitive};
 use crate::{DefinitionError, Dialect, Leaf, MessageType, Rank, TypeName};
 
 const DEEPEST: usize = 32;
-const MOST_FIELDS: usize = 4096;
+pub(crate) const MOST_FIELDS: usize = 4096;
 const BIGGEST: usize = 64 << 20;
 
 /// A message with the messages in it, as the plan compiler walks it.
@@ -45,6 +45,25 @@ pub(crate) enum ShapeKind {
 impl Primitive {
     pub(crate) const fn builtin(self) -> BuiltinType {
         match self {
+            Self::Number(number) => number.builtin(),
+            Self::Clock(clock) => clock.builtin(),
+            Self::Text(_) => BuiltinType::String,
+        }
+    }
+
+    /// Bytes of one on the wire, of a string its length alone.
+    pub(crate) const fn size(self) -> usize {
+        match self {
+            Self::Number(number) => number.size(),
+            Self::Clock(_) => 8,
+            Self::Text(_) => 4,
+        }
+    }
+}
+
+impl Number {
+    pub(crate) const fn builtin(self) -> BuiltinType {
+        match self {
             Self::Bool => BuiltinType::Boolean,
             Self::Int8 => BuiltinType::SByte,
             Self::UInt8 => BuiltinType::Byte,
@@ -55,24 +74,25 @@ impl Primitive {
             Self::Int64 => BuiltinType::Int64,
             Self::UInt64 => BuiltinType::UInt64,
             Self::Float32 => BuiltinType::Float,
-            Self::Float64 | Self::Duration1 | Self::Duration2 => BuiltinType::Double,
-            Self::Time1 | Self::Time2 => BuiltinType::DateTime,
-            Self::String { .. } | Self::WString { .. } => BuiltinType::String,
+            Self::Float64 => BuiltinType::Double,
         }
     }
 
-    /// Bytes of one on the wire, of a string its length alone.
     pub(crate) const fn size(self) -> usize {
         match self {
             Self::Bool | Self::Int8 | Self::UInt8 => 1,
             Self::Int16 | Self::UInt16 => 2,
-            Self::Int32
-            | Self::UInt32
-            | Self::Float32
-            | Self::String { .. }
-            | Self::WString { .. } => 4,
+            Self::Int32 | Self::UInt32 | Self::Float32 => 4,
             Self::Int64 | Self::UInt64 | Self::Float64 => 8,
-            Self::Time1 | Self::Time2 | Self::Duration1 | Self::Duration2 => 8,
+        }
+    }
+}
+
+impl Clock {
+    pub(crate) const fn builtin(self) -> BuiltinType {
+        match self {
+            Self::Time1 | Self::Time2 => BuiltinType::DateTime,
+            Self::Duration1 | Self::Duration2 => BuiltinType::Double,
         }
     }
 }
@@ -121,17 +141,17 @@ impl<'r> Resolver<'r> {
             }
             _ => self.shape(name, &mut Vec::new())?,
         };
-        let (md5, definition) = match definition {
-            Some(text) => (self.md5(name)?, text.to_owned()),
-            None => (self.md5(name)?, self.full_text(name)?),
+        // Only now, as the shape has shown that nothing contains itself.
+        let md5 = match self.dialect {
+            Dialect::Ros1 => self.md5(name)?,
+            Dialect::Ros2 => String::new(),
+        };
+        let definition = match definition {
+            Some(text) => text.to_owned(),
+            None => self.full_text(name)?,
         };
         let mut leaves = Vec::new();
         flatten(&shape, "", &mut leaves);
-        let md5 = if self.dialect == Dialect::Ros1 {
-            md5
-        } else {
-            String::new()
-        };
         Ok(MessageType {
             name: name.clone(),
             dialect: self.dialect,
@@ -144,9 +164,11 @@ impl<'r> Resolver<'r> {
 
     fn time(&self, name: &TypeName) -> Option<Primitive> {
         match self.dialect {
-            Dialect::Ros2 if name.is("builtin_interfaces", "Time") => Some(Primitive::Time2),
+            Dialect::Ros2 if name.is("builtin_interfaces", "Time") => {
+                Some(Primitive::Clock(Clock::Time2))
+            }
             Dialect::Ros2 if name.is("builtin_interfaces", "Duration") => {
-                Some(Primitive::Duration2)
+                Some(Primitive::Clock(Clock::Duration2))
             }
             Dialect::Ros1 | Dialect::Ros2 => None,
         }
@@ -265,29 +287,29 @@ impl<'r> Resolver<'r> {
         Ok(text)
     }
 
-    /// What a type needs: first all it names itself, then what each of those needs.
+    /// What a type needs, depth first, each once.
     fn dependencies(
         &self,
         name: &TypeName,
         found: &mut Vec<TypeName>,
     ) -> Result<(), DefinitionError> {
-        let definition = self.find(name, None)?;
-        let mut direct = Vec::new();
-        for field in &definition.fields {
+        if self.time(name).is_some() {
+            return Ok(());
+        }
+        for field in &self.find(name, None)?.fields {
             if let FieldType::Message(inner) = &field.kind
                 && !found.contains(inner)
             {
                 found.push(inner.clone());
-                direct.push(inner.clone());
+                self.dependencies(inner, found)?;
             }
         }
-        direct
-            .iter()
-            .try_for_each(|inner| self.dependencies(inner, found))
+        Ok(())
     }
 
     pub(crate) fn suggest(&self, name: &TypeName) -> Option<TypeName> {
         let wanted = name.to_string();
+        let furthest = name.name().len() / 3;
         let known = self.sets.iter().flat_map(|set| set.keys());
         let (distance, nearest) = known
             .map(|known| {
@@ -302,7 +324,7 @@ impl<'r> Resolver<'r> {
                 )
             })
             .min_by_key(|(distance, _)| *distance)?;
-        (distance <= name.name().len() / 3).then(|| nearest.clone())
+        (distance <= furthest).then(|| nearest.clone())
     }
 }
 
@@ -350,7 +372,10 @@ fn flatten(shape: &Shape, prefix: &str, leaves: &mut Vec<Leaf>) {
                 builtin: BuiltinType::ExtensionObject,
                 rank: rank(arity),
             }),
-            (ShapeKind::Primitive(Primitive::UInt8), Arity::Fixed(_) | Arity::Sequence { .. }) => {
+            (
+                ShapeKind::Primitive(Primitive::Number(Number::UInt8)),
+                Arity::Fixed(_) | Arity::Sequence { .. },
+            ) => {
                 leaves.push(Leaf {
                     path,
                     builtin: BuiltinType::ByteString,
