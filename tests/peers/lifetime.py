@@ -38,6 +38,18 @@ def say(**fields):
     sys.stdout.flush()
 
 
+def told():
+    """An event that is set when a line comes on standard input."""
+    event = threading.Event()
+
+    def read():
+        if sys.stdin.readline():
+            event.set()
+
+    threading.Thread(target=read, daemon=True).start()
+    return event
+
+
 def values_of(arguments):
     """The values to send: those of --value, or else the lines of standard input."""
     if arguments.value:

@@ -13,12 +13,11 @@ async def run(args):
     async with await opcua_session.client_of(args) as client:
         for text in args.node:
             node = client.get_node(text)
-            wanted = ua.ReadValueId(NodeId_=node.nodeid, AttributeId=ua.AttributeIds.Value)
-            answer = await client.uaclient.read(
-                ua.ReadParameters(
-                    TimestampsToReturn_=ua.TimestampsToReturn.Both, NodesToRead=[wanted]
-                )
-            )
+            wanted = ua.ReadValueId(node.nodeid, ua.AttributeIds.Value)
+            parameters = ua.ReadParameters()
+            parameters.TimestampsToReturn = ua.TimestampsToReturn.Both
+            parameters.NodesToRead = [wanted]
+            answer = await client.uaclient.read(parameters)
             lifetime.say(**opcua_session.described(text, answer[0]))
 
 

@@ -1,6 +1,7 @@
 """A rospy publisher. Values come as JSON from --value or standard input; --numbered makes "0", "1", ..."""
 
 import argparse
+import json
 import time
 
 import rospy
@@ -16,6 +17,7 @@ def arguments():
     parser.add_argument("--node", default="rospy_pub")
     parser.add_argument("--value", action="append")
     parser.add_argument("--numbered", type=int, help="send this many numbers instead of values")
+    parser.add_argument("--warm-up", help="JSON value to send ten times a second until a line comes on standard input")
     parser.add_argument("--rate", type=float, default=10.0)
     parser.add_argument("--repeat", type=int, default=1, help="how often to send the values; 0: until told to end")
     parser.add_argument("--latch", action="store_true")
@@ -59,6 +61,12 @@ def main():
     lifetime.say(ready=args.topic)
     while publisher.get_num_connections() < args.wait_subscribers and not rospy.is_shutdown():
         time.sleep(0.005)
+
+    if args.warm_up is not None:
+        told = lifetime.told()
+        warm_up = ros1_messages.build(kind, json.loads(args.warm_up))
+        while not told.wait(0.1) and not rospy.is_shutdown():
+            publisher.publish(warm_up)
 
     sent = 0
     for message in paced(messages, args.rate, args.repeat):

@@ -1,6 +1,7 @@
 """A Cyclone DDS writer with ROS 2 names. Values come as JSON from --value or standard input."""
 
 import argparse
+import json
 import threading
 import time
 
@@ -17,6 +18,7 @@ def main():
     ros2_types.add_arguments(parser)
     parser.add_argument("--value", action="append")
     parser.add_argument("--numbered", type=int, help="send this many numbers instead of values")
+    parser.add_argument("--warm-up", help="JSON value to send ten times a second until a line comes on standard input")
     parser.add_argument("--rate", type=float, default=10.0)
     parser.add_argument("--repeat", type=int, default=1, help="how often to send the values; 0: until told to end")
     parser.add_argument("--wait-readers", type=int, default=0)
@@ -37,6 +39,12 @@ def main():
     lifetime.say(ready=args.topic)
     while len(writer.get_matched_subscriptions()) < args.wait_readers:
         time.sleep(0.005)
+
+    if args.warm_up is not None:
+        told = lifetime.told()
+        warm_up = ros2_types.build(kind, json.loads(args.warm_up))
+        while not told.wait(0.1):
+            writer.write(warm_up)
 
     start = time.monotonic()
     sent = 0

@@ -152,7 +152,9 @@ fn skip(reason: &str) {
         .create(true)
         .append(true)
         .open(path)
-        .and_then(|mut file| std::io::Write::write_all(&mut file, format!("{test}: {reason}\n").as_bytes()));
+        .and_then(|mut file| {
+            std::io::Write::write_all(&mut file, format!("{test}: {reason}\n").as_bytes())
+        });
     if let Err(error) = report {
         eprintln!("and this could not be written down: {error}");
     }

@@ -28,7 +28,7 @@ pub struct Started {
     name: String,
     command: Command,
     ends_on: Signal,
-    input: Option<String>,
+    told: bool,
 }
 
 impl Started {
@@ -42,7 +42,7 @@ impl Started {
             name: name.to_owned(),
             command,
             ends_on: Signal::SIGTERM,
-            input: None,
+            told: false,
         }
     }
 
@@ -67,10 +67,10 @@ impl Started {
         self
     }
 
-    /// What the process reads from standard input, which is closed after it.
+    /// The process has a standard input, for [`Child::tell`].
     #[must_use]
-    pub fn input(mut self, text: impl Into<String>) -> Self {
-        self.input = Some(text.into());
+    pub fn told(mut self) -> Self {
+        self.told = true;
         self
     }
 
@@ -81,7 +81,7 @@ impl Started {
     #[must_use]
     pub fn start(mut self) -> Child {
         self.command
-            .stdin(if self.input.is_some() {
+            .stdin(if self.told {
                 Stdio::piped()
             } else {
                 Stdio::null()
@@ -92,10 +92,6 @@ impl Started {
             .command
             .spawn()
             .unwrap_or_else(|error| panic!("{} does not start: {error}", self.name));
-        if let (Some(mut pipe), Some(text)) = (process.stdin.take(), self.input) {
-            pipe.write_all(text.as_bytes())
-                .unwrap_or_else(|error| panic!("{} does not read its input: {error}", self.name));
-        }
         let output = Arc::new(Output::default());
         let readers = vec![
             collect(process.stdout.take().unwrap(), Stream::Out, &output),
@@ -190,6 +186,15 @@ impl Child {
                 None => panic!("{} within {deadline:?} not so: {what}", self.name),
             }
         }
+    }
+
+    /// Writes a line to the process's standard input.
+    ///
+    /// # Panics
+    /// When it has none, or does not read it.
+    pub fn tell(&mut self, line: &str) {
+        let input = self.process.stdin.as_mut().unwrap();
+        writeln!(input, "{line}").unwrap();
     }
 
     /// All lines so far, of both streams.
@@ -368,7 +373,10 @@ fn collect(
     std::thread::spawn(move || {
         let mut pipe = BufReader::new(pipe);
         let mut bytes = Vec::new();
-        while pipe.read_until(b'\n', &mut bytes).is_ok_and(|read| read > 0) {
+        while pipe
+            .read_until(b'\n', &mut bytes)
+            .is_ok_and(|read| read > 0)
+        {
             let text = String::from_utf8_lossy(&bytes).trim_end().to_owned();
             bytes.clear();
             let mut lines = output.lines.lock().unwrap();

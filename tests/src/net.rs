@@ -10,7 +10,7 @@ use serde_json::Value;
 use socket2::{Domain, Protocol, Socket, Type};
 
 /// The group and port programs use that are told nothing else.
-pub const GROUP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 0, 0, 5), 4840);
+pub const GROUP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 40), 4840);
 
 const PATIENCE: Duration = Duration::from_secs(5);
 
@@ -95,12 +95,18 @@ pub fn http_get(address: &str, path: &str) -> Option<String> {
     exchange(address, &request)
 }
 
-/// The body of the answer to an XML-RPC call with `caller_id` as its one argument, or `None` while nobody answers.
+/// The body of the answer to an XML-RPC call, or `None` while nobody answers. An argument is text, or XML of a value.
 #[must_use]
-pub fn xml_rpc(address: &str, method: &str, caller_id: &str) -> Option<String> {
+pub fn xml_rpc(address: &str, method: &str, arguments: &[&str]) -> Option<String> {
+    let params: String = arguments
+        .iter()
+        .map(|argument| match argument.starts_with('<') {
+            true => format!("<param><value>{argument}</value></param>"),
+            false => format!("<param><value><string>{argument}</string></value></param>"),
+        })
+        .collect();
     let body = format!(
-        "<?xml version=\"1.0\"?><methodCall><methodName>{method}</methodName><params><param><value>\
-         <string>{caller_id}</string></value></param></params></methodCall>"
+        "<?xml version=\"1.0\"?><methodCall><methodName>{method}</methodName><params>{params}</params></methodCall>"
     );
     let request = format!(
         "POST / HTTP/1.1\r\nHost: {address}\r\nContent-Type: text/xml\r\nConnection: close\r\n\

@@ -26,7 +26,8 @@ impl Cell {
     pub fn roscore(&self) -> Child {
         let master = self.roscore_unwatched();
         eventually("the ROS 1 master answers getPid", START, || {
-            xml_rpc(MASTER, "getPid", "/system_tests").filter(|answer| answer.contains("<int>1</int>"))
+            xml_rpc(MASTER, "getPid", &["/system_tests"])
+                .filter(|answer| answer.contains("<int>1</int>"))
         });
         master
     }
@@ -56,10 +57,13 @@ impl Cell {
     #[must_use]
     pub fn topic_tools_relay(&self, from: &str, to: &str) -> Child {
         // roscpp leaves its registrations in the master on SIGTERM.
-        self.with_ros1(Started::new("relay", Path::new("/usr/lib/topic_tools/relay")))
-            .args([from, to])
-            .ends_on(Signal::SIGINT)
-            .start()
+        self.with_ros1(Started::new(
+            "relay",
+            Path::new("/usr/lib/topic_tools/relay"),
+        ))
+        .args([from, to])
+        .ends_on(Signal::SIGINT)
+        .start()
     }
 
     /// rosrust publishing or subscribing `std_msgs/String`; it has said that it is ready.
@@ -74,10 +78,13 @@ impl Cell {
     /// A Cyclone DDS script of `peers/` that has said it is ready.
     #[must_use]
     pub fn cyclone(&self, script: &str, args: &[&str]) -> Child {
-        self.python(script, args)
-            .env("CYCLONEDDS_URI", CYCLONE)
-            .start()
-            .ready(START)
+        self.cyclone_started(script, args).start().ready(START)
+    }
+
+    /// A Cyclone DDS script of `peers/`, not started yet.
+    #[must_use]
+    pub fn cyclone_started(&self, script: &str, args: &[&str]) -> Started {
+        self.python(script, args).env("CYCLONEDDS_URI", CYCLONE)
     }
 
     /// An asyncua script of `peers/` that stays and has said it is ready.
@@ -119,6 +126,31 @@ impl Cell {
             .args(args)
     }
 
+    /// Where the ROS 1 node `name` serves its slave API, as `127.0.0.1:40001`; `None` while the master does not know it.
+    #[must_use]
+    pub fn slave_api(&self, name: &str) -> Option<String> {
+        let answer = xml_rpc(MASTER, "lookupNode", &["/system_tests", name])?;
+        let (_, rest) = answer.split_once("http://")?;
+        Some(rest.split(['/', '<']).next()?.to_owned())
+    }
+
+    /// Where the ROS 1 node `name` serves the topic by TCPROS; `None` while it does not publish it.
+    #[must_use]
+    pub fn tcpros_port(&self, name: &str, topic: &str) -> Option<String> {
+        let tcpros = "<array><data><value><array><data><value><string>TCPROS</string></value></data></array></value>\
+                      </data></array>";
+        let answer = xml_rpc(
+            &self.slave_api(name)?,
+            "requestTopic",
+            &["/system_tests", topic, tcpros],
+        )?;
+        // [1, message, ["TCPROS", host, port]]: the port is the last number.
+        let (before, _) = answer.rsplit_once("</i")?;
+        let (_, port) = before.rsplit_once('>')?;
+        let port: u16 = port.parse().ok().filter(|port| *port > 1)?;
+        Some(format!("127.0.0.1:{port}"))
+    }
+
     /// The environment of a ROS 1 program in this cell.
     pub(crate) fn with_ros1(&self, started: Started) -> Started {
         started
@@ -132,5 +164,7 @@ impl Cell {
 }
 
 fn peer_script(name: &str) -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("peers").join(name)
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("peers")
+        .join(name)
 }

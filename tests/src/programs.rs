@@ -51,7 +51,14 @@ impl Cell {
     pub fn bridge_ros2_started(&self, args: &[&str]) -> Started {
         Started::new("bridge-ros2", &program("bridge-ros2"))
             .args(args)
-            .args(["--domain", "2", "--interface", "lo", "--metrics", METRICS_ROS2])
+            .args([
+                "--domain",
+                "2",
+                "--interface",
+                "lo",
+                "--metrics",
+                METRICS_ROS2,
+            ])
     }
 
     /// ua-server as it answers, with `args` after those every cell needs.
@@ -73,9 +80,11 @@ impl Cell {
 }
 
 fn answers(name: &str, address: &str) {
-    eventually(&format!("{name} answers at {address}/status"), START, || {
-        metrics(address)
-    });
+    eventually(
+        &format!("{name} answers at {address}/status"),
+        START,
+        || metrics(address),
+    );
 }
 
 /// The sum of all numbers under keys called `key`, at any depth: a status may count per topic or as a whole.
@@ -90,6 +99,24 @@ pub fn number(status: &Value, key: &str) -> u64 {
             })
             .sum(),
         Value::Array(items) => items.iter().map(|item| number(item, key)).sum(),
+        _ => 0,
+    }
+}
+
+/// The samples and datagrams a program has dropped, for whatever reason.
+#[must_use]
+pub fn drops(status: &Value) -> u64 {
+    match status {
+        Value::Object(fields) => fields
+            .iter()
+            .map(|(name, value)| match value.as_object() {
+                Some(reasons) if name == "dropped" => {
+                    reasons.values().filter_map(Value::as_u64).sum()
+                }
+                _ => drops(value),
+            })
+            .sum(),
+        Value::Array(items) => items.iter().map(drops).sum(),
         _ => 0,
     }
 }
@@ -121,8 +148,17 @@ mod tests {
     use super::*;
 
     #[test]
+    fn all_reasons_of_all_topics_are_drops() {
+        let status = json!({"topics": {"a": {"sent": 7, "dropped": {"looped": 1, "malformed": 2}}},
+                            "others": {"dropped": {"not_in_space": 4}}});
+        assert_eq!(drops(&status), 7);
+        assert_eq!(drops(&json!({"sent": 3})), 0);
+    }
+
+    #[test]
     fn a_count_is_summed_over_all_topics_of_a_status() {
-        let status = json!({"malformed": 2, "topics": [{"malformed": 3}, {"malformed": 4, "looped": 9}]});
+        let status =
+            json!({"malformed": 2, "topics": [{"malformed": 3}, {"malformed": 4, "looped": 9}]});
         assert_eq!(number(&status, "malformed"), 9);
     }
 }

@@ -40,7 +40,15 @@ fn uadp_reaches_no_io() {
 fn uadp_knows_neither_ros_nor_the_space_nor_yaml() {
     does_not_reach(
         "uadp",
-        &["messages", "mappings", "bridge-*", "ros_message", "serde*", "tcpros", "transport"],
+        &[
+            "messages",
+            "mappings",
+            "bridge-*",
+            "ros_message",
+            "serde*",
+            "tcpros",
+            "transport",
+        ],
     );
 }
 
@@ -68,7 +76,15 @@ fn bridge_core_knows_no_carrier() {
 fn tcpros_is_a_ros_1_library_that_knows_no_space() {
     does_not_reach(
         "tcpros",
-        &["uadp", "messages", "mappings", "bridge-*", "transport", "rosrust*", "rustdds"],
+        &[
+            "uadp",
+            "messages",
+            "mappings",
+            "bridge-*",
+            "transport",
+            "rosrust*",
+            "rustdds",
+        ],
     );
 }
 
@@ -84,19 +100,32 @@ fn transport_does_not_know_what_a_datagram_means() {
 fn the_shell_knows_no_ros_library() {
     does_not_reach(
         "bridge-node",
-        &["tcpros", "rosrust*", "ros2-client", "rustdds", "async-opcua", "async-opcua-server"],
+        &[
+            "tcpros",
+            "rosrust*",
+            "ros2-client",
+            "rustdds",
+            "async-opcua",
+            "async-opcua-server",
+        ],
     );
 }
 
 #[test]
 fn each_bridge_knows_its_own_ros_library_only() {
-    does_not_reach("bridge-ros1", &["ros2-client", "rustdds", "bridge-ros2", "rosrust*"]);
+    does_not_reach(
+        "bridge-ros1",
+        &["ros2-client", "rustdds", "bridge-ros2", "rosrust*"],
+    );
     does_not_reach("bridge-ros2", &["tcpros", "bridge-ros1", "rosrust*"]);
 }
 
 #[test]
 fn the_server_knows_no_ros_library() {
-    does_not_reach("ua-server", &["tcpros", "ros2-client", "rustdds", "rosrust*"]);
+    does_not_reach(
+        "ua-server",
+        &["tcpros", "ros2-client", "rustdds", "rosrust*"],
+    );
 }
 
 #[test]

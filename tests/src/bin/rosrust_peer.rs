@@ -1,6 +1,6 @@
 //! rosrust as an independent ROS 1 implementation: publishes or subscribes `std_msgs/String`.
 //!
-//! `rosrust-peer pub TOPIC VALUE..` sends each value once a subscriber is there; `rosrust-peer sub TOPIC` prints one
+//! `rosrust-peer pub TOPIC VALUE..` sends the values ten times a second; `rosrust-peer sub TOPIC` prints one
 //! JSON line per message. Both end on SIGTERM, and by themselves after two minutes.
 
 use std::{
@@ -12,6 +12,7 @@ use rosrust::{RawMessage, RawMessageDescription};
 use serde_json::{Value, json};
 
 const LIMIT: Duration = Duration::from_secs(120);
+const PERIOD: Duration = Duration::from_millis(100);
 const POLL: Duration = Duration::from_millis(20);
 
 fn main() {
@@ -37,23 +38,24 @@ fn publish(topic: &str, values: &[String]) {
         rosrust::publish_with_description::<RawMessage>(topic, 100, description).unwrap();
     say(&json!({ "ready": topic }));
     let start = Instant::now();
-    while publisher.subscriber_count() == 0 && rosrust::is_ok() && start.elapsed() < LIMIT {
-        std::thread::sleep(POLL);
+    while rosrust::is_ok() && start.elapsed() < LIMIT {
+        for value in values {
+            publisher.send(RawMessage(to_bytes(value))).unwrap();
+        }
+        std::thread::sleep(PERIOD);
     }
-    for value in values {
-        publisher.send(RawMessage(to_bytes(value))).unwrap();
-    }
-    say(&json!({ "sent": values.len() }));
-    stay(start);
 }
 
 fn subscribe(topic: &str) {
     rosrust::init("rosrust_sub");
     let name = topic.to_owned();
-    let subscriber = rosrust::subscribe_with_ids(topic, 1000, move |message: RawMessage, id: &str| {
-        say(&json!({ "topic": name, "callerid": id, "value": { "data": to_text(&message.0) } }));
-    })
-    .unwrap();
+    let subscriber =
+        rosrust::subscribe_with_ids(topic, 1000, move |message: RawMessage, id: &str| {
+            say(
+                &json!({ "topic": name, "callerid": id, "value": { "data": to_text(&message.0) } }),
+            );
+        })
+        .unwrap();
     say(&json!({ "ready": topic }));
     stay(Instant::now());
     drop(subscriber);
