@@ -5,7 +5,10 @@ use std::{
     marker::PhantomData,
     path::{Path, PathBuf},
     process::Command,
-    sync::atomic::{AtomicU32, Ordering},
+    sync::{
+        Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicU32, Ordering},
+    },
 };
 
 use nix::sched::{CloneFlags, unshare};
@@ -21,12 +24,16 @@ pub enum Peer {
 
 /// A network namespace with nothing in it but a loopback that carries multicast, and a folder for files.
 ///
-/// Processes have to be started from the thread that made it: the namespace is the thread's.
+/// Processes have to be started from the thread that made it: the namespace is the thread's. There is one at a time,
+/// since peers that start side by side on a small machine take each other's time.
 pub struct Cell {
     folder: PathBuf,
     pub(crate) python: PathBuf,
     not_send: PhantomData<*const ()>,
+    _only: MutexGuard<'static, ()>,
 }
+
+static ONLY: Mutex<()> = Mutex::new(());
 
 impl Cell {
     /// Puts this thread into a new network, or says why the test is skipped and gives `None`.
@@ -36,6 +43,10 @@ impl Cell {
     #[must_use]
     pub fn with(peers: &[Peer]) -> Option<Self> {
         let python = python();
+        if let Some(reason) = env::var_os("UA_NO_NETWORK") {
+            skip(&reason.to_string_lossy());
+            return None;
+        }
         for peer in peers {
             if let Err(reason) = find(*peer, &python) {
                 skip(&reason);
@@ -47,6 +58,8 @@ impl Cell {
 
     fn enter(python: PathBuf) -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
+        // A test that failed with the lock has left nothing behind that the next one could trip over.
+        let only = ONLY.lock().unwrap_or_else(PoisonError::into_inner);
         if let Err(error) = unshare(CloneFlags::CLONE_NEWNET) {
             panic!(
                 "this process may not make a network of its own ({error}): run `cargo xtask test`, \
@@ -66,6 +79,7 @@ impl Cell {
             folder,
             python,
             not_send: PhantomData,
+            _only: only,
         }
     }
 
