@@ -1,1 +1,27 @@
-//! Placeholder of the skeleton.
+//! What the system tests stand on: a network of their own, the peers of other makers, and the programs under test.
+//!
+//! A test starts with [`Cell::with`], which puts its thread into a new network namespace. Everything it starts from
+//! there lives in that network and nowhere else, so ports, multicast groups and DDS domains of two tests never meet,
+//! and fixed port numbers are free.
+//!
+//! `cells/` has the mappings of the tests' cells.
+//!
+//! A peer that this machine does not have skips the test with the reason; with `CI=true` that is a failure.
+
+mod arrows;
+mod cell;
+mod child;
+mod net;
+mod peers;
+mod programs;
+mod wait;
+
+pub use arrows::{forbidden, tree};
+pub use cell::{Cell, Peer};
+pub use child::{Child, Started};
+pub use net::{GROUP, UadpSocket, http_get, metrics, xml_rpc};
+pub use peers::MASTER;
+pub use programs::{
+    METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, SERVER_ENDPOINT, drops, number, program,
+};
+pub use wait::{eventually, holds_for};

@@ -1,2 +1,57 @@
-//! Placeholder of the skeleton.
-fn main() {}
+//! The project's own commands: `cargo xtask <verb>`.
+#![expect(
+    clippy::print_stdout,
+    clippy::print_stderr,
+    reason = "a command line speaks to the person who typed it"
+)]
+
+mod bench;
+mod demo;
+mod lint;
+mod namespace;
+mod peers;
+mod shell;
+mod test;
+mod workspace;
+
+use std::process::ExitCode;
+
+use crate::{shell::Ended, workspace::Workspace};
+
+const VERBS: &str = "\
+cargo xtask <verb>
+
+  demo [ARGS]                    build the programs and run the assembly line; ARGS go to it (--help lists them)
+  test [--no-install] [FILTER..] install the peers of the tests (apt, pip), then run all tests whose name contains a FILTER
+  lint                           formatting, clippy, licences and sources of dependencies, documentation
+  bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
+";
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    match run(&arguments) {
+        Ok(ended) => ended.into(),
+        Err(error) => {
+            eprintln!("xtask: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
+    match arguments {
+        [] | ["help" | "--help" | "-h"] => {
+            print!("{VERBS}");
+            Ok(Ended::WELL)
+        }
+        ["demo", rest @ ..] => demo::run(&Workspace::find()?, rest),
+        ["test", rest @ ..] => test::run(&Workspace::find()?, rest),
+        ["lint"] => lint::run(&Workspace::find()?),
+        ["bench", "hop", rest @ ..] => bench::hop(&Workspace::find()?, rest),
+        _ => {
+            eprint!("xtask: there is no `{}`\n\n{VERBS}", arguments.join(" "));
+            Ok(Ended::USAGE)
+        }
+    }
+}

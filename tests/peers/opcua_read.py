@@ -1,0 +1,33 @@
+"""Reads nodes of an OPC UA server: one JSON line per node, status and timestamps included."""
+
+import argparse
+import asyncio
+
+from asyncua import ua
+
+import lifetime
+import opcua_session
+
+
+async def run(args):
+    async with await opcua_session.client_of(args) as client:
+        for text in args.node:
+            node = client.get_node(text)
+            wanted = ua.ReadValueId(node.nodeid, ua.AttributeIds.Value)
+            parameters = ua.ReadParameters()
+            parameters.TimestampsToReturn = ua.TimestampsToReturn.Both
+            parameters.NodesToRead = [wanted]
+            answer = await client.uaclient.read(parameters)
+            lifetime.say(**opcua_session.described(text, answer[0]))
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    opcua_session.add_arguments(parser)
+    parser.add_argument("node", nargs="+", help="as OPC UA writes it: ns=2;i=10")
+    args = parser.parse_args()
+    lifetime.bound(args.limit)
+    asyncio.run(run(args))
+
+
+main()

@@ -1,0 +1,39 @@
+"""A rospy subscriber: one JSON line per message, with the name of the node that sent it."""
+
+import argparse
+
+import rospy
+
+import lifetime
+import ros1_messages
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("topic")
+    parser.add_argument("type")
+    parser.add_argument("--node", default="rospy_sub")
+    parser.add_argument("--limit", type=float, default=120.0)
+    args = parser.parse_args()
+    lifetime.limit(args.limit)
+
+    def heard(message):
+        header = message._connection_header
+        lifetime.say(
+            topic=args.topic,
+            callerid=header.get("callerid"),
+            type=header.get("type"),
+            latching=header.get("latching") == "1",
+            value=ros1_messages.plain(message),
+        )
+
+    rospy.init_node(args.node, disable_rosout=True)
+    subscriber = rospy.Subscriber(
+        args.topic, ros1_messages.message_class(args.type), heard, queue_size=None, tcp_nodelay=True
+    )
+    lifetime.say(ready=args.topic)
+    rospy.spin()
+    subscriber.unregister()
+
+
+main()

@@ -1,0 +1,130 @@
+"""The ROS 2 interfaces the tests speak, under the names ROS 2 gives them on DDS."""
+
+import base64
+from dataclasses import dataclass, field, fields, is_dataclass
+
+from cyclonedds.core import Policy, Qos
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.annotations import final
+from cyclonedds.idl.types import float64, int32, sequence, uint32
+from cyclonedds.util import duration
+
+
+@dataclass
+@final
+class Bool(IdlStruct, typename="std_msgs.msg.dds_.Bool_"):
+    data: bool = False
+
+
+@dataclass
+@final
+class UInt32(IdlStruct, typename="std_msgs.msg.dds_.UInt32_"):
+    data: uint32 = 0
+
+
+@dataclass
+@final
+class Float64(IdlStruct, typename="std_msgs.msg.dds_.Float64_"):
+    data: float64 = 0.0
+
+
+@dataclass
+@final
+class String(IdlStruct, typename="std_msgs.msg.dds_.String_"):
+    data: str = ""
+
+
+@dataclass
+@final
+class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
+    sec: int32 = 0
+    nanosec: uint32 = 0
+
+
+@dataclass
+@final
+class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
+    stamp: Time = field(default_factory=Time)
+    frame_id: str = ""
+
+
+@dataclass
+@final
+class JointState(IdlStruct, typename="sensor_msgs.msg.dds_.JointState_"):
+    header: Header = field(default_factory=Header)
+    name: sequence[str] = field(default_factory=list)
+    position: sequence[float64] = field(default_factory=list)
+    velocity: sequence[float64] = field(default_factory=list)
+    effort: sequence[float64] = field(default_factory=list)
+
+
+TYPES = {
+    "std_msgs/Bool": Bool,
+    "std_msgs/UInt32": UInt32,
+    "std_msgs/Float64": Float64,
+    "std_msgs/String": String,
+    "sensor_msgs/JointState": JointState,
+}
+
+
+def kind_of(type_name):
+    try:
+        return TYPES[type_name]
+    except KeyError:
+        raise SystemExit(f"no ROS 2 type {type_name} here; there are {', '.join(TYPES)}") from None
+
+
+def build(kind, value):
+    """A sample of class `kind`. A value that is no object is that of the field `data`."""
+    wanted = value if isinstance(value, dict) else {"data": value}
+    sample = kind()
+    for one in fields(kind):
+        if one.name in wanted:
+            given = wanted[one.name]
+            old = getattr(sample, one.name)
+            setattr(sample, one.name, build(type(old), given) if is_dataclass(old) else given)
+    return sample
+
+
+def plain(value):
+    """The JSON form of a sample."""
+    if is_dataclass(value):
+        return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, (bytes, bytearray)):
+        return base64.b64encode(value).decode("ascii")
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    return value
+
+
+def dds_topic(ros_topic):
+    return "rt/" + ros_topic.lstrip("/")
+
+
+def qos(args):
+    reliability = (
+        Policy.Reliability.Reliable(duration(seconds=10))
+        if args.reliability == "reliable"
+        else Policy.Reliability.BestEffort
+    )
+    durability = (
+        Policy.Durability.TransientLocal
+        if args.durability == "transient_local"
+        else Policy.Durability.Volatile
+    )
+    return Qos(
+        reliability,
+        durability,
+        Policy.History.KeepLast(args.depth),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+    )
+
+
+def add_arguments(parser):
+    parser.add_argument("topic", help="as ROS 2 names it: /chatter")
+    parser.add_argument("type")
+    parser.add_argument("--domain", type=int, default=0)
+    parser.add_argument("--reliability", choices=["reliable", "best_effort"], default="reliable")
+    parser.add_argument("--durability", choices=["volatile", "transient_local"], default="volatile")
+    parser.add_argument("--depth", type=int, default=20000)
+    parser.add_argument("--limit", type=float, default=120.0)

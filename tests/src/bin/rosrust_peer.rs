@@ -1,0 +1,84 @@
+//! rosrust as an independent ROS 1 implementation: publishes or subscribes `std_msgs/String`.
+//!
+//! `rosrust-peer pub TOPIC VALUE..` sends the values ten times a second; `rosrust-peer sub TOPIC` prints one
+//! JSON line per message. Both end on SIGTERM, and by themselves after two minutes.
+
+use std::{
+    io::Write,
+    time::{Duration, Instant},
+};
+
+use rosrust::{RawMessage, RawMessageDescription};
+use serde_json::{Value, json};
+
+const LIMIT: Duration = Duration::from_secs(120);
+const PERIOD: Duration = Duration::from_millis(100);
+const POLL: Duration = Duration::from_millis(20);
+
+fn main() {
+    let args = rosrust::args();
+    match args.get(1..).unwrap_or_default() {
+        [verb, topic, values @ ..] if verb == "pub" => publish(topic, values),
+        [verb, topic] if verb == "sub" => subscribe(topic),
+        _ => {
+            eprintln!("usage: rosrust-peer pub TOPIC VALUE.. | sub TOPIC");
+            std::process::exit(64);
+        }
+    }
+}
+
+fn publish(topic: &str, values: &[String]) {
+    rosrust::init("rosrust_pub");
+    let description = RawMessageDescription {
+        msg_definition: "string data\n".into(),
+        md5sum: "992ce8a1687cec8c8bd883ec73ca41d1".into(),
+        msg_type: "std_msgs/String".into(),
+    };
+    let publisher =
+        rosrust::publish_with_description::<RawMessage>(topic, 100, description).unwrap();
+    say(&json!({ "ready": topic }));
+    let start = Instant::now();
+    while rosrust::is_ok() && start.elapsed() < LIMIT {
+        for value in values {
+            publisher.send(RawMessage(to_bytes(value))).unwrap();
+        }
+        std::thread::sleep(PERIOD);
+    }
+}
+
+fn subscribe(topic: &str) {
+    rosrust::init("rosrust_sub");
+    let name = topic.to_owned();
+    let subscriber =
+        rosrust::subscribe_with_ids(topic, 1000, move |message: RawMessage, id: &str| {
+            say(
+                &json!({ "topic": name, "callerid": id, "value": { "data": to_text(&message.0) } }),
+            );
+        })
+        .unwrap();
+    say(&json!({ "ready": topic }));
+    stay(Instant::now());
+    drop(subscriber);
+}
+
+fn stay(start: Instant) {
+    while rosrust::is_ok() && start.elapsed() < LIMIT {
+        std::thread::sleep(POLL);
+    }
+}
+
+fn to_bytes(text: &str) -> Vec<u8> {
+    let length = u32::try_from(text.len()).unwrap();
+    [&length.to_le_bytes()[..], text.as_bytes()].concat()
+}
+
+fn to_text(body: &[u8]) -> Option<String> {
+    let (length, text) = body.split_first_chunk::<4>()?;
+    let length = usize::try_from(u32::from_le_bytes(*length)).ok()?;
+    String::from_utf8(text.get(..length)?.to_vec()).ok()
+}
+
+fn say(line: &Value) {
+    let mut out = std::io::stdout().lock();
+    writeln!(out, "{line}").and_then(|()| out.flush()).unwrap();
+}

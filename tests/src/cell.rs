@@ -1,0 +1,175 @@
+//! A network of its own for each test.
+
+use std::{
+    env, fs,
+    marker::PhantomData,
+    path::{Path, PathBuf},
+    process::Command,
+    sync::{
+        Mutex, MutexGuard, PoisonError,
+        atomic::{AtomicU32, Ordering},
+    },
+};
+
+use nix::sched::{CloneFlags, unshare};
+
+/// Software of other makers that a test needs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Peer {
+    /// rosmaster, rospy and roscpp's `topic_tools`, from Debian or Ubuntu.
+    Ros1,
+    /// Cyclone DDS and asyncua, in the Python environment that `cargo xtask test` makes.
+    Python,
+}
+
+/// A network namespace with nothing in it but a loopback that carries multicast, and a folder for files.
+///
+/// Processes have to be started from the thread that made it: the namespace is the thread's. There is one at a time,
+/// since peers that start side by side on a small machine take each other's time.
+pub struct Cell {
+    folder: PathBuf,
+    pub(crate) python: PathBuf,
+    not_send: PhantomData<*const ()>,
+    _only: MutexGuard<'static, ()>,
+}
+
+static ONLY: Mutex<()> = Mutex::new(());
+
+impl Cell {
+    /// Puts this thread into a new network, or says why the test is skipped and gives `None`.
+    ///
+    /// # Panics
+    /// When a peer is missing and `CI=true`, and when this process may not make network namespaces.
+    #[must_use]
+    pub fn with(peers: &[Peer]) -> Option<Self> {
+        let python = python();
+        if let Some(reason) = env::var_os("UA_NO_NETWORK") {
+            skip(&reason.to_string_lossy());
+            return None;
+        }
+        for peer in peers {
+            if let Err(reason) = find(*peer, &python) {
+                skip(&reason);
+                return None;
+            }
+        }
+        Some(Self::enter(python))
+    }
+
+    fn enter(python: PathBuf) -> Self {
+        static COUNT: AtomicU32 = AtomicU32::new(0);
+        // A test that failed with the lock has left nothing behind that the next one could trip over.
+        let only = ONLY.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Err(error) = unshare(CloneFlags::CLONE_NEWNET) {
+            panic!(
+                "this process may not make a network of its own ({error}): run `cargo xtask test`, \
+                 which arranges for that"
+            );
+        }
+        ip(&["link", "set", "lo", "up"]);
+        ip(&["link", "set", "lo", "multicast", "on"]);
+        ip(&["route", "add", "224.0.0.0/4", "dev", "lo"]);
+        let folder = env::temp_dir().join(format!(
+            "ua-bridge-test-{}-{}",
+            std::process::id(),
+            COUNT.fetch_add(1, Ordering::Relaxed)
+        ));
+        fs::create_dir_all(&folder).unwrap();
+        Self {
+            folder,
+            python,
+            not_send: PhantomData,
+            _only: only,
+        }
+    }
+
+    /// A folder of this test, removed when it passes.
+    #[must_use]
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// Writes a file into the folder and gives its path.
+    ///
+    /// # Panics
+    /// When that fails.
+    #[must_use]
+    pub fn file(&self, name: &str, text: &str) -> PathBuf {
+        let path = self.folder.join(name);
+        fs::write(&path, text).unwrap();
+        path
+    }
+}
+
+impl Drop for Cell {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            eprintln!("its files are kept in {}", self.folder.display());
+        } else if let Err(error) = fs::remove_dir_all(&self.folder) {
+            eprintln!("{} stays: {error}", self.folder.display());
+        }
+    }
+}
+
+fn ip(args: &[&str]) {
+    let output = Command::new("ip")
+        .args(args)
+        .output()
+        .unwrap_or_else(|error| panic!("`ip` (package iproute2) does not start: {error}"));
+    assert!(
+        output.status.success(),
+        "ip {}: {}",
+        args.join(" "),
+        String::from_utf8_lossy(&output.stderr)
+    );
+}
+
+fn python() -> PathBuf {
+    env::var_os("UA_PEERS_PYTHON").map_or_else(
+        || Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/peers/venv/bin/python"),
+        PathBuf::from,
+    )
+}
+
+fn find(peer: Peer, python: &Path) -> Result<(), String> {
+    let needed: &[&Path] = match peer {
+        Peer::Ros1 => &[
+            Path::new("/usr/bin/rosmaster"),
+            Path::new("/usr/lib/python3/dist-packages/rospy/__init__.py"),
+            Path::new("/usr/lib/python3/dist-packages/sensor_msgs/__init__.py"),
+            Path::new("/usr/lib/topic_tools/relay"),
+        ],
+        Peer::Python => &[python],
+    };
+    match needed.iter().find(|path| !path.exists()) {
+        None => Ok(()),
+        Some(path) => Err(format!(
+            "the {peer:?} peer is not on this machine ({} is missing); `cargo xtask test` installs it",
+            path.display()
+        )),
+    }
+}
+
+/// Reports a test that cannot run here. The runner of the tests captures what a passing test prints, so the reason
+/// also goes into the file `UA_SKIPPED` names, which `cargo xtask test` shows at the end.
+fn skip(reason: &str) {
+    let test = std::thread::current().name().unwrap_or("a test").to_owned();
+    assert!(
+        env::var_os("CI").is_none_or(|ci| ci != "true"),
+        "with CI=true nothing is skipped, and {reason}"
+    );
+    eprintln!("skipped: {test}: {reason}");
+    let Some(path) = env::var_os("UA_SKIPPED") else {
+        return;
+    };
+    let report = fs::OpenOptions::new()
+        .create(true)
+        .append(true)
+        .open(path)
+        .and_then(|mut file| {
+            std::io::Write::write_all(&mut file, format!("{test}: {reason}\n").as_bytes())
+        });
+    if let Err(error) = report {
+        eprintln!("and this could not be written down: {error}");
+    }
+}

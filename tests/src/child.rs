@@ -1,0 +1,392 @@
+//! Processes a test starts, what they print, and their end.
+
+use std::{
+    fmt,
+    io::{BufRead, BufReader, Read, Write},
+    path::Path,
+    process::{Command, ExitStatus, Stdio},
+    sync::{Arc, Condvar, Mutex},
+    thread::JoinHandle,
+    time::{Duration, Instant},
+};
+
+use nix::{
+    sys::signal::{Signal, kill},
+    unistd::Pid,
+};
+use serde_json::Value;
+
+/// How long a process has between the signal that asks it to end and the one that makes it.
+const GRACE: Duration = Duration::from_secs(5);
+/// Lines kept per process. What comes after them is read and counted, so that the process never blocks on its pipe.
+const KEPT: usize = 200_000;
+/// Lines shown when a test fails.
+const SHOWN: usize = 60;
+
+/// A process to start: its program, arguments and environment.
+pub struct Started {
+    name: String,
+    command: Command,
+    ends_on: Signal,
+    told: bool,
+}
+
+impl Started {
+    /// `program` under the name the messages of a failing test call it by.
+    #[must_use]
+    pub fn new(name: &str, program: &Path) -> Self {
+        // The kernel ends the process with the thread that started it: a test that is killed leaves nothing behind.
+        let mut command = Command::new("setpriv");
+        command.args(["--pdeathsig", "KILL", "--"]).arg(program);
+        Self {
+            name: name.to_owned(),
+            command,
+            ends_on: Signal::SIGTERM,
+            told: false,
+        }
+    }
+
+    /// More arguments.
+    #[must_use]
+    pub fn args<S: AsRef<std::ffi::OsStr>>(mut self, args: impl IntoIterator<Item = S>) -> Self {
+        self.command.args(args);
+        self
+    }
+
+    /// One variable of the process's environment.
+    #[must_use]
+    pub fn env(mut self, key: &str, value: impl AsRef<std::ffi::OsStr>) -> Self {
+        self.command.env(key, value);
+        self
+    }
+
+    /// The signal that ends the process in order, where that is not SIGTERM.
+    #[must_use]
+    pub fn ends_on(mut self, signal: Signal) -> Self {
+        self.ends_on = signal;
+        self
+    }
+
+    /// The process has a standard input, for [`Child::tell`].
+    #[must_use]
+    pub fn told(mut self) -> Self {
+        self.told = true;
+        self
+    }
+
+    /// Starts the process.
+    ///
+    /// # Panics
+    /// When it cannot be started.
+    #[must_use]
+    pub fn start(mut self) -> Child {
+        self.command
+            .stdin(if self.told {
+                Stdio::piped()
+            } else {
+                Stdio::null()
+            })
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped());
+        let mut process = self
+            .command
+            .spawn()
+            .unwrap_or_else(|error| panic!("{} does not start: {error}", self.name));
+        let output = Arc::new(Output::default());
+        let readers = vec![
+            collect(process.stdout.take().unwrap(), Stream::Out, &output),
+            collect(process.stderr.take().unwrap(), Stream::Err, &output),
+        ];
+        Child {
+            name: self.name,
+            process,
+            ends_on: self.ends_on,
+            output,
+            readers,
+        }
+    }
+}
+
+/// A process of this test. Dropping it ends it; if the test is failing, its last lines are shown.
+pub struct Child {
+    name: String,
+    process: std::process::Child,
+    ends_on: Signal,
+    output: Arc<Output>,
+    readers: Vec<JoinHandle<()>>,
+}
+
+impl Child {
+    /// The first line, of both streams, that contains `pattern`, whether printed before or after the call.
+    ///
+    /// # Panics
+    /// After `deadline`, or when the process ends without having printed one.
+    pub fn wait_for_line(&mut self, pattern: &str, deadline: Duration) -> String {
+        self.wait_for(&format!("a line with `{pattern}`"), deadline, |line| {
+            line.text.contains(pattern).then(|| line.text.clone())
+        })
+    }
+
+    /// What `pick` makes of the first JSON line of standard output it does not answer `None` to.
+    ///
+    /// # Panics
+    /// As [`Self::wait_for_line`].
+    pub fn wait_for_json<T>(
+        &mut self,
+        what: &str,
+        deadline: Duration,
+        mut pick: impl FnMut(&Value) -> Option<T>,
+    ) -> T {
+        self.wait_for(what, deadline, |line| {
+            line.json().and_then(|value| pick(&value))
+        })
+    }
+
+    /// Waits until the peer has said that it is ready.
+    ///
+    /// # Panics
+    /// As [`Self::wait_for_line`].
+    #[must_use]
+    pub fn ready(mut self, deadline: Duration) -> Self {
+        self.wait_for_json("it says that it is ready", deadline, |line| {
+            line.get("ready").map(drop)
+        });
+        self
+    }
+
+    fn wait_for<T>(
+        &mut self,
+        what: &str,
+        deadline: Duration,
+        mut pick: impl FnMut(&Line) -> Option<T>,
+    ) -> T {
+        let start = Instant::now();
+        let mut seen = 0;
+        loop {
+            // Asked before the lines are read, so that the last lines of a process that has ended are seen.
+            let ended = self.process.try_wait().unwrap();
+            if ended.is_some() {
+                self.join_readers();
+            }
+            let waited = start.elapsed();
+            {
+                let lines = self.output.lines.lock().unwrap();
+                if let Some(found) = lines.kept[seen..].iter().find_map(&mut pick) {
+                    return found;
+                }
+                seen = lines.kept.len();
+                if ended.is_none() && waited < deadline {
+                    let rest = (deadline - waited).min(Duration::from_millis(100));
+                    drop(self.output.changed.wait_timeout(lines, rest).unwrap());
+                    continue;
+                }
+            }
+            match ended {
+                Some(status) => panic!("{} ended ({status}) before: {what}", self.name),
+                None => panic!("{} within {deadline:?} not so: {what}", self.name),
+            }
+        }
+    }
+
+    /// Writes a line to the process's standard input.
+    ///
+    /// # Panics
+    /// When it has none, or does not read it.
+    pub fn tell(&mut self, line: &str) {
+        let input = self.process.stdin.as_mut().unwrap();
+        writeln!(input, "{line}").unwrap();
+    }
+
+    /// All lines so far, of both streams.
+    #[must_use]
+    pub fn lines(&self) -> Vec<String> {
+        let lines = self.output.lines.lock().unwrap();
+        lines.kept.iter().map(|line| line.text.clone()).collect()
+    }
+
+    /// The JSON objects printed to standard output so far.
+    #[must_use]
+    pub fn json_lines(&self) -> Vec<Value> {
+        let lines = self.output.lines.lock().unwrap();
+        lines.kept.iter().filter_map(Line::json).collect()
+    }
+
+    /// The `value`s among the JSON lines so far: what a subscriber has heard.
+    #[must_use]
+    pub fn values(&self) -> Vec<Value> {
+        self.json_lines()
+            .iter()
+            .filter_map(|line| line.get("value").cloned())
+            .collect()
+    }
+
+    /// Its process id.
+    #[must_use]
+    pub fn id(&self) -> u32 {
+        self.process.id()
+    }
+
+    /// Whether it still runs.
+    #[must_use]
+    pub fn runs(&mut self) -> bool {
+        self.process.try_wait().unwrap().is_none()
+    }
+
+    /// Sends it a signal.
+    ///
+    /// # Panics
+    /// When the process is gone.
+    pub fn signal(&self, signal: Signal) {
+        kill(self.pid(), signal).unwrap();
+    }
+
+    /// Waits for its end.
+    ///
+    /// # Panics
+    /// After `deadline`.
+    pub fn wait_for_end(&mut self, deadline: Duration) -> ExitStatus {
+        let name = self.name.clone();
+        let status = crate::eventually(&format!("{name} ends"), deadline, || {
+            self.process.try_wait().unwrap()
+        });
+        self.join_readers();
+        status
+    }
+
+    /// Asks it to end as a user would and waits for that.
+    ///
+    /// # Panics
+    /// When it has not ended in five seconds.
+    pub fn end(&mut self) -> ExitStatus {
+        self.signal(self.ends_on);
+        self.wait_for_end(GRACE)
+    }
+
+    fn pid(&self) -> Pid {
+        Pid::from_raw(i32::try_from(self.process.id()).unwrap())
+    }
+
+    fn join_readers(&mut self) {
+        for reader in self.readers.drain(..) {
+            reader.join().unwrap();
+        }
+    }
+
+    /// Ends it without ever panicking: this runs while a test may be failing already.
+    fn put_away(&mut self) {
+        let Ok(None) = self.process.try_wait() else {
+            return;
+        };
+        if kill(self.pid(), self.ends_on).is_ok() {
+            let start = Instant::now();
+            while start.elapsed() < GRACE {
+                let Ok(None) = self.process.try_wait() else {
+                    return;
+                };
+                std::thread::sleep(Duration::from_millis(5));
+            }
+        }
+        eprintln!("{} did not end when asked to: it is killed", self.name);
+        if let Err(error) = self.process.kill().and_then(|()| self.process.wait()) {
+            eprintln!("{} could not be killed: {error}", self.name);
+        }
+    }
+}
+
+impl Drop for Child {
+    fn drop(&mut self) {
+        self.put_away();
+        if std::thread::panicking() {
+            eprintln!("{self}");
+        }
+    }
+}
+
+impl fmt::Display for Child {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Ok(lines) = self.output.lines.lock() else {
+            return writeln!(f, "---- {}: its output is lost", self.name);
+        };
+        let before = lines.kept.len().saturating_sub(SHOWN);
+        writeln!(f, "---- {} printed:", self.name)?;
+        if before > 0 {
+            writeln!(f, "  ... {before} lines before these")?;
+        }
+        for line in &lines.kept[before..] {
+            writeln!(f, "  {} {}", line.stream.mark(), line.text)?;
+        }
+        if lines.not_kept > 0 {
+            writeln!(f, "  ... {} lines after these", lines.not_kept)?;
+        }
+        Ok(())
+    }
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum Stream {
+    Out,
+    Err,
+}
+
+impl Stream {
+    const fn mark(self) -> char {
+        match self {
+            Self::Out => '|',
+            Self::Err => '!',
+        }
+    }
+}
+
+struct Line {
+    stream: Stream,
+    text: String,
+}
+
+impl Line {
+    fn json(&self) -> Option<Value> {
+        if self.stream == Stream::Out && self.text.starts_with('{') {
+            serde_json::from_str(&self.text).ok()
+        } else {
+            None
+        }
+    }
+}
+
+#[derive(Default)]
+struct Lines {
+    kept: Vec<Line>,
+    not_kept: usize,
+}
+
+#[derive(Default)]
+struct Output {
+    lines: Mutex<Lines>,
+    changed: Condvar,
+}
+
+fn collect(
+    pipe: impl Read + Send + 'static,
+    stream: Stream,
+    output: &Arc<Output>,
+) -> JoinHandle<()> {
+    let output = Arc::clone(output);
+    std::thread::spawn(move || {
+        let mut pipe = BufReader::new(pipe);
+        let mut bytes = Vec::new();
+        while pipe
+            .read_until(b'\n', &mut bytes)
+            .is_ok_and(|read| read > 0)
+        {
+            let text = String::from_utf8_lossy(&bytes).trim_end().to_owned();
+            bytes.clear();
+            let mut lines = output.lines.lock().unwrap();
+            if lines.kept.len() < KEPT {
+                lines.kept.push(Line { stream, text });
+            } else {
+                lines.not_kept += 1;
+            }
+            drop(lines);
+            output.changed.notify_all();
+        }
+    })
+}

@@ -1,0 +1,169 @@
+//! Bytes of the tests' own: the UADP group, HTTP, XML-RPC.
+
+use std::{
+    io::{Read, Write},
+    net::{Ipv4Addr, SocketAddrV4, TcpStream, UdpSocket},
+    time::{Duration, Instant},
+};
+
+use serde_json::Value;
+use socket2::{Domain, Protocol, Socket, Type};
+
+/// The group and port programs use that are told nothing else.
+pub const GROUP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 40), 4840);
+
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// A member of the UADP group on loopback, which sees and sends raw datagrams.
+pub struct UadpSocket(UdpSocket);
+
+impl UadpSocket {
+    /// Joins [`GROUP`].
+    ///
+    /// # Panics
+    /// When the socket cannot be made.
+    #[must_use]
+    pub fn join() -> Self {
+        let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP)).unwrap();
+        socket.set_reuse_address(true).unwrap();
+        socket.set_recv_buffer_size(4 << 20).unwrap();
+        socket.bind(&GROUP.into()).unwrap();
+        socket
+            .join_multicast_v4(GROUP.ip(), &Ipv4Addr::LOCALHOST)
+            .unwrap();
+        socket.set_multicast_if_v4(&Ipv4Addr::LOCALHOST).unwrap();
+        socket.set_multicast_loop_v4(true).unwrap();
+        Self(socket.into())
+    }
+
+    /// Sends one datagram to the group.
+    ///
+    /// # Panics
+    /// When it does not leave.
+    pub fn send(&self, datagram: &[u8]) {
+        let sent = self.0.send_to(datagram, GROUP).unwrap();
+        assert_eq!(sent, datagram.len());
+    }
+
+    /// The next datagram of anyone in the group, this socket's own included; `None` after `deadline`.
+    ///
+    /// # Panics
+    /// When reading fails.
+    #[must_use]
+    pub fn receive(&self, deadline: Duration) -> Option<Vec<u8>> {
+        self.0
+            .set_read_timeout(Some(deadline.max(Duration::from_millis(1))))
+            .unwrap();
+        let mut buffer = vec![0; 65_536];
+        match self.0.recv(&mut buffer) {
+            Ok(length) => {
+                buffer.truncate(length);
+                Some(buffer)
+            }
+            Err(error) if matches!(error.kind(), std::io::ErrorKind::WouldBlock) => None,
+            Err(error) => panic!("the group cannot be read: {error}"),
+        }
+    }
+
+    /// The datagrams that arrive within `window`, those waiting already included.
+    #[must_use]
+    pub fn receive_for(&self, window: Duration) -> Vec<Vec<u8>> {
+        let start = Instant::now();
+        let mut all = Vec::new();
+        while let Some(rest) = window.checked_sub(start.elapsed()) {
+            all.extend(self.receive(rest));
+        }
+        all
+    }
+
+    /// Reads away what is waiting.
+    pub fn drain(&self) {
+        while self.receive(Duration::from_millis(1)).is_some() {}
+    }
+}
+
+/// What a program says about itself at `/status`, or `None` while it does not answer.
+#[must_use]
+pub fn metrics(address: &str) -> Option<Value> {
+    serde_json::from_str(&http_get(address, "/status")?).ok()
+}
+
+/// The body of a successful answer to an HTTP GET, or `None`.
+#[must_use]
+pub fn http_get(address: &str, path: &str) -> Option<String> {
+    let request = format!("GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
+    exchange(address, &request)
+}
+
+/// The body of the answer to an XML-RPC call, or `None` while nobody answers. An argument is text, or XML of a value.
+#[must_use]
+pub fn xml_rpc(address: &str, method: &str, arguments: &[&str]) -> Option<String> {
+    let params: String = arguments
+        .iter()
+        .map(|argument| match argument.starts_with('<') {
+            true => format!("<param><value>{argument}</value></param>"),
+            false => format!("<param><value><string>{argument}</string></value></param>"),
+        })
+        .collect();
+    let body = format!(
+        "<?xml version=\"1.0\"?><methodCall><methodName>{method}</methodName><params>{params}</params></methodCall>"
+    );
+    let request = format!(
+        "POST / HTTP/1.1\r\nHost: {address}\r\nContent-Type: text/xml\r\nConnection: close\r\n\
+         Content-Length: {}\r\n\r\n{body}",
+        body.len()
+    );
+    exchange(address, &request)
+}
+
+fn exchange(address: &str, request: &str) -> Option<String> {
+    let mut stream = TcpStream::connect_timeout(&address.parse().ok()?, PATIENCE).ok()?;
+    stream.set_read_timeout(Some(PATIENCE)).ok()?;
+    stream.write_all(request.as_bytes()).ok()?;
+    let mut answer = Vec::new();
+    stream.read_to_end(&mut answer).ok()?;
+    let answer = String::from_utf8_lossy(&answer);
+    let (head, body) = answer.split_once("\r\n\r\n")?;
+    if !head.lines().next()?.contains(" 200 ") {
+        return None;
+    }
+    let chunked = head
+        .lines()
+        .any(|line| line.eq_ignore_ascii_case("transfer-encoding: chunked"));
+    if chunked {
+        unchunk(body)
+    } else {
+        Some(body.to_owned())
+    }
+}
+
+fn unchunk(mut body: &str) -> Option<String> {
+    let mut whole = String::new();
+    loop {
+        let (size, rest) = body.split_once("\r\n")?;
+        let size = usize::from_str_radix(size.split(';').next()?.trim(), 16).ok()?;
+        if size == 0 {
+            return Some(whole);
+        }
+        whole.push_str(rest.get(..size)?);
+        body = rest.get(size..)?.strip_prefix("\r\n")?;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_body_in_chunks_is_put_together() {
+        assert_eq!(
+            unchunk("4\r\n{\"a\"\r\n3;x=y\r\n:1}\r\n0\r\n\r\n").as_deref(),
+            Some("{\"a\":1}")
+        );
+    }
+
+    #[test]
+    fn a_body_cut_in_a_chunk_is_none() {
+        assert_eq!(unchunk("9\r\n{\"a\"\r\n"), None);
+    }
+}

@@ -1,0 +1,170 @@
+//! The peers: ROS 1 from Debian, Cyclone DDS and asyncua from PyPI, rosrust.
+
+use std::{
+    path::{Path, PathBuf},
+    time::Duration,
+};
+
+use nix::sys::signal::Signal;
+
+use crate::{Cell, Child, GROUP, Started, eventually, program, xml_rpc};
+
+/// Where the ROS 1 master of a cell is.
+pub const MASTER: &str = "127.0.0.1:11311";
+
+/// Python and a ROS graph on a busy machine need seconds to come up.
+const START: Duration = Duration::from_secs(30);
+
+const CYCLONE: &str = r#"<CycloneDDS><Domain id="any">
+<General><Interfaces><NetworkInterface name="lo" multicast="true"/></Interfaces></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex></Discovery>
+</Domain></CycloneDDS>"#;
+
+impl Cell {
+    /// A running ROS 1 master: it has answered `getPid`.
+    #[must_use]
+    pub fn roscore(&self) -> Child {
+        let master = self.roscore_unwatched();
+        eventually("the ROS 1 master answers getPid", START, || {
+            xml_rpc(MASTER, "getPid", &["/system_tests"])
+                .filter(|answer| answer.contains("<int>1</int>"))
+        });
+        master
+    }
+
+    fn roscore_unwatched(&self) -> Child {
+        let port = MASTER.rsplit(':').next().unwrap_or("11311");
+        self.with_ros1(Started::new("rosmaster", Path::new("/usr/bin/rosmaster")))
+            .args(["--core", "-p", port])
+            .start()
+    }
+
+    /// A rospy script of `peers/` that has said it is ready.
+    #[must_use]
+    pub fn rospy(&self, script: &str, args: &[&str]) -> Child {
+        self.rospy_started(script, args).start().ready(START)
+    }
+
+    /// A rospy script of `peers/`, not started yet.
+    #[must_use]
+    pub fn rospy_started(&self, script: &str, args: &[&str]) -> Started {
+        self.with_ros1(Started::new(script, Path::new("/usr/bin/python3")))
+            .args([peer_script(script)])
+            .args(args)
+    }
+
+    /// roscpp's `topic_tools relay` from one topic to another. It says nothing when it is ready.
+    #[must_use]
+    pub fn topic_tools_relay(&self, from: &str, to: &str) -> Child {
+        // roscpp leaves its registrations in the master on SIGTERM.
+        self.with_ros1(Started::new(
+            "relay",
+            Path::new("/usr/lib/topic_tools/relay"),
+        ))
+        .args([from, to])
+        .ends_on(Signal::SIGINT)
+        .start()
+    }
+
+    /// rosrust publishing or subscribing `std_msgs/String`; it has said that it is ready.
+    #[must_use]
+    pub fn rosrust(&self, args: &[&str]) -> Child {
+        self.with_ros1(Started::new("rosrust-peer", &program("rosrust-peer")))
+            .args(args)
+            .start()
+            .ready(START)
+    }
+
+    /// A Cyclone DDS script of `peers/` that has said it is ready.
+    #[must_use]
+    pub fn cyclone(&self, script: &str, args: &[&str]) -> Child {
+        self.cyclone_started(script, args).start().ready(START)
+    }
+
+    /// A Cyclone DDS script of `peers/`, not started yet.
+    #[must_use]
+    pub fn cyclone_started(&self, script: &str, args: &[&str]) -> Started {
+        self.python(script, args).env("CYCLONEDDS_URI", CYCLONE)
+    }
+
+    /// An asyncua script of `peers/` that stays and has said it is ready.
+    #[must_use]
+    pub fn asyncua(&self, script: &str, args: &[&str]) -> Child {
+        self.python(script, args).start().ready(START)
+    }
+
+    /// An asyncua script of `peers/` that ends by itself; the JSON lines it printed.
+    ///
+    /// # Panics
+    /// When it fails.
+    #[must_use]
+    pub fn asyncua_once(&self, script: &str, args: &[&str]) -> Vec<serde_json::Value> {
+        let mut child = self.python(script, args).start();
+        let status = child.wait_for_end(START);
+        assert!(status.success(), "{script} ended with {status}");
+        child.json_lines()
+    }
+
+    /// Like [`Self::asyncua_once`], `None` when the script fails: for a server that may not be there yet.
+    #[must_use]
+    pub fn asyncua_try(&self, script: &str, args: &[&str]) -> Option<Vec<serde_json::Value>> {
+        let mut child = self.python(script, args).start();
+        let status = child.wait_for_end(START);
+        status.success().then(|| child.json_lines())
+    }
+
+    /// asyncua's PubSub listening on the UADP group.
+    #[must_use]
+    pub fn uadp_listener(&self) -> Child {
+        self.asyncua("uadp_listen.py", &[&format!("opc.udp://{GROUP}")])
+    }
+
+    fn python(&self, script: &str, args: &[&str]) -> Started {
+        Started::new(script, &self.python)
+            .env("PYTHONUNBUFFERED", "1")
+            .args([peer_script(script)])
+            .args(args)
+    }
+
+    /// Where the ROS 1 node `name` serves its slave API, as `127.0.0.1:40001`; `None` while the master does not know it.
+    #[must_use]
+    pub fn slave_api(&self, name: &str) -> Option<String> {
+        let answer = xml_rpc(MASTER, "lookupNode", &["/system_tests", name])?;
+        let (_, rest) = answer.split_once("http://")?;
+        Some(rest.split(['/', '<']).next()?.to_owned())
+    }
+
+    /// Where the ROS 1 node `name` serves the topic by TCPROS; `None` while it does not publish it.
+    #[must_use]
+    pub fn tcpros_port(&self, name: &str, topic: &str) -> Option<String> {
+        let tcpros = "<array><data><value><array><data><value><string>TCPROS</string></value></data></array></value>\
+                      </data></array>";
+        let answer = xml_rpc(
+            &self.slave_api(name)?,
+            "requestTopic",
+            &["/system_tests", topic, tcpros],
+        )?;
+        // [1, message, ["TCPROS", host, port]]: the port is the last number.
+        let (before, _) = answer.rsplit_once("</i")?;
+        let (_, port) = before.rsplit_once('>')?;
+        let port: u16 = port.parse().ok().filter(|port| *port > 1)?;
+        Some(format!("127.0.0.1:{port}"))
+    }
+
+    /// The environment of a ROS 1 program in this cell.
+    pub(crate) fn with_ros1(&self, started: Started) -> Started {
+        started
+            .env("PATH", "/usr/bin:/bin")
+            .env("PYTHONUNBUFFERED", "1")
+            .env("ROS_MASTER_URI", format!("http://{MASTER}"))
+            .env("ROS_HOSTNAME", "127.0.0.1")
+            .env("ROS_HOME", self.folder().join("ros"))
+            .env("ROS_LOG_DIR", self.folder().join("ros/log"))
+    }
+}
+
+fn peer_script(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("peers")
+        .join(name)
+}

@@ -1,0 +1,164 @@
+//! The programs under test, found and started as users start them.
+
+use std::{
+    env,
+    path::{Path, PathBuf},
+    time::Duration,
+};
+
+use serde_json::Value;
+
+use crate::{Cell, Child, Started, eventually, metrics};
+
+/// Where a cell's bridge-ros1 answers about itself.
+pub const METRICS_ROS1: &str = "127.0.0.1:9101";
+/// Where a cell's bridge-ros2 answers about itself.
+pub const METRICS_ROS2: &str = "127.0.0.1:9102";
+/// Where a cell's ua-server answers about itself.
+pub const METRICS_SERVER: &str = "127.0.0.1:9103";
+/// The endpoint of a cell's ua-server.
+pub const SERVER_ENDPOINT: &str = "opc.tcp://127.0.0.1:4840";
+
+const START: Duration = Duration::from_secs(20);
+
+impl Cell {
+    /// bridge-ros1 as it answers, with `args` after those every cell needs.
+    #[must_use]
+    pub fn bridge_ros1(&self, args: &[&str]) -> Child {
+        let child = self.bridge_ros1_started(args).start();
+        answers("bridge-ros1", METRICS_ROS1);
+        child
+    }
+
+    /// bridge-ros1, not started yet.
+    #[must_use]
+    pub fn bridge_ros1_started(&self, args: &[&str]) -> Started {
+        self.with_ros1(Started::new("bridge-ros1", &program("bridge-ros1")))
+            .args(args)
+            .args(["--interface", "lo", "--metrics", METRICS_ROS1])
+    }
+
+    /// bridge-ros2 in domain 2 as it answers, with `args` after those every cell needs.
+    #[must_use]
+    pub fn bridge_ros2(&self, args: &[&str]) -> Child {
+        let child = self.bridge_ros2_started(args).start();
+        answers("bridge-ros2", METRICS_ROS2);
+        child
+    }
+
+    /// bridge-ros2 in domain 2, not started yet.
+    #[must_use]
+    pub fn bridge_ros2_started(&self, args: &[&str]) -> Started {
+        Started::new("bridge-ros2", &program("bridge-ros2"))
+            .args(args)
+            .args([
+                "--domain",
+                "2",
+                "--interface",
+                "lo",
+                "--metrics",
+                METRICS_ROS2,
+            ])
+    }
+
+    /// ua-server as it answers, with `args` after those every cell needs.
+    #[must_use]
+    pub fn ua_server(&self, args: &[&str]) -> Child {
+        let child = self.ua_server_started(args).start();
+        answers("ua-server", METRICS_SERVER);
+        child
+    }
+
+    /// ua-server, not started yet.
+    #[must_use]
+    pub fn ua_server_started(&self, args: &[&str]) -> Started {
+        Started::new("ua-server", &program("ua-server"))
+            .args(args)
+            .args(["--pki".into(), self.folder().join("pki")])
+            .args(["--interface", "lo", "--metrics", METRICS_SERVER])
+    }
+}
+
+fn answers(name: &str, address: &str) {
+    eventually(
+        &format!("{name} answers at {address}/status"),
+        START,
+        || metrics(address),
+    );
+}
+
+/// The sum of all numbers under keys called `key`, at any depth: a status may count per topic or as a whole.
+#[must_use]
+pub fn number(status: &Value, key: &str) -> u64 {
+    match status {
+        Value::Object(fields) => fields
+            .iter()
+            .map(|(name, value)| match value.as_u64() {
+                Some(count) if name == key => count,
+                _ => number(value, key),
+            })
+            .sum(),
+        Value::Array(items) => items.iter().map(|item| number(item, key)).sum(),
+        _ => 0,
+    }
+}
+
+/// The samples and datagrams a program has dropped, for whatever reason.
+#[must_use]
+pub fn drops(status: &Value) -> u64 {
+    match status {
+        Value::Object(fields) => fields
+            .iter()
+            .map(|(name, value)| match value.as_object() {
+                Some(reasons) if name == "dropped" => {
+                    reasons.values().filter_map(Value::as_u64).sum()
+                }
+                _ => drops(value),
+            })
+            .sum(),
+        Value::Array(items) => items.iter().map(drops).sum(),
+        _ => 0,
+    }
+}
+
+/// The path of a program of this workspace.
+///
+/// # Panics
+/// When it has not been built.
+#[must_use]
+pub fn program(name: &str) -> PathBuf {
+    let given = env::var_os("UA_BIN_DIR").map(PathBuf::from);
+    let beside = env::current_exe()
+        .ok()
+        .and_then(|test| Some(test.parent()?.parent()?.to_path_buf()));
+    let folders: Vec<PathBuf> = given.into_iter().chain(beside).collect();
+    folders
+        .iter()
+        .map(|folder| folder.join(name))
+        .find(|path| Path::is_file(path))
+        .unwrap_or_else(|| {
+            panic!("{name} has not been built (looked in {folders:?}): run `cargo xtask test`, which builds it first")
+        })
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn all_reasons_of_all_topics_are_drops() {
+        let status = json!({"topics": {"a": {"sent": 7, "dropped": {"looped": 1, "malformed": 2}}},
+                            "others": {"dropped": {"not_in_space": 4}}});
+        assert_eq!(drops(&status), 7);
+        assert_eq!(drops(&json!({"sent": 3})), 0);
+    }
+
+    #[test]
+    fn a_count_is_summed_over_all_topics_of_a_status() {
+        let status =
+            json!({"malformed": 2, "topics": [{"malformed": 3}, {"malformed": 4, "looped": 9}]});
+        assert_eq!(number(&status, "malformed"), 9);
+    }
+}

@@ -1,0 +1,134 @@
+//! The arrows of the workspace: what a crate may not know, it does not reach.
+
+use system_tests::{forbidden, tree};
+
+/// IO, clocks and libraries of one ROS or one OPC UA implementation.
+const IMPURE: &[&str] = &[
+    "tokio*",
+    "async-std",
+    "smol",
+    "mio",
+    "socket2",
+    "hyper*",
+    "reqwest",
+    "rosrust*",
+    "roslibrust*",
+    "rustdds",
+    "ros2-client",
+    "async-opcua",
+    "async-opcua-server",
+    "async-opcua-client",
+    "iceoryx2*",
+];
+
+fn does_not_reach(package: &str, banned: &[&str]) {
+    let tree = tree(package);
+    assert!(
+        tree.starts_with(&format!("{package} v")),
+        "cargo tree begins with the package itself: {tree}"
+    );
+    let found = forbidden(&tree, banned);
+    assert!(found.is_empty(), "{package} reaches {found:?}:\n{tree}");
+}
+
+#[test]
+fn uadp_reaches_no_io() {
+    does_not_reach("uadp", IMPURE);
+}
+
+#[test]
+fn uadp_knows_neither_ros_nor_the_space_nor_yaml() {
+    does_not_reach(
+        "uadp",
+        &[
+            "messages",
+            "mappings",
+            "bridge-*",
+            "ros_message",
+            "serde*",
+            "tcpros",
+            "transport",
+        ],
+    );
+}
+
+#[test]
+fn messages_reaches_no_io() {
+    does_not_reach("messages", IMPURE);
+}
+
+#[test]
+fn mappings_reaches_no_io() {
+    does_not_reach("mappings", IMPURE);
+}
+
+#[test]
+fn bridge_core_reaches_no_io() {
+    does_not_reach("bridge-core", IMPURE);
+}
+
+#[test]
+fn bridge_core_knows_no_carrier() {
+    does_not_reach("bridge-core", &["tcpros", "transport", "bridge-node"]);
+}
+
+#[test]
+fn tcpros_is_a_ros_1_library_that_knows_no_space() {
+    does_not_reach(
+        "tcpros",
+        &[
+            "uadp",
+            "messages",
+            "mappings",
+            "bridge-*",
+            "transport",
+            "rosrust*",
+            "rustdds",
+        ],
+    );
+}
+
+#[test]
+fn transport_does_not_know_what_a_datagram_means() {
+    does_not_reach(
+        "transport",
+        &["uadp", "messages", "mappings", "bridge-*", "tcpros"],
+    );
+}
+
+#[test]
+fn the_shell_knows_no_ros_library() {
+    does_not_reach(
+        "bridge-node",
+        &[
+            "tcpros",
+            "rosrust*",
+            "ros2-client",
+            "rustdds",
+            "async-opcua",
+            "async-opcua-server",
+        ],
+    );
+}
+
+#[test]
+fn each_bridge_knows_its_own_ros_library_only() {
+    does_not_reach(
+        "bridge-ros1",
+        &["ros2-client", "rustdds", "bridge-ros2", "rosrust*"],
+    );
+    does_not_reach("bridge-ros2", &["tcpros", "bridge-ros1", "rosrust*"]);
+}
+
+#[test]
+fn the_server_knows_no_ros_library() {
+    does_not_reach(
+        "ua-server",
+        &["tcpros", "ros2-client", "rustdds", "rosrust*"],
+    );
+}
+
+#[test]
+fn the_check_sees_what_a_shell_reaches() {
+    assert!(forbidden(&tree("bridge-node"), IMPURE).contains(&"tokio".to_owned()));
+}

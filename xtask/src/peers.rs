@@ -1,0 +1,130 @@
+//! The software of other makers that the system tests talk to: ROS 1 from Debian or Ubuntu, the rest from PyPI.
+
+use std::{
+    fs,
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use anyhow::{Context as _, ensure};
+
+use crate::{
+    shell::{line, run, step, succeeds},
+    workspace::Workspace,
+};
+
+const APT: &[&str] = &[
+    "python3-roslaunch",
+    "python3-rosmaster",
+    "python3-rospy",
+    "python3-rostopic",
+    "python3-rosnode",
+    "python3-rosservice",
+    "python3-rosparam",
+    "python3-std-msgs",
+    "python3-geometry-msgs",
+    "python3-sensor-msgs",
+    "python3-tf2-msgs",
+    "topic-tools",
+    "tshark",
+    "iproute2",
+    "python3-venv",
+];
+
+/// Installs what is missing. What cannot be installed is told; its tests then skip themselves, or fail with `CI=true`.
+pub(crate) fn install(workspace: &Workspace) {
+    if let Err(error) = apt() {
+        eprintln!("xtask: the peers from apt are not complete: {error:#}");
+    }
+    if let Err(error) = venv(workspace) {
+        eprintln!("xtask: the peers from PyPI are not complete: {error:#}");
+    }
+}
+
+/// The Python that has the peers of PyPI.
+pub(crate) fn python(workspace: &Workspace) -> PathBuf {
+    workspace.venv().join("bin/python")
+}
+
+fn apt() -> anyhow::Result<()> {
+    let missing: Vec<&str> = APT
+        .iter()
+        .copied()
+        .filter(|name| !is_installed(name))
+        .collect();
+    if missing.is_empty() {
+        return Ok(());
+    }
+    ensure!(
+        succeeds("apt-get", &["--version"]),
+        "this is no Debian or Ubuntu (no apt-get), and these are missing: {}",
+        missing.join(" ")
+    );
+    step(&format!("installing with apt: {}", missing.join(" ")));
+    for arguments in [
+        &["update"][..],
+        &[&["install", "-y", "--no-install-recommends"][..], &missing].concat(),
+    ] {
+        let mut command = as_root("env");
+        command
+            .args(["DEBIAN_FRONTEND=noninteractive", "apt-get"])
+            .args(arguments);
+        println!("    {}", line(&command));
+        run(&mut command)?;
+    }
+    Ok(())
+}
+
+fn is_installed(package: &str) -> bool {
+    let output = Command::new("dpkg-query")
+        .args(["--show", "--showformat=${db:Status-Status}", package])
+        .output();
+    output.is_ok_and(|output| output.status.success() && output.stdout == b"installed")
+}
+
+fn as_root(program: &str) -> Command {
+    let id = Command::new("id").arg("-u").output();
+    if id.is_ok_and(|output| output.stdout.trim_ascii() == b"0") {
+        return Command::new(program);
+    }
+    let mut command = Command::new("sudo");
+    command.arg(program);
+    command
+}
+
+fn venv(workspace: &Workspace) -> anyhow::Result<()> {
+    let folder = workspace.venv();
+    let requirements = workspace.root.join("tests/peers/requirements.txt");
+    let wanted = fs::read_to_string(&requirements)
+        .with_context(|| format!("{} cannot be read", requirements.display()))?;
+    let installed = folder.join("requirements.txt");
+    if fs::read_to_string(&installed).is_ok_and(|there| there == wanted) {
+        return Ok(());
+    }
+    step(&format!(
+        "installing from PyPI into {}: {}",
+        folder.display(),
+        wanted.split_whitespace().collect::<Vec<_>>().join(" ")
+    ));
+    // ROS 1 is made for the system's Python, so that one is there or can be had; another may be first in PATH.
+    let system = Path::new("/usr/bin/python3");
+    let python3 = if system.exists() {
+        system
+    } else {
+        Path::new("python3")
+    };
+    run(Command::new(python3)
+        .args(["-m", "venv", "--clear"])
+        .arg(&folder))?;
+    run(Command::new(python(workspace))
+        .args([
+            "-m",
+            "pip",
+            "install",
+            "--disable-pip-version-check",
+            "--requirement",
+        ])
+        .arg(&requirements))?;
+    fs::write(&installed, wanted)
+        .with_context(|| format!("{} cannot be written", installed.display()))
+}

@@ -1,0 +1,73 @@
+//! Running other programs and passing on how they ended.
+
+use std::process::{Command, ExitCode, ExitStatus};
+
+use anyhow::{Context as _, bail};
+
+/// How a command ended, for the exit code of this one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Ended(u8);
+
+impl Ended {
+    pub(crate) const WELL: Self = Self(0);
+    pub(crate) const BADLY: Self = Self(1);
+    pub(crate) const USAGE: Self = Self(64);
+}
+
+impl From<ExitStatus> for Ended {
+    fn from(status: ExitStatus) -> Self {
+        let code = status.code().and_then(|code| u8::try_from(code).ok());
+        code.map_or(Self::BADLY, Self)
+    }
+}
+
+impl From<Ended> for ExitCode {
+    fn from(ended: Ended) -> Self {
+        Self::from(ended.0)
+    }
+}
+
+/// Says what is done next.
+pub(crate) fn step(what: &str) {
+    println!("==> {what}");
+}
+
+/// Runs a command with the user's terminal and gives its status.
+///
+/// # Errors
+/// When it does not start.
+pub(crate) fn status(command: &mut Command) -> anyhow::Result<ExitStatus> {
+    command
+        .status()
+        .with_context(|| format!("{} does not start", command.get_program().display()))
+}
+
+/// Runs a command that has to succeed.
+///
+/// # Errors
+/// When it does not start, or fails.
+pub(crate) fn run(command: &mut Command) -> anyhow::Result<()> {
+    let status = status(command)?;
+    if !status.success() {
+        bail!("{} ended with {status}", line(command));
+    }
+    Ok(())
+}
+
+/// Whether a command runs and succeeds; what it prints is nobody's business.
+pub(crate) fn succeeds(program: &str, arguments: &[&str]) -> bool {
+    let output = Command::new(program).args(arguments).output();
+    output.is_ok_and(|output| output.status.success())
+}
+
+/// The command as one would type it.
+pub(crate) fn line(command: &Command) -> String {
+    let words = std::iter::once(command.get_program()).chain(command.get_args());
+    let words: Vec<String> = words.map(|word| word.display().to_string()).collect();
+    words.join(" ")
+}
+
+/// Whether this runs where nobody watches and nothing may be skipped.
+pub(crate) fn is_ci() -> bool {
+    std::env::var_os("CI").is_some_and(|ci| ci == "true")
+}

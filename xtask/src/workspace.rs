@@ -1,0 +1,57 @@
+//! Where things are.
+
+use std::{env, ffi::OsString, path::PathBuf, process::Command};
+
+use anyhow::{Context as _, ensure};
+use serde_json::Value;
+
+/// The paths of this workspace.
+pub(crate) struct Workspace {
+    pub(crate) root: PathBuf,
+    /// Where cargo builds, wherever the user has put that.
+    pub(crate) target: PathBuf,
+}
+
+impl Workspace {
+    /// Asks cargo.
+    ///
+    /// # Errors
+    /// When cargo does not answer.
+    pub(crate) fn find() -> anyhow::Result<Self> {
+        let output = Command::new(cargo_program())
+            .args(["metadata", "--no-deps", "--format-version", "1", "--locked"])
+            .output()
+            .context("cargo does not start")?;
+        ensure!(
+            output.status.success(),
+            "cargo metadata: {}",
+            String::from_utf8_lossy(&output.stderr)
+        );
+        let metadata: Value = serde_json::from_slice(&output.stdout)?;
+        let path = |key: &str| {
+            let text = metadata.get(key).and_then(Value::as_str);
+            text.map(PathBuf::from)
+                .with_context(|| format!("cargo metadata has no {key}"))
+        };
+        Ok(Self {
+            root: path("workspace_root")?,
+            target: path("target_directory")?,
+        })
+    }
+
+    /// What the peers of the tests are installed into.
+    pub(crate) fn venv(&self) -> PathBuf {
+        self.target.join("peers/venv")
+    }
+
+    /// A command of cargo, in the root.
+    pub(crate) fn cargo(&self, arguments: &[&str]) -> Command {
+        let mut command = Command::new(cargo_program());
+        command.current_dir(&self.root).args(arguments);
+        command
+    }
+}
+
+fn cargo_program() -> OsString {
+    env::var_os("CARGO").unwrap_or_else(|| "cargo".into())
+}
