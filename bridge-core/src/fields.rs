@@ -32,7 +32,9 @@ pub(crate) fn read(
             Fields::parse(block)
                 .and_then(|fields| fields.checked_bytes())
                 .map_err(|error| (Reason::Malformed, error.to_string()))?;
-            frame.fields_block(block).map_err(|error| (Reason::TooBig, error.to_string()))
+            frame
+                .fields_block(block)
+                .map_err(|error| (Reason::TooBig, error.to_string()))
         }
         Payload::Ros(plan, bytes) => {
             let mut sink = FrameSink { frame, namespace };
@@ -51,12 +53,15 @@ pub(crate) fn write(
     out: &mut Vec<u8>,
 ) -> Result<(), (Reason, String)> {
     let mut source = FieldSource::new(fields);
-    plan.write(&mut source, out).map_err(|error| (Reason::Mismatch, error.to_string()))
+    plan.write(&mut source, out)
+        .map_err(|error| (Reason::Mismatch, error.to_string()))
 }
 
 /// Appends the fields as they are, once it is sure that they can be read.
 pub(crate) fn copy(fields: &Fields<'_>, out: &mut Vec<u8>) -> Result<(), (Reason, String)> {
-    let block = fields.checked_bytes().map_err(|error| (Reason::Malformed, error.to_string()))?;
+    let block = fields
+        .checked_bytes()
+        .map_err(|error| (Reason::Malformed, error.to_string()))?;
     out.extend_from_slice(block);
     Ok(())
 }
@@ -110,7 +115,8 @@ impl Sink for FrameSink<'_, '_> {
     }
 
     fn begin_structure(&mut self, of: &TypeName) -> Result<(), EncodeError> {
-        self.frame.begin_structure(NodeId::string(self.namespace, &of.to_string()))
+        self.frame
+            .begin_structure(NodeId::string(self.namespace, &of.to_string()))
     }
 
     fn end_structure(&mut self) -> Result<(), EncodeError> {
@@ -131,11 +137,19 @@ struct FieldSource<'a> {
 
 impl<'a> FieldSource<'a> {
     const fn new(fields: Fields<'a>) -> Self {
-        Self { fields, elements: None, structures: None, structure: None }
+        Self {
+            fields,
+            elements: None,
+            structures: None,
+            structure: None,
+        }
     }
 
     fn field(&mut self) -> Result<Variant<'a>, SourceError> {
-        self.fields.next().ok_or(SourceError::Missing)?.map_err(malformed)
+        self.fields
+            .next()
+            .ok_or(SourceError::Missing)?
+            .map_err(malformed)
     }
 
     /// The next field, or the next value of the structure being read, as an array.
@@ -169,7 +183,10 @@ impl<'a> Source<'a> for FieldSource<'a> {
     fn array(&mut self, expected: BuiltinType) -> Result<usize, SourceError> {
         if let (Some(structure), BuiltinType::ExtensionObject) = (&mut self.structure, expected) {
             // Messages within a message of an array stand inline: only their number is here.
-            return structure.length().map_err(malformed).map(Option::unwrap_or_default);
+            return structure
+                .length()
+                .map_err(malformed)
+                .map(Option::unwrap_or_default);
         }
         let array = self.next_array(expected)?;
         self.elements = Some(array.iter());
@@ -177,8 +194,11 @@ impl<'a> Source<'a> for FieldSource<'a> {
     }
 
     fn element(&mut self, expected: BuiltinType) -> Result<Scalar<'a>, SourceError> {
-        let element =
-            self.elements.as_mut().and_then(Iterator::next).ok_or(SourceError::Missing)?;
+        let element = self
+            .elements
+            .as_mut()
+            .and_then(Iterator::next)
+            .ok_or(SourceError::Missing)?;
         if element.builtin_type() == expected {
             return Ok(element);
         }
@@ -192,22 +212,37 @@ impl<'a> Source<'a> for FieldSource<'a> {
     }
 
     fn begin_structure(&mut self) -> Result<(), SourceError> {
-        let next =
-            self.structures.as_mut().and_then(Iterator::next).ok_or(SourceError::Missing)?;
+        let next = self
+            .structures
+            .as_mut()
+            .and_then(Iterator::next)
+            .ok_or(SourceError::Missing)?;
         let Scalar::ExtensionObject(object) = next else {
-            return Err(unexpected(BuiltinType::ExtensionObject, false, &Variant::Scalar(next)));
+            return Err(unexpected(
+                BuiltinType::ExtensionObject,
+                false,
+                &Variant::Scalar(next),
+            ));
         };
         let ExtensionBody::Binary(body) = object.body else {
-            return Err(SourceError::Malformed("a structure without a binary body".to_owned()));
+            return Err(SourceError::Malformed(
+                "a structure without a binary body".to_owned(),
+            ));
         };
         self.structure = Some(StructureReader::new(body));
         Ok(())
     }
 
     fn end_structure(&mut self) -> Result<(), SourceError> {
-        match self.structure.take().map_or(0, |structure| structure.remaining()) {
+        match self
+            .structure
+            .take()
+            .map_or(0, |structure| structure.remaining())
+        {
             0 => Ok(()),
-            left => Err(SourceError::Malformed(format!("{left} bytes too many in a structure"))),
+            left => Err(SourceError::Malformed(format!(
+                "{left} bytes too many in a structure"
+            ))),
         }
     }
 
@@ -226,5 +261,10 @@ fn malformed(error: DecodeError) -> SourceError {
 
 fn unexpected(expected: BuiltinType, expected_array: bool, found: &Variant<'_>) -> SourceError {
     let found_array = matches!(found, Variant::Array(_));
-    SourceError::Type { expected, expected_array, found: found.builtin_type(), found_array }
+    SourceError::Type {
+        expected,
+        expected_array,
+        found: found.builtin_type(),
+        found_array,
+    }
 }

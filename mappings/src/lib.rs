@@ -1,9 +1,14 @@
 //! The names of the space, and the YAML that ties them to ROS topics and OPC UA nodes.
 
+mod code;
+mod diagnostic;
 mod mapping;
 mod node_id;
 mod topic;
+mod tree;
 
+pub use code::{Code, UnknownCode};
+pub use diagnostic::{Diagnostic, Severity, Span};
 pub use mapping::{
     Binding, Endpoint, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, Server, Space,
     Variable,
