@@ -139,13 +139,19 @@ mod tests {
     #[test]
     fn a_reader_is_reliable_only_when_all_writers_are() {
         assert_eq!(asked(&[writer(true, false)]), (true, false));
-        assert_eq!(asked(&[writer(true, false), writer(false, false)]), (false, false));
+        assert_eq!(
+            asked(&[writer(true, false), writer(false, false)]),
+            (false, false)
+        );
     }
 
     #[test]
     fn a_reader_asks_for_old_values_only_when_all_writers_keep_them() {
         assert_eq!(asked(&[writer(true, true)]), (true, true));
-        assert_eq!(asked(&[writer(true, true), writer(true, false)]), (true, false));
+        assert_eq!(
+            asked(&[writer(true, true), writer(true, false)]),
+            (true, false)
+        );
     }
 
     #[test]

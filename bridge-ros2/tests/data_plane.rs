@@ -73,10 +73,14 @@ fn meet_readers(domain: &Domain, outlet: &mut Outlet, topic: &str) {
 #[ignore = "needs Cyclone DDS"]
 async fn a_message_arrives_with_its_byte_order_in_front() {
     let domain = join(11);
-    let _peer = Peer::start("pub --topic ua_11_1_1 --type std_msgs/String --domain 11 --value \"hello\"");
+    let _peer =
+        Peer::start("pub --topic ua_11_1_1 --type std_msgs/String --domain 11 --value \"hello\"");
     let requested = writers_of(&domain, "rt/ua_11_1_1");
     let mut inbox = Inbox::new();
-    inbox.insert((), domain.reader("rt/ua_11_1_1", STRING, requested).unwrap());
+    inbox.insert(
+        (),
+        domain.reader("rt/ua_11_1_1", STRING, requested).unwrap(),
+    );
     let (bytes, missing) = sample(&mut inbox).await;
     assert_eq!(bytes[..14], string("hello")[..14]);
     assert_eq!(missing, 0);
@@ -91,7 +95,10 @@ async fn ten_thousand_messages_at_1_khz_arrive_in_order_without_loss() {
         "pub --topic ua_12_1_1 --type std_msgs/UInt32 --domain 12 --count 10000 --rate 1000 --no-wait --transient-local --depth 2000",
     );
     let requested = writers_of(&domain, "rt/ua_12_1_1");
-    inbox.insert((), domain.reader("rt/ua_12_1_1", UINT32, requested).unwrap());
+    inbox.insert(
+        (),
+        domain.reader("rt/ua_12_1_1", UINT32, requested).unwrap(),
+    );
     for expected in 0..10_000_u32 {
         let (bytes, missing) = sample(&mut inbox).await;
         assert_eq!(missing, 0, "before {expected}");
@@ -110,8 +117,9 @@ async fn ten_thousand_messages_at_1_khz_are_written_without_loss() {
         UINT32,
         Offered::DropOldest(NonZeroU16::new(1000).unwrap()),
     );
-    let mut peer =
-        Peer::start("sub --topic ua_1_1_1 --type std_msgs/UInt32 --domain 13 --count 10000 --depth 1000 --timeout 30");
+    let mut peer = Peer::start(
+        "sub --topic ua_1_1_1 --type std_msgs/UInt32 --domain 13 --count 10000 --depth 1000 --timeout 30",
+    );
     meet_readers(&domain, &mut out, "rt/ua_1_1_1");
     assert!(peer.line()["matched_after"].is_number());
     let begin = Instant::now();
@@ -158,7 +166,10 @@ async fn a_transient_local_value_from_before_our_time_is_read() {
     let domain = join(15);
     let requested = writers_of(&domain, "rt/ua_15_1_1");
     let mut inbox = Inbox::new();
-    inbox.insert((), domain.reader("rt/ua_15_1_1", STRING, requested).unwrap());
+    inbox.insert(
+        (),
+        domain.reader("rt/ua_15_1_1", STRING, requested).unwrap(),
+    );
     let (bytes, _) = sample(&mut inbox).await;
     assert_eq!(bytes[..12], string("old")[..12]);
 }
@@ -230,7 +241,9 @@ async fn leaving_a_domain_ends_in_time() {
         let topic = format!("rt/ua_18_1_{}", n + 1);
         inbox.insert(
             (),
-            domain.reader(&topic, UINT32, Requested::from_writers(&[])).unwrap(),
+            domain
+                .reader(&topic, UINT32, Requested::from_writers(&[]))
+                .unwrap(),
         );
     }
     let begin = Instant::now();

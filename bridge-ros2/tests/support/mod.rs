@@ -1,9 +1,5 @@
 //! A peer process that speaks JSON lines, and waiting for things to happen.
-#![expect(
-    clippy::unwrap_used,
-    clippy::disallowed_methods,
-    reason = "test code"
-)]
+#![expect(clippy::unwrap_used, clippy::disallowed_methods, reason = "test code")]
 
 use std::io::{BufRead, BufReader};
 use std::path::Path;
@@ -23,8 +19,7 @@ impl Peer {
     /// Starts it with arguments separated by spaces.
     pub(crate) fn start(arguments: &str) -> Self {
         let python = std::env::var("CYCLONE_PYTHON").unwrap_or_else(|_| "python3".into());
-        let script =
-            Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/peers/ros2_peer.py");
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../tests/peers/ros2_peer.py");
         let mut process = Command::new(python)
             .arg(script)
             .args(arguments.split(' '))
@@ -41,6 +36,11 @@ impl Peer {
             }
         });
         Self { process, lines }
+    }
+
+    /// What it has printed next, if it has.
+    pub(crate) fn try_line(&mut self) -> Option<Value> {
+        self.lines.try_recv().ok()
     }
 
     /// What it prints next.
@@ -60,8 +60,11 @@ impl Drop for Peer {
 pub(crate) fn eventually(what: &str, mut so: impl FnMut() -> bool) {
     let begin = Instant::now();
     while !so() {
-        assert!(begin.elapsed() < Duration::from_secs(10), "{what}: not in 10 s");
-            std::thread::park_timeout(Duration::from_millis(5));
+        assert!(
+            begin.elapsed() < Duration::from_secs(10),
+            "{what}: not in 10 s"
+        );
+        std::thread::park_timeout(Duration::from_millis(5));
     }
 }
 
