@@ -113,7 +113,12 @@ mod tests {
         let texts: Vec<&str> = Code::ALL.iter().map(|code| code.as_str()).collect();
         assert!(texts.is_sorted_by(|a, b| a < b), "{texts:?}");
         assert_eq!(
-            UnknownCode.to_string().rsplit("are ").next().unwrap_or_default().to_owned(),
+            UnknownCode
+                .to_string()
+                .rsplit("are ")
+                .next()
+                .unwrap_or_default()
+                .to_owned(),
             format!("{} to {}", texts[0], texts[texts.len() - 1])
         );
     }

@@ -287,25 +287,21 @@ impl<'r> Resolver<'r> {
         Ok(text)
     }
 
-    /// What a type needs: first all it names itself, then what each of those needs.
+    /// What a type needs, depth first, each once.
     fn dependencies(
         &self,
         name: &TypeName,
         found: &mut Vec<TypeName>,
     ) -> Result<(), DefinitionError> {
-        let definition = self.find(name, None)?;
-        let mut direct = Vec::new();
-        for field in &definition.fields {
+        for field in &self.find(name, None)?.fields {
             if let FieldType::Message(inner) = &field.kind
                 && !found.contains(inner)
             {
                 found.push(inner.clone());
-                direct.push(inner.clone());
+                self.dependencies(inner, found)?;
             }
         }
-        direct
-            .iter()
-            .try_for_each(|inner| self.dependencies(inner, found))
+        Ok(())
     }
 
     pub(crate) fn suggest(&self, name: &TypeName) -> Option<TypeName> {
