@@ -46,9 +46,10 @@ impl BridgeRos2 {
     fn networks(&self) -> Result<Vec<IpAddr>, Failure> {
         if let Some(wanted) = &self.ros_interface {
             let interface = Interface::find(wanted).map_err(|error| {
-                let kind = match error {
-                    InterfaceError::Unknown { .. } => FailureKind::Unavailable,
-                    _ => FailureKind::Io,
+                let kind = if matches!(error, InterfaceError::List(_)) {
+                    FailureKind::Io
+                } else {
+                    FailureKind::Unavailable
                 };
                 Failure::new(kind, format!("--ros-interface: {error}"))
             })?;
@@ -97,9 +98,10 @@ impl Program for BridgeRos2 {
                 .unwrap_or_default(),
         };
         Ros2Port::start(options).map_err(|error| {
-            let kind = match error {
-                DomainError::Domain(_) | DomainError::DiscoveryRange(_) => FailureKind::Usage,
-                _ => FailureKind::Unavailable,
+            let kind = if matches!(error, DomainError::Domain(_)) {
+                FailureKind::Usage
+            } else {
+                FailureKind::Unavailable
             };
             Failure::new(kind, error.to_string())
         })

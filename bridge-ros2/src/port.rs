@@ -174,7 +174,6 @@ impl Ros2Port {
         while let Poll::Ready(Some(event)) = events.poll_next_unpin(cx) {
             self.schedule.changed |= is_change(&event);
         }
-        drop(events);
         self.schedule.changed && !before
     }
 
@@ -228,21 +227,21 @@ impl Ros2Port {
 
     /// The timer rang: send what waits, and compare the domain with what is open.
     fn look_again(&mut self) {
-        if self.schedule.waiting {
-            self.flush();
-        }
         let now = Instant::now();
+        if self.schedule.waiting {
+            self.flush(now);
+        }
         if now >= self.schedule.next_reconcile() {
             self.reconcile(now);
         }
         self.schedule.arm(now);
     }
 
-    fn flush(&mut self) {
+    fn flush(&mut self, now: Instant) {
         let mut waiting = false;
         for (topic, sink) in &mut self.sinks {
             let Some(open) = &mut sink.open else { continue };
-            if let Err(refusal) = open.outlet.flush() {
+            if let Err(refusal) = open.outlet.flush(now) {
                 self.events.push_back(lost(*topic, refusal.label(), 1));
             }
             waiting |= open.outlet.is_waiting();
@@ -267,7 +266,7 @@ impl Ros2Port {
         }
         let topics: Vec<TopicId> = self.sinks.keys().copied().collect();
         for topic in topics {
-            self.reconcile_sink(topic);
+            self.reconcile_sink(topic, now);
         }
     }
 
@@ -464,13 +463,13 @@ impl Ros2Port {
         });
     }
 
-    fn reconcile_sink(&mut self, topic: TopicId) {
+    fn reconcile_sink(&mut self, topic: TopicId, now: Instant) {
         let Some(sink) = self.sinks.get_mut(&topic) else {
             return;
         };
         let readers = self.graph.readers(&sink.dds_topic);
         if let Some(open) = &mut sink.open {
-            match open.outlet.set_readers(readers) {
+            match open.outlet.set_readers(readers, now) {
                 Ok(()) => {}
                 Err(refusal) => self.events.push_back(lost(topic, refusal.label(), 1)),
             }
@@ -515,7 +514,7 @@ impl Ros2Port {
         };
         info!(topic = dds_topic, message_type = %message_type.name(), ?offered, "advertised");
         let mut outlet = Outlet::new(writer, offered);
-        if let Err(refusal) = outlet.set_readers(self.graph.readers(&dds_topic)) {
+        if let Err(refusal) = outlet.set_readers(self.graph.readers(&dds_topic), Instant::now()) {
             self.events.push_back(lost(topic, refusal.label(), 1));
         }
         if let Some(sink) = self.sinks.get_mut(&topic) {
@@ -595,7 +594,9 @@ impl Port for Ros2Port {
             return Err("no writer yet");
         };
         let size = payload.len();
-        let offered = open.outlet.offer(payload, source.map(dds_time));
+        let offered = open
+            .outlet
+            .offer(payload, source.map(dds_time), Instant::now());
         self.schedule.waiting |= open.outlet.is_waiting();
         if let Err(Refusal::TooLarge(limit)) = offered {
             let dds_topic = dds_topic.clone();

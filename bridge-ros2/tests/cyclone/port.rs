@@ -1,16 +1,4 @@
-//! The port against Cyclone DDS peers: what it reports and what they receive.
-//!
-//! Ignored unless asked for, like `data_plane.rs`.
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    clippy::disallowed_methods,
-    clippy::print_stderr,
-    reason = "test code"
-)]
-
-mod support;
+//! What the port reports and what its peers receive.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::Arc;
@@ -20,8 +8,9 @@ use bridge_node::{Delivery, Port, PortEvent};
 use bridge_ros2::domain::DomainOptions;
 use bridge_ros2::{PortOptions, Ros2Port};
 use mappings::{Mapping, SpaceId, TopicId};
-use support::{Peer, string};
 use uadp::BuiltinType;
+
+use crate::peer::{Peer, string};
 
 fn port(domain: u16, mapping: Mapping) -> Ros2Port {
     Ros2Port::start(PortOptions {
@@ -215,9 +204,10 @@ async fn samples_of_another_type_than_the_topics_are_counted_and_not_handed_up()
             break;
         }
         let until = tokio::time::Instant::now() + Duration::from_millis(10);
-        match tokio::time::timeout_at(until, port.recv()).await {
-            Ok(PortEvent::Sample { payload, .. }) => panic!("handed up: {payload:?}"),
-            Ok(_) | Err(_) => {}
+        if let Ok(PortEvent::Sample { payload, .. }) =
+            tokio::time::timeout_at(until, port.recv()).await
+        {
+            panic!("handed up: {payload:?}");
         }
     }
 }

@@ -1,6 +1,4 @@
 //! A peer process that speaks JSON lines, and waiting for things to happen.
-#![expect(clippy::unwrap_used, clippy::disallowed_methods, reason = "test code")]
-
 use std::io::{BufRead, BufReader};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};

@@ -1,15 +1,4 @@
-//! Bytes between our endpoints and a Cyclone DDS peer on this machine.
-//!
-//! The peer is `tests/peers/ros2_peer.py`; the tests are ignored unless they are asked for, in a network namespace of
-//! their own, with `CYCLONE_PYTHON` naming a Python that has `cyclonedds`.
-#![expect(
-    clippy::unwrap_used,
-    clippy::indexing_slicing,
-    clippy::disallowed_methods,
-    reason = "test code"
-)]
-
-mod support;
+//! Bytes between our endpoints and the peer.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::num::NonZeroU16;
@@ -21,10 +10,15 @@ use bridge_ros2::inbox::{Inbox, Taken};
 use bridge_ros2::outlet::Outlet;
 use bridge_ros2::qos::{Offered, Requested};
 use bridge_ros2::raw::Payload;
-use support::{Peer, eventually, string};
+
+use crate::peer::{Peer, eventually, string};
 
 const STRING: &str = "std_msgs::msg::dds_::String_";
 const UINT32: &str = "std_msgs::msg::dds_::UInt32_";
+
+fn now() -> tokio::time::Instant {
+    tokio::time::Instant::now()
+}
 
 fn join(domain: u16) -> Domain {
     Domain::join(&DomainOptions {
@@ -64,9 +58,19 @@ fn outlet(domain: &Domain, topic: &str, type_name: &str, offered: Offered) -> Ou
 fn meet_readers(domain: &Domain, outlet: &mut Outlet, topic: &str) {
     eventually("a reader is discovered", || {
         let graph = Graph::snapshot(domain.participant());
-        outlet.set_readers(graph.readers(topic)).unwrap();
+        outlet.set_readers(graph.readers(topic), now()).unwrap();
         !graph.readers(topic).is_empty()
     });
+}
+
+/// Flushes until nothing waits.
+async fn sent(outlet: &mut Outlet) {
+    let deadline = now() + Duration::from_secs(5);
+    while outlet.is_waiting() {
+        assert!(now() < deadline, "still waiting");
+        outlet.flush(now()).unwrap();
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
 }
 
 #[tokio::test]
@@ -126,11 +130,12 @@ async fn ten_thousand_messages_at_1_khz_are_written_without_loss() {
     for number in 0..10_000_u32 {
         let mut payload = vec![0, 1, 0, 0];
         payload.extend_from_slice(&number.to_le_bytes());
-        out.offer(Payload::to_write(payload.into()).unwrap(), None)
+        out.offer(Payload::to_write(payload.into()).unwrap(), None, now())
             .unwrap();
         tokio::time::sleep_until((begin + Duration::from_millis(u64::from(number))).into()).await;
-        out.flush().unwrap();
+        out.flush(now()).unwrap();
     }
+    sent(&mut out).await;
     for expected in 0..10_000_u32 {
         assert_eq!(peer.line()["value"], expected);
     }
@@ -142,12 +147,17 @@ async fn a_late_joiner_gets_the_last_value_and_no_older_one() {
     let domain = join(14);
     let mut out = outlet(&domain, "rt/ua_1_1_2", STRING, Offered::KeepLatest);
     for value in ["first", "second", "last"] {
-        out.offer(Payload::to_write(string(value).into()).unwrap(), None)
-            .unwrap();
+        out.offer(
+            Payload::to_write(string(value).into()).unwrap(),
+            None,
+            now(),
+        )
+        .unwrap();
     }
     let mut peer =
         Peer::start("sub --topic ua_1_1_2 --type std_msgs/String --domain 14 --transient-local");
     meet_readers(&domain, &mut out, "rt/ua_1_1_2");
+    sent(&mut out).await;
     assert!(peer.line()["matched_after"].is_number());
     assert_eq!(peer.line()["value"], "last");
 
@@ -198,9 +208,14 @@ async fn a_large_message_of_odd_length_crosses_both_ways() {
     assert!(peer.line()["matched_after"].is_number());
     for length in 99_991..100_001 {
         let text = "y".repeat(length);
-        out.offer(Payload::to_write(string(&text).into()).unwrap(), None)
-            .unwrap();
+        out.offer(
+            Payload::to_write(string(&text).into()).unwrap(),
+            None,
+            now(),
+        )
+        .unwrap();
     }
+    sent(&mut out).await;
     for length in 99_991..100_001 {
         assert_eq!(peer.line()["length"], length);
     }
