@@ -684,7 +684,7 @@ fn encode(
     let timestamp_at = message.timestamp_offset();
     let mut frame = message.key_frame(header).map_err(too_big)?;
     let sequence_at = frame.sequence_offset();
-    fields::read(sample, &mut frame)?;
+    fields::read(sample, namespace, &mut frame)?;
     frame.finish().map_err(too_big)?;
     message.finish().map_err(too_big)?;
     encoded.timestamp_at = timestamp_at.unwrap_or(usize::MAX);
