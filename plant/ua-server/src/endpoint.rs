@@ -39,10 +39,15 @@ impl EndpointUrl {
     /// The host has no address, or none of its addresses can be listened on.
     pub(crate) fn bind(&self) -> Result<TcpListener, BindError> {
         let failed = |address: String| {
-            move |source: io::Error| match source.kind() {
-                io::ErrorKind::AddrInUse => BindError::Taken { address, port: self.port },
-                io::ErrorKind::AddrNotAvailable => BindError::NotOurs(address),
-                _ => BindError::Other { address, source },
+            move |source: io::Error| {
+                let kind = source.kind();
+                if kind == io::ErrorKind::AddrInUse {
+                    BindError::Taken { address, port: self.port }
+                } else if kind == io::ErrorKind::AddrNotAvailable {
+                    BindError::NotOurs(address)
+                } else {
+                    BindError::Other { address, source }
+                }
             }
         };
         let name = format!("{}:{}", self.host, self.port);

@@ -152,10 +152,9 @@ impl TopicNode {
     pub(crate) fn new(topic: TopicId, node: NodeId, name: String, fields: Vec<(String, Shape)>) -> Self {
         let compound = fields.len() > 1;
         let fields = if compound {
-            let parent = node.clone();
             fields
                 .into_iter()
-                .map(|(path, shape)| FieldNode { node: component(&parent, &path), name: path, shape })
+                .map(|(path, shape)| FieldNode { node: component(&node, &path), name: path, shape })
                 .collect()
         } else {
             let shape = fields.first().map_or(Shape(None), |(_, shape)| *shape);

@@ -101,8 +101,7 @@ impl SpaceNodes {
         self.namespaces.iter().map(|ns| (ns.namespace_index, ns.namespace_uri.as_str()))
     }
 
-    /// Stores `values` and tells who watches them. `flipped` marks a value whose status changed, whether or not the
-    /// value did.
+    /// Stores `values` and tells who watches them.
     pub(crate) fn store(
         &self,
         address_space: &RwLock<AddressSpace>,
@@ -111,6 +110,7 @@ impl SpaceNodes {
     ) {
         let mut address_space = address_space.write();
         for Stored { node, value, flipped } in values {
+            let flipped = flipped && value.value == current_data_value(&address_space, &node).and_then(|v| v.value);
             if let Some(NodeType::Variable(variable)) = address_space.find_mut(&node) {
                 variable.set_data_value(value.clone());
                 self.notify(subscriptions, &node, value, flipped);
@@ -128,10 +128,10 @@ impl SpaceNodes {
         };
         if flipped {
             let unfiltered = self.unfiltered.lock();
-            let between = DataValue { value: Some(Variant::Empty), ..value.clone() };
             for (handle, _) in items.entries() {
                 if unfiltered.contains(handle) {
-                    items.data_value_to_item(between.clone(), handle);
+                    let between = DataValue { value: Some(Variant::Empty), ..value };
+                    items.data_value_to_item(between, handle);
                 }
             }
         }
@@ -197,6 +197,7 @@ fn unfiltered(item: &CreateMonitoredItem) -> bool {
 pub(crate) struct Stored {
     pub(crate) node: NodeId,
     pub(crate) value: DataValue,
+    /// Its status is another than that of the value before.
     pub(crate) flipped: bool,
 }
 
@@ -223,11 +224,12 @@ pub(crate) fn topic_values(topic: &TopicNode, fields: Vec<Variant>, stamp: Stamp
         values.push((topic.node.clone(), data_value(Variant::Array(Box::new(array)), stamp)));
     }
     for (field, value) in topic.fields.iter().zip(fields) {
-        let value = match value {
-            Variant::StatusCode(status) if !field.shape.accepts(&Variant::StatusCode(status)) => {
-                data_value(Variant::Empty, Stamp { status, ..stamp })
-            }
-            value => data_value(value, stamp),
+        let value = if let Variant::StatusCode(status) = value
+            && !field.shape.accepts(&value)
+        {
+            data_value(Variant::Empty, Stamp { status, ..stamp })
+        } else {
+            data_value(value, stamp)
         };
         values.push((field.node.clone(), value));
     }
@@ -286,10 +288,7 @@ fn members(value: Variant) -> Result<Vec<Variant>, StatusCode> {
     Ok(array
         .values
         .into_iter()
-        .map(|value| match value {
-            Variant::Variant(inner) => *inner,
-            other => other,
-        })
+        .map(|value| if let Variant::Variant(inner) = value { *inner } else { value })
         .collect())
 }
 

@@ -100,20 +100,13 @@ impl Pki {
     /// Says how to trust each client certificate refused since the last call, and keeps the newest
     /// [`REJECTED_KEPT`] of them: anyone who reaches the port can have one stored.
     pub(crate) fn report_rejected(&mut self) {
-        let rejected = match self.rejected() {
-            Ok(rejected) => rejected,
-            Err(error) => {
-                warn!(path = %self.root.join("rejected").display(), %error, "refused certificates cannot be listed");
-                return;
-            }
-        };
-        for path in rejected.iter().rev().skip(REJECTED_KEPT) {
-            if let Err(error) = fs::remove_file(path) {
-                warn!(path = %path.display(), %error, "an old refused certificate cannot be removed");
-            }
-        }
-        for path in rejected.iter().rev().take(REJECTED_KEPT) {
-            if !self.reported.contains(path) {
+        // Clients' certificates are refused all the same when the directory is gone: the server says so itself.
+        let rejected = self.rejected().unwrap_or_default();
+        let oldest = rejected.len().saturating_sub(REJECTED_KEPT);
+        for (at, path) in rejected.iter().enumerate() {
+            if at < oldest {
+                remove(path);
+            } else if !self.reported.contains(path) {
                 // No shell command to copy: the file name begins with a name the client chose.
                 warn!(
                     "a client was refused because its certificate is not trusted; to trust it, move {:?} into {:?}",
@@ -147,6 +140,12 @@ pub(crate) fn default_root(variable: impl Fn(&str) -> Option<String>) -> PathBuf
         .or_else(|| given("HOME").map(|home| home.join(".local/state")))
         .unwrap_or_else(|| PathBuf::from("/var/lib"));
     state.join("ua-bridge/pki")
+}
+
+fn remove(refused: &Path) {
+    if let Err(error) = fs::remove_file(refused) {
+        warn!(path = %refused.display(), %error, "an old refused certificate cannot be removed");
+    }
 }
 
 fn certificate_data(application_uri: &str, host: &str) -> X509Data {

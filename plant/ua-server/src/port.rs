@@ -152,13 +152,10 @@ impl Port for ServerPort {
 
     async fn shutdown(mut self) {
         self.handle.cancel();
-        if let Some(serving) = &mut self.serving {
-            match tokio::time::timeout(SHUTDOWN, serving).await {
-                Ok(Ok(Ok(()))) => {}
-                Ok(Ok(Err(error))) => warn!(%error, "the server ended badly"),
-                Ok(Err(error)) => warn!(%error, "the server ended badly"),
-                Err(_) => warn!("clients kept their connections; they are dropped"),
-            }
+        if let Some(serving) = &mut self.serving
+            && tokio::time::timeout(SHUTDOWN, serving).await.is_err()
+        {
+            warn!("clients kept their connections; they are dropped");
         }
         if let Some(runtime) = self.runtime.take() {
             runtime.shutdown_background();

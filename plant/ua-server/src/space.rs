@@ -128,10 +128,9 @@ impl Known {
         if fields.len() != self.node.fields.len() {
             return Err("other fields than mapped");
         }
-        let fits = self.node.fields.iter().zip(&fields).all(|(field, value)| match value {
-            // No value, or a status in place of one.
-            Variant::Empty | Variant::StatusCode(_) => true,
-            value => field.shape.accepts(value),
+        let fits = self.node.fields.iter().zip(&fields).all(|(field, value)| {
+            let in_place_of_a_value = matches!(value, Variant::Empty | Variant::StatusCode(_));
+            in_place_of_a_value || field.shape.accepts(value)
         });
         if fits { Ok(fields) } else { Err("another type than mapped") }
     }
