@@ -6,6 +6,14 @@ use crate::{DefinitionError, Dialect, TypeName};
 /// A type that is no message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Primitive {
+    Number(Number),
+    Clock(Clock),
+    Text(Text),
+}
+
+/// A type whose bytes, little endian, are those of its OPC UA value.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Number {
     Bool,
     Int8,
     UInt8,
@@ -17,6 +25,11 @@ pub(crate) enum Primitive {
     UInt64,
     Float32,
     Float64,
+}
+
+/// Two words of 32 bits: seconds and nanoseconds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Clock {
     /// ROS 1 `time`: unsigned seconds.
     Time1,
     /// `builtin_interfaces/Time`: signed seconds.
@@ -25,12 +38,13 @@ pub(crate) enum Primitive {
     Duration1,
     /// `builtin_interfaces/Duration`: unsigned nanoseconds.
     Duration2,
-    String {
-        bound: Option<u32>,
-    },
-    WString {
-        bound: Option<u32>,
-    },
+}
+
+/// `string`, or `wstring` if `wide`; the bound is in bytes or UTF-16 units.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Text {
+    pub(crate) wide: bool,
+    pub(crate) bound: u32,
 }
 
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -126,12 +140,12 @@ impl Definition {
         }
         // genmsg takes all of the line after the first `=`, a `#` included, as the text of a string.
         let value = match (dialect, primitive) {
-            (Dialect::Ros1, Primitive::String { .. }) => line
+            (Dialect::Ros1, Primitive::Text(_)) => line
                 .split_once('=')
                 .map_or(value, |(_, value)| value.trim()),
             _ => value,
         };
-        if value.is_empty() && !matches!(primitive, Primitive::String { .. }) {
+        if value.is_empty() && !matches!(primitive, Primitive::Text(_)) {
             return Err("a value expected");
         }
         self.constants.push(Constant {
@@ -198,13 +212,7 @@ fn parse_type(
         Some(primitive) => FieldType::Primitive(primitive),
         None => FieldType::Message(message_name(dialect, of, base)?),
     };
-    let has_bound = matches!(
-        kind,
-        FieldType::Primitive(
-            Primitive::String { bound: Some(_) } | Primitive::WString { bound: Some(_) }
-        )
-    );
-    if bound.is_some() && !has_bound {
+    if bound.is_some() && !matches!(kind, FieldType::Primitive(Primitive::Text(_))) {
         return Err("only strings have a bound of their own");
     }
     Ok((kind, arity))
@@ -234,22 +242,28 @@ fn parse_length(text: &str) -> Result<u32, &'static str> {
 fn primitive(dialect: Dialect, base: &str, bound: Option<u32>) -> Option<Primitive> {
     let ros1 = dialect == Dialect::Ros1;
     Some(match base {
-        "bool" => Primitive::Bool,
-        "int8" => Primitive::Int8,
-        "byte" if ros1 => Primitive::Int8,
-        "uint8" | "char" | "byte" => Primitive::UInt8,
-        "int16" => Primitive::Int16,
-        "uint16" => Primitive::UInt16,
-        "int32" => Primitive::Int32,
-        "uint32" => Primitive::UInt32,
-        "int64" => Primitive::Int64,
-        "uint64" => Primitive::UInt64,
-        "float32" => Primitive::Float32,
-        "float64" => Primitive::Float64,
-        "string" => Primitive::String { bound },
-        "wstring" if !ros1 => Primitive::WString { bound },
-        "time" if ros1 => Primitive::Time1,
-        "duration" if ros1 => Primitive::Duration1,
+        "bool" => Primitive::Number(Number::Bool),
+        "int8" => Primitive::Number(Number::Int8),
+        "byte" if ros1 => Primitive::Number(Number::Int8),
+        "uint8" | "char" | "byte" => Primitive::Number(Number::UInt8),
+        "int16" => Primitive::Number(Number::Int16),
+        "uint16" => Primitive::Number(Number::UInt16),
+        "int32" => Primitive::Number(Number::Int32),
+        "uint32" => Primitive::Number(Number::UInt32),
+        "int64" => Primitive::Number(Number::Int64),
+        "uint64" => Primitive::Number(Number::UInt64),
+        "float32" => Primitive::Number(Number::Float32),
+        "float64" => Primitive::Number(Number::Float64),
+        "string" => Primitive::Text(Text {
+            wide: false,
+            bound: bound.unwrap_or(u32::MAX),
+        }),
+        "wstring" if !ros1 => Primitive::Text(Text {
+            wide: true,
+            bound: bound.unwrap_or(u32::MAX),
+        }),
+        "time" if ros1 => Primitive::Clock(Clock::Time1),
+        "duration" if ros1 => Primitive::Clock(Clock::Duration1),
         _ => return None,
     })
 }
@@ -297,17 +311,17 @@ mod tests {
                 ("header".to_owned(), message("std_msgs/Header"), Arity::One),
                 (
                     "b".to_owned(),
-                    FieldType::Primitive(Primitive::Int8),
+                    FieldType::Primitive(Primitive::Number(Number::Int8)),
                     Arity::Fixed(3)
                 ),
                 (
                     "c".to_owned(),
-                    FieldType::Primitive(Primitive::UInt8),
+                    FieldType::Primitive(Primitive::Number(Number::UInt8)),
                     Arity::One
                 ),
                 (
                     "t".to_owned(),
-                    FieldType::Primitive(Primitive::Time1),
+                    FieldType::Primitive(Primitive::Clock(Clock::Time1)),
                     Arity::One
                 ),
                 (
@@ -328,23 +342,29 @@ mod tests {
             [
                 (
                     "name".to_owned(),
-                    FieldType::Primitive(Primitive::String { bound: Some(10) }),
+                    FieldType::Primitive(Primitive::Text(Text {
+                        wide: false,
+                        bound: 10
+                    })),
                     Arity::One
                 ),
                 (
                     "few".to_owned(),
-                    FieldType::Primitive(Primitive::Int32),
+                    FieldType::Primitive(Primitive::Number(Number::Int32)),
                     Arity::Sequence { bound: Some(5) }
                 ),
                 (
                     "wide".to_owned(),
-                    FieldType::Primitive(Primitive::WString { bound: Some(3) }),
+                    FieldType::Primitive(Primitive::Text(Text {
+                        wide: true,
+                        bound: 3
+                    })),
                     Arity::Sequence { bound: Some(2) }
                 ),
                 ("header".to_owned(), message("pkg/Header"), Arity::One),
                 (
                     "b".to_owned(),
-                    FieldType::Primitive(Primitive::UInt8),
+                    FieldType::Primitive(Primitive::Number(Number::UInt8)),
                     Arity::One
                 ),
             ]

@@ -1,5 +1,6 @@
 use std::fmt;
 use std::str::FromStr;
+use std::sync::Arc;
 
 use crate::NameError;
 
@@ -18,8 +19,8 @@ pub enum Dialect {
 /// 255 bytes of ASCII letters, digits and underscores, each part starting with a letter.
 #[derive(Clone, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct TypeName {
-    package: String,
-    name: String,
+    text: Arc<str>,
+    slash: usize,
 }
 
 const LONGEST: usize = 255;
@@ -32,29 +33,29 @@ impl TypeName {
             return Err(NameError::new(&format!("{package}/{name}")));
         }
         Ok(Self {
-            package: package.to_owned(),
-            name: name.to_owned(),
+            text: format!("{package}/{name}").into(),
+            slash: package.len(),
         })
     }
 
     /// `std_msgs` of `std_msgs/Bool`.
     pub fn package(&self) -> &str {
-        &self.package
+        self.text.get(..self.slash).unwrap_or_default()
     }
 
     /// `Bool` of `std_msgs/Bool`.
     pub fn name(&self) -> &str {
-        &self.name
+        self.text.get(self.slash + 1..).unwrap_or_default()
     }
 
     /// The ROS 2 spelling, `std_msgs/msg/Bool`.
     pub fn ros2(&self) -> String {
-        format!("{}/msg/{}", self.package, self.name)
+        format!("{}/msg/{}", self.package(), self.name())
     }
 
     /// The DDS type name ROS 2 announces, `std_msgs::msg::dds_::Bool_`.
     pub fn dds(&self) -> String {
-        format!("{}::msg::dds_::{}_", self.package, self.name)
+        format!("{}::msg::dds_::{}_", self.package(), self.name())
     }
 
     /// Reads what [`TypeName::dds`] prints; names of services and actions are not message types and err.
@@ -69,7 +70,7 @@ impl TypeName {
     }
 
     pub(crate) fn is(&self, package: &str, name: &str) -> bool {
-        self.package == package && self.name == name
+        self.package() == package && self.name() == name
     }
 }
 
@@ -90,7 +91,7 @@ impl FromStr for TypeName {
 
 impl fmt::Display for TypeName {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}/{}", self.package, self.name)
+        f.write_str(&self.text)
     }
 }
 

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use md5::{Digest, Md5};
 use uadp::BuiltinType;
 
-use crate::definition::{Arity, Definition, FieldType, Primitive};
+use crate::definition::{Arity, Clock, Definition, FieldType, Number, Primitive};
 use crate::{DefinitionError, Dialect, Leaf, MessageType, Rank, TypeName};
 
 const DEEPEST: usize = 32;
@@ -45,6 +45,25 @@ pub(crate) enum ShapeKind {
 impl Primitive {
     pub(crate) const fn builtin(self) -> BuiltinType {
         match self {
+            Self::Number(number) => number.builtin(),
+            Self::Clock(clock) => clock.builtin(),
+            Self::Text(_) => BuiltinType::String,
+        }
+    }
+
+    /// Bytes of one on the wire, of a string its length alone.
+    pub(crate) const fn size(self) -> usize {
+        match self {
+            Self::Number(number) => number.size(),
+            Self::Clock(_) => 8,
+            Self::Text(_) => 4,
+        }
+    }
+}
+
+impl Number {
+    pub(crate) const fn builtin(self) -> BuiltinType {
+        match self {
             Self::Bool => BuiltinType::Boolean,
             Self::Int8 => BuiltinType::SByte,
             Self::UInt8 => BuiltinType::Byte,
@@ -55,24 +74,25 @@ impl Primitive {
             Self::Int64 => BuiltinType::Int64,
             Self::UInt64 => BuiltinType::UInt64,
             Self::Float32 => BuiltinType::Float,
-            Self::Float64 | Self::Duration1 | Self::Duration2 => BuiltinType::Double,
-            Self::Time1 | Self::Time2 => BuiltinType::DateTime,
-            Self::String { .. } | Self::WString { .. } => BuiltinType::String,
+            Self::Float64 => BuiltinType::Double,
         }
     }
 
-    /// Bytes of one on the wire, of a string its length alone.
     pub(crate) const fn size(self) -> usize {
         match self {
             Self::Bool | Self::Int8 | Self::UInt8 => 1,
             Self::Int16 | Self::UInt16 => 2,
-            Self::Int32
-            | Self::UInt32
-            | Self::Float32
-            | Self::String { .. }
-            | Self::WString { .. } => 4,
+            Self::Int32 | Self::UInt32 | Self::Float32 => 4,
             Self::Int64 | Self::UInt64 | Self::Float64 => 8,
-            Self::Time1 | Self::Time2 | Self::Duration1 | Self::Duration2 => 8,
+        }
+    }
+}
+
+impl Clock {
+    pub(crate) const fn builtin(self) -> BuiltinType {
+        match self {
+            Self::Time1 | Self::Time2 => BuiltinType::DateTime,
+            Self::Duration1 | Self::Duration2 => BuiltinType::Double,
         }
     }
 }
@@ -144,9 +164,11 @@ impl<'r> Resolver<'r> {
 
     fn time(&self, name: &TypeName) -> Option<Primitive> {
         match self.dialect {
-            Dialect::Ros2 if name.is("builtin_interfaces", "Time") => Some(Primitive::Time2),
+            Dialect::Ros2 if name.is("builtin_interfaces", "Time") => {
+                Some(Primitive::Clock(Clock::Time2))
+            }
             Dialect::Ros2 if name.is("builtin_interfaces", "Duration") => {
-                Some(Primitive::Duration2)
+                Some(Primitive::Clock(Clock::Duration2))
             }
             Dialect::Ros1 | Dialect::Ros2 => None,
         }
@@ -265,25 +287,21 @@ impl<'r> Resolver<'r> {
         Ok(text)
     }
 
-    /// What a type needs: first all it names itself, then what each of those needs.
+    /// What a type needs, depth first, each once.
     fn dependencies(
         &self,
         name: &TypeName,
         found: &mut Vec<TypeName>,
     ) -> Result<(), DefinitionError> {
-        let definition = self.find(name, None)?;
-        let mut direct = Vec::new();
-        for field in &definition.fields {
+        for field in &self.find(name, None)?.fields {
             if let FieldType::Message(inner) = &field.kind
                 && !found.contains(inner)
             {
                 found.push(inner.clone());
-                direct.push(inner.clone());
+                self.dependencies(inner, found)?;
             }
         }
-        direct
-            .iter()
-            .try_for_each(|inner| self.dependencies(inner, found))
+        Ok(())
     }
 
     pub(crate) fn suggest(&self, name: &TypeName) -> Option<TypeName> {
@@ -350,7 +368,10 @@ fn flatten(shape: &Shape, prefix: &str, leaves: &mut Vec<Leaf>) {
                 builtin: BuiltinType::ExtensionObject,
                 rank: rank(arity),
             }),
-            (ShapeKind::Primitive(Primitive::UInt8), Arity::Fixed(_) | Arity::Sequence { .. }) => {
+            (
+                ShapeKind::Primitive(Primitive::Number(Number::UInt8)),
+                Arity::Fixed(_) | Arity::Sequence { .. },
+            ) => {
                 leaves.push(Leaf {
                     path,
                     builtin: BuiltinType::ByteString,

@@ -5,9 +5,7 @@ mod write;
 
 use std::sync::Arc;
 
-use uadp::BuiltinType;
-
-use crate::definition::{Arity, Primitive};
+use crate::definition::{Arity, Number, Primitive};
 use crate::resolve::{Shape, ShapeKind};
 use crate::{Dialect, Leaf, MessageType, PlanError, ReadError, Sink, Source, TypeName, WriteError};
 
@@ -73,13 +71,6 @@ enum What {
         align: usize,
         bytes: usize,
     },
-}
-
-/// An element of a packed array.
-#[derive(Clone, Copy, Debug)]
-struct Number {
-    builtin: BuiltinType,
-    size: usize,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -249,10 +240,7 @@ impl Compiler {
     }
 
     fn primitive(&mut self, primitive: Primitive, arity: Arity) -> usize {
-        let text = matches!(
-            primitive,
-            Primitive::String { .. } | Primitive::WString { .. }
-        );
+        let text = matches!(primitive, Primitive::Text(_));
         let size = primitive.size();
         let Some(len) = length(arity) else {
             self.push(What::One(primitive));
@@ -261,14 +249,10 @@ impl Compiler {
             }
             return size;
         };
-        let number = Number {
-            builtin: primitive.builtin(),
-            size,
-        };
         self.push(match primitive {
-            Primitive::UInt8 => What::Bytes(len),
-            _ if text || primitive.is_converted() => What::Many(primitive, len),
-            _ => What::Packed(number, len),
+            Primitive::Number(Number::UInt8) => What::Bytes(len),
+            Primitive::Number(number) => What::Packed(number, len),
+            Primitive::Clock(_) | Primitive::Text(_) => What::Many(primitive, len),
         });
         match len {
             Len::Fixed(count) => {
@@ -334,16 +318,11 @@ fn length(arity: Arity) -> Option<Len> {
 }
 
 impl Primitive {
-    /// Whether the bytes of one are not those of its OPC UA value.
-    const fn is_converted(self) -> bool {
-        matches!(
-            self,
-            Self::Time1 | Self::Time2 | Self::Duration1 | Self::Duration2
-        )
-    }
-
     /// What one is aligned to in CDR.
     const fn align(self) -> usize {
-        if self.is_converted() { 4 } else { self.size() }
+        match self {
+            Self::Number(number) => number.size(),
+            Self::Clock(_) | Self::Text(_) => 4,
+        }
     }
 }

@@ -4,8 +4,8 @@ use std::marker::PhantomData;
 
 use uadp::{BuiltinType, Scalar};
 
-use super::{Len, Number, Op, Plan, What, Wire};
-use crate::definition::Primitive;
+use super::{Len, Op, Plan, What, Wire};
+use crate::definition::{Clock, Number, Primitive};
 use crate::{Fault, ReadError, Sink, TypeName, duration_to_millis, time_to_date_time};
 
 /// How numbers lie in the payload.
@@ -176,55 +176,42 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
 
     #[inline]
     fn one(&mut self, primitive: Primitive) -> Result<(), Stop<S::Error>> {
-        match primitive {
-            Primitive::Float64 => {
-                let bits = self.u64()?;
-                self.scalar(Scalar::Double(f64::from_bits(bits)))
+        let value = match primitive {
+            Primitive::Number(number) => self.number(number)?,
+            Primitive::Clock(clock) => self.clock(clock)?,
+            Primitive::Text(text) if text.wide => {
+                let text = self.wide(text.bound)?;
+                return self.scalar(Scalar::String(Some(&text)));
             }
-            Primitive::Float32 => {
-                let bits = self.u32()?;
-                self.scalar(Scalar::Float(f32::from_bits(bits)))
-            }
-            Primitive::String { .. } | Primitive::WString { .. } => {
-                self.text(primitive, Self::scalar)
-            }
-            Primitive::Time1 | Primitive::Time2 | Primitive::Duration1 | Primitive::Duration2 => {
-                let value = self.converted(primitive)?;
-                self.scalar(value)
-            }
-            _ => {
-                let value = self.integer(primitive)?;
-                self.scalar(value)
-            }
-        }
+            Primitive::Text(text) => Scalar::String(Some(self.narrow(text.bound)?)),
+        };
+        self.scalar(value)
     }
 
     #[inline]
-    fn integer(&mut self, primitive: Primitive) -> Result<Scalar<'static>, Fault> {
-        Ok(match primitive {
-            Primitive::Bool => Scalar::Boolean(self.array::<1>()? != [0]),
-            Primitive::Int8 => Scalar::SByte(i8::from_le_bytes(self.array()?)),
-            Primitive::Int16 => Scalar::Int16(self.u16()?.cast_signed()),
-            Primitive::UInt16 => Scalar::UInt16(self.u16()?),
-            Primitive::Int32 => Scalar::Int32(self.u32()?.cast_signed()),
-            Primitive::UInt32 => Scalar::UInt32(self.u32()?),
-            Primitive::Int64 => Scalar::Int64(self.u64()?.cast_signed()),
-            Primitive::UInt64 => Scalar::UInt64(self.u64()?),
-            _ => Scalar::Byte(u8::from_le_bytes(self.array()?)),
+    fn number(&mut self, number: Number) -> Result<Scalar<'static>, Fault> {
+        Ok(match number {
+            Number::Bool => Scalar::Boolean(self.array::<1>()? != [0]),
+            Number::Int8 => Scalar::SByte(i8::from_le_bytes(self.array()?)),
+            Number::UInt8 => Scalar::Byte(u8::from_le_bytes(self.array()?)),
+            Number::Int16 => Scalar::Int16(self.u16()?.cast_signed()),
+            Number::UInt16 => Scalar::UInt16(self.u16()?),
+            Number::Int32 => Scalar::Int32(self.u32()?.cast_signed()),
+            Number::UInt32 => Scalar::UInt32(self.u32()?),
+            Number::Int64 => Scalar::Int64(self.u64()?.cast_signed()),
+            Number::UInt64 => Scalar::UInt64(self.u64()?),
+            Number::Float32 => Scalar::Float(f32::from_bits(self.u32()?)),
+            Number::Float64 => Scalar::Double(f64::from_bits(self.u64()?)),
         })
     }
 
-    fn skip_one(&mut self, primitive: Primitive) -> Result<(), Stop<S::Error>> {
+    fn skip_one(&mut self, primitive: Primitive) -> Result<(), Fault> {
         match primitive {
-            Primitive::String { .. } => {
-                let bytes = self.u32()?;
-                self.take(1, length(bytes)?)?;
+            Primitive::Text(text) => {
+                let said = length(self.u32()?)?;
+                self.take(1, product(said, if text.wide { 4 } else { 1 })?)?;
             }
-            Primitive::WString { .. } => {
-                let units = self.u32()?;
-                self.take(4, product(length(units)?, 4)?)?;
-            }
-            _ => {
+            Primitive::Number(_) | Primitive::Clock(_) => {
                 self.take(primitive.align(), primitive.size())?;
             }
         }
@@ -234,16 +221,17 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
     fn packed(&mut self, number: Number, len: Len, carry: bool) -> Result<(), Stop<S::Error>> {
         let count = self.count(len)?;
         // Elements that are not there are not aligned to.
-        let align = if count == 0 { 1 } else { number.size };
-        let bytes = self.take(align, product(count, number.size)?)?;
+        let align = if count == 0 { 1 } else { number.size() };
+        let bytes = self.take(align, product(count, number.size())?)?;
         if !carry {
             return Ok(());
         }
-        let odd = number.builtin == BuiltinType::Boolean && bytes.iter().any(|byte| *byte > 1);
-        if !odd && !(L::SWAPPED && number.size > 1) {
+        let odd = number == Number::Bool && bytes.iter().any(|byte| *byte > 1);
+        let swap = L::SWAPPED && number.size() > 1;
+        if !odd && !swap {
             return self
                 .sink
-                .packed_array(number.builtin, count, bytes)
+                .packed_array(number.builtin(), count, bytes)
                 .map_err(Stop::Sink);
         }
         self.scratch.clear();
@@ -253,11 +241,11 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         } else {
             self.scratch.extend_from_slice(bytes);
             self.scratch
-                .chunks_exact_mut(number.size)
+                .chunks_exact_mut(number.size())
                 .for_each(<[u8]>::reverse);
         }
         self.sink
-            .packed_array(number.builtin, count, &self.scratch)
+            .packed_array(number.builtin(), count, &self.scratch)
             .map_err(Stop::Sink)
     }
 
@@ -265,52 +253,41 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         let count = self.count(len)?;
         self.room(count, primitive.size())?;
         if !carry {
-            return (0..count).try_for_each(|_| self.skip_one(primitive));
+            return Ok((0..count).try_for_each(|_| self.skip_one(primitive))?);
         }
         self.sink
             .array(primitive.builtin(), count)
             .map_err(Stop::Sink)?;
-        if primitive.is_converted() {
-            return (0..count).try_for_each(|_| {
-                let value = self.converted(primitive)?;
-                self.element(value)
-            });
+        for _ in 0..count {
+            let value = match primitive {
+                Primitive::Number(number) => self.number(number)?,
+                Primitive::Clock(clock) => self.clock(clock)?,
+                Primitive::Text(text) if text.wide => {
+                    let text = self.wide(text.bound)?;
+                    self.element(Scalar::String(Some(&text)))?;
+                    continue;
+                }
+                Primitive::Text(text) => Scalar::String(Some(self.narrow(text.bound)?)),
+            };
+            self.element(value)?;
         }
-        (0..count).try_for_each(|_| self.text(primitive, Self::element))
+        Ok(())
     }
 
-    fn converted(&mut self, primitive: Primitive) -> Result<Scalar<'static>, Fault> {
+    fn clock(&mut self, clock: Clock) -> Result<Scalar<'static>, Fault> {
         let (first, second) = (self.u32()?, self.u32()?);
         let signed = first.cast_signed();
-        Ok(match primitive {
-            Primitive::Time1 => Scalar::DateTime(time_to_date_time(i64::from(first), second)),
-            Primitive::Time2 => Scalar::DateTime(time_to_date_time(i64::from(signed), second)),
-            Primitive::Duration1 => {
+        Ok(match clock {
+            Clock::Time1 => Scalar::DateTime(time_to_date_time(i64::from(first), second)),
+            Clock::Time2 => Scalar::DateTime(time_to_date_time(i64::from(signed), second)),
+            Clock::Duration1 => {
                 Scalar::Double(duration_to_millis(signed, i64::from(second.cast_signed())))
             }
-            _ => Scalar::Double(duration_to_millis(signed, i64::from(second))),
+            Clock::Duration2 => Scalar::Double(duration_to_millis(signed, i64::from(second))),
         })
     }
 
-    fn text(
-        &mut self,
-        primitive: Primitive,
-        give: fn(&mut Self, Scalar<'_>) -> Result<(), Stop<S::Error>>,
-    ) -> Result<(), Stop<S::Error>> {
-        match primitive {
-            Primitive::WString { bound } => {
-                let text = self.wide(bound)?;
-                give(self, Scalar::String(Some(&text)))
-            }
-            Primitive::String { bound } => {
-                let text = self.narrow(bound)?;
-                give(self, Scalar::String(Some(text)))
-            }
-            _ => Ok(()),
-        }
-    }
-
-    fn narrow(&mut self, bound: Option<u32>) -> Result<&'p str, Fault> {
+    fn narrow(&mut self, bound: u32) -> Result<&'p str, Fault> {
         let said = self.u32()?;
         let mut bytes = self.take(1, length(said)?)?;
         // Some writers give an empty CDR string the length 0 instead of a NUL.
@@ -324,7 +301,7 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         std::str::from_utf8(bytes).map_err(|_| Fault::Text)
     }
 
-    fn wide(&mut self, bound: Option<u32>) -> Result<String, Fault> {
+    fn wide(&mut self, bound: u32) -> Result<String, Fault> {
         let said = self.u32()?;
         check(bound, said)?;
         let bytes = self.take(1, product(length(said)?, 4)?)?;
@@ -354,7 +331,7 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
             Len::Fixed(count) => length(count),
             Len::Counted { bound } => {
                 let count = self.u32()?;
-                check(Some(bound), count)?;
+                check(bound, count)?;
                 length(count)
             }
         }
@@ -440,9 +417,10 @@ fn product(count: usize, size: usize) -> Result<usize, Fault> {
     count.checked_mul(size).ok_or(Fault::Truncated)
 }
 
-fn check(bound: Option<u32>, found: u32) -> Result<(), Fault> {
-    match bound {
-        Some(bound) if found > bound => Err(Fault::Bound { bound, found }),
-        _ => Ok(()),
+fn check(bound: u32, found: u32) -> Result<(), Fault> {
+    if found > bound {
+        Err(Fault::Bound { bound, found })
+    } else {
+        Ok(())
     }
 }

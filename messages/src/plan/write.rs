@@ -2,8 +2,8 @@
 
 use uadp::{BuiltinType, Scalar};
 
-use super::{Len, Number, Op, Plan, What, Wire};
-use crate::definition::Primitive;
+use super::{Len, Op, Plan, What, Wire};
+use crate::definition::{Clock, Number, Primitive};
 use crate::{Source, SourceError, WriteError, WriteFault, date_time_to_time, millis_to_duration};
 
 struct Writer<'o, 's, S> {
@@ -96,33 +96,24 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
     #[inline]
     fn one(&mut self, primitive: Primitive, value: Scalar<'_>) -> Result<(), WriteFault> {
         match (primitive, value) {
-            (Primitive::Bool, Scalar::Boolean(value)) => self.out.push(u8::from(value)),
-            (Primitive::Int8, Scalar::SByte(value)) => self.put(value.to_le_bytes()),
-            (Primitive::UInt8, Scalar::Byte(value)) => self.out.push(value),
-            (Primitive::Int16, Scalar::Int16(value)) => self.put(value.to_le_bytes()),
-            (Primitive::UInt16, Scalar::UInt16(value)) => self.put(value.to_le_bytes()),
-            (Primitive::Int32, Scalar::Int32(value)) => self.put(value.to_le_bytes()),
-            (Primitive::UInt32, Scalar::UInt32(value)) => self.put(value.to_le_bytes()),
-            (Primitive::Int64, Scalar::Int64(value)) => self.put(value.to_le_bytes()),
-            (Primitive::UInt64, Scalar::UInt64(value)) => self.put(value.to_le_bytes()),
-            (Primitive::Float32, Scalar::Float(value)) => self.put(value.to_le_bytes()),
-            (Primitive::Float64, Scalar::Double(value)) => self.put(value.to_le_bytes()),
-            (Primitive::String { bound }, Scalar::String(value)) => {
-                return self.narrow(bound, value.unwrap_or_default());
+            (Primitive::Number(number), value) => return self.number(number, value),
+            (Primitive::Text(text), Scalar::String(value)) if text.wide => {
+                return self.wide(text.bound, value.unwrap_or_default());
             }
-            (Primitive::WString { bound }, Scalar::String(value)) => {
-                return self.wide(bound, value.unwrap_or_default());
+            (Primitive::Text(text), Scalar::String(value)) => {
+                return self.narrow(text.bound, value.unwrap_or_default());
             }
-            (Primitive::Time1 | Primitive::Time2, Scalar::DateTime(value)) => {
+            (Primitive::Clock(clock @ (Clock::Time1 | Clock::Time2)), Scalar::DateTime(value)) => {
                 let (sec, nanosec) = date_time_to_time(value);
-                let sec = match primitive {
-                    Primitive::Time1 => u32::try_from(sec).ok(),
-                    _ => i32::try_from(sec).ok().map(i32::cast_unsigned),
+                let sec = if clock == Clock::Time1 {
+                    u32::try_from(sec)
+                } else {
+                    i32::try_from(sec).map(i32::cast_unsigned)
                 };
-                self.put(sec.ok_or(WriteFault::Time)?.to_le_bytes());
+                self.put(sec.map_err(|_| WriteFault::Time)?.to_le_bytes());
                 self.put(nanosec.to_le_bytes());
             }
-            (Primitive::Duration1 | Primitive::Duration2, Scalar::Double(value)) => {
+            (Primitive::Clock(Clock::Duration1 | Clock::Duration2), Scalar::Double(value)) => {
                 let (sec, nanosec) = millis_to_duration(value).ok_or(WriteFault::Duration)?;
                 self.put(sec.to_le_bytes());
                 self.put(nanosec.to_le_bytes());
@@ -132,15 +123,34 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
         Ok(())
     }
 
+    #[inline]
+    fn number(&mut self, number: Number, value: Scalar<'_>) -> Result<(), WriteFault> {
+        match (number, value) {
+            (Number::Bool, Scalar::Boolean(value)) => self.out.push(u8::from(value)),
+            (Number::Int8, Scalar::SByte(value)) => self.put(value.to_le_bytes()),
+            (Number::UInt8, Scalar::Byte(value)) => self.out.push(value),
+            (Number::Int16, Scalar::Int16(value)) => self.put(value.to_le_bytes()),
+            (Number::UInt16, Scalar::UInt16(value)) => self.put(value.to_le_bytes()),
+            (Number::Int32, Scalar::Int32(value)) => self.put(value.to_le_bytes()),
+            (Number::UInt32, Scalar::UInt32(value)) => self.put(value.to_le_bytes()),
+            (Number::Int64, Scalar::Int64(value)) => self.put(value.to_le_bytes()),
+            (Number::UInt64, Scalar::UInt64(value)) => self.put(value.to_le_bytes()),
+            (Number::Float32, Scalar::Float(value)) => self.put(value.to_le_bytes()),
+            (Number::Float64, Scalar::Double(value)) => self.put(value.to_le_bytes()),
+            (number, value) => return Err(mismatch(number.builtin(), &value)),
+        }
+        Ok(())
+    }
+
     fn packed(&mut self, number: Number, len: Len, carry: bool) -> Result<(), WriteFault> {
         if !carry {
             let count = self.zero_count(len);
-            let align = if count == 0 { 1 } else { number.size };
-            self.zeros(align, count.saturating_mul(number.size));
+            let align = if count == 0 { 1 } else { number.size() };
+            self.zeros(align, count.saturating_mul(number.size()));
             return Ok(());
         }
-        let (count, bytes) = self.source.packed_array(number.builtin)?;
-        if count.checked_mul(number.size) != Some(bytes.len()) {
+        let (count, bytes) = self.source.packed_array(number.builtin())?;
+        if count.checked_mul(number.size()) != Some(bytes.len()) {
             return Err(SourceError::Malformed(format!(
                 "{count} elements in {} bytes",
                 bytes.len()
@@ -149,9 +159,9 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
         }
         self.count(len, count)?;
         if count > 0 {
-            self.align(number.size);
+            self.align(number.size());
         }
-        if number.builtin == BuiltinType::Boolean {
+        if number == Number::Bool {
             self.out
                 .extend(bytes.iter().map(|byte| u8::from(*byte != 0)));
         } else {
@@ -191,9 +201,9 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
         Ok(())
     }
 
-    fn narrow(&mut self, bound: Option<u32>, text: &str) -> Result<(), WriteFault> {
+    fn narrow(&mut self, bound: u32, text: &str) -> Result<(), WriteFault> {
         let cdr = self.origin.is_some();
-        let length = within(bound.unwrap_or(u32::MAX - 1), text.len())?;
+        let length = within(bound.min(u32::MAX - 1), text.len())?;
         if cdr && text.contains('\0') {
             return Err(WriteFault::Nul);
         }
@@ -205,8 +215,8 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
         Ok(())
     }
 
-    fn wide(&mut self, bound: Option<u32>, text: &str) -> Result<(), WriteFault> {
-        let length = within(bound.unwrap_or(u32::MAX), text.encode_utf16().count())?;
+    fn wide(&mut self, bound: u32, text: &str) -> Result<(), WriteFault> {
+        let length = within(bound, text.encode_utf16().count())?;
         if text.contains('\0') {
             return Err(WriteFault::Nul);
         }
@@ -247,11 +257,13 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
 
     fn zero(&mut self, primitive: Primitive) {
         match primitive {
-            Primitive::String { .. } if self.origin.is_some() => {
+            Primitive::Text(text) if self.origin.is_some() && !text.wide => {
                 self.put(1u32.to_le_bytes());
                 self.out.push(0);
             }
-            _ => self.zeros(primitive.align(), primitive.size()),
+            Primitive::Number(_) | Primitive::Clock(_) | Primitive::Text(_) => {
+                self.zeros(primitive.align(), primitive.size())
+            }
         }
     }
 
