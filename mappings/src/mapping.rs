@@ -138,7 +138,7 @@ pub struct PubSub {
     pub key_frame_period: Duration,
     /// A writer that has nothing to say says so after this time.
     pub keep_alive_period: Duration,
-    /// A writer that is silent for this long counts as gone; longer than the two periods above.
+    /// A writer that is silent for this long counts as gone; longer than `keep_alive_period`.
     pub receive_timeout: Duration,
 }
 
