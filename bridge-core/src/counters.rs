@@ -141,7 +141,10 @@ impl Counters {
 
     /// Every reason that occurred, with its count.
     pub fn drops(&self) -> impl Iterator<Item = (Reason, u64)> {
-        Reason::ALL.into_iter().zip(self.dropped).filter(|(_, count)| *count > 0)
+        Reason::ALL
+            .into_iter()
+            .zip(self.dropped)
+            .filter(|(_, count)| *count > 0)
     }
 
     /// Adds `count` drops and says how many there are now.
@@ -158,7 +161,9 @@ impl Counters {
 
 /// Whether the `total`th occurrence is told: the 1st, 10th, 100th and so on, so that a flood stays a few lines.
 pub(crate) fn is_told(total: u64) -> bool {
-    total.checked_ilog10().is_some_and(|digits| total == 10_u64.pow(digits))
+    total
+        .checked_ilog10()
+        .is_some_and(|digits| total == 10_u64.pow(digits))
 }
 
 #[cfg(test)]

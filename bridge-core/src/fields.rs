@@ -24,13 +24,17 @@ pub(crate) enum Payload<'a> {
 pub(crate) fn read(
     payload: &Payload<'_>,
     namespace: u16,
-    frame: &mut FieldEncoder<'_, '_>,
+    frame: &mut FieldEncoder<'_>,
 ) -> Result<(), (Reason, String)> {
     match payload {
         Payload::Block(block) => {
             // Checked here, since a bad block would be an unreadable datagram for everybody.
-            check(block).map_err(|error| (Reason::Malformed, error.to_string()))?;
-            frame.fields_block(block).map_err(|error| (Reason::TooBig, error.to_string()))
+            Fields::parse(block)
+                .and_then(|fields| fields.checked_bytes())
+                .map_err(|error| (Reason::Malformed, error.to_string()))?;
+            frame
+                .fields_block(block)
+                .map_err(|error| (Reason::TooBig, error.to_string()))
         }
         Payload::Ros(plan, bytes) => {
             let mut sink = FrameSink { frame, namespace };
@@ -42,16 +46,24 @@ pub(crate) fn read(
     }
 }
 
-/// Appends the ROS message that a block of fields makes.
+/// Appends the ROS message that the fields make.
 pub(crate) fn write(
     plan: &Plan,
-    block: &[u8],
+    fields: Fields<'_>,
     out: &mut Vec<u8>,
 ) -> Result<(), (Reason, String)> {
-    let fields = Fields::parse(block)
-        .map_err(|error| (Reason::Malformed, error.to_string()))?;
     let mut source = FieldSource::new(fields);
-    plan.write(&mut source, out).map_err(|error| (Reason::Mismatch, error.to_string()))
+    plan.write(&mut source, out)
+        .map_err(|error| (Reason::Mismatch, error.to_string()))
+}
+
+/// Appends the fields as they are, once it is sure that they can be read.
+pub(crate) fn copy(fields: &Fields<'_>, out: &mut Vec<u8>) -> Result<(), (Reason, String)> {
+    let block = fields
+        .checked_bytes()
+        .map_err(|error| (Reason::Malformed, error.to_string()))?;
+    out.extend_from_slice(block);
+    Ok(())
 }
 
 /// Builtin type of a field, and whether it is an array.
@@ -63,21 +75,14 @@ pub(crate) fn shape(field: &Variant<'_>) -> (BuiltinType, bool) {
     }
 }
 
-fn check(block: &[u8]) -> Result<(), DecodeError> {
-    for field in Fields::parse(block)? {
-        field?;
-    }
-    Ok(())
-}
-
 /// A key frame that takes what a plan reads.
-struct FrameSink<'f, 'e, 'b> {
-    frame: &'f mut FieldEncoder<'e, 'b>,
+struct FrameSink<'f, 'm> {
+    frame: &'f mut FieldEncoder<'m>,
     /// That of the structures' TypeIds.
     namespace: u16,
 }
 
-impl Sink for FrameSink<'_, '_, '_> {
+impl Sink for FrameSink<'_, '_> {
     type Error = EncodeError;
 
     fn scalar(&mut self, value: Scalar<'_>) -> Result<(), EncodeError> {
@@ -94,7 +99,11 @@ impl Sink for FrameSink<'_, '_, '_> {
     }
 
     fn array(&mut self, element: BuiltinType, count: usize) -> Result<(), EncodeError> {
-        self.frame.array(element, count)
+        match element {
+            // Messages within a message of an array: structures by value.
+            BuiltinType::ExtensionObject => self.frame.inline_structures(count),
+            _ => self.frame.array(element, count),
+        }
     }
 
     fn element(&mut self, value: Scalar<'_>) -> Result<(), EncodeError> {
@@ -106,7 +115,8 @@ impl Sink for FrameSink<'_, '_, '_> {
     }
 
     fn begin_structure(&mut self, of: &TypeName) -> Result<(), EncodeError> {
-        self.frame.begin_structure(NodeId::string(self.namespace, &of.to_string()))
+        self.frame
+            .begin_structure(NodeId::string(self.namespace, &of.to_string()))
     }
 
     fn end_structure(&mut self) -> Result<(), EncodeError> {
@@ -127,11 +137,19 @@ struct FieldSource<'a> {
 
 impl<'a> FieldSource<'a> {
     const fn new(fields: Fields<'a>) -> Self {
-        Self { fields, elements: None, structures: None, structure: None }
+        Self {
+            fields,
+            elements: None,
+            structures: None,
+            structure: None,
+        }
     }
 
     fn field(&mut self) -> Result<Variant<'a>, SourceError> {
-        self.fields.next().ok_or(SourceError::Missing)?.map_err(malformed)
+        self.fields
+            .next()
+            .ok_or(SourceError::Missing)?
+            .map_err(malformed)
     }
 
     /// The next field, or the next value of the structure being read, as an array.
@@ -165,7 +183,10 @@ impl<'a> Source<'a> for FieldSource<'a> {
     fn array(&mut self, expected: BuiltinType) -> Result<usize, SourceError> {
         if let (Some(structure), BuiltinType::ExtensionObject) = (&mut self.structure, expected) {
             // Messages within a message of an array stand inline: only their number is here.
-            return structure.length().map_err(malformed).map(Option::unwrap_or_default);
+            return structure
+                .length()
+                .map_err(malformed)
+                .map(Option::unwrap_or_default);
         }
         let array = self.next_array(expected)?;
         self.elements = Some(array.iter());
@@ -173,8 +194,11 @@ impl<'a> Source<'a> for FieldSource<'a> {
     }
 
     fn element(&mut self, expected: BuiltinType) -> Result<Scalar<'a>, SourceError> {
-        let element =
-            self.elements.as_mut().and_then(Iterator::next).ok_or(SourceError::Missing)?;
+        let element = self
+            .elements
+            .as_mut()
+            .and_then(Iterator::next)
+            .ok_or(SourceError::Missing)?;
         if element.builtin_type() == expected {
             return Ok(element);
         }
@@ -188,22 +212,37 @@ impl<'a> Source<'a> for FieldSource<'a> {
     }
 
     fn begin_structure(&mut self) -> Result<(), SourceError> {
-        let next =
-            self.structures.as_mut().and_then(Iterator::next).ok_or(SourceError::Missing)?;
+        let next = self
+            .structures
+            .as_mut()
+            .and_then(Iterator::next)
+            .ok_or(SourceError::Missing)?;
         let Scalar::ExtensionObject(object) = next else {
-            return Err(unexpected(BuiltinType::ExtensionObject, false, &Variant::Scalar(next)));
+            return Err(unexpected(
+                BuiltinType::ExtensionObject,
+                false,
+                &Variant::Scalar(next),
+            ));
         };
         let ExtensionBody::Binary(body) = object.body else {
-            return Err(SourceError::Malformed("a structure without a binary body".to_owned()));
+            return Err(SourceError::Malformed(
+                "a structure without a binary body".to_owned(),
+            ));
         };
         self.structure = Some(StructureReader::new(body));
         Ok(())
     }
 
     fn end_structure(&mut self) -> Result<(), SourceError> {
-        match self.structure.take().map_or(0, |structure| structure.remaining()) {
+        match self
+            .structure
+            .take()
+            .map_or(0, |structure| structure.remaining())
+        {
             0 => Ok(()),
-            left => Err(SourceError::Malformed(format!("{left} bytes too many in a structure"))),
+            left => Err(SourceError::Malformed(format!(
+                "{left} bytes too many in a structure"
+            ))),
         }
     }
 
@@ -222,5 +261,10 @@ fn malformed(error: DecodeError) -> SourceError {
 
 fn unexpected(expected: BuiltinType, expected_array: bool, found: &Variant<'_>) -> SourceError {
     let found_array = matches!(found, Variant::Array(_));
-    SourceError::Type { expected, expected_array, found: found.builtin_type(), found_array }
+    SourceError::Type {
+        expected,
+        expected_array,
+        found: found.builtin_type(),
+        found_array,
+    }
 }

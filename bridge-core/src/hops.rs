@@ -32,7 +32,10 @@ impl Delays {
         let histogram = Histogram::new_with_bounds(1, 3_600_000_000_000, 2)
             .or_else(|_| Histogram::new(2))
             .unwrap_or_else(|_| unreachable!("two significant digits are valid"));
-        Self { histogram, negative: 0 }
+        Self {
+            histogram,
+            negative: 0,
+        }
     }
 
     fn record(&mut self, nanoseconds: i128) {
@@ -127,8 +130,16 @@ mod tests {
         hops.record(Hop::Network, at(1000), at(0));
         let network = hops.of(Hop::Network);
         assert_eq!((network.count(), network.negative()), (100, 1));
-        assert!((49.0..=51.0).contains(&network.quantile_us(0.5)), "{}", network.quantile_us(0.5));
-        assert!((99.0..=101.0).contains(&network.max_us()), "{}", network.max_us());
+        assert!(
+            (49.0..=51.0).contains(&network.quantile_us(0.5)),
+            "{}",
+            network.quantile_us(0.5)
+        );
+        assert!(
+            (99.0..=101.0).contains(&network.max_us()),
+            "{}",
+            network.max_us()
+        );
         assert_eq!(hops.of(Hop::In).count(), 0);
     }
 }

@@ -23,3 +23,17 @@ pub fn may_cross(own: SpaceId, heard_on: Side, origin: SpaceId) -> bool {
         Side::Ua => origin != own,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_own_values_leave_and_only_foreign_ones_enter() {
+        let [own, other] = [2, 7].map(|id| SpaceId::new(id).unwrap());
+        assert!(may_cross(own, Side::Local, own));
+        assert!(!may_cross(own, Side::Local, other));
+        assert!(!may_cross(own, Side::Ua, own));
+        assert!(may_cross(own, Side::Ua, other));
+    }
+}

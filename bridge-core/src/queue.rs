@@ -17,12 +17,19 @@ impl<T> Queue<T> {
             Overflow::KeepLatest => 1,
             Overflow::DropOldest(depth) => usize::from(depth.get()),
         };
-        Self { items: VecDeque::new(), depth }
+        Self {
+            items: VecDeque::new(),
+            depth,
+        }
     }
 
     /// Appends a sample and gives back the oldest one if it had to go.
     pub(crate) fn push(&mut self, item: T) -> Option<T> {
-        let dropped = if self.items.len() >= self.depth { self.items.pop_front() } else { None };
+        let dropped = if self.items.len() >= self.depth {
+            self.items.pop_front()
+        } else {
+            None
+        };
         self.items.push_back(item);
         dropped
     }
@@ -47,7 +54,10 @@ mod tests {
         let mut queue = Queue::new(Overflow::DropOldest(NonZeroU16::new(2).unwrap()));
         let dropped: Vec<_> = (1..=4).filter_map(|sample| queue.push(sample)).collect();
         assert_eq!(dropped, [1, 2]);
-        assert_eq!((queue.pop(), queue.pop(), queue.pop()), (Some(3), Some(4), None));
+        assert_eq!(
+            (queue.pop(), queue.pop(), queue.pop()),
+            (Some(3), Some(4), None)
+        );
     }
 
     #[test]

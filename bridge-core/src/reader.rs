@@ -69,8 +69,9 @@ impl Reader {
 
     /// Whether the writer has just been silent for `timeout`. True once per silence.
     pub(crate) fn fell_silent(&mut self, now: Instant, timeout: Duration) -> bool {
-        let silent = now.saturating_duration_since(self.heard) >= timeout;
-        !std::mem::replace(&mut self.silent, self.silent || silent) && silent
+        let fell = !self.silent && now.saturating_duration_since(self.heard) >= timeout;
+        self.silent |= fell;
+        fell
     }
 
     /// When silence is to be looked for again; `None` while the writer is silent.
@@ -87,15 +88,13 @@ impl Reader {
         let restarted = place.from != self.from
             || matches!((place.stamp, self.stamp), (Some(new), Some(last)) if new > last);
         let missing = match (self.sequence, place.sequence) {
-            (Some(last), Some(sequence)) => {
-                match sequence.wrapping_sub(last) {
-                    0 if !restarted => return Err(Reason::Duplicate),
-                    0 => 0,
-                    ahead @ 1..=QUARTER => ahead - 1,
-                    OLD.. if !restarted => return Err(Reason::Stale),
-                    _ => 0,
-                }
-            }
+            (Some(last), Some(sequence)) => match sequence.wrapping_sub(last) {
+                0 if !restarted => return Err(Reason::Duplicate),
+                0 => 0,
+                ahead @ 1..=QUARTER => ahead - 1,
+                OLD.. if !restarted => return Err(Reason::Stale),
+                _ => 0,
+            },
             (_, _) => 0,
         };
         self.sequence = place.sequence;
@@ -140,7 +139,10 @@ mod tests {
         }
     }
 
-    #[expect(clippy::disallowed_methods, reason = "a test needs some instant to count from")]
+    #[expect(
+        clippy::disallowed_methods,
+        reason = "a test needs some instant to count from"
+    )]
     fn reader() -> (Reader, Instant) {
         let now = Instant::now();
         (Reader::new(address(1), now), now)
@@ -160,9 +162,20 @@ mod tests {
         assert_eq!(reader.admit(place(500, 9000)), Ok(0));
         assert_eq!(reader.admit(place(500, 9000)), Err(Reason::Duplicate));
         assert_eq!(reader.admit(place(499, 8000)), Err(Reason::Stale));
-        assert_eq!(reader.admit(place(0, 10_000)), Ok(0), "a newer stamp tells of a restart");
-        let moved = Place { from: address(2), ..place(0, 10_000) };
-        assert_eq!(reader.admit(moved), Ok(0), "another address tells of a restart");
+        assert_eq!(
+            reader.admit(place(0, 10_000)),
+            Ok(0),
+            "a newer stamp tells of a restart"
+        );
+        let moved = Place {
+            from: address(2),
+            ..place(0, 10_000)
+        };
+        assert_eq!(
+            reader.admit(moved),
+            Ok(0),
+            "another address tells of a restart"
+        );
     }
 
     #[test]
@@ -174,11 +187,21 @@ mod tests {
         assert_eq!(reader.admit(place(2, 1000)), Err(Reason::Repeat));
         assert_eq!(reader.admit(place(3, 2000)), Ok(0), "another sample");
         let (mut coarse, _) = self::reader();
-        let stamp_without_picoseconds = Place { fine: false, ..place(1, 1000) };
+        let stamp_without_picoseconds = Place {
+            fine: false,
+            ..place(1, 1000)
+        };
         assert_eq!(coarse.admit(stamp_without_picoseconds), Ok(0));
         coarse.delivered(stamp_without_picoseconds);
-        let next = Place { sequence: Some(2), ..stamp_without_picoseconds };
-        assert_eq!(coarse.admit(next), Ok(0), "a coarse stamp may be shared by two samples");
+        let next = Place {
+            sequence: Some(2),
+            ..stamp_without_picoseconds
+        };
+        assert_eq!(
+            coarse.admit(next),
+            Ok(0),
+            "a coarse stamp may be shared by two samples"
+        );
     }
 
     #[test]

@@ -6,9 +6,9 @@ use mappings::Overflow;
 use messages::Plan;
 
 use crate::counters::Counters;
+use crate::output::Delivery;
 use crate::queue::Queue;
 use crate::reader::Reader;
-use crate::router::Delivery;
 use crate::writer::{Encoded, Writer};
 
 /// One topic of the space, seen from one bridge: of our own space, or of another.

@@ -42,7 +42,11 @@ impl Encoded {
     /// Sets the NetworkMessage Timestamp and PicoSeconds.
     pub(crate) fn stamp(&mut self, at: Timestamp) {
         patch(&mut self.bytes, self.timestamp_at, &at.time.0.to_le_bytes());
-        patch(&mut self.bytes, self.timestamp_at + 8, &at.picoseconds.to_le_bytes());
+        patch(
+            &mut self.bytes,
+            self.timestamp_at + 8,
+            &at.picoseconds.to_le_bytes(),
+        );
     }
 
     fn number(&mut self, sequence: u16) {
@@ -97,7 +101,10 @@ impl Writer {
         let sequence = self.sequence;
         let last = self.last.as_ref()?;
         buffer.clone_from(&last.bytes);
-        let mut again = Encoded { bytes: buffer, ..*last };
+        let mut again = Encoded {
+            bytes: buffer,
+            ..*last
+        };
         again.number(sequence);
         self.sequence = sequence.wrapping_add(1);
         self.sent = now;
@@ -110,7 +117,11 @@ impl Writer {
     }
 
     /// When the writer has to speak again, and how.
-    pub(crate) fn due(&self, key_frames: Duration, keep_alives: Duration) -> Option<(Instant, Idle)> {
+    pub(crate) fn due(
+        &self,
+        key_frames: Duration,
+        keep_alives: Duration,
+    ) -> Option<(Instant, Idle)> {
         if !self.live || !self.started {
             return None;
         }
@@ -133,10 +144,17 @@ mod tests {
     use super::*;
 
     fn sample() -> Encoded {
-        Encoded { bytes: vec![0; 20], timestamp_at: 2, sequence_at: 16 }
+        Encoded {
+            bytes: vec![0; 20],
+            timestamp_at: 2,
+            sequence_at: 16,
+        }
     }
 
-    #[expect(clippy::disallowed_methods, reason = "a test needs some instant to count from")]
+    #[expect(
+        clippy::disallowed_methods,
+        reason = "a test needs some instant to count from"
+    )]
     fn writer() -> (Writer, Instant) {
         let now = Instant::now();
         (Writer::new(now), now)
@@ -157,29 +175,51 @@ mod tests {
     #[test]
     fn values_are_repeated_with_keep_alives_between_when_those_are_more_frequent() {
         let (mut writer, now) = writer();
-        assert_eq!(writer.due(SECOND, SECOND), None, "nothing to repeat before the first value");
+        assert_eq!(
+            writer.due(SECOND, SECOND),
+            None,
+            "nothing to repeat before the first value"
+        );
         writer.sent(&sample(), true, now);
-        assert_eq!(writer.due(SECOND, SECOND), Some((now + SECOND, Idle::Repeat)));
-        assert_eq!(writer.due(SECOND * 2, SECOND), Some((now + SECOND, Idle::KeepAlive)));
+        assert_eq!(
+            writer.due(SECOND, SECOND),
+            Some((now + SECOND, Idle::Repeat))
+        );
+        assert_eq!(
+            writer.due(SECOND * 2, SECOND),
+            Some((now + SECOND, Idle::KeepAlive))
+        );
         writer.sent_keep_alive(now + SECOND);
-        assert_eq!(writer.due(SECOND * 2, SECOND), Some((now + SECOND * 2, Idle::Repeat)));
+        assert_eq!(
+            writer.due(SECOND * 2, SECOND),
+            Some((now + SECOND * 2, Idle::Repeat))
+        );
     }
 
     #[test]
     fn events_are_not_repeated_and_a_topic_without_producer_falls_silent() {
         let (mut writer, now) = writer();
         writer.sent(&sample(), false, now);
-        assert_eq!(writer.due(SECOND, SECOND), Some((now + SECOND, Idle::KeepAlive)));
+        assert_eq!(
+            writer.due(SECOND, SECOND),
+            Some((now + SECOND, Idle::KeepAlive))
+        );
         writer.set_live(false);
         assert_eq!(writer.due(SECOND, SECOND), None);
         writer.sent(&sample(), false, now);
-        assert!(writer.due(SECOND, SECOND).is_some(), "a sample shows that it has one again");
+        assert!(
+            writer.due(SECOND, SECOND).is_some(),
+            "a sample shows that it has one again"
+        );
     }
 
     #[test]
     fn the_send_time_is_written_where_the_header_has_it() {
         let mut encoded = sample();
-        encoded.stamp(Timestamp { time: uadp::DateTime(0x0102), picoseconds: 0x0304 });
+        encoded.stamp(Timestamp {
+            time: uadp::DateTime(0x0102),
+            picoseconds: 0x0304,
+        });
         assert_eq!(encoded.bytes[2..12], [2, 1, 0, 0, 0, 0, 0, 0, 4, 3]);
     }
 }

@@ -181,6 +181,19 @@ impl<'m> FieldEncoder<'m> {
         self.array(BuiltinType::ExtensionObject, count)
     }
 
+    /// Inside a structure, the length of an array of `count` structures by value: their fields follow inline, one
+    /// structure after the other (OPC 10000-6, 5.2.6).
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] outside of a structure or while an array wants elements, [`EncodeError::TooBig`]
+    /// past 2^31-1 structures.
+    pub fn inline_structures(&mut self, count: usize) -> Result<(), EncodeError> {
+        if self.depth == 0 {
+            return Err(EncodeError::Misplaced("inline structures outside of a structure"));
+        }
+        self.begin_array(BuiltinType::ExtensionObject, count)
+    }
+
     /// Opens an ExtensionObject with a binary body: the next of the open array of structures, or with no array
     /// open a value of its own. `type_id` names the binary encoding of the structure's type.
     ///
