@@ -40,7 +40,7 @@ codes! {
     Domain = "M012", "A DDS domain is 0..232 and only a ROS 2 space has one.";
     DomainTwice = "M013", "Two spaces live in one DDS domain, so neither bridge could tell whose a topic is.";
     UndeclaredSpace = "M014", "A variable names a space that is not listed under `spaces`.";
-    Address = "M020", "The PubSub address is not opc.udp://<IPv4 or IPv6 address>:<port>. A host name would have to be resolved, and is not read.";
+    Address = "M020", "The PubSub address is not `opc.udp://<IPv4 or IPv6 address>:<port>`. A host name would have to be resolved, and is not read.";
     DiscoveryGroup = "M021", "224.0.2.14 is the group OPC UA keeps for discovery messages; data sent there reaches everybody who looks for publishers.";
     UnscopedGroup = "M022", "The group is none of 239.0.0.0/8, which sites use as they like; others are assigned to protocols and may be treated by switches as such.";
     Interface = "M023", "An interface is named as the operating system does (at most 15 characters, `ip link` lists them) or by an address of it.";
@@ -48,16 +48,16 @@ codes! {
     Timing = "M025", "A writer that has nothing to say speaks once per keep_alive_period: with a shorter receive_timeout it would be taken for dead each time.";
     Namespace = "M030", "A namespace is an index 1..65535 and a URI, each of them once.";
     UndeclaredNamespace = "M031", "A node's namespace index is not listed under `namespaces`. The index alone means nothing: servers number their namespaces as they like, the URI ties it down.";
-    Endpoint = "M040", "The endpoint is not opc.tcp://<host>:<port>[/path].";
+    Endpoint = "M040", "The endpoint is not `opc.tcp://<host>:<port>[/path]`.";
     ApplicationUri = "M041", "The ApplicationUri is a URI as urn:my-plant:server; certificates carry it.";
-    NodeId = "M050", "A node id is ns=<index>;i=<number>, or s=<text>, g=<guid>, b=<base64> after the `;`.";
+    NodeId = "M050", "A node id is `ns=<index>;i=<number>`, or `s=<text>`, `g=<guid>`, `b=<base64>` after the `;`.";
     AliasNeeded = "M051", "The identifier of a topic is a number 1..65535. A node whose id is none (a text, a Guid, opaque bytes, 0 or above 65535, or in namespace 0) needs an `alias`.";
     Alias = "M052", "An alias is 1..65535 and stands for a node id that is no such number; other nodes keep their own number.";
     NodeTwice = "M053", "Two variables have one node. A value has one origin; the node of the server would have two.";
     TopicTwice = "M054", "Two variables have one topic, so one would be taken for the other.";
     NameTwice = "M055", "Two variables of one namespace have one name, and look the same to people who browse the server.";
     Name = "M056", "A variable's name has 1..512 characters and none of them is a control character.";
-    ValueType = "M057", "The type is an OPC UA builtin type, with [] behind it for an array of one dimension.";
+    ValueType = "M057", "The type is an OPC UA builtin type, with `[]` behind it for an array of one dimension.";
     RosTopic = "M060", "A ROS topic name begins with / and has letters, digits and underscores between slashes; in ROS 1 the first character is a letter, in ROS 2 no part begins with a digit.";
     SpaceName = "M061", "The topic's name is one of the space, but not the name of this variable. Zero configuration would carry it as another value.";
     MessageTypeName = "M062", "A message type is package/Name or package/msg/Name.";

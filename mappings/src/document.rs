@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use schemars::JsonSchema;
 
 use crate::code::Code;
-use crate::read::{At, Read, Reader, choice, document, list};
+use crate::read::{At, Read, Reader, choice, document, short};
 use crate::tree::{Kind, Node, Place};
 
 document! {
@@ -86,7 +86,8 @@ document! {
         /// The space that produces the value: 0 the OPC UA side, else one of `spaces`.
         #[schemars(required, range(max = 232))]
         origin: u16,
-        /// Stands for the identifier in topic names when the node id is no number from 1 to 65535 or in namespace 0.
+        /// Stands for the identifier in topic names when the node id is no number from 1 to 65535 or in namespace
+        /// 0. In the topic names of nodes of namespace 0 the namespace is 65535.
         #[schemars(range(min = 1, max = 65535))]
         alias: u16,
         /// The ROS topics tied to the value, one or a list, at most one per space. In the space of its origin the topic is
@@ -144,7 +145,7 @@ impl Read for Namespaces {
             if key.is_none() {
                 let message = format!(
                     "expected a namespace index from 1 to 65535, found `{}`",
-                    pair.key
+                    short(pair.key)
                 );
                 reader.findings.error(Code::WrongValue, pair.place, message);
             }
@@ -204,7 +205,6 @@ pub(crate) enum Queue {
 
 impl Read for Queue {
     fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
-        const WORDS: [&str; 2] = ["keep_latest", "drop_oldest: <number>"];
         match &node.kind {
             Kind::Scalar(text) if text == "keep_latest" => Some(Self::KeepLatest),
             Kind::Map(_) => {
@@ -234,7 +234,10 @@ impl Read for Queue {
                 let note = reader.findings.error(
                     Code::WrongValue,
                     node.place,
-                    format!("expected {}, found {}", list(&WORDS), found(node)),
+                    format!(
+                        "expected `keep_latest` or `drop_oldest`, found {}",
+                        found(node)
+                    ),
                 );
                 note.help("queue: keep_latest, or queue: {drop_oldest: 100}");
                 None
@@ -245,8 +248,8 @@ impl Read for Queue {
 
 fn found(node: &Node) -> String {
     match &node.kind {
-        Kind::Scalar(text) => format!("`{}`", crate::read::short(text)),
-        kind => kind.name().to_owned(),
+        Kind::Scalar(text) => format!("`{}`", short(text)),
+        Kind::Null | Kind::List(_) | Kind::Map(_) => node.kind.name().to_owned(),
     }
 }
 

@@ -125,6 +125,13 @@ impl Note<'_> {
         self
     }
 
+    /// As [`Note::help`], for what takes long to make.
+    pub(crate) fn help_with(self, help: impl FnOnce() -> String) {
+        if self.0.is_some() {
+            self.help(help());
+        }
+    }
+
     pub(crate) fn help(mut self, help: impl Into<String>) -> Self {
         if let Some(found) = &mut self.0 {
             found.help = Some(help.into());

@@ -72,7 +72,8 @@ impl Mapping {
         if !id.is_ros2() {
             return None;
         }
-        self.space(id).map_or(Some(id.into()), |space| space.domain)
+        self.space(id)
+            .map_or_else(|| Some(id.into()), |space| space.domain)
     }
 
     /// The ROS 2 space whose values live in that DDS domain: the declared one, else the one of the domain's number.

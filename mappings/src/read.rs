@@ -110,7 +110,7 @@ impl<'f> Reader<'f> {
                 continue;
             };
             if let Some(line) = first.insert(text.as_str(), key.place.line) {
-                let message = format!("the key `{text}` is repeated");
+                let message = format!("the key `{}` is repeated", short(text));
                 self.findings
                     .error(Code::DuplicateKey, key.place, message)
                     .label(format!("first at line {line}"));
@@ -144,13 +144,12 @@ impl<'f> Reader<'f> {
                 *slot = Some(&**value);
                 continue;
             }
-            let help = match nearest(key, keys) {
+            let message = format!("unknown key `{}`", short(key));
+            let note = self.findings.error(Code::UnknownKey, place, message);
+            note.help_with(|| match nearest(key, keys) {
                 Some(near) => format!("did you mean `{near}`? Known here are {}", list(&keys)),
                 None => format!("known here are {}", list(&keys)),
-            };
-            self.findings
-                .error(Code::UnknownKey, place, format!("unknown key `{key}`"))
-                .help(help);
+            });
         }
         Some(values)
     }

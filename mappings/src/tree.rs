@@ -95,8 +95,8 @@ pub(crate) fn parse(text: &str) -> Result<Rc<Node>, Fault> {
     let mut builder = Builder::default();
     for event in Parser::new_from_str_with_options(text, options) {
         let (event, marks) = event.map_err(|error| syntax(text, &error))?;
-        let place = place(text, marks);
         if let Some(tag) = event.tag() {
+            let place = place(text, marks.tag_span().unwrap_or(marks));
             let message = format!("the tag `{}` is not read here", tag.original());
             return Err(fault(
                 place,
@@ -104,7 +104,7 @@ pub(crate) fn parse(text: &str) -> Result<Rc<Node>, Fault> {
                 Some("leave the tag out; the key says what its value is"),
             ));
         }
-        builder.event(event, place)?;
+        builder.event(event, place(text, marks))?;
     }
     Ok(builder.root.unwrap_or_else(|| {
         Rc::new(Node {
@@ -195,8 +195,11 @@ impl Builder {
                     Some("a text that begins with * stands in quotes: \"*\""),
                 ))
             }
-            // Stream and document ends; whatever else a later parser reports beside the nodes.
-            _ => Ok(()),
+            Event::StreamStart | Event::StreamEnd | Event::DocumentEnd | Event::Anchor(..) => {
+                Ok(())
+            }
+            // The enumeration is open: a node this does not know would be missing from the tree.
+            other => Err(fault(place, format!("{other:?} is not read here"), None)),
         }
     }
 
@@ -314,7 +317,7 @@ mod tests {
             .iter()
             .map(|(key, value)| match &key.kind {
                 Kind::Scalar(text) => (text.as_str(), &**value),
-                other => panic!("{other:?}"),
+                Kind::Null | Kind::List(_) | Kind::Map(_) => panic!("{key:?}"),
             })
             .collect()
     }

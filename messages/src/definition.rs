@@ -1,6 +1,7 @@
 //! The parser of `.msg` texts: genmsg's rules for ROS 1, rosidl's for ROS 2.
 
 use crate::name::is_identifier;
+use crate::resolve::MOST_FIELDS;
 use crate::{DefinitionError, Dialect, TypeName};
 
 /// A type that is no message.
@@ -161,6 +162,9 @@ impl Definition {
         }
         if !default.is_empty() && dialect == Dialect::Ros1 {
             return Err("ROS 1 fields have no default value");
+        }
+        if self.fields.len() >= MOST_FIELDS {
+            return Err("more than 4096 fields");
         }
         if self.fields.iter().any(|field| field.name == name) {
             return Err("the field is defined twice");

@@ -5,6 +5,19 @@
 //! per message type, [`Selection`] and [`Wire`]; it then runs over the bytes of a message into a [`Sink`], or takes the
 //! fields of a [`Source`] and writes the bytes. No tree of values is built on either way.
 //!
+//! ```
+//! use messages::{Dialect, Plan, Registry, Selection, Wire};
+//!
+//! let mut registry = Registry::bundle(Dialect::Ros1);
+//! registry.add(&"line/Cover".parse()?, "Header header\ngeometry_msgs/Point position\nuint8 colour")?;
+//! let cover = registry.get(&"line/Cover".parse()?)?;
+//! let paths: Vec<&str> = cover.leaves().iter().map(|leaf| leaf.path.as_str()).collect();
+//! assert_eq!(paths, ["header.stamp", "header.frame_id", "position.x", "position.y", "position.z", "colour"]);
+//! let plan = Plan::compile(&cover, &Selection::Field("position.x".to_owned()), Wire::Ros1)?;
+//! assert_eq!(plan.leaves().len(), 1);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
 //! # Definitions
 //! Both dialects are read by a parser of this crate: definition texts come from peers, and published parsers panic on
 //! hostile ones (an array length of twenty digits) or know one dialect only.

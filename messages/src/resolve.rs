@@ -11,7 +11,7 @@ use crate::definition::{Arity, Clock, Definition, FieldType, Number, Primitive};
 use crate::{DefinitionError, Dialect, Leaf, MessageType, Rank, TypeName};
 
 const DEEPEST: usize = 32;
-const MOST_FIELDS: usize = 4096;
+pub(crate) const MOST_FIELDS: usize = 4096;
 const BIGGEST: usize = 64 << 20;
 
 /// A message with the messages in it, as the plan compiler walks it.
@@ -141,17 +141,17 @@ impl<'r> Resolver<'r> {
             }
             _ => self.shape(name, &mut Vec::new())?,
         };
-        let (md5, definition) = match definition {
-            Some(text) => (self.md5(name)?, text.to_owned()),
-            None => (self.md5(name)?, self.full_text(name)?),
+        // Only now, as the shape has shown that nothing contains itself.
+        let md5 = match self.dialect {
+            Dialect::Ros1 => self.md5(name)?,
+            Dialect::Ros2 => String::new(),
+        };
+        let definition = match definition {
+            Some(text) => text.to_owned(),
+            None => self.full_text(name)?,
         };
         let mut leaves = Vec::new();
         flatten(&shape, "", &mut leaves);
-        let md5 = if self.dialect == Dialect::Ros1 {
-            md5
-        } else {
-            String::new()
-        };
         Ok(MessageType {
             name: name.clone(),
             dialect: self.dialect,
@@ -293,6 +293,9 @@ impl<'r> Resolver<'r> {
         name: &TypeName,
         found: &mut Vec<TypeName>,
     ) -> Result<(), DefinitionError> {
+        if self.time(name).is_some() {
+            return Ok(());
+        }
         for field in &self.find(name, None)?.fields {
             if let FieldType::Message(inner) = &field.kind
                 && !found.contains(inner)
@@ -306,6 +309,7 @@ impl<'r> Resolver<'r> {
 
     pub(crate) fn suggest(&self, name: &TypeName) -> Option<TypeName> {
         let wanted = name.to_string();
+        let furthest = name.name().len() / 3;
         let known = self.sets.iter().flat_map(|set| set.keys());
         let (distance, nearest) = known
             .map(|known| {
@@ -320,7 +324,7 @@ impl<'r> Resolver<'r> {
                 )
             })
             .min_by_key(|(distance, _)| *distance)?;
-        (distance <= name.name().len() / 3).then(|| nearest.clone())
+        (distance <= furthest).then(|| nearest.clone())
     }
 }
 

@@ -43,6 +43,13 @@ struct Found {
     fields: Option<Vec<Leaf>>,
 }
 
+/// Where a binding stands.
+struct Site<'s> {
+    place: Place,
+    space: Option<SpaceId>,
+    subject: &'s Subject,
+}
+
 /// What is done to one ROS topic of one space.
 struct Use {
     place: Place,
@@ -92,7 +99,12 @@ impl<'c> Bindings<'c> {
                 note.help("one topic per space: a second one is a second variable");
                 continue;
             }
-            found.extend(self.binding(entry, at.place, space, subject, findings));
+            let site = Site {
+                place: at.place,
+                space,
+                subject,
+            };
+            found.extend(self.binding(entry, &site, findings));
         }
         differences(&found, findings);
         for one in &found {
@@ -143,18 +155,15 @@ impl<'c> Bindings<'c> {
     fn binding(
         &mut self,
         entry: &BindingEntry,
-        owner: Place,
-        space: Option<SpaceId>,
-        subject: &Subject,
+        site: &Site<'_>,
         findings: &mut Findings,
     ) -> Option<Found> {
-        let topic = required(&entry.topic, "topic", "a binding", owner, findings);
-        let topic =
-            topic.and_then(|(text, place)| topic_name(text, place, space, subject, findings));
-        let named = self.type_name(entry, owner, space, subject, findings);
+        let topic = required(&entry.topic, "topic", "the binding", site.place, findings);
+        let topic = topic.and_then(|(text, place)| topic_name(text, place, site, findings));
+        let named = self.type_name(entry, site, findings);
         let (name, place) = named?;
-        let space = space?;
-        let message_type = self.message_type(&name, place, space, subject, findings);
+        let space = site.space?;
+        let message_type = self.message_type(&name, place, site, findings);
         let selection = match &entry.field {
             None => Selection::Whole,
             Some(at) => Selection::Field(at.value.clone()?),
@@ -163,7 +172,7 @@ impl<'c> Bindings<'c> {
             Some(message_type) => {
                 let place = entry.field.as_ref().map_or(place, |at| at.place);
                 let fields = select(&message_type, &selection, place, findings)?;
-                compare(&fields, &name, subject, place, findings);
+                compare(&fields, &name, site.subject, place, findings);
                 Some(fields)
             }
             None => None,
@@ -185,9 +194,7 @@ impl<'c> Bindings<'c> {
     fn type_name(
         &self,
         entry: &BindingEntry,
-        owner: Place,
-        space: Option<SpaceId>,
-        subject: &Subject,
+        site: &Site<'_>,
         findings: &mut Findings,
     ) -> Option<(TypeName, Place)> {
         if let Some(at) = &entry.r#type {
@@ -201,24 +208,25 @@ impl<'c> Bindings<'c> {
             }
             return Some((name?, at.place));
         }
-        let Some((builtin, array)) = subject.declared else {
-            if !subject.type_faulty {
-                let note = findings.error(Code::MissingKey, owner, "the binding has no `type`");
+        let Some((builtin, array)) = site.subject.declared else {
+            if !site.subject.type_faulty {
+                let note =
+                    findings.error(Code::MissingKey, site.place, "the binding has no `type`");
                 note.help("the ROS message type, as std_msgs/Bool; or give the variable a `type`");
             }
             return None;
         };
-        let name = Types::registry(dialect(space?)).standard_type(builtin, array);
+        let name = Types::registry(dialect(site.space?)).standard_type(builtin, array);
         if name.is_none() {
             let message = format!(
                 "the binding has no `type`, and none of std_msgs holds {}",
                 types::print((builtin, array))
             );
             findings
-                .error(Code::MissingKey, owner, message)
+                .error(Code::MissingKey, site.place, message)
                 .help("name the ROS message type, and the field if it has several");
         }
-        Some((name?, owner))
+        Some((name?, site.place))
     }
 
     /// `None` when it is not known, which is noted.
@@ -226,19 +234,16 @@ impl<'c> Bindings<'c> {
         &mut self,
         name: &TypeName,
         place: Place,
-        space: SpaceId,
-        subject: &Subject,
+        site: &Site<'_>,
         findings: &mut Findings,
     ) -> Option<Arc<MessageType>> {
+        let space = site.space?;
         let dialect = dialect(space);
         let error = match self.types.get(dialect, name) {
             Ok(message_type) => return Some(Arc::clone(message_type)),
             Err(error) => error,
         };
-        let suggestion = Types::registry(dialect)
-            .suggest(name)
-            .map(|near| format!("did you mean `{near}`?"));
-        let message = match error {
+        let message = match &**error {
             DefinitionError::Unknown { .. } => {
                 format!("no definition of `{name}` is built in for {}", ros(dialect))
             }
@@ -247,22 +252,31 @@ impl<'c> Bindings<'c> {
             | DefinitionError::TooBig { .. }
             | DefinitionError::Syntax { .. } => error.to_string(),
         };
-        // What is read from a ROS 1 topic brings its definition along; an origin that could not be read may be space 1.
-        if space == SpaceId::ROS1 && subject.origin.is_none_or(|origin| origin == space) {
-            let note = findings.warning(Code::UnknownMessageType, place, message);
-            let help =
-                "the publisher's connection header will bring it, and the field is checked then";
-            note.help(
-                suggestion.map_or_else(|| help.to_owned(), |near| format!("{near} Else {help}")),
-            );
+        // What is read from a ROS 1 topic brings its definition; an origin that could not be read may be space 1.
+        let read =
+            space == SpaceId::ROS1 && site.subject.origin.is_none_or(|origin| origin == space);
+        let (note, why) = if read {
+            let why = "the publisher's connection header brings it, and the field is checked then";
+            (
+                findings.warning(Code::UnknownMessageType, place, message),
+                why,
+            )
         } else {
-            let note = findings.error(Code::UnknownMessageType, place, message);
             let why = match dialect {
                 Dialect::Ros1 => "what is written to ROS 1 must be known beforehand",
-                Dialect::Ros2 => "ROS 2 peers do not send definitions",
+                Dialect::Ros2 => {
+                    "ROS 2 peers do not send definitions, so only types built in can be bound"
+                }
             };
-            note.help(suggestion.map_or_else(|| why.to_owned(), |near| format!("{near} {why}")));
-        }
+            (
+                findings.error(Code::UnknownMessageType, place, message),
+                why,
+            )
+        };
+        note.help_with(|| match Types::registry(dialect).suggest(name) {
+            Some(near) => format!("did you mean `{near}`? If not: {why}"),
+            None => why.to_owned(),
+        });
         None
     }
 
@@ -334,11 +348,10 @@ fn conflict(first: &Use, other: &Use, topic: &str, findings: &mut Findings) {
 fn topic_name(
     text: &str,
     place: Place,
-    space: Option<SpaceId>,
-    subject: &Subject,
+    site: &Site<'_>,
     findings: &mut Findings,
 ) -> Option<(String, Place)> {
-    let dialect = space.map_or(Dialect::Ros1, dialect);
+    let dialect = site.space.map_or(Dialect::Ros1, dialect);
     if let Some(fault) = topic_fault(text, dialect) {
         let note = findings
             .error(
@@ -355,7 +368,7 @@ fn topic_name(
     if let Some(other) = text
         .strip_prefix('/')
         .and_then(|name| name.parse::<TopicId>().ok())
-        && let Some(topic) = subject.topic
+        && let Some(topic) = site.subject.topic
         && topic != other
     {
         let message =
@@ -455,7 +468,7 @@ fn compare(
                 "the variable is {told_type}, but `{}` of `{name}` is {found}",
                 one.path
             );
-            let help = format!("leave the variable's `type` out, or write  type: {found}");
+            let help = format!("leave the variable's `type` out, or write `type: {found}`");
             findings.error(Code::TypeDiffers, place, message).help(help);
         }
         several => {

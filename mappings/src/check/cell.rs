@@ -62,7 +62,7 @@ pub(super) fn spaces(
 }
 
 fn id(entry: &SpaceEntry, owner: Place, findings: &mut Findings) -> Option<(SpaceId, Place)> {
-    let (number, place) = required(&entry.id, "id", "a space", owner, findings)?;
+    let (number, place) = required(&entry.id, "id", "the space", owner, findings)?;
     let Some(id) = SpaceId::new(*number).filter(|id| *id != SpaceId::UA) else {
         let what = if *number == 0 {
             "0 is the OPC UA side"

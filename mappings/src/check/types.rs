@@ -52,7 +52,7 @@ pub(super) fn suggest_value_type(text: &str) -> Option<&'static str> {
         ("bytes", "ByteString"),
         ("uuid", "Guid"),
     ];
-    let name = text.strip_suffix("[]").unwrap_or(text);
+    let name = text.split('[').next().unwrap_or(text);
     let elsewhere = ELSEWHERE
         .iter()
         .find(|(other, _)| other.eq_ignore_ascii_case(name));
@@ -72,9 +72,11 @@ pub(super) const fn dialect(space: SpaceId) -> Dialect {
     }
 }
 
+type Answer = Result<Arc<MessageType>, Box<DefinitionError>>;
+
 /// The message types that are built in.
 pub(super) struct Types {
-    asked: HashMap<(Dialect, TypeName), Result<Arc<MessageType>, DefinitionError>>,
+    asked: HashMap<(Dialect, TypeName), Answer>,
 }
 
 static ROS1: LazyLock<Registry> = LazyLock::new(|| Registry::bundle(Dialect::Ros1));
@@ -94,14 +96,10 @@ impl Types {
         }
     }
 
-    pub(super) fn get(
-        &mut self,
-        dialect: Dialect,
-        name: &TypeName,
-    ) -> &Result<Arc<MessageType>, DefinitionError> {
+    pub(super) fn get(&mut self, dialect: Dialect, name: &TypeName) -> &Answer {
         self.asked
             .entry((dialect, name.clone()))
-            .or_insert_with(|| Self::registry(dialect).get(name))
+            .or_insert_with(|| Self::registry(dialect).get(name).map_err(Box::new))
     }
 }
 

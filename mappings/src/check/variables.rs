@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::num::NonZeroU16;
+use std::ops::RangeInclusive;
 
 use messages::{Leaf, Rank};
 
@@ -12,7 +13,7 @@ use crate::code::Code;
 use crate::document::{Queue, VariableEntry};
 use crate::findings::Findings;
 use crate::mapping::{Overflow, Space, Variable};
-use crate::node_id::NodeIdText;
+use crate::node_id::{Identifier, NodeIdText};
 use crate::read::{At, given, short};
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::Place;
@@ -96,9 +97,9 @@ fn draft<'d>(
     namespaces: &Namespaces,
     findings: &mut Findings,
 ) -> Draft<'d> {
-    let node = required(&entry.node, "node", "a variable", place, findings);
+    let node = required(&entry.node, "node", &title(entry), place, findings);
     let node = node.and_then(|(text, place)| node_id(text, place, namespaces, findings));
-    let origin = required(&entry.origin, "origin", "a variable", place, findings)
+    let origin = required(&entry.origin, "origin", &title(entry), place, findings)
         .and_then(|(number, place)| space(*number, place, "origin", spaces, findings));
     let alias = given(&entry.alias).and_then(|(number, place)| {
         if *number == 0 {
@@ -114,6 +115,14 @@ fn draft<'d>(
         node,
         origin,
         alias,
+    }
+}
+
+/// How a finding calls a variable of which something is missing.
+fn title(entry: &VariableEntry) -> String {
+    match given(&entry.name).or_else(|| given(&entry.node)) {
+        Some((text, _)) => format!("the variable `{}`", short(text)),
+        None => "the variable".to_owned(),
     }
 }
 
@@ -141,7 +150,7 @@ fn node_id(
         );
         let note = findings.error(Code::UndeclaredNamespace, place, message);
         note.help(format!(
-            "add it with its URI:  namespaces: {{{index}: urn:my-plant:line}}"
+            "add it with its URI: `namespaces: {{{index}: urn:my-plant:line}}`"
         ));
     }
     Some((node, place))
@@ -178,13 +187,15 @@ pub(super) fn space(
         format!("0, {}", known.join(", "))
     };
     note.help(format!(
-        "declared are {known}; add  - {{id: {number}}}  to `spaces`"
+        "declared are {known}; add `- {{id: {number}}}` to `spaces`"
     ));
     None
 }
 
 fn aliases(drafts: &[Draft<'_>], findings: &mut Findings) {
-    let mut used: HashSet<TopicId> = drafts.iter().filter_map(Draft::topic).collect();
+    let used: HashSet<TopicId> = drafts.iter().filter_map(Draft::topic).collect();
+    // The numbers not yet proposed.
+    let mut next: HashMap<(SpaceId, NonZeroU16), RangeInclusive<u16>> = HashMap::new();
     for draft in drafts {
         let Some((node, place)) = &draft.node else {
             continue;
@@ -204,25 +215,39 @@ fn aliases(drafts: &[Draft<'_>], findings: &mut Findings) {
         let message = format!("node `{}` needs an alias", short(&node.to_string()));
         let note = findings
             .error(Code::AliasNeeded, *place, message)
-            .label("no number from 1 to 65535 of a namespace from 1");
+            .label(why_alias(node));
         let free = draft
             .origin
             .zip(draft.namespace())
             .and_then(|(space, namespace)| {
-                let topics =
-                    (1..=u16::MAX).filter_map(|n| TopicId::new(space.into(), namespace.get(), n));
-                topics.into_iter().find(|topic| !used.contains(topic))
+                let next = next.entry((space, namespace)).or_insert(1..=u16::MAX);
+                let topics = next.filter_map(NonZeroU16::new);
+                let mut topics = topics.map(|identifier| TopicId {
+                    space,
+                    namespace,
+                    identifier,
+                });
+                topics.find(|topic| !used.contains(topic))
             });
-        match free {
+        note.help(match free {
             Some(topic) => {
-                used.insert(topic);
-                note.help(format!(
-                    "add  alias: {}  which is free; the topic is then {topic}",
-                    topic.identifier
-                ));
+                let alias = topic.identifier;
+                format!("add `alias: {alias}`, which is free; the topic is then `{topic}`")
             }
-            None => drop(note.help("add  alias: <1 to 65535>")),
-        }
+            None => "add `alias:` and a number from 1 to 65535".to_owned(),
+        });
+    }
+}
+
+/// Why the identifier of a node is none of a topic.
+fn why_alias(node: &NodeIdText) -> &'static str {
+    match node.identifier {
+        Identifier::Numeric(_) if node.namespace == 0 => "a node of namespace 0",
+        Identifier::Numeric(0) => "0 is no identifier of a topic",
+        Identifier::Numeric(_) => "topics have numbers up to 65535",
+        Identifier::String(_) => "a text, where topics have numbers",
+        Identifier::Guid(_) => "a Guid, where topics have numbers",
+        Identifier::Opaque(_) => "opaque bytes, where topics have numbers",
     }
 }
 
@@ -280,7 +305,7 @@ fn variable(
     findings: &mut Findings,
 ) -> Option<Variable> {
     let entry = draft.entry;
-    let name = required(&entry.name, "name", "a variable", draft.place, findings);
+    let name = required(&entry.name, "name", &title(entry), draft.place, findings);
     let name = name.and_then(|(name, place)| checked_name(name, place, findings));
     let declared =
         given(&entry.r#type).and_then(|(text, place)| declared_type(text, place, findings));
@@ -294,10 +319,10 @@ fn variable(
     let fields = bound
         .fields
         .unwrap_or_else(|| declared.map(only_field).into_iter().collect());
-    let value_type = declared.or(match fields.as_slice() {
-        [one] => Some(types::value_type(one)),
-        _ => None,
-    });
+    let value_type = match fields.as_slice() {
+        [one] => Some(declared.unwrap_or_else(|| types::value_type(one))),
+        _ => declared,
+    };
     let overflow = match given(&entry.queue) {
         Some((Queue::DropOldest(size), _)) => Overflow::DropOldest(NonZeroU16::new(*size)?),
         Some((Queue::KeepLatest, _)) | None => Overflow::KeepLatest,
@@ -353,7 +378,9 @@ fn declared_type(text: &str, place: Place, findings: &mut Findings) -> Option<Va
         let ros = text
             .contains('/')
             .then(|| "a ROS type belongs into the binding under `ros`".to_owned());
-        let near = types::suggest_value_type(text).map(|near| format!("did you mean `{near}`?"));
+        let brackets = if text.contains('[') { "[]" } else { "" };
+        let near = types::suggest_value_type(text);
+        let near = near.map(|near| format!("did you mean `{near}{brackets}`?"));
         note.help(
             ros.or(near)
                 .unwrap_or_else(|| "for example Boolean, Int32, Double[], String".to_owned()),

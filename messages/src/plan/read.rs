@@ -116,7 +116,7 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
             ops = after;
             self.leaf = Some(op.leaf);
             match &op.what {
-                What::One(primitive) if op.carry => self.one(*primitive)?,
+                What::One(primitive) if op.carry => self.one(*primitive, S::scalar)?,
                 What::One(primitive) => self.skip_one(*primitive)?,
                 What::Skip { align, bytes } => {
                     self.take(*align, *bytes)?;
@@ -126,7 +126,9 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
                     let count = self.count(*len)?;
                     let bytes = self.take(1, count)?;
                     if op.carry {
-                        self.scalar(Scalar::ByteString(Some(bytes)))?;
+                        self.sink
+                            .scalar(Scalar::ByteString(Some(bytes)))
+                            .map_err(Stop::Sink)?;
                     }
                 }
                 What::Many(primitive, len) => self.many(*primitive, *len, op.carry)?,
@@ -174,35 +176,55 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         }
     }
 
+    /// Reads one value and hands it to `give`, a method of the sink. Each kind is handed over where it is read: a
+    /// Scalar that only passes through registers is what makes small messages cheap.
     #[inline]
-    fn one(&mut self, primitive: Primitive) -> Result<(), Stop<S::Error>> {
-        let value = match primitive {
-            Primitive::Number(number) => self.number(number)?,
-            Primitive::Clock(clock) => self.clock(clock)?,
+    fn one<G>(&mut self, primitive: Primitive, give: G) -> Result<(), Stop<S::Error>>
+    where
+        G: Fn(&mut S, Scalar<'_>) -> Result<(), S::Error>,
+    {
+        match primitive {
+            Primitive::Number(number) => self.number(number, give),
+            Primitive::Clock(clock) => {
+                let value = self.clock(clock)?;
+                give(self.sink, value).map_err(Stop::Sink)
+            }
             Primitive::Text(text) if text.wide => {
                 let text = self.wide(text.bound)?;
-                return self.scalar(Scalar::String(Some(&text)));
+                give(self.sink, Scalar::String(Some(&text))).map_err(Stop::Sink)
             }
-            Primitive::Text(text) => Scalar::String(Some(self.narrow(text.bound)?)),
-        };
-        self.scalar(value)
+            Primitive::Text(text) => {
+                let text = self.narrow(text.bound)?;
+                give(self.sink, Scalar::String(Some(text))).map_err(Stop::Sink)
+            }
+        }
     }
 
     #[inline]
-    fn number(&mut self, number: Number) -> Result<Scalar<'static>, Fault> {
-        Ok(match number {
-            Number::Bool => Scalar::Boolean(self.array::<1>()? != [0]),
-            Number::Int8 => Scalar::SByte(i8::from_le_bytes(self.array()?)),
-            Number::UInt8 => Scalar::Byte(u8::from_le_bytes(self.array()?)),
-            Number::Int16 => Scalar::Int16(self.u16()?.cast_signed()),
-            Number::UInt16 => Scalar::UInt16(self.u16()?),
-            Number::Int32 => Scalar::Int32(self.u32()?.cast_signed()),
-            Number::UInt32 => Scalar::UInt32(self.u32()?),
-            Number::Int64 => Scalar::Int64(self.u64()?.cast_signed()),
-            Number::UInt64 => Scalar::UInt64(self.u64()?),
-            Number::Float32 => Scalar::Float(f32::from_bits(self.u32()?)),
-            Number::Float64 => Scalar::Double(f64::from_bits(self.u64()?)),
-        })
+    fn number<G>(&mut self, number: Number, give: G) -> Result<(), Stop<S::Error>>
+    where
+        G: Fn(&mut S, Scalar<'_>) -> Result<(), S::Error>,
+    {
+        macro_rules! hand {
+            ($variant:ident, $value:expr) => {{
+                let value = $value;
+                give(self.sink, Scalar::$variant(value))
+            }};
+        }
+        let given = match number {
+            Number::Bool => hand!(Boolean, self.array::<1>()? != [0]),
+            Number::Int8 => hand!(SByte, i8::from_le_bytes(self.array()?)),
+            Number::UInt8 => hand!(Byte, u8::from_le_bytes(self.array()?)),
+            Number::Int16 => hand!(Int16, self.u16()?.cast_signed()),
+            Number::UInt16 => hand!(UInt16, self.u16()?),
+            Number::Int32 => hand!(Int32, self.u32()?.cast_signed()),
+            Number::UInt32 => hand!(UInt32, self.u32()?),
+            Number::Int64 => hand!(Int64, self.u64()?.cast_signed()),
+            Number::UInt64 => hand!(UInt64, self.u64()?),
+            Number::Float32 => hand!(Float, f32::from_bits(self.u32()?)),
+            Number::Float64 => hand!(Double, f64::from_bits(self.u64()?)),
+        };
+        given.map_err(Stop::Sink)
     }
 
     fn skip_one(&mut self, primitive: Primitive) -> Result<(), Fault> {
@@ -258,20 +280,7 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         self.sink
             .array(primitive.builtin(), count)
             .map_err(Stop::Sink)?;
-        for _ in 0..count {
-            let value = match primitive {
-                Primitive::Number(number) => self.number(number)?,
-                Primitive::Clock(clock) => self.clock(clock)?,
-                Primitive::Text(text) if text.wide => {
-                    let text = self.wide(text.bound)?;
-                    self.element(Scalar::String(Some(&text)))?;
-                    continue;
-                }
-                Primitive::Text(text) => Scalar::String(Some(self.narrow(text.bound)?)),
-            };
-            self.element(value)?;
-        }
-        Ok(())
+        (0..count).try_for_each(|_| self.one(primitive, S::element))
     }
 
     fn clock(&mut self, clock: Clock) -> Result<Scalar<'static>, Fault> {
@@ -314,15 +323,6 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         });
         let units = units.collect::<Result<Vec<u16>, Fault>>()?;
         String::from_utf16(&units).map_err(|_| Fault::Text)
-    }
-
-    #[inline]
-    fn scalar(&mut self, value: Scalar<'_>) -> Result<(), Stop<S::Error>> {
-        self.sink.scalar(value).map_err(Stop::Sink)
-    }
-
-    fn element(&mut self, value: Scalar<'_>) -> Result<(), Stop<S::Error>> {
-        self.sink.element(value).map_err(Stop::Sink)
     }
 
     /// The length of an array, within its bound.

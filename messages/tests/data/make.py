@@ -1,6 +1,7 @@
 """Makes the tables beside it: what other implementations say about the common interfaces.
 
     python3 make.py rosbags   needs the package rosbags (0.11.9) -> ros1_md5.txt, ros2_fields.txt, rosbags.json
+    python3 make.py cyclone   needs rosbags and cyclonedds (11.0.1) -> cyclone.json
     python3 make.py genpy     needs Debian's python3-std-msgs, -geometry-msgs, -sensor-msgs, -tf2-msgs,
                               -rosgraph-msgs, -actionlib-msgs -> genpy.json
 
@@ -188,6 +189,71 @@ def rosbags():
     write("rosbags.json", samples)
 
 
+def cyclone():
+    """Types by rosbags' description, bytes by Cyclone DDS."""
+    from dataclasses import dataclass
+
+    from cyclonedds.idl import IdlStruct, types
+    from rosbags.interfaces import Nodetype
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    clocks = {"builtin_interfaces/msg/Time": "time", "builtin_interfaces/msg/Duration": "duration"}
+    schema, classes = {}, {}
+
+    def cls(full):
+        """Class of the type; its bases first."""
+        if full in classes:
+            return classes[full]
+        annotations, rows = {}, []
+        for field, desc in store.fielddefs[full][1]:
+            node, what = desc
+            length = None
+            if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                (node, what), count = what
+                length = count if desc[0] == Nodetype.ARRAY else -1
+            if node == Nodetype.NAME:
+                base, kind = cls(what), clocks.get(what) or short(what)
+            else:
+                kind = what[0]
+                base = {"string": str, "bool": bool}.get(kind) or getattr(types, {"char": "uint8"}.get(kind, kind))
+                kind = {"char": "uint8"}.get(kind, kind)
+            if length is not None:
+                base = types.array[base, length] if length >= 0 else types.sequence[base]
+            annotations[field] = base
+            if field != "structure_needs_at_least_one_member":
+                rows.append((field, kind, length))
+        name = full.replace("/", "_")
+        made = type(name, (IdlStruct,), {"__annotations__": annotations, "__module__": __name__}, typename=name)
+        globals()[name] = made
+        schema[short(full)] = rows
+        classes[full] = dataclass(made)
+        return classes[full]
+
+    def build(name, made):
+        full = name.replace("/", "/msg/")
+        args = {}
+        for field, kind, length in schema[name]:
+            def one(v):
+                if kind in schema:
+                    return build(kind, v)
+                if kind in ("time", "duration"):
+                    return classes["builtin_interfaces/msg/" + kind.title()](*v)
+                return v
+            args[field] = one(made[field]) if length is None else [one(e) for e in made[field]]
+        return classes[full](**args) if args else classes[full](0)
+
+    samples = []
+    for full in sorted(store.fielddefs):
+        if full.split("/")[0] in PACKAGES_2 and full not in clocks:
+            cls(full)
+            name = short(full)
+            made = make(schema, name, random.Random("cyclone " + name))
+            fields = list(events(schema, name, made))
+            samples.append({"type": name, "dialect": 2, "fields": fields, "little": build(name, made).serialize().hex()})
+    write("cyclone.json", samples)
+
+
 def genpy():
     import importlib
     import re
@@ -232,4 +298,4 @@ def genpy():
     write("genpy.json", samples)
 
 
-{"rosbags": rosbags, "genpy": genpy}[sys.argv[1]]()
+{"rosbags": rosbags, "cyclone": cyclone, "genpy": genpy}[sys.argv[1]]()
