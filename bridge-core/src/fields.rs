@@ -99,10 +99,11 @@ impl Sink for FrameSink<'_, '_> {
     }
 
     fn array(&mut self, element: BuiltinType, count: usize) -> Result<(), EncodeError> {
-        match element {
+        if element == BuiltinType::ExtensionObject {
             // Messages within a message of an array: structures by value.
-            BuiltinType::ExtensionObject => self.frame.inline_structures(count),
-            _ => self.frame.array(element, count),
+            self.frame.inline_structures(count)
+        } else {
+            self.frame.array(element, count)
         }
     }
 
@@ -159,7 +160,9 @@ impl<'a> FieldSource<'a> {
         }
         match self.field()? {
             Variant::Array(array) if array.element() == expected => Ok(array),
-            other => Err(unexpected(expected, true, &other)),
+            other @ (Variant::Null | Variant::Scalar(_) | Variant::Array(_)) => {
+                Err(unexpected(expected, true, &other))
+            }
         }
     }
 }
@@ -171,7 +174,9 @@ impl<'a> Source<'a> for FieldSource<'a> {
         }
         match self.field()? {
             Variant::Scalar(scalar) if scalar.builtin_type() == expected => Ok(scalar),
-            other => Err(unexpected(expected, false, &other)),
+            other @ (Variant::Null | Variant::Scalar(_) | Variant::Array(_)) => {
+                Err(unexpected(expected, false, &other))
+            }
         }
     }
 
@@ -254,7 +259,6 @@ impl<'a> Source<'a> for FieldSource<'a> {
     }
 }
 
-#[expect(clippy::needless_pass_by_value, reason = "for map_err")]
 fn malformed(error: DecodeError) -> SourceError {
     SourceError::Malformed(error.to_string())
 }

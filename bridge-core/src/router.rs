@@ -208,7 +208,7 @@ impl Router {
                     let id = TopicId::new(u16::from(space.get()), namespace, writer_id);
                     match id {
                         Some(topic) => self.handle_message(topic, &message, (from, sent), now),
-                        None => self.count(None, Some(from), Reason::NotInSpace, 1, String::new),
+                        None => self.count(About::sender(from), Reason::NotInSpace, 1, String::new),
                     }
                 }
                 Err(error) => self.drop_undecoded(None, from, &error),
@@ -290,12 +290,14 @@ impl Router {
             // It was not delivered after all, so its repetition is welcome.
             reader.forget_delivered();
         }
-        self.count(Some(topic), None, reason, 1, || detail.to_owned());
+        self.count(About::topic(topic), reason, 1, || detail.to_owned());
     }
 
     /// Samples that were lost before the Router saw them, in a queue of the port or the kernel.
     pub fn lost(&mut self, topic: Option<TopicId>, count: u64, why: &'static str) {
-        self.count(topic, None, Reason::Overflow, count, || why.to_owned());
+        self.count(About { topic, from: None }, Reason::Overflow, count, || {
+            why.to_owned()
+        });
     }
 
     /// Takes back the buffer of a datagram or payload that has been used, so that the next one needs no allocation.
@@ -335,13 +337,13 @@ impl Router {
             Some(PublisherId::String(_)) | None => (u64::MAX, false),
         };
         let Some(space) = u16::try_from(number).ok().and_then(SpaceId::new) else {
-            self.count(None, Some(from), Reason::NotInSpace, 1, String::new);
+            self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return None;
         };
         if exact || self.mapping.pubsub().publisher_id == PublisherIdRule::AnyWidth {
             return Some(space);
         }
-        self.count(None, Some(from), Reason::PublisherWidth, 1, || {
+        self.count(About::sender(from), Reason::PublisherWidth, 1, || {
             format!(
                 "PublisherId {number} is not a UInt16; if that writer is meant to be space {space}, \
                  set `publisher_id: any_width`"
@@ -362,7 +364,7 @@ impl Router {
         } else {
             Reason::SpaceTaken
         };
-        self.count(None, Some(from), reason, 1, || {
+        self.count(About::sender(from), reason, 1, || {
             format!(
                 "another program sends as space {own}: every sample is doubled; end one of them"
             )
@@ -378,9 +380,15 @@ impl Router {
         now: Now,
     ) {
         if !message.header.valid {
-            self.count(Some(topic), Some(from), Reason::Invalid, 1, || {
-                "the writer marked its DataSetMessage as invalid".to_owned()
-            });
+            self.count(
+                About {
+                    topic: Some(topic),
+                    from: Some(from),
+                },
+                Reason::Invalid,
+                1,
+                || "the writer marked its DataSetMessage as invalid".to_owned(),
+            );
             return;
         }
         let place = place(&message.header, from);
@@ -390,7 +398,7 @@ impl Router {
             ..
         }) = self.entry(topic, Some(from), now)
         else {
-            self.count(None, Some(from), Reason::TooManyTopics, 1, || {
+            self.count(About::sender(from), Reason::TooManyTopics, 1, || {
                 format!("more than {MAX_TOPICS} topics are in the space; {topic} is not followed")
             });
             return;
@@ -415,7 +423,15 @@ impl Router {
         }
         match admitted {
             None => {}
-            Some(Err(reason)) => self.count(Some(topic), Some(from), reason, 1, String::new),
+            Some(Err(reason)) => self.count(
+                About {
+                    topic: Some(topic),
+                    from: Some(from),
+                },
+                reason,
+                1,
+                String::new,
+            ),
             Some(Ok(_)) => match message.fields() {
                 Ok(fields) => {
                     self.record_way(place.stamp, sent, now);
@@ -468,7 +484,7 @@ impl Router {
             arrived: sample.arrived,
         });
         // Not yet a loss: the newest one waits. It is not told, since the port names topics without a type.
-        self.count(Some(topic), None, Reason::Untyped, 1, String::new);
+        self.count(About::topic(topic), Reason::Untyped, 1, String::new);
     }
 
     fn deliver(&mut self, topic: TopicId, sample: &Sample<'_>) {
@@ -483,7 +499,7 @@ impl Router {
         };
         if let Err((reason, detail)) = written {
             self.recycle(payload);
-            self.count(Some(topic), None, reason, 1, || detail);
+            self.count(About::topic(topic), reason, 1, || detail);
             return;
         }
         let Sample {
@@ -625,27 +641,34 @@ impl Router {
             return false;
         };
         self.recycle(bytes);
-        self.count(Some(topic), None, Reason::Overflow, 1, || {
+        self.count(About::topic(topic), Reason::Overflow, 1, || {
             "the queue was full, its oldest sample was dropped".to_owned()
         });
         true
     }
 
     fn drop_undecoded(&mut self, topic: Option<TopicId>, from: SocketAddr, error: &DecodeError) {
-        self.count(topic, Some(from), reason_of(error), 1, || error.to_string());
+        self.count(
+            About {
+                topic,
+                from: Some(from),
+            },
+            reason_of(error),
+            1,
+            || error.to_string(),
+        );
     }
 
     /// Counts a sample of the local side that does not cross.
     fn refuse(&mut self, topic: TopicId, reason: Reason, detail: String) -> Verdict {
-        self.count(Some(topic), None, reason, 1, || detail);
+        self.count(About::topic(topic), reason, 1, || detail);
         Verdict::Drop(reason)
     }
 
     /// Counts drops, and tells of them at their 1st, 10th, 100th ... occurrence.
     fn count(
         &mut self,
-        topic: Option<TopicId>,
-        from: Option<SocketAddr>,
+        About { topic, from }: About,
         reason: Reason,
         count: u64,
         detail: impl FnOnce() -> String,
@@ -675,6 +698,29 @@ impl Router {
     }
 }
 
+/// What a drop is about.
+#[derive(Clone, Copy)]
+struct About {
+    topic: Option<TopicId>,
+    from: Option<SocketAddr>,
+}
+
+impl About {
+    const fn topic(topic: TopicId) -> Self {
+        Self {
+            topic: Some(topic),
+            from: None,
+        }
+    }
+
+    const fn sender(from: SocketAddr) -> Self {
+        Self {
+            topic: None,
+            from: Some(from),
+        }
+    }
+}
+
 /// A key frame's content on its way to the local side.
 struct Sample<'a> {
     fields: Fields<'a>,
@@ -696,9 +742,10 @@ fn place(header: &DataSetHeader, from: SocketAddr) -> Place {
 }
 
 const fn reason_of(error: &DecodeError) -> Reason {
-    match error {
-        DecodeError::Unsupported(_) => Reason::Unsupported,
-        _ => Reason::Malformed,
+    if matches!(error, DecodeError::Unsupported(_)) {
+        Reason::Unsupported
+    } else {
+        Reason::Malformed
     }
 }
 

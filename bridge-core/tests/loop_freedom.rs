@@ -1,6 +1,13 @@
 //! Any set of bridges around one group: a value enters every other space once, never comes home, and then there is
 //! silence.
 
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
+
 use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -26,8 +33,15 @@ struct Cell {
 }
 
 enum Event {
-    Datagram { from: SpaceId, bytes: Vec<u8> },
-    Message { space: SpaceId, topic: TopicId, payload: Vec<u8> },
+    Datagram {
+        from: SpaceId,
+        bytes: Vec<u8>,
+    },
+    Message {
+        space: SpaceId,
+        topic: TopicId,
+        payload: Vec<u8>,
+    },
 }
 
 impl Cell {
@@ -37,8 +51,11 @@ impl Cell {
         let bridges = spaces
             .iter()
             .map(|own| {
-                let settings =
-                    Settings { own: *own, local: Local::Ros1, source: Some(address(*own)) };
+                let settings = Settings {
+                    own: *own,
+                    local: Local::Ros1,
+                    source: Some(address(*own)),
+                };
                 (*own, Router::new(settings, Arc::clone(&mapping)))
             })
             .collect();
@@ -54,21 +71,34 @@ impl Cell {
 
     fn now(&mut self) -> Now {
         self.clock += 1_000;
-        Now { monotonic: self.started, utc: Timestamp::from_unix_nanos(self.clock) }
+        Now {
+            monotonic: self.started,
+            utc: Timestamp::from_unix_nanos(self.clock),
+        }
     }
 
     fn publish(&mut self, topic: TopicId, text: &str) {
         let mut payload = u32::try_from(text.len()).unwrap().to_le_bytes().to_vec();
         payload.extend_from_slice(text.as_bytes());
-        self.under_way.push_back(Event::Message { space: topic.space, topic, payload });
+        self.under_way.push_back(Event::Message {
+            space: topic.space,
+            topic,
+            payload,
+        });
     }
 
     /// Lets everything under way happen. Panics when it does not end.
     fn run(&mut self) {
         for _ in 0..10_000 {
-            let Some(event) = self.under_way.pop_front() else { return };
+            let Some(event) = self.under_way.pop_front() else {
+                return;
+            };
             match event {
-                Event::Message { space, topic, payload } => {
+                Event::Message {
+                    space,
+                    topic,
+                    payload,
+                } => {
                     let now = self.now();
                     let bridge = self.bridges.get_mut(&space).unwrap();
                     bind(bridge, topic, now);
@@ -96,7 +126,8 @@ impl Cell {
             match output {
                 Output::Datagram { bytes, .. } => {
                     self.datagrams += 1;
-                    self.under_way.push_back(Event::Datagram { from: space, bytes });
+                    self.under_way
+                        .push_back(Event::Datagram { from: space, bytes });
                 }
                 Output::Delivery(delivery) => {
                     let topic = delivery.topic;
@@ -104,7 +135,11 @@ impl Cell {
                     payloads.push(delivery.payload.clone());
                     // The graph echoes what the bridge published to the bridge itself.
                     let payload = delivery.payload;
-                    self.under_way.push_back(Event::Message { space, topic, payload });
+                    self.under_way.push_back(Event::Message {
+                        space,
+                        topic,
+                        payload,
+                    });
                 }
                 Output::Unbound { topic, .. } => bind(bridge, topic, now),
                 _ => {}

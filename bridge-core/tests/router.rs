@@ -1,5 +1,12 @@
 //! What a bridge does with samples, datagrams and time, seen from outside.
 
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
+
 use std::net::SocketAddr;
 use std::num::NonZeroU16;
 use std::sync::Arc;
@@ -27,11 +34,18 @@ impl Bench {
     #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
     fn with(own: u16, local: Local, mapping: Mapping) -> Self {
         let own = SpaceId::new(own).unwrap();
-        let settings = Settings { own, local, source: Some(OUR_ADDRESS) };
+        let settings = Settings {
+            own,
+            local,
+            source: Some(OUR_ADDRESS),
+        };
         let utc = Timestamp::from_unix_nanos(1_700_000_000_000_000_000);
         Self {
             router: Router::new(settings, Arc::new(mapping)),
-            now: Now { monotonic: Instant::now(), utc },
+            now: Now {
+                monotonic: Instant::now(),
+                utc,
+            },
         }
     }
 
@@ -76,14 +90,20 @@ impl Bench {
     }
 
     fn dropped(&self, reason: Reason) -> u64 {
-        let topics: u64 = self.router.topics().map(|(_, counters)| counters.dropped(reason)).sum();
+        let topics: u64 = self
+            .router
+            .topics()
+            .map(|(_, counters)| counters.dropped(reason))
+            .sum();
         topics + self.router.others().dropped(reason)
     }
 
     fn bind(&mut self, topic: TopicId, type_name: &str) {
         let registry = Registry::bundle(Dialect::Ros1);
         let message_type = registry.get(&type_name.parse().unwrap()).unwrap();
-        self.router.bind(topic, &message_type, &Selection::Whole, self.now).unwrap();
+        self.router
+            .bind(topic, &message_type, &Selection::Whole, self.now)
+            .unwrap();
     }
 
     fn hear(&mut self, datagram: &[u8]) {
@@ -91,7 +111,8 @@ impl Bench {
     }
 
     fn say(&mut self, topic: TopicId, payload: &[u8]) -> Verdict {
-        self.router.handle_local(topic, payload, self.now.utc, self.now)
+        self.router
+            .handle_local(topic, payload, self.now.utc, self.now)
     }
 }
 
@@ -110,7 +131,10 @@ impl Frame {
             publisher: PublisherId::UInt16(2),
             group: 5,
             writer,
-            header: DataSetHeader { sequence_number: Some(sequence), ..DataSetHeader::default() },
+            header: DataSetHeader {
+                sequence_number: Some(sequence),
+                ..DataSetHeader::default()
+            },
             value,
         }
     }
@@ -155,23 +179,33 @@ fn value_of(delivery: &Delivery) -> u32 {
     u32::from_le_bytes(delivery.payload[..].try_into().unwrap())
 }
 
-const OUR_ADDRESS: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 50_000);
-const PEER: SocketAddr = SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 50_001);
+const OUR_ADDRESS: SocketAddr =
+    SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 50_000);
+const PEER: SocketAddr =
+    SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 50_001);
 const SECOND: Duration = Duration::from_secs(1);
 
 #[test]
 fn a_ros_message_becomes_a_key_frame_of_its_triple() {
     let mut bench = Bench::new(1, Local::Ros1);
     bench.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
-    assert_eq!(bench.say(topic("ua_1_5_10"), &[7, 0, 0, 0]), Verdict::Forward);
-    let [datagram] = &bench.datagrams()[..] else { panic!("one datagram") };
+    assert_eq!(
+        bench.say(topic("ua_1_5_10"), &[7, 0, 0, 0]),
+        Verdict::Forward
+    );
+    let [datagram] = &bench.datagrams()[..] else {
+        panic!("one datagram")
+    };
     let message = NetworkMessage::decode(datagram).unwrap();
     let header = message.header();
     assert_eq!(header.publisher_id, Some(PublisherId::UInt16(1)));
     assert_eq!(header.group.unwrap().writer_group_id, Some(5));
     assert_eq!(header.timestamp, Some(bench.now.utc.time));
     let message = message.messages().next().unwrap().unwrap();
-    assert_eq!((message.writer_id, message.kind), (Some(10), MessageKind::KeyFrame));
+    assert_eq!(
+        (message.writer_id, message.kind),
+        (Some(10), MessageKind::KeyFrame)
+    );
     assert_eq!(message.header.timestamp, Some(bench.now.utc.time));
     let fields: Vec<_> = message.fields().unwrap().collect();
     assert_eq!(fields, [Ok(Variant::Scalar(Scalar::UInt32(7)))]);
@@ -194,10 +228,22 @@ fn a_broken_ros_message_is_counted_and_told_and_the_next_one_crosses() {
     let notices = bench.notices();
     assert_eq!(notices.len(), 1);
     assert_eq!(notices[0].topic, Some(topic("ua_1_5_10")));
-    assert_eq!(bench.say(topic("ua_1_5_10"), &[7, 0, 0, 0]), Verdict::Forward);
+    assert_eq!(
+        bench.say(topic("ua_1_5_10"), &[7, 0, 0, 0]),
+        Verdict::Forward
+    );
     let datagrams = bench.datagrams();
-    let message = NetworkMessage::decode(&datagrams[0]).unwrap().messages().next().unwrap().unwrap();
-    assert_eq!(message.header.sequence_number, Some(0), "a dropped sample uses up no number");
+    let message = NetworkMessage::decode(&datagrams[0])
+        .unwrap()
+        .messages()
+        .next()
+        .unwrap()
+        .unwrap();
+    assert_eq!(
+        message.header.sequence_number,
+        Some(0),
+        "a dropped sample uses up no number"
+    );
 }
 
 #[test]
@@ -206,7 +252,10 @@ fn a_message_too_big_for_a_datagram_is_named() {
     bench.bind(topic("ua_1_5_10"), "std_msgs/String");
     let mut payload = 70_000_u32.to_le_bytes().to_vec();
     payload.resize(70_004, b'x');
-    assert_eq!(bench.say(topic("ua_1_5_10"), &payload), Verdict::Drop(Reason::TooBig));
+    assert_eq!(
+        bench.say(topic("ua_1_5_10"), &payload),
+        Verdict::Drop(Reason::TooBig)
+    );
     assert!(bench.notices()[0].detail.contains("65507"));
 }
 
@@ -223,7 +272,10 @@ fn a_value_of_another_space_is_published_with_its_source_time() {
     let deliveries = bench.deliveries();
     assert_eq!(deliveries.len(), 1);
     assert_eq!(value_of(&deliveries[0]), 42);
-    assert_eq!((deliveries[0].source, deliveries[0].status), (Some(taken), 0x8000));
+    assert_eq!(
+        (deliveries[0].source, deliveries[0].status),
+        (Some(taken), 0x8000)
+    );
 }
 
 #[test]
@@ -232,11 +284,26 @@ fn a_value_waits_for_its_type_and_then_goes_out() {
     bench.hear(&Frame::new(10, 1, 41).bytes());
     bench.hear(&Frame::new(10, 2, 42).bytes());
     let outputs = bench.outputs();
-    let [Output::Unbound { topic: asked, shape }] = &outputs[..] else { panic!("{outputs:?}") };
-    assert_eq!((*asked, &shape[..]), (topic("ua_2_5_10"), &[(BuiltinType::UInt32, false)][..]));
+    let [
+        Output::Unbound {
+            topic: asked,
+            shape,
+        },
+    ] = &outputs[..]
+    else {
+        panic!("{outputs:?}")
+    };
+    assert_eq!(
+        (*asked, &shape[..]),
+        (topic("ua_2_5_10"), &[(BuiltinType::UInt32, false)][..])
+    );
     bench.bind(topic("ua_2_5_10"), "std_msgs/UInt32");
     let deliveries = bench.deliveries();
-    assert_eq!(deliveries.iter().map(value_of).collect::<Vec<_>>(), [42], "the newest one");
+    assert_eq!(
+        deliveries.iter().map(value_of).collect::<Vec<_>>(),
+        [42],
+        "the newest one"
+    );
 }
 
 #[test]
@@ -246,14 +313,23 @@ fn a_value_of_another_type_than_the_topic_has_is_a_mismatch() {
     bench.hear(&Frame::new(10, 1, 42).bytes());
     let notices = bench.notices();
     assert_eq!(notices[0].reason, Reason::Mismatch);
-    assert!(notices[0].detail.contains("UInt32"), "{}", notices[0].detail);
+    assert!(
+        notices[0].detail.contains("UInt32"),
+        "{}",
+        notices[0].detail
+    );
 }
 
 #[test]
 fn our_own_datagram_is_looped_and_a_rival_is_named_once() {
     let mut bench = Bench::new(1, Local::Ros1);
-    let frame = Frame { publisher: PublisherId::UInt16(1), ..Frame::new(10, 1, 42) };
-    bench.router.handle_datagram(&frame.bytes(), OUR_ADDRESS, bench.now);
+    let frame = Frame {
+        publisher: PublisherId::UInt16(1),
+        ..Frame::new(10, 1, 42)
+    };
+    bench
+        .router
+        .handle_datagram(&frame.bytes(), OUR_ADDRESS, bench.now);
     assert!(bench.outputs().is_empty());
     assert_eq!(bench.dropped(Reason::Looped), 1);
     for _ in 0..5 {
@@ -261,13 +337,19 @@ fn our_own_datagram_is_looped_and_a_rival_is_named_once() {
     }
     let notices = bench.notices();
     assert_eq!(notices.len(), 1);
-    assert_eq!((notices[0].reason, notices[0].from), (Reason::SpaceTaken, Some(PEER)));
+    assert_eq!(
+        (notices[0].reason, notices[0].from),
+        (Reason::SpaceTaken, Some(PEER))
+    );
     assert_eq!(bench.dropped(Reason::SpaceTaken), 5);
 }
 
 #[test]
 fn our_number_in_another_width_is_named_unless_the_mapping_takes_any() {
-    let frame = Frame { publisher: PublisherId::Byte(2), ..Frame::new(10, 1, 42) };
+    let frame = Frame {
+        publisher: PublisherId::Byte(2),
+        ..Frame::new(10, 1, 42)
+    };
     let mut exact = Bench::new(1, Local::Fields);
     exact.hear(&frame.bytes());
     let notices = exact.notices();
@@ -310,7 +392,10 @@ fn garbage_is_counted_and_told_once_per_decade() {
         bench.hear(b"GET / HTTP/1.1\r\n");
     }
     bench.hear(&[]);
-    assert_eq!(bench.dropped(Reason::Malformed) + bench.dropped(Reason::Unsupported), 101);
+    assert_eq!(
+        bench.dropped(Reason::Malformed) + bench.dropped(Reason::Unsupported),
+        101
+    );
     let told = bench.notices().len();
     assert!((1..=4).contains(&told), "{told}");
     bench.hear(&Frame::new(10, 1, 42).bytes());
@@ -332,9 +417,15 @@ fn a_state_is_repeated_with_its_time_and_its_readers_deliver_it_once() {
     let mut sender = Bench::new(1, Local::Ros1);
     let mut reader = Bench::new(2, Local::Fields);
     sender.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
-    assert_eq!(sender.say(topic("ua_1_5_10"), &[7, 0, 0, 0]), Verdict::Forward);
+    assert_eq!(
+        sender.say(topic("ua_1_5_10"), &[7, 0, 0, 0]),
+        Verdict::Forward
+    );
     let first = sender.datagrams().remove(0);
-    assert_eq!(sender.router.poll_timeout(), Some(sender.now.monotonic + SECOND));
+    assert_eq!(
+        sender.router.poll_timeout(),
+        Some(sender.now.monotonic + SECOND)
+    );
     sender.wait(SECOND);
     sender.router.handle_timeout(sender.now);
     let again = sender.datagrams().remove(0);
@@ -342,7 +433,11 @@ fn a_state_is_repeated_with_its_time_and_its_readers_deliver_it_once() {
         let message = NetworkMessage::decode(datagram).unwrap();
         let sent = message.header().timestamp.unwrap();
         let message = message.messages().next().unwrap().unwrap();
-        (sent, message.header.timestamp.unwrap(), message.header.sequence_number.unwrap())
+        (
+            sent,
+            message.header.timestamp.unwrap(),
+            message.header.sequence_number.unwrap(),
+        )
     };
     let ((sent, taken, number), (sent_again, taken_again, next)) = (stamps(&first), stamps(&again));
     assert_eq!((taken, number + 1), (taken_again, next));
@@ -354,14 +449,21 @@ fn a_state_is_repeated_with_its_time_and_its_readers_deliver_it_once() {
     assert_eq!(reader.dropped(Reason::Repeat), 1);
     let mut late = Bench::new(3, Local::Fields);
     late.hear(&again);
-    assert_eq!(late.deliveries().len(), 1, "who comes late gets it from the repetition");
+    assert_eq!(
+        late.deliveries().len(),
+        1,
+        "who comes late gets it from the repetition"
+    );
 }
 
 #[test]
 fn a_topic_without_a_producer_is_not_repeated() {
     let mut bench = Bench::new(1, Local::Ros1);
     bench.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
-    assert_eq!(bench.say(topic("ua_1_5_10"), &[7, 0, 0, 0]), Verdict::Forward);
+    assert_eq!(
+        bench.say(topic("ua_1_5_10"), &[7, 0, 0, 0]),
+        Verdict::Forward
+    );
     bench.router.set_live(topic("ua_1_5_10"), false, bench.now);
     bench.outputs();
     bench.wait(SECOND * 2);
@@ -377,20 +479,41 @@ fn events_keep_their_order_and_are_kept_alive_instead_of_repeated() {
     let overflow = bench.now;
     bench.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
     for value in 1..=4_u32 {
-        let verdict =
-            bench.router.handle_local(topic("ua_1_5_10"), &value.to_le_bytes(), overflow.utc, overflow);
+        let verdict = bench.router.handle_local(
+            topic("ua_1_5_10"),
+            &value.to_le_bytes(),
+            overflow.utc,
+            overflow,
+        );
         let full = value > 3;
-        assert_eq!(verdict == Verdict::ForwardAfterDroppingOldest, full, "{value}");
+        assert_eq!(
+            verdict == Verdict::ForwardAfterDroppingOldest,
+            full,
+            "{value}"
+        );
     }
-    let values: Vec<_> = bench.datagrams().iter().map(|datagram| only_value(datagram)).collect();
+    let values: Vec<_> = bench
+        .datagrams()
+        .iter()
+        .map(|datagram| only_value(datagram))
+        .collect();
     assert_eq!(values, [2, 3, 4]);
     assert_eq!(bench.dropped(Reason::Overflow), 1);
     bench.wait(SECOND);
     bench.router.handle_timeout(bench.now);
     let datagram = bench.datagrams().remove(0);
-    let message = NetworkMessage::decode(&datagram).unwrap().messages().next().unwrap().unwrap();
+    let message = NetworkMessage::decode(&datagram)
+        .unwrap()
+        .messages()
+        .next()
+        .unwrap()
+        .unwrap();
     assert_eq!(message.kind, MessageKind::KeepAlive);
-    assert_eq!(message.header.sequence_number, Some(4), "the number to expect next");
+    assert_eq!(
+        message.header.sequence_number,
+        Some(4),
+        "the number to expect next"
+    );
     assert_eq!(NonZeroU16::new(10).map(NonZeroU16::get), message.writer_id);
 }
 
@@ -400,7 +523,10 @@ fn topics_are_served_in_turn() {
     let frame = Frame::new(0, 0, 0);
     let mut bytes = Vec::new();
     let ids = [1, 1, 1, 9];
-    let network = NetworkHeader { publisher_id: Some(PublisherId::UInt16(1)), ..frame.network() };
+    let network = NetworkHeader {
+        publisher_id: Some(PublisherId::UInt16(1)),
+        ..frame.network()
+    };
     let mut message = NetworkMessageEncoder::new(&mut bytes, &network, Some(&ids)).unwrap();
     for value in 0..4 {
         let mut fields = message.key_frame(&DataSetHeader::default()).unwrap();
@@ -409,14 +535,28 @@ fn topics_are_served_in_turn() {
     }
     message.finish().unwrap();
     let yaml = "namespaces: {5: 'urn:test'}\nspaces: [{id: 1, ros: 1}]\nvariables:\n  - {node: ns=5;i=1, name: Camera, type: UInt32, origin: 1, queue: {drop_oldest: 8}}\n";
-    let mut mapped =
-        Bench::with(2, Local::Fields, Mapping::from_yaml(yaml, "test.yaml").mapping.unwrap());
+    let mut mapped = Bench::with(
+        2,
+        Local::Fields,
+        Mapping::from_yaml(yaml, "test.yaml").mapping.unwrap(),
+    );
     mapped.hear(&bytes);
-    let order: Vec<_> =
-        mapped.deliveries().iter().map(|delivery| delivery.topic.triple().2).collect();
-    assert_eq!(order, [1, 9, 1, 1], "the button waits for one picture, not for three");
+    let order: Vec<_> = mapped
+        .deliveries()
+        .iter()
+        .map(|delivery| delivery.topic.triple().2)
+        .collect();
+    assert_eq!(
+        order,
+        [1, 9, 1, 1],
+        "the button waits for one picture, not for three"
+    );
     bench.hear(&bytes);
-    assert_eq!(bench.deliveries().len(), 2, "a state keeps its latest value only");
+    assert_eq!(
+        bench.deliveries().len(),
+        2,
+        "a state keeps its latest value only"
+    );
 }
 
 #[test]
@@ -443,7 +583,10 @@ fn a_silent_writer_is_told_once_and_keep_alives_prevent_it() {
     bench.hear(&Frame::new(10, 2, 43).bytes());
     let outputs = bench.outputs();
     assert!(
-        matches!(outputs[..], [Output::Silent { silent: false, .. }, Output::Delivery(_)]),
+        matches!(
+            outputs[..],
+            [Output::Silent { silent: false, .. }, Output::Delivery(_)]
+        ),
         "{outputs:?}"
     );
 }
@@ -460,7 +603,10 @@ fn an_opc_ua_side_hands_over_fields_and_gets_fields() {
     let delivery = other.deliveries().remove(0);
     let fields: Vec<_> = Fields::parse(&delivery.payload).unwrap().collect();
     assert_eq!(fields, [Ok(Variant::Scalar(Scalar::Boolean(true)))]);
-    assert_eq!(server.say(topic("ua_0_5_1"), &[9, 0, 1]), Verdict::Drop(Reason::Malformed));
+    assert_eq!(
+        server.say(topic("ua_0_5_1"), &[9, 0, 1]),
+        Verdict::Drop(Reason::Malformed)
+    );
 }
 
 #[test]
@@ -469,7 +615,10 @@ fn the_delays_of_a_sample_are_read_off_its_stamps() {
     sender.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
     let received = sender.now.utc;
     sender.wait(Duration::from_micros(30));
-    let _verdict = sender.router.handle_local(topic("ua_1_5_10"), &[1, 0, 0, 0], received, sender.now);
+    let _verdict =
+        sender
+            .router
+            .handle_local(topic("ua_1_5_10"), &[1, 0, 0, 0], received, sender.now);
     let datagram = sender.datagrams().remove(0);
     let mut reader = Bench::new(2, Local::Fields);
     reader.now = sender.now;

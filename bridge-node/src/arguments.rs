@@ -24,7 +24,12 @@ pub struct Arguments {
     #[arg(long, value_name = "URL", env = "UA_ADDRESS")]
     pub address: Option<String>,
     /// How log lines look
-    #[arg(long, value_name = "FORMAT", env = "UA_LOG_FORMAT", default_value = "text")]
+    #[arg(
+        long,
+        value_name = "FORMAT",
+        env = "UA_LOG_FORMAT",
+        default_value = "text"
+    )]
     pub log: LogFormat,
     /// Serve counters and delays at this address: /metrics for Prometheus, /status as JSON
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]

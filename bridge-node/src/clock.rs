@@ -9,7 +9,10 @@ use uadp::Timestamp;
 #[must_use]
 #[expect(clippy::disallowed_methods, reason = "the shell's one clock read")]
 pub fn now() -> Now {
-    Now { monotonic: Instant::now(), utc: timestamp(SystemTime::now()) }
+    Now {
+        monotonic: Instant::now(),
+        utc: timestamp(SystemTime::now()),
+    }
 }
 
 /// A system time as OPC UA has it. Times before 1970 are taken as 1970.

@@ -27,7 +27,10 @@ pub enum FailureKind {
 impl Failure {
     /// A failure with a message that says what, where and what to do.
     pub fn new(kind: FailureKind, message: impl Into<String>) -> Self {
-        Self { kind, message: message.into() }
+        Self {
+            kind,
+            message: message.into(),
+        }
     }
 
     /// Whose it is to mend.

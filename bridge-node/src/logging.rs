@@ -15,7 +15,7 @@ pub enum LogFormat {
 
 /// Starts logging. `UA_LOG` sets levels as `debug` or `info,bridge_core=trace`; `quiet` holds the directives that
 /// hush what a library says without need.
-pub fn start(format: LogFormat, quiet: &str) {
+pub(crate) fn start(format: LogFormat, quiet: &str) {
     let levels = std::env::var("UA_LOG").unwrap_or_else(|_| "info".to_owned());
     let filter = EnvFilter::builder().parse_lossy(format!("{levels},{quiet}"));
     let builder = tracing_subscriber::fmt()

@@ -23,7 +23,9 @@ pub(crate) type Requests = mpsc::Receiver<oneshot::Sender<Status>>;
 /// Listens at `address` and gives the requests for status to answer. Without an address there are never any.
 pub(crate) async fn serve(address: Option<SocketAddr>) -> Result<Requests, Failure> {
     let (ask, requests) = mpsc::channel(4);
-    let Some(address) = address else { return Ok(requests) };
+    let Some(address) = address else {
+        return Ok(requests);
+    };
     let listener = TcpListener::bind(address).await.map_err(|error| {
         Failure::new(
             FailureKind::Unavailable,
@@ -39,7 +41,9 @@ pub(crate) async fn serve(address: Option<SocketAddr>) -> Result<Requests, Failu
 async fn accept(listener: TcpListener, ask: mpsc::Sender<oneshot::Sender<Status>>) {
     let places = std::sync::Arc::new(Semaphore::new(MAX_CONNECTIONS));
     loop {
-        let Ok(place) = std::sync::Arc::clone(&places).acquire_owned().await else { return };
+        let Ok(place) = std::sync::Arc::clone(&places).acquire_owned().await else {
+            return;
+        };
         let stream = tokio::select! {
             accepted = listener.accept() => match accepted {
                 Ok((stream, _)) => stream,
@@ -54,7 +58,10 @@ async fn accept(listener: TcpListener, ask: mpsc::Sender<oneshot::Sender<Status>
         };
         let ask = ask.clone();
         tokio::spawn(async move {
-            if tokio::time::timeout(CONNECTION_TIME, answer(stream, ask)).await.is_err() {
+            if tokio::time::timeout(CONNECTION_TIME, answer(stream, ask))
+                .await
+                .is_err()
+            {
                 debug!("a connection for metrics was closed for its age");
             }
             drop(place);
@@ -84,7 +91,12 @@ async fn page(
     let json = match request.uri().path() {
         "/metrics" => false,
         "/status" => true,
-        _ => return text(StatusCode::NOT_FOUND, "there are /metrics and /status here\n".into()),
+        _ => {
+            return text(
+                StatusCode::NOT_FOUND,
+                "there are /metrics and /status here\n".into(),
+            );
+        }
     };
     let (reply, status) = oneshot::channel();
     let status = match ask.send(reply).await {
@@ -94,7 +106,10 @@ async fn page(
     match status {
         Some(status) if json => text(StatusCode::OK, status.json()),
         Some(status) => text(StatusCode::OK, status.prometheus()),
-        None => text(StatusCode::SERVICE_UNAVAILABLE, "the program is ending\n".into()),
+        None => text(
+            StatusCode::SERVICE_UNAVAILABLE,
+            "the program is ending\n".into(),
+        ),
     }
 }
 

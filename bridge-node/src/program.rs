@@ -9,7 +9,7 @@ use std::sync::Arc;
 use bridge_core::{Local, Router, Settings};
 use clap::Parser;
 use clap::error::ErrorKind;
-use mappings::{Mapping, SpaceId};
+use mappings::{Mapping, PubSub, SpaceId};
 use tokio::signal::unix::{SignalKind, signal};
 use tracing::{error, info};
 use transport::{Options, Udp};
@@ -66,9 +66,11 @@ pub fn run<P: Program>() -> ExitCode {
         Err(usage) => {
             // Nobody is left to tell when stdout or stderr is closed.
             let _printed = usage.print();
-            return match usage.kind() {
-                ErrorKind::DisplayHelp | ErrorKind::DisplayVersion => ExitCode::SUCCESS,
-                _ => FailureKind::Usage.into(),
+            let asked = [ErrorKind::DisplayHelp, ErrorKind::DisplayVersion];
+            return if asked.contains(&usage.kind()) {
+                ExitCode::SUCCESS
+            } else {
+                FailureKind::Usage.into()
             };
         }
     };
@@ -93,7 +95,10 @@ fn load(arguments: &Arguments) -> Result<Option<Mapping>, Failure> {
         return Ok((!arguments.check).then(Mapping::default));
     };
     let text = std::fs::read_to_string(file).map_err(|error| {
-        Failure::new(FailureKind::Io, format!("cannot read the mapping {}: {error}", file.display()))
+        Failure::new(
+            FailureKind::Io,
+            format!("cannot read the mapping {}: {error}", file.display()),
+        )
     })?;
     let checked = Mapping::from_yaml(&text, &file.display().to_string());
     let findings = checked.render(&text);
@@ -154,29 +159,37 @@ fn serve<P: Program>(program: P, mapping: Arc<Mapping>) -> Result<(), Failure> {
 fn open(arguments: &Arguments, mapping: &Mapping) -> Result<Udp, Failure> {
     let pubsub = mapping.pubsub();
     let address: SocketAddr = match &arguments.address {
-        Some(url) => mappings::parse_pubsub_address(url).map_err(|error| {
-            Failure::new(FailureKind::Usage, format!("--address {url}: {error}"))
+        Some(url) => PubSub::parse_address(url).ok_or_else(|| {
+            let message = format!("--address {url}: for example opc.udp://{}", PubSub::ADDRESS);
+            Failure::new(FailureKind::Usage, message)
         })?,
         None => pubsub.address,
     };
     let options = Options {
-        interface: arguments.interface.clone().or_else(|| pubsub.interface.clone()),
+        interface: arguments
+            .interface
+            .clone()
+            .or_else(|| pubsub.interface.clone()),
         ttl: u32::from(pubsub.ttl),
         ..Options::new(address)
     };
-    Udp::open(&options)
-        .map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))
+    Udp::open(&options).map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))
 }
 
 /// Ready at the first SIGINT or SIGTERM.
 fn stopped() -> Result<impl Future<Output = ()>, Failure> {
     let listen = |kind| {
         signal(kind).map_err(|error| {
-            Failure::new(FailureKind::Io, format!("cannot listen for signals: {error}"))
+            Failure::new(
+                FailureKind::Io,
+                format!("cannot listen for signals: {error}"),
+            )
         })
     };
-    let (mut interrupt, mut terminate) =
-        (listen(SignalKind::interrupt())?, listen(SignalKind::terminate())?);
+    let (mut interrupt, mut terminate) = (
+        listen(SignalKind::interrupt())?,
+        listen(SignalKind::terminate())?,
+    );
     Ok(async move {
         tokio::select! {
             _ = interrupt.recv() => {}

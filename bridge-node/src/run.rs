@@ -86,16 +86,22 @@ impl<P: Port> Shell<P> {
     /// Takes in what the port reports; gives the message to end with, if it is the end.
     fn port_event(&mut self, event: PortEvent) -> Option<String> {
         match event {
-            PortEvent::Sample { topic, payload, received } => {
+            PortEvent::Sample {
+                topic,
+                payload,
+                received,
+            } => {
                 // Counted by the router, whatever it is.
                 let _verdict = self.router.handle_local(topic, &payload, received, now());
             }
-            PortEvent::Bound { topic, message_type, selection } => {
-                match self.router.bind(topic, &message_type, &selection, now()) {
-                    Ok(()) => info!(%topic, message_type = %message_type.name(), "bound"),
-                    Err(error) => warn!(%topic, %error, "the topic cannot cross"),
-                }
-            }
+            PortEvent::Bound {
+                topic,
+                message_type,
+                selection,
+            } => match self.router.bind(topic, &message_type, &selection, now()) {
+                Ok(()) => info!(%topic, message_type = %message_type.name(), "bound"),
+                Err(error) => warn!(%topic, %error, "the topic cannot cross"),
+            },
             PortEvent::Live { topic, live } => self.router.set_live(topic, live, now()),
             PortEvent::Lost { topic, why, count } => self.router.lost(topic, count, why),
             PortEvent::Ended(why) => return Some(why),
@@ -107,9 +113,14 @@ impl<P: Port> Shell<P> {
         while let Some(output) = self.router.poll_output(now()) {
             match output {
                 Output::Datagram { topic, bytes } => {
-                    let sent = if self.dry_run { Ok(()) } else { self.udp.try_send(&bytes) };
+                    let sent = if self.dry_run {
+                        Ok(())
+                    } else {
+                        self.udp.try_send(&bytes)
+                    };
                     if let Err(error) = sent {
-                        self.router.failed(topic, not_sent(error), &error.to_string());
+                        self.router
+                            .failed(topic, not_sent(error), &error.to_string());
                     }
                     self.router.recycle(bytes);
                 }
@@ -123,12 +134,23 @@ impl<P: Port> Shell<P> {
     }
 
     fn deliver(&mut self, delivery: bridge_core::Delivery) {
-        let bridge_core::Delivery { topic, payload, source, status, arrived } = delivery;
+        let bridge_core::Delivery {
+            topic,
+            payload,
+            source,
+            status,
+            arrived,
+        } = delivery;
         if self.dry_run {
             self.router.recycle(payload);
             return;
         }
-        let sample = Delivery { topic, payload: Bytes::from(payload), source, status };
+        let sample = Delivery {
+            topic,
+            payload: Bytes::from(payload),
+            source,
+            status,
+        };
         match self.port.publish(sample) {
             Ok(()) => self.router.published(arrived, now()),
             Err(why) => self.router.failed(topic, Reason::NotPublished, why),
@@ -136,15 +158,22 @@ impl<P: Port> Shell<P> {
     }
 }
 
-const fn not_sent(error: SendError) -> Reason {
-    match error {
-        SendError::TooBig => Reason::TooBig,
-        _ => Reason::NotSent,
+fn not_sent(error: SendError) -> Reason {
+    if error == SendError::TooBig {
+        Reason::TooBig
+    } else {
+        Reason::NotSent
     }
 }
 
 fn tell(notice: &Notice) {
-    let Notice { topic, from, reason, total, detail } = notice;
+    let Notice {
+        topic,
+        from,
+        reason,
+        total,
+        detail,
+    } = notice;
     let topic = topic.map(tracing::field::display);
     let from = from.map(tracing::field::display);
     warn!(topic, from, reason = %reason, total, "dropped: {detail}");

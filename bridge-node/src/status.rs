@@ -9,7 +9,7 @@ use serde::Serialize;
 
 /// A program's counters and delays at one moment.
 #[derive(Debug, Clone, Serialize)]
-pub struct Status {
+pub(crate) struct Status {
     program: &'static str,
     space: u8,
     topics: BTreeMap<String, TopicStatus>,
@@ -39,13 +39,21 @@ struct HopStatus {
 
 impl Status {
     pub(crate) fn of(program: &'static str, space: SpaceId, router: &Router) -> Self {
-        let topics =
-            router.topics().map(|(topic, counters)| (topic.to_string(), counters.into())).collect();
+        let topics = router
+            .topics()
+            .map(|(topic, counters)| (topic.to_string(), counters.into()))
+            .collect();
         let hops = HOPS
             .into_iter()
             .map(|(hop, label)| (label, router.hops().of(hop).into()))
             .collect();
-        Self { program, space: space.get(), topics, others: router.others().into(), hops }
+        Self {
+            program,
+            space: space.get(),
+            topics,
+            others: router.others().into(),
+            hops,
+        }
     }
 
     /// One JSON object.
@@ -62,7 +70,11 @@ impl Status {
             let _written = writeln!(text, "ua_{name}{{{labels}}} {value}");
         };
         let none = [("none".to_owned(), &self.others)];
-        let all = self.topics.iter().map(|(topic, status)| (topic.clone(), status)).chain(none);
+        let all = self
+            .topics
+            .iter()
+            .map(|(topic, status)| (topic.clone(), status))
+            .chain(none);
         for (topic, status) in all {
             let labels = format!("program=\"{}\",topic=\"{topic}\"", self.program);
             line("samples_sent_total", &labels, &status.sent);
@@ -71,7 +83,11 @@ impl Status {
             line("keep_alives_total", &labels, &status.keep_alives);
             line("messages_missing_total", &labels, &status.missing);
             for (reason, count) in &status.dropped {
-                line("samples_dropped_total", &format!("{labels},reason=\"{reason}\""), count);
+                line(
+                    "samples_dropped_total",
+                    &format!("{labels},reason=\"{reason}\""),
+                    count,
+                );
             }
         }
         for (hop, delays) in &self.hops {
@@ -94,7 +110,10 @@ impl From<&Counters> for TopicStatus {
             repeated: counters.repeated,
             keep_alives: counters.keep_alives,
             missing: counters.missing,
-            dropped: counters.drops().map(|(reason, count)| (reason.label(), count)).collect(),
+            dropped: counters
+                .drops()
+                .map(|(reason, count)| (reason.label(), count))
+                .collect(),
         }
     }
 }
@@ -111,5 +130,9 @@ impl From<&Delays> for HopStatus {
     }
 }
 
-const HOPS: [(Hop, &str); 4] =
-    [(Hop::Out, "out"), (Hop::Origin, "origin"), (Hop::Network, "network"), (Hop::In, "in")];
+const HOPS: [(Hop, &str); 4] = [
+    (Hop::Out, "out"),
+    (Hop::Origin, "origin"),
+    (Hop::Network, "network"),
+    (Hop::In, "in"),
+];

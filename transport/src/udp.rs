@@ -200,14 +200,20 @@ impl Udp {
 }
 
 fn send_error(error: &io::Error) -> SendError {
-    match error.kind() {
-        io::ErrorKind::WouldBlock => SendError::Busy,
-        io::ErrorKind::NetworkUnreachable
-        | io::ErrorKind::HostUnreachable
-        | io::ErrorKind::NetworkDown
-        | io::ErrorKind::ConnectionRefused => SendError::Unreachable,
-        _ if error.raw_os_error() == Some(EMSGSIZE) => SendError::TooBig,
-        _ => SendError::Refused,
+    let unreachable = [
+        io::ErrorKind::NetworkUnreachable,
+        io::ErrorKind::HostUnreachable,
+        io::ErrorKind::NetworkDown,
+        io::ErrorKind::ConnectionRefused,
+    ];
+    if error.kind() == io::ErrorKind::WouldBlock {
+        SendError::Busy
+    } else if unreachable.contains(&error.kind()) {
+        SendError::Unreachable
+    } else if error.raw_os_error() == Some(EMSGSIZE) {
+        SendError::TooBig
+    } else {
+        SendError::Refused
     }
 }
 
@@ -242,16 +248,17 @@ fn receiver(
         .set_recv_buffer_size(options.receive_buffer)
         .map_err(at("set the receive buffer"))?;
     // Bound to the group itself, so that datagrams of other groups at this port stay away.
-    socket
-        .bind(&address.into())
-        .map_err(|source| match source.kind() {
-            io::ErrorKind::AddrInUse => OpenError::PortTaken(address),
-            _ => OpenError::Socket {
+    socket.bind(&address.into()).map_err(|source| {
+        if source.kind() == io::ErrorKind::AddrInUse {
+            OpenError::PortTaken(address)
+        } else {
+            OpenError::Socket {
                 what: "bind",
                 address,
                 source,
-            },
-        })?;
+            }
+        }
+    })?;
     if ip.is_multicast() {
         join(&socket, ip, interface)?;
     }

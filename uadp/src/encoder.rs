@@ -234,6 +234,11 @@ fn write_group_header(buf: &mut Vec<u8>, group: &GroupHeader) {
 
 #[inline]
 fn write_payload_header(buf: &mut Vec<u8>, ids: &[u16]) -> Result<(), EncodeError> {
+    if let [id] = ids {
+        let [low, high] = id.to_le_bytes();
+        buf.extend_from_slice(&[1, low, high]);
+        return Ok(());
+    }
     let count = u8::try_from(ids.len()).map_err(|_| EncodeError::TooBig {
         what: "DataSetWriterIds",
         len: ids.len(),

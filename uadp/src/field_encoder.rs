@@ -18,7 +18,7 @@ pub struct FieldEncoder<'m> {
     count_at: usize,
     fields: usize,
     /// Elements an open array still wants, and their type.
-    wanted: usize,
+    wanted: u32,
     element: BuiltinType,
     depth: usize,
     /// The open structures, outermost first; `depth` of them are in use.
@@ -29,9 +29,9 @@ pub struct FieldEncoder<'m> {
 #[derive(Debug, Clone, Copy)]
 struct Outer {
     /// Where the length of the structure's body stands.
-    length_at: usize,
+    length_at: u32,
     /// Elements wanted behind the structure.
-    wanted: usize,
+    wanted: u32,
 }
 
 const MAX_DEPTH: usize = 8;
@@ -147,8 +147,12 @@ impl<'m> FieldEncoder<'m> {
         {
             return Err(EncodeError::Unsupported(element));
         }
+        let wanted = u32::try_from(count).map_err(|_| EncodeError::TooBig {
+            what: "array",
+            len: count,
+        })?;
         self.begin_array(element, count)?;
-        self.wanted = count;
+        self.wanted = wanted;
         self.element = element;
         Ok(())
     }
@@ -222,7 +226,11 @@ impl<'m> FieldEncoder<'m> {
         }
         type_id.write(self.buf)?;
         self.buf.push(BINARY_BODY);
-        let length_at = self.buf.len();
+        let len = self.buf.len();
+        let length_at = u32::try_from(len).map_err(|_| EncodeError::TooBig {
+            what: "buffer",
+            len,
+        })?;
         self.buf.extend_from_slice(&[0; 4]);
         if let Some(outer) = self.outer.get_mut(self.depth) {
             *outer = Outer {
@@ -246,6 +254,7 @@ impl<'m> FieldEncoder<'m> {
         }
         let depth = self.depth.checked_sub(1).ok_or(NO_STRUCTURE)?;
         let Outer { length_at, wanted } = self.outer.get(depth).copied().ok_or(NO_STRUCTURE)?;
+        let length_at = length_at as usize;
         let len = self.buf.len() - length_at - 4;
         let length = writer::int32_length(len, "ExtensionObject body")?;
         writer::patch(self.buf, length_at, length);
