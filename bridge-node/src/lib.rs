@@ -1,18 +1,21 @@
-//! stub
-mod arguments; mod clock; mod exit; mod logging; mod port;
+//! What the programs of the space share: the port trait, the run loop, arguments, logging and metrics.
+//!
+//! A program implements [`Program`] and [`Port`], and its `main` is [`run`]. This crate does not know which ROS it
+//! serves (that is the port) nor how UADP bytes look (that is `bridge-core`).
+
+mod arguments;
+mod clock;
+mod exit;
+mod logging;
+mod metrics;
+mod port;
+mod program;
+mod run;
+mod status;
+
 pub use arguments::Arguments;
 pub use clock::{now, timestamp};
 pub use exit::{Failure, FailureKind};
+pub use logging::LogFormat;
 pub use port::{Delivery, Port, PortEvent};
-pub use logging::{LogFormat, start};
-pub trait Program: clap::Parser {
-    type Port: Port;
-    const NAME: &'static str;
-    const LOCAL: bridge_core::Local;
-    const QUIET: &'static str = "";
-    fn arguments(&self) -> &Arguments;
-    fn own(&self, mapping: &mappings::Mapping) -> Result<mappings::SpaceId, Failure>;
-    fn start(self, context: Context) -> impl Future<Output = Result<Self::Port, Failure>>;
-}
-pub struct Context { pub mapping: std::sync::Arc<mappings::Mapping>, pub own: mappings::SpaceId }
-pub fn run<P: Program>() -> std::process::ExitCode { std::process::ExitCode::SUCCESS }
+pub use program::{Context, Program, run};
