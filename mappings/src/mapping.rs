@@ -148,6 +148,22 @@ impl PubSub {
     /// leaks it to the world; the port is the one registered for OPC UA over UDP (OPC 10000-14, 7.3.2).
     pub const ADDRESS: SocketAddr =
         SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::new(239, 192, 0, 40)), 4840);
+    /// Reads `opc.udp://<group or host by number>:<port>`; the port is 4840 when left out (OPC 10000-14, 7.3.2).
+    #[must_use]
+    pub fn parse_address(url: &str) -> Option<SocketAddr> {
+        let rest = url.strip_prefix("opc.udp://")?;
+        let rest = rest.strip_suffix('/').unwrap_or(rest);
+        let alone = || {
+            rest.trim_start_matches('[')
+                .trim_end_matches(']')
+                .parse()
+                .ok()
+        };
+        rest.parse()
+            .ok()
+            .or_else(|| Some(SocketAddr::new(alone()?, Self::ADDRESS.port())))
+    }
+
     /// The group OPC 10000-14, 7.3.2.1 keeps for discovery messages: no data belongs there.
     pub const DISCOVERY_GROUP: Ipv4Addr = Ipv4Addr::new(224, 0, 2, 14);
 }

@@ -84,20 +84,7 @@ fn timing(entry: &PubSubEntry, pubsub: &PubSub, findings: &mut Findings) {
 
 /// `opc.udp://host:port`, port 4840 when left out (OPC 10000-14, 7.3.2).
 fn address(text: &str, place: Place, findings: &mut Findings) -> Option<SocketAddr> {
-    let parsed = text
-        .strip_prefix("opc.udp://")
-        .map(|rest| rest.strip_suffix('/').unwrap_or(rest))
-        .and_then(|rest| {
-            let with_port = rest.parse::<SocketAddr>().ok();
-            let alone = || {
-                rest.trim_start_matches('[')
-                    .trim_end_matches(']')
-                    .parse::<IpAddr>()
-                    .ok()
-            };
-            with_port.or_else(|| Some(SocketAddr::new(alone()?, PORT)))
-        });
-    let Some(address) = parsed else {
+    let Some(address) = PubSub::parse_address(text) else {
         let message = format!("`{}` is no PubSub address", short(text));
         let note = findings.error(Code::Address, place, message);
         note.help(format!(
