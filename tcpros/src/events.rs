@@ -1,0 +1,141 @@
+//! What this crate tells operators, one function per event.
+//!
+//! DEBUG: something ended or was retried as it should. WARN: a peer or the set-up is wrong, and we go on.
+
+use std::fmt::Display;
+use std::time::Duration;
+
+use tracing::{debug, info, warn};
+
+use crate::clock::{self, Throttle};
+
+pub(crate) fn master_awaited(uri: &str, error: &dyn Display) {
+    warn!(
+        ROS_MASTER_URI = uri,
+        %error,
+        "waiting for the ROS master: start roscore there, or set ROS_MASTER_URI to where it runs"
+    );
+}
+
+pub(crate) fn master_found(uri: &str) {
+    info!(ROS_MASTER_URI = uri, "registered with the ROS master");
+}
+
+pub(crate) fn master_restarted(uri: &str) {
+    warn!(
+        ROS_MASTER_URI = uri,
+        "the ROS master has restarted or forgotten this node: registering everything again"
+    );
+}
+
+pub(crate) fn registration_refused(topic: &str, error: &dyn Display) {
+    warn!(topic, %error, "the ROS master did not take a registration: trying again");
+}
+
+pub(crate) fn unregistration_failed(topic: &str, error: &dyn Display) {
+    warn!(topic, %error, "a registration stays behind in the ROS master: `rosnode cleanup` removes it");
+}
+
+pub(crate) fn shutdown_incomplete(limit: Duration) {
+    warn!(
+        ?limit,
+        "not everything was withdrawn in time: `rosnode cleanup` removes what stays in the ROS master"
+    );
+}
+
+pub(crate) fn hostname_unresolvable(hostname: &str, error: &dyn Display) {
+    warn!(
+        hostname,
+        %error,
+        "other nodes are told this host name, and it does not resolve even here: set ROS_IP or ROS_HOSTNAME"
+    );
+}
+
+pub(crate) fn shutdown_asked(reason: &str) {
+    warn!(
+        reason,
+        "told by the ROS master to shut down; another node of the same name does that"
+    );
+}
+
+pub(crate) fn subscriber_joined(topic: &str, subscriber: &str, nodelay: bool) {
+    debug!(topic, subscriber, nodelay, "a subscriber connected");
+}
+
+pub(crate) fn subscriber_left(topic: &str, subscriber: &str, dropped: u64, why: &dyn Display) {
+    if dropped > 0 {
+        warn!(topic, subscriber, dropped, %why, "a subscriber left that had lost messages by being slow");
+    } else {
+        debug!(topic, subscriber, %why, "a subscriber left");
+    }
+}
+
+pub(crate) fn message_too_long(topic: &str, bytes: usize) {
+    tracing::error!(
+        topic,
+        bytes,
+        "a message longer than TCPROS can say was not published"
+    );
+}
+
+pub(crate) fn publisher_joined(topic: &str, publisher: &str) {
+    debug!(topic, publisher, "connected to a publisher");
+}
+
+pub(crate) fn link_failed(topic: &str, uri: &str, node: Option<&str>, error: &dyn Display) {
+    let node = node.unwrap_or("(unknown)");
+    warn!(
+        topic,
+        node,
+        uri,
+        %error,
+        "no connection to a registered publisher, still trying: if that node is gone, `rosnode cleanup` removes it; if it runs, check that its host name resolves here"
+    );
+}
+
+pub(crate) fn link_retried(topic: &str, uri: &str, error: &dyn Display, wait: Duration) {
+    debug!(topic, uri, %error, ?wait, "a connection to a publisher failed or ended");
+}
+
+/// What a listener could not take, with one line per ten seconds.
+pub(crate) struct Refusals {
+    server: &'static str,
+    accept: Throttle,
+    crowd: Throttle,
+    handshake: Throttle,
+}
+
+impl Refusals {
+    pub(crate) const fn new(server: &'static str) -> Self {
+        let every = Duration::from_secs(10);
+        Self {
+            server,
+            accept: Throttle::new(every),
+            crowd: Throttle::new(every),
+            handshake: Throttle::new(every),
+        }
+    }
+
+    /// Running out of file descriptors must not become a busy loop: waits a little.
+    pub(crate) async fn accept_failed(&mut self, error: &std::io::Error) {
+        if let Some(more) = self.accept.admit(clock::now()) {
+            warn!(server = self.server, %error, more, "a connection could not be accepted");
+        }
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+
+    pub(crate) fn too_many(&mut self, limit: usize) {
+        if let Some(more) = self.crowd.admit(clock::now()) {
+            warn!(
+                server = self.server,
+                limit, more, "a connection was refused: too many are open"
+            );
+        }
+    }
+
+    pub(crate) fn handshake_failed(&mut self, peer: &dyn Display, error: &dyn Display) {
+        if let Some(more) = self.handshake.admit(clock::now()) {
+            warn!(server = self.server, %peer, %error, more, "a peer was turned away");
+        }
+    }
+}

@@ -1,0 +1,267 @@
+//! The way to one publisher of one topic: asking it for its address, connecting, reading, and all of it again.
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use socket2::{SockRef, TcpKeepalive};
+use thiserror::Error;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::TcpStream;
+use tokio::time::{sleep, timeout};
+
+use crate::clock::{self, Throttle};
+use crate::events;
+use crate::frame::{FrameTooLong, Frames};
+use crate::header::{ConnectionHeader, HeaderError};
+use crate::inbox::{Message, Peer};
+use crate::master::{Master, MasterError, unwrap_triple};
+use crate::rpc::{self, Endpoint, RpcError};
+use crate::subscription::{Feed, LinkState};
+use crate::xmlrpc::Value;
+
+/// What all links of a node share.
+#[derive(Debug)]
+pub(crate) struct LinkContext {
+    pub(crate) caller_id: String,
+    pub(crate) max_message: usize,
+    pub(crate) master: Master,
+}
+
+/// Keeps a subscription connected to one publisher until the master no longer names it. A task of its own.
+pub(crate) async fn run(
+    feed: Arc<Feed>,
+    context: Arc<LinkContext>,
+    uri: String,
+    state: Arc<LinkState>,
+) {
+    let mut wait = FIRST_WAIT;
+    let mut failures = 0u32;
+    let mut throttle = Throttle::new(LOG_PERIOD);
+    loop {
+        let before = state.messages.load(Ordering::Relaxed);
+        let started = clock::now();
+        let error = match connect(&feed, &context, &uri).await {
+            Ok((stream, peer)) => follow(stream, peer, &feed, &context, &state).await,
+            Err(error) => error,
+        };
+        if matches!(error, LinkError::Ourselves) {
+            // The entry stays, so that the next update does not try again.
+            return;
+        }
+        if !feed.still_wanted(&uri, &state) {
+            return;
+        }
+        let lived = state.messages.load(Ordering::Relaxed) > before
+            || started.elapsed() > CONNECT_LIMIT + HANDSHAKE_LIMIT + REQUEST_LIMIT;
+        if lived {
+            (wait, failures) = (FIRST_WAIT, 0);
+        }
+        failures += 1;
+        if error.is_fault() || failures == PATIENCE {
+            if throttle.admit(clock::now()).is_some() {
+                let node = context.master.name_of(&feed.topic, &uri).await;
+                events::link_failed(&feed.topic, &uri, node.as_deref(), &error);
+            }
+            failures = failures.min(PATIENCE - 1);
+        } else {
+            events::link_retried(&feed.topic, &uri, &error, wait);
+        }
+        sleep(wait).await;
+        wait = (wait * 2).min(LAST_WAIT);
+    }
+}
+
+async fn connect(
+    feed: &Feed,
+    context: &LinkContext,
+    uri: &str,
+) -> Result<(TcpStream, Arc<Peer>), LinkError> {
+    let (host, port) = request_topic(feed, context, uri).await?;
+    let connecting = timeout(CONNECT_LIMIT, rpc::connect(&host, port));
+    let mut stream = connecting
+        .await
+        .map_err(|_| LinkError::NoConnection(CONNECT_LIMIT))??;
+    prepare(&stream)?;
+    let shaking = timeout(HANDSHAKE_LIMIT, shake_hands(&mut stream, feed, context));
+    let header = shaking
+        .await
+        .map_err(|_| LinkError::NoHeader(HANDSHAKE_LIMIT))??;
+    Ok((
+        stream,
+        Arc::new(Peer {
+            caller_id: header.caller_id().to_owned(),
+            header,
+        }),
+    ))
+}
+
+async fn request_topic(
+    feed: &Feed,
+    context: &LinkContext,
+    uri: &str,
+) -> Result<(String, u16), LinkError> {
+    let endpoint = Endpoint::parse(uri).ok_or(RpcError::Uri)?;
+    let protocols = vec![Value::Array(vec!["TCPROS".into()])];
+    let params = vec![
+        context.caller_id.as_str().into(),
+        feed.topic.as_str().into(),
+        protocols.into(),
+    ];
+    let reply = rpc::call(&endpoint, "requestTopic", params, REQUEST_LIMIT).await?;
+    let chosen = unwrap_triple(reply, "requestTopic")?;
+    match chosen.as_array() {
+        Some([protocol, Value::String(host), port, ..]) if protocol.as_str() == Some("TCPROS") => {
+            let port = port.as_int().and_then(|port| u16::try_from(port).ok());
+            Ok((
+                host.clone(),
+                port.ok_or(MasterError::Shape("requestTopic"))?,
+            ))
+        }
+        _ => Err(MasterError::Shape("requestTopic").into()),
+    }
+}
+
+async fn shake_hands(
+    stream: &mut TcpStream,
+    feed: &Feed,
+    context: &LinkContext,
+) -> Result<ConnectionHeader, LinkError> {
+    let wanted = &feed.wanted;
+    let md5sum = wanted.md5sum.as_deref().unwrap_or("*");
+    let request = ConnectionHeader::default()
+        .with("callerid", &*context.caller_id)
+        .with("topic", &*feed.topic)
+        .with("type", wanted.type_name.as_deref().unwrap_or("*"))
+        .with("md5sum", md5sum)
+        .with("tcp_nodelay", "1");
+    stream.write_all(&request.encode()?).await?;
+    let reply = ConnectionHeader::read(stream).await?;
+    if let Some(error) = reply.get("error") {
+        return Err(LinkError::Refused(error.to_owned()));
+    }
+    if reply.caller_id() == context.caller_id {
+        return Err(LinkError::Ourselves);
+    }
+    match reply.md5sum() {
+        Some(theirs) if md5sum != "*" && theirs != "*" && theirs != md5sum => {
+            Err(LinkError::OtherType {
+                theirs: format!("{}/{theirs}", reply.type_name().unwrap_or("?")),
+                ours: format!("{}/{md5sum}", wanted.type_name.as_deref().unwrap_or("*")),
+            })
+        }
+        _ => Ok(reply),
+    }
+}
+
+/// Delivers what the publisher sends until the connection ends, and returns how it ended.
+async fn follow(
+    mut stream: TcpStream,
+    peer: Arc<Peer>,
+    feed: &Feed,
+    context: &LinkContext,
+    state: &LinkState,
+) -> LinkError {
+    events::publisher_joined(&feed.topic, &peer.caller_id);
+    let _connected = feed.connected(Arc::clone(&peer), state);
+    let mut frames = Frames::new(context.max_message);
+    loop {
+        match stream.read_buf(frames.room()).await {
+            Ok(0) => return LinkError::Closed,
+            Ok(read) => {
+                frames.filled(read);
+                state
+                    .bytes
+                    .fetch_add(u64::try_from(read).unwrap_or(u64::MAX), Ordering::Relaxed);
+            }
+            Err(error) => return LinkError::Io(error),
+        }
+        // All messages that this read completes have the same time: it was read once for them.
+        let received = clock::utc();
+        loop {
+            match frames.next() {
+                Ok(Some(bytes)) => {
+                    state.messages.fetch_add(1, Ordering::Relaxed);
+                    feed.deliver(Message {
+                        bytes,
+                        peer: Arc::clone(&peer),
+                        received,
+                    });
+                }
+                Ok(None) => break,
+                Err(error) => {
+                    feed.refused_frames.fetch_add(1, Ordering::Relaxed);
+                    return error.into();
+                }
+            }
+        }
+    }
+}
+
+/// Small messages leave at once, and a peer that has silently gone is noticed in minutes instead of never.
+pub(crate) fn prepare(stream: &TcpStream) -> std::io::Result<()> {
+    stream.set_nodelay(true)?;
+    let keepalive = TcpKeepalive::new()
+        .with_time(Duration::from_secs(60))
+        .with_interval(Duration::from_secs(10))
+        .with_retries(6);
+    SockRef::from(stream).set_tcp_keepalive(&keepalive)
+}
+
+/// Why there is no connection to a publisher at the moment.
+#[derive(Debug, Error)]
+enum LinkError {
+    #[error("it does not tell its address: {0}")]
+    Request(#[from] MasterError),
+    #[error("its address does not answer within {0:?}")]
+    NoConnection(Duration),
+    #[error("it sent no connection header within {0:?}")]
+    NoHeader(Duration),
+    #[error(transparent)]
+    Header(#[from] HeaderError),
+    #[error("it refuses: {0}")]
+    Refused(String),
+    #[error("it publishes {theirs}, and {ours} is wanted")]
+    OtherType { theirs: String, ours: String },
+    #[error("it is this node")]
+    Ourselves,
+    #[error(transparent)]
+    FrameTooLong(#[from] FrameTooLong),
+    #[error("it closed the connection")]
+    Closed,
+    #[error("the connection failed: {0}")]
+    Io(#[from] std::io::Error),
+}
+
+impl LinkError {
+    /// Whether an operator must do something, however short it lasts.
+    const fn is_fault(&self) -> bool {
+        matches!(
+            self,
+            Self::Refused(_)
+                | Self::OtherType { .. }
+                | Self::FrameTooLong(_)
+                | Self::Header(
+                    HeaderError::TooLong(_)
+                        | HeaderError::Truncated
+                        | HeaderError::NoEquals
+                        | HeaderError::TooManyFields
+                )
+        )
+    }
+}
+
+impl From<RpcError> for LinkError {
+    fn from(error: RpcError) -> Self {
+        Self::Request(error.into())
+    }
+}
+
+const REQUEST_LIMIT: Duration = Duration::from_secs(5);
+const CONNECT_LIMIT: Duration = Duration::from_secs(5);
+const HANDSHAKE_LIMIT: Duration = Duration::from_secs(5);
+const FIRST_WAIT: Duration = Duration::from_millis(100);
+const LAST_WAIT: Duration = Duration::from_secs(20);
+/// Failures in a row before the first warning: a publisher that just starts or ends is no news.
+const PATIENCE: u32 = 4;
+const LOG_PERIOD: Duration = Duration::from_secs(60);

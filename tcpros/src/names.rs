@@ -1,0 +1,156 @@
+//! Graph resource names: what `chatter`, `/chatter`, `~chatter` and a remapping come to.
+
+use thiserror::Error;
+
+/// Resolves names as one node sees them.
+#[derive(Clone, Debug)]
+pub(crate) struct Names {
+    node: String,
+    namespace: String,
+    remappings: Vec<(String, String)>,
+}
+
+impl Names {
+    /// Fails when the node's own name or namespace or a remapping is no graph name.
+    pub(crate) fn new(
+        name: &str,
+        namespace: &str,
+        remappings: &[(String, String)],
+    ) -> Result<Self, NameError> {
+        let base = name.strip_prefix('/').unwrap_or(name);
+        if base.contains('/') {
+            return Err(NameError::NodeName(name.to_owned()));
+        }
+        let namespace = match namespace.trim_matches('/') {
+            "" => "/".to_owned(),
+            inner => format!("/{inner}"),
+        };
+        check(base)?;
+        check(&namespace)?;
+        let mut names = Self {
+            node: join(&namespace, base),
+            namespace,
+            remappings: Vec::new(),
+        };
+        let resolved = remappings
+            .iter()
+            .map(|(from, to)| Ok((names.expand(from)?, names.expand(to)?)));
+        names.remappings = resolved.collect::<Result<_, NameError>>()?;
+        Ok(names)
+    }
+
+    /// The resolved name of the node itself.
+    pub(crate) fn node(&self) -> &str {
+        &self.node
+    }
+
+    /// A topic's name in the graph, remapped.
+    pub(crate) fn resolve(&self, name: &str) -> Result<String, NameError> {
+        let name = self.expand(name)?;
+        let remapped = self.remappings.iter().find(|(from, _)| *from == name);
+        Ok(remapped.map_or(name, |(_, to)| to.clone()))
+    }
+
+    fn expand(&self, name: &str) -> Result<String, NameError> {
+        check(name)?;
+        let full = if name.starts_with('/') {
+            name.to_owned()
+        } else if let Some(private) = name.strip_prefix('~') {
+            join(&self.node, private)
+        } else {
+            join(&self.namespace, name)
+        };
+        let mut clean = String::with_capacity(full.len());
+        for part in full.split('/').filter(|part| !part.is_empty()) {
+            clean.push('/');
+            clean.push_str(part);
+        }
+        if clean.is_empty() {
+            Err(NameError::Invalid(name.to_owned()))
+        } else {
+            Ok(clean)
+        }
+    }
+}
+
+/// A name that is no graph resource name.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum NameError {
+    /// Something other than a letter, `/` or `~`, then letters, digits, `_` and `/`.
+    #[error(
+        "`{0}` is no ROS name: letters, digits, `_` and `/`, beginning with a letter, `/` or `~`"
+    )]
+    Invalid(String),
+    /// A node's name holds no `/`; that part is its namespace.
+    #[error("`{0}` is no node name: put what stands before the last `/` into the namespace")]
+    NodeName(String),
+}
+
+fn join(namespace: &str, name: &str) -> String {
+    format!(
+        "{}/{}",
+        namespace.trim_end_matches('/'),
+        name.trim_start_matches('/')
+    )
+}
+
+fn check(name: &str) -> Result<(), NameError> {
+    let mut bytes = name.bytes();
+    let head = bytes
+        .next()
+        .is_some_and(|b| b.is_ascii_alphabetic() || b == b'/' || b == b'~');
+    if head && bytes.all(|b| b.is_ascii_alphanumeric() || b == b'_' || b == b'/') {
+        Ok(())
+    } else {
+        Err(NameError::Invalid(name.to_owned()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(remappings: &[(&str, &str)]) -> Names {
+        let owned: Vec<_> = remappings
+            .iter()
+            .map(|(a, b)| ((*a).to_owned(), (*b).to_owned()))
+            .collect();
+        Names::new("cell", "line1/", &owned).unwrap()
+    }
+
+    #[test]
+    fn names_resolve_as_the_ros_wiki_tables_them() {
+        let names = names(&[]);
+        assert_eq!(names.node(), "/line1/cell");
+        assert_eq!(names.resolve("chatter").unwrap(), "/line1/chatter");
+        assert_eq!(names.resolve("/chatter").unwrap(), "/chatter");
+        assert_eq!(names.resolve("~chatter").unwrap(), "/line1/cell/chatter");
+        assert_eq!(names.resolve("a//b/").unwrap(), "/line1/a/b");
+        assert_eq!(Names::new("cell", "", &[]).unwrap().node(), "/cell");
+        assert_eq!(
+            Names::new("/cell", "/", &[]).unwrap().resolve("a").unwrap(),
+            "/a"
+        );
+    }
+
+    #[test]
+    fn a_remapping_holds_for_every_spelling_of_its_name() {
+        let names = names(&[("chatter", "/talk")]);
+        assert_eq!(names.resolve("chatter").unwrap(), "/talk");
+        assert_eq!(names.resolve("/line1/chatter").unwrap(), "/talk");
+        assert_eq!(names.resolve("/chatter").unwrap(), "/chatter");
+    }
+
+    #[test]
+    fn what_is_no_name_is_refused() {
+        let names = names(&[]);
+        for bad in ["", "/", "1a", "a b", "a-b", "ä", "_a"] {
+            assert!(names.resolve(bad).is_err(), "{bad}");
+        }
+        assert_eq!(
+            Names::new("a/b", "", &[]).unwrap_err(),
+            NameError::NodeName("a/b".to_owned())
+        );
+    }
+}

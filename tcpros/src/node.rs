@@ -1,0 +1,497 @@
+//! The node: what it publishes and subscribes, and the tasks that serve it.
+
+use std::collections::HashMap;
+use std::net::IpAddr;
+use std::sync::atomic::{AtomicI32, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use thiserror::Error;
+use tokio::net::TcpListener;
+use tokio::sync::{Notify, watch};
+use tokio::task::JoinSet;
+use tokio::time::timeout;
+
+use crate::events;
+use crate::inbox::Inbox;
+use crate::link::LinkContext;
+use crate::master::{Graph, Master, MasterError};
+use crate::names::{NameError, Names};
+use crate::options::NodeOptions;
+use crate::outbox::{Limit, lock};
+use crate::publisher::{Hub, Publisher, PublisherOptions, TopicType};
+use crate::subscription::{Feed, SubscriberOptions, Subscription, Wanted};
+use crate::{registrar, rpc, slave, topic_server};
+
+/// A ROS 1 node. Dropping it ends its connections; only [`Node::shutdown`] also tells the master.
+///
+/// Three tasks belong to it: the slave API, the listener for subscribers, and the one that keeps the master
+/// informed. Each connection to a subscriber or publisher is a task besides. All end with the node.
+#[derive(Debug)]
+pub struct Node {
+    inner: Arc<Inner>,
+    tasks: JoinSet<()>,
+}
+
+impl Node {
+    /// Opens the node's two ports and begins to look for the master, which need not be there yet.
+    ///
+    /// Must be called inside a tokio runtime with IO and time. Fails when a name is no ROS name, when the master's
+    /// URI does not read as one, or when no port can be opened.
+    pub fn start(options: NodeOptions) -> Result<Self, NodeError> {
+        if tokio::runtime::Handle::try_current().is_err() {
+            return Err(NodeError::NoRuntime);
+        }
+        let names = options.names()?;
+        let endpoint = options
+            .master()
+            .ok_or_else(|| NodeError::MasterUri(options.master_uri.clone()))?;
+        let (api, api_port) = listen(options.bind)?;
+        let (topics, topics_port) = listen(options.bind)?;
+        let uri = format!("http://{}:{api_port}/", bracketed(&options.hostname));
+        let caller_id = names.node().to_owned();
+        let master = Master::new(endpoint, options.master_uri, caller_id.clone(), uri.clone());
+        let context = LinkContext {
+            caller_id,
+            max_message: options.max_message,
+            master: master.clone(),
+        };
+        let inner = Arc::new(Inner {
+            names,
+            uri,
+            hostname: options.hostname,
+            topics_port,
+            master,
+            links: Arc::new(context),
+            registry: Mutex::default(),
+            changed: Notify::new(),
+            master_state: watch::Sender::new(MasterState::Awaited),
+            shutdown: watch::Sender::new(None),
+            settled: watch::Sender::new(false),
+            draining: watch::Sender::new(0),
+            next_id: AtomicI32::new(1),
+        });
+        let mut tasks = JoinSet::new();
+        let handler = Arc::clone(&inner);
+        tasks
+            .spawn(async move { rpc::serve(api, move |call| slave::answer(&handler, call)).await });
+        tasks.spawn(topic_server::serve(topics, Arc::clone(&inner)));
+        tasks.spawn(registrar::run(Arc::clone(&inner)));
+        Ok(Self { inner, tasks })
+    }
+
+    /// The node's resolved name, as others see it in `callerid`.
+    pub fn name(&self) -> &str {
+        self.inner.name()
+    }
+
+    /// The URI of the node's slave API, as the master is told it.
+    pub fn uri(&self) -> &str {
+        &self.inner.uri
+    }
+
+    /// A topic's name as this node resolves it: namespace, `~` and remappings applied.
+    pub fn resolve(&self, topic: &str) -> Result<String, NameError> {
+        self.inner.names.resolve(topic)
+    }
+
+    /// Whether the master has been found, now and as it changes.
+    pub fn master_state(&self) -> watch::Receiver<MasterState> {
+        self.inner.master_state.subscribe()
+    }
+
+    /// Waits until the master tells this node to shut down, which it does when another node takes its name, and
+    /// returns the reason given. Cancel-safe.
+    pub async fn shutdown_requested(&self) -> String {
+        let mut asked = self.inner.shutdown.subscribe();
+        let reason = asked.wait_for(Option::is_some).await;
+        reason
+            .ok()
+            .and_then(|reason| reason.clone())
+            .unwrap_or_default()
+    }
+
+    /// Publishes a topic. Fails when the name is no ROS name, when this node already publishes it, or when the type
+    /// is not complete: subscribers compare its checksum, and `rosbag` records its definition.
+    pub fn advertise(
+        &self,
+        topic: &str,
+        topic_type: TopicType,
+        options: PublisherOptions,
+    ) -> Result<Publisher, NodeError> {
+        let topic = self.inner.names.resolve(topic)?;
+        if !topic_type.name.contains('/') || topic_type.md5sum.len() != 32 {
+            return Err(NodeError::Type {
+                topic,
+                type_name: topic_type.name,
+            });
+        }
+        let mut registry = lock(&self.inner.registry);
+        if registry.publications.contains_key(&topic) {
+            return Err(NodeError::AlreadyPublished(topic));
+        }
+        let generation = registry.next_generation();
+        let draining = self.inner.draining.clone();
+        let hub = Arc::new(Hub::new(
+            topic.clone(),
+            topic_type,
+            options,
+            generation,
+            draining,
+        ));
+        registry.publications.insert(topic, Arc::clone(&hub));
+        drop(registry);
+        self.inner.changed.notify_one();
+        Ok(Publisher::new(hub, Arc::clone(&self.inner)))
+    }
+
+    /// Subscribes a topic into an inbox. What this node publishes itself is not received. Fails when the name is no
+    /// ROS name.
+    pub fn subscribe<K: Clone + Send + 'static>(
+        &self,
+        topic: &str,
+        wanted: Wanted,
+        options: SubscriberOptions,
+        key: K,
+        inbox: &Inbox<K>,
+    ) -> Result<Subscription, NodeError> {
+        let topic = self.inner.names.resolve(topic)?;
+        let limit = Limit {
+            messages: options.queue_messages,
+            bytes: options.queue_bytes,
+        };
+        let entrance = Box::new(inbox.open(key, limit));
+        let feed = Arc::new(Feed::new(topic.clone(), wanted, entrance));
+        let mut registry = lock(&self.inner.registry);
+        let generation = registry.next_generation();
+        let entry = registry
+            .subscriptions
+            .entry(topic)
+            .or_insert_with(|| Subscribed {
+                generation,
+                updates: 0,
+                publishers: Vec::new(),
+                feeds: Vec::new(),
+            });
+        entry.feeds.push(Arc::clone(&feed));
+        let publishers = entry.publishers.clone();
+        drop(registry);
+        self.inner.connect(&feed, &publishers);
+        self.inner.changed.notify_one();
+        Ok(Subscription::new(feed, Arc::clone(&self.inner)))
+    }
+
+    /// Asks the master who publishes and subscribes what.
+    pub async fn graph(&self) -> Result<Graph, MasterError> {
+        self.inner.master.graph().await
+    }
+
+    /// Withdraws everything from the master and ends: connections to subscribers after their queues are written,
+    /// all within two seconds. What could not be withdrawn is logged.
+    pub async fn shutdown(mut self) {
+        let mut settled = self.inner.settled.subscribe();
+        let mut draining = self.inner.draining.subscribe();
+        self.inner.close();
+        self.inner.changed.notify_one();
+        let done = async {
+            tokio::join!(
+                settled.wait_for(|settled| *settled),
+                draining.wait_for(|open| *open == 0)
+            )
+        };
+        if timeout(SHUTDOWN_LIMIT, done).await.is_err() {
+            events::shutdown_incomplete(SHUTDOWN_LIMIT);
+        }
+        self.tasks.shutdown().await;
+    }
+}
+
+impl Drop for Node {
+    fn drop(&mut self) {
+        self.inner.close();
+    }
+}
+
+/// Where the node stands with its master.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MasterState {
+    /// Not found yet, or lost: the node looks for it.
+    Awaited,
+    /// The master has all registrations of this node.
+    Registered,
+}
+
+/// Why a node could not start or a topic could not be taken.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum NodeError {
+    /// Called outside a tokio runtime.
+    #[error("a node needs a running tokio runtime")]
+    NoRuntime,
+    /// A name that is no ROS name.
+    #[error(transparent)]
+    Name(#[from] NameError),
+    /// The master's URI is not `http://host:port`.
+    #[error("the master's URI `{0}` is not of the form http://host:11311 (ROS_MASTER_URI)")]
+    MasterUri(String),
+    /// No port to listen on.
+    #[error("cannot listen on {address}: {source}")]
+    Listen {
+        /// The address tried.
+        address: IpAddr,
+        /// What the system says.
+        #[source]
+        source: std::io::Error,
+    },
+    /// This node publishes the topic already.
+    #[error("{0} is already published by this node")]
+    AlreadyPublished(String),
+    /// The type has no package or no checksum.
+    #[error("{topic} cannot be published with the incomplete type `{type_name}`")]
+    Type {
+        /// The resolved topic.
+        topic: String,
+        /// The name given.
+        type_name: String,
+    },
+}
+
+/// What the node's handles and tasks share.
+#[derive(Debug)]
+pub(crate) struct Inner {
+    names: Names,
+    pub(crate) uri: String,
+    pub(crate) hostname: String,
+    pub(crate) topics_port: u16,
+    pub(crate) master: Master,
+    links: Arc<LinkContext>,
+    registry: Mutex<Registry>,
+    /// Rings when the registry no longer is what the master was told.
+    pub(crate) changed: Notify,
+    pub(crate) master_state: watch::Sender<MasterState>,
+    /// The reason once the master asked for it.
+    shutdown: watch::Sender<Option<String>>,
+    /// True once everything is closed and the master was told so.
+    pub(crate) settled: watch::Sender<bool>,
+    /// Connections to subscribers, those of withdrawn topics included.
+    draining: watch::Sender<usize>,
+    next_id: AtomicI32,
+}
+
+#[derive(Debug, Default)]
+struct Registry {
+    publications: HashMap<String, Arc<Hub>>,
+    subscriptions: HashMap<String, Subscribed>,
+    generation: u64,
+    closed: bool,
+}
+
+impl Registry {
+    const fn next_generation(&mut self) -> u64 {
+        self.generation += 1;
+        self.generation
+    }
+}
+
+#[derive(Debug)]
+struct Subscribed {
+    generation: u64,
+    /// How many lists of publishers have come.
+    updates: u64,
+    /// The last of them.
+    publishers: Vec<String>,
+    feeds: Vec<Arc<Feed>>,
+}
+
+/// What the master should know of one topic, and which version of it.
+#[derive(Clone, Debug)]
+pub(crate) struct Registration {
+    pub(crate) topic: String,
+    pub(crate) kind: TopicKind,
+    pub(crate) generation: u64,
+    pub(crate) type_name: String,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(crate) enum TopicKind {
+    Published,
+    Subscribed,
+}
+
+impl Inner {
+    pub(crate) fn name(&self) -> &str {
+        self.names.node()
+    }
+
+    pub(crate) fn next_connection_id(&self) -> i32 {
+        self.next_id.fetch_add(1, Ordering::Relaxed)
+    }
+
+    pub(crate) fn publication(&self, topic: &str) -> Option<Arc<Hub>> {
+        lock(&self.registry).publications.get(topic).cloned()
+    }
+
+    pub(crate) fn publications(&self) -> Vec<Arc<Hub>> {
+        lock(&self.registry)
+            .publications
+            .values()
+            .cloned()
+            .collect()
+    }
+
+    pub(crate) fn feeds(&self) -> Vec<Arc<Feed>> {
+        let registry = lock(&self.registry);
+        registry
+            .subscriptions
+            .values()
+            .flat_map(|entry| entry.feeds.iter().cloned())
+            .collect()
+    }
+
+    pub(crate) fn withdraw_publication(&self, hub: &Arc<Hub>) {
+        let mut registry = lock(&self.registry);
+        if registry
+            .publications
+            .get(&hub.topic)
+            .is_some_and(|known| Arc::ptr_eq(known, hub))
+        {
+            registry.publications.remove(&hub.topic);
+        }
+        drop(registry);
+        self.changed.notify_one();
+    }
+
+    pub(crate) fn withdraw_subscription(&self, feed: &Arc<Feed>) {
+        let mut registry = lock(&self.registry);
+        if let Some(entry) = registry.subscriptions.get_mut(&feed.topic) {
+            entry.feeds.retain(|known| !Arc::ptr_eq(known, feed));
+            if entry.feeds.is_empty() {
+                registry.subscriptions.remove(&feed.topic);
+            }
+        }
+        drop(registry);
+        self.changed.notify_one();
+    }
+
+    /// All that the master should know now.
+    pub(crate) fn wanted_registrations(&self) -> Vec<Registration> {
+        let registry = lock(&self.registry);
+        let published = registry.publications.values().map(|hub| Registration {
+            topic: hub.topic.clone(),
+            kind: TopicKind::Published,
+            generation: hub.generation,
+            type_name: hub.topic_type.name.clone(),
+        });
+        let subscribed = registry
+            .subscriptions
+            .iter()
+            .map(|(topic, entry)| Registration {
+                topic: topic.clone(),
+                kind: TopicKind::Subscribed,
+                generation: entry.generation,
+                type_name: entry
+                    .feeds
+                    .iter()
+                    .find_map(|feed| feed.wanted.type_name.clone())
+                    .unwrap_or_else(|| "*".to_owned()),
+            });
+        published.chain(subscribed).collect()
+    }
+
+    /// How many lists of publishers have come for a topic.
+    pub(crate) fn updates(&self, topic: &str) -> u64 {
+        lock(&self.registry)
+            .subscriptions
+            .get(topic)
+            .map_or(0, |entry| entry.updates)
+    }
+
+    /// Takes the list that answers a registration, unless a newer one came meanwhile.
+    pub(crate) fn registered_publishers(&self, topic: &str, publishers: &[String], seen: u64) {
+        if self.updates(topic) == seen {
+            self.publishers_changed(topic, publishers);
+        }
+    }
+
+    pub(crate) fn publishers_changed(&self, topic: &str, publishers: &[String]) {
+        let mut registry = lock(&self.registry);
+        if registry.closed {
+            return;
+        }
+        let Some(entry) = registry.subscriptions.get_mut(topic) else {
+            return;
+        };
+        entry.updates += 1;
+        entry.publishers = publishers.to_vec();
+        let feeds = entry.feeds.clone();
+        drop(registry);
+        for feed in feeds {
+            self.connect(&feed, publishers);
+        }
+    }
+
+    /// Links a feed to publishers other than this node itself.
+    fn connect(&self, feed: &Arc<Feed>, publishers: &[String]) {
+        let own = self.uri.trim_end_matches('/');
+        let others: Vec<String> = publishers
+            .iter()
+            .filter(|uri| uri.trim_end_matches('/') != own)
+            .cloned()
+            .collect();
+        feed.update(&others, &self.links, || self.next_connection_id());
+    }
+
+    /// Tells whoever waits in [`Node::shutdown_requested`].
+    pub(crate) fn ask_to_shut_down(&self, reason: &str) {
+        self.shutdown.send_if_modified(|asked| {
+            let first = asked.is_none();
+            asked.get_or_insert_with(|| reason.to_owned());
+            first
+        });
+    }
+
+    pub(crate) fn is_closed(&self) -> bool {
+        lock(&self.registry).closed
+    }
+
+    /// Ends all topics, for good.
+    fn close(&self) {
+        let mut registry = lock(&self.registry);
+        registry.closed = true;
+        let hubs: Vec<_> = registry.publications.drain().map(|(_, hub)| hub).collect();
+        let feeds: Vec<_> = registry
+            .subscriptions
+            .drain()
+            .flat_map(|(_, entry)| entry.feeds)
+            .collect();
+        drop(registry);
+        for hub in &hubs {
+            hub.close();
+        }
+        for feed in &feeds {
+            feed.close();
+        }
+    }
+}
+
+/// Listens on a port of the system's choosing.
+fn listen(address: IpAddr) -> Result<(TcpListener, u16), NodeError> {
+    let open = || {
+        let listener = std::net::TcpListener::bind((address, 0))?;
+        listener.set_nonblocking(true)?;
+        let port = listener.local_addr()?.port();
+        Ok((TcpListener::from_std(listener)?, port))
+    };
+    open().map_err(|source| NodeError::Listen { address, source })
+}
+
+/// An IPv6 address as it stands in a URI.
+fn bracketed(host: &str) -> String {
+    if host.contains(':') {
+        format!("[{host}]")
+    } else {
+        host.to_owned()
+    }
+}
+
+const SHUTDOWN_LIMIT: Duration = Duration::from_secs(2);

@@ -1,0 +1,359 @@
+//! Publishing: one topic, its subscribers, and the message a late one gets.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+
+use bytes::Bytes;
+use tokio::sync::watch;
+
+use crate::events;
+use crate::header::ConnectionHeader;
+use crate::node::Inner;
+use crate::outbox::{Limit, Outbox, lock};
+
+/// The type of a topic, as publishers and subscribers compare it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TopicType {
+    /// Such as `std_msgs/String`.
+    pub name: String,
+    /// Checksum of the definition, 32 hexadecimal digits.
+    pub md5sum: String,
+    /// Text of the definition with those it contains appended, as `rosbag` needs it.
+    pub definition: String,
+}
+
+/// How a publisher treats its subscribers.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PublisherOptions {
+    /// Whether late subscribers get the last message.
+    pub latch: bool,
+    /// How many messages may wait for one subscriber; then its oldest are dropped.
+    pub queue_messages: usize,
+    /// How many bytes may wait for one subscriber; then its oldest are dropped. The newest message is always kept.
+    pub queue_bytes: usize,
+}
+
+impl Default for PublisherOptions {
+    /// Not latched, 1000 messages, 16 MiB.
+    fn default() -> Self {
+        Self {
+            latch: false,
+            queue_messages: 1000,
+            queue_bytes: 16 * 1024 * 1024,
+        }
+    }
+}
+
+/// What became of one message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[must_use]
+pub struct Published {
+    /// Subscribers it was queued for.
+    pub sent_to: usize,
+    /// Older messages that gave way to it, over all subscribers.
+    pub dropped_oldest: u64,
+}
+
+/// Publishes on one topic. Dropping it withdraws the topic; what is queued is still sent, within a second.
+#[derive(Debug)]
+pub struct Publisher {
+    hub: Arc<Hub>,
+    node: Arc<Inner>,
+}
+
+impl Publisher {
+    pub(crate) const fn new(hub: Arc<Hub>, node: Arc<Inner>) -> Self {
+        Self { hub, node }
+    }
+
+    /// Queues a serialized message, without its length, for every subscriber. Never waits: a slow subscriber loses
+    /// its oldest messages and nobody else's. A message past 4 GiB has no length on the wire: it goes to nobody, with
+    /// a line in the log.
+    pub fn publish(&self, message: Bytes) -> Published {
+        self.hub.publish(message)
+    }
+
+    /// How many subscribers are connected.
+    pub fn subscribers(&self) -> usize {
+        lock(&self.hub.state).subscribers.len()
+    }
+
+    /// The topic's resolved name.
+    pub fn topic(&self) -> &str {
+        &self.hub.topic
+    }
+
+    /// Messages that slow subscribers have lost so far.
+    pub fn dropped(&self) -> u64 {
+        self.hub.dropped.load(Ordering::Relaxed)
+    }
+}
+
+impl Drop for Publisher {
+    fn drop(&mut self) {
+        self.hub.close();
+        self.node.withdraw_publication(&self.hub);
+    }
+}
+
+/// A published topic, shared by the publisher and the tasks that serve its subscribers.
+#[derive(Debug)]
+pub(crate) struct Hub {
+    pub(crate) topic: String,
+    pub(crate) topic_type: TopicType,
+    /// Tells this registration from an earlier one of the same topic.
+    pub(crate) generation: u64,
+    options: PublisherOptions,
+    state: Mutex<HubState>,
+    dropped: AtomicU64,
+    /// The node's count of connections to subscribers.
+    draining: watch::Sender<usize>,
+}
+
+#[derive(Debug, Default)]
+struct HubState {
+    subscribers: Vec<Arc<Subscriber>>,
+    latched: Option<Bytes>,
+    closed: bool,
+}
+
+/// One connected subscriber.
+#[derive(Debug)]
+pub(crate) struct Subscriber {
+    pub(crate) id: i32,
+    pub(crate) caller_id: String,
+    pub(crate) outbox: Outbox,
+    pub(crate) bytes: AtomicU64,
+    pub(crate) messages: AtomicU64,
+}
+
+impl Hub {
+    pub(crate) fn new(
+        topic: String,
+        topic_type: TopicType,
+        options: PublisherOptions,
+        generation: u64,
+        draining: watch::Sender<usize>,
+    ) -> Self {
+        Self {
+            topic,
+            topic_type,
+            generation,
+            options,
+            state: Mutex::default(),
+            dropped: AtomicU64::new(0),
+            draining,
+        }
+    }
+
+    fn publish(&self, message: Bytes) -> Published {
+        if u32::try_from(message.len()).is_err() {
+            events::message_too_long(&self.topic, message.len());
+            return Published {
+                sent_to: 0,
+                dropped_oldest: 0,
+            };
+        }
+        let mut state = lock(&self.state);
+        let mut published = Published {
+            sent_to: 0,
+            dropped_oldest: 0,
+        };
+        for subscriber in &state.subscribers {
+            published.dropped_oldest += subscriber.outbox.push(message.clone());
+            published.sent_to += 1;
+        }
+        if self.options.latch && !state.closed {
+            state.latched = Some(message);
+        }
+        drop(state);
+        self.dropped
+            .fetch_add(published.dropped_oldest, Ordering::Relaxed);
+        published
+    }
+
+    /// Adds a subscriber, its queue beginning with the latched message; `None` once the topic is withdrawn.
+    pub(crate) fn join(self: &Arc<Self>, id: i32, caller_id: &str) -> Option<Joined> {
+        let limit = Limit {
+            messages: self.options.queue_messages,
+            bytes: self.options.queue_bytes,
+        };
+        let subscriber = Arc::new(Subscriber {
+            id,
+            caller_id: caller_id.to_owned(),
+            outbox: Outbox::new(limit),
+            bytes: AtomicU64::new(0),
+            messages: AtomicU64::new(0),
+        });
+        let mut state = lock(&self.state);
+        if state.closed {
+            return None;
+        }
+        if let Some(latched) = &state.latched {
+            subscriber.outbox.push(latched.clone());
+        }
+        state.subscribers.push(Arc::clone(&subscriber));
+        drop(state);
+        self.draining.send_modify(|open| *open += 1);
+        Some(Joined {
+            hub: Arc::clone(self),
+            subscriber,
+        })
+    }
+
+    /// Ends the connections once their queues are written.
+    pub(crate) fn close(&self) {
+        let mut state = lock(&self.state);
+        state.closed = true;
+        state.latched = None;
+        for subscriber in &state.subscribers {
+            subscriber.outbox.close();
+        }
+    }
+
+    pub(crate) fn connected(&self) -> Vec<Arc<Subscriber>> {
+        lock(&self.state).subscribers.clone()
+    }
+
+    /// What a subscriber is told of this topic, or why it does not fit.
+    pub(crate) fn reply_to(
+        &self,
+        request: &ConnectionHeader,
+        own_name: &str,
+    ) -> Result<ConnectionHeader, String> {
+        let ours = &self.topic_type;
+        let fits = |wanted: Option<&str>, ours: &str| wanted.is_none_or(|w| w == "*" || w == ours);
+        let Some(md5sum) = request.md5sum() else {
+            return Err(
+                "Header from subscriber did not have the required elements: md5sum, topic"
+                    .to_owned(),
+            );
+        };
+        // As roscpp and rospy do it: the checksum decides. Names alone differ where packages were renamed.
+        if !fits(Some(md5sum), &ours.md5sum) {
+            return Err(format!(
+                "Client [{}] wants topic {} to have datatype/md5sum [{}/{md5sum}], but our version has [{}/{}]. Dropping connection.",
+                request.caller_id(),
+                self.topic,
+                request.type_name().unwrap_or("*"),
+                ours.name,
+                ours.md5sum,
+            ));
+        }
+        let reply = ConnectionHeader::default()
+            .with("callerid", own_name)
+            .with("md5sum", &*ours.md5sum)
+            .with("type", &*ours.name)
+            .with("message_definition", &*ours.definition)
+            .with("topic", &*self.topic)
+            .with("latching", if self.options.latch { "1" } else { "0" });
+        Ok(reply)
+    }
+}
+
+/// A subscriber's place at a topic, given up on drop.
+#[derive(Debug)]
+pub(crate) struct Joined {
+    pub(crate) hub: Arc<Hub>,
+    pub(crate) subscriber: Arc<Subscriber>,
+}
+
+impl Drop for Joined {
+    fn drop(&mut self) {
+        self.subscriber.outbox.close();
+        lock(&self.hub.state)
+            .subscribers
+            .retain(|other| !Arc::ptr_eq(other, &self.subscriber));
+        self.hub.draining.send_modify(|open| *open -= 1);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn hub(latch: bool) -> Arc<Hub> {
+        let topic_type = TopicType {
+            name: "std_msgs/String".to_owned(),
+            md5sum: "992ce8a1687cec8c8bd883ec73ca41d1".to_owned(),
+            definition: "string data\n".to_owned(),
+        };
+        let options = PublisherOptions {
+            latch,
+            queue_messages: 2,
+            ..PublisherOptions::default()
+        };
+        Arc::new(Hub::new(
+            "/chatter".to_owned(),
+            topic_type,
+            options,
+            1,
+            watch::Sender::new(0),
+        ))
+    }
+
+    fn request(md5sum: &str) -> ConnectionHeader {
+        ConnectionHeader::default()
+            .with("callerid", "/l")
+            .with("md5sum", md5sum)
+    }
+
+    #[test]
+    fn a_subscriber_of_any_type_is_told_ours_even_without_naming_one() {
+        let reply = hub(true).reply_to(&request("*"), "/n").unwrap();
+        assert_eq!(reply.type_name(), Some("std_msgs/String"));
+        assert_eq!(reply.message_definition(), Some("string data\n"));
+        assert_eq!(
+            (reply.caller_id(), reply.get("topic"), reply.latching()),
+            ("/n", Some("/chatter"), true)
+        );
+    }
+
+    #[test]
+    fn a_subscriber_of_another_checksum_is_told_both() {
+        let error = hub(false).reply_to(&request("0123"), "/n").unwrap_err();
+        assert!(
+            error.contains("[*/0123]") && error.contains("[std_msgs/String/992ce"),
+            "{error}"
+        );
+        assert!(
+            hub(false)
+                .reply_to(&ConnectionHeader::default(), "/n")
+                .unwrap_err()
+                .contains("required")
+        );
+    }
+
+    #[tokio::test]
+    async fn a_late_subscriber_gets_the_last_message_of_a_latched_topic_only() {
+        for latch in [true, false] {
+            let hub = hub(latch);
+            let none = hub.publish(Bytes::from_static(b"1"));
+            assert_eq!(
+                none,
+                Published {
+                    sent_to: 0,
+                    dropped_oldest: 0
+                }
+            );
+            let late = hub.join(1, "/late").unwrap();
+            hub.close();
+            let mut taken = Vec::new();
+            assert_eq!(late.subscriber.outbox.take(&mut taken, 64).await, latch);
+            assert_eq!(taken.len(), usize::from(latch));
+        }
+    }
+
+    #[test]
+    fn a_subscriber_that_does_not_read_costs_only_itself() {
+        let hub = hub(false);
+        let joined = hub.join(1, "/slow").unwrap();
+        let published: Vec<_> = (0..3u8)
+            .map(|n| hub.publish(Bytes::from(vec![n])).dropped_oldest)
+            .collect();
+        assert_eq!(published, [0, 0, 1]);
+        assert_eq!(joined.subscriber.outbox.dropped(), 1);
+        drop(joined);
+        assert_eq!(hub.publish(Bytes::new()).sent_to, 0);
+    }
+}

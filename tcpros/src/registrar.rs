@@ -1,0 +1,284 @@
+//! Keeps the master's knowledge of this node equal to what the node publishes and subscribes.
+//!
+//! It compares what should be registered with what the master was told and settles the difference, so the order in
+//! which topics come and go, a master that starts late, and one that restarts are the same case.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::task::JoinSet;
+use tokio::time::{Instant, sleep, timeout};
+
+use crate::clock::{self, Throttle};
+use crate::events;
+use crate::master::MasterError;
+use crate::node::{Inner, MasterState, Registration, TopicKind};
+
+/// Works until the node is closed and the master has been told.
+pub(crate) async fn run(node: Arc<Inner>) {
+    let mut chores = JoinSet::new();
+    chores.spawn(check_hostname(node.hostname.clone()));
+    let mut registrar = Registrar {
+        node: Arc::clone(&node),
+        told: HashMap::new(),
+        pid: None,
+        found: None,
+        checked: None,
+        refusals: Throttle::new(Duration::from_secs(30)),
+    };
+    let mut wait = TICK;
+    loop {
+        // Before the comparison: it then sees no more than what was there at closing.
+        let closed = node.is_closed();
+        match registrar.turn(closed).await {
+            Ok(()) => {
+                registrar.found();
+                wait = TICK;
+            }
+            Err(error) => {
+                registrar.lost(&error);
+                wait = if closed {
+                    Duration::ZERO
+                } else {
+                    (wait * 2).min(LONGEST_WAIT)
+                };
+            }
+        }
+        if closed && registrar.told.is_empty() {
+            node.settled.send_replace(true);
+            return;
+        }
+        tokio::select! {
+            () = node.changed.notified() => {}
+            () = sleep(wait) => {}
+        }
+    }
+}
+
+struct Registrar {
+    node: Arc<Inner>,
+    /// What the master was told, whether or not it has answered yet.
+    told: HashMap<(String, TopicKind), Told>,
+    pid: Option<i32>,
+    /// `None` before the first try.
+    found: Option<bool>,
+    checked: Option<Instant>,
+    refusals: Throttle,
+}
+
+#[derive(Clone, Copy)]
+struct Told {
+    generation: u64,
+    confirmed: bool,
+}
+
+enum Job {
+    Register {
+        registration: Registration,
+        replaces: bool,
+    },
+    Unregister {
+        topic: String,
+        kind: TopicKind,
+    },
+}
+
+type Outcome = ((String, TopicKind), Option<u64>, Result<(), MasterError>);
+
+impl Registrar {
+    async fn turn(&mut self, closed: bool) -> Result<(), MasterError> {
+        let due = self.checked.is_none_or(|at| at.elapsed() >= TICK) || self.found != Some(true);
+        if due && !closed {
+            self.check().await?;
+            self.checked = Some(clock::now());
+        }
+        let mut jobs = self.jobs();
+        let mut running: JoinSet<Outcome> = JoinSet::new();
+        let mut failure = None;
+        loop {
+            while failure.is_none()
+                && running.len() < PARALLEL
+                && let Some(job) = jobs.pop()
+            {
+                running.spawn(perform(Arc::clone(&self.node), job));
+            }
+            let Some(finished) = running.join_next().await else {
+                break;
+            };
+            if let Ok(outcome) = finished
+                && let Err(error) = self.note(outcome, closed)
+            {
+                failure = Some(error);
+            }
+        }
+        if closed && failure.is_some() {
+            // Nobody is there to be told: no use in trying what is left.
+            self.told.clear();
+        }
+        failure.map_or(Ok(()), Err)
+    }
+
+    /// Finds out whether the master is there, is the same as before, and still knows this node.
+    async fn check(&mut self) -> Result<(), MasterError> {
+        let master = &self.node.master;
+        let pid = master.pid().await?;
+        let other = self.pid.replace(pid).is_some_and(|before| before != pid);
+        let mut forgotten = other;
+        if !other && self.told.values().any(|told| told.confirmed) {
+            match master.lookup_node(self.node.name()).await? {
+                None => forgotten = true,
+                Some(uri) if uri != self.node.uri => {
+                    let reason = format!(
+                        "another node with the name {} runs at {uri}",
+                        self.node.name()
+                    );
+                    self.node.ask_to_shut_down(&reason);
+                }
+                Some(_) => {}
+            }
+        }
+        if forgotten && self.found == Some(true) {
+            events::master_restarted(master.uri());
+        }
+        if forgotten || self.found != Some(true) {
+            self.told
+                .values_mut()
+                .for_each(|told| told.confirmed = false);
+        }
+        Ok(())
+    }
+
+    fn jobs(&mut self) -> Vec<Job> {
+        let wanted = self.node.wanted_registrations();
+        let mut gone = self.told.clone();
+        let mut jobs = Vec::new();
+        for registration in wanted {
+            let key = (registration.topic.clone(), registration.kind);
+            let before = gone.remove(&key);
+            let current = before.filter(|told| told.generation == registration.generation);
+            if current.is_some_and(|told| told.confirmed) {
+                continue;
+            }
+            let told = Told {
+                generation: registration.generation,
+                confirmed: false,
+            };
+            self.told.insert(key, told);
+            let replaces = before.is_some() && current.is_none();
+            jobs.push(Job::Register {
+                registration,
+                replaces,
+            });
+        }
+        jobs.extend(
+            gone.into_keys()
+                .map(|(topic, kind)| Job::Unregister { topic, kind }),
+        );
+        jobs
+    }
+
+    /// Takes the result of one job. Only a master that cannot be reached is a failure of the turn.
+    fn note(&mut self, outcome: Outcome, closed: bool) -> Result<(), MasterError> {
+        let (key, registered, result) = outcome;
+        match (registered, result) {
+            (Some(generation), Ok(())) => {
+                if let Some(told) = self.told.get_mut(&key)
+                    && told.generation == generation
+                {
+                    told.confirmed = true;
+                }
+            }
+            (None, Ok(())) => {
+                self.told.remove(&key);
+            }
+            (Some(_), Err(error @ (MasterError::Refused { .. } | MasterError::Shape(_)))) => {
+                if self.refusals.admit(clock::now()).is_some() {
+                    events::registration_refused(&key.0, &error);
+                }
+            }
+            // A master that does not know the registration has nothing to forget.
+            (None, Err(MasterError::Refused { .. } | MasterError::Shape(_))) => {
+                self.told.remove(&key);
+            }
+            (None, Err(error)) if closed => {
+                events::unregistration_failed(&key.0, &error);
+                return Err(error);
+            }
+            (_, Err(error)) => return Err(error),
+        }
+        Ok(())
+    }
+
+    fn found(&mut self) {
+        if self.found.replace(true) != Some(true) {
+            events::master_found(self.node.master.uri());
+            self.node.master_state.send_replace(MasterState::Registered);
+        }
+    }
+
+    fn lost(&mut self, error: &MasterError) {
+        if self.found.replace(false) != Some(false) {
+            events::master_awaited(self.node.master.uri(), error);
+            self.node.master_state.send_replace(MasterState::Awaited);
+        }
+    }
+}
+
+async fn perform(node: Arc<Inner>, job: Job) -> Outcome {
+    let master = &node.master;
+    match job {
+        Job::Register {
+            registration,
+            replaces,
+        } => {
+            let Registration {
+                topic,
+                kind,
+                generation,
+                type_name,
+            } = registration;
+            let result = async {
+                if replaces {
+                    unregister(&node, &topic, kind).await?;
+                }
+                match kind {
+                    TopicKind::Published => master.register_publisher(&topic, &type_name).await,
+                    TopicKind::Subscribed => {
+                        let seen = node.updates(&topic);
+                        let publishers = master.register_subscriber(&topic, &type_name).await?;
+                        node.registered_publishers(&topic, &publishers, seen);
+                        Ok(())
+                    }
+                }
+            };
+            let result = result.await;
+            ((topic, kind), Some(generation), result)
+        }
+        Job::Unregister { topic, kind } => {
+            let result = unregister(&node, &topic, kind).await;
+            ((topic, kind), None, result)
+        }
+    }
+}
+
+async fn unregister(node: &Inner, topic: &str, kind: TopicKind) -> Result<(), MasterError> {
+    match kind {
+        TopicKind::Published => node.master.unregister_publisher(topic).await,
+        TopicKind::Subscribed => node.master.unregister_subscriber(topic).await,
+    }
+}
+
+/// The commonest set-up fault of ROS 1: a node that others cannot reach under the name it gives.
+async fn check_hostname(hostname: String) {
+    let lookup = tokio::net::lookup_host((hostname.as_str(), 0));
+    match timeout(Duration::from_secs(10), lookup).await {
+        Ok(Ok(_)) => {}
+        Ok(Err(error)) => events::hostname_unresolvable(&hostname, &error),
+        Err(error) => events::hostname_unresolvable(&hostname, &error),
+    }
+}
+
+const TICK: Duration = Duration::from_secs(1);
+const LONGEST_WAIT: Duration = Duration::from_secs(2);
+const PARALLEL: usize = 16;

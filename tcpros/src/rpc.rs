@@ -1,0 +1,366 @@
+//! XML-RPC over HTTP, both ends, with a time limit on everything.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use http_body_util::{BodyExt, Full, Limited};
+use hyper::body::{Body, Incoming};
+use hyper::header::{CONTENT_TYPE, HOST, HeaderValue};
+use hyper::service::service_fn;
+use hyper::{Method, Request, StatusCode};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use thiserror::Error;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Semaphore;
+use tokio::task::JoinSet;
+use tokio::time::timeout;
+
+use crate::events;
+use crate::xmlrpc::{Call, Fault, Response, Value, XmlError, encode_response, parse_response};
+
+/// Where an XML-RPC server listens.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub(crate) struct Endpoint {
+    host: String,
+    port: u16,
+    path: String,
+}
+
+impl Endpoint {
+    /// Reads `http://host:port[/path]`.
+    pub(crate) fn parse(uri: &str) -> Option<Self> {
+        let rest = uri.trim().strip_prefix("http://")?;
+        let (authority, path) = rest.find('/').map_or((rest, "/"), |at| rest.split_at(at));
+        let (host, port) = authority.rsplit_once(':')?;
+        let host = host
+            .strip_prefix('[')
+            .and_then(|h| h.strip_suffix(']'))
+            .unwrap_or(host);
+        let plain = |text: &str| text.bytes().all(|b| b.is_ascii_graphic());
+        if host.is_empty() || !plain(host) || !plain(path) {
+            return None;
+        }
+        Some(Self {
+            host: host.to_owned(),
+            port: port.parse().ok()?,
+            path: path.to_owned(),
+        })
+    }
+}
+
+/// Calls a method and waits for its result at most `limit`.
+pub(crate) async fn call(
+    endpoint: &Endpoint,
+    method: &str,
+    params: Vec<Value>,
+    limit: Duration,
+) -> Result<Value, RpcError> {
+    let body = Call {
+        method: method.to_owned(),
+        params,
+    }
+    .encode();
+    let exchange = Box::pin(exchange(endpoint, body));
+    let document = timeout(limit, exchange)
+        .await
+        .map_err(|_| RpcError::Timeout(limit))??;
+    Ok(parse_response(&document)??)
+}
+
+async fn exchange(endpoint: &Endpoint, body: String) -> Result<Bytes, RpcError> {
+    let stream = connect(&endpoint.host, endpoint.port)
+        .await
+        .map_err(RpcError::Connect)?;
+    let (mut sender, connection) = hyper::client::conn::http1::Builder::new()
+        .handshake(TokioIo::new(stream))
+        .await?;
+    let host = format!("{}:{}", endpoint.host, endpoint.port);
+    let request = Request::post(&endpoint.path)
+        .header(HOST, host)
+        .header(CONTENT_TYPE, XML)
+        .header("Connection", "close")
+        .body(Full::new(Bytes::from(body)))
+        .map_err(|_| RpcError::Uri)?;
+    let answer = async {
+        let response = sender.send_request(request).await?;
+        let status = response.status();
+        if status != StatusCode::OK {
+            return Err(RpcError::Status(status.as_u16()));
+        }
+        let body = Limited::new(response.into_body(), MAX_BODY).collect().await;
+        Ok(body
+            .map_err(|error| RpcError::Body(error.to_string()))?
+            .to_bytes())
+    };
+    // The connection does the reading and writing; once it ends, what it has read still waits in the response.
+    let drive = async {
+        if let Err(error) = connection.await {
+            tracing::trace!(%error, "an XML-RPC connection ended early");
+        }
+        std::future::pending().await
+    };
+    tokio::select! {
+        result = answer => result,
+        never = drive => never,
+    }
+}
+
+/// Connects with Nagle's algorithm off, to the IPv4 addresses of a name first, as ROS 1 peers listen there.
+pub(crate) async fn connect(host: &str, port: u16) -> std::io::Result<TcpStream> {
+    let mut addresses: Vec<SocketAddr> = tokio::net::lookup_host((host, port)).await?.collect();
+    addresses.sort_by_key(SocketAddr::is_ipv6);
+    let stream = TcpStream::connect(addresses.as_slice()).await?;
+    stream.set_nodelay(true)?;
+    Ok(stream)
+}
+
+/// Answers calls on a listener until it is dropped. The handler must not wait: it runs in the connection's task.
+pub(crate) async fn serve<H>(listener: TcpListener, handler: H)
+where
+    H: Fn(Call) -> Response + Send + Sync + 'static,
+{
+    let handler = Arc::new(handler);
+    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    // Dropping the set ends the connections with the server.
+    let mut connections = JoinSet::new();
+    let mut refusals = events::Refusals::new("XML-RPC");
+    loop {
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            Some(_) = connections.join_next() => continue,
+        };
+        let stream = match accepted {
+            Ok((stream, _)) => stream,
+            Err(error) => {
+                refusals.accept_failed(&error).await;
+                continue;
+            }
+        };
+        let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
+            refusals.too_many(MAX_CONNECTIONS);
+            continue;
+        };
+        let handler = Arc::clone(&handler);
+        connections.spawn(async move {
+            answer_connection(stream, handler).await;
+            drop(place);
+        });
+    }
+}
+
+async fn answer_connection<H>(stream: TcpStream, handler: Arc<H>)
+where
+    H: Fn(Call) -> Response + Send + Sync + 'static,
+{
+    if let Err(error) = stream.set_nodelay(true) {
+        tracing::debug!(%error, "an XML-RPC caller left at once");
+        return;
+    }
+    let service = service_fn(move |request| answer(request, Arc::clone(&handler)));
+    let served = hyper::server::conn::http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(READ_LIMIT)
+        // XmlRpc++ of old looks for `Content-length`, in some case or other.
+        .title_case_headers(true)
+        .serve_connection(TokioIo::new(stream), service)
+        .await;
+    if let Err(error) = served {
+        tracing::debug!(%error, "an XML-RPC caller was dropped");
+    }
+}
+
+async fn answer<H>(
+    request: Request<Incoming>,
+    handler: Arc<H>,
+) -> Result<hyper::Response<Full<Bytes>>, std::convert::Infallible>
+where
+    H: Fn(Call) -> Response + Send + Sync + 'static,
+{
+    if request.method() != Method::POST {
+        return Ok(plain(StatusCode::METHOD_NOT_ALLOWED));
+    }
+    if usize::try_from(request.body().size_hint().lower()).map_or(true, |size| size > MAX_BODY) {
+        return Ok(plain(StatusCode::PAYLOAD_TOO_LARGE));
+    }
+    let body = Limited::new(request.into_body(), MAX_BODY).collect();
+    let document = match timeout(READ_LIMIT, body).await {
+        Ok(Ok(body)) => body.to_bytes(),
+        Ok(Err(error)) if error.is::<http_body_util::LengthLimitError>() => {
+            return Ok(plain(StatusCode::PAYLOAD_TOO_LARGE));
+        }
+        Ok(Err(_)) => return Ok(plain(StatusCode::BAD_REQUEST)),
+        Err(_) => return Ok(plain(StatusCode::REQUEST_TIMEOUT)),
+    };
+    let response = match Call::parse(&document) {
+        Ok(call) => handler(call),
+        Err(error) => Err(Fault {
+            code: -1,
+            message: format!("malformed call: {error}"),
+        }),
+    };
+    let mut reply = hyper::Response::new(Full::new(Bytes::from(encode_response(&response))));
+    reply
+        .headers_mut()
+        .insert(CONTENT_TYPE, HeaderValue::from_static(XML));
+    Ok(reply)
+}
+
+fn plain(status: StatusCode) -> hyper::Response<Full<Bytes>> {
+    let mut response = hyper::Response::new(Full::default());
+    *response.status_mut() = status;
+    response
+}
+
+/// Why a call brought no result.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum RpcError {
+    /// The URI of the server is not `http://host:port`.
+    #[error("the URI is not http://host:port")]
+    Uri,
+    /// Nobody listens there, or the name does not resolve.
+    #[error("no connection: {0}")]
+    Connect(#[source] std::io::Error),
+    /// No answer in time.
+    #[error("no answer within {0:?}")]
+    Timeout(Duration),
+    /// The peer does not speak HTTP, or stopped midway.
+    #[error("HTTP failed: {0}")]
+    Http(#[from] hyper::Error),
+    /// The answer's body did not arrive or is longer than 4 MiB.
+    #[error("the answer was not read: {0}")]
+    Body(String),
+    /// A status other than 200.
+    #[error("HTTP status {0}")]
+    Status(u16),
+    /// The answer is not XML-RPC.
+    #[error("the answer is not XML-RPC: {0}")]
+    Xml(#[from] XmlError),
+    /// The method failed at the peer.
+    #[error(transparent)]
+    Fault(#[from] Fault),
+}
+
+const XML: &str = "text/xml";
+const MAX_BODY: usize = 4 * 1024 * 1024;
+const MAX_CONNECTIONS: usize = 256;
+const READ_LIMIT: Duration = Duration::from_secs(30);
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+
+    use super::*;
+
+    async fn echo_server() -> (u16, JoinSet<()>) {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let mut tasks = JoinSet::new();
+        tasks.spawn(serve(listener, |call| Ok(Value::Array(call.params))));
+        (port, tasks)
+    }
+
+    fn endpoint(port: u16) -> Endpoint {
+        Endpoint::parse(&format!("http://127.0.0.1:{port}/")).unwrap()
+    }
+
+    async fn raw(port: u16, request: &str) -> String {
+        let mut stream = TcpStream::connect(("127.0.0.1", port)).await.unwrap();
+        stream.write_all(request.as_bytes()).await.unwrap();
+        let mut answer = String::new();
+        let read = stream.read_to_string(&mut answer);
+        timeout(Duration::from_secs(5), read)
+            .await
+            .expect("the connection stays open")
+            .unwrap();
+        answer
+    }
+
+    #[test]
+    fn an_endpoint_is_host_and_port() {
+        let parsed = Endpoint::parse("http://robot.local:4711/RPC2").unwrap();
+        assert_eq!(
+            (parsed.host.as_str(), parsed.port, parsed.path.as_str()),
+            ("robot.local", 4711, "/RPC2")
+        );
+        assert_eq!(Endpoint::parse("http://[::1]:1").unwrap().host, "::1");
+        for bad in [
+            "robot:1",
+            "http://robot",
+            "http://:1",
+            "https://a:1",
+            "http://a:70000",
+            "http://a b:1",
+        ] {
+            assert_eq!(Endpoint::parse(bad), None, "{bad}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_call_comes_back() {
+        let (port, _tasks) = echo_server().await;
+        let params = vec![Value::Int(1), "<&>".into()];
+        let result = call(&endpoint(port), "echo", params.clone(), READ_LIMIT)
+            .await
+            .unwrap();
+        assert_eq!(result, Value::Array(params));
+    }
+
+    #[tokio::test]
+    async fn a_caller_of_http_1_0_is_answered_and_the_connection_closed() {
+        let (port, _tasks) = echo_server().await;
+        let body = Call {
+            method: "m".to_owned(),
+            params: vec![],
+        }
+        .encode();
+        let request = format!(
+            "POST /RPC2 HTTP/1.0\r\nContent-Length: {}\r\n\r\n{body}",
+            body.len()
+        );
+        let answer = raw(port, &request).await;
+        assert!(answer.starts_with("HTTP/1.0 200"), "{answer}");
+        assert!(answer.contains("<methodResponse>"), "{answer}");
+    }
+
+    #[tokio::test]
+    async fn a_caller_that_asks_to_close_is_not_left_hanging() {
+        let (port, _tasks) = echo_server().await;
+        let body = "garbage";
+        let request = format!(
+            "POST / HTTP/1.1\r\nHost: x\r\nConnection: close\r\nContent-Length: 7\r\n\r\n{body}"
+        );
+        let answer = raw(port, &request).await;
+        assert!(
+            answer.contains("<fault>") && answer.contains("malformed call"),
+            "{answer}"
+        );
+    }
+
+    #[tokio::test]
+    async fn a_body_past_the_limit_and_a_get_are_refused() {
+        let (port, _tasks) = echo_server().await;
+        let answer = raw(
+            port,
+            "POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 99999999\r\nConnection: close\r\n\r\n",
+        )
+        .await;
+        assert!(answer.starts_with("HTTP/1.1 413"), "{answer}");
+        let answer = raw(
+            port,
+            "GET / HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n",
+        )
+        .await;
+        assert!(answer.starts_with("HTTP/1.1 405"), "{answer}");
+    }
+
+    #[tokio::test]
+    async fn a_server_that_never_answers_ends_in_a_timeout() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let silent = endpoint(listener.local_addr().unwrap().port());
+        let result = call(&silent, "m", vec![], Duration::from_millis(50)).await;
+        assert!(matches!(result, Err(RpcError::Timeout(_))));
+    }
+}

@@ -1,0 +1,179 @@
+//! The slave API: what the master, other nodes and `rosnode` ask of this node.
+//!
+//! Every call is answered at once; what it sets in motion goes on in tasks of its own.
+
+use std::sync::atomic::Ordering;
+
+use crate::events;
+use crate::master::strings;
+use crate::node::Inner;
+use crate::xmlrpc::{Call, Fault, Response, Value};
+
+/// Answers one call.
+pub(crate) fn answer(node: &Inner, call: Call) -> Response {
+    let params = call.params.as_slice();
+    match call.method.as_str() {
+        "getPid" => Ok(done(i32::try_from(std::process::id()).unwrap_or(0))),
+        "getMasterUri" => Ok(done(node.master.uri())),
+        "getPublications" => Ok(done(publications(node))),
+        "getSubscriptions" => Ok(done(subscriptions(node))),
+        "getBusStats" => Ok(done(bus_stats(node))),
+        "getBusInfo" => Ok(done(bus_info(node))),
+        "publisherUpdate" => Ok(publisher_update(node, params)),
+        "requestTopic" => Ok(request_topic(node, params)),
+        // No parameter is cached here, so none can be stale.
+        "paramUpdate" => Ok(done(0)),
+        "shutdown" => Ok(shutdown(node, params)),
+        other => Err(Fault {
+            code: -1,
+            message: format!("no such method: {other}"),
+        }),
+    }
+}
+
+fn publisher_update(node: &Inner, params: &[Value]) -> Value {
+    let [_, Value::String(topic), publishers] = params else {
+        return refused("publisherUpdate takes (caller_id, topic, publishers)");
+    };
+    let Some(publishers) = strings(publishers) else {
+        return refused("publishers must be a list of strings");
+    };
+    node.publishers_changed(topic, &publishers);
+    done(0)
+}
+
+fn request_topic(node: &Inner, params: &[Value]) -> Value {
+    let [_, Value::String(topic), Value::Array(protocols)] = params else {
+        return refused("requestTopic takes (caller_id, topic, protocols)");
+    };
+    if node.publication(topic).is_none() {
+        return triple(-1, &format!("not a publisher of [{topic}]"), Vec::new());
+    }
+    let tcpros = |protocol: &Value| {
+        protocol
+            .as_array()
+            .and_then(<[Value]>::first)
+            .and_then(Value::as_str)
+            == Some("TCPROS")
+    };
+    if !protocols.iter().any(tcpros) {
+        return triple(0, "only TCPROS is spoken here", Vec::new());
+    }
+    let port = i32::from(node.topics_port);
+    let chosen = vec!["TCPROS".into(), node.hostname.as_str().into(), port.into()];
+    triple(1, &format!("ready on {}:{port}", node.hostname), chosen)
+}
+
+fn shutdown(node: &Inner, params: &[Value]) -> Value {
+    let reason = params.get(1).and_then(Value::as_str).unwrap_or("");
+    events::shutdown_asked(reason);
+    node.ask_to_shut_down(reason);
+    done(0)
+}
+
+fn publications(node: &Inner) -> Value {
+    let pair = |hub: &std::sync::Arc<crate::publisher::Hub>| {
+        Value::Array(vec![
+            hub.topic.as_str().into(),
+            hub.topic_type.name.as_str().into(),
+        ])
+    };
+    Value::Array(node.publications().iter().map(pair).collect())
+}
+
+fn subscriptions(node: &Inner) -> Value {
+    let pair = |feed: &std::sync::Arc<crate::subscription::Feed>| {
+        let wanted = feed.wanted.type_name.as_deref().unwrap_or("*");
+        Value::Array(vec![feed.topic.as_str().into(), wanted.into()])
+    };
+    Value::Array(node.feeds().iter().map(pair).collect())
+}
+
+/// `[publishStats, subscribeStats, serviceStats]`.
+fn bus_stats(node: &Inner) -> Value {
+    let mut published = Vec::new();
+    for hub in node.publications() {
+        let (mut total, mut connections) = (0u64, Vec::new());
+        for subscriber in hub.connected() {
+            let bytes = subscriber.bytes.load(Ordering::Relaxed);
+            let messages = subscriber.messages.load(Ordering::Relaxed);
+            total = total.saturating_add(bytes);
+            connections.push(Value::Array(vec![
+                subscriber.id.into(),
+                count(bytes),
+                count(messages),
+                Value::Bool(true),
+            ]));
+        }
+        published.push(vec![hub.topic.as_str().into(), count(total), connections.into()].into());
+    }
+    let mut subscribed = Vec::new();
+    for feed in node.feeds() {
+        let connection = |(_, link): (String, std::sync::Arc<crate::subscription::LinkState>)| {
+            let bytes = count(link.bytes.load(Ordering::Relaxed));
+            Value::Array(vec![
+                link.id.into(),
+                bytes,
+                count(feed.dropped()),
+                Value::Bool(true),
+            ])
+        };
+        let connections: Vec<Value> = feed.connections().into_iter().map(connection).collect();
+        subscribed.push(vec![feed.topic.as_str().into(), connections.into()].into());
+    }
+    let services = vec![0.into(), 0.into(), 0.into()];
+    Value::Array(vec![
+        Value::Array(published),
+        Value::Array(subscribed),
+        Value::Array(services),
+    ])
+}
+
+/// `[connectionId, destinationId, direction, transport, topic, connected]` per connection.
+fn bus_info(node: &Inner) -> Value {
+    let entry = |id: i32, peer: &str, direction: &str, topic: &str| {
+        Value::Array(vec![
+            id.into(),
+            peer.into(),
+            direction.into(),
+            "TCPROS".into(),
+            topic.into(),
+            Value::Bool(true),
+        ])
+    };
+    let mut entries = Vec::new();
+    for hub in node.publications() {
+        let connected = hub.connected();
+        entries.extend(
+            connected
+                .iter()
+                .map(|s| entry(s.id, &s.caller_id, "o", &hub.topic)),
+        );
+    }
+    for feed in node.feeds() {
+        let connected = feed.connections();
+        entries.extend(
+            connected
+                .iter()
+                .map(|(uri, link)| entry(link.id, uri, "i", &feed.topic)),
+        );
+    }
+    Value::Array(entries)
+}
+
+/// XML-RPC integers have 32 bits: counts stop at their end.
+fn count(number: u64) -> Value {
+    Value::Int(i32::try_from(number).unwrap_or(i32::MAX))
+}
+
+fn done(result: impl Into<Value>) -> Value {
+    triple(1, "", result)
+}
+
+fn refused(message: &str) -> Value {
+    triple(-1, message, 0)
+}
+
+fn triple(code: i32, message: &str, result: impl Into<Value>) -> Value {
+    Value::Array(vec![code.into(), message.into(), result.into()])
+}

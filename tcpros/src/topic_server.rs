@@ -1,0 +1,236 @@
+//! Where subscribers connect: accepting, the handshake, and writing to each on its own.
+//!
+//! The accept loop only accepts. Each connection is one task, which ends with the connection, with its publisher, or
+//! with the node, whose accept task owns them all.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::Duration;
+
+use bytes::{Buf, BufMut, Bytes, BytesMut};
+use thiserror::Error;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::tcp::{ReadHalf, WriteHalf};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Semaphore;
+use tokio::task::JoinSet;
+use tokio::time::{sleep, timeout};
+
+use crate::events::{self, Refusals};
+use crate::header::{ConnectionHeader, HeaderError};
+use crate::link::prepare;
+use crate::node::Inner;
+use crate::outbox::Outbox;
+use crate::publisher::{Joined, Subscriber};
+
+/// Serves the subscribers of all topics of a node until it is dropped.
+pub(crate) async fn serve(listener: TcpListener, node: Arc<Inner>) {
+    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    let mut connections: JoinSet<Result<(), (SocketAddr, Refused)>> = JoinSet::new();
+    let mut refusals = Refusals::new("TCPROS");
+    loop {
+        let accepted = tokio::select! {
+            accepted = listener.accept() => accepted,
+            Some(ended) = connections.join_next() => {
+                if let Ok(Err((peer, error))) = ended {
+                    refusals.handshake_failed(&peer, &error);
+                }
+                continue;
+            }
+        };
+        let (stream, peer) = match accepted {
+            Ok(accepted) => accepted,
+            Err(error) => {
+                refusals.accept_failed(&error).await;
+                continue;
+            }
+        };
+        let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
+            refusals.too_many(MAX_CONNECTIONS);
+            continue;
+        };
+        let node = Arc::clone(&node);
+        connections.spawn(async move {
+            let served = serve_one(stream, &node)
+                .await
+                .map_err(|error| (peer, error));
+            drop(place);
+            served
+        });
+    }
+}
+
+async fn serve_one(mut stream: TcpStream, node: &Inner) -> Result<(), Refused> {
+    let handshake = timeout(HANDSHAKE_LIMIT, shake_hands(&mut stream, node));
+    let joined = handshake
+        .await
+        .map_err(|_| Refused::Silent(HANDSHAKE_LIMIT))??;
+    let subscriber = &joined.subscriber;
+    let ended = write_messages(&mut stream, subscriber).await;
+    let dropped = subscriber.outbox.dropped();
+    events::subscriber_left(&joined.hub.topic, &subscriber.caller_id, dropped, &ended);
+    Ok(())
+}
+
+async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Joined, Refused> {
+    prepare(stream)?;
+    let request = ConnectionHeader::read(stream).await?;
+    match admit(&request, node) {
+        Ok((reply, joined)) => {
+            stream.write_all(&reply.encode()?).await?;
+            let nodelay = request.get("tcp_nodelay") == Some("1");
+            events::subscriber_joined(&joined.hub.topic, &joined.subscriber.caller_id, nodelay);
+            Ok(joined)
+        }
+        Err(error) => {
+            let reply = ConnectionHeader::default().with("error", &*error);
+            stream.write_all(&reply.encode()?).await?;
+            stream.shutdown().await?;
+            Err(Refused::Mismatch(error))
+        }
+    }
+}
+
+/// Joins before the reply is written, so that what is published from then on arrives.
+fn admit(request: &ConnectionHeader, node: &Inner) -> Result<(ConnectionHeader, Joined), String> {
+    if let Some(service) = request.get("service") {
+        return Err(format!("service [{service}] is not provided by this node"));
+    }
+    let Some(topic) = request.get("topic") else {
+        return Err(
+            "Header from subscriber did not have the required elements: md5sum, topic".to_owned(),
+        );
+    };
+    let caller = request.caller_id();
+    let gone =
+        || format!("received a connection for a nonexistent topic [{topic}] from [{caller}]");
+    let hub = node.publication(topic).ok_or_else(gone)?;
+    let reply = hub.reply_to(request, node.name())?;
+    let joined = hub
+        .join(node.next_connection_id(), caller)
+        .ok_or_else(gone)?;
+    Ok((reply, joined))
+}
+
+async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ended {
+    let outbox = &subscriber.outbox;
+    let (mut reader, mut writer) = stream.split();
+    let mut waiting = Vec::new();
+    let mut batch = BytesMut::new();
+    loop {
+        waiting.clear();
+        // Both branches are cancel-safe: `take` takes nothing before it returns, and what is read is of no use.
+        let more = tokio::select! {
+            biased;
+            more = outbox.take(&mut waiting, BATCH) => more,
+            ended = until_closed(&mut reader) => return ended,
+        };
+        if !more {
+            return Ended::Withdrawn;
+        }
+        let bytes: usize = waiting.iter().map(|message| message.len() + 4).sum();
+        let messages = waiting.len();
+        for message in waiting.drain(..) {
+            batch.put_slice(&length(&message));
+            if message.len() <= COPIED {
+                batch.put_slice(&message);
+            } else if let Err(ended) =
+                write(&mut writer, batch.split().freeze(), message, outbox).await
+            {
+                return ended;
+            }
+        }
+        if let Err(ended) = write(&mut writer, batch.split().freeze(), Bytes::new(), outbox).await {
+            return ended;
+        }
+        subscriber
+            .bytes
+            .fetch_add(u64::try_from(bytes).unwrap_or(u64::MAX), Ordering::Relaxed);
+        subscriber.messages.fetch_add(
+            u64::try_from(messages).unwrap_or(u64::MAX),
+            Ordering::Relaxed,
+        );
+    }
+}
+
+/// Writes two pieces as one, the second without copying it, as long as the peer takes at least something in time.
+async fn write(
+    writer: &mut WriteHalf<'_>,
+    head: Bytes,
+    body: Bytes,
+    outbox: &Outbox,
+) -> Result<(), Ended> {
+    let mut data = head.chain(body);
+    while data.has_remaining() {
+        let overdue = async {
+            outbox.closed().await;
+            sleep(DRAIN_LIMIT).await;
+        };
+        tokio::select! {
+            biased;
+            written = writer.write_buf(&mut data) => match written {
+                Ok(0) => return Err(Ended::Closed),
+                Ok(_) => {}
+                Err(error) => return Err(Ended::Failed(error)),
+            },
+            () = sleep(STALL_LIMIT) => return Err(Ended::Stalled),
+            () = overdue => return Err(Ended::Withdrawn),
+        }
+    }
+    Ok(())
+}
+
+/// A subscriber has nothing to say after its header: reading is how its leaving is noticed.
+async fn until_closed(reader: &mut ReadHalf<'_>) -> Ended {
+    let mut nothing = [0; 256];
+    loop {
+        match reader.read(&mut nothing).await {
+            Ok(0) => return Ended::Closed,
+            Ok(_) => {}
+            Err(error) => return Ended::Failed(error),
+        }
+    }
+}
+
+fn length(message: &Bytes) -> [u8; 4] {
+    // `publish` lets nothing longer in.
+    u32::try_from(message.len())
+        .unwrap_or(u32::MAX)
+        .to_le_bytes()
+}
+
+/// Why a peer was turned away.
+#[derive(Debug, Error)]
+enum Refused {
+    #[error("it sent no connection header within {0:?}")]
+    Silent(Duration),
+    #[error(transparent)]
+    Header(#[from] HeaderError),
+    #[error("{0}")]
+    Mismatch(String),
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+}
+
+/// How a subscriber's connection came to its end.
+#[derive(Debug, Error)]
+enum Ended {
+    #[error("it closed the connection")]
+    Closed,
+    #[error("the topic was withdrawn")]
+    Withdrawn,
+    #[error("it took nothing for {STALL_LIMIT:?}")]
+    Stalled,
+    #[error("the connection failed: {0}")]
+    Failed(std::io::Error),
+}
+
+const MAX_CONNECTIONS: usize = 4096;
+const HANDSHAKE_LIMIT: Duration = Duration::from_secs(5);
+const STALL_LIMIT: Duration = Duration::from_secs(10);
+const DRAIN_LIMIT: Duration = Duration::from_secs(1);
+/// Messages written in one go.
+const BATCH: usize = 64 * 1024;
+/// Up to here copying a message into the batch is cheaper than a write of its own.
+const COPIED: usize = 16 * 1024;
