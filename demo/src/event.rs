@@ -41,11 +41,18 @@ pub(crate) enum MasterEvent {
 pub(crate) enum SupervisorEvent {
     Connected,
     /// These values have not come to the server yet.
-    Awaits { names: Vec<Name> },
+    Awaits {
+        names: Vec<Name>,
+    },
     /// It has written the switch of the conveyor.
-    Switched { on: bool },
+    Switched {
+        on: bool,
+    },
     /// The server has a new value; the stamp is the server's.
-    Saw { name: Name, value: Value },
+    Saw {
+        name: Name,
+        value: Value,
+    },
 }
 
 /// The two kinds of values of the line.
@@ -72,7 +79,10 @@ pub(crate) fn tell(event: impl Into<Event>) -> io::Result<()> {
 
 /// Tells of an event that happened at `at_ns`.
 pub(crate) fn tell_at(at_ns: i64, event: impl Into<Event>) -> io::Result<()> {
-    let mut line = serde_json::to_vec(&Stamped { at_ns, event: event.into() })?;
+    let mut line = serde_json::to_vec(&Stamped {
+        at_ns,
+        event: event.into(),
+    })?;
     line.push(b'\n');
     let mut out = io::stdout().lock();
     out.write_all(&line)?;
@@ -111,17 +121,38 @@ mod tests {
     #[test]
     fn every_kind_of_event_comes_back_as_it_was_told() {
         let events: [Event; 6] = [
-            MasterEvent::Listening { uri: "http://127.0.0.1:1/".to_owned() }.into(),
-            NiryoEvent::Waits { cause: WaitCause::ParkFree }.into(),
+            MasterEvent::Listening {
+                uri: "http://127.0.0.1:1/".to_owned(),
+            }
+            .into(),
+            NiryoEvent::Waits {
+                cause: WaitCause::ParkFree,
+            }
+            .into(),
             NiryoEvent::StorageEmpty.into(),
             TurtlebotEvent::Unloaded { total: 3 }.into(),
-            SupervisorEvent::Saw { name: Name::ParkBusy, value: Value::Boolean(true) }.into(),
-            SupervisorEvent::Saw { name: Name::CoversInStorage, value: Value::Number(4) }.into(),
+            SupervisorEvent::Saw {
+                name: Name::ParkBusy,
+                value: Value::Boolean(true),
+            }
+            .into(),
+            SupervisorEvent::Saw {
+                name: Name::CoversInStorage,
+                value: Value::Number(4),
+            }
+            .into(),
         ];
         for event in events {
-            let stamped = Stamped { at_ns: 1_700_000_000_123_456_789, event };
+            let stamped = Stamped {
+                at_ns: 1_700_000_000_123_456_789,
+                event,
+            };
             let text = serde_json::to_string(&stamped).unwrap();
-            assert_eq!(serde_json::from_str::<Stamped>(&text).unwrap(), stamped, "{text}");
+            assert_eq!(
+                serde_json::from_str::<Stamped>(&text).unwrap(),
+                stamped,
+                "{text}"
+            );
         }
     }
 }

@@ -13,7 +13,9 @@ pub(crate) async fn run() -> anyhow::Result<()> {
     let mut stop = Stop::new()?;
     let core = Core::start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
         .context("cannot listen on 127.0.0.1")?;
-    tell(MasterEvent::Listening { uri: core.uri().to_owned() })?;
+    tell(MasterEvent::Listening {
+        uri: core.uri().to_owned(),
+    })?;
     stop.wait().await;
     Ok(())
 }

@@ -24,7 +24,10 @@ impl Speed {
     /// How many seconds of the story so many nanoseconds are.
     pub(crate) fn story_seconds(self, real_nanos: i64) -> f64 {
         // Exact up to 2^53 ns, which is a hundred days.
-        #[expect(clippy::cast_precision_loss, reason = "a story lasts less than a hundred days")]
+        #[expect(
+            clippy::cast_precision_loss,
+            reason = "a story lasts less than a hundred days"
+        )]
         let nanos = real_nanos as f64;
         nanos / 1e9 * self.0
     }
@@ -81,7 +84,11 @@ impl Pace {
 
     /// One half of the cycle of this number, counted from 0.
     pub(crate) const fn half_cycle(&self, cycle: u32) -> Duration {
-        if cycle.is_multiple_of(2) { self.far_half } else { self.near_half }
+        if cycle.is_multiple_of(2) {
+            self.far_half
+        } else {
+            self.near_half
+        }
     }
 }
 

@@ -42,8 +42,14 @@ impl<T> Channel<T> {
 fn play(covers: u32, off_at: u64, delay: Duration, keep: u32) -> Outcome {
     let pace = Pace::at(Speed::new(1.0).unwrap());
     let (mut niryo, mut turtlebot) = (Niryo::new(covers, pace), Turtlebot::new(pace));
-    let mut counts = Channel { delay, under_way: VecDeque::new() };
-    let mut status = Channel { delay, under_way: VecDeque::new() };
+    let mut counts = Channel {
+        delay,
+        under_way: VecDeque::new(),
+    };
+    let mut status = Channel {
+        delay,
+        under_way: VecDeque::new(),
+    };
     let mut outcome = Outcome::default();
     let mut picked_at = Duration::ZERO;
     for tick in 0..100_000_u32 {
@@ -97,7 +103,10 @@ fn play(covers: u32, off_at: u64, delay: Duration, keep: u32) -> Outcome {
 fn the_default_story_is_that_of_the_paper() {
     let outcome = play(4, 25, Duration::from_millis(10), 1);
     assert_eq!((outcome.by_conveyor, outcome.by_turtlebot), (2, 2));
-    assert!(outcome.last_cycle > Duration::from_secs(10), "the last cycle waits: {outcome:?}");
+    assert!(
+        outcome.last_cycle > Duration::from_secs(10),
+        "the last cycle waits: {outcome:?}"
+    );
     assert!(outcome.finished < Duration::from_secs(76), "{outcome:?}");
 }
 
@@ -105,7 +114,11 @@ fn the_default_story_is_that_of_the_paper() {
 fn the_line_finishes_whenever_the_conveyor_stops() {
     for off_at in 0..60 {
         let outcome = play(4, off_at, Duration::from_millis(10), 1);
-        assert_eq!(outcome.by_conveyor + outcome.by_turtlebot, 4, "off at {off_at}");
+        assert_eq!(
+            outcome.by_conveyor + outcome.by_turtlebot,
+            4,
+            "off at {off_at}"
+        );
         assert!(outcome.most_in_bucket <= 1, "off at {off_at}: {outcome:?}");
     }
 }
@@ -123,7 +136,11 @@ fn the_line_finishes_with_slow_values_and_one_cover_in_the_bucket_at_a_time() {
 fn the_line_finishes_when_most_reports_are_lost() {
     for keep in [2, 7, 19] {
         let outcome = play(5, 12, Duration::from_millis(10), keep);
-        assert_eq!(outcome.by_conveyor + outcome.by_turtlebot, 5, "one report of {keep}");
+        assert_eq!(
+            outcome.by_conveyor + outcome.by_turtlebot,
+            5,
+            "one report of {keep}"
+        );
     }
 }
 

@@ -76,11 +76,19 @@ pub(crate) struct Niryo {
 enum Arm {
     /// Until the switch of the conveyor has been heard once.
     Awaiting,
-    Resting { until: Duration },
-    Picking { until: Duration },
-    Carrying { until: Duration },
+    Resting {
+        until: Duration,
+    },
+    Picking {
+        until: Duration,
+    },
+    Carrying {
+        until: Duration,
+    },
     /// Over the place with a cover in the gripper.
-    Holding { told: Option<WaitCause> },
+    Holding {
+        told: Option<WaitCause>,
+    },
     Done,
 }
 
@@ -91,7 +99,9 @@ enum Bucket {
     Free,
     Busy,
     /// We have placed a cover. Reports that it is free may be older than that.
-    Filled { at: Duration },
+    Filled {
+        at: Duration,
+    },
 }
 
 impl Niryo {
@@ -133,7 +143,9 @@ impl Niryo {
     /// When to come back if nothing is heard.
     pub(crate) const fn timeout(&self) -> Option<Duration> {
         match self.arm {
-            Arm::Resting { until } | Arm::Picking { until } | Arm::Carrying { until } => Some(until),
+            Arm::Resting { until } | Arm::Picking { until } | Arm::Carrying { until } => {
+                Some(until)
+            }
             Arm::Awaiting | Arm::Holding { .. } | Arm::Done => None,
         }
     }
@@ -141,7 +153,9 @@ impl Niryo {
     fn hear_switch(&mut self, on: bool, now: Duration, events: &mut Vec<NiryoEvent>) {
         self.switch = Some(on);
         if self.arm == Arm::Awaiting {
-            self.arm = Arm::Resting { until: now + self.pace.first_rest };
+            self.arm = Arm::Resting {
+                until: now + self.pace.first_rest,
+            };
         }
         // The cable: the conveyor follows its switch at once.
         if self.counts.conveyor_running != on {
@@ -180,13 +194,19 @@ impl Niryo {
                     self.arm = Arm::Done;
                     return Some(Some(NiryoEvent::StorageEmpty));
                 }
-                self.arm = Arm::Picking { until: now + self.pace.half_cycle(self.cycle) };
+                self.arm = Arm::Picking {
+                    until: now + self.pace.half_cycle(self.cycle),
+                };
                 Some(None)
             }
             Arm::Picking { until } if until <= now => {
                 self.counts.in_storage = self.counts.in_storage.saturating_sub(1);
-                self.arm = Arm::Carrying { until: now + self.pace.half_cycle(self.cycle) };
-                Some(Some(NiryoEvent::Picked { left: self.counts.in_storage }))
+                self.arm = Arm::Carrying {
+                    until: now + self.pace.half_cycle(self.cycle),
+                };
+                Some(Some(NiryoEvent::Picked {
+                    left: self.counts.in_storage,
+                }))
             }
             Arm::Carrying { until } if until <= now => {
                 self.arm = Arm::Holding { told: None };
@@ -201,17 +221,23 @@ impl Niryo {
     fn place(&mut self, told: Option<WaitCause>, now: Duration) -> Option<NiryoEvent> {
         let event = if self.counts.conveyor_running {
             self.counts.on_conveyor += 1;
-            NiryoEvent::PlacedOnConveyor { total: self.counts.on_conveyor }
+            NiryoEvent::PlacedOnConveyor {
+                total: self.counts.on_conveyor,
+            }
         } else if let Some(cause) = self.turtlebot_not_ready() {
             self.arm = Arm::Holding { told: Some(cause) };
             return (told != Some(cause)).then_some(NiryoEvent::Waits { cause });
         } else {
             self.counts.on_turtlebot += 1;
             self.bucket = Bucket::Filled { at: now };
-            NiryoEvent::PlacedOnTurtlebot { total: self.counts.on_turtlebot }
+            NiryoEvent::PlacedOnTurtlebot {
+                total: self.counts.on_turtlebot,
+            }
         };
         self.cycle += 1;
-        self.arm = Arm::Resting { until: now + self.pace.rest };
+        self.arm = Arm::Resting {
+            until: now + self.pace.rest,
+        };
         Some(event)
     }
 
@@ -238,7 +264,12 @@ mod tests {
     fn run_until(niryo: &mut Niryo, end: Duration) -> Vec<(Duration, NiryoEvent)> {
         let mut events = Vec::new();
         while let Some(at) = niryo.timeout().filter(|at| *at <= end) {
-            events.extend(niryo.handle(Heard::Nothing, at).into_iter().map(|event| (at, event)));
+            events.extend(
+                niryo
+                    .handle(Heard::Nothing, at)
+                    .into_iter()
+                    .map(|event| (at, event)),
+            );
         }
         events
     }
@@ -253,7 +284,10 @@ mod tests {
         arm.handle(Heard::Park(true), s(1));
         arm.handle(Heard::Bucket(false), s(1));
         assert_eq!(arm.timeout(), None);
-        assert_eq!(arm.handle(Heard::Switch(true), s(2)), [NiryoEvent::ConveyorStarted]);
+        assert_eq!(
+            arm.handle(Heard::Switch(true), s(2)),
+            [NiryoEvent::ConveyorStarted]
+        );
         assert_eq!(arm.timeout(), Some(s(4)));
     }
 
@@ -275,7 +309,10 @@ mod tests {
             [
                 (Duration::from_millis(5500), NiryoEvent::Picked { left: 1 }),
                 (s(9), NiryoEvent::PlacedOnConveyor { total: 1 }),
-                (Duration::from_millis(14_500), NiryoEvent::Picked { left: 0 }),
+                (
+                    Duration::from_millis(14_500),
+                    NiryoEvent::Picked { left: 0 }
+                ),
                 (s(17), NiryoEvent::PlacedOnConveyor { total: 2 }),
                 (s(20), NiryoEvent::StorageEmpty),
             ]
@@ -292,10 +329,15 @@ mod tests {
         assert_eq!(arm.counts().on_conveyor, 2);
         assert_eq!(
             arm.handle(Heard::Switch(false), s(25)),
-            [NiryoEvent::ConveyorStopped { holding_cover: true }]
+            [NiryoEvent::ConveyorStopped {
+                holding_cover: true
+            }]
         );
         let events = run_until(&mut arm, s(27));
-        assert_eq!(events, [(s(27), NiryoEvent::PlacedOnTurtlebot { total: 1 })]);
+        assert_eq!(
+            events,
+            [(s(27), NiryoEvent::PlacedOnTurtlebot { total: 1 })]
+        );
         assert!(!arm.counts().conveyor_running);
         assert_eq!(arm.counts().on_conveyor, 2);
     }
@@ -306,7 +348,9 @@ mod tests {
         arm.handle(Heard::Park(false), s(0));
         arm.handle(Heard::Bucket(false), s(0));
         arm.handle(Heard::Switch(false), s(0));
-        let waits = NiryoEvent::Waits { cause: WaitCause::ParkFree };
+        let waits = NiryoEvent::Waits {
+            cause: WaitCause::ParkFree,
+        };
         assert_eq!(run_until(&mut arm, s(60)).last(), Some(&(s(9), waits)));
         assert_eq!(arm.handle(Heard::Park(false), s(61)), [], "it says so once");
         assert_eq!(
@@ -334,7 +378,9 @@ mod tests {
         let mut arm = niryo(1);
         arm.handle(Heard::Switch(false), s(0));
         arm.handle(Heard::Park(true), s(1));
-        let waits = NiryoEvent::Waits { cause: WaitCause::Unknown };
+        let waits = NiryoEvent::Waits {
+            cause: WaitCause::Unknown,
+        };
         assert_eq!(run_until(&mut arm, s(60)).last(), Some(&(s(9), waits)));
     }
 
@@ -377,7 +423,10 @@ mod tests {
         assert_eq!(arm.counts().on_turtlebot, 1, "the park is free");
         let events = arm.handle(Heard::Park(true), s(28));
         assert_eq!(events, [NiryoEvent::PlacedOnTurtlebot { total: 2 }]);
-        assert_eq!(run_until(&mut arm, s(40)).last(), Some(&(s(31), NiryoEvent::StorageEmpty)));
+        assert_eq!(
+            run_until(&mut arm, s(40)).last(),
+            Some(&(s(31), NiryoEvent::StorageEmpty))
+        );
         assert_eq!(arm.timeout(), None);
     }
 
@@ -388,7 +437,10 @@ mod tests {
         run_until(&mut arm, s(60));
         assert_eq!(
             arm.handle(Heard::Switch(true), s(61)),
-            [NiryoEvent::ConveyorStarted, NiryoEvent::PlacedOnConveyor { total: 1 }]
+            [
+                NiryoEvent::ConveyorStarted,
+                NiryoEvent::PlacedOnConveyor { total: 1 }
+            ]
         );
     }
 }

@@ -29,7 +29,9 @@ pub(crate) async fn run(covers: u32, speed: Speed) -> anyhow::Result<()> {
     let mut niryo = Niryo::new(covers, Pace::at(speed));
     let mut repeat = interval(REPEAT);
     loop {
-        let wake = niryo.timeout().map_or_else(|| far_away(started), |at| started + at);
+        let wake = niryo
+            .timeout()
+            .map_or_else(|| far_away(started), |at| started + at);
         let heard = tokio::select! {
             (name, event) = inbox.recv() => heard(name, &event),
             () = sleep_until(wake) => Some(Heard::Nothing),
@@ -55,7 +57,9 @@ fn tell(stamp: i64, events: &[NiryoEvent]) -> io::Result<()> {
 }
 
 fn heard(name: Name, event: &InboxEvent) -> Option<Heard> {
-    let InboxEvent::Message(message) = event else { return None };
+    let InboxEvent::Message(message) = event else {
+        return None;
+    };
     let Some(value) = read_bool(&message.bytes) else {
         tracing::warn!(%name, bytes = message.bytes.len(), "a message is no std_msgs/Bool");
         return None;
@@ -109,7 +113,10 @@ impl Outputs {
                 md5sum: md5sum.to_owned(),
                 definition: definition.to_owned(),
             };
-            let options = PublisherOptions { latch: true, ..PublisherOptions::default() };
+            let options = PublisherOptions {
+                latch: true,
+                ..PublisherOptions::default()
+            };
             node.advertise(&format!("/{}", name.ros_topic()), topic_type, options)
         };
         Ok(Self {
@@ -138,10 +145,16 @@ impl Outputs {
 }
 
 /// Type name, checksum and definition of the two ROS types of the line.
-const BOOL: (&str, &str, &str) =
-    ("std_msgs/Bool", "8b94c1b53db61fb6aed406028ad6332a", "bool data\n");
-const UINT32: (&str, &str, &str) =
-    ("std_msgs/UInt32", "304a39449588c7f8ce2df6e8001c5fce", "uint32 data\n");
+const BOOL: (&str, &str, &str) = (
+    "std_msgs/Bool",
+    "8b94c1b53db61fb6aed406028ad6332a",
+    "bool data\n",
+);
+const UINT32: (&str, &str, &str) = (
+    "std_msgs/UInt32",
+    "304a39449588c7f8ce2df6e8001c5fce",
+    "uint32 data\n",
+);
 
 #[cfg(test)]
 mod tests {

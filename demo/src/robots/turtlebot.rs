@@ -23,10 +23,16 @@ pub(crate) struct Status {
 #[serde(tag = "turtlebot", rename_all = "snake_case")]
 pub(crate) enum TurtlebotEvent {
     /// `placed` is the count that says so.
-    CoverInBucket { placed: u32 },
-    LeavesPark { placed: u32 },
+    CoverInBucket {
+        placed: u32,
+    },
+    LeavesPark {
+        placed: u32,
+    },
     /// `total` covers have been delivered so far.
-    Unloaded { total: u32 },
+    Unloaded {
+        total: u32,
+    },
     BackAtPark,
 }
 
@@ -52,7 +58,12 @@ enum Place {
 impl Turtlebot {
     /// A robot at the park with an empty bucket.
     pub(crate) const fn new(pace: Pace) -> Self {
-        Self { pace, placed: 0, delivered: 0, place: Place::Park }
+        Self {
+            pace,
+            placed: 0,
+            delivered: 0,
+            place: Place::Park,
+        }
     }
 
     /// Takes the count of covers placed on it, `None` when only time has passed.
@@ -91,22 +102,36 @@ impl Turtlebot {
         }
         let (place, event) = match self.place {
             Place::Park if self.status().bucket_busy => (
-                Place::Loading { until: now + self.pace.load },
-                TurtlebotEvent::CoverInBucket { placed: self.placed },
+                Place::Loading {
+                    until: now + self.pace.load,
+                },
+                TurtlebotEvent::CoverInBucket {
+                    placed: self.placed,
+                },
             ),
             Place::Park => return None,
             Place::Loading { .. } => (
-                Place::ToWorker { until: now + self.pace.drive, placed: self.placed },
-                TurtlebotEvent::LeavesPark { placed: self.placed },
+                Place::ToWorker {
+                    until: now + self.pace.drive,
+                    placed: self.placed,
+                },
+                TurtlebotEvent::LeavesPark {
+                    placed: self.placed,
+                },
             ),
             Place::ToWorker { placed, .. } => {
-                self.place = Place::AtWorker { until: now + self.pace.unload, placed };
+                self.place = Place::AtWorker {
+                    until: now + self.pace.unload,
+                    placed,
+                };
                 return self.step(now);
             }
             Place::AtWorker { placed, .. } => {
                 self.delivered = placed;
                 (
-                    Place::ToPark { until: now + self.pace.drive },
+                    Place::ToPark {
+                        until: now + self.pace.drive,
+                    },
                     TurtlebotEvent::Unloaded { total: placed },
                 )
             }
@@ -142,7 +167,13 @@ mod tests {
     fn it_waits_at_the_park_with_an_empty_bucket() {
         let mut robot = turtlebot();
         assert_eq!(robot.handle(Some(0), s(1)), []);
-        assert_eq!(robot.status(), Status { park_busy: true, bucket_busy: false });
+        assert_eq!(
+            robot.status(),
+            Status {
+                park_busy: true,
+                bucket_busy: false
+            }
+        );
         assert_eq!(robot.timeout(), None);
     }
 
@@ -153,19 +184,46 @@ mod tests {
             robot.handle(Some(1), s(10)),
             [TurtlebotEvent::CoverInBucket { placed: 1 }]
         );
-        assert_eq!(robot.status(), Status { park_busy: true, bucket_busy: true });
+        assert_eq!(
+            robot.status(),
+            Status {
+                park_busy: true,
+                bucket_busy: true
+            }
+        );
         assert_eq!(
             run_until(&mut robot, s(12)),
             [(s(12), TurtlebotEvent::LeavesPark { placed: 1 })]
         );
-        assert_eq!(robot.status(), Status { park_busy: false, bucket_busy: true });
+        assert_eq!(
+            robot.status(),
+            Status {
+                park_busy: false,
+                bucket_busy: true
+            }
+        );
         assert_eq!(
             run_until(&mut robot, s(22)),
             [(s(22), TurtlebotEvent::Unloaded { total: 1 })]
         );
-        assert_eq!(robot.status(), Status { park_busy: false, bucket_busy: false });
-        assert_eq!(run_until(&mut robot, s(60)), [(s(29), TurtlebotEvent::BackAtPark)]);
-        assert_eq!(robot.status(), Status { park_busy: true, bucket_busy: false });
+        assert_eq!(
+            robot.status(),
+            Status {
+                park_busy: false,
+                bucket_busy: false
+            }
+        );
+        assert_eq!(
+            run_until(&mut robot, s(60)),
+            [(s(29), TurtlebotEvent::BackAtPark)]
+        );
+        assert_eq!(
+            robot.status(),
+            Status {
+                park_busy: true,
+                bucket_busy: false
+            }
+        );
     }
 
     #[test]
@@ -176,7 +234,13 @@ mod tests {
             run_until(&mut robot, s(second));
             robot.handle(Some(1), s(second));
         }
-        assert_eq!(robot.status(), Status { park_busy: true, bucket_busy: false });
+        assert_eq!(
+            robot.status(),
+            Status {
+                park_busy: true,
+                bucket_busy: false
+            }
+        );
         assert_eq!(robot.timeout(), None);
     }
 
@@ -186,7 +250,10 @@ mod tests {
         robot.handle(Some(1), s(0));
         run_until(&mut robot, s(5));
         robot.handle(Some(2), s(5));
-        let events: Vec<_> = run_until(&mut robot, s(60)).into_iter().map(|(_, e)| e).collect();
+        let events: Vec<_> = run_until(&mut robot, s(60))
+            .into_iter()
+            .map(|(_, e)| e)
+            .collect();
         assert_eq!(
             events,
             [
@@ -204,8 +271,14 @@ mod tests {
     fn counts_missed_while_nothing_was_heard_are_delivered_together() {
         let mut robot = turtlebot();
         robot.handle(Some(2), s(0));
-        let events: Vec<_> = run_until(&mut robot, s(60)).into_iter().map(|(_, e)| e).collect();
-        assert!(events.contains(&TurtlebotEvent::Unloaded { total: 2 }), "{events:?}");
+        let events: Vec<_> = run_until(&mut robot, s(60))
+            .into_iter()
+            .map(|(_, e)| e)
+            .collect();
+        assert!(
+            events.contains(&TurtlebotEvent::Unloaded { total: 2 }),
+            "{events:?}"
+        );
         assert!(!robot.status().bucket_busy);
     }
 }

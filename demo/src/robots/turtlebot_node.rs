@@ -34,7 +34,9 @@ pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
     let mut robot = Turtlebot::new(Pace::at(speed));
     let mut repeat = interval(REPEAT);
     loop {
-        let wake = robot.timeout().map_or_else(|| far_away(started), |at| started + at);
+        let wake = robot
+            .timeout()
+            .map_or_else(|| far_away(started), |at| started + at);
         let placed = tokio::select! {
             sample = covers.next() => match sample {
                 Some(Ok((count, _))) => Some(count),
@@ -71,8 +73,12 @@ fn join() -> anyhow::Result<Node> {
     let context = Context::from_domain_participant(participant)
         .map_err(|error| anyhow!("cannot make a ROS 2 context: {error}"))?;
     let name = NodeName::new("/", "turtlebot3").map_err(|error| anyhow!("{error:?}"))?;
-    let options = NodeOptions::new().start_parameter_services(false).enable_rosout(false);
-    context.new_node(name, options).map_err(|error| anyhow!("cannot make a ROS 2 node: {error}"))
+    let options = NodeOptions::new()
+        .start_parameter_services(false)
+        .enable_rosout(false);
+    context
+        .new_node(name, options)
+        .map_err(|error| anyhow!("cannot make a ROS 2 node: {error}"))
 }
 
 /// The last value counts, and who comes late gets it.
@@ -81,11 +87,15 @@ const STATE: QosProfile = QosProfile::publisher_default()
     .durability(Durability::TransientLocal)
     .history(History::KeepLast { depth: 1 });
 
-fn topic(node: &Node, name: Name, type_name: &str) -> anyhow::Result<ros2_client::Topic> {
+fn topic(node: &Node, name: Name, type_name: &str) -> anyhow::Result<rustdds::Topic> {
     let ros_name = RosName::parse(&format!("/{}", name.ros_topic()))
         .map_err(|error| anyhow!("{name} has no ROS 2 name: {error:?}"))?;
-    node.create_topic(&ros_name, MessageTypeName::new("std_msgs", type_name), &STATE)
-        .map_err(|error| anyhow!("cannot make the topic of {name}: {error}"))
+    node.create_topic(
+        &ros_name,
+        MessageTypeName::new("std_msgs", type_name),
+        &STATE,
+    )
+    .map_err(|error| anyhow!("cannot make the topic of {name}: {error}"))
 }
 
 fn publisher(node: &mut Node, name: Name) -> anyhow::Result<Publisher<bool>> {
