@@ -1,1 +1,29 @@
-//! Placeholder of the skeleton.
+//! What crosses between a space and UADP, and what does not.
+//!
+//! The [`Router`] is sans-IO: time and bytes go in through `handle_*`, values come out of
+//! [`poll_output`](Router::poll_output), and [`poll_timeout`](Router::poll_timeout) says when to come back. There is
+//! no socket, clock or task in here. After every `handle_*` drain `poll_output`; when `poll_timeout` has passed, call
+//! [`handle_timeout`](Router::handle_timeout).
+//!
+//! The checks run in the order header, loop, route, payload, so that looped and unmapped traffic costs a header read
+//! and no allocation.
+
+mod counters;
+mod fields;
+mod hops;
+mod loop_rule;
+mod network;
+mod output;
+mod queue;
+mod reader;
+mod router;
+mod settings;
+mod topic;
+mod writer;
+
+pub use counters::{Counters, Reason, Verdict};
+pub use hops::{Delays, Hop, Hops};
+pub use loop_rule::{Side, may_cross};
+pub use output::{Delivery, Notice, Output};
+pub use router::Router;
+pub use settings::{Local, Now, Settings};

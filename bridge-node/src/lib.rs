@@ -1,1 +1,21 @@
-//! Placeholder of the skeleton.
+//! What the programs of the space share: the port trait, the run loop, arguments, logging and metrics.
+//!
+//! A program implements [`Program`] and [`Port`], and its `main` is [`run`]. This crate does not know which ROS it
+//! serves (that is the port) nor how UADP bytes look (that is `bridge-core`).
+
+mod arguments;
+mod clock;
+mod exit;
+mod logging;
+mod metrics;
+mod port;
+mod program;
+mod run;
+mod status;
+
+pub use arguments::Arguments;
+pub use clock::{now, timestamp};
+pub use exit::{Failure, FailureKind};
+pub use logging::LogFormat;
+pub use port::{Delivery, Port, PortEvent};
+pub use program::{Context, Program, run};

@@ -1,2 +1,191 @@
-//! Placeholder of the skeleton.
-fn main() {}
+//! `bridge-ros2`: carries topics between a ROS 2 domain and the space.
+
+use std::net::IpAddr;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use bridge_core::Local;
+use bridge_node::{Arguments, Context, Failure, FailureKind, Program};
+use bridge_ros2::domain::{DiscoveryRange, DomainError, DomainOptions};
+use bridge_ros2::{PortOptions, Ros2Port};
+use clap::Parser;
+use mappings::{Mapping, SpaceId};
+use transport::{Interface, InterfaceError};
+
+fn main() -> ExitCode {
+    bridge_node::run::<BridgeRos2>()
+}
+
+/// Carries topics between a ROS 2 domain and the space of OPC UA PubSub.
+#[derive(Debug, Parser)]
+#[command(name = "bridge-ros2", version)]
+struct BridgeRos2 {
+    #[command(flatten)]
+    arguments: Arguments,
+    /// The DDS domain to join; without it the domain of the space, or of the mapping's only ROS 2 space
+    #[arg(long, value_name = "N", env = "ROS_DOMAIN_ID", value_parser = clap::value_parser!(u16).range(0..=232))]
+    domain: Option<u16>,
+    /// The space of this domain's values, 2 to 232; without it the one the mapping gives the domain, or the one of the
+    /// domain's number
+    #[arg(long, value_name = "N", env = "UA_SPACE", value_parser = clap::value_parser!(u16).range(2..=232))]
+    space: Option<u16>,
+    /// The network interface of the ROS 2 side, by name or address; without it what `ROS_AUTOMATIC_DISCOVERY_RANGE`
+    /// and `ROS_LOCALHOST_ONLY` say, else all
+    #[arg(long, value_name = "NAME|ADDRESS", env = "UA_ROS_INTERFACE")]
+    ros_interface: Option<String>,
+}
+
+impl BridgeRos2 {
+    /// The domain to join for the space `own`.
+    fn domain(&self, own: SpaceId, mapping: &Mapping) -> u16 {
+        self.domain
+            .or_else(|| mapping.domain_of(own))
+            .unwrap_or_else(|| own.into())
+    }
+
+    fn networks(&self) -> Result<Vec<IpAddr>, Failure> {
+        if let Some(wanted) = &self.ros_interface {
+            let interface = Interface::find(wanted).map_err(|error| {
+                let kind = if matches!(error, InterfaceError::List(_)) {
+                    FailureKind::Io
+                } else {
+                    FailureKind::Unavailable
+                };
+                Failure::new(kind, format!("--ros-interface: {error}"))
+            })?;
+            return Ok(vec![interface.address.into()]);
+        }
+        let variable = |name| std::env::var(name).ok();
+        DiscoveryRange::from_env(
+            variable("ROS_AUTOMATIC_DISCOVERY_RANGE").as_deref(),
+            variable("ROS_LOCALHOST_ONLY").as_deref(),
+        )
+        .map(DiscoveryRange::networks)
+        .map_err(|error| Failure::new(FailureKind::Usage, error.to_string()))
+    }
+}
+
+impl Program for BridgeRos2 {
+    type Port = Ros2Port;
+
+    const NAME: &'static str = "bridge-ros2";
+    const LOCAL: Local = Local::Cdr;
+    // On leaving a domain RustDDS reports errors that mean nothing, and at all times much that only its authors need.
+    const QUIET: &'static str = "rustdds=error,rustdds::dds::pubsub=off,rustdds::network=off,\
+                                 rustdds::rtps::dp_event_loop=off,ros2_client=warn";
+
+    fn arguments(&self) -> &Arguments {
+        &self.arguments
+    }
+
+    fn own(&self, mapping: &Mapping) -> Result<SpaceId, Failure> {
+        choose_space(self.space, self.domain, mapping)
+            .map_err(|message| Failure::new(FailureKind::Usage, message))
+    }
+
+    async fn start(self, context: Context) -> Result<Ros2Port, Failure> {
+        let Context { mapping, own } = context;
+        let options = PortOptions {
+            domain: DomainOptions {
+                domain: self.domain(own, &mapping),
+                networks: self.networks()?,
+                node: NODE_NAME.to_owned(),
+            },
+            own,
+            mapping,
+            prefixes: std::env::var_os("AMENT_PREFIX_PATH")
+                .map(|list| std::env::split_paths(&list).collect::<Vec<PathBuf>>())
+                .unwrap_or_default(),
+        };
+        Ros2Port::start(options).map_err(|error| {
+            let kind = if matches!(error, DomainError::Domain(_)) {
+                FailureKind::Usage
+            } else {
+                FailureKind::Unavailable
+            };
+            Failure::new(kind, error.to_string())
+        })
+    }
+}
+
+/// The space a bridge serves: what was asked for, else the space of the domain asked for, else the mapping's only one.
+fn choose_space(
+    space: Option<u16>,
+    domain: Option<u16>,
+    mapping: &Mapping,
+) -> Result<SpaceId, String> {
+    if let Some(space) = space {
+        let id = SpaceId::new(space)
+            .filter(|id| id.is_ros2())
+            .ok_or_else(|| format!("--space {space}: a ROS 2 space is 2 to 232"))?;
+        let declared = mapping.space(id).and_then(|space| space.domain);
+        return match (domain, declared) {
+            (Some(asked), Some(declared)) if asked != declared => Err(format!(
+                "space {id} is DDS domain {declared} in the mapping, but domain {asked} is asked for \
+                 (--domain or ROS_DOMAIN_ID)"
+            )),
+            _ => Ok(id),
+        };
+    }
+    if let Some(domain) = domain {
+        return mapping.space_of_domain(domain).ok_or_else(|| {
+            format!(
+                "DDS domain {domain} has no space: declare one in the mapping (spaces), or say --space N, 2 to 232"
+            )
+        });
+    }
+    let mut declared = mapping
+        .spaces()
+        .iter()
+        .map(|space| space.id)
+        .filter(|id| id.is_ros2());
+    match (declared.next(), declared.next()) {
+        (Some(only), None) => Ok(only),
+        (Some(_), Some(_)) => Err(
+            "the mapping has several ROS 2 spaces: say which with --space N or --domain N"
+                .to_owned(),
+        ),
+        (None, _) => Err(
+            "which DDS domain? Say --domain N (or set ROS_DOMAIN_ID), or declare a ROS 2 space in the mapping"
+                .to_owned(),
+        ),
+    }
+}
+
+/// How the bridge appears in `ros2 node list`.
+const NODE_NAME: &str = "ua_bridge_ros2";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_command_line_is_well_formed() {
+        BridgeRos2::command().debug_assert();
+    }
+
+    #[test]
+    fn a_domain_is_the_space_of_its_number() {
+        let space = choose_space(None, Some(7), &Mapping::default()).unwrap();
+        assert_eq!(space.get(), 7);
+    }
+
+    #[test]
+    fn domain_0_needs_a_space() {
+        let error = choose_space(None, Some(0), &Mapping::default()).unwrap_err();
+        assert!(error.contains("--space"), "{error}");
+        assert_eq!(
+            choose_space(Some(40), Some(0), &Mapping::default())
+                .unwrap()
+                .get(),
+            40
+        );
+    }
+
+    #[test]
+    fn without_a_domain_or_a_mapping_nothing_is_guessed() {
+        let error = choose_space(None, None, &Mapping::default()).unwrap_err();
+        assert!(error.contains("--domain"), "{error}");
+    }
+}

@@ -1,1 +1,24 @@
-//! Placeholder of the skeleton.
+//! The names of the space, and the YAML that ties them to ROS topics and OPC UA nodes.
+
+mod check;
+mod code;
+mod diagnostic;
+mod document;
+mod findings;
+mod mapping;
+mod nearest;
+mod node_id;
+mod read;
+mod topic;
+mod tree;
+
+pub use check::Checked;
+pub use code::{Code, UnknownCode};
+pub use diagnostic::{Diagnostic, Severity, Span};
+pub use document::schema;
+pub use mapping::{
+    Binding, Endpoint, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, Server, Space,
+    Variable,
+};
+pub use node_id::{Identifier, NodeIdError, NodeIdText};
+pub use topic::{Part, SpaceId, TopicError, TopicId};

@@ -1,1 +1,68 @@
-//! Placeholder of the skeleton.
+//! ROS message definitions at run time, and ROS messages to and from OPC UA fields.
+//!
+//! A [`Registry`] holds `.msg` texts of one [`Dialect`] and makes [`MessageType`]s of them: the flattened list of
+//! [`Leaf`]s, and for ROS 1 the md5 and the full definition text a publisher advertises. A [`Plan`] is compiled once
+//! per message type, [`Selection`] and [`Wire`]; it then runs over the bytes of a message into a [`Sink`], or takes the
+//! fields of a [`Source`] and writes the bytes. No tree of values is built on either way.
+//!
+//! ```
+//! use messages::{Dialect, Plan, Registry, Selection, Wire};
+//!
+//! let mut registry = Registry::bundle(Dialect::Ros1);
+//! registry.add(&"line/Cover".parse()?, "Header header\ngeometry_msgs/Point position\nuint8 colour")?;
+//! let cover = registry.get(&"line/Cover".parse()?)?;
+//! let paths: Vec<&str> = cover.leaves().iter().map(|leaf| leaf.path.as_str()).collect();
+//! assert_eq!(paths, ["header.stamp", "header.frame_id", "position.x", "position.y", "position.z", "colour"]);
+//! let plan = Plan::compile(&cover, &Selection::Field("position.x".to_owned()), Wire::Ros1)?;
+//! assert_eq!(plan.leaves().len(), 1);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+//!
+//! # Definitions
+//! Both dialects are read by a parser of this crate: definition texts come from peers, and published parsers panic on
+//! hostile ones (an array length of twenty digits) or know one dialect only.
+//!
+//! # Values
+//! | ROS | field |
+//! |---|---|
+//! | `bool` | Boolean (any byte but 0 is true) |
+//! | `int8`, ROS 1 `byte` | SByte |
+//! | `uint8`, `char`, ROS 2 `byte` | Byte |
+//! | `int16` .. `uint64` | Int16 .. UInt64 |
+//! | `float32`, `float64` | Float, Double |
+//! | `string`, `wstring` | String |
+//! | ROS 1 `time`, `builtin_interfaces/Time` | DateTime, rounded down to 100 ns; see [`time_to_date_time`] |
+//! | ROS 1 `duration`, `builtin_interfaces/Duration` | Double, milliseconds; see [`duration_to_millis`] |
+//! | array of `uint8`, `char` or ROS 2 `byte` | ByteString, a scalar |
+//! | array of anything else that is not a message | array of the above |
+//! | message | its fields, named `outer.inner` |
+//! | array of messages | array of structures, one field; see [`Sink::structures`] |
+//!
+//! `seq` of a ROS 1 `std_msgs/Header` is no field: it is skipped when read and 0 when written. A ROS 2 topic whose type
+//! is `builtin_interfaces/Time` or `Duration` itself is one field named `data`.
+//!
+//! # Bytes
+//! ROS 1 is packed little endian. CDR is plain XCDR version 1 (DDS-RTPS 10.2, DDS-XTypes 7.4.1): alignment counts from
+//! the byte after the 4 byte encapsulation header, a string's length counts its NUL, and an empty message is one byte.
+//! A `wstring` is a count of UTF-16 units, each written as 4 bytes, as `rmw_cyclonedds` and `rmw_fastrtps` do.
+
+mod bundle;
+mod convert;
+mod definition;
+mod error;
+mod fields;
+mod message;
+mod name;
+mod plan;
+mod registry;
+mod resolve;
+
+pub use convert::{date_time_to_time, duration_to_millis, millis_to_duration, time_to_date_time};
+pub use error::{
+    DefinitionError, Fault, NameError, PlanError, ReadError, SourceError, WriteError, WriteFault,
+};
+pub use fields::{Sink, Source};
+pub use message::{Leaf, MessageType, Rank, standard_type};
+pub use name::{Dialect, TypeName};
+pub use plan::{Plan, Selection, Wire};
+pub use registry::Registry;

@@ -10,6 +10,9 @@ use tokio::signal::unix::{SignalKind, signal};
 
 #[tokio::main(flavor = "current_thread")]
 async fn main() -> Result<(), Box<dyn std::error::Error>> {
+    tracing_subscriber::fmt()
+        .with_writer(std::io::stderr)
+        .init();
     let mut options = NodeOptions::from_env("relay");
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let topics = options.apply_arguments(&arguments);

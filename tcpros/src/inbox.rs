@@ -316,7 +316,9 @@ mod tests {
     fn content(event: &InboxEvent) -> &[u8] {
         match event {
             InboxEvent::Message(message) => &message.bytes,
-            other => panic!("{other:?} instead of a message"),
+            other @ (InboxEvent::Peer { .. } | InboxEvent::Dropped(_)) => {
+                panic!("{other:?} instead of a message")
+            }
         }
     }
 

@@ -147,6 +147,10 @@ impl Node {
 
     /// Subscribes a topic into an inbox. What this node publishes itself is not received. Fails when the name is no
     /// ROS name.
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "the key and the inbox belong to the call, not to a subscriber's options"
+    )]
     pub fn subscribe<K: Clone + Send + 'static>(
         &self,
         topic: &str,

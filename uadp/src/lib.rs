@@ -1,1 +1,78 @@
-//! Placeholder of the skeleton.
+//! UADP, the binary message mapping of OPC UA PubSub: NetworkMessages to and from bytes.
+//!
+//! Reads and writes data key frames and keep-alives (OPC 10000-14, 7.2.4) with fields encoded as Variants
+//! (OPC 10000-6, 5.2.2.16). What the standard has beyond that is [`DecodeError::Unsupported`]: delta frames, events,
+//! the DataValue and RawData field encodings, PromotedFields, chunks, message security, discovery messages,
+//! Actions, multi-dimensional arrays, and DataValue, Variant and DiagnosticInfo as values of a Variant.
+//!
+//! No sockets, no clock, no thread: bytes in, values out. Reading borrows from the datagram and allocates nothing;
+//! writing appends to a buffer of the caller. No datagram makes either panic.
+//!
+//! # Reading
+//! ```
+//! use uadp::{NetworkMessage, PublisherId, Scalar, Variant};
+//!
+//! let datagram = [
+//!     0xF1, 0x01, 0x02, 0x00, // version 1, PublisherId UInt16 2
+//!     0x01, 0x05, 0x00, // WriterGroupId 5
+//!     0x01, 0x0A, 0x00, // one DataSetMessage, of DataSetWriterId 10
+//!     0x01, 0x01, 0x00, // a valid key frame of one field
+//!     0x06, 0x2A, 0x00, 0x00, 0x00, // Int32 42
+//! ];
+//! let message = NetworkMessage::decode(&datagram)?;
+//! assert_eq!(message.header().publisher_id, Some(PublisherId::UInt16(2)));
+//! for data_set_message in message.messages() {
+//!     let data_set_message = data_set_message?;
+//!     assert_eq!(data_set_message.writer_id, Some(10));
+//!     for field in data_set_message.fields()? {
+//!         assert_eq!(field?, Variant::Scalar(Scalar::Int32(42)));
+//!     }
+//! }
+//! # Ok::<(), uadp::DecodeError>(())
+//! ```
+//!
+//! # Writing
+//! ```
+//! use uadp::{BuiltinType, DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar};
+//!
+//! let header = NetworkHeader {
+//!     publisher_id: Some(PublisherId::UInt16(2)),
+//!     group: Some(GroupHeader { writer_group_id: Some(5), ..GroupHeader::default() }),
+//!     ..NetworkHeader::default()
+//! };
+//! let mut datagram = Vec::new();
+//! let mut message = NetworkMessageEncoder::new(&mut datagram, &header, Some(&[10]))?;
+//! let mut fields = message.key_frame(&DataSetHeader::default())?;
+//! fields.scalar(Scalar::Int32(42))?;
+//! fields.packed_array(BuiltinType::UInt16, 2, &[1, 0, 2, 0])?;
+//! fields.finish()?;
+//! message.finish()?;
+//! assert_eq!(datagram[10..18], [0x01, 0x02, 0x00, 0x06, 0x2A, 0x00, 0x00, 0x00]);
+//! # Ok::<(), uadp::EncodeError>(())
+//! ```
+
+mod builtin;
+mod data_set_message;
+mod encoder;
+mod error;
+mod field_encoder;
+mod network_message;
+mod node_id;
+mod reader;
+mod scalar;
+mod structure;
+mod time;
+mod variant;
+mod writer;
+
+pub use builtin::{BuiltinType, Guid, StatusCode};
+pub use data_set_message::{DataSetHeader, DataSetMessage, Fields, MessageKind};
+pub use encoder::NetworkMessageEncoder;
+pub use error::{DecodeError, EncodeError};
+pub use field_encoder::FieldEncoder;
+pub use network_message::{GroupHeader, Messages, NetworkHeader, NetworkMessage, PublisherId};
+pub use node_id::{ExpandedNodeId, Identifier, NodeId};
+pub use scalar::{ExtensionBody, ExtensionObject, LocalizedText, QualifiedName, Scalar};
+pub use structure::StructureReader;
+pub use time::{DateTime, Timestamp};
+pub use variant::{Array, Elements, Variant};

@@ -1,2 +1,79 @@
-//! Placeholder of the skeleton.
-fn main() {}
+//! The OPC UA server of the cell: the values of the space as nodes.
+//!
+//! It is the citizen of the space with origin 0. Values of the other spaces come by UADP and are read here; what
+//! clients write to the variables of origin 0 goes out by UADP. It knows no ROS.
+//!
+//! Reading order: `layout` (which nodes), `nodes` (the node manager), `space` (values in), `port` (the shell's side),
+//! `endpoint` and `pki` (how clients get in), `value` (between the two codecs).
+
+mod endpoint;
+mod layout;
+mod nodes;
+mod pki;
+mod port;
+mod space;
+mod value;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use bridge_node::{Arguments, Context, Failure, FailureKind, Program};
+use mappings::{Mapping, SpaceId};
+
+use crate::endpoint::EndpointUrl;
+use crate::pki::Pki;
+use crate::port::{ServerPort, Setup};
+
+/// The OPC UA server of the cell: every value of the space as a variable, and a way in for those of origin 0.
+#[derive(Debug, clap::Parser)]
+#[command(name = "ua-server", version)]
+struct UaServer {
+    #[command(flatten)]
+    arguments: Arguments,
+    /// Where clients connect, as opc.tcp://127.0.0.1:4840; the mapping's endpoint without it
+    #[arg(long, value_name = "URL", env = "UA_ENDPOINT")]
+    endpoint: Option<EndpointUrl>,
+    /// The certificate store: own, private, trusted and rejected under one directory
+    #[arg(long, value_name = "DIR", env = "UA_PKI")]
+    pki: Option<PathBuf>,
+    /// Trust every client certificate, and keep it as trusted. For tests and demonstrations only
+    #[arg(long)]
+    trust_any_client_certificate: bool,
+}
+
+fn main() -> ExitCode {
+    bridge_node::run::<UaServer>()
+}
+
+impl Program for UaServer {
+    type Port = ServerPort;
+
+    const NAME: &'static str = "ua-server";
+    const LOCAL: bridge_core::Local = bridge_core::Local::Fields;
+    // The libraries say at level info what they do for each client, and at level error what a bad client did.
+    const QUIET: &'static str = "opcua_server=warn,opcua_crypto=warn,opcua_core=warn,opcua_nodes=warn,opcua_types=off";
+
+    fn arguments(&self) -> &Arguments {
+        &self.arguments
+    }
+
+    fn own(&self, _mapping: &Mapping) -> Result<SpaceId, Failure> {
+        Ok(SpaceId::UA)
+    }
+
+    async fn start(self, context: Context) -> Result<ServerPort, Failure> {
+        let url = match self.endpoint {
+            Some(url) => url,
+            None => {
+                let endpoint = context.mapping.server().endpoint.to_string();
+                endpoint.parse().map_err(|error| {
+                    Failure::new(FailureKind::Configuration, format!("server.endpoint {endpoint}: {error}"))
+                })?
+            }
+        };
+        let root = self.pki.unwrap_or_else(|| pki::default_root(|name| std::env::var(name).ok()));
+        let pki = Pki::open(root).map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
+        let setup = Setup { url, pki, trust_any_client: self.trust_any_client_certificate };
+        ServerPort::start(&context.mapping, setup)
+    }
+}

@@ -1,0 +1,192 @@
+//! What happened to each sample: forwarded, or dropped for a named reason and counted.
+
+use std::fmt;
+
+/// Why a sample or datagram did not cross.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Reason {
+    /// It came back to where it was produced, as every sample does that a bridge hears of itself.
+    Looped,
+    /// Somebody else sends under our space's PublisherId: two bridges serve one space.
+    SpaceTaken,
+    /// A datagram whose triple is none of the space (no number, out of range, or zero).
+    NotInSpace,
+    /// The PublisherId has our number but another width than UInt16 (OPC 10000-14 7.2.4.4.2).
+    PublisherWidth,
+    /// Bytes that break the encoding they claim to have.
+    Malformed,
+    /// Well-formed, but of a kind that is not read.
+    Unsupported,
+    /// A DataSetMessage whose valid bit is clear.
+    Invalid,
+    /// No local message type is known for the topic.
+    Untyped,
+    /// The value is not what the topic's message type holds.
+    Mismatch,
+    /// A sequence number that was there already.
+    Duplicate,
+    /// Older than what was delivered.
+    Stale,
+    /// A key frame repeated for late joiners, which we delivered before.
+    Repeat,
+    /// The topic's queue was full and its oldest sample gave way.
+    Overflow,
+    /// Larger than one NetworkMessage carries.
+    TooBig,
+    /// More topics than are tracked.
+    TooManyTopics,
+    /// The local side did not take it.
+    NotPublished,
+    /// The socket did not take it.
+    NotSent,
+}
+
+impl Reason {
+    /// All of them, in the order of their counters.
+    pub const ALL: [Self; 17] = [
+        Self::Looped,
+        Self::SpaceTaken,
+        Self::NotInSpace,
+        Self::PublisherWidth,
+        Self::Malformed,
+        Self::Unsupported,
+        Self::Invalid,
+        Self::Untyped,
+        Self::Mismatch,
+        Self::Duplicate,
+        Self::Stale,
+        Self::Repeat,
+        Self::Overflow,
+        Self::TooBig,
+        Self::TooManyTopics,
+        Self::NotPublished,
+        Self::NotSent,
+    ];
+
+    /// The label of its counter.
+    #[must_use]
+    pub const fn label(self) -> &'static str {
+        match self {
+            Self::Looped => "looped",
+            Self::SpaceTaken => "space_taken",
+            Self::NotInSpace => "not_in_space",
+            Self::PublisherWidth => "publisher_width",
+            Self::Malformed => "malformed",
+            Self::Unsupported => "unsupported",
+            Self::Invalid => "invalid",
+            Self::Untyped => "untyped",
+            Self::Mismatch => "mismatch",
+            Self::Duplicate => "duplicate",
+            Self::Stale => "stale",
+            Self::Repeat => "repeat",
+            Self::Overflow => "overflow",
+            Self::TooBig => "too_big",
+            Self::TooManyTopics => "too_many_topics",
+            Self::NotPublished => "not_published",
+            Self::NotSent => "not_sent",
+        }
+    }
+
+    /// Whether it belongs to normal traffic, so that nobody needs to be told.
+    #[must_use]
+    pub const fn is_routine(self) -> bool {
+        matches!(self, Self::Looped | Self::Repeat | Self::NotInSpace)
+    }
+}
+
+impl fmt::Display for Reason {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.label())
+    }
+}
+
+/// What became of one sample.
+#[must_use]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// It waits in the topic's queue for `poll_output`.
+    Forward,
+    /// It waits in the queue, and the oldest one there was dropped for it.
+    ForwardAfterDroppingOldest,
+    /// It does not cross.
+    Drop(Reason),
+}
+
+/// Counts of one topic, or of the datagrams that belong to none.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Samples of our own space that were handed out as NetworkMessages.
+    pub sent: u64,
+    /// Samples of other spaces that were handed out to the local side.
+    pub delivered: u64,
+    /// Key frames repeated for late joiners.
+    pub repeated: u64,
+    /// DataSetMessages of other spaces that never came, by the gaps in their sequence numbers.
+    pub missing: u64,
+    /// Keep-alives sent.
+    pub keep_alives: u64,
+    dropped: [u64; Reason::ALL.len()],
+}
+
+impl Counters {
+    /// How many were dropped for `reason`.
+    #[must_use]
+    pub fn dropped(&self, reason: Reason) -> u64 {
+        Reason::ALL
+            .iter()
+            .zip(self.dropped)
+            .find_map(|(each, count)| (*each == reason).then_some(count))
+            .unwrap_or_default()
+    }
+
+    /// Every reason that occurred, with its count.
+    pub fn drops(&self) -> impl Iterator<Item = (Reason, u64)> {
+        Reason::ALL
+            .into_iter()
+            .zip(self.dropped)
+            .filter(|(_, count)| *count > 0)
+    }
+
+    /// Adds `count` drops and says how many there are now.
+    pub(crate) fn add(&mut self, reason: Reason, count: u64) -> u64 {
+        for (each, total) in Reason::ALL.iter().zip(&mut self.dropped) {
+            if *each == reason {
+                *total = total.saturating_add(count);
+                return *total;
+            }
+        }
+        0
+    }
+}
+
+/// Whether the `total`th occurrence is told: the 1st, 10th, 100th and so on, so that a flood stays a few lines.
+pub(crate) fn is_told(total: u64) -> bool {
+    total
+        .checked_ilog10()
+        .is_some_and(|digits| total == 10_u64.pow(digits))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_flood_is_told_once_per_decade() {
+        let told: Vec<u64> = (0..=1000).filter(|total| is_told(*total)).collect();
+        assert_eq!(told, [1, 10, 100, 1000]);
+    }
+
+    #[test]
+    fn every_reason_has_its_own_counter_and_label() {
+        let mut counters = Counters::default();
+        for (index, reason) in Reason::ALL.into_iter().enumerate() {
+            counters.add(reason, index as u64 + 1);
+        }
+        for (index, reason) in Reason::ALL.into_iter().enumerate() {
+            assert_eq!(counters.dropped(reason), index as u64 + 1, "{reason}");
+        }
+        let labels: std::collections::BTreeSet<_> =
+            Reason::ALL.iter().map(|reason| reason.label()).collect();
+        assert_eq!(labels.len(), Reason::ALL.len());
+    }
+}

@@ -1,0 +1,274 @@
+//! Where the fields of a ROS message and those of a DataSetMessage meet.
+//!
+//! `messages` runs its plans into a sink and from a source and knows no UADP bytes; here are the sink that is a
+//! [`FieldEncoder`] and the source that reads [`Fields`]. A message in an array of messages is an ExtensionObject with
+//! a binary body, its TypeId a string NodeId of the ROS type's name in the topic's namespace.
+
+use messages::{Plan, ReadError, Sink, Source, SourceError, TypeName};
+use uadp::{
+    Array, BuiltinType, DecodeError, Elements, EncodeError, ExtensionBody, FieldEncoder, Fields,
+    NodeId, Scalar, StructureReader, Variant,
+};
+
+use crate::counters::Reason;
+
+/// A local payload, with what is needed to read it.
+pub(crate) enum Payload<'a> {
+    /// A block of fields, to be copied.
+    Block(&'a [u8]),
+    /// A ROS message.
+    Ros(&'a Plan, &'a [u8]),
+}
+
+/// Writes the fields of a local payload into a key frame.
+pub(crate) fn read(
+    payload: &Payload<'_>,
+    namespace: u16,
+    frame: &mut FieldEncoder<'_>,
+) -> Result<(), (Reason, String)> {
+    match payload {
+        Payload::Block(block) => {
+            // Checked here, since a bad block would be an unreadable datagram for everybody.
+            Fields::parse(block)
+                .and_then(|fields| fields.checked_bytes())
+                .map_err(|error| (Reason::Malformed, error.to_string()))?;
+            frame
+                .fields_block(block)
+                .map_err(|error| (Reason::TooBig, error.to_string()))
+        }
+        Payload::Ros(plan, bytes) => {
+            let mut sink = FrameSink { frame, namespace };
+            plan.read(bytes, &mut sink).map_err(|error| match &error {
+                ReadError::Malformed { .. } => (Reason::Malformed, error.to_string()),
+                ReadError::Sink { source, .. } => (Reason::TooBig, source.to_string()),
+            })
+        }
+    }
+}
+
+/// Appends the ROS message that the fields make.
+pub(crate) fn write(
+    plan: &Plan,
+    fields: Fields<'_>,
+    out: &mut Vec<u8>,
+) -> Result<(), (Reason, String)> {
+    let mut source = FieldSource::new(fields);
+    plan.write(&mut source, out)
+        .map_err(|error| (Reason::Mismatch, error.to_string()))
+}
+
+/// Appends the fields as they are, once it is sure that they can be read.
+pub(crate) fn copy(fields: &Fields<'_>, out: &mut Vec<u8>) -> Result<(), (Reason, String)> {
+    let block = fields
+        .checked_bytes()
+        .map_err(|error| (Reason::Malformed, error.to_string()))?;
+    out.extend_from_slice(block);
+    Ok(())
+}
+
+/// Builtin type of a field, and whether it is an array.
+pub(crate) fn shape(field: &Variant<'_>) -> (BuiltinType, bool) {
+    match field {
+        Variant::Null => (BuiltinType::Variant, false),
+        Variant::Scalar(scalar) => (scalar.builtin_type(), false),
+        Variant::Array(array) => (array.element(), true),
+    }
+}
+
+/// A key frame that takes what a plan reads.
+struct FrameSink<'f, 'm> {
+    frame: &'f mut FieldEncoder<'m>,
+    /// That of the structures' TypeIds.
+    namespace: u16,
+}
+
+impl Sink for FrameSink<'_, '_> {
+    type Error = EncodeError;
+
+    fn scalar(&mut self, value: Scalar<'_>) -> Result<(), EncodeError> {
+        self.frame.scalar(value)
+    }
+
+    fn packed_array(
+        &mut self,
+        element: BuiltinType,
+        count: usize,
+        bytes: &[u8],
+    ) -> Result<(), EncodeError> {
+        self.frame.packed_array(element, count, bytes)
+    }
+
+    fn array(&mut self, element: BuiltinType, count: usize) -> Result<(), EncodeError> {
+        if element == BuiltinType::ExtensionObject {
+            // Messages within a message of an array: structures by value.
+            self.frame.inline_structures(count)
+        } else {
+            self.frame.array(element, count)
+        }
+    }
+
+    fn element(&mut self, value: Scalar<'_>) -> Result<(), EncodeError> {
+        self.frame.element(value)
+    }
+
+    fn structures(&mut self, _of: &TypeName, count: usize) -> Result<(), EncodeError> {
+        self.frame.structures(count)
+    }
+
+    fn begin_structure(&mut self, of: &TypeName) -> Result<(), EncodeError> {
+        self.frame
+            .begin_structure(NodeId::string(self.namespace, &of.to_string()))
+    }
+
+    fn end_structure(&mut self) -> Result<(), EncodeError> {
+        self.frame.end_structure()
+    }
+}
+
+/// The fields of a key frame, given one by one to a plan that writes a message.
+struct FieldSource<'a> {
+    fields: Fields<'a>,
+    /// What is left of the array opened last.
+    elements: Option<Elements<'a>>,
+    /// What is left of the structures opened last.
+    structures: Option<Elements<'a>>,
+    /// The structure being read.
+    structure: Option<StructureReader<'a>>,
+}
+
+impl<'a> FieldSource<'a> {
+    const fn new(fields: Fields<'a>) -> Self {
+        Self {
+            fields,
+            elements: None,
+            structures: None,
+            structure: None,
+        }
+    }
+
+    fn field(&mut self) -> Result<Variant<'a>, SourceError> {
+        self.fields
+            .next()
+            .ok_or(SourceError::Missing)?
+            .map_err(malformed)
+    }
+
+    /// The next field, or the next value of the structure being read, as an array.
+    fn next_array(&mut self, expected: BuiltinType) -> Result<Array<'a>, SourceError> {
+        if let Some(structure) = &mut self.structure {
+            return structure.array(expected).map_err(malformed);
+        }
+        match self.field()? {
+            Variant::Array(array) if array.element() == expected => Ok(array),
+            other @ (Variant::Null | Variant::Scalar(_) | Variant::Array(_)) => {
+                Err(unexpected(expected, true, &other))
+            }
+        }
+    }
+}
+
+impl<'a> Source<'a> for FieldSource<'a> {
+    fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'a>, SourceError> {
+        if let Some(structure) = &mut self.structure {
+            return structure.scalar(expected).map_err(malformed);
+        }
+        match self.field()? {
+            Variant::Scalar(scalar) if scalar.builtin_type() == expected => Ok(scalar),
+            other @ (Variant::Null | Variant::Scalar(_) | Variant::Array(_)) => {
+                Err(unexpected(expected, false, &other))
+            }
+        }
+    }
+
+    fn packed_array(&mut self, expected: BuiltinType) -> Result<(usize, &'a [u8]), SourceError> {
+        let array = self.next_array(expected)?;
+        Ok((array.len(), array.bytes()))
+    }
+
+    fn array(&mut self, expected: BuiltinType) -> Result<usize, SourceError> {
+        if let (Some(structure), BuiltinType::ExtensionObject) = (&mut self.structure, expected) {
+            // Messages within a message of an array stand inline: only their number is here.
+            return structure
+                .length()
+                .map_err(malformed)
+                .map(Option::unwrap_or_default);
+        }
+        let array = self.next_array(expected)?;
+        self.elements = Some(array.iter());
+        Ok(array.len())
+    }
+
+    fn element(&mut self, expected: BuiltinType) -> Result<Scalar<'a>, SourceError> {
+        let element = self
+            .elements
+            .as_mut()
+            .and_then(Iterator::next)
+            .ok_or(SourceError::Missing)?;
+        if element.builtin_type() == expected {
+            return Ok(element);
+        }
+        Err(unexpected(expected, false, &Variant::Scalar(element)))
+    }
+
+    fn structures(&mut self) -> Result<usize, SourceError> {
+        let array = self.next_array(BuiltinType::ExtensionObject)?;
+        self.structures = Some(array.iter());
+        Ok(array.len())
+    }
+
+    fn begin_structure(&mut self) -> Result<(), SourceError> {
+        let next = self
+            .structures
+            .as_mut()
+            .and_then(Iterator::next)
+            .ok_or(SourceError::Missing)?;
+        let Scalar::ExtensionObject(object) = next else {
+            return Err(unexpected(
+                BuiltinType::ExtensionObject,
+                false,
+                &Variant::Scalar(next),
+            ));
+        };
+        let ExtensionBody::Binary(body) = object.body else {
+            return Err(SourceError::Malformed(
+                "a structure without a binary body".to_owned(),
+            ));
+        };
+        self.structure = Some(StructureReader::new(body));
+        Ok(())
+    }
+
+    fn end_structure(&mut self) -> Result<(), SourceError> {
+        match self
+            .structure
+            .take()
+            .map_or(0, |structure| structure.remaining())
+        {
+            0 => Ok(()),
+            left => Err(SourceError::Malformed(format!(
+                "{left} bytes too many in a structure"
+            ))),
+        }
+    }
+
+    fn finish(&mut self) -> Result<(), SourceError> {
+        match self.fields.by_ref().count() {
+            0 => Ok(()),
+            left => Err(SourceError::LeftOver(left)),
+        }
+    }
+}
+
+fn malformed(error: DecodeError) -> SourceError {
+    SourceError::Malformed(error.to_string())
+}
+
+fn unexpected(expected: BuiltinType, expected_array: bool, found: &Variant<'_>) -> SourceError {
+    let found_array = matches!(found, Variant::Array(_));
+    SourceError::Type {
+        expected,
+        expected_array,
+        found: found.builtin_type(),
+        found_array,
+    }
+}

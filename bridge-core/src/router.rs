@@ -1,0 +1,762 @@
+//! The Router: verdicts on samples, queues per topic, repetitions and silences.
+
+use std::cmp::Reverse;
+use std::collections::{BinaryHeap, HashMap, VecDeque};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use mappings::{Mapping, Overflow, PublisherIdRule, SpaceId, TopicId};
+use messages::{MessageType, Plan, PlanError, Selection, Wire};
+use uadp::{
+    DataSetHeader, DataSetMessage, DecodeError, Fields, MessageKind, NetworkHeader, NetworkMessage,
+    PublisherId, Timestamp,
+};
+
+use crate::counters::{Counters, Reason, Verdict, is_told};
+use crate::fields;
+use crate::hops::{Hop, Hops};
+use crate::loop_rule::{Side, may_cross};
+use crate::network::{data_set_header, encode, keep_alive};
+use crate::output::{Delivery, Notice, Output};
+use crate::reader::{Held, Place, Reader};
+use crate::settings::{Local, Now, Settings};
+use crate::topic::{Item, Role, Topic};
+use crate::writer::{Encoded, Idle, Writer};
+
+/// Decides what crosses between one space and UADP. See the crate's page for how it is driven.
+#[derive(Debug)]
+pub struct Router {
+    settings: Settings,
+    mapping: Arc<Mapping>,
+    topics: HashMap<TopicId, Topic>,
+    /// Topics with something in their queue, served in turn: a camera cannot starve a button.
+    ready: VecDeque<TopicId>,
+    /// What is told besides samples. Bounded by the topics and by [`is_told`].
+    told: VecDeque<Output>,
+    timers: BinaryHeap<Reverse<(Instant, TopicId)>>,
+    /// Buffers given back by [`recycle`](Self::recycle).
+    spare: Vec<Vec<u8>>,
+    /// Datagrams and messages that belong to no topic.
+    others: Counters,
+    hops: Hops,
+}
+
+impl Router {
+    /// A Router for one space. `mapping` says how each topic queues and how often values are repeated.
+    #[must_use]
+    pub fn new(settings: Settings, mapping: Arc<Mapping>) -> Self {
+        Self {
+            settings,
+            mapping,
+            topics: HashMap::new(),
+            ready: VecDeque::new(),
+            told: VecDeque::new(),
+            timers: BinaryHeap::new(),
+            spare: Vec::new(),
+            others: Counters::default(),
+            hops: Hops::new(),
+        }
+    }
+
+    /// Ties a topic to its local message type, compiled once. A topic bound anew starts afresh with the new type; a
+    /// sample that was waiting for a type goes out.
+    ///
+    /// # Errors
+    /// [`PlanError`] when the selection is not in the type; the topic stays as it was.
+    pub fn bind(
+        &mut self,
+        topic: TopicId,
+        message_type: &Arc<MessageType>,
+        selection: &Selection,
+        now: Now,
+    ) -> Result<(), PlanError> {
+        let wire = match self.settings.local {
+            Local::Ros1 => Wire::Ros1,
+            Local::Cdr => Wire::Cdr,
+            // A side that speaks in fields needs no plan.
+            Local::Fields => return Ok(()),
+        };
+        let plan = Plan::compile(message_type, selection, wire)?;
+        let Some(entry) = self.entry(topic, None, now) else {
+            return Ok(());
+        };
+        entry.plan = Some(plan);
+        let held = match &mut entry.role {
+            Role::Theirs(reader) => {
+                reader.forget_delivered();
+                reader.held.take()
+            }
+            Role::Ours(_) => None,
+        };
+        if let Some(held) = held
+            && let Ok(fields) = Fields::parse(&held.fields)
+        {
+            let Held {
+                source,
+                status,
+                arrived,
+                ..
+            } = held;
+            let sample = Sample {
+                fields,
+                source,
+                status,
+                arrived,
+            };
+            self.deliver(topic, &sample);
+        }
+        Ok(())
+    }
+
+    /// A sample was heard on the local side. `received` is when it came.
+    pub fn handle_local(
+        &mut self,
+        topic: TopicId,
+        payload: &[u8],
+        received: Timestamp,
+        now: Now,
+    ) -> Verdict {
+        if !may_cross(self.settings.own, Side::Local, topic.space) {
+            return self.refuse(topic, Reason::Looped, String::new());
+        }
+        let mut encoded = Encoded {
+            bytes: self.buffer(),
+            ..Encoded::default()
+        };
+        let local = self.settings.local;
+        let Some(Topic {
+            role: Role::Ours(writer),
+            plan,
+            overflow,
+            ..
+        }) = self.entry(topic, None, now)
+        else {
+            let detail = format!("more than {MAX_TOPICS} topics are in the space");
+            return self.refuse(topic, Reason::TooManyTopics, detail);
+        };
+        let sample = match (local, plan) {
+            (Local::Fields, _) => fields::Payload::Block(payload),
+            (Local::Ros1 | Local::Cdr, Some(plan)) => fields::Payload::Ros(plan, payload),
+            (Local::Ros1 | Local::Cdr, None) => {
+                let detail = "its message type is not known yet".to_owned();
+                return self.refuse(topic, Reason::Untyped, detail);
+            }
+        };
+        let header = data_set_header(writer.expected_sequence(), received);
+        match encode(&mut encoded, topic, &header, now.utc, &sample) {
+            Ok(()) => {}
+            Err((reason, detail)) => {
+                self.recycle(encoded.bytes);
+                return self.refuse(topic, reason, detail);
+            }
+        }
+        // The number is used up only by a message that goes out.
+        writer.next_sequence();
+        let keep = *overflow == Overflow::KeepLatest;
+        writer.sent(&encoded, keep, now.monotonic);
+        self.hops.record(Hop::Out, received, now.utc);
+        self.schedule(topic);
+        if self.push(topic, Item::Datagram(encoded)) {
+            Verdict::ForwardAfterDroppingOldest
+        } else {
+            Verdict::Forward
+        }
+    }
+
+    /// Whether a topic of our own space has a producer. Without one its value is no longer repeated, so that
+    /// readers see it fall silent; the next sample revives it.
+    pub fn set_live(&mut self, topic: TopicId, live: bool, now: Now) {
+        if let Some(Topic {
+            role: Role::Ours(writer),
+            ..
+        }) = self.entry(topic, None, now)
+        {
+            writer.set_live(live);
+            self.schedule(topic);
+        }
+    }
+
+    /// A datagram came from the UA side. What its messages hold is queued; what is wrong with it is counted.
+    pub fn handle_datagram(&mut self, datagram: &[u8], from: SocketAddr, now: Now) {
+        let message = match NetworkMessage::decode(datagram) {
+            Ok(message) => message,
+            Err(error) => {
+                self.drop_undecoded(None, from, &error);
+                return;
+            }
+        };
+        let header = message.header();
+        let (Some(space), Some(namespace)) = (
+            self.space_of(header, from),
+            header.group.and_then(|group| group.writer_group_id),
+        ) else {
+            return;
+        };
+        if !may_cross(self.settings.own, Side::Ua, space) {
+            self.drop_own(from);
+            return;
+        }
+        let sent = header.timestamp.map(|time| Timestamp {
+            time,
+            picoseconds: header.picoseconds.unwrap_or_default(),
+        });
+        for message in message.messages() {
+            match message {
+                Ok(message) => {
+                    let writer_id = message.writer_id.unwrap_or_default();
+                    let id = TopicId::new(u16::from(space.get()), namespace, writer_id);
+                    match id {
+                        Some(topic) => self.handle_message(topic, &message, (from, sent), now),
+                        None => self.count(About::sender(from), Reason::NotInSpace, 1, String::new),
+                    }
+                }
+                Err(error) => self.drop_undecoded(None, from, &error),
+            }
+        }
+    }
+
+    /// Repeats values, sends keep-alives and notices silences that are due by `now`.
+    pub fn handle_timeout(&mut self, now: Now) {
+        while let Some(Reverse((at, topic))) = self.timers.peek().copied() {
+            if at > now.monotonic {
+                break;
+            }
+            self.timers.pop();
+            let Some(entry) = self.topics.get_mut(&topic) else {
+                continue;
+            };
+            if entry.timer != Some(at) {
+                // An entry that a later one replaced.
+                continue;
+            }
+            entry.timer = None;
+            self.handle_due(topic, now);
+            self.schedule(topic);
+        }
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) is wanted next.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<Instant> {
+        self.timers.peek().map(|Reverse((at, _))| *at)
+    }
+
+    /// The next thing to do, topic by topic in turn. `None`: nothing until the next `handle_*`.
+    pub fn poll_output(&mut self, now: Now) -> Option<Output> {
+        if let Some(told) = self.told.pop_front() {
+            return Some(told);
+        }
+        while let Some(topic) = self.ready.pop_front() {
+            let Some(entry) = self.topics.get_mut(&topic) else {
+                continue;
+            };
+            let item = entry.queue.pop();
+            entry.ready = !entry.queue.is_empty();
+            if entry.ready {
+                self.ready.push_back(topic);
+            }
+            match item {
+                Some(Item::Datagram(mut datagram)) => {
+                    entry.counters.sent += 1;
+                    datagram.stamp(now.utc);
+                    return Some(Output::Datagram {
+                        topic,
+                        bytes: datagram.bytes,
+                    });
+                }
+                Some(Item::Delivery(delivery)) => {
+                    entry.counters.delivered += 1;
+                    return Some(Output::Delivery(delivery));
+                }
+                None => {}
+            }
+        }
+        None
+    }
+
+    /// The local side took a delivery: its time in this program ends at `now`.
+    pub fn published(&mut self, arrived: Timestamp, now: Now) {
+        self.hops.record(Hop::In, arrived, now.utc);
+    }
+
+    /// An output could not be carried out: counts it under `reason`, with what was said.
+    pub fn failed(&mut self, topic: TopicId, reason: Reason, detail: &str) {
+        if let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+        {
+            // It was not delivered after all, so its repetition is welcome.
+            reader.forget_delivered();
+        }
+        self.count(About::topic(topic), reason, 1, || detail.to_owned());
+    }
+
+    /// Samples that were lost before the Router saw them, in a queue of the port or the kernel.
+    pub fn lost(&mut self, topic: Option<TopicId>, count: u64, why: &'static str) {
+        self.count(About { topic, from: None }, Reason::Overflow, count, || {
+            why.to_owned()
+        });
+    }
+
+    /// Takes back the buffer of a datagram or payload that has been used, so that the next one needs no allocation.
+    pub fn recycle(&mut self, mut buffer: Vec<u8>) {
+        if self.spare.len() < SPARE_BUFFERS && buffer.capacity() <= SPARE_CAPACITY {
+            buffer.clear();
+            self.spare.push(buffer);
+        }
+    }
+
+    /// The counters of each topic, in no order.
+    pub fn topics(&self) -> impl Iterator<Item = (TopicId, &Counters)> {
+        self.topics
+            .iter()
+            .map(|(topic, entry)| (*topic, &entry.counters))
+    }
+
+    /// The counters of datagrams and messages that belong to no topic.
+    #[must_use]
+    pub const fn others(&self) -> &Counters {
+        &self.others
+    }
+
+    /// The delays seen so far.
+    #[must_use]
+    pub const fn hops(&self) -> &Hops {
+        &self.hops
+    }
+
+    /// Gives the space a NetworkMessage comes from, or counts why it is none of ours to read.
+    fn space_of(&mut self, header: &NetworkHeader<'_>, from: SocketAddr) -> Option<SpaceId> {
+        let (number, exact) = match header.publisher_id {
+            Some(PublisherId::UInt16(number)) => (u64::from(number), true),
+            Some(PublisherId::Byte(number)) => (u64::from(number), false),
+            Some(PublisherId::UInt32(number)) => (u64::from(number), false),
+            Some(PublisherId::UInt64(number)) => (number, false),
+            Some(PublisherId::String(_)) | None => (u64::MAX, false),
+        };
+        let Some(space) = u16::try_from(number).ok().and_then(SpaceId::new) else {
+            self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
+            return None;
+        };
+        if exact || self.mapping.pubsub().publisher_id == PublisherIdRule::AnyWidth {
+            return Some(space);
+        }
+        self.count(About::sender(from), Reason::PublisherWidth, 1, || {
+            format!(
+                "PublisherId {number} is not a UInt16; if that writer is meant to be space {space}, \
+                 set `publisher_id: any_width`"
+            )
+        });
+        None
+    }
+
+    /// Counts a datagram with our own PublisherId: our own, or that of a rival.
+    fn drop_own(&mut self, from: SocketAddr) {
+        let own = self.settings.own;
+        let ours = self.settings.source.is_none_or(|source| {
+            source.port() == from.port()
+                && (source.ip().is_unspecified() || source.ip() == from.ip())
+        });
+        let reason = if ours {
+            Reason::Looped
+        } else {
+            Reason::SpaceTaken
+        };
+        self.count(About::sender(from), reason, 1, || {
+            format!(
+                "another program sends as space {own}: every sample is doubled; end one of them"
+            )
+        });
+    }
+
+    /// One DataSetMessage of another space: into the sequence, and on if it brings something new.
+    fn handle_message(
+        &mut self,
+        topic: TopicId,
+        message: &DataSetMessage<'_>,
+        (from, sent): (SocketAddr, Option<Timestamp>),
+        now: Now,
+    ) {
+        if !message.header.valid {
+            self.count(
+                About {
+                    topic: Some(topic),
+                    from: Some(from),
+                },
+                Reason::Invalid,
+                1,
+                || "the writer marked its DataSetMessage as invalid".to_owned(),
+            );
+            return;
+        }
+        let place = place(&message.header, from);
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            counters,
+            ..
+        }) = self.entry(topic, Some(from), now)
+        else {
+            self.count(About::sender(from), Reason::TooManyTopics, 1, || {
+                format!("more than {MAX_TOPICS} topics are in the space; {topic} is not followed")
+            });
+            return;
+        };
+        let was_silent = reader.heard(now.monotonic);
+        let admitted = match message.kind {
+            MessageKind::KeyFrame => Some(reader.admit(place)),
+            // It says that the writer lives, and that is all.
+            MessageKind::KeepAlive => None,
+            // Told apart below, by what the codec says of them.
+            MessageKind::DeltaFrame | MessageKind::Event => Some(Ok(0)),
+        };
+        if let Some(Ok(missing)) = admitted {
+            counters.missing += u64::from(missing);
+        }
+        if was_silent {
+            self.told.push_back(Output::Silent {
+                topic,
+                silent: false,
+            });
+            self.schedule(topic);
+        }
+        match admitted {
+            None => {}
+            Some(Err(reason)) => self.count(
+                About {
+                    topic: Some(topic),
+                    from: Some(from),
+                },
+                reason,
+                1,
+                String::new,
+            ),
+            Some(Ok(_)) => match message.fields() {
+                Ok(fields) => {
+                    self.record_way(place.stamp, sent, now);
+                    let sample = Sample {
+                        fields,
+                        source: place.stamp,
+                        status: message.header.status.unwrap_or_default(),
+                        arrived: now.utc,
+                    };
+                    self.route(topic, &sample, place, now);
+                }
+                Err(error) => self.drop_undecoded(Some(topic), from, &error),
+            },
+        }
+    }
+
+    /// Hands a sample on, or keeps it until its local type is known.
+    fn route(&mut self, topic: TopicId, sample: &Sample<'_>, place: Place, now: Now) {
+        let typed = self.settings.local == Local::Fields;
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            plan,
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        if typed || plan.is_some() {
+            reader.delivered(place);
+            self.deliver(topic, sample);
+            return;
+        }
+        if reader
+            .asked
+            .is_none_or(|asked| now.monotonic >= asked + ASK_AGAIN)
+        {
+            reader.asked = Some(now.monotonic);
+            let fields = sample.fields.clone();
+            let shape = fields
+                .filter_map(Result::ok)
+                .map(|field| fields::shape(&field))
+                .collect();
+            self.told.push_back(Output::Unbound { topic, shape });
+        }
+        let fields = sample.fields.bytes();
+        reader.held = (fields.len() <= MAX_HELD).then(|| Held {
+            fields: fields.to_vec(),
+            source: sample.source,
+            status: sample.status,
+            arrived: sample.arrived,
+        });
+        // Not yet a loss: the newest one waits. It is not told, since the port names topics without a type.
+        self.count(About::topic(topic), Reason::Untyped, 1, String::new);
+    }
+
+    fn deliver(&mut self, topic: TopicId, sample: &Sample<'_>) {
+        let mut payload = self.buffer();
+        let written = match self
+            .topics
+            .get(&topic)
+            .and_then(|entry| entry.plan.as_ref())
+        {
+            Some(plan) => fields::write(plan, sample.fields.clone(), &mut payload),
+            None => fields::copy(&sample.fields, &mut payload),
+        };
+        if let Err((reason, detail)) = written {
+            self.recycle(payload);
+            self.count(About::topic(topic), reason, 1, || detail);
+            return;
+        }
+        let Sample {
+            source,
+            status,
+            arrived,
+            ..
+        } = *sample;
+        self.push(
+            topic,
+            Item::Delivery(Delivery {
+                topic,
+                payload,
+                source,
+                status,
+                arrived,
+            }),
+        );
+    }
+
+    fn record_way(&mut self, taken: Option<Timestamp>, sent: Option<Timestamp>, now: Now) {
+        // Stacks that never fill the stamps send zeros.
+        let filled = |stamp: &Timestamp| stamp.time.0 != 0;
+        let Some(sent) = sent.filter(filled) else {
+            return;
+        };
+        self.hops.record(Hop::Network, sent, now.utc);
+        if let Some(taken) = taken.filter(filled) {
+            self.hops.record(Hop::Origin, taken, sent);
+        }
+    }
+
+    fn handle_due(&mut self, topic: TopicId, now: Now) {
+        let (key_frames, keep_alives, silence) = self.periods();
+        let buffer = self.buffer();
+        let Some(entry) = self.topics.get_mut(&topic) else {
+            return;
+        };
+        match &mut entry.role {
+            Role::Theirs(reader) => {
+                if reader.fell_silent(now.monotonic, silence) {
+                    self.told.push_back(Output::Silent {
+                        topic,
+                        silent: true,
+                    });
+                }
+            }
+            Role::Ours(writer) => {
+                let Some((at, idle)) = writer.due(key_frames, keep_alives) else {
+                    return;
+                };
+                if at > now.monotonic {
+                    return;
+                }
+                let datagram = match idle {
+                    Idle::Repeat => {
+                        entry.counters.repeated += 1;
+                        writer.repeat(now.monotonic, buffer)
+                    }
+                    Idle::KeepAlive => {
+                        entry.counters.keep_alives += 1;
+                        writer.sent_keep_alive(now.monotonic);
+                        keep_alive(buffer, topic, writer.expected_sequence(), now.utc)
+                    }
+                };
+                // A fresh sample that waits in the queue says more than a repetition of the one before.
+                if let (Some(datagram), true) = (datagram, entry.queue.is_empty()) {
+                    self.push(topic, Item::Datagram(datagram));
+                }
+            }
+        }
+    }
+
+    /// Puts the topic on the timer list at the time it wants to be looked at.
+    fn schedule(&mut self, topic: TopicId) {
+        let (key_frames, keep_alives, silence) = self.periods();
+        let Some(entry) = self.topics.get_mut(&topic) else {
+            return;
+        };
+        let due = match &entry.role {
+            Role::Ours(writer) => writer.due(key_frames, keep_alives).map(|(at, _)| at),
+            Role::Theirs(reader) => reader.due(silence),
+        };
+        // An earlier entry stays: it finds nothing due and asks again, which spares the list an entry per sample.
+        if let Some(due) = due
+            && entry.timer.is_none_or(|at| due < at)
+        {
+            entry.timer = Some(due);
+            self.timers.push(Reverse((due, topic)));
+        }
+    }
+
+    fn periods(&self) -> (Duration, Duration, Duration) {
+        let pubsub = self.mapping.pubsub();
+        (
+            pubsub.key_frame_period,
+            pubsub.keep_alive_period,
+            pubsub.receive_timeout,
+        )
+    }
+
+    /// The topic's entry, made when it is new and there is room.
+    fn entry(&mut self, topic: TopicId, from: Option<SocketAddr>, now: Now) -> Option<&mut Topic> {
+        if !self.topics.contains_key(&topic) {
+            if self.topics.len() >= MAX_TOPICS {
+                return None;
+            }
+            let overflow = self
+                .mapping
+                .variable(topic)
+                .map_or(Overflow::KeepLatest, |found| found.overflow);
+            let role = if topic.space == self.settings.own {
+                Role::Ours(Writer::new(now.monotonic))
+            } else {
+                let from = from.unwrap_or_else(|| SocketAddr::from(([0, 0, 0, 0], 0)));
+                Role::Theirs(Reader::new(from, now.monotonic))
+            };
+            self.topics.insert(topic, Topic::new(role, overflow));
+            if from.is_some() {
+                self.schedule(topic);
+            }
+        }
+        self.topics.get_mut(&topic)
+    }
+
+    /// Queues an item, and says whether the oldest one had to go for it.
+    fn push(&mut self, topic: TopicId, item: Item) -> bool {
+        let Some(entry) = self.topics.get_mut(&topic) else {
+            return false;
+        };
+        let dropped = entry.queue.push(item);
+        if !entry.ready {
+            entry.ready = true;
+            self.ready.push_back(topic);
+        }
+        let (Some(Item::Datagram(Encoded { bytes, .. }))
+        | Some(Item::Delivery(Delivery { payload: bytes, .. }))) = dropped
+        else {
+            return false;
+        };
+        self.recycle(bytes);
+        self.count(About::topic(topic), Reason::Overflow, 1, || {
+            "the queue was full, its oldest sample was dropped".to_owned()
+        });
+        true
+    }
+
+    fn drop_undecoded(&mut self, topic: Option<TopicId>, from: SocketAddr, error: &DecodeError) {
+        self.count(
+            About {
+                topic,
+                from: Some(from),
+            },
+            reason_of(error),
+            1,
+            || error.to_string(),
+        );
+    }
+
+    /// Counts a sample of the local side that does not cross.
+    fn refuse(&mut self, topic: TopicId, reason: Reason, detail: String) -> Verdict {
+        self.count(About::topic(topic), reason, 1, || detail);
+        Verdict::Drop(reason)
+    }
+
+    /// Counts drops, and tells of them at their 1st, 10th, 100th ... occurrence.
+    fn count(
+        &mut self,
+        About { topic, from }: About,
+        reason: Reason,
+        count: u64,
+        detail: impl FnOnce() -> String,
+    ) {
+        let counters = topic
+            .and_then(|topic| self.topics.get_mut(&topic))
+            .map_or(&mut self.others, |entry| &mut entry.counters);
+        let before = counters.dropped(reason);
+        let total = counters.add(reason, count);
+        let told = !reason.is_routine() && (before + 1..=total).take(MAX_TOLD_STEPS).any(is_told);
+        if told {
+            let detail = detail();
+            if !detail.is_empty() {
+                self.told.push_back(Output::Notice(Notice {
+                    topic,
+                    from,
+                    reason,
+                    total,
+                    detail,
+                }));
+            }
+        }
+    }
+
+    fn buffer(&mut self) -> Vec<u8> {
+        self.spare.pop().unwrap_or_default()
+    }
+}
+
+/// What a drop is about.
+#[derive(Clone, Copy)]
+struct About {
+    topic: Option<TopicId>,
+    from: Option<SocketAddr>,
+}
+
+impl About {
+    const fn topic(topic: TopicId) -> Self {
+        Self {
+            topic: Some(topic),
+            from: None,
+        }
+    }
+
+    const fn sender(from: SocketAddr) -> Self {
+        Self {
+            topic: None,
+            from: Some(from),
+        }
+    }
+}
+
+/// A key frame's content on its way to the local side.
+struct Sample<'a> {
+    fields: Fields<'a>,
+    source: Option<Timestamp>,
+    status: u16,
+    arrived: Timestamp,
+}
+
+fn place(header: &DataSetHeader, from: SocketAddr) -> Place {
+    Place {
+        sequence: header.sequence_number,
+        stamp: header.timestamp.map(|time| Timestamp {
+            time,
+            picoseconds: header.picoseconds.unwrap_or_default(),
+        }),
+        fine: header.picoseconds.is_some(),
+        from,
+    }
+}
+
+const fn reason_of(error: &DecodeError) -> Reason {
+    if matches!(error, DecodeError::Unsupported(_)) {
+        Reason::Unsupported
+    } else {
+        Reason::Malformed
+    }
+}
+
+/// Topics followed at a time. Triples are free to invent for whoever sends to the group; memory is not.
+const MAX_TOPICS: usize = 16_384;
+/// A sample that waits for its type is kept up to this size.
+const MAX_HELD: usize = 65_536;
+/// How long the port is left alone with a topic it found no type for.
+const ASK_AGAIN: Duration = Duration::from_secs(1);
+/// Buffers kept for reuse, and how large each may have grown.
+const SPARE_BUFFERS: usize = 64;
+const SPARE_CAPACITY: usize = 128 * 1024;
+/// How far a sudden jump of a counter is searched for a decade to be told at.
+const MAX_TOLD_STEPS: usize = 1_000;

@@ -1,0 +1,57 @@
+//! Everything the Router keeps for one topic.
+
+use std::time::Instant;
+
+use mappings::Overflow;
+use messages::Plan;
+
+use crate::counters::Counters;
+use crate::output::Delivery;
+use crate::queue::Queue;
+use crate::reader::Reader;
+use crate::writer::{Encoded, Writer};
+
+/// One topic of the space, seen from one bridge: of our own space, or of another.
+#[derive(Debug)]
+pub(crate) struct Topic {
+    pub(crate) role: Role,
+    /// How its bytes become fields or the other way. `None` until the local type is known, and for a local side
+    /// that speaks in fields.
+    pub(crate) plan: Option<Plan>,
+    pub(crate) queue: Queue<Item>,
+    pub(crate) overflow: Overflow,
+    pub(crate) counters: Counters,
+    /// Whether it stands in the Router's list of topics with something to poll.
+    pub(crate) ready: bool,
+    /// The instant the Router's timer list holds for it.
+    pub(crate) timer: Option<Instant>,
+}
+
+#[derive(Debug)]
+pub(crate) enum Role {
+    /// Produced here: we are its DataSetWriter.
+    Ours(Writer),
+    /// Produced elsewhere.
+    Theirs(Reader),
+}
+
+/// A sample on its way out.
+#[derive(Debug)]
+pub(crate) enum Item {
+    Datagram(Encoded),
+    Delivery(Delivery),
+}
+
+impl Topic {
+    pub(crate) fn new(role: Role, overflow: Overflow) -> Self {
+        Self {
+            role,
+            plan: None,
+            queue: Queue::new(overflow),
+            overflow,
+            counters: Counters::default(),
+            ready: false,
+            timer: None,
+        }
+    }
+}

@@ -1,0 +1,644 @@
+//! What a bridge does with samples, datagrams and time, seen from outside.
+
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
+
+use std::net::SocketAddr;
+use std::num::NonZeroU16;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bridge_core::{Delivery, Hop, Local, Notice, Now, Output, Reason, Router, Settings, Verdict};
+use mappings::{Mapping, SpaceId, TopicId};
+use messages::{Dialect, Registry, Selection};
+use uadp::{
+    BuiltinType, DataSetHeader, Fields, GroupHeader, MessageKind, NetworkHeader, NetworkMessage,
+    NetworkMessageEncoder, PublisherId, Scalar, Timestamp, Variant,
+};
+
+/// One bridge under test and a clock that moves only when told.
+struct Bench {
+    router: Router,
+    now: Now,
+}
+
+impl Bench {
+    fn new(own: u16, local: Local) -> Self {
+        Self::with(own, local, Mapping::default())
+    }
+
+    #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
+    fn with(own: u16, local: Local, mapping: Mapping) -> Self {
+        let own = SpaceId::new(own).unwrap();
+        let settings = Settings {
+            own,
+            local,
+            source: Some(OUR_ADDRESS),
+        };
+        let utc = Timestamp::from_unix_nanos(1_700_000_000_000_000_000);
+        Self {
+            router: Router::new(settings, Arc::new(mapping)),
+            now: Now {
+                monotonic: Instant::now(),
+                utc,
+            },
+        }
+    }
+
+    fn wait(&mut self, time: Duration) {
+        self.now.monotonic += time;
+        let nanos = self.now.utc.unix_nanos() + i128::try_from(time.as_nanos()).unwrap();
+        self.now.utc = Timestamp::from_unix_nanos(nanos);
+    }
+
+    fn outputs(&mut self) -> Vec<Output> {
+        std::iter::from_fn(|| self.router.poll_output(self.now)).collect()
+    }
+
+    fn datagrams(&mut self) -> Vec<Vec<u8>> {
+        let outputs = self.outputs().into_iter();
+        outputs
+            .filter_map(|output| match output {
+                Output::Datagram { bytes, .. } => Some(bytes),
+                _ => None,
+            })
+            .collect()
+    }
+
+    fn deliveries(&mut self) -> Vec<Delivery> {
+        let outputs = self.outputs().into_iter();
+        outputs
+            .filter_map(|output| match output {
+                Output::Delivery(delivery) => Some(delivery),
+                _ => None,
+            })
+            .collect()
+    }
+
+    fn notices(&mut self) -> Vec<Notice> {
+        let outputs = self.outputs().into_iter();
+        outputs
+            .filter_map(|output| match output {
+                Output::Notice(notice) => Some(notice),
+                _ => None,
+            })
+            .collect()
+    }
+
+    fn dropped(&self, reason: Reason) -> u64 {
+        let topics: u64 = self
+            .router
+            .topics()
+            .map(|(_, counters)| counters.dropped(reason))
+            .sum();
+        topics + self.router.others().dropped(reason)
+    }
+
+    fn bind(&mut self, topic: TopicId, type_name: &str) {
+        let registry = Registry::bundle(Dialect::Ros1);
+        let message_type = registry.get(&type_name.parse().unwrap()).unwrap();
+        self.router
+            .bind(topic, &message_type, &Selection::Whole, self.now)
+            .unwrap();
+    }
+
+    fn hear(&mut self, datagram: &[u8]) {
+        self.router.handle_datagram(datagram, PEER, self.now);
+    }
+
+    fn say(&mut self, topic: TopicId, payload: &[u8]) -> Verdict {
+        self.router
+            .handle_local(topic, payload, self.now.utc, self.now)
+    }
+}
+
+/// What a foreign writer sends: one UInt32 in a key frame.
+struct Frame {
+    publisher: PublisherId<'static>,
+    group: u16,
+    writer: u16,
+    header: DataSetHeader,
+    value: u32,
+}
+
+impl Frame {
+    fn new(writer: u16, sequence: u16, value: u32) -> Self {
+        Self {
+            publisher: PublisherId::UInt16(2),
+            group: 5,
+            writer,
+            header: DataSetHeader {
+                sequence_number: Some(sequence),
+                ..DataSetHeader::default()
+            },
+            value,
+        }
+    }
+
+    fn bytes(&self) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        let mut message =
+            NetworkMessageEncoder::new(&mut bytes, &self.network(), Some(&[self.writer])).unwrap();
+        let mut frame = message.key_frame(&self.header).unwrap();
+        frame.scalar(Scalar::UInt32(self.value)).unwrap();
+        frame.finish().unwrap();
+        message.finish().unwrap();
+        bytes
+    }
+
+    fn keep_alive(&self) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        let mut message =
+            NetworkMessageEncoder::new(&mut bytes, &self.network(), Some(&[self.writer])).unwrap();
+        message.keep_alive(&self.header).unwrap();
+        message.finish().unwrap();
+        bytes
+    }
+
+    fn network(&self) -> NetworkHeader<'static> {
+        NetworkHeader {
+            publisher_id: Some(self.publisher),
+            group: Some(GroupHeader {
+                writer_group_id: Some(self.group),
+                ..GroupHeader::default()
+            }),
+            ..NetworkHeader::default()
+        }
+    }
+}
+
+fn topic(text: &str) -> TopicId {
+    text.parse().unwrap()
+}
+
+fn value_of(delivery: &Delivery) -> u32 {
+    u32::from_le_bytes(delivery.payload[..].try_into().unwrap())
+}
+
+const OUR_ADDRESS: SocketAddr =
+    SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 50_000);
+const PEER: SocketAddr =
+    SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 50_001);
+const SECOND: Duration = Duration::from_secs(1);
+
+#[test]
+fn a_ros_message_becomes_a_key_frame_of_its_triple() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    bench.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
+    assert_eq!(
+        bench.say(topic("ua_1_5_10"), &[7, 0, 0, 0]),
+        Verdict::Forward
+    );
+    let [datagram] = &bench.datagrams()[..] else {
+        panic!("one datagram")
+    };
+    let message = NetworkMessage::decode(datagram).unwrap();
+    let header = message.header();
+    assert_eq!(header.publisher_id, Some(PublisherId::UInt16(1)));
+    assert_eq!(header.group.unwrap().writer_group_id, Some(5));
+    assert_eq!(header.timestamp, Some(bench.now.utc.time));
+    let message = message.messages().next().unwrap().unwrap();
+    assert_eq!(
+        (message.writer_id, message.kind),
+        (Some(10), MessageKind::KeyFrame)
+    );
+    assert_eq!(message.header.timestamp, Some(bench.now.utc.time));
+    let fields: Vec<_> = message.fields().unwrap().collect();
+    assert_eq!(fields, [Ok(Variant::Scalar(Scalar::UInt32(7)))]);
+}
+
+#[test]
+fn what_is_heard_on_ros_of_another_space_is_looped() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    let verdict = bench.say(topic("ua_2_5_10"), &[7, 0, 0, 0]);
+    assert_eq!(verdict, Verdict::Drop(Reason::Looped));
+    assert!(bench.outputs().is_empty());
+}
+
+#[test]
+fn a_broken_ros_message_is_counted_and_told_and_the_next_one_crosses() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    bench.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
+    let verdict = bench.say(topic("ua_1_5_10"), &[7, 0]);
+    assert_eq!(verdict, Verdict::Drop(Reason::Malformed));
+    let notices = bench.notices();
+    assert_eq!(notices.len(), 1);
+    assert_eq!(notices[0].topic, Some(topic("ua_1_5_10")));
+    assert_eq!(
+        bench.say(topic("ua_1_5_10"), &[7, 0, 0, 0]),
+        Verdict::Forward
+    );
+    let datagrams = bench.datagrams();
+    let message = NetworkMessage::decode(&datagrams[0])
+        .unwrap()
+        .messages()
+        .next()
+        .unwrap()
+        .unwrap();
+    assert_eq!(
+        message.header.sequence_number,
+        Some(0),
+        "a dropped sample uses up no number"
+    );
+}
+
+#[test]
+fn a_message_too_big_for_a_datagram_is_named() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    bench.bind(topic("ua_1_5_10"), "std_msgs/String");
+    let mut payload = 70_000_u32.to_le_bytes().to_vec();
+    payload.resize(70_004, b'x');
+    assert_eq!(
+        bench.say(topic("ua_1_5_10"), &payload),
+        Verdict::Drop(Reason::TooBig)
+    );
+    assert!(bench.notices()[0].detail.contains("65507"));
+}
+
+#[test]
+fn a_value_of_another_space_is_published_with_its_source_time() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    bench.bind(topic("ua_2_5_10"), "std_msgs/UInt32");
+    let taken = Timestamp::from_unix_nanos(1_699_999_999_123_456_789);
+    let mut frame = Frame::new(10, 1, 42);
+    frame.header.timestamp = Some(taken.time);
+    frame.header.picoseconds = Some(taken.picoseconds);
+    frame.header.status = Some(0x8000);
+    bench.hear(&frame.bytes());
+    let deliveries = bench.deliveries();
+    assert_eq!(deliveries.len(), 1);
+    assert_eq!(value_of(&deliveries[0]), 42);
+    assert_eq!(
+        (deliveries[0].source, deliveries[0].status),
+        (Some(taken), 0x8000)
+    );
+}
+
+#[test]
+fn a_value_waits_for_its_type_and_then_goes_out() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    bench.hear(&Frame::new(10, 1, 41).bytes());
+    bench.hear(&Frame::new(10, 2, 42).bytes());
+    let outputs = bench.outputs();
+    let [
+        Output::Unbound {
+            topic: asked,
+            shape,
+        },
+    ] = &outputs[..]
+    else {
+        panic!("{outputs:?}")
+    };
+    assert_eq!(
+        (*asked, &shape[..]),
+        (topic("ua_2_5_10"), &[(BuiltinType::UInt32, false)][..])
+    );
+    bench.bind(topic("ua_2_5_10"), "std_msgs/UInt32");
+    let deliveries = bench.deliveries();
+    assert_eq!(
+        deliveries.iter().map(value_of).collect::<Vec<_>>(),
+        [42],
+        "the newest one"
+    );
+}
+
+#[test]
+fn a_value_of_another_type_than_the_topic_has_is_a_mismatch() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    bench.bind(topic("ua_2_5_10"), "std_msgs/String");
+    bench.hear(&Frame::new(10, 1, 42).bytes());
+    let notices = bench.notices();
+    assert_eq!(notices[0].reason, Reason::Mismatch);
+    assert!(
+        notices[0].detail.contains("UInt32"),
+        "{}",
+        notices[0].detail
+    );
+}
+
+#[test]
+fn our_own_datagram_is_looped_and_a_rival_is_named_once() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    let frame = Frame {
+        publisher: PublisherId::UInt16(1),
+        ..Frame::new(10, 1, 42)
+    };
+    bench
+        .router
+        .handle_datagram(&frame.bytes(), OUR_ADDRESS, bench.now);
+    assert!(bench.outputs().is_empty());
+    assert_eq!(bench.dropped(Reason::Looped), 1);
+    for _ in 0..5 {
+        bench.hear(&frame.bytes());
+    }
+    let notices = bench.notices();
+    assert_eq!(notices.len(), 1);
+    assert_eq!(
+        (notices[0].reason, notices[0].from),
+        (Reason::SpaceTaken, Some(PEER))
+    );
+    assert_eq!(bench.dropped(Reason::SpaceTaken), 5);
+}
+
+#[test]
+fn our_number_in_another_width_is_named_unless_the_mapping_takes_any() {
+    let frame = Frame {
+        publisher: PublisherId::Byte(2),
+        ..Frame::new(10, 1, 42)
+    };
+    let mut exact = Bench::new(1, Local::Fields);
+    exact.hear(&frame.bytes());
+    let notices = exact.notices();
+    assert_eq!(notices[0].reason, Reason::PublisherWidth);
+    assert!(notices[0].detail.contains("any_width"));
+    let checked = Mapping::from_yaml("pubsub: {publisher_id: any_width}\n", "test.yaml");
+    let mut relaxed = Bench::with(1, Local::Fields, checked.mapping.unwrap());
+    relaxed.hear(&frame.bytes());
+    assert_eq!(relaxed.deliveries().len(), 1);
+}
+
+#[test]
+fn every_message_of_a_datagram_is_handled_and_a_bad_one_hides_none() {
+    let mut bench = Bench::new(1, Local::Fields);
+    let frame = Frame::new(0, 0, 0);
+    let mut bytes = Vec::new();
+    let mut message =
+        NetworkMessageEncoder::new(&mut bytes, &frame.network(), Some(&[1, 2, 3])).unwrap();
+    for value in 1..=3 {
+        let mut fields = message.key_frame(&DataSetHeader::default()).unwrap();
+        fields.scalar(Scalar::UInt32(value)).unwrap();
+        fields.finish().unwrap();
+    }
+    message.finish().unwrap();
+    bench.hear(&bytes);
+    assert_eq!(bench.deliveries().len(), 3);
+    // The type byte of the second message's field: no such builtin type.
+    let second = bytes.len() - 8 - 5;
+    assert_eq!(bytes[second], BuiltinType::UInt32.id());
+    bytes[second] = 0x3f;
+    bench.hear(&bytes);
+    assert_eq!(bench.deliveries().len(), 2);
+    assert_eq!(bench.dropped(Reason::Malformed), 1);
+}
+
+#[test]
+fn garbage_is_counted_and_told_once_per_decade() {
+    let mut bench = Bench::new(1, Local::Fields);
+    for _ in 0..100 {
+        bench.hear(b"GET / HTTP/1.1\r\n");
+    }
+    bench.hear(&[]);
+    assert_eq!(
+        bench.dropped(Reason::Malformed) + bench.dropped(Reason::Unsupported),
+        101
+    );
+    let told = bench.notices().len();
+    assert!((1..=4).contains(&told), "{told}");
+    bench.hear(&Frame::new(10, 1, 42).bytes());
+    assert_eq!(bench.deliveries().len(), 1, "traffic of others goes on");
+}
+
+#[test]
+fn a_lost_message_is_counted_as_missing() {
+    let mut bench = Bench::new(1, Local::Fields);
+    for sequence in [1, 2, 5] {
+        bench.hear(&Frame::new(10, sequence, 0).bytes());
+    }
+    let (_, counters) = bench.router.topics().next().unwrap();
+    assert_eq!(counters.missing, 2);
+}
+
+#[test]
+fn a_state_is_repeated_with_its_time_and_its_readers_deliver_it_once() {
+    let mut sender = Bench::new(1, Local::Ros1);
+    let mut reader = Bench::new(2, Local::Fields);
+    sender.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
+    assert_eq!(
+        sender.say(topic("ua_1_5_10"), &[7, 0, 0, 0]),
+        Verdict::Forward
+    );
+    let first = sender.datagrams().remove(0);
+    assert_eq!(
+        sender.router.poll_timeout(),
+        Some(sender.now.monotonic + SECOND)
+    );
+    sender.wait(SECOND);
+    sender.router.handle_timeout(sender.now);
+    let again = sender.datagrams().remove(0);
+    let stamps = |datagram: &[u8]| {
+        let message = NetworkMessage::decode(datagram).unwrap();
+        let sent = message.header().timestamp.unwrap();
+        let message = message.messages().next().unwrap().unwrap();
+        (
+            sent,
+            message.header.timestamp.unwrap(),
+            message.header.sequence_number.unwrap(),
+        )
+    };
+    let ((sent, taken, number), (sent_again, taken_again, next)) = (stamps(&first), stamps(&again));
+    assert_eq!((taken, number + 1), (taken_again, next));
+    assert_eq!(sent_again.0 - sent.0, 10_000_000, "sent a second later");
+
+    reader.hear(&first);
+    reader.hear(&again);
+    assert_eq!(reader.deliveries().len(), 1);
+    assert_eq!(reader.dropped(Reason::Repeat), 1);
+    let mut late = Bench::new(3, Local::Fields);
+    late.hear(&again);
+    assert_eq!(
+        late.deliveries().len(),
+        1,
+        "who comes late gets it from the repetition"
+    );
+}
+
+#[test]
+fn a_topic_without_a_producer_is_not_repeated() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    bench.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
+    assert_eq!(
+        bench.say(topic("ua_1_5_10"), &[7, 0, 0, 0]),
+        Verdict::Forward
+    );
+    bench.router.set_live(topic("ua_1_5_10"), false, bench.now);
+    bench.outputs();
+    bench.wait(SECOND * 2);
+    bench.router.handle_timeout(bench.now);
+    assert!(bench.outputs().is_empty());
+}
+
+#[test]
+fn events_keep_their_order_and_are_kept_alive_instead_of_repeated() {
+    let yaml = "namespaces: {5: 'urn:test'}\nspaces: [{id: 1, ros: 1}]\nvariables:\n  - {node: ns=5;i=10, name: Part, type: UInt32, origin: 1, queue: {drop_oldest: 3}}\n";
+    let checked = Mapping::from_yaml(yaml, "test.yaml");
+    let mut bench = Bench::with(1, Local::Ros1, checked.mapping.expect("a valid mapping"));
+    let overflow = bench.now;
+    bench.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
+    for value in 1..=4_u32 {
+        let verdict = bench.router.handle_local(
+            topic("ua_1_5_10"),
+            &value.to_le_bytes(),
+            overflow.utc,
+            overflow,
+        );
+        let full = value > 3;
+        assert_eq!(
+            verdict == Verdict::ForwardAfterDroppingOldest,
+            full,
+            "{value}"
+        );
+    }
+    let values: Vec<_> = bench
+        .datagrams()
+        .iter()
+        .map(|datagram| only_value(datagram))
+        .collect();
+    assert_eq!(values, [2, 3, 4]);
+    assert_eq!(bench.dropped(Reason::Overflow), 1);
+    bench.wait(SECOND);
+    bench.router.handle_timeout(bench.now);
+    let datagram = bench.datagrams().remove(0);
+    let message = NetworkMessage::decode(&datagram)
+        .unwrap()
+        .messages()
+        .next()
+        .unwrap()
+        .unwrap();
+    assert_eq!(message.kind, MessageKind::KeepAlive);
+    assert_eq!(
+        message.header.sequence_number,
+        Some(4),
+        "the number to expect next"
+    );
+    assert_eq!(NonZeroU16::new(10).map(NonZeroU16::get), message.writer_id);
+}
+
+#[test]
+fn topics_are_served_in_turn() {
+    let mut bench = Bench::new(2, Local::Fields);
+    let frame = Frame::new(0, 0, 0);
+    let mut bytes = Vec::new();
+    let ids = [1, 1, 1, 9];
+    let network = NetworkHeader {
+        publisher_id: Some(PublisherId::UInt16(1)),
+        ..frame.network()
+    };
+    let mut message = NetworkMessageEncoder::new(&mut bytes, &network, Some(&ids)).unwrap();
+    for value in 0..4 {
+        let mut fields = message.key_frame(&DataSetHeader::default()).unwrap();
+        fields.scalar(Scalar::UInt32(value)).unwrap();
+        fields.finish().unwrap();
+    }
+    message.finish().unwrap();
+    let yaml = "namespaces: {5: 'urn:test'}\nspaces: [{id: 1, ros: 1}]\nvariables:\n  - {node: ns=5;i=1, name: Camera, type: UInt32, origin: 1, queue: {drop_oldest: 8}}\n";
+    let mut mapped = Bench::with(
+        2,
+        Local::Fields,
+        Mapping::from_yaml(yaml, "test.yaml").mapping.unwrap(),
+    );
+    mapped.hear(&bytes);
+    let order: Vec<_> = mapped
+        .deliveries()
+        .iter()
+        .map(|delivery| delivery.topic.triple().2)
+        .collect();
+    assert_eq!(
+        order,
+        [1, 9, 1, 1],
+        "the button waits for one picture, not for three"
+    );
+    bench.hear(&bytes);
+    assert_eq!(
+        bench.deliveries().len(),
+        2,
+        "a state keeps its latest value only"
+    );
+}
+
+#[test]
+fn a_silent_writer_is_told_once_and_keep_alives_prevent_it() {
+    let mut bench = Bench::new(1, Local::Fields);
+    let frame = Frame::new(10, 1, 42);
+    bench.hear(&frame.bytes());
+    bench.outputs();
+    bench.wait(SECOND * 2);
+    bench.hear(&Frame::new(10, 2, 0).keep_alive());
+    bench.wait(SECOND * 2);
+    bench.router.handle_timeout(bench.now);
+    assert!(bench.outputs().is_empty(), "it spoke two seconds ago");
+    bench.wait(SECOND);
+    bench.router.handle_timeout(bench.now);
+    let outputs = bench.outputs();
+    assert!(
+        matches!(outputs[..], [Output::Silent { silent: true, .. }]),
+        "{outputs:?}"
+    );
+    bench.wait(SECOND * 10);
+    bench.router.handle_timeout(bench.now);
+    assert!(bench.outputs().is_empty());
+    bench.hear(&Frame::new(10, 2, 43).bytes());
+    let outputs = bench.outputs();
+    assert!(
+        matches!(
+            outputs[..],
+            [Output::Silent { silent: false, .. }, Output::Delivery(_)]
+        ),
+        "{outputs:?}"
+    );
+}
+
+#[test]
+fn an_opc_ua_side_hands_over_fields_and_gets_fields() {
+    let mut server = Bench::new(0, Local::Fields);
+    let mut block = 1_u16.to_le_bytes().to_vec();
+    block.extend_from_slice(&[BuiltinType::Boolean.id(), 1]);
+    assert_eq!(server.say(topic("ua_0_5_1"), &block), Verdict::Forward);
+    let datagram = server.datagrams().remove(0);
+    let mut other = Bench::new(7, Local::Fields);
+    other.hear(&datagram);
+    let delivery = other.deliveries().remove(0);
+    let fields: Vec<_> = Fields::parse(&delivery.payload).unwrap().collect();
+    assert_eq!(fields, [Ok(Variant::Scalar(Scalar::Boolean(true)))]);
+    assert_eq!(
+        server.say(topic("ua_0_5_1"), &[9, 0, 1]),
+        Verdict::Drop(Reason::Malformed)
+    );
+}
+
+#[test]
+fn the_delays_of_a_sample_are_read_off_its_stamps() {
+    let mut sender = Bench::new(1, Local::Ros1);
+    sender.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
+    let received = sender.now.utc;
+    sender.wait(Duration::from_micros(30));
+    let _verdict =
+        sender
+            .router
+            .handle_local(topic("ua_1_5_10"), &[1, 0, 0, 0], received, sender.now);
+    let datagram = sender.datagrams().remove(0);
+    let mut reader = Bench::new(2, Local::Fields);
+    reader.now = sender.now;
+    reader.wait(Duration::from_micros(200));
+    reader.hear(&datagram);
+    let delivery = reader.deliveries().remove(0);
+    reader.wait(Duration::from_micros(50));
+    reader.router.published(delivery.arrived, reader.now);
+    let max = |bench: &Bench, hop| bench.router.hops().of(hop).max_us().round();
+    assert_eq!(max(&sender, Hop::Out), 30.0);
+    assert_eq!(max(&reader, Hop::Origin), 30.0);
+    assert!((199.0..=202.0).contains(&max(&reader, Hop::Network)));
+    assert!((50.0..=51.0).contains(&max(&reader, Hop::In)));
+}
+
+fn only_value(datagram: &[u8]) -> u32 {
+    let message = NetworkMessage::decode(datagram).unwrap();
+    let message = message.messages().next().unwrap().unwrap();
+    match message.fields().unwrap().next() {
+        Some(Ok(Variant::Scalar(Scalar::UInt32(value)))) => value,
+        other => panic!("{other:?}"),
+    }
+}

@@ -1,0 +1,37 @@
+//! The arguments all programs of the space take.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use crate::logging::LogFormat;
+
+/// Flags win over `UA_*` environment variables, which win over the mapping.
+#[derive(Debug, Clone, clap::Args)]
+pub struct Arguments {
+    /// The mapping YAML of the cell. Without one, topics named in the space cross, whatever their type
+    #[arg(value_name = "MAPPING", env = "UA_MAPPING")]
+    pub mapping: Option<PathBuf>,
+    /// Check the mapping, print every finding, and exit
+    #[arg(long)]
+    pub check: bool,
+    /// Hear and decode, but publish nothing on either side
+    #[arg(long)]
+    pub dry_run: bool,
+    /// The network interface of the PubSub group, by name or address
+    #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
+    pub interface: Option<String>,
+    /// The PubSub group, as opc.udp://239.192.0.40:4840
+    #[arg(long, value_name = "URL", env = "UA_ADDRESS")]
+    pub address: Option<String>,
+    /// How log lines look
+    #[arg(
+        long,
+        value_name = "FORMAT",
+        env = "UA_LOG_FORMAT",
+        default_value = "text"
+    )]
+    pub log: LogFormat,
+    /// Serve counters and delays at this address: /metrics for Prometheus, /status as JSON
+    #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
+    pub metrics: Option<SocketAddr>,
+}

@@ -1,0 +1,124 @@
+//! The HTTP page with counters and delays.
+
+use std::convert::Infallible;
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use bytes::Bytes;
+use http_body_util::Full;
+use hyper::body::Incoming;
+use hyper::service::service_fn;
+use hyper::{Request, Response, StatusCode};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::{Semaphore, mpsc, oneshot};
+use tracing::{debug, info};
+
+use crate::exit::{Failure, FailureKind};
+use crate::status::Status;
+
+/// The run loop's end: each request brings the place for its answer.
+pub(crate) type Requests = mpsc::Receiver<oneshot::Sender<Status>>;
+
+/// Listens at `address` and gives the requests for status to answer. Without an address there are never any.
+pub(crate) async fn serve(address: Option<SocketAddr>) -> Result<Requests, Failure> {
+    let (ask, requests) = mpsc::channel(4);
+    let Some(address) = address else {
+        return Ok(requests);
+    };
+    let listener = TcpListener::bind(address).await.map_err(|error| {
+        Failure::new(
+            FailureKind::Unavailable,
+            format!("cannot serve metrics at {address}: {error}; give another --metrics address"),
+        )
+    })?;
+    let at = listener.local_addr().unwrap_or(address);
+    info!("metrics at http://{at}/metrics, status at http://{at}/status");
+    tokio::spawn(accept(listener, ask));
+    Ok(requests)
+}
+
+async fn accept(listener: TcpListener, ask: mpsc::Sender<oneshot::Sender<Status>>) {
+    let places = std::sync::Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    loop {
+        let Ok(place) = std::sync::Arc::clone(&places).acquire_owned().await else {
+            return;
+        };
+        let stream = tokio::select! {
+            accepted = listener.accept() => match accepted {
+                Ok((stream, _)) => stream,
+                // Out of descriptors, most likely: others may be closed by then.
+                Err(error) => {
+                    debug!(%error, "a connection for metrics was not accepted");
+                    tokio::time::sleep(ACCEPT_AGAIN).await;
+                    continue;
+                }
+            },
+            () = ask.closed() => return,
+        };
+        let ask = ask.clone();
+        tokio::spawn(async move {
+            if tokio::time::timeout(CONNECTION_TIME, answer(stream, ask))
+                .await
+                .is_err()
+            {
+                debug!("a connection for metrics was closed for its age");
+            }
+            drop(place);
+        });
+    }
+}
+
+async fn answer(stream: TcpStream, ask: mpsc::Sender<oneshot::Sender<Status>>) {
+    let service = service_fn(|request| {
+        let ask = ask.clone();
+        async move { Ok::<_, Infallible>(page(&request, &ask).await) }
+    });
+    let served = hyper::server::conn::http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(CONNECTION_TIME)
+        .serve_connection(TokioIo::new(stream), service)
+        .await;
+    if let Err(error) = served {
+        debug!(%error, "a connection for metrics broke off");
+    }
+}
+
+async fn page(
+    request: &Request<Incoming>,
+    ask: &mpsc::Sender<oneshot::Sender<Status>>,
+) -> Response<Full<Bytes>> {
+    let json = match request.uri().path() {
+        "/metrics" => false,
+        "/status" => true,
+        _ => {
+            return text(
+                StatusCode::NOT_FOUND,
+                "there are /metrics and /status here\n".into(),
+            );
+        }
+    };
+    let (reply, status) = oneshot::channel();
+    let status = match ask.send(reply).await {
+        Ok(()) => status.await.ok(),
+        Err(_) => None,
+    };
+    match status {
+        Some(status) if json => text(StatusCode::OK, status.json()),
+        Some(status) => text(StatusCode::OK, status.prometheus()),
+        None => text(
+            StatusCode::SERVICE_UNAVAILABLE,
+            "the program is ending\n".into(),
+        ),
+    }
+}
+
+fn text(status: StatusCode, body: String) -> Response<Full<Bytes>> {
+    let mut response = Response::new(Full::new(Bytes::from(body)));
+    *response.status_mut() = status;
+    response
+}
+
+const MAX_CONNECTIONS: usize = 16;
+const CONNECTION_TIME: Duration = Duration::from_secs(30);
+const ACCEPT_AGAIN: Duration = Duration::from_millis(100);

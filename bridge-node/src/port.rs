@@ -1,0 +1,93 @@
+//! What a bridge program brings to the shell: its own side of the bridge.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use mappings::TopicId;
+use messages::{MessageType, Selection};
+use uadp::{BuiltinType, Timestamp};
+
+/// The local side of a bridge: a ROS 1 graph, a DDS domain, or an OPC UA address space.
+///
+/// The shell polls [`recv`](Self::recv) beside the socket, and hands over what the Router lets pass. Topic names are
+/// resolved once, when a port subscribes; the samples carry the [`TopicId`].
+pub trait Port {
+    /// The next thing that happened on this side. Cancel-safe: dropping the future loses nothing. Pends while there
+    /// is nothing.
+    fn recv(&mut self) -> impl Future<Output = PortEvent>;
+
+    /// Publishes a sample of another space. Never waits.
+    ///
+    /// `payload` is a ROS 1 message body without its length, a CDR with its 4 byte encapsulation header, or a block
+    /// of OPC UA fields, as the port's [`Local`](bridge_core::Local) says.
+    ///
+    /// # Errors
+    /// A short reason under which the sample is counted as dropped.
+    fn publish(&mut self, sample: Delivery) -> Result<(), &'static str>;
+
+    /// The Router heard a value of another space whose local type is not known yet. The port finds one (mapping,
+    /// then a local subscriber's, then the standard type of the value) and answers with [`PortEvent::Bound`], now or
+    /// when a subscriber comes; it is asked again while values arrive.
+    fn wanted(&mut self, topic: TopicId, shape: &[(BuiltinType, bool)]);
+
+    /// The writer of a topic of another space fell silent past its receive timeout, or speaks again.
+    fn silent(&mut self, topic: TopicId, silent: bool);
+
+    /// Withdraws every registration and ends. Bounded by 2 s.
+    fn shutdown(self) -> impl Future<Output = ()>;
+}
+
+/// One value of another space on its way to the local side.
+#[derive(Debug, Clone)]
+pub struct Delivery {
+    /// Which value.
+    pub topic: TopicId,
+    /// Its bytes in the port's encoding.
+    pub payload: Bytes,
+    /// When its producer's bridge took it (the DataSetMessage Timestamp), where the writer says so.
+    pub source: Option<Timestamp>,
+    /// The DataSetMessage Status: the upper 16 bits of an OPC UA StatusCode, 0 for Good.
+    pub status: u16,
+}
+
+/// What a port reports.
+#[derive(Debug)]
+pub enum PortEvent {
+    /// The local type of a topic is known, for the first time or anew: values can be transcoded from now on.
+    Bound {
+        /// Which value.
+        topic: TopicId,
+        /// Its message type in the port's dialect.
+        message_type: Arc<MessageType>,
+        /// The part of the message that is the value.
+        selection: Selection,
+    },
+    /// A message was received on a topic of our own space.
+    Sample {
+        /// Which value; a message that several variables select from is reported once for each.
+        topic: TopicId,
+        /// The message as it came.
+        payload: Bytes,
+        /// When it came.
+        received: Timestamp,
+    },
+    /// A topic of our own space has a producer now, or has none any more.
+    Live {
+        /// Which value.
+        topic: TopicId,
+        /// Whether anybody publishes it.
+        live: bool,
+    },
+    /// Samples were lost before the Router saw them, in a bounded queue that was full.
+    Lost {
+        /// Which value, if it is known.
+        topic: Option<TopicId>,
+        /// Why, in two or three words; the counter's label.
+        why: &'static str,
+        /// How many.
+        count: u64,
+    },
+    /// The port cannot go on, such as a ROS 1 node that was told to shut down because another took its name. The
+    /// program ends with this message.
+    Ended(String),
+}

@@ -1,0 +1,199 @@
+//! From the command line to the run loop and back: what every program's `main` does.
+
+use std::io::Write as _;
+use std::net::SocketAddr;
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use bridge_core::{Local, Router, Settings};
+use clap::Parser;
+use clap::error::ErrorKind;
+use mappings::{Mapping, PubSub, SpaceId};
+use tokio::signal::unix::{SignalKind, signal};
+use tracing::{error, info};
+use transport::{Options, Udp};
+
+use crate::arguments::Arguments;
+use crate::exit::{Failure, FailureKind};
+use crate::logging;
+use crate::metrics;
+use crate::port::Port;
+use crate::run::Shell;
+
+/// What one program is, for [`run`].
+pub trait Program: Parser {
+    /// Its local side.
+    type Port: Port;
+
+    /// Its name, as typed.
+    const NAME: &'static str;
+    /// What its local side's payloads are.
+    const LOCAL: Local;
+    /// Log directives that hush what a library says without need, such as `rustdds=warn`.
+    const QUIET: &'static str = "";
+
+    /// The arguments all programs have.
+    fn arguments(&self) -> &Arguments;
+
+    /// The space it serves.
+    ///
+    /// # Errors
+    /// When neither the arguments nor the mapping say which, or they contradict each other.
+    fn own(&self, mapping: &Mapping) -> Result<SpaceId, Failure>;
+
+    /// Starts the local side.
+    ///
+    /// # Errors
+    /// What keeps it from running at all. A peer that is not there yet is waited for instead.
+    fn start(self, context: Context) -> impl Future<Output = Result<Self::Port, Failure>>;
+}
+
+/// What a port is started with.
+#[derive(Debug, Clone)]
+pub struct Context {
+    /// The cell, as the mapping has it.
+    pub mapping: Arc<Mapping>,
+    /// The space to serve.
+    pub own: SpaceId,
+}
+
+/// Runs a program from its command line to its end.
+#[must_use]
+pub fn run<P: Program>() -> ExitCode {
+    let program = match P::try_parse() {
+        Ok(program) => program,
+        Err(usage) => {
+            // Nobody is left to tell when stdout or stderr is closed.
+            let _printed = usage.print();
+            let asked = [ErrorKind::DisplayHelp, ErrorKind::DisplayVersion];
+            return if asked.contains(&usage.kind()) {
+                ExitCode::SUCCESS
+            } else {
+                FailureKind::Usage.into()
+            };
+        }
+    };
+    logging::start(program.arguments().log, P::QUIET);
+    let ended = match load(program.arguments()) {
+        Ok(Some(mapping)) => serve(program, Arc::new(mapping)),
+        Ok(None) => Ok(()),
+        Err(failure) => Err(failure),
+    };
+    match ended {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            error!("{failure}");
+            failure.kind().into()
+        }
+    }
+}
+
+/// Reads the mapping and prints its findings. `None`: that was all that was asked for.
+fn load(arguments: &Arguments) -> Result<Option<Mapping>, Failure> {
+    let Some(file) = &arguments.mapping else {
+        return Ok((!arguments.check).then(Mapping::default));
+    };
+    let text = std::fs::read_to_string(file).map_err(|error| {
+        Failure::new(
+            FailureKind::Io,
+            format!("cannot read the mapping {}: {error}", file.display()),
+        )
+    })?;
+    let checked = Mapping::from_yaml(&text, &file.display().to_string());
+    let findings = checked.render(&text);
+    // A closed stderr is no reason not to run.
+    let _printed = std::io::stderr().write_all(findings.as_bytes());
+    match checked.mapping {
+        Some(_) if arguments.check => {
+            info!("{} can run", file.display());
+            Ok(None)
+        }
+        Some(mapping) => Ok(Some(mapping)),
+        None => Err(refused(file)),
+    }
+}
+
+fn refused(file: &Path) -> Failure {
+    Failure::new(
+        FailureKind::Configuration,
+        format!("{} cannot run, see the findings above", file.display()),
+    )
+}
+
+fn serve<P: Program>(program: P, mapping: Arc<Mapping>) -> Result<(), Failure> {
+    // One thread: the way from the socket to ROS and back has no hand-over, and its state no lock.
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .map_err(|error| Failure::new(FailureKind::Io, format!("cannot start: {error}")))?;
+    runtime.block_on(async move {
+        let arguments = program.arguments().clone();
+        let own = program.own(&mapping)?;
+        info!(
+            version = env!("CARGO_PKG_VERSION"),
+            space = %own,
+            mapping = arguments.mapping.as_ref().map(|file| tracing::field::display(file.display())),
+            "{} starts",
+            P::NAME
+        );
+        let stop = stopped()?;
+        let udp = open(&arguments, &mapping)?;
+        let requests = metrics::serve(arguments.metrics).await?;
+        let settings = Settings { own, local: P::LOCAL, source: Some(udp.source()) };
+        let router = Router::new(settings, Arc::clone(&mapping));
+        let port = program.start(Context { mapping, own }).await?;
+        let shell = Shell {
+            program: P::NAME,
+            own,
+            router,
+            port,
+            udp,
+            requests,
+            dry_run: arguments.dry_run,
+        };
+        shell.run(stop).await
+    })
+}
+
+fn open(arguments: &Arguments, mapping: &Mapping) -> Result<Udp, Failure> {
+    let pubsub = mapping.pubsub();
+    let address: SocketAddr = match &arguments.address {
+        Some(url) => PubSub::parse_address(url).ok_or_else(|| {
+            let message = format!("--address {url}: for example opc.udp://{}", PubSub::ADDRESS);
+            Failure::new(FailureKind::Usage, message)
+        })?,
+        None => pubsub.address,
+    };
+    let options = Options {
+        interface: arguments
+            .interface
+            .clone()
+            .or_else(|| pubsub.interface.clone()),
+        ttl: u32::from(pubsub.ttl),
+        ..Options::new(address)
+    };
+    Udp::open(&options).map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))
+}
+
+/// Ready at the first SIGINT or SIGTERM.
+fn stopped() -> Result<impl Future<Output = ()>, Failure> {
+    let listen = |kind| {
+        signal(kind).map_err(|error| {
+            Failure::new(
+                FailureKind::Io,
+                format!("cannot listen for signals: {error}"),
+            )
+        })
+    };
+    let (mut interrupt, mut terminate) = (
+        listen(SignalKind::interrupt())?,
+        listen(SignalKind::terminate())?,
+    );
+    Ok(async move {
+        tokio::select! {
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+        }
+    })
+}

@@ -1,0 +1,183 @@
+//! The run loop: the only place where a bridge waits.
+
+use std::io;
+use std::time::Duration;
+
+use bridge_core::{Notice, Output, Reason, Router};
+use bytes::Bytes;
+use mappings::SpaceId;
+use tokio::time::{Instant as TokioInstant, Sleep};
+use tracing::{debug, info, warn};
+use transport::{SendError, Udp};
+
+use crate::clock::now;
+use crate::exit::{Failure, FailureKind};
+use crate::metrics::Requests;
+use crate::port::{Delivery, Port, PortEvent};
+use crate::status::Status;
+
+/// A bridge in the middle: router, port and socket, and who asks for the status.
+pub(crate) struct Shell<P> {
+    pub(crate) program: &'static str,
+    pub(crate) own: SpaceId,
+    pub(crate) router: Router,
+    pub(crate) port: P,
+    pub(crate) udp: Udp,
+    pub(crate) requests: Requests,
+    pub(crate) dry_run: bool,
+}
+
+impl<P: Port> Shell<P> {
+    /// Carries samples until `stop` is ready or the port cannot go on, then shuts the port down.
+    ///
+    /// All branches of the `select!` are cancel-safe: a socket and bounded channels that hold what was not taken.
+    pub(crate) async fn run(mut self, stop: impl Future<Output = ()>) -> Result<(), Failure> {
+        let mut stop = std::pin::pin!(stop);
+        let mut timer = std::pin::pin!(tokio::time::sleep(FAR));
+        // Any UDP datagram fits.
+        let mut buffer = vec![0; 65_536];
+        let ended = loop {
+            self.arm(timer.as_mut());
+            tokio::select! {
+                () = &mut stop => break Ok(()),
+                heard = self.udp.recv(&mut buffer) => self.heard(heard, &buffer),
+                event = self.port.recv() => {
+                    if let Some(why) = self.port_event(event) {
+                        break Err(Failure::new(FailureKind::Unavailable, why));
+                    }
+                }
+                () = timer.as_mut() => self.router.handle_timeout(now()),
+                Some(reply) = self.requests.recv() => {
+                    let status = Status::of(self.program, self.own, &self.router);
+                    // Who asked may have gone; there is nobody else to tell.
+                    drop(reply.send(status));
+                }
+            }
+            self.drain();
+        };
+        let status = Status::of(self.program, self.own, &self.router);
+        info!(status = %status.json(), "ending");
+        self.port.shutdown().await;
+        ended
+    }
+
+    fn arm(&self, mut timer: std::pin::Pin<&mut Sleep>) {
+        let due = self
+            .router
+            .poll_timeout()
+            .map_or_else(|| TokioInstant::now() + FAR, TokioInstant::from_std);
+        // Only an earlier deadline needs the timer wheel; a later one is found out when it rings.
+        if timer.is_elapsed() || due < timer.deadline() {
+            timer.as_mut().reset(due);
+        }
+    }
+
+    fn heard(&mut self, heard: io::Result<(usize, std::net::SocketAddr)>, buffer: &[u8]) {
+        match heard {
+            Ok((len, from)) => {
+                let datagram = buffer.get(..len).unwrap_or_default();
+                self.router.handle_datagram(datagram, from, now());
+            }
+            // An ICMP answer to a unicast peer, at worst; the socket stays as it is.
+            Err(error) => debug!(%error, "receiving failed"),
+        }
+    }
+
+    /// Takes in what the port reports; gives the message to end with, if it is the end.
+    fn port_event(&mut self, event: PortEvent) -> Option<String> {
+        match event {
+            PortEvent::Sample {
+                topic,
+                payload,
+                received,
+            } => {
+                // Counted by the router, whatever it is.
+                let _verdict = self.router.handle_local(topic, &payload, received, now());
+            }
+            PortEvent::Bound {
+                topic,
+                message_type,
+                selection,
+            } => match self.router.bind(topic, &message_type, &selection, now()) {
+                Ok(()) => info!(%topic, message_type = %message_type.name(), "bound"),
+                Err(error) => warn!(%topic, %error, "the topic cannot cross"),
+            },
+            PortEvent::Live { topic, live } => self.router.set_live(topic, live, now()),
+            PortEvent::Lost { topic, why, count } => self.router.lost(topic, count, why),
+            PortEvent::Ended(why) => return Some(why),
+        }
+        None
+    }
+
+    fn drain(&mut self) {
+        while let Some(output) = self.router.poll_output(now()) {
+            match output {
+                Output::Datagram { topic, bytes } => {
+                    let sent = if self.dry_run {
+                        Ok(())
+                    } else {
+                        self.udp.try_send(&bytes)
+                    };
+                    if let Err(error) = sent {
+                        self.router
+                            .failed(topic, not_sent(error), &error.to_string());
+                    }
+                    self.router.recycle(bytes);
+                }
+                Output::Delivery(delivery) => self.deliver(delivery),
+                Output::Unbound { topic, shape } => self.port.wanted(topic, &shape),
+                Output::Silent { topic, silent } => self.port.silent(topic, silent),
+                Output::Notice(notice) => tell(&notice),
+                other => debug!(?other, "an output this program does not know"),
+            }
+        }
+    }
+
+    fn deliver(&mut self, delivery: bridge_core::Delivery) {
+        let bridge_core::Delivery {
+            topic,
+            payload,
+            source,
+            status,
+            arrived,
+        } = delivery;
+        if self.dry_run {
+            self.router.recycle(payload);
+            return;
+        }
+        let sample = Delivery {
+            topic,
+            payload: Bytes::from(payload),
+            source,
+            status,
+        };
+        match self.port.publish(sample) {
+            Ok(()) => self.router.published(arrived, now()),
+            Err(why) => self.router.failed(topic, Reason::NotPublished, why),
+        }
+    }
+}
+
+fn not_sent(error: SendError) -> Reason {
+    if error == SendError::TooBig {
+        Reason::TooBig
+    } else {
+        Reason::NotSent
+    }
+}
+
+fn tell(notice: &Notice) {
+    let Notice {
+        topic,
+        from,
+        reason,
+        total,
+        detail,
+    } = notice;
+    let topic = topic.map(tracing::field::display);
+    let from = from.map(tracing::field::display);
+    warn!(topic, from, reason = %reason, total, "dropped: {detail}");
+}
+
+/// A deadline for when there is nothing to wait for.
+const FAR: Duration = Duration::from_secs(3600);

@@ -1,0 +1,138 @@
+//! What a program says of itself: counters per topic and delays per hop, as JSON and for Prometheus.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+
+use bridge_core::{Counters, Delays, Hop, Router};
+use mappings::SpaceId;
+use serde::Serialize;
+
+/// A program's counters and delays at one moment.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Status {
+    program: &'static str,
+    space: u8,
+    topics: BTreeMap<String, TopicStatus>,
+    /// Datagrams and messages that belong to no topic.
+    others: TopicStatus,
+    hops: BTreeMap<&'static str, HopStatus>,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct TopicStatus {
+    sent: u64,
+    delivered: u64,
+    repeated: u64,
+    keep_alives: u64,
+    missing: u64,
+    dropped: BTreeMap<&'static str, u64>,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct HopStatus {
+    count: u64,
+    negative: u64,
+    p50_us: f64,
+    p99_us: f64,
+    max_us: f64,
+}
+
+impl Status {
+    pub(crate) fn of(program: &'static str, space: SpaceId, router: &Router) -> Self {
+        let topics = router
+            .topics()
+            .map(|(topic, counters)| (topic.to_string(), counters.into()))
+            .collect();
+        let hops = HOPS
+            .into_iter()
+            .map(|(hop, label)| (label, router.hops().of(hop).into()))
+            .collect();
+        Self {
+            program,
+            space: space.get(),
+            topics,
+            others: router.others().into(),
+            hops,
+        }
+    }
+
+    /// One JSON object.
+    pub(crate) fn json(&self) -> String {
+        // All keys are strings and no number is special, so there is nothing that could fail.
+        serde_json::to_string(self).unwrap_or_default()
+    }
+
+    /// The text exposition format of Prometheus, version 0.0.4.
+    pub(crate) fn prometheus(&self) -> String {
+        let mut text = String::new();
+        let mut line = |name: &str, labels: &str, value: &dyn std::fmt::Display| {
+            // Writing to a string does not fail.
+            let _written = writeln!(text, "ua_{name}{{{labels}}} {value}");
+        };
+        let none = [("none".to_owned(), &self.others)];
+        let all = self
+            .topics
+            .iter()
+            .map(|(topic, status)| (topic.clone(), status))
+            .chain(none);
+        for (topic, status) in all {
+            let labels = format!("program=\"{}\",topic=\"{topic}\"", self.program);
+            line("samples_sent_total", &labels, &status.sent);
+            line("samples_delivered_total", &labels, &status.delivered);
+            line("key_frames_repeated_total", &labels, &status.repeated);
+            line("keep_alives_total", &labels, &status.keep_alives);
+            line("messages_missing_total", &labels, &status.missing);
+            for (reason, count) in &status.dropped {
+                line(
+                    "samples_dropped_total",
+                    &format!("{labels},reason=\"{reason}\""),
+                    count,
+                );
+            }
+        }
+        for (hop, delays) in &self.hops {
+            let labels = format!("program=\"{}\",hop=\"{hop}\"", self.program);
+            line("hop_count", &labels, &delays.count);
+            line("hop_negative_total", &labels, &delays.negative);
+            line("hop_p50_microseconds", &labels, &delays.p50_us);
+            line("hop_p99_microseconds", &labels, &delays.p99_us);
+            line("hop_max_microseconds", &labels, &delays.max_us);
+        }
+        text
+    }
+}
+
+impl From<&Counters> for TopicStatus {
+    fn from(counters: &Counters) -> Self {
+        Self {
+            sent: counters.sent,
+            delivered: counters.delivered,
+            repeated: counters.repeated,
+            keep_alives: counters.keep_alives,
+            missing: counters.missing,
+            dropped: counters
+                .drops()
+                .map(|(reason, count)| (reason.label(), count))
+                .collect(),
+        }
+    }
+}
+
+impl From<&Delays> for HopStatus {
+    fn from(delays: &Delays) -> Self {
+        Self {
+            count: delays.count(),
+            negative: delays.negative(),
+            p50_us: delays.quantile_us(0.5),
+            p99_us: delays.quantile_us(0.99),
+            max_us: delays.max_us(),
+        }
+    }
+}
+
+const HOPS: [(Hop, &str); 4] = [
+    (Hop::Out, "out"),
+    (Hop::Origin, "origin"),
+    (Hop::Network, "network"),
+    (Hop::In, "in"),
+];

@@ -1,0 +1,131 @@
+//! Who else is in the domain: the endpoints of other participants, by topic.
+//!
+//! RustDDS reports discovery as events too, but on a channel that drops when it is full, and its graph events name
+//! built-in entities. A snapshot of its database is the whole truth at that moment.
+
+use std::collections::BTreeMap;
+
+use rustdds::policy::{Durability, Reliability};
+use rustdds::{DomainParticipant, GUID, RTPSEntity};
+
+/// One writer or reader of another participant.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Endpoint {
+    /// Who it is.
+    pub guid: GUID,
+    /// The DDS name of its type, such as `std_msgs::msg::dds_::String_`.
+    pub type_name: String,
+    /// Offered (writer) or requested (reader) reliability.
+    pub reliable: bool,
+    /// Offered or requested durability is transient-local or stronger.
+    pub transient_local: bool,
+}
+
+impl Endpoint {
+    /// Whether the endpoint is of Fast DDS, by the vendor in its GUID (eProsima is 01.0f in the OMG's list).
+    #[must_use]
+    pub fn is_fast_dds(&self) -> bool {
+        self.guid.prefix.as_ref().starts_with(&[0x01, 0x0f])
+    }
+}
+
+/// The endpoints of others on the topics of ROS (`rt/...`), by DDS topic name.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct Graph {
+    writers: BTreeMap<String, Vec<Endpoint>>,
+    readers: BTreeMap<String, Vec<Endpoint>>,
+}
+
+impl Graph {
+    /// What `participant` has discovered by now; its own endpoints are left out.
+    #[must_use]
+    pub fn snapshot(participant: &DomainParticipant) -> Self {
+        let own = participant.guid().prefix;
+        let writers = participant.discovered_writers().into_iter().map(|writer| {
+            let data = writer.publication_topic_data;
+            let endpoint = Endpoint {
+                guid: writer.writer_proxy.remote_writer_guid,
+                type_name: data.type_name,
+                // The default of a writer is reliable, that of a reader is best effort (DDS 1.4, 2.2.3.14).
+                reliable: data.reliability != Some(Reliability::BestEffort),
+                transient_local: is_durable(data.durability),
+            };
+            (data.topic_name, endpoint)
+        });
+        let readers = participant.discovered_readers().into_iter().map(|reader| {
+            let data = reader.subscription_topic_data;
+            let qos = data.qos();
+            let endpoint = Endpoint {
+                guid: reader.reader_proxy.remote_reader_guid,
+                type_name: data.type_name().clone(),
+                reliable: matches!(qos.reliability(), Some(Reliability::Reliable { .. })),
+                transient_local: is_durable(qos.durability()),
+            };
+            (data.topic_name().clone(), endpoint)
+        });
+        let foreign = |(_, endpoint): &(String, Endpoint)| endpoint.guid.prefix != own;
+        Self::from_endpoints(writers.filter(foreign), readers.filter(foreign))
+    }
+
+    /// Sorts endpoints by topic, leaving out what is not a ROS topic.
+    pub fn from_endpoints(
+        writers: impl IntoIterator<Item = (String, Endpoint)>,
+        readers: impl IntoIterator<Item = (String, Endpoint)>,
+    ) -> Self {
+        Self {
+            writers: by_topic(writers),
+            readers: by_topic(readers),
+        }
+    }
+
+    /// The writers of a topic, in the order of their GUIDs.
+    #[must_use]
+    pub fn writers(&self, topic: &str) -> &[Endpoint] {
+        self.writers.get(topic).map_or(&[], Vec::as_slice)
+    }
+
+    /// The readers of a topic, in the order of their GUIDs.
+    #[must_use]
+    pub fn readers(&self, topic: &str) -> &[Endpoint] {
+        self.readers.get(topic).map_or(&[], Vec::as_slice)
+    }
+
+    /// The topics somebody writes.
+    pub fn written_topics(&self) -> impl Iterator<Item = &str> {
+        self.writers.keys().map(String::as_str)
+    }
+}
+
+/// The DDS name of a ROS topic given with its leading slash.
+#[must_use]
+pub fn dds_topic(ros_topic: &str) -> String {
+    format!("{TOPIC_PREFIX}{}", ros_topic.trim_start_matches('/'))
+}
+
+/// The ROS name of a DDS topic without the leading slash, or `None` when it is not a topic of ROS.
+#[must_use]
+pub fn ros_topic(dds_topic: &str) -> Option<&str> {
+    dds_topic.strip_prefix(TOPIC_PREFIX)
+}
+
+fn by_topic(
+    endpoints: impl IntoIterator<Item = (String, Endpoint)>,
+) -> BTreeMap<String, Vec<Endpoint>> {
+    let mut topics: BTreeMap<String, Vec<Endpoint>> = BTreeMap::new();
+    for (topic, endpoint) in endpoints {
+        if ros_topic(&topic).is_some() {
+            topics.entry(topic).or_default().push(endpoint);
+        }
+    }
+    for endpoints in topics.values_mut() {
+        endpoints.sort_by_key(|endpoint| endpoint.guid);
+    }
+    topics
+}
+
+fn is_durable(durability: Option<Durability>) -> bool {
+    durability.is_some_and(|durability| durability != Durability::Volatile)
+}
+
+/// What ROS 2 puts before the name of a topic (design.ros2.org, topic and service names).
+const TOPIC_PREFIX: &str = "rt/";

@@ -1,0 +1,174 @@
+//! Which quality of service our endpoints ask for and offer.
+
+use std::num::NonZeroU16;
+
+use rustdds::policy::{Durability, History, ResourceLimits};
+use rustdds::{Duration, QosPolicies, QosPolicyBuilder};
+
+use crate::graph::Endpoint;
+
+/// What a reader asks for, derived from what the writers of its topic offer.
+///
+/// A reader that asks for more than a writer offers is not matched with it (DDS 1.4, 2.2.3), so it asks for the most
+/// that all of them offer. Without any writer it asks for what a ROS publisher offers unless told otherwise: reliable,
+/// so that the first message after a match is repaired when it was sent before we noticed the match, and volatile.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Requested {
+    reliable: bool,
+    transient_local: bool,
+}
+
+impl Requested {
+    /// The most that every one of `writers` offers.
+    #[must_use]
+    pub fn from_writers(writers: &[Endpoint]) -> Self {
+        Self {
+            reliable: writers.iter().all(|writer| writer.reliable),
+            transient_local: !writers.is_empty()
+                && writers.iter().all(|writer| writer.transient_local),
+        }
+    }
+
+    /// The policies of such a reader, with a history of [`READER_DEPTH`].
+    #[must_use]
+    pub fn policies(self) -> QosPolicies {
+        let qos = QosPolicyBuilder::new()
+            .durability(if self.transient_local {
+                Durability::TransientLocal
+            } else {
+                Durability::Volatile
+            })
+            .history(History::KeepLast {
+                depth: READER_DEPTH,
+            })
+            .resource_limits(limits(READER_DEPTH));
+        if self.reliable {
+            qos.reliable(Duration::ZERO).build()
+        } else {
+            qos.best_effort().build()
+        }
+    }
+}
+
+/// What a writer offers, and what its bounded queue does when it is full.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Offered {
+    /// The last value counts: transient-local, so that who comes late gets it, and the newest value wins.
+    KeepLatest,
+    /// Every value counts, up to this many waiting: volatile, and the oldest is dropped.
+    DropOldest(NonZeroU16),
+}
+
+impl Offered {
+    /// The policies of such a writer.
+    ///
+    /// Always reliable, which best-effort readers match too, and never blocking: with a blocking time of zero a full
+    /// send window is an immediate [`WouldBlock`](rustdds::dds::WriteError::WouldBlock). `max_samples` is that window
+    /// in RustDDS: how many samples a reader may leave unacknowledged before the writer stops.
+    #[must_use]
+    pub fn policies(self) -> QosPolicies {
+        let qos = QosPolicyBuilder::new().reliable(Duration::ZERO);
+        match self {
+            Self::KeepLatest => qos
+                .durability(Durability::TransientLocal)
+                .history(History::KeepLast { depth: 1 })
+                .resource_limits(limits(KEEP_LATEST_WINDOW))
+                .build(),
+            Self::DropOldest(_) => qos
+                .durability(Durability::Volatile)
+                .history(History::KeepLast {
+                    depth: DROP_OLDEST_DEPTH,
+                })
+                .resource_limits(limits(DROP_OLDEST_WINDOW))
+                .build(),
+        }
+    }
+
+    /// How many samples may wait on our side of a full send window.
+    #[must_use]
+    pub fn waiting_room(self) -> usize {
+        match self {
+            Self::KeepLatest => 1,
+            Self::DropOldest(depth) => usize::from(depth.get()),
+        }
+    }
+}
+
+/// Samples a reader keeps for us while we are busy. RustDDS keeps them until newer ones push them out, so this is also
+/// the memory of a topic that carries large messages.
+pub const READER_DEPTH: i32 = 256;
+
+/// RustDDS prunes a writer's history by a timer (4 s), to the depth when every reader acknowledged, else to this
+/// window. So this many old values, at most, reach a late joiner before the last one; and so many values may go by
+/// before a reader that vanished without a word (10 to 20 s of lease) holds up the topic.
+const KEEP_LATEST_WINDOW: i32 = 256;
+const DROP_OLDEST_DEPTH: i32 = 100;
+const DROP_OLDEST_WINDOW: i32 = 1024;
+
+fn limits(max_samples: i32) -> ResourceLimits {
+    ResourceLimits {
+        max_samples,
+        max_instances: 1,
+        max_samples_per_instance: max_samples,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rustdds::GUID;
+    use rustdds::policy::Reliability;
+
+    fn writer(reliable: bool, transient_local: bool) -> Endpoint {
+        Endpoint {
+            guid: GUID::GUID_UNKNOWN,
+            type_name: "std_msgs::msg::dds_::Bool_".into(),
+            reliable,
+            transient_local,
+        }
+    }
+
+    fn asked(writers: &[Endpoint]) -> (bool, bool) {
+        let qos = Requested::from_writers(writers).policies();
+        (
+            matches!(qos.reliability(), Some(Reliability::Reliable { .. })),
+            qos.durability() == Some(Durability::TransientLocal),
+        )
+    }
+
+    #[test]
+    fn a_reader_is_reliable_only_when_all_writers_are() {
+        assert_eq!(asked(&[writer(true, false)]), (true, false));
+        assert_eq!(
+            asked(&[writer(true, false), writer(false, false)]),
+            (false, false)
+        );
+    }
+
+    #[test]
+    fn a_reader_asks_for_old_values_only_when_all_writers_keep_them() {
+        assert_eq!(asked(&[writer(true, true)]), (true, true));
+        assert_eq!(
+            asked(&[writer(true, true), writer(true, false)]),
+            (true, false)
+        );
+    }
+
+    #[test]
+    fn a_reader_without_writers_matches_a_default_publisher() {
+        assert_eq!(asked(&[]), (true, false));
+    }
+
+    #[test]
+    fn a_state_topic_offers_its_last_value_to_late_joiners() {
+        let qos = Offered::KeepLatest.policies();
+        assert_eq!(qos.durability(), Some(Durability::TransientLocal));
+        assert_eq!(qos.history(), Some(History::KeepLast { depth: 1 }));
+    }
+
+    #[test]
+    fn an_event_topic_replays_nothing() {
+        let qos = Offered::DropOldest(NonZeroU16::MIN).policies();
+        assert_eq!(qos.durability(), Some(Durability::Volatile));
+    }
+}

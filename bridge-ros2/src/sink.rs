@@ -1,0 +1,152 @@
+//! A topic of the domain that we write values of other spaces to.
+
+use std::sync::Arc;
+
+use mappings::{Overflow, TopicId, Variable};
+use messages::{MessageType, Selection, TypeName};
+
+use crate::graph::{Endpoint, dds_topic};
+use crate::outlet::Outlet;
+use crate::qos::Offered;
+
+/// Where the values of one topic of another space go.
+#[derive(Debug)]
+pub(crate) struct Sink {
+    pub(crate) dds_topic: String,
+    pub(crate) offered: Offered,
+    /// What the mapping ties it to; it decides alone.
+    pub(crate) mapped: Option<(TypeName, Selection)>,
+    /// The std_msgs type of the value the Router holds, if it is one value and there is such a type.
+    pub(crate) standard: Option<TypeName>,
+    /// The topic as it is written.
+    pub(crate) open: Option<Open>,
+}
+
+/// A writer and its type.
+#[derive(Debug)]
+pub(crate) struct Open {
+    pub(crate) message_type: Arc<MessageType>,
+    pub(crate) outlet: Outlet,
+}
+
+impl Sink {
+    /// For a value with or without a variable in the mapping, but without a ROS topic there.
+    pub(crate) fn by_name(topic: TopicId, variable: Option<&Variable>) -> Self {
+        Self {
+            dds_topic: dds_topic(&topic.to_string()),
+            offered: offered(
+                variable
+                    .map(|variable| variable.overflow)
+                    .unwrap_or_default(),
+            ),
+            mapped: None,
+            standard: None,
+            open: None,
+        }
+    }
+
+    /// For a value the mapping ties to a ROS topic.
+    pub(crate) fn mapped(
+        ros_topic: &str,
+        message_type: TypeName,
+        selection: Selection,
+        overflow: Overflow,
+    ) -> Self {
+        Self {
+            dds_topic: dds_topic(ros_topic),
+            offered: offered(overflow),
+            mapped: Some((message_type, selection)),
+            standard: None,
+            open: None,
+        }
+    }
+
+    /// The types it could have, best first: the mapping's; what a subscriber asks for; the standard type of the value.
+    pub(crate) fn candidates(&self, readers: &[Endpoint]) -> Vec<TypeName> {
+        if let Some((message_type, _)) = &self.mapped {
+            return vec![message_type.clone()];
+        }
+        let mut candidates: Vec<TypeName> = Vec::new();
+        let asked_for = readers
+            .iter()
+            .filter_map(|reader| TypeName::from_dds(&reader.type_name).ok());
+        for name in asked_for.chain(self.standard.clone()) {
+            if !candidates.contains(&name) {
+                candidates.push(name);
+            }
+        }
+        candidates
+    }
+
+    /// Whether what is open serves somebody, so that it is not to be given up for another type.
+    pub(crate) fn serves(&self, readers: &[Endpoint]) -> bool {
+        self.open.as_ref().is_some_and(|open| {
+            let dds_type = open.message_type.name().dds();
+            readers.is_empty() || readers.iter().any(|reader| reader.type_name == dds_type)
+        })
+    }
+
+    pub(crate) fn selection(&self) -> Selection {
+        self.mapped
+            .as_ref()
+            .map_or(Selection::Whole, |(_, selection)| selection.clone())
+    }
+}
+
+fn offered(overflow: Overflow) -> Offered {
+    match overflow {
+        Overflow::KeepLatest => Offered::KeepLatest,
+        Overflow::DropOldest(depth) => Offered::DropOldest(depth),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rustdds::GUID;
+
+    fn reader(name: &str) -> Endpoint {
+        Endpoint {
+            guid: GUID::GUID_UNKNOWN,
+            type_name: name.parse::<TypeName>().unwrap().dds(),
+            reliable: true,
+            transient_local: false,
+        }
+    }
+
+    fn names(candidates: &[TypeName]) -> Vec<String> {
+        candidates.iter().map(ToString::to_string).collect()
+    }
+
+    #[test]
+    fn a_subscriber_decides_before_the_standard_type() {
+        let mut sink = Sink::by_name("ua_1_2_3".parse().unwrap(), None);
+        sink.standard = Some("std_msgs/Float64".parse().unwrap());
+        assert_eq!(names(&sink.candidates(&[])), ["std_msgs/Float64"]);
+        assert_eq!(
+            names(&sink.candidates(&[reader("std_msgs/Float32")])),
+            ["std_msgs/Float32", "std_msgs/Float64"]
+        );
+    }
+
+    #[test]
+    fn the_mapping_decides_before_any_subscriber() {
+        let sink = Sink::mapped(
+            "/button",
+            "std_msgs/Bool".parse().unwrap(),
+            Selection::Whole,
+            Overflow::KeepLatest,
+        );
+        assert_eq!(
+            names(&sink.candidates(&[reader("std_msgs/String")])),
+            ["std_msgs/Bool"]
+        );
+        assert_eq!(sink.dds_topic, "rt/button");
+    }
+
+    #[test]
+    fn a_topic_of_the_space_has_its_own_name() {
+        let sink = Sink::by_name("ua_1_2_3".parse().unwrap(), None);
+        assert_eq!(sink.dds_topic, "rt/ua_1_2_3");
+    }
+}

@@ -1,0 +1,63 @@
+//! A topic of the domain whose values are ours to send out.
+
+use std::collections::BTreeSet;
+
+use mappings::TopicId;
+use messages::{Selection, TypeName};
+use rustdds::{GUID, RTPSEntity};
+
+use crate::graph::Endpoint;
+use crate::inbox::SlotId;
+use crate::qos::Requested;
+
+/// A topic somebody in the domain writes, and which of our values it holds.
+#[derive(Debug)]
+pub(crate) struct Source {
+    pub(crate) dds_topic: String,
+    pub(crate) message_type: TypeName,
+    /// Which values are made of a message; one unless a mapping ties several variables to one topic.
+    pub(crate) values: Vec<(TopicId, Selection)>,
+    pub(crate) reading: Reading,
+    /// Whether somebody writes it, in our type.
+    pub(crate) live: bool,
+    /// Writers of this topic with another type. RustDDS matches by topic name alone, so their samples come too.
+    pub(crate) strangers: BTreeSet<GUID>,
+}
+
+/// What there is of a reader.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Reading {
+    /// To be made when there is room for another endpoint.
+    Pending,
+    /// In the inbox.
+    Open { slot: SlotId, requested: Requested },
+}
+
+impl Source {
+    pub(crate) fn new(dds_topic: String, message_type: TypeName) -> Self {
+        Self {
+            dds_topic,
+            message_type,
+            values: Vec::new(),
+            reading: Reading::Pending,
+            live: false,
+            strangers: BTreeSet::new(),
+        }
+    }
+
+    /// Sorts the writers the topic has by now into ours and strangers; returns ours.
+    pub(crate) fn meet(&mut self, writers: &[Endpoint]) -> Vec<Endpoint> {
+        let dds_type = self.message_type.dds();
+        let (ours, strangers): (Vec<_>, Vec<_>) = writers
+            .iter()
+            .cloned()
+            .partition(|writer| writer.type_name == dds_type);
+        self.strangers = strangers.iter().map(|writer| writer.guid).collect();
+        ours
+    }
+}
+
+/// The prefix all endpoints of a participant share.
+pub(crate) fn same_participant(endpoint: GUID, participant: &impl RTPSEntity) -> bool {
+    endpoint.prefix == participant.guid().prefix
+}

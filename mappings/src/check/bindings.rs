@@ -1,0 +1,527 @@
+//! ROS bindings: topic, type and field of each, and what they do to one another.
+
+use std::collections::HashMap;
+use std::collections::hash_map::Entry;
+use std::sync::Arc;
+
+use messages::{DefinitionError, Dialect, Leaf, MessageType, Selection, TypeName};
+
+use super::names::{mended, topic_fault};
+use super::types::{self, Types, ValueType, dialect};
+use super::{Declared, required, variables};
+use crate::code::Code;
+use crate::document::{self, BindingEntry};
+use crate::findings::Findings;
+use crate::mapping::{Binding, Space};
+use crate::nearest::nearest;
+use crate::read::{At, list, short};
+use crate::topic::{SpaceId, TopicId};
+use crate::tree::Place;
+
+/// Most fields that are told in a help.
+const TOLD: usize = 12;
+
+/// The variable whose bindings are looked at.
+pub(super) struct Subject {
+    pub(super) topic: Option<TopicId>,
+    pub(super) origin: Option<SpaceId>,
+    pub(super) declared: Option<ValueType>,
+    /// It has a `type`, which is no type.
+    pub(super) type_faulty: bool,
+}
+
+pub(super) struct Bound {
+    pub(super) bindings: Vec<Binding>,
+    /// `None` when no type of a binding is known.
+    pub(super) fields: Option<Vec<Leaf>>,
+}
+
+/// One binding, as far as it goes.
+struct Found {
+    binding: Binding,
+    place: Place,
+    fields: Option<Vec<Leaf>>,
+}
+
+/// Where a binding stands.
+struct Site<'s> {
+    place: Place,
+    space: Option<SpaceId>,
+    subject: &'s Subject,
+}
+
+/// What is done to one ROS topic of one space.
+struct Use {
+    place: Place,
+    reads: bool,
+    message_type: TypeName,
+}
+
+pub(super) struct Bindings<'c> {
+    spaces: &'c Declared<Vec<Space>>,
+    types: Types,
+    uses: HashMap<(SpaceId, String), Vec<Use>>,
+    /// The topics in the order they came, so that findings do.
+    order: Vec<(SpaceId, String)>,
+}
+
+impl<'c> Bindings<'c> {
+    pub(super) fn new(spaces: &'c Declared<Vec<Space>>) -> Self {
+        Self {
+            spaces,
+            types: Types::new(),
+            uses: HashMap::new(),
+            order: Vec::new(),
+        }
+    }
+
+    pub(super) fn check(
+        &mut self,
+        entries: Option<&At<document::Bindings>>,
+        subject: &Subject,
+        findings: &mut Findings,
+    ) -> Bound {
+        let mut found: Vec<Found> = Vec::new();
+        let mut spaces: HashMap<SpaceId, usize> = HashMap::new();
+        let entries = entries
+            .and_then(|at| at.value.as_ref())
+            .map_or(&[][..], |bindings| &bindings.0);
+        for at in entries {
+            let Some(entry) = &at.value else { continue };
+            let (space, place) = self.space(entry, at.place, subject, findings);
+            if let Some(space) = space
+                && let Some(line) = spaces.insert(space, place.line)
+            {
+                let message = format!("the variable is bound twice in space {space}");
+                let note = findings
+                    .error(Code::BindingTwice, place, message)
+                    .label(format!("first at line {line}"));
+                note.help("one topic per space: a second one is a second variable");
+                continue;
+            }
+            let site = Site {
+                place: at.place,
+                space,
+                subject,
+            };
+            found.extend(self.binding(entry, &site, findings));
+        }
+        differences(&found, findings);
+        for one in &found {
+            self.note_use(one, subject);
+        }
+        // What the writer of the value sends decides its fields.
+        let own = found
+            .iter()
+            .filter(|one| Some(one.binding.space) == subject.origin);
+        let fields = own.chain(&found).find_map(|one| one.fields.clone());
+        Bound {
+            bindings: found.into_iter().map(|one| one.binding).collect(),
+            fields,
+        }
+    }
+
+    fn space(
+        &self,
+        entry: &BindingEntry,
+        owner: Place,
+        subject: &Subject,
+        findings: &mut Findings,
+    ) -> (Option<SpaceId>, Place) {
+        let Some(at) = &entry.space else {
+            if subject.origin == Some(SpaceId::UA) {
+                let note = findings.error(Code::MissingKey, owner, "the binding has no `space`");
+                note.help("the value comes from the OPC UA side, which has no ROS topics: say whose topic it is");
+                return (None, owner);
+            }
+            return (subject.origin, owner);
+        };
+        let number = at.value;
+        let space = number
+            .and_then(|number| variables::space(number, at.place, "space", self.spaces, findings));
+        if space == Some(SpaceId::UA) {
+            let note = findings.error(
+                Code::OpcUaBinding,
+                at.place,
+                "space 0 is the OPC UA side and has no ROS topics",
+            );
+            note.help("leave the binding out: the server shows every variable under its node");
+            return (None, at.place);
+        }
+        (space, at.place)
+    }
+
+    /// `None` when something of it is faulty. Without a space, what does not depend on it is checked.
+    fn binding(
+        &mut self,
+        entry: &BindingEntry,
+        site: &Site<'_>,
+        findings: &mut Findings,
+    ) -> Option<Found> {
+        let topic = required(&entry.topic, "topic", "the binding", site.place, findings);
+        let topic = topic.and_then(|(text, place)| topic_name(text, place, site, findings));
+        let named = self.type_name(entry, site, findings);
+        let (name, place) = named?;
+        let space = site.space?;
+        let message_type = self.message_type(&name, place, site, findings);
+        let selection = match &entry.field {
+            None => Selection::Whole,
+            Some(at) => Selection::Field(at.value.clone()?),
+        };
+        let fields = match message_type {
+            Some(message_type) => {
+                let place = entry.field.as_ref().map_or(place, |at| at.place);
+                let fields = select(&message_type, &selection, place, findings)?;
+                compare(&fields, &name, site.subject, place, findings);
+                Some(fields)
+            }
+            None => None,
+        };
+        let (ros_topic, place) = topic?;
+        let binding = Binding {
+            space,
+            ros_topic,
+            message_type: name,
+            selection,
+        };
+        Some(Found {
+            binding,
+            place,
+            fields,
+        })
+    }
+
+    fn type_name(
+        &self,
+        entry: &BindingEntry,
+        site: &Site<'_>,
+        findings: &mut Findings,
+    ) -> Option<(TypeName, Place)> {
+        if let Some(at) = &entry.r#type {
+            let text = at.value.as_ref()?;
+            let name = text.parse().ok();
+            if name.is_none() {
+                let message = format!("`{}` is no message type name", short(text));
+                findings
+                    .error(Code::MessageTypeName, at.place, message)
+                    .help("package and name, as std_msgs/Bool");
+            }
+            return Some((name?, at.place));
+        }
+        let Some((builtin, array)) = site.subject.declared else {
+            if !site.subject.type_faulty {
+                let note =
+                    findings.error(Code::MissingKey, site.place, "the binding has no `type`");
+                note.help("the ROS message type, as std_msgs/Bool; or give the variable a `type`");
+            }
+            return None;
+        };
+        let name = Types::registry(dialect(site.space?)).standard_type(builtin, array);
+        if name.is_none() {
+            let message = format!(
+                "the binding has no `type`, and none of std_msgs holds {}",
+                types::print((builtin, array))
+            );
+            findings
+                .error(Code::MissingKey, site.place, message)
+                .help("name the ROS message type, and the field if it has several");
+        }
+        Some((name?, site.place))
+    }
+
+    /// `None` when it is not known, which is noted.
+    fn message_type(
+        &mut self,
+        name: &TypeName,
+        place: Place,
+        site: &Site<'_>,
+        findings: &mut Findings,
+    ) -> Option<Arc<MessageType>> {
+        let space = site.space?;
+        let dialect = dialect(space);
+        let error = match self.types.get(dialect, name) {
+            Ok(message_type) => return Some(Arc::clone(message_type)),
+            Err(error) => error,
+        };
+        let message = match &**error {
+            DefinitionError::Unknown { .. } => {
+                format!("no definition of `{name}` is built in for {}", ros(dialect))
+            }
+            DefinitionError::Cyclic { .. }
+            | DefinitionError::TooDeep { .. }
+            | DefinitionError::TooBig { .. }
+            | DefinitionError::Syntax { .. } => error.to_string(),
+        };
+        // What is read from a ROS 1 topic brings its definition; an origin that could not be read may be space 1.
+        let read =
+            space == SpaceId::ROS1 && site.subject.origin.is_none_or(|origin| origin == space);
+        let (note, why) = if read {
+            let why = "the publisher's connection header brings it, and the field is checked then";
+            (
+                findings.warning(Code::UnknownMessageType, place, message),
+                why,
+            )
+        } else {
+            let why = match dialect {
+                Dialect::Ros1 => "what is written to ROS 1 must be known beforehand",
+                Dialect::Ros2 => {
+                    "ROS 2 peers do not send definitions, so only types built in can be bound"
+                }
+            };
+            (
+                findings.error(Code::UnknownMessageType, place, message),
+                why,
+            )
+        };
+        note.help_with(|| match Types::registry(dialect).suggest(name) {
+            Some(near) => format!("did you mean `{near}`? If not: {why}"),
+            None => why.to_owned(),
+        });
+        None
+    }
+
+    fn note_use(&mut self, found: &Found, subject: &Subject) {
+        let Some(origin) = subject.origin else { return };
+        let Binding {
+            space,
+            ros_topic,
+            message_type,
+            ..
+        } = &found.binding;
+        let one = Use {
+            place: found.place,
+            reads: *space == origin,
+            message_type: message_type.clone(),
+        };
+        match self.uses.entry((*space, ros_topic.clone())) {
+            Entry::Occupied(uses) => uses.into_mut().push(one),
+            Entry::Vacant(slot) => {
+                self.order.push(slot.key().clone());
+                slot.insert(vec![one]);
+            }
+        }
+    }
+
+    /// What variables do to one another through a topic they share.
+    pub(super) fn conflicts(&self, findings: &mut Findings) {
+        for key in &self.order {
+            let uses = self.uses.get(key).map_or(&[][..], Vec::as_slice);
+            let Some((first, others)) = uses.split_first() else {
+                continue;
+            };
+            let (space, topic) = key;
+            for other in others {
+                conflict(
+                    first,
+                    other,
+                    &format!("`{topic}` of space {space}"),
+                    findings,
+                );
+            }
+        }
+    }
+}
+
+fn conflict(first: &Use, other: &Use, topic: &str, findings: &mut Findings) {
+    let label = format!("first at line {}", first.place.line);
+    if first.reads != other.reads {
+        let message = format!("{topic} is read for one variable and written for another");
+        let note = findings
+            .error(Code::ReadAndWritten, other.place, message)
+            .label(label);
+        note.help("what is written there would come back as a value of its own: use two topics");
+    } else if !other.reads {
+        let message = format!("two variables are written to {topic}");
+        let note = findings
+            .error(Code::WrittenTwice, other.place, message)
+            .label(label);
+        note.help("a topic shows one value: give each its own topic");
+    } else if first.message_type != other.message_type {
+        let (a, b) = (&first.message_type, &other.message_type);
+        let message = format!("{topic} cannot be both {a} and {b}");
+        findings
+            .error(Code::TopicTypesDiffer, other.place, message)
+            .label(label);
+    }
+}
+
+fn topic_name(
+    text: &str,
+    place: Place,
+    site: &Site<'_>,
+    findings: &mut Findings,
+) -> Option<(String, Place)> {
+    let dialect = site.space.map_or(Dialect::Ros1, dialect);
+    if let Some(fault) = topic_fault(text, dialect) {
+        let note = findings
+            .error(
+                Code::RosTopic,
+                place,
+                format!("`{}` is no ROS topic name", short(text)),
+            )
+            .label(fault);
+        if let Some(mended) = mended(text, dialect) {
+            note.help(format!("did you mean `{mended}`?"));
+        }
+        return None;
+    }
+    if let Some(other) = text
+        .strip_prefix('/')
+        .and_then(|name| name.parse::<TopicId>().ok())
+        && let Some(topic) = site.subject.topic
+        && topic != other
+    {
+        let message =
+            format!("`{text}` is the name of another value of the space; this one is `/{topic}`");
+        findings
+            .error(Code::SpaceName, place, message)
+            .help(format!(
+                "write `/{topic}`, or a name that does not begin with ua_"
+            ));
+        return None;
+    }
+    Some((text.to_owned(), place))
+}
+
+const fn ros(dialect: Dialect) -> &'static str {
+    match dialect {
+        Dialect::Ros1 => "ROS 1",
+        Dialect::Ros2 => "ROS 2",
+    }
+}
+
+fn select(
+    message_type: &MessageType,
+    selection: &Selection,
+    place: Place,
+    findings: &mut Findings,
+) -> Option<Vec<Leaf>> {
+    let Selection::Field(path) = selection else {
+        return Some(message_type.leaves().to_vec());
+    };
+    if let Some(leaf) = message_type.leaf(path) {
+        return Some(vec![leaf.clone()]);
+    }
+    let paths: Vec<&str> = message_type
+        .leaves()
+        .iter()
+        .map(|leaf| leaf.path.as_str())
+        .collect();
+    let name = message_type.name();
+    let inner: Vec<&str> = paths
+        .iter()
+        .copied()
+        .filter(|known| {
+            known
+                .strip_prefix(path.as_str())
+                .is_some_and(|rest| rest.starts_with('.'))
+        })
+        .collect();
+    if inner.is_empty() {
+        let message = format!("`{name}` has no field `{}`", short(path));
+        let note = findings.error(Code::UnknownField, place, message);
+        let near =
+            nearest(path, paths.iter().copied()).map(|near| format!("did you mean `{near}`? "));
+        note.help(format!(
+            "{}its fields are {}",
+            near.unwrap_or_default(),
+            told(&paths)
+        ));
+    } else {
+        let message = format!(
+            "`{}` of `{name}` is a message of its own, not one value",
+            short(path)
+        );
+        findings
+            .error(Code::UnknownField, place, message)
+            .help(format!("its fields are {}", told(&inner)));
+    }
+    None
+}
+
+fn told(paths: &[&str]) -> String {
+    match paths.split_at_checked(TOLD) {
+        Some((first, rest)) if !rest.is_empty() => {
+            format!("{} and {} more", list(first), rest.len())
+        }
+        Some(_) | None if paths.is_empty() => "none".to_owned(),
+        Some(_) | None => list(paths),
+    }
+}
+
+fn compare(
+    fields: &[Leaf],
+    name: &TypeName,
+    subject: &Subject,
+    place: Place,
+    findings: &mut Findings,
+) {
+    let Some(declared) = subject.declared else {
+        return;
+    };
+    let told_type = types::print(declared);
+    match fields {
+        [one] if types::value_type(one) == declared => {}
+        [one] => {
+            let found = types::print(types::value_type(one));
+            let message = format!(
+                "the variable is {told_type}, but `{}` of `{name}` is {found}",
+                one.path
+            );
+            let help = format!("leave the variable's `type` out, or write `type: {found}`");
+            findings.error(Code::TypeDiffers, place, message).help(help);
+        }
+        several => {
+            let paths: Vec<&str> = several.iter().map(|leaf| leaf.path.as_str()).collect();
+            let message = format!(
+                "the variable is one {told_type}, but `{name}` has {} fields",
+                several.len()
+            );
+            let help = format!(
+                "bind one `field` of {}, or leave the variable's `type` out",
+                told(&paths)
+            );
+            findings.error(Code::TypeDiffers, place, message).help(help);
+        }
+    }
+}
+
+/// Where the fields of two bindings could not stand for one another.
+fn differences(found: &[Found], findings: &mut Findings) {
+    let mut known = found
+        .iter()
+        .filter_map(|one| Some((one, one.fields.as_ref()?)));
+    let Some((first, fields)) = known.next() else {
+        return;
+    };
+    let shape =
+        |fields: &[Leaf]| -> Vec<ValueType> { fields.iter().map(types::value_type).collect() };
+    for (other, others) in known {
+        if shape(fields) == shape(others) {
+            continue;
+        }
+        let told = |fields: &[Leaf]| match fields {
+            [one] => types::print(types::value_type(one)),
+            several => format!("{} fields", several.len()),
+        };
+        let (a, b) = (&first.binding, &other.binding);
+        let message = match (fields.as_slice(), others.as_slice()) {
+            (a_fields, b_fields) if a_fields.len() == b_fields.len() && a_fields.len() > 1 => {
+                format!(
+                    "the fields of `{}` are not of the types of those of `{}`",
+                    b.message_type, a.message_type
+                )
+            }
+            _ => format!(
+                "the value is {} in space {}, but {} in space {}",
+                told(fields),
+                a.space,
+                told(others),
+                b.space
+            ),
+        };
+        let note = findings.error(Code::BindingsDiffer, other.place, message);
+        note.label(format!("differs from line {}", first.place.line))
+            .help("bind fields of one type on both sides");
+    }
+}

@@ -1,0 +1,373 @@
+//! Where datagrams go, when, and where the server listens.
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::time::Duration;
+
+use super::cell::is_uri;
+use crate::code::Code;
+use crate::document::{PubSubEntry, PublisherIdEntry, SecurityEntry, ServerEntry};
+use crate::findings::Findings;
+use crate::mapping::{Endpoint, PubSub, PublisherIdRule, SecurityPolicy, Server};
+use crate::read::{At, Field, given, short};
+use crate::tree::Place;
+
+/// The port registered for OPC UA, TCP and UDP.
+const PORT: u16 = 4840;
+
+pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -> PubSub {
+    let default = PubSub::default();
+    let Some(entry) = entry.and_then(|at| at.value.as_ref()) else {
+        return default;
+    };
+    let address = given(&entry.address).and_then(|(text, place)| address(text, place, findings));
+    let interface =
+        given(&entry.interface).and_then(|(text, place)| interface(text, place, findings));
+    let ttl = given(&entry.ttl).and_then(|(number, place)| {
+        let ttl = u8::try_from(*number).ok();
+        if ttl.is_none() {
+            let message = format!("a ttl of {number} does not fit into its one byte");
+            findings
+                .error(Code::WrongValue, place, message)
+                .label("0 to 255");
+        }
+        ttl
+    });
+    let publisher_id = match given(&entry.publisher_id) {
+        Some((PublisherIdEntry::AnyWidth, _)) => PublisherIdRule::AnyWidth,
+        Some((PublisherIdEntry::Exact, _)) | None => PublisherIdRule::Exact,
+    };
+    let key_frame_period = duration(&entry.key_frame_period, findings);
+    let keep_alive_period = duration(&entry.keep_alive_period, findings);
+    let receive_timeout = duration(&entry.receive_timeout, findings);
+    let pubsub = PubSub {
+        address: address.unwrap_or(default.address),
+        interface,
+        ttl: ttl.unwrap_or(default.ttl),
+        publisher_id,
+        key_frame_period: key_frame_period.unwrap_or(default.key_frame_period),
+        keep_alive_period: keep_alive_period.unwrap_or(default.keep_alive_period),
+        receive_timeout: receive_timeout.unwrap_or(default.receive_timeout),
+    };
+    timing(entry, &pubsub, findings);
+    pubsub
+}
+
+fn timing(entry: &PubSubEntry, pubsub: &PubSub, findings: &mut Findings) {
+    let faulty = |field: &Field<String>| {
+        field
+            .as_ref()
+            .is_some_and(|at| at.value.as_deref().and_then(parse_duration).is_none())
+    };
+    if pubsub.receive_timeout > pubsub.keep_alive_period
+        || faulty(&entry.receive_timeout)
+        || faulty(&entry.keep_alive_period)
+    {
+        return;
+    }
+    let Some(at) = entry
+        .receive_timeout
+        .as_ref()
+        .or(entry.keep_alive_period.as_ref())
+    else {
+        return;
+    };
+    let (timeout, period) = (pubsub.receive_timeout, pubsub.keep_alive_period);
+    let message = format!(
+        "the receive_timeout of {timeout:?} is not longer than the keep_alive_period of {period:?}"
+    );
+    let note = findings.error(Code::Timing, at.place, message);
+    note.help(format!(
+        "three periods ride out two lost datagrams: receive_timeout: {:?}",
+        period.saturating_mul(3)
+    ));
+}
+
+/// `opc.udp://host:port`, port 4840 when left out (OPC 10000-14, 7.3.2).
+fn address(text: &str, place: Place, findings: &mut Findings) -> Option<SocketAddr> {
+    let Some(address) = PubSub::parse_address(text) else {
+        let message = format!("`{}` is no PubSub address", short(text));
+        let note = findings.error(Code::Address, place, message);
+        note.help(format!(
+            "a group or host by number: opc.udp://{}",
+            PubSub::ADDRESS
+        ));
+        return None;
+    };
+    let unusable = if address.port() == 0 {
+        Some("port 0 cannot be sent to")
+    } else if address.ip().is_unspecified() {
+        Some("the unspecified address cannot be sent to")
+    } else if address.ip() == IpAddr::V4(Ipv4Addr::BROADCAST) {
+        Some("broadcasts are not sent")
+    } else {
+        None
+    };
+    if let Some(why) = unusable {
+        findings
+            .error(Code::Address, place, why)
+            .help(format!("for example opc.udp://{}", PubSub::ADDRESS));
+        return None;
+    }
+    if address.ip() == IpAddr::V4(PubSub::DISCOVERY_GROUP) {
+        let message = format!(
+            "{} is the group for discovery messages, not for data",
+            PubSub::DISCOVERY_GROUP
+        );
+        let note = findings.error(Code::DiscoveryGroup, place, message);
+        note.help(format!("for example opc.udp://{}", PubSub::ADDRESS));
+        return None;
+    }
+    if let IpAddr::V4(group) = address.ip()
+        && group.is_multicast()
+        && group.octets().first() != Some(&239)
+    {
+        let message = format!("{group} is not one of the groups a site may use as it likes");
+        let note = findings.warning(Code::UnscopedGroup, place, message);
+        note.help("239.0.0.0 to 239.255.255.255 are; keep this one only if a publisher demands it");
+    }
+    Some(address)
+}
+
+/// Linux takes 15 bytes.
+const MAX_INTERFACE: usize = 15;
+
+fn interface(text: &str, place: Place, findings: &mut Findings) -> Option<String> {
+    let named = !text.is_empty()
+        && text.len() <= MAX_INTERFACE
+        && !text.contains(|c: char| c.is_whitespace() || c.is_control() || c == '/');
+    if !named && text.parse::<IpAddr>().is_err() {
+        let message = format!(
+            "`{}` is neither the name nor the address of an interface",
+            short(text)
+        );
+        findings
+            .error(Code::Interface, place, message)
+            .help("`ip -brief address` lists them, as eth0 or 192.168.1.5");
+        return None;
+    }
+    Some(text.to_owned())
+}
+
+const SHORTEST: Duration = Duration::from_millis(10);
+const LONGEST: Duration = Duration::from_secs(3600);
+
+fn duration(field: &Field<String>, findings: &mut Findings) -> Option<Duration> {
+    let (text, place) = given(field)?;
+    let duration = parse_duration(text);
+    if duration.is_none() {
+        let message = format!("`{}` is no duration from 10ms to 1h", short(text));
+        let note = findings.error(Code::Duration, place, message);
+        note.help("a number with its unit: 500ms, 1s, 2.5s, 1min");
+    }
+    duration
+}
+
+/// `None` also outside 10 ms to 1 h.
+fn parse_duration(text: &str) -> Option<Duration> {
+    let unit = text.find(|c: char| c.is_ascii_alphabetic())?;
+    let (number, unit) = text.split_at_checked(unit)?;
+    let (whole, fraction) = number.split_once('.').unwrap_or((number, "0"));
+    let digits =
+        |text: &str| (1..=9).contains(&text.len()) && text.bytes().all(|b| b.is_ascii_digit());
+    if !digits(whole) || !digits(fraction) {
+        return None;
+    }
+    let unit_nanos: u64 = match unit {
+        "ms" => 1_000_000,
+        "s" => 1_000_000_000,
+        "min" => 60_000_000_000,
+        "h" => 3_600_000_000_000,
+        _ => return None,
+    };
+    let scale = 10_u64.checked_pow(u32::try_from(fraction.len()).ok()?)?;
+    let whole = whole.parse::<u64>().ok()?.checked_mul(unit_nanos)?;
+    let fraction =
+        u128::from(fraction.parse::<u64>().ok()?) * u128::from(unit_nanos) / u128::from(scale);
+    let nanos = whole.checked_add(u64::try_from(fraction).ok()?)?;
+    let duration = Duration::from_nanos(nanos);
+    (SHORTEST..=LONGEST).contains(&duration).then_some(duration)
+}
+
+pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -> Server {
+    let default = Server::default();
+    let Some(entry) = entry.and_then(|at| at.value.as_ref()) else {
+        return default;
+    };
+    let endpoint = given(&entry.endpoint).and_then(|(text, place)| {
+        let endpoint = parse_endpoint(text);
+        if endpoint.is_none() {
+            let message = format!("`{}` is no endpoint", short(text));
+            findings
+                .error(Code::Endpoint, place, message)
+                .help(format!("for example {}", default.endpoint));
+        }
+        endpoint
+    });
+    let application_uri = given(&entry.application_uri).and_then(|(text, place)| {
+        if is_uri(text) {
+            return Some(text.clone());
+        }
+        let message = format!("`{}` is no ApplicationUri", short(text));
+        findings
+            .error(Code::ApplicationUri, place, message)
+            .help(format!("for example {}", default.application_uri));
+        None
+    });
+    let security =
+        given(&entry.security).and_then(|(entries, place)| security(entries, place, findings));
+    Server {
+        endpoint: endpoint.unwrap_or(default.endpoint),
+        application_uri: application_uri.unwrap_or(default.application_uri),
+        security: security.unwrap_or(default.security),
+    }
+}
+
+fn security(
+    entries: &[At<SecurityEntry>],
+    place: Place,
+    findings: &mut Findings,
+) -> Option<Vec<SecurityPolicy>> {
+    if entries.is_empty() {
+        let message = "a server without a security policy has no endpoint";
+        findings
+            .error(Code::WrongValue, place, message)
+            .help("security: [None, Basic256Sha256]");
+        return None;
+    }
+    let mut policies = Vec::new();
+    for entry in entries {
+        let policy = match entry.value {
+            Some(SecurityEntry::None) => SecurityPolicy::None,
+            Some(SecurityEntry::Basic256Sha256) => SecurityPolicy::Basic256Sha256,
+            None => continue,
+        };
+        if policies.contains(&policy) {
+            let message = format!("the security policy {} is listed twice", policy.name());
+            findings
+                .warning(Code::WrongValue, entry.place, message)
+                .help("leave it out here");
+        } else {
+            policies.push(policy);
+        }
+    }
+    Some(policies)
+}
+
+/// `opc.tcp://host:port/path`, port 4840 when left out (OPC 10000-6, 7.2).
+fn parse_endpoint(text: &str) -> Option<Endpoint> {
+    let rest = text.strip_prefix("opc.tcp://")?;
+    let slash = rest.find('/').unwrap_or(rest.len());
+    let (authority, path) = rest.split_at_checked(slash)?;
+    let (host, port) = match authority
+        .strip_prefix('[')
+        .and_then(|rest| rest.split_once(']'))
+    {
+        Some((host, port)) => {
+            host.parse::<std::net::Ipv6Addr>().ok()?;
+            (
+                host,
+                if port.is_empty() {
+                    None
+                } else {
+                    Some(port.strip_prefix(':')?)
+                },
+            )
+        }
+        None => match authority.split_once(':') {
+            Some((host, port)) => (host, Some(port)),
+            None => (authority, None),
+        },
+    };
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-._".contains(c);
+    let named = !host.is_empty()
+        && host.len() <= 255
+        && (authority.starts_with('[') || host.chars().all(plain));
+    let port = match port {
+        Some(text) if text.bytes().all(|b| b.is_ascii_digit()) => {
+            text.parse().ok().filter(|port| *port != 0)?
+        }
+        Some(_) => return None,
+        None => PORT,
+    };
+    let whole = !path.contains(|c: char| c.is_whitespace() || c.is_control()) && path.len() <= 1024;
+    (named && whole).then(|| Endpoint {
+        host: host.to_owned(),
+        port,
+        path: path.to_owned(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_duration_is_a_number_with_its_unit() {
+        for (text, millis) in [
+            ("500ms", 500),
+            ("1s", 1000),
+            ("2.5s", 2500),
+            ("1min", 60_000),
+            ("1h", 3_600_000),
+            ("0.010s", 10),
+            ("10ms", 10),
+        ] {
+            assert_eq!(
+                parse_duration(text),
+                Some(Duration::from_millis(millis)),
+                "{text}"
+            );
+        }
+        for text in [
+            "",
+            "1",
+            "s",
+            "1 s",
+            "-1s",
+            "+1s",
+            "1.s",
+            ".5s",
+            "1e3s",
+            "9ms",
+            "3601s",
+            "1.1h",
+            "0s",
+            "1d",
+            "1.2.3s",
+            "99999999999999999999s",
+            "999999999h",
+            "١s",
+        ] {
+            assert_eq!(parse_duration(text), None, "{text}");
+        }
+    }
+
+    #[test]
+    fn an_endpoint_prints_as_it_was_read() {
+        for text in [
+            "opc.tcp://127.0.0.1:4840",
+            "opc.tcp://plant-7.local:1/ua/x",
+            "opc.tcp://[::1]:4841",
+        ] {
+            assert_eq!(parse_endpoint(text).unwrap().to_string(), text);
+        }
+        assert_eq!(parse_endpoint("opc.tcp://gateway").unwrap().port, 4840);
+        for text in [
+            "",
+            "127.0.0.1:4840",
+            "http://a:1",
+            "opc.tcp://",
+            "opc.tcp://:4840",
+            "opc.tcp://a:0",
+            "opc.tcp://a:x",
+            "opc.tcp://a:65536",
+            "opc.tcp://[::1",
+            "opc.tcp://[x]:1",
+            "opc.tcp://a b:1",
+            "opc.tcp://a:1/ x",
+            "opc.tcp://a:+1",
+        ] {
+            assert_eq!(parse_endpoint(text), None, "{text}");
+        }
+    }
+}

@@ -1,0 +1,390 @@
+//! Variables: node, topic, name, type.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::num::NonZeroU16;
+use std::ops::RangeInclusive;
+
+use messages::{Leaf, Rank};
+
+use super::bindings::{self, Bindings};
+use super::types::{self, ValueType};
+use super::{Declared, required};
+use crate::code::Code;
+use crate::document::{Queue, VariableEntry};
+use crate::findings::Findings;
+use crate::mapping::{Overflow, Space, Variable};
+use crate::node_id::{Identifier, NodeIdText};
+use crate::read::{At, given, short};
+use crate::topic::{SpaceId, TopicId};
+use crate::tree::Place;
+
+/// Most variables of one document.
+const MAX_VARIABLES: usize = 20_000;
+
+/// The WriterGroupId of nodes of namespace 0, whose own index is the null value: the highest, which no server reaches.
+const NAMESPACE_ZERO: NonZeroU16 = NonZeroU16::MAX;
+
+type Namespaces = Declared<BTreeMap<u16, String>>;
+type Spaces = Declared<Vec<Space>>;
+
+/// What could be read of an entry that is a map.
+struct Draft<'d> {
+    entry: &'d VariableEntry,
+    place: Place,
+    node: Option<(NodeIdText, Place)>,
+    origin: Option<SpaceId>,
+    alias: Option<NonZeroU16>,
+}
+
+impl Draft<'_> {
+    fn namespace(&self) -> Option<NonZeroU16> {
+        let (node, _) = self.node.as_ref()?;
+        Some(NonZeroU16::new(node.namespace).unwrap_or(NAMESPACE_ZERO))
+    }
+
+    fn topic(&self) -> Option<TopicId> {
+        let (node, _) = self.node.as_ref()?;
+        let identifier = node.writer_id().or(self.alias)?;
+        Some(TopicId {
+            space: self.origin?,
+            namespace: self.namespace()?,
+            identifier,
+        })
+    }
+}
+
+pub(super) fn check(
+    entries: &[At<VariableEntry>],
+    spaces: &Spaces,
+    namespaces: &Namespaces,
+    findings: &mut Findings,
+) -> Vec<Variable> {
+    if let Some(first) = entries.get(MAX_VARIABLES) {
+        let message = format!(
+            "{} variables; at most {MAX_VARIABLES} are read",
+            entries.len()
+        );
+        findings.error(Code::TooLarge, first.place, message);
+        return Vec::new();
+    }
+    let drafts: Vec<Draft<'_>> = entries
+        .iter()
+        .filter_map(|at| {
+            Some(draft(
+                at.value.as_ref()?,
+                at.place,
+                spaces,
+                namespaces,
+                findings,
+            ))
+        })
+        .collect();
+    aliases(&drafts, findings);
+    unique(&drafts, findings);
+    let mut bindings = Bindings::new(spaces);
+    let variables = drafts
+        .iter()
+        .filter_map(|draft| variable(draft, &mut bindings, findings));
+    let variables = variables.collect();
+    bindings.conflicts(findings);
+    variables
+}
+
+fn draft<'d>(
+    entry: &'d VariableEntry,
+    place: Place,
+    spaces: &Spaces,
+    namespaces: &Namespaces,
+    findings: &mut Findings,
+) -> Draft<'d> {
+    let node = required(&entry.node, "node", &title(entry), place, findings);
+    let node = node.and_then(|(text, place)| node_id(text, place, namespaces, findings));
+    let origin = required(&entry.origin, "origin", &title(entry), place, findings)
+        .and_then(|(number, place)| space(*number, place, "origin", spaces, findings));
+    let alias = given(&entry.alias).and_then(|(number, place)| {
+        if *number == 0 {
+            findings
+                .error(Code::Alias, place, "0 is no alias")
+                .label("1 to 65535");
+        }
+        NonZeroU16::new(*number)
+    });
+    Draft {
+        entry,
+        place,
+        node,
+        origin,
+        alias,
+    }
+}
+
+/// How a finding calls a variable of which something is missing.
+fn title(entry: &VariableEntry) -> String {
+    match given(&entry.name).or_else(|| given(&entry.node)) {
+        Some((text, _)) => format!("the variable `{}`", short(text)),
+        None => "the variable".to_owned(),
+    }
+}
+
+fn node_id(
+    text: &str,
+    place: Place,
+    namespaces: &Namespaces,
+    findings: &mut Findings,
+) -> Option<(NodeIdText, Place)> {
+    let node: NodeIdText = match text.parse() {
+        Ok(node) => node,
+        Err(error) => {
+            let message = format!("`{}` is no node id", short(text));
+            findings
+                .error(Code::NodeId, place, message)
+                .help(error.to_string());
+            return None;
+        }
+    };
+    let index = node.namespace;
+    if index != 0 && !namespaces.partial && !namespaces.known.contains_key(&index) {
+        let message = format!(
+            "namespace {index} of node `{}` is not declared",
+            short(text)
+        );
+        let note = findings.error(Code::UndeclaredNamespace, place, message);
+        note.help(format!(
+            "add it with its URI: `namespaces: {{{index}: urn:my-plant:line}}`"
+        ));
+    }
+    Some((node, place))
+}
+
+/// A space that is the OPC UA side or declared.
+pub(super) fn space(
+    number: u16,
+    place: Place,
+    key: &str,
+    spaces: &Spaces,
+    findings: &mut Findings,
+) -> Option<SpaceId> {
+    let Some(id) = SpaceId::new(number) else {
+        let message = format!("{key} {number} is no space");
+        findings
+            .error(Code::SpaceId, place, message)
+            .label("0 to 232");
+        return None;
+    };
+    if id == SpaceId::UA || spaces.partial || spaces.known.iter().any(|space| space.id == id) {
+        return Some(id);
+    }
+    let message = format!("{key} {number} is not one of the declared spaces");
+    let note = findings.error(Code::UndeclaredSpace, place, message);
+    let known: Vec<String> = spaces
+        .known
+        .iter()
+        .map(|space| space.id.to_string())
+        .collect();
+    let known = if known.is_empty() {
+        "none but 0".to_owned()
+    } else {
+        format!("0, {}", known.join(", "))
+    };
+    note.help(format!(
+        "declared are {known}; add `- {{id: {number}}}` to `spaces`"
+    ));
+    None
+}
+
+fn aliases(drafts: &[Draft<'_>], findings: &mut Findings) {
+    let used: HashSet<TopicId> = drafts.iter().filter_map(Draft::topic).collect();
+    // The numbers not yet proposed.
+    let mut next: HashMap<(SpaceId, NonZeroU16), RangeInclusive<u16>> = HashMap::new();
+    for draft in drafts {
+        let Some((node, place)) = &draft.node else {
+            continue;
+        };
+        if let Some(own) = node.writer_id() {
+            if let Some((alias, place)) = given(&draft.entry.alias) {
+                let message = format!("node `{node}` needs no alias");
+                let note = findings.error(Code::Alias, place, message);
+                note.label(format!("{alias} would stand for {own}"))
+                    .help("leave `alias` out: the topic has the node's own number");
+            }
+            continue;
+        }
+        if draft.entry.alias.is_some() {
+            continue;
+        }
+        let message = format!("node `{}` needs an alias", short(&node.to_string()));
+        let note = findings
+            .error(Code::AliasNeeded, *place, message)
+            .label(why_alias(node));
+        let free = draft
+            .origin
+            .zip(draft.namespace())
+            .and_then(|(space, namespace)| {
+                let next = next.entry((space, namespace)).or_insert(1..=u16::MAX);
+                let topics = next.filter_map(NonZeroU16::new);
+                let mut topics = topics.map(|identifier| TopicId {
+                    space,
+                    namespace,
+                    identifier,
+                });
+                topics.find(|topic| !used.contains(topic))
+            });
+        note.help(match free {
+            Some(topic) => {
+                let alias = topic.identifier;
+                format!("add `alias: {alias}`, which is free; the topic is then `{topic}`")
+            }
+            None => "add `alias:` and a number from 1 to 65535".to_owned(),
+        });
+    }
+}
+
+/// Why the identifier of a node is none of a topic.
+fn why_alias(node: &NodeIdText) -> &'static str {
+    match node.identifier {
+        Identifier::Numeric(_) if node.namespace == 0 => "a node of namespace 0",
+        Identifier::Numeric(0) => "0 is no identifier of a topic",
+        Identifier::Numeric(_) => "topics have numbers up to 65535",
+        Identifier::String(_) => "a text, where topics have numbers",
+        Identifier::Guid(_) => "a Guid, where topics have numbers",
+        Identifier::Opaque(_) => "opaque bytes, where topics have numbers",
+    }
+}
+
+fn unique(drafts: &[Draft<'_>], findings: &mut Findings) {
+    let mut nodes: HashMap<&NodeIdText, usize> = HashMap::new();
+    let mut topics: HashMap<TopicId, usize> = HashMap::new();
+    let mut names: HashMap<(u16, &str), usize> = HashMap::new();
+    for draft in drafts {
+        let Some((node, place)) = &draft.node else {
+            continue;
+        };
+        let text = node.to_string();
+        if let Some((name, place)) = given(&draft.entry.name)
+            && let Some(line) = names.insert((node.namespace, name), place.line)
+        {
+            let message = format!(
+                "two variables of namespace {} are named `{}`",
+                node.namespace,
+                short(name)
+            );
+            let note = findings.warning(Code::NameTwice, place, message);
+            note.label(format!("first at line {line}"));
+        }
+        // Two variables of one node have one topic too, where the origin is the same: one finding is enough.
+        if let Some(line) = nodes.insert(node, place.line) {
+            let note = findings.error(
+                Code::NodeTwice,
+                *place,
+                format!("node `{}` has two variables", short(&text)),
+            );
+            note.label(format!("first at line {line}"))
+                .help("one node, one origin: give one of them another node");
+        } else if let Some(topic) = draft.topic()
+            && let Some(line) = topics.insert(topic, place.line)
+        {
+            let place = draft
+                .entry
+                .alias
+                .as_ref()
+                .map_or(*place, |alias| alias.place);
+            let note = findings.error(
+                Code::TopicTwice,
+                place,
+                format!("`{topic}` is mapped twice"),
+            );
+            note.label(format!("first at line {line}"))
+                .help("give one of them another alias");
+        }
+    }
+}
+
+fn variable(
+    draft: &Draft<'_>,
+    bindings: &mut Bindings<'_>,
+    findings: &mut Findings,
+) -> Option<Variable> {
+    let entry = draft.entry;
+    let name = required(&entry.name, "name", &title(entry), draft.place, findings);
+    let name = name.and_then(|(name, place)| checked_name(name, place, findings));
+    let declared =
+        given(&entry.r#type).and_then(|(text, place)| declared_type(text, place, findings));
+    let subject = bindings::Subject {
+        topic: draft.topic(),
+        origin: draft.origin,
+        declared,
+        type_faulty: entry.r#type.is_some() && declared.is_none(),
+    };
+    let bound = bindings.check(entry.ros.as_ref(), &subject, findings);
+    let fields = bound
+        .fields
+        .unwrap_or_else(|| declared.map(only_field).into_iter().collect());
+    let value_type = match fields.as_slice() {
+        [one] => Some(declared.unwrap_or_else(|| types::value_type(one))),
+        _ => declared,
+    };
+    let overflow = match given(&entry.queue) {
+        Some((Queue::DropOldest(size), _)) => Overflow::DropOldest(NonZeroU16::new(*size)?),
+        Some((Queue::KeepLatest, _)) | None => Overflow::KeepLatest,
+    };
+    let (node, _) = draft.node.clone()?;
+    let topic = draft.topic()?;
+    Some(Variable {
+        topic,
+        node,
+        name: name?,
+        value_type,
+        fields,
+        bindings: bound.bindings,
+        overflow,
+    })
+}
+
+/// As the std_msgs type of a value has it.
+fn only_field((builtin, array): ValueType) -> Leaf {
+    let rank = if array {
+        Rank::Array { fixed: None }
+    } else {
+        Rank::Scalar
+    };
+    Leaf {
+        path: "data".to_owned(),
+        builtin,
+        rank,
+    }
+}
+
+fn checked_name(name: &str, place: Place, findings: &mut Findings) -> Option<String> {
+    let fault = if name.trim().is_empty() {
+        "is empty"
+    } else if name.chars().count() > 512 {
+        "is longer than 512 characters"
+    } else if name.contains(char::is_control) {
+        "holds a control character"
+    } else {
+        return Some(name.to_owned());
+    };
+    findings
+        .error(Code::Name, place, format!("the name {fault}"))
+        .help("a name as ConveyorRunning");
+    None
+}
+
+fn declared_type(text: &str, place: Place, findings: &mut Findings) -> Option<ValueType> {
+    let declared = types::parse_value_type(text);
+    if declared.is_none() {
+        let message = format!("`{}` is no OPC UA builtin type", short(text));
+        let note = findings.error(Code::ValueType, place, message);
+        let ros = text
+            .contains('/')
+            .then(|| "a ROS type belongs into the binding under `ros`".to_owned());
+        let brackets = if text.contains('[') { "[]" } else { "" };
+        let near = types::suggest_value_type(text);
+        let near = near.map(|near| format!("did you mean `{near}{brackets}`?"));
+        note.help(
+            ros.or(near)
+                .unwrap_or_else(|| "for example Boolean, Int32, Double[], String".to_owned()),
+        );
+    }
+    declared
+}

@@ -1,0 +1,125 @@
+//! The codes of findings.
+
+use std::fmt;
+
+macro_rules! codes {
+    ($($(#[$doc:meta])* $name:ident = $text:literal, $explanation:literal;)*) => {
+        /// What kind of finding. A code keeps its meaning from release to release; new ones may come.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        #[non_exhaustive]
+        pub enum Code { $(#[doc = concat!($text, ": ", $explanation)] $name,)* }
+
+        impl Code {
+            /// Every code, ascending.
+            pub const ALL: &'static [Self] = &[$(Self::$name),*];
+
+            /// `M001`
+            #[must_use]
+            pub const fn as_str(self) -> &'static str {
+                match self { $(Self::$name => $text),* }
+            }
+
+            /// What the code means in general and what to do about it.
+            #[must_use]
+            pub const fn explanation(self) -> &'static str {
+                match self { $(Self::$name => $explanation),* }
+            }
+        }
+    };
+}
+
+codes! {
+    Syntax = "M001", "The text is not YAML, or uses what is not read here: several documents, tags, references to nothing. Nothing after the place has been looked at.";
+    TooLarge = "M002", "The document passes a limit: 4 MiB, 500 000 values, 20 000 variables, 24 levels of nesting.";
+    UnknownKey = "M003", "No key of that name is read at this place. Keys are spelt in lower case with underscores.";
+    DuplicateKey = "M004", "A key occurs twice in one map. The first one counts, which is seldom what was meant.";
+    WrongValue = "M005", "The value is not what its key takes: a list, a map, a number of a range, or one of a few words.";
+    MissingKey = "M006", "A key that has no default is not there.";
+    SpaceId = "M010", "A space is 1 (the one ROS 1 space) or 2..232 (ROS 2 spaces); 0 is the OPC UA side and is always there.";
+    SpaceTwice = "M011", "Two spaces have one id.";
+    Domain = "M012", "A DDS domain is 0..232 and only a ROS 2 space has one.";
+    DomainTwice = "M013", "Two spaces live in one DDS domain, so neither bridge could tell whose a topic is.";
+    UndeclaredSpace = "M014", "A variable names a space that is not listed under `spaces`.";
+    Address = "M020", "The PubSub address is not `opc.udp://<IPv4 or IPv6 address>:<port>`. A host name would have to be resolved, and is not read.";
+    DiscoveryGroup = "M021", "224.0.2.14 is the group OPC UA keeps for discovery messages; data sent there reaches everybody who looks for publishers.";
+    UnscopedGroup = "M022", "The group is none of 239.0.0.0/8, which sites use as they like; others are assigned to protocols and may be treated by switches as such.";
+    Interface = "M023", "An interface is named as the operating system does (at most 15 characters, `ip link` lists them) or by an address of it.";
+    Duration = "M024", "A duration is a number with its unit, as 500ms, 1s or 2.5s, from 10ms to 1h.";
+    Timing = "M025", "A writer that has nothing to say speaks once per keep_alive_period: with a shorter receive_timeout it would be taken for dead each time.";
+    Namespace = "M030", "A namespace is an index 1..65535 and a URI, each of them once.";
+    UndeclaredNamespace = "M031", "A node's namespace index is not listed under `namespaces`. The index alone means nothing: servers number their namespaces as they like, the URI ties it down.";
+    Endpoint = "M040", "The endpoint is not `opc.tcp://<host>:<port>[/path]`.";
+    ApplicationUri = "M041", "The ApplicationUri is a URI as urn:my-plant:server; certificates carry it.";
+    NodeId = "M050", "A node id is `ns=<index>;i=<number>`, or `s=<text>`, `g=<guid>`, `b=<base64>` after the `;`.";
+    AliasNeeded = "M051", "The identifier of a topic is a number 1..65535. A node whose id is none (a text, a Guid, opaque bytes, 0 or above 65535, or in namespace 0) needs an `alias`.";
+    Alias = "M052", "An alias is 1..65535 and stands for a node id that is no such number; other nodes keep their own number.";
+    NodeTwice = "M053", "Two variables have one node. A value has one origin; the node of the server would have two.";
+    TopicTwice = "M054", "Two variables have one topic, so one would be taken for the other.";
+    NameTwice = "M055", "Two variables of one namespace have one name, and look the same to people who browse the server.";
+    Name = "M056", "A variable's name has 1..512 characters and none of them is a control character.";
+    ValueType = "M057", "The type is an OPC UA builtin type, with `[]` behind it for an array of one dimension.";
+    RosTopic = "M060", "A ROS topic name begins with / and has letters, digits and underscores between slashes; in ROS 1 the first character is a letter, in ROS 2 no part begins with a digit.";
+    SpaceName = "M061", "The topic's name is one of the space, but not the name of this variable. Zero configuration would carry it as another value.";
+    MessageTypeName = "M062", "A message type is package/Name or package/msg/Name.";
+    UnknownMessageType = "M063", "No definition of the message type is built in. What a ROS 1 publisher sends brings its definition along; all else must be known.";
+    UnknownField = "M064", "The message type has no such field. Fields of nested messages are named from the outside in: pose.position.x.";
+    TypeDiffers = "M065", "The declared type is not the type of the bound field, or several fields are bound where one value is declared.";
+    BindingsDiffer = "M066", "The fields of two bindings of one variable differ in number or type, so the value of one cannot be written to the other.";
+    BindingTwice = "M067", "A variable is bound twice in one space.";
+    WrittenTwice = "M068", "Two variables are written to one ROS topic, which would show now the one value, now the other.";
+    ReadAndWritten = "M069", "One ROS topic is read for one variable and written for another: what is written would come back under the other name.";
+    TopicTypesDiffer = "M070", "One ROS topic is bound with two message types.";
+    OpcUaBinding = "M071", "Space 0 is the OPC UA side and has no ROS topics.";
+}
+
+impl fmt::Display for Code {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+impl std::str::FromStr for Code {
+    type Err = UnknownCode;
+
+    /// Reads `M001`, in either case.
+    fn from_str(text: &str) -> Result<Self, UnknownCode> {
+        let found = Self::ALL
+            .iter()
+            .find(|code| code.as_str().eq_ignore_ascii_case(text));
+        found.copied().ok_or(UnknownCode)
+    }
+}
+
+/// A text that is none of the codes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("no finding has that code; codes are M001 to M071")]
+pub struct UnknownCode;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_code_is_read_back_from_its_text() {
+        for code in Code::ALL {
+            assert_eq!(code.as_str().parse(), Ok(*code));
+            assert_eq!(code.as_str().to_lowercase().parse(), Ok(*code));
+        }
+        assert_eq!("M999".parse::<Code>(), Err(UnknownCode));
+    }
+
+    #[test]
+    fn codes_ascend_and_none_is_used_twice() {
+        let texts: Vec<&str> = Code::ALL.iter().map(|code| code.as_str()).collect();
+        assert!(texts.is_sorted_by(|a, b| a < b), "{texts:?}");
+        assert_eq!(
+            UnknownCode
+                .to_string()
+                .rsplit("are ")
+                .next()
+                .unwrap_or_default()
+                .to_owned(),
+            format!("{} to {}", texts[0], texts[texts.len() - 1])
+        );
+    }
+}

@@ -1,0 +1,213 @@
+//! Findings in a document, told as rustc tells them: code, place, the line with a caret, help.
+
+use std::fmt::{self, Write as _};
+use std::sync::Arc;
+
+use crate::code::Code;
+
+/// One finding. Its `Display` is one line without the source: `error[M003]: <message> (cell.yaml:14:3)`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Diagnostic {
+    /// What kind of finding; stable from release to release.
+    pub code: Code,
+    /// Whether the document can run with it.
+    pub severity: Severity,
+    /// The text it is about.
+    pub at: Span,
+    /// What is wrong, naming the value.
+    pub message: String,
+    /// A word beside the caret.
+    pub label: Option<String>,
+    /// What to do about it.
+    pub help: Option<String>,
+}
+
+/// Whether a document with the finding can run.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Severity {
+    /// It cannot: there is no [`Mapping`](crate::Mapping).
+    Error,
+    /// It can.
+    Warning,
+}
+
+impl fmt::Display for Severity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Error => "error",
+            Self::Warning => "warning",
+        })
+    }
+}
+
+/// A piece of one line of a document.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Span {
+    /// The name the document was given.
+    pub file: Arc<str>,
+    /// From 1.
+    pub line: usize,
+    /// From 1, in characters.
+    pub column: usize,
+    /// In characters, at least 1.
+    pub len: usize,
+}
+
+impl Diagnostic {
+    /// The finding with its source line, several lines of text that end in a newline. `source` is the text that was
+    /// checked; without that line the finding is told without it. Control characters of the source are replaced, so
+    /// that a document cannot steer the terminal.
+    #[must_use]
+    pub fn render(&self, source: &str) -> String {
+        let Span {
+            file,
+            line,
+            column,
+            len,
+        } = &self.at;
+        let width = line.to_string().len();
+        let mut out = format!(
+            "{}[{}]: {}\n",
+            self.severity,
+            self.code,
+            printable(&self.message)
+        );
+        let place = format!("{:width$}--> {}:{line}:{column}\n", "", printable(file));
+        out.push_str(&place);
+        if let Some(text) = line.checked_sub(1).and_then(|n| source.lines().nth(n)) {
+            let (shown, caret, carets) = window(text, column.saturating_sub(1), *len);
+            let label = self.label.as_deref().map(printable).unwrap_or_default();
+            let pointer = format!("{:caret$}{:^<carets$} {label}", "", "");
+            // A write to a String cannot fail.
+            _ = write!(out, "{:width$} |\n{line} | {shown}\n", "");
+            _ = writeln!(out, "{:width$} | {}", "", pointer.trim_end());
+        }
+        if let Some(help) = &self.help {
+            _ = writeln!(out, "{:width$} = help: {}", "", printable(help));
+        }
+        out
+    }
+}
+
+impl fmt::Display for Diagnostic {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self {
+            code,
+            severity,
+            at,
+            message,
+            ..
+        } = self;
+        let (message, file) = (printable(message), printable(&at.file));
+        write!(
+            f,
+            "{severity}[{code}]: {message} ({file}:{}:{})",
+            at.line, at.column
+        )
+    }
+}
+
+/// Widest piece of a line that is shown.
+const WIDTH: usize = 120;
+
+/// What is shown of a line, where in that the carets begin, and how many there are.
+fn window(text: &str, column: usize, len: usize) -> (String, usize, usize) {
+    let text = text.trim_end();
+    let total = text.chars().count();
+    let start = if column + len <= WIDTH {
+        0
+    } else {
+        column.saturating_sub(WIDTH / 2)
+    };
+    let piece: String = text.chars().skip(start).take(WIDTH).map(visible).collect();
+    let before = if start > 0 { "..." } else { "" };
+    let after = if start + WIDTH < total { "..." } else { "" };
+    let room = WIDTH.saturating_sub(column - start).max(1);
+    let carets = len.min(total.saturating_sub(column)).clamp(1, room);
+    (
+        format!("{before}{piece}{after}"),
+        column - start + before.len(),
+        carets,
+    )
+}
+
+fn printable(text: &str) -> String {
+    text.chars().map(visible).collect()
+}
+
+fn visible(c: char) -> char {
+    match c {
+        '\t' => '\u{2192}',
+        c if c.is_control() => '\u{fffd}',
+        // Marks that turn the direction of the text around them.
+        '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => '\u{fffd}',
+        c => c,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn finding(line: usize, column: usize, len: usize) -> Diagnostic {
+        Diagnostic {
+            code: Code::TopicTwice,
+            severity: Severity::Error,
+            at: Span {
+                file: "cell.yaml".into(),
+                line,
+                column,
+                len,
+            },
+            message: "`ua_2_5_10` is mapped twice".to_owned(),
+            label: Some("also mapped at line 6".to_owned()),
+            help: Some("give one of them another identifier".to_owned()),
+        }
+    }
+
+    #[test]
+    fn a_finding_shows_its_line_with_carets_below_the_text() {
+        let source = "\n\n\n\n\n\n\n\n\nspaces: []\n";
+        assert_eq!(
+            finding(10, 1, 6).render(source),
+            "error[M054]: `ua_2_5_10` is mapped twice\n  --> cell.yaml:10:1\n   |\n10 | spaces: []\n   | ^^^^^^ \
+             also mapped at line 6\n   = help: give one of them another identifier\n"
+        );
+        assert_eq!(
+            finding(10, 1, 6).to_string(),
+            "error[M054]: `ua_2_5_10` is mapped twice (cell.yaml:10:1)"
+        );
+    }
+
+    #[test]
+    fn a_long_line_is_cut_around_the_place() {
+        let source = format!("{}bad{}", "x".repeat(500), "y".repeat(500));
+        let text = finding(1, 501, 3).render(&source);
+        let lines: Vec<&str> = text.lines().collect();
+        let at = lines[4].find('^').unwrap();
+        assert_eq!(&lines[3][at..at + 3], "bad");
+        assert!(lines[3].len() < 140, "{text}");
+    }
+
+    #[test]
+    fn a_document_cannot_steer_the_terminal() {
+        let mut finding = finding(1, 1, 3);
+        finding.message = "\u{1b}[2J".to_owned();
+        let text = finding.render("a\u{1b}[31m\u{202e}b");
+        assert!(
+            !text.contains('\u{1b}') && !text.contains('\u{202e}'),
+            "{text:?}"
+        );
+    }
+
+    #[test]
+    fn a_place_outside_the_source_is_told_without_a_line() {
+        for (line, column, len) in [(0, 0, 0), (9, 9, 9), (1, 400, 900), (1, 0, 1)] {
+            assert!(
+                finding(line, column, len)
+                    .render("x")
+                    .starts_with("error[M054]")
+            );
+        }
+    }
+}

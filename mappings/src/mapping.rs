@@ -1,0 +1,389 @@
+//! What the document says once it is checked: every name resolved, every default filled in.
+
+use std::collections::{BTreeMap, HashMap};
+use std::net::{Ipv4Addr, SocketAddr};
+use std::num::NonZeroU16;
+use std::time::Duration;
+
+use messages::{Leaf, Selection, TypeName};
+use uadp::BuiltinType;
+
+use crate::node_id::NodeIdText;
+use crate::topic::{SpaceId, TopicId};
+
+/// The checked mapping of one cell. Immutable: a changed file makes a new one.
+///
+/// `Mapping::default()` is zero configuration: the PubSub defaults, no space declared (each ROS 2 space is then the
+/// DDS domain of its number), no variable.
+#[derive(Clone, Debug, Default)]
+pub struct Mapping {
+    pubsub: PubSub,
+    spaces: Vec<Space>,
+    namespaces: BTreeMap<u16, String>,
+    server: Server,
+    variables: Vec<Variable>,
+    by_topic: HashMap<TopicId, usize>,
+}
+
+impl Mapping {
+    pub(crate) fn new(
+        pubsub: PubSub,
+        spaces: Vec<Space>,
+        namespaces: BTreeMap<u16, String>,
+        server: Server,
+        variables: Vec<Variable>,
+    ) -> Self {
+        let by_topic = variables
+            .iter()
+            .enumerate()
+            .map(|(at, v)| (v.topic, at))
+            .collect();
+        Self {
+            pubsub,
+            spaces,
+            namespaces,
+            server,
+            variables,
+            by_topic,
+        }
+    }
+
+    /// How NetworkMessages travel.
+    #[must_use]
+    pub const fn pubsub(&self) -> &PubSub {
+        &self.pubsub
+    }
+
+    /// The declared ROS spaces, ordered by id.
+    #[must_use]
+    pub fn spaces(&self) -> &[Space] {
+        &self.spaces
+    }
+
+    /// The declared space of that id.
+    #[must_use]
+    pub fn space(&self, id: SpaceId) -> Option<&Space> {
+        self.spaces.iter().find(|space| space.id == id)
+    }
+
+    /// The DDS domain of a ROS 2 space, declared or not; `None` for the OPC UA side and ROS 1.
+    #[must_use]
+    pub fn domain_of(&self, id: SpaceId) -> Option<u16> {
+        if !id.is_ros2() {
+            return None;
+        }
+        self.space(id)
+            .map_or_else(|| Some(id.into()), |space| space.domain)
+    }
+
+    /// The ROS 2 space whose values live in that DDS domain: the declared one, else the one of the domain's number.
+    /// `None` for a domain below 2 or above 232 that no space declares, and when the space of that number is
+    /// declared for another domain.
+    #[must_use]
+    pub fn space_of_domain(&self, domain: u16) -> Option<SpaceId> {
+        if let Some(space) = self
+            .spaces
+            .iter()
+            .find(|space| space.domain == Some(domain))
+        {
+            return Some(space.id);
+        }
+        SpaceId::new(domain).filter(|id| id.is_ros2() && self.space(*id).is_none())
+    }
+
+    /// Namespace index -> namespace URI. An index is only as good as the URI a server has at it.
+    #[must_use]
+    pub const fn namespaces(&self) -> &BTreeMap<u16, String> {
+        &self.namespaces
+    }
+
+    /// The OPC UA server of the cell.
+    #[must_use]
+    pub const fn server(&self) -> &Server {
+        &self.server
+    }
+
+    /// In the order of the document.
+    #[must_use]
+    pub fn variables(&self) -> &[Variable] {
+        &self.variables
+    }
+
+    /// The variable of a topic.
+    #[must_use]
+    pub fn variable(&self, topic: TopicId) -> Option<&Variable> {
+        self.variables.get(*self.by_topic.get(&topic)?)
+    }
+
+    /// Every binding to a ROS topic of one space. A ROS topic occurs more than once only where its fields are read by
+    /// several variables; a topic that is written occurs once.
+    pub fn bindings(&self, space: SpaceId) -> impl Iterator<Item = (&Variable, &Binding)> {
+        self.variables
+            .iter()
+            .filter_map(move |v| Some((v, v.binding(space)?)))
+    }
+}
+
+/// How NetworkMessages travel between the spaces.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PubSub {
+    /// Group or host the NetworkMessages are sent to, and its UDP port.
+    pub address: SocketAddr,
+    /// Name or address of the network interface; `None` lets the operating system choose.
+    pub interface: Option<String>,
+    /// Hops a multicast datagram may travel; 1 stays on the link.
+    pub ttl: u8,
+    /// When a received PublisherId is taken for a space.
+    pub publisher_id: PublisherIdRule,
+    /// A value that does not change is sent again after this time, which heals a lost datagram.
+    pub key_frame_period: Duration,
+    /// A writer that has nothing to say says so after this time.
+    pub keep_alive_period: Duration,
+    /// A writer that is silent for this long counts as gone; longer than `keep_alive_period`.
+    pub receive_timeout: Duration,
+}
+
+impl PubSub {
+    /// 239.192.0.40:4840. The group is of the IPv4 organization-local scope (RFC 2365, 6.2), so no router
+    /// leaks it to the world; the port is the one registered for OPC UA over UDP (OPC 10000-14, 7.3.2).
+    pub const ADDRESS: SocketAddr =
+        SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::new(239, 192, 0, 40)), 4840);
+    /// Reads `opc.udp://<group or host by number>:<port>`; the port is 4840 when left out (OPC 10000-14, 7.3.2).
+    #[must_use]
+    pub fn parse_address(url: &str) -> Option<SocketAddr> {
+        let rest = url.strip_prefix("opc.udp://")?;
+        let rest = rest.strip_suffix('/').unwrap_or(rest);
+        let alone = || {
+            rest.trim_start_matches('[')
+                .trim_end_matches(']')
+                .parse()
+                .ok()
+        };
+        rest.parse()
+            .ok()
+            .or_else(|| Some(SocketAddr::new(alone()?, Self::ADDRESS.port())))
+    }
+
+    /// The group OPC 10000-14, 7.3.2.1 keeps for discovery messages: no data belongs there.
+    pub const DISCOVERY_GROUP: Ipv4Addr = Ipv4Addr::new(224, 0, 2, 14);
+}
+
+impl Default for PubSub {
+    fn default() -> Self {
+        Self {
+            address: Self::ADDRESS,
+            interface: None,
+            ttl: 1,
+            publisher_id: PublisherIdRule::Exact,
+            key_frame_period: Duration::from_secs(1),
+            keep_alive_period: Duration::from_secs(1),
+            receive_timeout: Duration::from_secs(3),
+        }
+    }
+}
+
+/// When a received PublisherId is taken for a space.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum PublisherIdRule {
+    /// Only a UInt16 of the space's number: type and value must be equal (OPC 10000-14, 7.2.4.4.2).
+    #[default]
+    Exact,
+    /// The space's number in any unsigned integer type, for publishers that cannot send UInt16.
+    AnyWidth,
+}
+
+/// A ROS side of the cell.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Space {
+    /// 1 or above.
+    pub id: SpaceId,
+    /// The DDS domain of a ROS 2 space; `None` for ROS 1.
+    pub domain: Option<u16>,
+}
+
+/// The OPC UA server of the cell.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Server {
+    /// Where clients connect.
+    pub endpoint: Endpoint,
+    /// ApplicationUri of the server.
+    pub application_uri: String,
+    /// The security policies it offers, without repetition, never empty.
+    pub security: Vec<SecurityPolicy>,
+}
+
+impl Default for Server {
+    fn default() -> Self {
+        Self {
+            endpoint: Endpoint::default(),
+            application_uri: "urn:ua-bridge:server".to_owned(),
+            security: vec![SecurityPolicy::None, SecurityPolicy::Basic256Sha256],
+        }
+    }
+}
+
+/// `opc.tcp://host:port/path`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Endpoint {
+    /// Host name or address; an IPv6 address without its brackets.
+    pub host: String,
+    /// 1..=65535.
+    pub port: u16,
+    /// Empty, or begins with `/`.
+    pub path: String,
+}
+
+impl Default for Endpoint {
+    fn default() -> Self {
+        Self {
+            host: "127.0.0.1".to_owned(),
+            port: 4840,
+            path: String::new(),
+        }
+    }
+}
+
+impl std::fmt::Display for Endpoint {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Self { host, port, path } = self;
+        if host.contains(':') {
+            write!(f, "opc.tcp://[{host}]:{port}{path}")
+        } else {
+            write!(f, "opc.tcp://{host}:{port}{path}")
+        }
+    }
+}
+
+/// A SecurityPolicy of OPC 10000-7.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SecurityPolicy {
+    /// Neither signed nor encrypted.
+    None,
+    /// `http://opcfoundation.org/UA/SecurityPolicy#Basic256Sha256`
+    Basic256Sha256,
+}
+
+impl SecurityPolicy {
+    /// The name in the URI's fragment.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::None => "None",
+            Self::Basic256Sha256 => "Basic256Sha256",
+        }
+    }
+}
+
+/// One value of the space: an OPC UA node, the topic that carries it, and the ROS topics tied to it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Variable {
+    /// Origin, namespace index, and the node's numeric identifier or alias.
+    pub topic: TopicId,
+    /// The OPC UA node.
+    pub node: NodeIdText,
+    /// BrowseName and DisplayName of the node.
+    pub name: String,
+    /// Builtin type and whether it is an array; `None` when the variable has several fields, or when neither the
+    /// document nor a known ROS type says it.
+    pub value_type: Option<(BuiltinType, bool)>,
+    /// One per DataSet field. Empty when nothing is known before a message or a type arrives.
+    pub fields: Vec<Leaf>,
+    /// At most one per space.
+    pub bindings: Vec<Binding>,
+    /// What its queue does when full.
+    pub overflow: Overflow,
+}
+
+impl Variable {
+    /// The binding to a ROS topic of that space.
+    #[must_use]
+    pub fn binding(&self, space: SpaceId) -> Option<&Binding> {
+        self.bindings.iter().find(|binding| binding.space == space)
+    }
+}
+
+/// A ROS topic tied to a variable: read when `space` is the variable's origin, written otherwise.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Binding {
+    /// Whose ROS graph the topic is in.
+    pub space: SpaceId,
+    /// With its leading `/`.
+    pub ros_topic: String,
+    /// The type of the topic.
+    pub message_type: TypeName,
+    /// One field of the message or all of it.
+    pub selection: Selection,
+}
+
+/// What a queue does when it is full.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Overflow {
+    /// One place: a newer value replaces the one that waits. For states.
+    #[default]
+    KeepLatest,
+    /// That many places: the oldest goes. For events.
+    DropOldest(NonZeroU16),
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn id(n: u16) -> SpaceId {
+        SpaceId::new(n).unwrap()
+    }
+
+    #[test]
+    fn without_a_document_a_ros_2_space_is_the_domain_of_its_number() {
+        let mapping = Mapping::default();
+        assert_eq!(mapping.domain_of(id(7)), Some(7));
+        assert_eq!(mapping.domain_of(SpaceId::ROS1), None);
+        assert_eq!(mapping.domain_of(SpaceId::UA), None);
+        assert_eq!(mapping.space_of_domain(7), Some(id(7)));
+        assert_eq!(mapping.space_of_domain(0), None);
+        assert_eq!(mapping.space_of_domain(1), None);
+        assert_eq!(mapping.space_of_domain(233), None);
+        assert!(mapping.variables().is_empty());
+    }
+
+    #[test]
+    fn a_declared_domain_takes_the_place_of_the_number() {
+        let spaces = vec![
+            Space {
+                id: SpaceId::ROS1,
+                domain: None,
+            },
+            Space {
+                id: id(40),
+                domain: Some(0),
+            },
+            Space {
+                id: id(41),
+                domain: Some(7),
+            },
+        ];
+        let mapping = Mapping {
+            spaces,
+            ..Mapping::default()
+        };
+        assert_eq!(mapping.domain_of(id(40)), Some(0));
+        assert_eq!(mapping.space_of_domain(0), Some(id(40)));
+        assert_eq!(mapping.space_of_domain(7), Some(id(41)));
+        assert_eq!(
+            mapping.space_of_domain(40),
+            None,
+            "space 40 lives in domain 0"
+        );
+    }
+
+    #[test]
+    fn the_default_group_stays_within_the_organization() {
+        let SocketAddr::V4(address) = PubSub::default().address else {
+            panic!("IPv4")
+        };
+        // RFC 2365, 6.2: 239.192.0.0/14
+        assert_eq!(address.ip().octets()[0], 239);
+        assert_eq!(address.ip().octets()[1] & 0b1111_1100, 192);
+        assert!(PubSub::default().receive_timeout > PubSub::default().keep_alive_period);
+    }
+}

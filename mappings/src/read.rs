@@ -1,0 +1,261 @@
+//! Tree -> values. Every fault is noted and reading goes on beside it.
+
+use std::borrow::Cow;
+use std::rc::Rc;
+
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+
+use crate::code::Code;
+use crate::findings::Findings;
+use crate::nearest::nearest;
+use crate::tree::{Kind, Node, Place};
+
+/// Most nodes that are read: an alias may lead to one node many times.
+const MAX_READ: usize = 2_000_000;
+
+/// A value and its place in the text.
+#[derive(Clone, Debug)]
+pub(crate) struct At<T> {
+    pub(crate) place: Place,
+    /// `None` when what stands there is faulty; it has been noted.
+    pub(crate) value: Option<T>,
+}
+
+/// A key that may be left out.
+pub(crate) type Field<T> = Option<At<T>>;
+
+/// The value of a key, if it is there and sound.
+pub(crate) fn given<T>(field: &Field<T>) -> Option<(&T, Place)> {
+    let field = field.as_ref()?;
+    Some((field.value.as_ref()?, field.place))
+}
+
+impl<T: JsonSchema> JsonSchema for At<T> {
+    fn inline_schema() -> bool {
+        T::inline_schema()
+    }
+
+    fn schema_name() -> Cow<'static, str> {
+        T::schema_name()
+    }
+
+    fn schema_id() -> Cow<'static, str> {
+        T::schema_id()
+    }
+
+    fn json_schema(generator: &mut SchemaGenerator) -> Schema {
+        T::json_schema(generator)
+    }
+}
+
+/// What can be made of a node.
+pub(crate) trait Read: Sized {
+    /// `None` after noting why.
+    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self>;
+}
+
+pub(crate) struct Reader<'f> {
+    pub(crate) findings: &'f mut Findings,
+    read: usize,
+}
+
+impl<'f> Reader<'f> {
+    pub(crate) const fn new(findings: &'f mut Findings) -> Self {
+        Self { findings, read: 0 }
+    }
+
+    pub(crate) fn at<T: Read>(&mut self, node: &Node) -> At<T> {
+        self.read += 1;
+        let value = if self.read <= MAX_READ {
+            T::read(node, self)
+        } else {
+            if self.read == MAX_READ + 1 {
+                let message = format!("aliases lead to more than {MAX_READ} values");
+                self.findings.error(Code::TooLarge, node.place, message);
+            }
+            None
+        };
+        At {
+            place: node.place,
+            value,
+        }
+    }
+
+    /// Notes that `wanted` (with its article) should stand there.
+    pub(crate) fn wrong(&mut self, node: &Node, wanted: &str) {
+        let message = format!("expected {wanted}, found {}", node.kind.name());
+        self.findings.error(Code::WrongValue, node.place, message);
+    }
+
+    pub(crate) fn text<'n>(&mut self, node: &'n Node, wanted: &str) -> Option<&'n str> {
+        if let Kind::Scalar(text) = &node.kind {
+            return Some(text);
+        }
+        self.wrong(node, wanted);
+        None
+    }
+
+    /// The pairs of a map whose keys are texts, each key once.
+    pub(crate) fn pairs<'n>(&mut self, node: &'n Node, wanted: &str) -> Option<Vec<Pair<'n>>> {
+        let Kind::Map(pairs) = &node.kind else {
+            self.wrong(node, wanted);
+            return None;
+        };
+        let mut first = std::collections::HashMap::new();
+        let mut found = Vec::with_capacity(pairs.len());
+        for (key, value) in pairs {
+            let Kind::Scalar(text) = &key.kind else {
+                let message = format!("expected a key, found {}", key.kind.name());
+                self.findings.error(Code::WrongValue, key.place, message);
+                continue;
+            };
+            if let Some(line) = first.insert(text.as_str(), key.place.line) {
+                let message = format!("the key `{}` is repeated", short(text));
+                self.findings
+                    .error(Code::DuplicateKey, key.place, message)
+                    .label(format!("first at line {line}"));
+                first.insert(text, line);
+                continue;
+            }
+            found.push(Pair {
+                key: text,
+                place: key.place,
+                value,
+            });
+        }
+        Some(found)
+    }
+
+    /// The values of a map in the order of `keys`. Keys that are none of them are noted.
+    pub(crate) fn keys<'n, const N: usize>(
+        &mut self,
+        node: &'n Node,
+        keys: [&'static str; N],
+    ) -> Option<[Option<&'n Node>; N]> {
+        let mut values = [None; N];
+        for Pair { key, place, value } in
+            self.pairs(node, &format!("a map with {}", list(&keys)))?
+        {
+            if let Some((_, slot)) = keys
+                .iter()
+                .zip(&mut values)
+                .find(|(known, _)| **known == key)
+            {
+                *slot = Some(&**value);
+                continue;
+            }
+            let message = format!("unknown key `{}`", short(key));
+            let note = self.findings.error(Code::UnknownKey, place, message);
+            note.help_with(|| match nearest(key, keys) {
+                Some(near) => format!("did you mean `{near}`? Known here are {}", list(&keys)),
+                None => format!("known here are {}", list(&keys)),
+            });
+        }
+        Some(values)
+    }
+
+    /// A key without a value counts as left out.
+    pub(crate) fn field<T: Read>(&mut self, node: Option<&Node>) -> Field<T> {
+        let node = node.filter(|node| !matches!(node.kind, Kind::Null))?;
+        Some(self.at(node))
+    }
+}
+
+pub(crate) struct Pair<'n> {
+    pub(crate) key: &'n str,
+    pub(crate) place: Place,
+    pub(crate) value: &'n Rc<Node>,
+}
+
+/// `a`, `b`, `c`
+pub(crate) fn list(names: &[impl AsRef<str>]) -> String {
+    let names: Vec<String> = names
+        .iter()
+        .map(|name| format!("`{}`", name.as_ref()))
+        .collect();
+    names.join(", ")
+}
+
+impl Read for String {
+    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+        reader.text(node, "a text").map(str::to_owned)
+    }
+}
+
+impl Read for u16 {
+    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+        let text = reader.text(node, "a number")?;
+        let number = text
+            .parse()
+            .ok()
+            .filter(|_| text.bytes().all(|b| b.is_ascii_digit()));
+        if number.is_none() {
+            let message = format!("expected a number from 0 to 65535, found `{}`", short(text));
+            reader.findings.error(Code::WrongValue, node.place, message);
+        }
+        number
+    }
+}
+
+impl<T: Read> Read for Vec<At<T>> {
+    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+        let Kind::List(items) = &node.kind else {
+            reader.wrong(node, "a list (each entry begins with `- `)");
+            return None;
+        };
+        Some(items.iter().map(|item| reader.at(item)).collect())
+    }
+}
+
+/// At most 64 characters of a text out of a document.
+pub(crate) fn short(text: &str) -> String {
+    let mut short: String = text.chars().take(64).collect();
+    if short.len() < text.len() {
+        short.push_str("...");
+    }
+    short
+}
+
+/// A map of known keys, each of which may be left out; the names of the fields are the keys.
+macro_rules! document {
+    ($($(#[$meta:meta])* struct $name:ident { $($(#[$field_meta:meta])* $field:ident: $type:ty,)* })*) => {$(
+        #[derive(Clone, Debug, schemars::JsonSchema)]
+        $(#[$meta])*
+        #[schemars(deny_unknown_fields)]
+        pub(crate) struct $name { $($(#[$field_meta])* pub(crate) $field: $crate::read::Field<$type>,)* }
+
+        impl $crate::read::Read for $name {
+            fn read(node: &$crate::tree::Node, reader: &mut $crate::read::Reader<'_>) -> Option<Self> {
+                let keys = [$(stringify!($field).trim_start_matches("r#")),*];
+                let [$($field),*] = reader.keys(node, keys)?;
+                Some(Self { $($field: reader.field($field),)* })
+            }
+        }
+    )*};
+}
+
+/// One of a few words.
+macro_rules! choice {
+    ($($(#[$meta:meta])* enum $name:ident { $($(#[$variant_meta:meta])* $variant:ident = $word:literal,)* })*) => {$(
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, schemars::JsonSchema)]
+        $(#[$meta])*
+        pub(crate) enum $name { $($(#[$variant_meta])* #[schemars(rename = $word)] $variant,)* }
+
+        impl $crate::read::Read for $name {
+            fn read(node: &$crate::tree::Node, reader: &mut $crate::read::Reader<'_>) -> Option<Self> {
+                let words = [$($word),*];
+                let wanted = format!("one of {}", $crate::read::list(&words));
+                let text = reader.text(node, &wanted)?;
+                $(if text == $word { return Some(Self::$variant); })*
+                let message = format!("expected {wanted}, found `{}`", $crate::read::short(text));
+                let note = reader.findings.error($crate::Code::WrongValue, node.place, message);
+                if let Some(near) = $crate::nearest::nearest(text, words) {
+                    note.help(format!("did you mean `{near}`?"));
+                }
+                None
+            }
+        }
+    )*};
+}
+
+pub(crate) use {choice, document};

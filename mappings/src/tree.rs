@@ -1,0 +1,441 @@
+//! YAML text -> a tree of nodes that know their place. Says nothing about what the nodes mean.
+//!
+//! Anchors and aliases are read: an alias shares the node it names, it is never copied, so a document of nested aliases
+//! takes no more room than its text. Merge keys (`<<`) are ordinary keys, and tags are refused.
+
+use std::collections::HashMap;
+use std::rc::Rc;
+
+use granit_parser::{Event, Parser, ScalarStyle, ScanError, Span as Marks};
+
+use crate::code::Code;
+
+/// Largest text, in bytes.
+const MAX_BYTES: usize = 4 * 1024 * 1024;
+/// Most nodes a text may hold.
+const MAX_NODES: usize = 500_000;
+/// Deepest nesting, aliases followed.
+const MAX_DEPTH: usize = 24;
+
+/// Where in the text, counted from 1 in lines and characters, within one line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(crate) struct Place {
+    pub(crate) line: usize,
+    pub(crate) column: usize,
+    pub(crate) len: usize,
+}
+
+impl Place {
+    /// The beginning of the text.
+    pub(crate) const START: Self = Self {
+        line: 1,
+        column: 1,
+        len: 1,
+    };
+}
+
+#[derive(Debug)]
+pub(crate) struct Node {
+    pub(crate) place: Place,
+    pub(crate) kind: Kind,
+    depth: usize,
+}
+
+#[derive(Debug)]
+pub(crate) enum Kind {
+    /// Nothing, `~` or `null`.
+    Null,
+    Scalar(String),
+    List(Vec<Rc<Node>>),
+    /// In the order of the text, repeated keys included.
+    Map(Vec<(Rc<Node>, Rc<Node>)>),
+}
+
+impl Kind {
+    /// With its article.
+    pub(crate) const fn name(&self) -> &'static str {
+        match self {
+            Self::Null => "nothing",
+            Self::Scalar(_) => "a single value",
+            Self::List(_) => "a list",
+            Self::Map(_) => "a map",
+        }
+    }
+}
+
+/// Why there is no tree.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Fault {
+    pub(crate) code: Code,
+    pub(crate) place: Place,
+    pub(crate) message: String,
+    pub(crate) help: Option<&'static str>,
+}
+
+/// The root node; null when the text holds comments only.
+pub(crate) fn parse(text: &str) -> Result<Rc<Node>, Fault> {
+    if text.len() > MAX_BYTES {
+        let message = format!(
+            "the document has {} bytes; at most {MAX_BYTES} are read",
+            text.len()
+        );
+        return Err(Fault {
+            code: Code::TooLarge,
+            place: Place::START,
+            message,
+            help: None,
+        });
+    }
+    let options = granit_parser::options! {
+        emit_comments: false,
+        emit_unresolved_aliases: true,
+        flow_nesting_limit: MAX_DEPTH,
+        block_nesting_limit: MAX_DEPTH
+    };
+    let mut builder = Builder::default();
+    for event in Parser::new_from_str_with_options(text, options) {
+        let (event, marks) = event.map_err(|error| syntax(text, &error))?;
+        if let Some(tag) = event.tag() {
+            let place = place(text, marks.tag_span().unwrap_or(marks));
+            let message = format!("the tag `{}` is not read here", tag.original());
+            return Err(fault(
+                place,
+                message,
+                Some("leave the tag out; the key says what its value is"),
+            ));
+        }
+        builder.event(event, place(text, marks))?;
+    }
+    Ok(builder.root.unwrap_or_else(|| {
+        Rc::new(Node {
+            place: Place::START,
+            kind: Kind::Null,
+            depth: 0,
+        })
+    }))
+}
+
+#[derive(Default)]
+struct Builder {
+    open: Vec<Open>,
+    anchors: HashMap<usize, Rc<Node>>,
+    root: Option<Rc<Node>>,
+    documents: usize,
+    nodes: usize,
+}
+
+/// A list or map whose end has not come.
+struct Open {
+    anchor: usize,
+    place: Place,
+    map: bool,
+    children: Vec<Rc<Node>>,
+}
+
+impl Builder {
+    fn event(&mut self, event: Event<'_>, place: Place) -> Result<(), Fault> {
+        match event {
+            Event::DocumentStart(..) => {
+                self.documents += 1;
+                if self.documents > 1 {
+                    let help = Some("one file is one document: remove the `---`");
+                    return Err(fault(
+                        place,
+                        "a second document begins here".to_owned(),
+                        help,
+                    ));
+                }
+                Ok(())
+            }
+            Event::Scalar(text, style, anchor, _) => {
+                let null = style == ScalarStyle::Plain
+                    && matches!(&*text, "" | "~" | "null" | "Null" | "NULL");
+                let kind = if null {
+                    Kind::Null
+                } else {
+                    Kind::Scalar(text.into_owned())
+                };
+                self.close(anchor, place, kind, 0)
+            }
+            Event::SequenceStart(_, anchor, _) => {
+                self.open.push(Open {
+                    anchor,
+                    place,
+                    map: false,
+                    children: Vec::new(),
+                });
+                Ok(())
+            }
+            Event::MappingStart(_, anchor, _) => {
+                self.open.push(Open {
+                    anchor,
+                    place,
+                    map: true,
+                    children: Vec::new(),
+                });
+                Ok(())
+            }
+            Event::SequenceEnd | Event::MappingEnd => match self.open.pop() {
+                Some(open) => self.end(open),
+                None => Ok(()),
+            },
+            Event::Alias(id) => match self.anchors.get(&id) {
+                Some(node) => self.place(Rc::clone(node), place),
+                None => Err(fault(
+                    place,
+                    "the alias lies within the node it names".to_owned(),
+                    None,
+                )),
+            },
+            Event::UnresolvedAlias(name) => {
+                let message = format!("no `&{name}` before this alias");
+                Err(fault(
+                    place,
+                    message,
+                    Some("a text that begins with * stands in quotes: \"*\""),
+                ))
+            }
+            Event::StreamStart | Event::StreamEnd | Event::DocumentEnd | Event::Anchor(..) => {
+                Ok(())
+            }
+            // The enumeration is open: a node this does not know would be missing from the tree.
+            other => Err(fault(place, format!("{other:?} is not read here"), None)),
+        }
+    }
+
+    fn end(&mut self, open: Open) -> Result<(), Fault> {
+        let depth = open
+            .children
+            .iter()
+            .map(|child| child.depth + 1)
+            .max()
+            .unwrap_or(1);
+        let kind = if open.map {
+            let mut pairs = Vec::with_capacity(open.children.len() / 2);
+            let mut children = open.children.into_iter();
+            while let (Some(key), Some(value)) = (children.next(), children.next()) {
+                pairs.push((key, value));
+            }
+            Kind::Map(pairs)
+        } else {
+            Kind::List(open.children)
+        };
+        self.close(open.anchor, open.place, kind, depth)
+    }
+
+    fn close(
+        &mut self,
+        anchor: usize,
+        place: Place,
+        kind: Kind,
+        depth: usize,
+    ) -> Result<(), Fault> {
+        let node = Rc::new(Node { place, kind, depth });
+        if anchor != 0 {
+            self.anchors.insert(anchor, Rc::clone(&node));
+        }
+        self.place(node, place)
+    }
+
+    /// Puts a finished node where it belongs.
+    fn place(&mut self, node: Rc<Node>, place: Place) -> Result<(), Fault> {
+        self.nodes += 1;
+        let message = if self.nodes > MAX_NODES {
+            format!("more than {MAX_NODES} values")
+        } else if self.open.len() + node.depth > MAX_DEPTH {
+            format!("values nest deeper than {MAX_DEPTH} levels")
+        } else {
+            match self.open.last_mut() {
+                Some(open) => open.children.push(node),
+                None => self.root = Some(node),
+            }
+            return Ok(());
+        };
+        Err(Fault {
+            code: Code::TooLarge,
+            place,
+            message,
+            help: None,
+        })
+    }
+}
+
+fn fault(place: Place, message: String, help: Option<&'static str>) -> Fault {
+    Fault {
+        code: Code::Syntax,
+        place,
+        message,
+        help,
+    }
+}
+
+fn syntax(text: &str, error: &ScanError) -> Fault {
+    let place = place(text, Marks::empty(*error.marker()));
+    let line = text.lines().nth(place.line - 1).unwrap_or_default();
+    let help = if line.trim_start_matches(' ').starts_with('\t') {
+        Some("YAML is indented with spaces, never with tabs")
+    } else {
+        Some("nothing after this place has been checked")
+    };
+    fault(place, error.info(), help)
+}
+
+/// The first line of what is marked.
+fn place(text: &str, marks: Marks) -> Place {
+    let (start, end) = (marks.start, marks.end);
+    let len = if end.line() == start.line() {
+        end.col().saturating_sub(start.col())
+    } else {
+        let rest = start
+            .byte_offset()
+            .and_then(|at| text.get(at..))
+            .unwrap_or_default();
+        rest.lines()
+            .next()
+            .unwrap_or_default()
+            .trim_end()
+            .chars()
+            .count()
+    };
+    Place {
+        line: start.line().max(1),
+        column: start.col() + 1,
+        len: len.max(1),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn map(node: &Node) -> Vec<(&str, &Node)> {
+        let Kind::Map(pairs) = &node.kind else {
+            panic!("{node:?}")
+        };
+        pairs
+            .iter()
+            .map(|(key, value)| match &key.kind {
+                Kind::Scalar(text) => (text.as_str(), &**value),
+                Kind::Null | Kind::List(_) | Kind::Map(_) => panic!("{key:?}"),
+            })
+            .collect()
+    }
+
+    fn at(line: usize, column: usize, len: usize) -> Place {
+        Place { line, column, len }
+    }
+
+    #[test]
+    fn every_node_knows_its_place_in_characters() {
+        let root =
+            parse("# c\nspaces:\n  - {id: 1, ros: \"ä1\"}\nname: 'x'\nnote: |\n  long\n  er\n")
+                .unwrap();
+        let root = map(&root);
+        assert_eq!(root[1].1.place, at(4, 7, 3));
+        let Kind::List(items) = &root[0].1.kind else {
+            panic!()
+        };
+        assert_eq!((items[0].place.line, items[0].place.column), (3, 5));
+        let item = map(&items[0]);
+        assert_eq!(item[0].1.place, at(3, 10, 1));
+        assert_eq!(item[1].1.place, at(3, 18, 4));
+        assert!(matches!(&root[2].1.kind, Kind::Scalar(text) if text == "long\ner\n"));
+    }
+
+    #[test]
+    fn repeated_keys_are_kept() {
+        let root = parse("a: 1\na: 2\n").unwrap();
+        assert_eq!(map(&root).len(), 2);
+    }
+
+    #[test]
+    fn nothing_is_null_and_quotes_make_a_text() {
+        let root = parse("a:\nb: ~\nc: ''\nd: 'null'\n").unwrap();
+        let kinds: Vec<&str> = map(&root)
+            .iter()
+            .map(|(_, node)| node.kind.name())
+            .collect();
+        assert_eq!(
+            kinds,
+            ["nothing", "nothing", "a single value", "a single value"]
+        );
+        for text in ["", "# only a comment\n", "---\n", "\u{feff}# with a mark\n"] {
+            assert!(matches!(parse(text).unwrap().kind, Kind::Null), "{text:?}");
+        }
+    }
+
+    #[test]
+    fn an_alias_shares_the_node_it_names() {
+        let root = parse("a: &x {b: 1}\nc: *x\n").unwrap();
+        let root = map(&root);
+        assert!(std::ptr::eq(root[0].1, root[1].1));
+    }
+
+    #[test]
+    fn a_tower_of_aliases_is_refused_at_its_height_not_at_its_size() {
+        let mut text = "a0: &a0 [x]\n".to_owned();
+        for n in 1..40 {
+            let below = n - 1;
+            text += &format!("a{n}: &a{n} [*a{below}, *a{below}, *a{below}, *a{below}]\n");
+        }
+        let fault = parse(&text).unwrap_err();
+        assert_eq!((fault.code, fault.place.line), (Code::TooLarge, MAX_DEPTH));
+    }
+
+    #[test]
+    fn what_is_not_read_is_named_with_its_place() {
+        for (text, line, word) in [
+            ("a: [1, 2\nb: 3\n", 2, ""),
+            ("a: 1\n---\nb: 2\n", 2, "second document"),
+            ("a: !!str 1\n", 1, "tag `!!str`"),
+            ("a: !degrees 1\n", 1, "tag `!degrees`"),
+            ("a: *b\n", 1, "no `&b`"),
+            ("a: &a [*a]\n", 1, "within the node it names"),
+        ] {
+            let fault = parse(text).unwrap_err();
+            assert_eq!(
+                (fault.code, fault.place.line),
+                (Code::Syntax, line),
+                "{text}: {fault:?}"
+            );
+            assert!(fault.message.contains(word), "{fault:?}");
+        }
+        let tab = parse("a:\n\tb: 1\n").unwrap_err();
+        assert!(tab.help.unwrap().contains("tabs"), "{tab:?}");
+    }
+
+    #[test]
+    fn what_is_too_large_is_refused() {
+        let code = |text: &str| parse(text).unwrap_err().code;
+        assert_eq!(code(&"#".repeat(MAX_BYTES + 1)), Code::TooLarge);
+        assert_eq!(
+            code(&format!("[{}]", "1,".repeat(MAX_NODES))),
+            Code::TooLarge
+        );
+        for deep in [
+            "[".repeat(100_000),
+            "- ".repeat(100_000),
+            "{a: ".repeat(100_000),
+        ] {
+            assert!(parse(&deep).is_err());
+        }
+        assert!(
+            parse(&format!(
+                "{}{}",
+                "[".repeat(MAX_DEPTH),
+                "]".repeat(MAX_DEPTH)
+            ))
+            .is_ok()
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn any_text_is_a_tree_or_a_fault(text in "[-a-c:{}\\[\\],&*!|>'\"# \n\t~?%@]{0,60}|\\PC{0,60}") {
+            if let Err(fault) = parse(&text) {
+                prop_assert!(fault.place.line >= 1 && fault.place.column >= 1 && fault.place.len >= 1);
+            }
+        }
+    }
+}

@@ -1,0 +1,77 @@
+//! The common interfaces, one file per package.
+//!
+//! A line `message Name` begins a definition of both dialects, `message Name 1` and `message Name 2` one of ROS 1 and of
+//! ROS 2, where they differ. Field names, types and constants only.
+
+use crate::{Dialect, TypeName};
+
+const PACKAGES: [(&str, &str); 17] = [
+    ("action_msgs", include_str!("../bundle/action_msgs.txt")),
+    (
+        "actionlib_msgs",
+        include_str!("../bundle/actionlib_msgs.txt"),
+    ),
+    (
+        "builtin_interfaces",
+        include_str!("../bundle/builtin_interfaces.txt"),
+    ),
+    (
+        "diagnostic_msgs",
+        include_str!("../bundle/diagnostic_msgs.txt"),
+    ),
+    ("geometry_msgs", include_str!("../bundle/geometry_msgs.txt")),
+    (
+        "lifecycle_msgs",
+        include_str!("../bundle/lifecycle_msgs.txt"),
+    ),
+    ("nav_msgs", include_str!("../bundle/nav_msgs.txt")),
+    (
+        "rcl_interfaces",
+        include_str!("../bundle/rcl_interfaces.txt"),
+    ),
+    ("rosgraph_msgs", include_str!("../bundle/rosgraph_msgs.txt")),
+    ("sensor_msgs", include_str!("../bundle/sensor_msgs.txt")),
+    ("shape_msgs", include_str!("../bundle/shape_msgs.txt")),
+    ("std_msgs", include_str!("../bundle/std_msgs.txt")),
+    ("stereo_msgs", include_str!("../bundle/stereo_msgs.txt")),
+    ("tf2_msgs", include_str!("../bundle/tf2_msgs.txt")),
+    (
+        "trajectory_msgs",
+        include_str!("../bundle/trajectory_msgs.txt"),
+    ),
+    (
+        "unique_identifier_msgs",
+        include_str!("../bundle/unique_identifier_msgs.txt"),
+    ),
+    (
+        "visualization_msgs",
+        include_str!("../bundle/visualization_msgs.txt"),
+    ),
+];
+
+/// Name and text of each definition of the dialect.
+pub(crate) fn texts(dialect: Dialect) -> Vec<(TypeName, String)> {
+    let other = match dialect {
+        Dialect::Ros1 => "2",
+        Dialect::Ros2 => "1",
+    };
+    let mut found: Vec<(TypeName, String)> = Vec::new();
+    for (package, text) in PACKAGES {
+        let mut skip = true;
+        for line in text.lines() {
+            if let Some(heading) = line.strip_prefix("message ") {
+                let (name, only) = heading.split_once(' ').unwrap_or((heading, ""));
+                skip = only == other;
+                if !skip && let Ok(name) = TypeName::new(package, name) {
+                    found.push((name, String::new()));
+                }
+            } else if !skip && let Some((_, text)) = found.last_mut() {
+                if !text.is_empty() {
+                    text.push('\n');
+                }
+                text.push_str(line);
+            }
+        }
+    }
+    found
+}

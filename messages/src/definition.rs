@@ -1,0 +1,466 @@
+//! The parser of `.msg` texts: genmsg's rules for ROS 1, rosidl's for ROS 2.
+
+use crate::name::is_identifier;
+use crate::resolve::MOST_FIELDS;
+use crate::{DefinitionError, Dialect, TypeName};
+
+/// A type that is no message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Primitive {
+    Number(Number),
+    Clock(Clock),
+    Text(Text),
+}
+
+/// A type whose bytes, little endian, are those of its OPC UA value.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Number {
+    Bool,
+    Int8,
+    UInt8,
+    Int16,
+    UInt16,
+    Int32,
+    UInt32,
+    Int64,
+    UInt64,
+    Float32,
+    Float64,
+}
+
+/// Two words of 32 bits: seconds and nanoseconds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Clock {
+    /// ROS 1 `time`: unsigned seconds.
+    Time1,
+    /// `builtin_interfaces/Time`: signed seconds.
+    Time2,
+    /// ROS 1 `duration`: signed nanoseconds.
+    Duration1,
+    /// `builtin_interfaces/Duration`: unsigned nanoseconds.
+    Duration2,
+}
+
+/// `string`, or `wstring` if `wide`; the bound is in bytes or UTF-16 units.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Text {
+    pub(crate) wide: bool,
+    pub(crate) bound: u32,
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) enum FieldType {
+    Primitive(Primitive),
+    Message(TypeName),
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Arity {
+    One,
+    Fixed(u32),
+    Sequence { bound: Option<u32> },
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Field {
+    pub(crate) name: String,
+    /// The type as written, which is what the md5 is made of.
+    pub(crate) written: String,
+    pub(crate) kind: FieldType,
+    pub(crate) arity: Arity,
+}
+
+/// A constant as the md5 has it: `uint8 RED=1`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Constant {
+    pub(crate) line: String,
+}
+
+#[derive(Clone, Debug)]
+pub(crate) struct Definition {
+    pub(crate) name: TypeName,
+    pub(crate) text: String,
+    pub(crate) constants: Vec<Constant>,
+    pub(crate) fields: Vec<Field>,
+}
+
+impl Definition {
+    pub(crate) fn parse(
+        dialect: Dialect,
+        name: &TypeName,
+        text: &str,
+    ) -> Result<Self, DefinitionError> {
+        let mut parsed = Self {
+            name: name.clone(),
+            text: text.to_owned(),
+            constants: Vec::new(),
+            fields: Vec::new(),
+        };
+        for (number, line) in text.lines().enumerate() {
+            parsed
+                .line(dialect, line)
+                .map_err(|reason| DefinitionError::Syntax {
+                    name: name.clone(),
+                    line: number + 1,
+                    reason,
+                    text: line.trim().chars().take(200).collect(),
+                })?;
+        }
+        Ok(parsed)
+    }
+
+    fn line(&mut self, dialect: Dialect, line: &str) -> Result<(), &'static str> {
+        let clean = without_comment(dialect, line);
+        if clean.is_empty() {
+            return Ok(());
+        }
+        let (written, rest) = clean
+            .split_once(char::is_whitespace)
+            .ok_or("a type and a name expected")?;
+        let rest = rest.trim_start();
+        match rest.split_once('=') {
+            Some((name, value)) if is_identifier(name.trim_end()) => {
+                self.constant(dialect, line, (written, name.trim_end(), value.trim()))
+            }
+            _ => self.field(dialect, written, rest),
+        }
+    }
+
+    fn constant(
+        &mut self,
+        dialect: Dialect,
+        line: &str,
+        (written, name, value): (&str, &str, &str),
+    ) -> Result<(), &'static str> {
+        let (kind, arity) = parse_type(dialect, &self.name, written)?;
+        let FieldType::Primitive(primitive) = kind else {
+            return Err("a constant is of a primitive type");
+        };
+        if arity != Arity::One {
+            return Err("a constant is no array");
+        }
+        // genmsg takes all of the line after the first `=`, a `#` included, as the text of a string.
+        let value = match (dialect, primitive) {
+            (Dialect::Ros1, Primitive::Text(_)) => line
+                .split_once('=')
+                .map_or(value, |(_, value)| value.trim()),
+            _ => value,
+        };
+        if value.is_empty() && !matches!(primitive, Primitive::Text(_)) {
+            return Err("a value expected");
+        }
+        self.constants.push(Constant {
+            line: format!("{written} {name}={value}"),
+        });
+        Ok(())
+    }
+
+    fn field(&mut self, dialect: Dialect, written: &str, rest: &str) -> Result<(), &'static str> {
+        let (name, default) = rest.split_once(char::is_whitespace).unwrap_or((rest, ""));
+        if !is_identifier(name) {
+            return Err("a field name expected: letters, digits and `_`, a letter first");
+        }
+        if !default.is_empty() && dialect == Dialect::Ros1 {
+            return Err("ROS 1 fields have no default value");
+        }
+        if self.fields.len() >= MOST_FIELDS {
+            return Err("more than 4096 fields");
+        }
+        if self.fields.iter().any(|field| field.name == name) {
+            return Err("the field is defined twice");
+        }
+        let (kind, arity) = parse_type(dialect, &self.name, written)?;
+        self.fields.push(Field {
+            name: name.to_owned(),
+            written: written.to_owned(),
+            kind,
+            arity,
+        });
+        Ok(())
+    }
+}
+
+/// The line without its comment and outer blanks. In ROS 2 a `#` within quotes of a default value is none.
+fn without_comment(dialect: Dialect, line: &str) -> &str {
+    let mut quote = None;
+    for (at, c) in line.char_indices() {
+        match (quote, c) {
+            (None, '#') => return line.get(..at).unwrap_or_default().trim(),
+            (None, '"' | '\'') if dialect == Dialect::Ros2 => quote = Some(c),
+            (Some(open), c) if open == c => quote = None,
+            _ => {}
+        }
+    }
+    // An apostrophe of a comment opens no quote: the comment was met first. An unclosed quote is text.
+    line.trim()
+}
+
+fn parse_type(
+    dialect: Dialect,
+    of: &TypeName,
+    written: &str,
+) -> Result<(FieldType, Arity), &'static str> {
+    let (base, arity) = match written.strip_suffix(']') {
+        None => (written, Arity::One),
+        Some(inner) => {
+            let (base, length) = inner.rsplit_once('[').ok_or("`[` expected")?;
+            (base, parse_arity(dialect, length)?)
+        }
+    };
+    let (base, bound) = match base.split_once("<=") {
+        None => (base, None),
+        Some((base, bound)) if dialect == Dialect::Ros2 => (base, Some(parse_length(bound)?)),
+        Some(_) => return Err("bounded types are ROS 2's"),
+    };
+    let kind = match primitive(dialect, base, bound) {
+        Some(primitive) => FieldType::Primitive(primitive),
+        None => FieldType::Message(message_name(dialect, of, base)?),
+    };
+    if bound.is_some() && !matches!(kind, FieldType::Primitive(Primitive::Text(_))) {
+        return Err("only strings have a bound of their own");
+    }
+    Ok((kind, arity))
+}
+
+fn parse_arity(dialect: Dialect, length: &str) -> Result<Arity, &'static str> {
+    if length.is_empty() {
+        return Ok(Arity::Sequence { bound: None });
+    }
+    match length.strip_prefix("<=") {
+        Some(bound) if dialect == Dialect::Ros2 => Ok(Arity::Sequence {
+            bound: Some(parse_length(bound)?),
+        }),
+        Some(_) => Err("bounded arrays are ROS 2's"),
+        None => Ok(Arity::Fixed(parse_length(length)?)),
+    }
+}
+
+fn parse_length(text: &str) -> Result<u32, &'static str> {
+    let digits = !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit());
+    text.parse()
+        .ok()
+        .filter(|_| digits)
+        .ok_or("a length of at most 4294967295 expected")
+}
+
+fn primitive(dialect: Dialect, base: &str, bound: Option<u32>) -> Option<Primitive> {
+    let ros1 = dialect == Dialect::Ros1;
+    Some(match base {
+        "bool" => Primitive::Number(Number::Bool),
+        "int8" => Primitive::Number(Number::Int8),
+        "byte" if ros1 => Primitive::Number(Number::Int8),
+        "uint8" | "char" | "byte" => Primitive::Number(Number::UInt8),
+        "int16" => Primitive::Number(Number::Int16),
+        "uint16" => Primitive::Number(Number::UInt16),
+        "int32" => Primitive::Number(Number::Int32),
+        "uint32" => Primitive::Number(Number::UInt32),
+        "int64" => Primitive::Number(Number::Int64),
+        "uint64" => Primitive::Number(Number::UInt64),
+        "float32" => Primitive::Number(Number::Float32),
+        "float64" => Primitive::Number(Number::Float64),
+        "string" => Primitive::Text(Text {
+            wide: false,
+            bound: bound.unwrap_or(u32::MAX),
+        }),
+        "wstring" if !ros1 => Primitive::Text(Text {
+            wide: true,
+            bound: bound.unwrap_or(u32::MAX),
+        }),
+        "time" if ros1 => Primitive::Clock(Clock::Time1),
+        "duration" if ros1 => Primitive::Clock(Clock::Duration1),
+        _ => return None,
+    })
+}
+
+fn message_name(dialect: Dialect, of: &TypeName, base: &str) -> Result<TypeName, &'static str> {
+    let bad = |_| "a type expected: a primitive, `Name` or `package/Name`";
+    if base.contains('/') {
+        return base.parse().map_err(bad);
+    }
+    let package = if dialect == Dialect::Ros1 && base == "Header" {
+        "std_msgs"
+    } else {
+        of.package()
+    };
+    TypeName::new(package, base).map_err(bad)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(dialect: Dialect, text: &str) -> Result<Definition, DefinitionError> {
+        Definition::parse(dialect, &"pkg/T".parse().unwrap(), text)
+    }
+
+    fn fields(dialect: Dialect, text: &str) -> Vec<(String, FieldType, Arity)> {
+        parse(dialect, text)
+            .unwrap()
+            .fields
+            .into_iter()
+            .map(|field| (field.name, field.kind, field.arity))
+            .collect()
+    }
+
+    fn message(name: &str) -> FieldType {
+        FieldType::Message(name.parse().unwrap())
+    }
+
+    #[test]
+    fn ros_1_texts_follow_genmsg() {
+        let text = "# only a comment\n\nHeader header # trailing\r\nbyte[3] b\nchar c\ntime t\nPeer[] peers\nother/msg/Thing thing\n";
+        assert_eq!(
+            fields(Dialect::Ros1, text),
+            [
+                ("header".to_owned(), message("std_msgs/Header"), Arity::One),
+                (
+                    "b".to_owned(),
+                    FieldType::Primitive(Primitive::Number(Number::Int8)),
+                    Arity::Fixed(3)
+                ),
+                (
+                    "c".to_owned(),
+                    FieldType::Primitive(Primitive::Number(Number::UInt8)),
+                    Arity::One
+                ),
+                (
+                    "t".to_owned(),
+                    FieldType::Primitive(Primitive::Clock(Clock::Time1)),
+                    Arity::One
+                ),
+                (
+                    "peers".to_owned(),
+                    message("pkg/Peer"),
+                    Arity::Sequence { bound: None }
+                ),
+                ("thing".to_owned(), message("other/Thing"), Arity::One),
+            ]
+        );
+    }
+
+    #[test]
+    fn ros_2_texts_follow_rosidl() {
+        let text = "string<=10 name 'a # b' # c\nint32[<=5] few [1, 2]\nwstring<=3[<=2] wide\nHeader header\nbyte b 7\nint32 X = -1\nstring S=\"x=y\"\n";
+        assert_eq!(
+            fields(Dialect::Ros2, text),
+            [
+                (
+                    "name".to_owned(),
+                    FieldType::Primitive(Primitive::Text(Text {
+                        wide: false,
+                        bound: 10
+                    })),
+                    Arity::One
+                ),
+                (
+                    "few".to_owned(),
+                    FieldType::Primitive(Primitive::Number(Number::Int32)),
+                    Arity::Sequence { bound: Some(5) }
+                ),
+                (
+                    "wide".to_owned(),
+                    FieldType::Primitive(Primitive::Text(Text {
+                        wide: true,
+                        bound: 3
+                    })),
+                    Arity::Sequence { bound: Some(2) }
+                ),
+                ("header".to_owned(), message("pkg/Header"), Arity::One),
+                (
+                    "b".to_owned(),
+                    FieldType::Primitive(Primitive::Number(Number::UInt8)),
+                    Arity::One
+                ),
+            ]
+        );
+    }
+
+    #[test]
+    fn a_ros_1_string_constant_keeps_its_hash() {
+        let parsed = parse(
+            Dialect::Ros1,
+            "string S = it's # all = text \nuint8 A=1 # one\nfloat32 F=-1.5e3",
+        )
+        .unwrap();
+        let lines: Vec<_> = parsed
+            .constants
+            .iter()
+            .map(|constant| constant.line.as_str())
+            .collect();
+        assert_eq!(
+            lines,
+            [
+                "string S=it's # all = text",
+                "uint8 A=1",
+                "float32 F=-1.5e3"
+            ]
+        );
+    }
+
+    #[test]
+    fn a_line_that_does_not_parse_is_named_with_its_number() {
+        for (dialect, line, reason) in [
+            (Dialect::Ros1, "int32", "a type and a name expected"),
+            (
+                Dialect::Ros1,
+                "int32 9lives",
+                "a field name expected: letters, digits and `_`, a letter first",
+            ),
+            (
+                Dialect::Ros1,
+                "int32 x 5",
+                "ROS 1 fields have no default value",
+            ),
+            (Dialect::Ros1, "string<=4 x", "bounded types are ROS 2's"),
+            (Dialect::Ros1, "int8[<=4] x", "bounded arrays are ROS 2's"),
+            (
+                Dialect::Ros1,
+                "int32[99999999999999999999999] x",
+                "a length of at most 4294967295 expected",
+            ),
+            (
+                Dialect::Ros1,
+                "int32[-1] x",
+                "a length of at most 4294967295 expected",
+            ),
+            (
+                Dialect::Ros1,
+                "int32[+1] x",
+                "a length of at most 4294967295 expected",
+            ),
+            (Dialect::Ros1, "int32] x", "`[` expected"),
+            (
+                Dialect::Ros1,
+                "a/b/c x",
+                "a type expected: a primitive, `Name` or `package/Name`",
+            ),
+            (
+                Dialect::Ros1,
+                "Thing X=1",
+                "a constant is of a primitive type",
+            ),
+            (Dialect::Ros1, "int8[] X=1", "a constant is no array"),
+            (Dialect::Ros1, "int8 X=", "a value expected"),
+            (
+                Dialect::Ros2,
+                "int32<=4 x",
+                "only strings have a bound of their own",
+            ),
+        ] {
+            let text = format!("bool first\n{line}\n");
+            let wanted = DefinitionError::Syntax {
+                name: "pkg/T".parse().unwrap(),
+                line: 2,
+                reason,
+                text: line.to_owned(),
+            };
+            assert_eq!(parse(dialect, &text).unwrap_err(), wanted, "{line}");
+        }
+        assert!(
+            parse(Dialect::Ros1, "int8 x\nint8 x")
+                .unwrap_err()
+                .to_string()
+                .contains("defined twice")
+        );
+    }
+}

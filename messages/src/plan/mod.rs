@@ -1,0 +1,328 @@
+//! A message type compiled for one wire and selection.
+
+mod read;
+mod write;
+
+use std::sync::Arc;
+
+use crate::definition::{Arity, Number, Primitive};
+use crate::resolve::{Shape, ShapeKind};
+use crate::{Dialect, Leaf, MessageType, PlanError, ReadError, Sink, Source, TypeName, WriteError};
+
+/// What the bytes of a message are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Wire {
+    /// The body of a ROS 1 message, without its 4 byte length. Read to its last byte.
+    Ros1,
+    /// The 4 byte encapsulation header and the CDR. Both byte orders are read; little endian is written, padded with
+    /// zeros to a multiple of 4. Whatever follows the last field is ignored, as DDS readers do.
+    Cdr,
+}
+
+/// Which fields of a message cross.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub enum Selection {
+    /// All of them.
+    Whole,
+    /// The one of that path.
+    Field(String),
+}
+
+/// Reads and writes the messages of one type on one wire.
+///
+/// Compile once, then share: it keeps nothing from message to message.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    wire: Wire,
+    ops: Vec<Op>,
+    leaves: Vec<Leaf>,
+    /// Paths of all fields, for errors; `Op::leaf` counts in it.
+    paths: Vec<String>,
+}
+
+/// One step. The steps of a message in an array follow its [`What::Messages`].
+#[derive(Clone, Debug)]
+struct Op {
+    what: What,
+    /// Whether the value crosses; else it is skipped when read and zero when written.
+    carry: bool,
+    /// Index of the field in the flattened message.
+    leaf: usize,
+}
+
+#[derive(Clone, Debug)]
+enum What {
+    One(Primitive),
+    /// Array of elements that are on the wire as in OPC UA.
+    Packed(Number, Len),
+    /// Array of `uint8`: a ByteString.
+    Bytes(Len),
+    /// Array of strings, times or durations.
+    Many(Primitive, Len),
+    /// Array of messages.
+    Messages {
+        of: TypeName,
+        len: Len,
+        steps: usize,
+        least: usize,
+    },
+    /// Bytes without meaning: `seq`, the byte of an empty message, and on ROS 1 what is not selected.
+    Skip {
+        align: usize,
+        bytes: usize,
+    },
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Len {
+    Fixed(u32),
+    Counted { bound: u32 },
+}
+
+impl Plan {
+    /// # Errors
+    /// A path the type has not, or a wire of the other ROS.
+    pub fn compile(
+        message: &Arc<MessageType>,
+        selection: &Selection,
+        wire: Wire,
+    ) -> Result<Self, PlanError> {
+        match (message.dialect(), wire) {
+            (Dialect::Ros1, Wire::Ros1) | (Dialect::Ros2, Wire::Cdr) => {}
+            _ => {
+                return Err(PlanError::Wire {
+                    name: message.name().clone(),
+                });
+            }
+        }
+        let paths: Vec<String> = message
+            .leaves()
+            .iter()
+            .map(|leaf| leaf.path.clone())
+            .collect();
+        let (selected, leaves) = match selection {
+            Selection::Whole => (None, message.leaves().to_vec()),
+            Selection::Field(path) => {
+                let found = message
+                    .leaves()
+                    .iter()
+                    .enumerate()
+                    .find(|(_, leaf)| leaf.path == *path);
+                let Some((at, leaf)) = found else {
+                    return Err(PlanError::UnknownField {
+                        name: message.name().clone(),
+                        path: path.clone(),
+                        known: paths,
+                    });
+                };
+                (Some(at), vec![leaf.clone()])
+            }
+        };
+        let mut compiler = Compiler {
+            wire,
+            selected,
+            leaf: 0,
+            ops: Vec::new(),
+            body: 0,
+            empty_elements: None,
+        };
+        compiler.message(&message.shape, false);
+        if let Some(what) = compiler.empty_elements {
+            return Err(PlanError::EmptyElements { name: what });
+        }
+        Ok(Self {
+            wire,
+            ops: compiler.ops,
+            leaves,
+            paths,
+        })
+    }
+
+    /// The fields that cross, in the order they do.
+    pub fn leaves(&self) -> &[Leaf] {
+        &self.leaves
+    }
+
+    /// Reads a message and hands each field to `sink`.
+    ///
+    /// A length is believed only after it was compared with the bytes that are left. When it errs the sink may have
+    /// taken some fields already.
+    pub fn read<S: Sink>(&self, payload: &[u8], sink: &mut S) -> Result<(), ReadError<S::Error>> {
+        read::read(self, payload, sink)
+    }
+
+    /// Takes the fields from `source` and appends the message to `out`; on error `out` is as it was.
+    pub fn write<'a, S: Source<'a>>(
+        &self,
+        source: &mut S,
+        out: &mut Vec<u8>,
+    ) -> Result<(), WriteError> {
+        write::write(self, source, out)
+    }
+
+    fn path(&self, leaf: Option<usize>) -> String {
+        leaf.and_then(|leaf| self.paths.get(leaf))
+            .cloned()
+            .unwrap_or_default()
+    }
+}
+
+struct Compiler {
+    wire: Wire,
+    selected: Option<usize>,
+    leaf: usize,
+    ops: Vec<Op>,
+    /// Where the steps of the innermost message in an array begin.
+    body: usize,
+    empty_elements: Option<TypeName>,
+}
+
+impl Compiler {
+    /// Returns the least number of bytes the message takes. `element`: it is one of an array.
+    fn message(&mut self, shape: &Shape, element: bool) -> usize {
+        if shape.fields.is_empty() && self.wire == Wire::Cdr {
+            self.push(What::Skip { align: 1, bytes: 1 });
+            return 1;
+        }
+        let mut least = 0;
+        for field in &shape.fields {
+            least += match &field.kind {
+                ShapeKind::Sequence => {
+                    self.push(What::Skip { align: 4, bytes: 4 });
+                    4
+                }
+                ShapeKind::Primitive(primitive) => {
+                    let bytes = self.primitive(*primitive, field.arity);
+                    self.leaf += usize::from(!element);
+                    bytes
+                }
+                ShapeKind::Message(inner) => match length(field.arity) {
+                    None => self.message(inner, element),
+                    Some(len) => {
+                        let bytes = self.messages(inner, len);
+                        self.leaf += usize::from(!element);
+                        bytes
+                    }
+                },
+            };
+        }
+        least
+    }
+
+    fn messages(&mut self, inner: &Shape, len: Len) -> usize {
+        let head = self.ops.len();
+        self.push(What::Messages {
+            of: inner.name.clone(),
+            len,
+            steps: 0,
+            least: 0,
+        });
+        let outer = std::mem::replace(&mut self.body, head + 1);
+        let each = self.message(inner, true);
+        // What follows is no part of the element, so no skip of the element may grow by it.
+        self.body = outer.max(self.ops.len());
+        let all = self.ops.len() - head - 1;
+        if let Some(Op {
+            what: What::Messages { steps, least, .. },
+            ..
+        }) = self.ops.get_mut(head)
+        {
+            (*steps, *least) = (all, each);
+        }
+        if each == 0 {
+            self.empty_elements
+                .get_or_insert_with(|| inner.name.clone());
+        }
+        match len {
+            Len::Fixed(count) => each.saturating_mul(usize::try_from(count).unwrap_or(usize::MAX)),
+            Len::Counted { .. } => 4,
+        }
+    }
+
+    fn primitive(&mut self, primitive: Primitive, arity: Arity) -> usize {
+        let text = matches!(primitive, Primitive::Text(_));
+        let size = primitive.size();
+        let Some(len) = length(arity) else {
+            self.push(What::One(primitive));
+            if !text {
+                self.shorten(size);
+            }
+            return size;
+        };
+        self.push(match primitive {
+            Primitive::Number(Number::UInt8) => What::Bytes(len),
+            Primitive::Number(number) => What::Packed(number, len),
+            Primitive::Clock(_) | Primitive::Text(_) => What::Many(primitive, len),
+        });
+        match len {
+            Len::Fixed(count) => {
+                let bytes = size.saturating_mul(usize::try_from(count).unwrap_or(usize::MAX));
+                if !text {
+                    self.shorten(bytes);
+                }
+                bytes
+            }
+            Len::Counted { .. } => 4,
+        }
+    }
+
+    fn push(&mut self, what: What) {
+        let carry = self.selected.is_none_or(|selected| selected == self.leaf);
+        self.ops.push(Op {
+            what,
+            carry,
+            leaf: self.leaf,
+        });
+        if let Some(Op {
+            what: What::Skip { bytes, .. },
+            ..
+        }) = self.ops.last()
+        {
+            self.shorten(*bytes);
+        }
+    }
+
+    /// On ROS 1, where nothing is aligned, joins the last step, of `bytes` bytes, with the skip before it.
+    fn shorten(&mut self, bytes: usize) {
+        let skips = |op: &Op| !op.carry || matches!(op.what, What::Skip { .. });
+        if self.wire != Wire::Ros1 || !self.ops.last().is_some_and(skips) {
+            return;
+        }
+        let last = self.ops.pop();
+        let mergeable = self.ops.len() > self.body;
+        let joined = match self.ops.last_mut() {
+            Some(Op {
+                what: What::Skip { bytes: before, .. },
+                ..
+            }) if mergeable => {
+                *before += bytes;
+                true
+            }
+            _ => false,
+        };
+        if let Some(mut op) = last.filter(|_| !joined) {
+            op.what = What::Skip { align: 1, bytes };
+            self.ops.push(op);
+        }
+    }
+}
+
+fn length(arity: Arity) -> Option<Len> {
+    match arity {
+        Arity::One => None,
+        Arity::Fixed(count) => Some(Len::Fixed(count)),
+        Arity::Sequence { bound } => Some(Len::Counted {
+            bound: bound.unwrap_or(u32::MAX),
+        }),
+    }
+}
+
+impl Primitive {
+    /// What one is aligned to in CDR.
+    const fn align(self) -> usize {
+        match self {
+            Self::Number(number) => number.size(),
+            Self::Clock(_) | Self::Text(_) => 4,
+        }
+    }
+}

@@ -1,0 +1,329 @@
+//! What becomes of definitions: flattened, incomplete, hostile, or a peer's.
+#![expect(clippy::unwrap_used, reason = "test code")]
+
+use std::sync::Arc;
+
+use messages::{
+    DefinitionError, Dialect, Leaf, MessageType, Plan, PlanError, Rank, Registry, Selection,
+    TypeName, Wire, standard_type,
+};
+use uadp::BuiltinType;
+
+fn name(text: &str) -> TypeName {
+    text.parse().unwrap()
+}
+
+fn registry(dialect: Dialect, definitions: &[(&str, &str)]) -> Registry {
+    let mut registry = Registry::bundle(dialect);
+    for (name_text, text) in definitions {
+        registry.add(&name(name_text), text).unwrap();
+    }
+    registry
+}
+
+fn message(dialect: Dialect, text: &str) -> Arc<MessageType> {
+    registry(dialect, &[("t/T", text)])
+        .get(&name("t/T"))
+        .unwrap()
+}
+
+#[test]
+fn a_pose_stamped_is_flattened_by_path_without_the_sequence_number() {
+    let leaf = |path: &str, builtin| Leaf {
+        path: path.to_owned(),
+        builtin,
+        rank: Rank::Scalar,
+    };
+    let mut wanted = vec![
+        leaf("header.stamp", BuiltinType::DateTime),
+        leaf("header.frame_id", BuiltinType::String),
+    ];
+    for part in [
+        "position.x",
+        "position.y",
+        "position.z",
+        "orientation.x",
+        "orientation.y",
+        "orientation.z",
+        "orientation.w",
+    ] {
+        wanted.push(leaf(&format!("pose.{part}"), BuiltinType::Double));
+    }
+    for dialect in [Dialect::Ros1, Dialect::Ros2] {
+        let found = Registry::bundle(dialect)
+            .get(&name("geometry_msgs/PoseStamped"))
+            .unwrap();
+        assert_eq!(found.leaves(), wanted, "{dialect:?}");
+        assert_eq!(found.leaf("pose.position.y"), wanted.get(3));
+        assert_eq!(found.leaf("pose"), None);
+    }
+}
+
+#[test]
+fn bytes_are_byte_strings_fixed_arrays_keep_their_length_and_messages_become_structures() {
+    let text = "byte[] signed\nuint8[4] four\nchar c\nfloat32[3] axes\ngeometry_msgs/Point[2] points\nduration[] waits";
+    let shapes: Vec<_> = message(Dialect::Ros1, text)
+        .leaves()
+        .iter()
+        .map(|leaf| (leaf.builtin, leaf.rank))
+        .collect();
+    assert_eq!(
+        shapes,
+        [
+            (BuiltinType::SByte, Rank::Array { fixed: None }),
+            (BuiltinType::ByteString, Rank::Scalar),
+            (BuiltinType::Byte, Rank::Scalar),
+            (BuiltinType::Float, Rank::Array { fixed: Some(3) }),
+            (BuiltinType::ExtensionObject, Rank::Array { fixed: Some(2) }),
+            (BuiltinType::Double, Rank::Array { fixed: None }),
+        ]
+    );
+    let ros2 = message(Dialect::Ros2, "byte[] bytes\nbyte one\nwstring wide");
+    let builtins: Vec<_> = ros2.leaves().iter().map(|leaf| leaf.builtin).collect();
+    assert_eq!(
+        builtins,
+        [
+            BuiltinType::ByteString,
+            BuiltinType::Byte,
+            BuiltinType::String
+        ]
+    );
+}
+
+#[test]
+fn a_missing_type_is_named_with_who_needs_it_and_what_may_be_meant() {
+    let registry = registry(
+        Dialect::Ros1,
+        &[
+            ("t/T", "geometry_msgs/Pont p"),
+            ("t/U", "nowhere/Unheard x"),
+        ],
+    );
+    let error = registry.get(&name("t/T")).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "no definition of `geometry_msgs/Pont`, which `t/T` needs; did you mean `geometry_msgs/Point`?"
+    );
+    assert_eq!(
+        registry.get(&name("t/U")).unwrap_err(),
+        DefinitionError::Unknown {
+            name: name("nowhere/Unheard"),
+            needed_by: Some(name("t/U")),
+            suggestion: None
+        }
+    );
+    assert_eq!(
+        registry.suggest(&name("sensor_msgs/Twist")),
+        Some(name("geometry_msgs/Twist"))
+    );
+    assert_eq!(
+        registry.suggest(&name("sensor_msgs/JointStates")),
+        Some(name("sensor_msgs/JointState"))
+    );
+}
+
+#[test]
+fn types_that_contain_themselves_or_nest_without_end_are_refused() {
+    let registry = registry(
+        Dialect::Ros1,
+        &[("t/Self", "Self[] more"), ("t/A", "B b"), ("t/B", "A[] a")],
+    );
+    assert_eq!(
+        registry.get(&name("t/Self")).unwrap_err(),
+        DefinitionError::Cyclic {
+            name: name("t/Self")
+        }
+    );
+    assert_eq!(
+        registry.get(&name("t/B")).unwrap_err(),
+        DefinitionError::Cyclic { name: name("t/B") }
+    );
+
+    let mut deep = Registry::empty(Dialect::Ros2);
+    deep.add(&name("t/L1"), "int8 x").unwrap();
+    for level in 2..=33 {
+        deep.add(
+            &name(&format!("t/L{level}")),
+            &format!("L{} below", level - 1),
+        )
+        .unwrap();
+    }
+    assert_eq!(deep.get(&name("t/L32")).unwrap().leaves().len(), 1);
+    assert_eq!(
+        deep.get(&name("t/L33")).unwrap_err(),
+        DefinitionError::TooDeep { name: name("t/L1") }
+    );
+}
+
+#[test]
+fn a_time_defined_by_itself_is_still_a_time() {
+    let registry = registry(
+        Dialect::Ros2,
+        &[
+            ("builtin_interfaces/Time", "Time again"),
+            ("t/T", "builtin_interfaces/Time at"),
+        ],
+    );
+    for type_name in ["t/T", "builtin_interfaces/Time"] {
+        let found = registry.get(&name(type_name)).unwrap();
+        assert_eq!(
+            found.leaves().first().unwrap().builtin,
+            BuiltinType::DateTime
+        );
+    }
+}
+
+#[test]
+fn a_text_of_very_many_fields_is_refused_where_the_limit_is_passed() {
+    let text: String = (0..5000).map(|field| format!("int8 f{field}\n")).collect();
+    let error = Registry::empty(Dialect::Ros1)
+        .add(&name("t/T"), &text)
+        .unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "`t/T` line 4097: more than 4096 fields: `int8 f4096`"
+    );
+}
+
+#[test]
+fn types_that_multiply_are_refused_before_they_are_built() {
+    let mut registry = Registry::empty(Dialect::Ros2);
+    registry.add(&name("t/L1"), "int8 x").unwrap();
+    for level in 2..=20 {
+        let text: String = (0..8)
+            .map(|field| format!("L{} f{field}\n", level - 1))
+            .collect();
+        registry.add(&name(&format!("t/L{level}")), &text).unwrap();
+    }
+    let too_many = DefinitionError::TooBig {
+        name: name("t/L5"),
+        what: "more than 4096 fields",
+    };
+    assert_eq!(registry.get(&name("t/L20")).unwrap_err(), too_many);
+    registry
+        .add(&name("t/Big"), "float64[4294967295] x")
+        .unwrap();
+    let too_big = DefinitionError::TooBig {
+        name: name("t/Big"),
+        what: "fixed arrays of more than 64 MiB",
+    };
+    assert_eq!(registry.get(&name("t/Big")).unwrap_err(), too_big);
+}
+
+const PEER: &str = "Header header\nmine/Thing[] things\n\n\
+    ================================================================================\nMSG: std_msgs/Header\n\
+    uint32 seq\ntime stamp\nstring frame_id\n\n\
+    ================================================================================\nMSG: mine/Thing\nint32 MAX=7\nuint16 id\n";
+
+#[test]
+fn a_connection_header_brings_its_own_definition() {
+    let mut registry = Registry::bundle(Dialect::Ros1);
+    let found = registry
+        .add_ros1_definition(&name("mine/Things"), PEER)
+        .unwrap();
+    let paths: Vec<_> = found
+        .leaves()
+        .iter()
+        .map(|leaf| leaf.path.as_str())
+        .collect();
+    assert_eq!(paths, ["header.stamp", "header.frame_id", "things"]);
+    assert_eq!(found.definition(), PEER);
+    let known = registry.get(&name("mine/Things")).unwrap();
+    assert_eq!(known.md5(), found.md5());
+    assert_eq!(registry.get(&name("mine/Thing")).unwrap().leaves().len(), 1);
+}
+
+#[test]
+fn a_peer_cannot_replace_a_definition() {
+    let mut registry = Registry::bundle(Dialect::Ros1);
+    let before = registry.get(&name("geometry_msgs/Point")).unwrap();
+    let found = registry
+        .add_ros1_definition(&name("geometry_msgs/Point"), "float32 x\n")
+        .unwrap();
+    assert_eq!(found.leaves().len(), 1);
+    assert_eq!(
+        registry.get(&name("geometry_msgs/Point")).unwrap().md5(),
+        before.md5()
+    );
+    registry
+        .add(&name("geometry_msgs/Point"), "float32 x\n")
+        .unwrap();
+    assert_eq!(
+        registry.get(&name("geometry_msgs/Point")).unwrap().md5(),
+        found.md5()
+    );
+}
+
+#[test]
+fn a_broken_connection_header_is_refused_and_leaves_nothing_behind() {
+    let mut registry = Registry::empty(Dialect::Ros1);
+    let rule = "=".repeat(80);
+    for text in [
+        format!("int8 x\n{rule}\nno heading\nint8 y\n"),
+        format!("int8 x\n{rule}\nMSG: not a name\nint8 y\n"),
+        format!("mine/Missing x\n{rule}\nMSG: mine/Other\nint8 y\n"),
+        format!("int8 x\n{rule}\nMSG: mine/Other\nint8[99999999999999999999] y\n"),
+    ] {
+        assert!(
+            registry
+                .add_ros1_definition(&name("mine/T"), &text)
+                .is_err(),
+            "{text}"
+        );
+        assert_eq!(registry.names().count(), 0, "{text}");
+    }
+    assert!(
+        registry
+            .add_ros1_definition(&name("mine/T"), &format!("int8 x\n{rule}"))
+            .is_ok()
+    );
+}
+
+#[test]
+fn a_wrong_path_lists_the_paths_there_are() {
+    let found = Registry::bundle(Dialect::Ros1)
+        .get(&name("geometry_msgs/Vector3"))
+        .unwrap();
+    let error = Plan::compile(&found, &Selection::Field("X".to_owned()), Wire::Ros1).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "`geometry_msgs/Vector3` has no field `X`; it has x, y, z"
+    );
+    let error = Plan::compile(&found, &Selection::Whole, Wire::Cdr).unwrap_err();
+    assert_eq!(
+        error,
+        PlanError::Wire {
+            name: found.name().clone()
+        }
+    );
+}
+
+#[test]
+fn every_standard_type_holds_its_builtin_type_alone() {
+    for dialect in [Dialect::Ros1, Dialect::Ros2] {
+        let registry = Registry::bundle(dialect);
+        let mut found = 0;
+        for builtin in (1..=25).filter_map(BuiltinType::from_id) {
+            assert_eq!(standard_type(builtin, true), None);
+            let Some(standard) = registry.standard_type(builtin, false) else {
+                continue;
+            };
+            let leaves = registry.get(&standard).unwrap().leaves().to_vec();
+            assert_eq!(
+                leaves,
+                [Leaf {
+                    path: "data".to_owned(),
+                    builtin,
+                    rank: Rank::Scalar
+                }],
+                "{standard}"
+            );
+            found += 1;
+        }
+        assert_eq!(found, 13);
+    }
+    assert_eq!(
+        standard_type(BuiltinType::DateTime, false),
+        Some(name("std_msgs/Time"))
+    );
+}

@@ -1,0 +1,259 @@
+//! What other implementations say: md5 sums, field lists, and messages they wrote. See `data/make.py`.
+#![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
+
+mod support;
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use md5::{Digest, Md5};
+use messages::{Dialect, MessageType, Plan, Registry, Selection, TypeName, Wire};
+use serde_json::Value as Json;
+use support::{Player, Recorder};
+
+const MD5S: &str = include_str!("data/ros1_md5.txt");
+const FIELDS: &str = include_str!("data/ros2_fields.txt");
+const ROSBAGS: &str = include_str!("data/rosbags.json");
+const CYCLONE: &str = include_str!("data/cyclone.json");
+const GENPY: &str = include_str!("data/genpy.json");
+
+fn name(text: &str) -> TypeName {
+    text.parse().unwrap()
+}
+
+fn bytes(hex: &Json) -> Vec<u8> {
+    let hex = hex.as_str().unwrap();
+    (0..hex.len())
+        .step_by(2)
+        .map(|at| u8::from_str_radix(&hex[at..at + 2], 16).unwrap())
+        .collect()
+}
+
+fn samples(text: &str) -> Vec<Json> {
+    serde_json::from_str(text).unwrap()
+}
+
+fn text(json: &Json) -> &str {
+    json.as_str().unwrap()
+}
+
+fn strings(json: &Json) -> Vec<String> {
+    json.as_array()
+        .unwrap()
+        .iter()
+        .map(|each| text(each).to_owned())
+        .collect()
+}
+
+#[test]
+fn the_md5_of_every_ros_1_type_of_the_bundle_is_the_one_others_compute() {
+    let registry = Registry::bundle(Dialect::Ros1);
+    let mut table: HashMap<String, String> = MD5S
+        .lines()
+        .map(|line| line.split_once(' ').unwrap())
+        .map(|(name, md5)| (name.to_owned(), md5.to_owned()))
+        .collect();
+    for sample in samples(GENPY) {
+        table.insert(
+            text(&sample["type"]).to_owned(),
+            text(&sample["md5"]).to_owned(),
+        );
+    }
+    for known in registry.names() {
+        let wanted = table
+            .remove(&known.to_string())
+            .unwrap_or_else(|| panic!("no table has {known}"));
+        assert_eq!(registry.get(known).unwrap().md5(), wanted, "{known}");
+    }
+    assert!(table.is_empty(), "the bundle lacks {table:?}");
+}
+
+#[test]
+fn the_md5s_well_known_to_ros_1_users_are_right() {
+    let registry = Registry::bundle(Dialect::Ros1);
+    for (type_name, md5) in [
+        ("std_msgs/String", "992ce8a1687cec8c8bd883ec73ca41d1"),
+        ("geometry_msgs/Twist", "9f195f881246fdfa2798d1d3eebca84a"),
+        ("nav_msgs/Odometry", "cd5e73d190d741a2f92e81eda573aca7"),
+        ("sensor_msgs/JointState", "3066dcd76a6cfaef579bd0f34173e9fd"),
+        ("tf2_msgs/TFMessage", "94810edda583a504dfda3829e70d7eec"),
+    ] {
+        assert_eq!(
+            registry.get(&name(type_name)).unwrap().md5(),
+            md5,
+            "{type_name}"
+        );
+    }
+}
+
+#[test]
+fn the_text_of_every_ros_1_type_means_the_same_to_the_crate_ros_message() {
+    let registry = Registry::bundle(Dialect::Ros1);
+    let path =
+        |name: &TypeName| ros_message::MessagePath::new(name.package(), name.name()).unwrap();
+    let types: Vec<Arc<MessageType>> = registry
+        .names()
+        .map(|name| registry.get(name).unwrap())
+        .collect();
+    let md5s: HashMap<_, _> = types
+        .iter()
+        .map(|each| (path(each.name()), each.md5().to_owned()))
+        .collect();
+    for each in &types {
+        let own_text = each.definition().split("\n====").next().unwrap();
+        let parsed = ros_message::Msg::new(path(each.name()), own_text).unwrap();
+        let hashed = Md5::digest(parsed.get_md5_representation(&md5s).unwrap().trim());
+        let hashed: String = hashed.iter().map(|byte| format!("{byte:02x}")).collect();
+        assert_eq!(hashed, each.md5(), "{}", each.name());
+    }
+    assert!(types.len() > 120);
+}
+
+#[test]
+fn the_fields_of_every_ros_2_type_of_the_bundle_are_those_of_rosbags() {
+    let mut others = Registry::empty(Dialect::Ros2);
+    for line in FIELDS.lines() {
+        let mut words = line.split(' ');
+        let type_name = name(words.next().unwrap());
+        let fields: Vec<String> = words
+            .map(|field| field.split_once(':').unwrap())
+            .map(|(field, kind)| format!("{} {field}", kind.replace("octet", "byte")))
+            .collect();
+        others.add(&type_name, &fields.join("\n")).unwrap();
+    }
+    let bundle = Registry::bundle(Dialect::Ros2);
+    let names = |registry: &Registry| registry.names().cloned().collect::<Vec<_>>();
+    assert_eq!(names(&bundle), names(&others));
+    for each in bundle.names() {
+        let (ours, theirs) = (bundle.get(each).unwrap(), others.get(each).unwrap());
+        assert_eq!(ours.leaves(), theirs.leaves(), "{each}");
+        let without_constants: Vec<&str> = ours
+            .definition()
+            .split("\n====")
+            .next()
+            .unwrap()
+            .lines()
+            .filter(|line| !line.contains('=') || line.contains("<="))
+            .collect();
+        let full = |line: &str| {
+            let (kind, field) = line.split_once(' ').unwrap();
+            let base = kind.split(['[', '<']).next().unwrap();
+            let local = !base.contains('/') && base.starts_with(|c: char| c.is_ascii_uppercase());
+            format!(
+                "{}{kind} {field}",
+                if local {
+                    format!("{}/", each.package())
+                } else {
+                    String::new()
+                }
+            )
+        };
+        let ours: Vec<String> = without_constants.iter().map(|line| full(line)).collect();
+        assert_eq!(
+            ours.join("\n"),
+            theirs.definition().split("\n====").next().unwrap(),
+            "{each}"
+        );
+    }
+}
+
+#[test]
+fn a_full_definition_names_what_it_needs_in_the_order_of_genpy() {
+    let registry = Registry::bundle(Dialect::Ros1);
+    for sample in samples(GENPY) {
+        let found = registry.get(&name(text(&sample["type"]))).unwrap();
+        let needs: Vec<String> = found
+            .definition()
+            .lines()
+            .filter_map(|line| line.strip_prefix("MSG: "))
+            .map(str::to_owned)
+            .collect();
+        assert_eq!(needs, strings(&sample["needs"]), "{}", found.name());
+        let mut empty = Registry::empty(Dialect::Ros1);
+        let again = empty
+            .add_ros1_definition(found.name(), found.definition())
+            .unwrap();
+        assert_eq!(again.md5(), found.md5());
+        assert_eq!(again.leaves(), found.leaves());
+    }
+}
+
+/// Reads `payload`, compares the fields, writes them and compares the bytes with `written`.
+fn judge(plan: &Plan, sample: &Json, payload: &[u8], written: &[u8]) {
+    let what = text(&sample["type"]);
+    let mut recorder = Recorder::default();
+    plan.read(payload, &mut recorder)
+        .unwrap_or_else(|error| panic!("{what}: {error}"));
+    let events: Vec<String> = recorder.events.iter().map(ToString::to_string).collect();
+    assert_eq!(events, strings(&sample["fields"]), "{what}");
+    let mut out = vec![0xEE];
+    plan.write(&mut Player::new(&recorder.events), &mut out)
+        .unwrap_or_else(|error| panic!("{what}: {error}"));
+    let mut wanted = vec![0xEE];
+    wanted.extend_from_slice(written);
+    assert_eq!(out, wanted, "{what}");
+}
+
+fn padded(mut cdr: Vec<u8>) -> Vec<u8> {
+    cdr.resize(cdr.len().next_multiple_of(4), 0);
+    cdr
+}
+
+#[test]
+fn ros_1_messages_written_by_genpy_and_rosbags_are_read_and_written_alike() {
+    let registry = Registry::bundle(Dialect::Ros1);
+    let mut count = 0;
+    for sample in samples(GENPY)
+        .iter()
+        .chain(&samples(ROSBAGS))
+        .filter(|sample| sample["dialect"] == 1)
+    {
+        let plan = Plan::compile(
+            &registry.get(&name(text(&sample["type"]))).unwrap(),
+            &Selection::Whole,
+            Wire::Ros1,
+        )
+        .unwrap();
+        let payload = bytes(&sample["ros1"]);
+        judge(&plan, sample, &payload, &payload);
+        count += 1;
+    }
+    assert!(count > 200, "{count}");
+}
+
+#[test]
+fn cdr_of_both_byte_orders_written_by_rosbags_is_read_alike_and_written_little_endian() {
+    let registry = Registry::bundle(Dialect::Ros2);
+    let mut count = 0;
+    for sample in samples(ROSBAGS)
+        .iter()
+        .filter(|sample| sample["dialect"] == 2)
+    {
+        let plan = Plan::compile(
+            &registry.get(&name(text(&sample["type"]))).unwrap(),
+            &Selection::Whole,
+            Wire::Cdr,
+        )
+        .unwrap();
+        let little = bytes(&sample["little"]);
+        let padded = padded(little.clone());
+        judge(&plan, sample, &little, &padded);
+        judge(&plan, sample, &bytes(&sample["big"]), &padded);
+        judge(&plan, sample, &padded, &padded);
+        count += 1;
+    }
+    assert!(count > 140, "{count}");
+}
+
+#[test]
+fn cdr_written_by_cyclone_dds_is_read_and_written_alike() {
+    let registry = Registry::bundle(Dialect::Ros2);
+    let samples = samples(CYCLONE);
+    for sample in &samples {
+        let found = registry.get(&name(text(&sample["type"]))).unwrap();
+        let plan = Plan::compile(&found, &Selection::Whole, Wire::Cdr).unwrap();
+        let payload = bytes(&sample["little"]);
+        judge(&plan, sample, &payload, &padded(payload.clone()));
+    }
+    assert!(samples.len() > 140, "{}", samples.len());
+}

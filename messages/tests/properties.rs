@@ -1,0 +1,401 @@
+//! Random values there and back, and bytes that are no message.
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::wildcard_enum_match_arm,
+    clippy::cast_possible_truncation,
+    reason = "test code"
+)]
+
+mod support;
+
+use std::collections::HashMap;
+
+use messages::{
+    Dialect, Fault, Plan, ReadError, Registry, Selection, Source, SourceError, Wire, WriteFault,
+};
+use proptest::prelude::*;
+use proptest::test_runner::{TestRng, TestRunner};
+use support::{Event, Player, Recorder, Value};
+use uadp::{BuiltinType, Scalar};
+
+/// Makes up whatever is asked for and remembers it.
+struct Inventor<'r> {
+    rng: &'r mut TestRng,
+    made: Vec<Event>,
+    /// Lengths the type wants, by the number of the array they are for.
+    lengths: &'r HashMap<usize, usize>,
+    arrays: usize,
+}
+
+const TEXTS: [&str; 6] = [
+    "",
+    "x",
+    "Grüße",
+    "日本語",
+    "🤖 robot",
+    "a longer text, to move what follows",
+];
+const BYTES: [&[u8]; 3] = [&[], &[0], &[1, 2, 3, 255]];
+
+impl Inventor<'_> {
+    fn length(&mut self) -> usize {
+        let number = self.arrays;
+        self.arrays += 1;
+        self.lengths
+            .get(&number)
+            .copied()
+            .unwrap_or_else(|| (self.rng.next_u32() % 4) as usize)
+    }
+
+    fn value(&mut self, builtin: BuiltinType) -> Value {
+        let random = self.rng.next_u64();
+        match builtin {
+            BuiltinType::String => Value::Text(TEXTS[(random % 6) as usize].to_owned()),
+            // Any Double may be a duration, so each is one that a nanosecond tells apart.
+            BuiltinType::Double => {
+                let eighths = (random % 16_000_000) as f64 / 8.0 - 1_000_000.0;
+                Value::of(Scalar::Double(eighths))
+            }
+            // From 1970 to 2037, in both ROS.
+            BuiltinType::DateTime => {
+                let ticks =
+                    116_444_736_000_000_000 + (random % 21_000_000_000_000_000).cast_signed();
+                Value::Fixed(builtin, ticks.to_le_bytes().to_vec())
+            }
+            BuiltinType::Boolean => Value::Fixed(builtin, vec![(random % 2) as u8]),
+            other => Value::Fixed(
+                other,
+                random.to_le_bytes()[..other.fixed_size().unwrap()].to_vec(),
+            ),
+        }
+    }
+}
+
+fn leak<T>(value: T) -> &'static T {
+    Box::leak(Box::new(value))
+}
+
+impl Source<'static> for Inventor<'_> {
+    fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'static>, SourceError> {
+        let value = if expected == BuiltinType::ByteString {
+            let number = self.arrays;
+            let length = self.length();
+            let free = BYTES[length % 3].to_vec();
+            Value::Bytes(if self.lengths.contains_key(&number) {
+                vec![7; length]
+            } else {
+                free
+            })
+        } else {
+            self.value(expected)
+        };
+        self.made.push(Event::Scalar(value.clone()));
+        Ok(leak(value).scalar())
+    }
+    fn packed_array(
+        &mut self,
+        expected: BuiltinType,
+    ) -> Result<(usize, &'static [u8]), SourceError> {
+        let count = self.length();
+        let mut bytes = Vec::new();
+        for _ in 0..count {
+            if let Value::Fixed(_, each) = self.value(expected) {
+                bytes.extend(each);
+            }
+        }
+        self.made
+            .push(Event::Packed(expected, count, bytes.clone()));
+        Ok((count, leak(bytes)))
+    }
+    fn array(&mut self, expected: BuiltinType) -> Result<usize, SourceError> {
+        let count = self.length();
+        self.made.push(Event::Array(expected, count));
+        Ok(count)
+    }
+    fn element(&mut self, expected: BuiltinType) -> Result<Scalar<'static>, SourceError> {
+        let value = self.value(expected);
+        self.made.push(Event::Element(value.clone()));
+        Ok(leak(value).scalar())
+    }
+    fn structures(&mut self) -> Result<usize, SourceError> {
+        let count = self.length();
+        self.made.push(Event::Structures(String::new(), count));
+        Ok(count)
+    }
+    fn begin_structure(&mut self) -> Result<(), SourceError> {
+        self.made.push(Event::Begin(String::new()));
+        Ok(())
+    }
+    fn end_structure(&mut self) -> Result<(), SourceError> {
+        self.made.push(Event::End);
+        Ok(())
+    }
+    fn finish(&mut self) -> Result<(), SourceError> {
+        Ok(())
+    }
+}
+
+/// Values of the plan's fields and the message they make. A fixed length is learnt from the refusal of another.
+fn invent(plan: &Plan, rng: &TestRng) -> (Vec<Event>, Vec<u8>) {
+    let mut lengths = HashMap::new();
+    for _ in 0..1000 {
+        let mut out = Vec::new();
+        let mut inventor = Inventor {
+            rng: &mut rng.clone(),
+            made: Vec::new(),
+            lengths: &lengths,
+            arrays: 0,
+        };
+        let done = plan.write(&mut inventor, &mut out);
+        let (made, arrays) = (inventor.made, inventor.arrays);
+        match done {
+            Ok(()) => return (made, out),
+            Err(error) => {
+                assert!(out.is_empty(), "a message that failed left bytes");
+                let length = match error.fault {
+                    WriteFault::Length { expected, .. } => expected,
+                    WriteFault::Bound { bound, .. } => bound,
+                    fault => panic!("{fault}"),
+                };
+                lengths.insert(arrays - 1, length as usize);
+            }
+        }
+    }
+    panic!("no values found");
+}
+
+fn plans() -> Vec<(String, Wire, Plan)> {
+    let mut plans = Vec::new();
+    for (dialect, wire) in [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)] {
+        let registry = Registry::bundle(dialect);
+        for name in registry.names() {
+            let plan =
+                Plan::compile(&registry.get(name).unwrap(), &Selection::Whole, wire).unwrap();
+            plans.push((format!("{name} {wire:?}"), wire, plan));
+        }
+    }
+    plans
+}
+
+/// Structures of an inventor have no name.
+fn unnamed(events: Vec<Event>) -> Vec<Event> {
+    let strip = |event| match event {
+        Event::Structures(_, count) => Event::Structures(String::new(), count),
+        Event::Begin(_) => Event::Begin(String::new()),
+        other => other,
+    };
+    events.into_iter().map(strip).collect()
+}
+
+fn runner() -> TestRunner {
+    TestRunner::deterministic()
+}
+
+#[test]
+fn random_values_of_every_type_of_the_bundle_return_from_either_wire() {
+    let mut runner = runner();
+    for (what, _, plan) in plans() {
+        for _ in 0..20 {
+            let (made, bytes) = invent(&plan, &runner.new_rng());
+            let mut recorder = Recorder::default();
+            plan.read(&bytes, &mut recorder)
+                .unwrap_or_else(|error| panic!("{what}: {error}"));
+            let mut again = Vec::new();
+            plan.write(&mut Player::new(&recorder.events), &mut again)
+                .unwrap();
+            assert_eq!(again, bytes, "{what}");
+            assert_eq!(unnamed(recorder.events), made, "{what}");
+        }
+    }
+}
+
+#[test]
+fn a_message_cut_short_errs_unless_only_padding_was_cut() {
+    let mut runner = runner();
+    for (what, wire, plan) in plans() {
+        let (made, bytes) = invent(&plan, &runner.new_rng());
+        for cut in 0..bytes.len() {
+            let mut recorder = Recorder::default();
+            match plan.read(&bytes[..cut], &mut recorder) {
+                Ok(()) => {
+                    assert_eq!(wire, Wire::Cdr, "{what} cut at {cut} of {}", bytes.len());
+                    assert!(
+                        bytes.len() - cut <= 3 && bytes[cut..].iter().all(|byte| *byte == 0),
+                        "{what} at {cut}"
+                    );
+                    assert_eq!(unnamed(recorder.events), made, "{what}");
+                }
+                Err(ReadError::Malformed {
+                    fault: Fault::Truncated,
+                    at,
+                    ..
+                }) => assert!(at <= cut, "{what}"),
+                Err(error) => panic!("{what} cut at {cut}: {error}"),
+            }
+        }
+    }
+}
+
+#[test]
+fn bytes_after_a_ros_1_message_err_and_after_cdr_do_not() {
+    let mut runner = runner();
+    for (what, wire, plan) in plans() {
+        let (made, mut bytes) = invent(&plan, &runner.new_rng());
+        bytes.extend([0; 5]);
+        let mut recorder = Recorder::default();
+        let done = plan.read(&bytes, &mut recorder);
+        match wire {
+            Wire::Ros1 => {
+                let wanted = ReadError::Malformed {
+                    field: String::new(),
+                    at: bytes.len() - 5,
+                    fault: Fault::TrailingBytes(5),
+                };
+                assert_eq!(done, Err(wanted), "{what}");
+            }
+            Wire::Cdr => assert_eq!((done, unnamed(recorder.events)), (Ok(()), made), "{what}"),
+        }
+    }
+}
+
+#[test]
+fn a_field_alone_is_what_it_is_in_the_whole_and_the_rest_is_zero() {
+    let mut runner = runner();
+    for (dialect, wire) in [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)] {
+        let registry = Registry::bundle(dialect);
+        for name in registry.names() {
+            let message = registry.get(name).unwrap();
+            let whole = Plan::compile(&message, &Selection::Whole, wire).unwrap();
+            let (_, bytes) = invent(&whole, &runner.new_rng());
+            let mut all = Recorder::default();
+            whole.read(&bytes, &mut all).unwrap();
+            let mut pieces = Vec::new();
+            for leaf in message.leaves() {
+                let what = format!("{name} {}", leaf.path);
+                let plan =
+                    Plan::compile(&message, &Selection::Field(leaf.path.clone()), wire).unwrap();
+                assert_eq!(plan.leaves(), std::slice::from_ref(leaf));
+                let mut one = Recorder::default();
+                plan.read(&bytes, &mut one)
+                    .unwrap_or_else(|error| panic!("{what}: {error}"));
+                let mut alone = Vec::new();
+                plan.write(&mut Player::new(&one.events), &mut alone)
+                    .unwrap();
+                let mut back = Recorder::default();
+                plan.read(&alone, &mut back)
+                    .unwrap_or_else(|error| panic!("{what}: {error}"));
+                assert_eq!(back.events, one.events, "{what}");
+                let mut rest = Recorder::default();
+                whole
+                    .read(&alone, &mut rest)
+                    .unwrap_or_else(|error| panic!("{what}: {error}"));
+                assert!(
+                    is_zero_but(&rest.events, &one.events),
+                    "{what}: {:?}",
+                    rest.events
+                );
+                pieces.extend(one.events);
+            }
+            assert_eq!(pieces, all.events, "{name}");
+        }
+    }
+}
+
+/// Whether all of `events` outside of one run of `carried` are zeros.
+fn is_zero_but(events: &[Event], carried: &[Event]) -> bool {
+    let epoch = 116_444_736_000_000_000i64.to_le_bytes();
+    let zero = |event: &Event| match event {
+        Event::Scalar(value) | Event::Element(value) => match value {
+            Value::Fixed(BuiltinType::DateTime, bytes) => *bytes == epoch,
+            Value::Fixed(_, bytes) | Value::Bytes(bytes) => bytes.iter().all(|byte| *byte == 0),
+            Value::Text(text) => text.is_empty(),
+        },
+        Event::Packed(_, _, bytes) => bytes.iter().all(|byte| *byte == 0),
+        Event::Array(..) | Event::Begin(_) | Event::End => true,
+        Event::Structures(..) => true,
+    };
+    (0..=events.len() - carried.len()).any(|at| {
+        let (before, rest) = events.split_at(at);
+        let (run, after) = rest.split_at(carried.len());
+        run == carried && before.iter().chain(after).all(zero)
+    })
+}
+
+#[test]
+fn a_length_beyond_the_payload_is_refused_before_the_sink_hears_of_it() {
+    for (dialect, wire, header) in [
+        (Dialect::Ros1, Wire::Ros1, &[][..]),
+        (Dialect::Ros2, Wire::Cdr, &[0, 1, 0, 0][..]),
+        (Dialect::Ros2, Wire::Cdr, &[0, 0, 0, 0][..]),
+    ] {
+        let mut registry = Registry::bundle(dialect);
+        for kind in [
+            "string",
+            "uint8[]",
+            "bool[]",
+            "float64[]",
+            "string[]",
+            "std_msgs/ColorRGBA[]",
+            "std_msgs/String[]",
+        ] {
+            let name = "test_msgs/T".parse().unwrap();
+            registry.add(&name, &format!("{kind} x")).unwrap();
+            let plan =
+                Plan::compile(&registry.get(&name).unwrap(), &Selection::Whole, wire).unwrap();
+            for count in [1u32, 0x7FFF_FFFF, 0x8000_0000, 0x8000_0080, u32::MAX] {
+                let mut payload = header.to_vec();
+                let big = header.get(1) == Some(&0);
+                payload.extend(if big {
+                    count.to_be_bytes()
+                } else {
+                    count.to_le_bytes()
+                });
+                let mut recorder = Recorder::default();
+                let wanted = ReadError::Malformed {
+                    field: "x".to_owned(),
+                    at: payload.len(),
+                    fault: Fault::Truncated,
+                };
+                assert_eq!(
+                    plan.read(&payload, &mut recorder),
+                    Err(wanted),
+                    "{kind} {count:#x}"
+                );
+                assert_eq!(recorder.events, [], "{kind}");
+            }
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    #[test]
+    fn random_bytes_never_panic(bytes in proptest::collection::vec(prop_oneof![Just(0u8), Just(1u8), any::<u8>()], 0..300)) {
+        for (_, wire, plan) in plans() {
+            let mut payload = if wire == Wire::Cdr { vec![0, bytes.len() as u8 % 2, 0, 0] } else { Vec::new() };
+            payload.extend(&bytes);
+            let mut recorder = Recorder::default();
+            if plan.read(&payload, &mut recorder).is_ok() {
+                let mut out = Vec::new();
+                // A text with a NUL and an unnormalised time are read but not written.
+                drop(plan.write(&mut Player::new(&recorder.events), &mut out));
+            }
+        }
+    }
+
+    #[test]
+    fn a_message_with_a_byte_changed_never_panics(seed in any::<u64>(), flips in proptest::collection::vec((any::<usize>(), any::<u8>()), 1..4)) {
+        let plans = plans();
+        let (_, _, plan) = &plans[(seed % plans.len() as u64) as usize];
+        let (_, mut bytes) = invent(plan, &runner().new_rng());
+        for (at, to) in flips {
+            if let Some(length) = bytes.len().checked_sub(1) {
+                bytes[at % (length + 1)] = to;
+            }
+        }
+        drop(plan.read(&bytes, &mut Recorder::default()));
+    }
+}

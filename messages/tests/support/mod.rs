@@ -1,0 +1,257 @@
+//! A sink that records, and a source that plays back what was recorded.
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
+
+use std::fmt;
+
+use messages::{Sink, Source, SourceError, TypeName};
+use uadp::{BuiltinType, DateTime, Scalar};
+
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Value {
+    /// Numbers and Booleans by their bytes, so that a NaN equals itself.
+    Fixed(BuiltinType, Vec<u8>),
+    Text(String),
+    Bytes(Vec<u8>),
+}
+
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Event {
+    Scalar(Value),
+    Packed(BuiltinType, usize, Vec<u8>),
+    Array(BuiltinType, usize),
+    Element(Value),
+    Structures(String, usize),
+    Begin(String),
+    End,
+}
+
+impl Value {
+    pub(crate) fn of(scalar: Scalar<'_>) -> Self {
+        let builtin = scalar.builtin_type();
+        match scalar {
+            Scalar::Boolean(v) => Self::Fixed(builtin, vec![u8::from(v)]),
+            Scalar::SByte(v) => Self::Fixed(builtin, v.to_le_bytes().to_vec()),
+            Scalar::Byte(v) => Self::Fixed(builtin, v.to_le_bytes().to_vec()),
+            Scalar::Int16(v) => Self::Fixed(builtin, v.to_le_bytes().to_vec()),
+            Scalar::UInt16(v) => Self::Fixed(builtin, v.to_le_bytes().to_vec()),
+            Scalar::Int32(v) => Self::Fixed(builtin, v.to_le_bytes().to_vec()),
+            Scalar::UInt32(v) => Self::Fixed(builtin, v.to_le_bytes().to_vec()),
+            Scalar::Int64(v) => Self::Fixed(builtin, v.to_le_bytes().to_vec()),
+            Scalar::UInt64(v) => Self::Fixed(builtin, v.to_le_bytes().to_vec()),
+            Scalar::Float(v) => Self::Fixed(builtin, v.to_le_bytes().to_vec()),
+            Scalar::Double(v) => Self::Fixed(builtin, v.to_le_bytes().to_vec()),
+            Scalar::DateTime(v) => Self::Fixed(builtin, v.0.to_le_bytes().to_vec()),
+            Scalar::String(v) => Self::Text(v.unwrap_or_default().to_owned()),
+            Scalar::ByteString(v) => Self::Bytes(v.unwrap_or_default().to_vec()),
+            other => panic!("{other:?} is no value of a ROS message"),
+        }
+    }
+
+    pub(crate) fn builtin(&self) -> BuiltinType {
+        match self {
+            Self::Fixed(builtin, _) => *builtin,
+            Self::Text(_) => BuiltinType::String,
+            Self::Bytes(_) => BuiltinType::ByteString,
+        }
+    }
+
+    pub(crate) fn scalar(&self) -> Scalar<'_> {
+        match self {
+            Self::Text(text) => Scalar::String(Some(text)),
+            Self::Bytes(bytes) => Scalar::ByteString(Some(bytes)),
+            Self::Fixed(BuiltinType::Boolean, bytes) => Scalar::Boolean(bytes[0] != 0),
+            Self::Fixed(BuiltinType::SByte, bytes) => Scalar::SByte(i8::from_le_bytes([bytes[0]])),
+            Self::Fixed(BuiltinType::Byte, bytes) => Scalar::Byte(bytes[0]),
+            Self::Fixed(BuiltinType::Int16, bytes) => {
+                Scalar::Int16(i16::from_le_bytes(chunk(bytes)))
+            }
+            Self::Fixed(BuiltinType::UInt16, bytes) => {
+                Scalar::UInt16(u16::from_le_bytes(chunk(bytes)))
+            }
+            Self::Fixed(BuiltinType::Int32, bytes) => {
+                Scalar::Int32(i32::from_le_bytes(chunk(bytes)))
+            }
+            Self::Fixed(BuiltinType::UInt32, bytes) => {
+                Scalar::UInt32(u32::from_le_bytes(chunk(bytes)))
+            }
+            Self::Fixed(BuiltinType::Int64, bytes) => {
+                Scalar::Int64(i64::from_le_bytes(chunk(bytes)))
+            }
+            Self::Fixed(BuiltinType::UInt64, bytes) => {
+                Scalar::UInt64(u64::from_le_bytes(chunk(bytes)))
+            }
+            Self::Fixed(BuiltinType::Float, bytes) => {
+                Scalar::Float(f32::from_le_bytes(chunk(bytes)))
+            }
+            Self::Fixed(BuiltinType::Double, bytes) => {
+                Scalar::Double(f64::from_le_bytes(chunk(bytes)))
+            }
+            Self::Fixed(BuiltinType::DateTime, bytes) => {
+                Scalar::DateTime(DateTime(i64::from_le_bytes(chunk(bytes))))
+            }
+            Self::Fixed(other, _) => panic!("{other:?} is no number"),
+        }
+    }
+}
+
+fn chunk<const N: usize>(bytes: &[u8]) -> [u8; N] {
+    bytes.try_into().unwrap()
+}
+
+impl fmt::Display for Value {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.scalar() {
+            Scalar::Boolean(v) => write!(f, "{v}"),
+            Scalar::SByte(v) => write!(f, "{v}"),
+            Scalar::Byte(v) => write!(f, "{v}"),
+            Scalar::Int16(v) => write!(f, "{v}"),
+            Scalar::UInt16(v) => write!(f, "{v}"),
+            Scalar::Int32(v) => write!(f, "{v}"),
+            Scalar::UInt32(v) => write!(f, "{v}"),
+            Scalar::Int64(v) => write!(f, "{v}"),
+            Scalar::UInt64(v) => write!(f, "{v}"),
+            Scalar::Float(v) => write!(f, "{v:?}"),
+            Scalar::Double(v) => write!(f, "{v:?}"),
+            Scalar::DateTime(v) => write!(f, "{}", v.0),
+            Scalar::String(v) => f.write_str(v.unwrap_or_default()),
+            Scalar::ByteString(v) => v
+                .unwrap_or_default()
+                .iter()
+                .try_for_each(|byte| write!(f, "{byte:02x}")),
+            other => panic!("{other:?} is no value of a ROS message"),
+        }
+    }
+}
+
+impl fmt::Display for Event {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Scalar(value) => write!(f, "scalar {} {value}", value.builtin().name()),
+            Self::Element(value) => write!(f, "element {} {value}", value.builtin().name()),
+            Self::Array(builtin, count) => write!(f, "array {} {count}", builtin.name()),
+            Self::Packed(builtin, count, bytes) => {
+                write!(f, "packed {} {count}", builtin.name())?;
+                let size = builtin.fixed_size().unwrap();
+                assert_eq!(bytes.len(), count * size);
+                bytes
+                    .chunks(size)
+                    .try_for_each(|each| write!(f, " {}", Value::Fixed(*builtin, each.to_vec())))
+            }
+            Self::Structures(of, count) => write!(f, "structures {of} {count}"),
+            Self::Begin(of) => write!(f, "begin {of}"),
+            Self::End => f.write_str("end"),
+        }
+    }
+}
+
+#[derive(Default)]
+pub(crate) struct Recorder {
+    pub(crate) events: Vec<Event>,
+}
+
+impl Recorder {
+    fn push(&mut self, event: Event) -> Result<(), ()> {
+        self.events.push(event);
+        Ok(())
+    }
+}
+
+impl Sink for Recorder {
+    type Error = ();
+
+    fn scalar(&mut self, value: Scalar<'_>) -> Result<(), ()> {
+        self.push(Event::Scalar(Value::of(value)))
+    }
+    fn packed_array(&mut self, element: BuiltinType, count: usize, bytes: &[u8]) -> Result<(), ()> {
+        self.push(Event::Packed(element, count, bytes.to_vec()))
+    }
+    fn array(&mut self, element: BuiltinType, count: usize) -> Result<(), ()> {
+        self.push(Event::Array(element, count))
+    }
+    fn element(&mut self, value: Scalar<'_>) -> Result<(), ()> {
+        self.push(Event::Element(Value::of(value)))
+    }
+    fn structures(&mut self, of: &TypeName, count: usize) -> Result<(), ()> {
+        self.push(Event::Structures(of.to_string(), count))
+    }
+    fn begin_structure(&mut self, of: &TypeName) -> Result<(), ()> {
+        self.push(Event::Begin(of.to_string()))
+    }
+    fn end_structure(&mut self) -> Result<(), ()> {
+        self.push(Event::End)
+    }
+}
+
+/// Plays recorded events back.
+pub(crate) struct Player<'e>(pub(crate) std::slice::Iter<'e, Event>);
+
+impl<'e> Player<'e> {
+    pub(crate) fn new(events: &'e [Event]) -> Self {
+        Self(events.iter())
+    }
+
+    fn wrong(found: Option<&Event>) -> SourceError {
+        found.map_or(SourceError::Missing, |event| {
+            SourceError::Malformed(format!("found {event}"))
+        })
+    }
+}
+
+impl<'e> Source<'e> for Player<'e> {
+    fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'e>, SourceError> {
+        match self.0.next() {
+            Some(Event::Scalar(value)) if value.builtin() == expected => Ok(value.scalar()),
+            other => Err(Self::wrong(other)),
+        }
+    }
+    fn packed_array(&mut self, expected: BuiltinType) -> Result<(usize, &'e [u8]), SourceError> {
+        match self.0.next() {
+            Some(Event::Packed(builtin, count, bytes)) if *builtin == expected => {
+                Ok((*count, bytes))
+            }
+            other => Err(Self::wrong(other)),
+        }
+    }
+    fn array(&mut self, expected: BuiltinType) -> Result<usize, SourceError> {
+        match self.0.next() {
+            Some(Event::Array(builtin, count)) if *builtin == expected => Ok(*count),
+            other => Err(Self::wrong(other)),
+        }
+    }
+    fn element(&mut self, expected: BuiltinType) -> Result<Scalar<'e>, SourceError> {
+        match self.0.next() {
+            Some(Event::Element(value)) if value.builtin() == expected => Ok(value.scalar()),
+            other => Err(Self::wrong(other)),
+        }
+    }
+    fn structures(&mut self) -> Result<usize, SourceError> {
+        match self.0.next() {
+            Some(Event::Structures(_, count)) => Ok(*count),
+            other => Err(Self::wrong(other)),
+        }
+    }
+    fn begin_structure(&mut self) -> Result<(), SourceError> {
+        match self.0.next() {
+            Some(Event::Begin(_)) => Ok(()),
+            other => Err(Self::wrong(other)),
+        }
+    }
+    fn end_structure(&mut self) -> Result<(), SourceError> {
+        match self.0.next() {
+            Some(Event::End) => Ok(()),
+            other => Err(Self::wrong(other)),
+        }
+    }
+    fn finish(&mut self) -> Result<(), SourceError> {
+        match self.0.len() {
+            0 => Ok(()),
+            left => Err(SourceError::LeftOver(left)),
+        }
+    }
+}

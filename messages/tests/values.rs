@@ -1,0 +1,344 @@
+//! Bytes that are read as documented, and values and bytes that do not fit.
+#![expect(clippy::unwrap_used, reason = "test code")]
+
+mod support;
+
+use std::sync::Arc;
+
+use messages::{
+    Dialect, Fault, MessageType, Plan, PlanError, ReadError, Registry, Selection, SourceError,
+    TypeName, Wire, WriteError, WriteFault,
+};
+use support::{Event, Player, Recorder, Value};
+use uadp::{BuiltinType, DateTime, Scalar};
+
+fn name(text: &str) -> TypeName {
+    text.parse().unwrap()
+}
+
+fn registry(dialect: Dialect, definitions: &[(&str, &str)]) -> Registry {
+    let mut registry = Registry::bundle(dialect);
+    for (name_text, text) in definitions {
+        registry.add(&name(name_text), text).unwrap();
+    }
+    registry
+}
+
+fn message(dialect: Dialect, text: &str) -> Arc<MessageType> {
+    registry(dialect, &[("t/T", text)])
+        .get(&name("t/T"))
+        .unwrap()
+}
+
+fn plan(dialect: Dialect, text: &str) -> Plan {
+    let wire = if dialect == Dialect::Ros1 {
+        Wire::Ros1
+    } else {
+        Wire::Cdr
+    };
+    Plan::compile(&message(dialect, text), &Selection::Whole, wire).unwrap()
+}
+
+fn read(plan: &Plan, payload: &[u8]) -> Result<Vec<String>, ReadError<()>> {
+    let mut recorder = Recorder::default();
+    plan.read(payload, &mut recorder)?;
+    Ok(recorder.events.iter().map(ToString::to_string).collect())
+}
+
+fn write(plan: &Plan, events: &[Event]) -> Result<Vec<u8>, WriteError> {
+    let mut out = Vec::new();
+    plan.write(&mut Player::new(events), &mut out)?;
+    Ok(out)
+}
+
+fn scalar(value: Scalar<'_>) -> Event {
+    Event::Scalar(Value::of(value))
+}
+
+#[test]
+fn an_array_of_messages_without_bytes_is_refused_on_ros_1_and_counted_in_cdr() {
+    let ros1 = message(Dialect::Ros1, "std_msgs/Empty[] nothings");
+    let error = Plan::compile(&ros1, &Selection::Whole, Wire::Ros1).unwrap_err();
+    assert_eq!(
+        error,
+        PlanError::EmptyElements {
+            name: name("std_msgs/Empty")
+        }
+    );
+    let ros2 = plan(Dialect::Ros2, "std_msgs/Empty[] nothings");
+    let events = read(&ros2, &[0, 1, 0, 0, 2, 0, 0, 0, 9, 9]).unwrap();
+    assert_eq!(
+        events,
+        [
+            "structures std_msgs/Empty 2",
+            "begin std_msgs/Empty",
+            "end",
+            "begin std_msgs/Empty",
+            "end"
+        ]
+    );
+}
+
+#[test]
+fn an_empty_message_is_no_byte_on_ros_1_and_one_in_cdr() {
+    assert_eq!(write(&plan(Dialect::Ros1, ""), &[]).unwrap(), []);
+    assert_eq!(
+        write(&plan(Dialect::Ros2, ""), &[]).unwrap(),
+        [0, 1, 0, 0, 0, 0, 0, 0]
+    );
+    assert_eq!(
+        read(&plan(Dialect::Ros2, ""), &[0, 1, 0, 0, 0]).unwrap(),
+        [""; 0]
+    );
+    assert!(read(&plan(Dialect::Ros2, ""), &[0, 1, 0, 0]).is_err());
+}
+
+#[test]
+fn the_sequence_number_of_a_header_is_skipped_and_written_as_zero() {
+    let plan = plan(Dialect::Ros1, "Header header\nbool last");
+    let payload = [7, 0, 0, 0, 1, 0, 0, 0, 200, 0, 0, 0, 1, 0, 0, 0, b'm', 2];
+    assert_eq!(
+        read(&plan, &payload).unwrap(),
+        [
+            "scalar DateTime 116444736010000002",
+            "scalar String m",
+            "scalar Boolean true"
+        ]
+    );
+    let mut recorder = Recorder::default();
+    plan.read(&payload, &mut recorder).unwrap();
+    assert_eq!(
+        write(&plan, &recorder.events).unwrap(),
+        [0, 0, 0, 0, 1, 0, 0, 0, 200, 0, 0, 0, 1, 0, 0, 0, b'm', 1]
+    );
+}
+
+#[test]
+fn booleans_of_an_array_become_zero_or_one() {
+    let plan = plan(Dialect::Ros1, "bool[3] flags");
+    assert_eq!(
+        read(&plan, &[0, 2, 255]).unwrap(),
+        ["packed Boolean 3 false true true"]
+    );
+    assert_eq!(
+        write(
+            &plan,
+            &[Event::Packed(BuiltinType::Boolean, 3, vec![0, 1, 9])]
+        )
+        .unwrap(),
+        [0, 1, 1]
+    );
+}
+
+#[test]
+fn a_wide_string_is_utf_16_in_words_of_four_bytes() {
+    let plan = plan(Dialect::Ros2, "int8 a\nwstring w\nint8 b");
+    let little = [
+        0, 1, 0, 0, 1, 0, 0, 0, 3, 0, 0, 0, 0xE9, 0, 0, 0, 0x3E, 0xD8, 0, 0, 0x16, 0xDD, 0, 0, 2,
+        0, 0, 0,
+    ];
+    assert_eq!(
+        read(&plan, &little).unwrap(),
+        ["scalar SByte 1", "scalar String é🤖", "scalar SByte 2"]
+    );
+    let mut recorder = Recorder::default();
+    plan.read(&little, &mut recorder).unwrap();
+    assert_eq!(write(&plan, &recorder.events).unwrap(), little);
+    let big = [0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0xE9, 2];
+    assert_eq!(
+        read(&plan, &big).unwrap(),
+        ["scalar SByte 1", "scalar String é", "scalar SByte 2"]
+    );
+    let alone = [0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0x3E, 0xD8, 0, 0, 2];
+    assert_eq!(fault(read(&plan, &alone)), Fault::Text);
+}
+
+fn fault(result: Result<Vec<String>, ReadError<()>>) -> Fault {
+    match result {
+        Err(ReadError::Malformed { fault, .. }) => fault,
+        other => unreachable!("{other:?}"),
+    }
+}
+
+#[test]
+fn texts_that_are_not_valid_are_refused() {
+    assert_eq!(
+        fault(read(&plan(Dialect::Ros1, "string s"), &[1, 0, 0, 0, 0xFF])),
+        Fault::Text
+    );
+    let cdr = plan(Dialect::Ros2, "string<=2 s");
+    assert_eq!(
+        fault(read(&cdr, &[0, 1, 0, 0, 1, 0, 0, 0, b'a'])),
+        Fault::Terminator
+    );
+    assert_eq!(
+        fault(read(&cdr, &[0, 1, 0, 0, 4, 0, 0, 0, b'a', b'b', b'c', 0])),
+        Fault::Bound { bound: 2, found: 3 }
+    );
+    assert_eq!(
+        read(&cdr, &[0, 1, 0, 0, 3, 0, 0, 0, b'a', b'b', 0]).unwrap(),
+        ["scalar String ab"]
+    );
+    assert_eq!(
+        read(&cdr, &[0, 1, 0, 0, 0, 0, 0, 0]).unwrap(),
+        ["scalar String "]
+    );
+    let bounded = plan(Dialect::Ros2, "int8[<=1] few");
+    assert_eq!(
+        fault(read(&bounded, &[0, 1, 0, 0, 2, 0, 0, 0, 1, 1])),
+        Fault::Bound { bound: 1, found: 2 }
+    );
+}
+
+#[test]
+fn a_cdr_of_another_representation_is_refused_by_its_number() {
+    let plan = plan(Dialect::Ros2, "int8 x");
+    for (identifier, low) in [(3, 3), (7, 7), (0x0A, 0x0A)] {
+        let error = ReadError::Malformed {
+            field: String::new(),
+            at: 0,
+            fault: Fault::Encapsulation(identifier),
+        };
+        assert_eq!(read(&plan, &[0, low, 0, 0, 1]), Err(error));
+    }
+    assert_eq!(fault(read(&plan, &[0, 1])), Fault::Truncated);
+}
+
+#[test]
+fn an_error_names_the_field_and_the_byte() {
+    let plan = plan(
+        Dialect::Ros2,
+        "geometry_msgs/Point[] points\nstd_msgs/String text",
+    );
+    let payload = [0, 1, 0, 0, 0, 0, 0, 0, 9, 0, 0, 0, b'a', 0];
+    assert_eq!(
+        read(&plan, &payload).unwrap_err().to_string(),
+        "field `text.data`: the message ends too early (byte 12)"
+    );
+}
+
+#[test]
+fn values_that_do_not_fit_are_refused_and_nothing_is_appended() {
+    let before_1970 = scalar(Scalar::DateTime(DateTime(116_444_735_999_999_999)));
+    let after_2106 = scalar(Scalar::DateTime(DateTime(200_000_000_000_000_000)));
+    let time = plan(Dialect::Ros1, "time t");
+    let duration = plan(Dialect::Ros1, "duration d");
+    let text = plan(Dialect::Ros2, "string s");
+    let fixed = plan(Dialect::Ros1, "float32[3] axes");
+    let bytes = plan(Dialect::Ros1, "uint8[2] id");
+    let cases = [
+        (&time, before_1970, WriteFault::Time),
+        (&time, after_2106, WriteFault::Time),
+        (
+            &duration,
+            scalar(Scalar::Double(f64::NAN)),
+            WriteFault::Duration,
+        ),
+        (
+            &duration,
+            scalar(Scalar::Double(2_147_483_648_000.0)),
+            WriteFault::Duration,
+        ),
+        (&text, scalar(Scalar::String(Some("a\0b"))), WriteFault::Nul),
+        (
+            &fixed,
+            Event::Packed(BuiltinType::Float, 2, vec![0; 8]),
+            WriteFault::Length {
+                expected: 3,
+                found: 2,
+            },
+        ),
+        (
+            &bytes,
+            scalar(Scalar::ByteString(Some(&[1]))),
+            WriteFault::Length {
+                expected: 2,
+                found: 1,
+            },
+        ),
+        (
+            &fixed,
+            Event::Packed(BuiltinType::Float, 3, vec![0; 8]),
+            WriteFault::Source(SourceError::Malformed("3 elements in 8 bytes".to_owned())),
+        ),
+    ];
+    for (plan, event, fault) in cases {
+        let mut out = vec![1, 2, 3];
+        let field = plan.leaves().first().unwrap().path.clone();
+        let done = plan.write(&mut Player::new(&[event]), &mut out);
+        assert_eq!(done, Err(WriteError { field, fault }));
+        assert_eq!(out, [1, 2, 3]);
+    }
+}
+
+#[test]
+fn a_field_too_few_or_too_many_is_refused() {
+    let plan = plan(Dialect::Ros1, "int8 a\nint8 b");
+    let one = scalar(Scalar::SByte(1));
+    let missing = WriteError {
+        field: "b".to_owned(),
+        fault: WriteFault::Source(SourceError::Missing),
+    };
+    assert_eq!(write(&plan, std::slice::from_ref(&one)), Err(missing));
+    let left = WriteError {
+        field: String::new(),
+        fault: WriteFault::Source(SourceError::LeftOver(1)),
+    };
+    assert_eq!(write(&plan, &[one.clone(), one.clone(), one]), Err(left));
+}
+
+#[test]
+fn the_null_time_and_null_texts_are_zero_and_empty() {
+    let plan = plan(Dialect::Ros1, "time t\nstring s");
+    let events = [
+        scalar(Scalar::DateTime(DateTime(0))),
+        scalar(Scalar::String(None)),
+    ];
+    assert_eq!(write(&plan, &events).unwrap(), [0; 12]);
+}
+
+#[test]
+fn messages_within_elements_are_inline_and_their_arrays_counted() {
+    let registry = registry(
+        Dialect::Ros1,
+        &[
+            ("t/Row", "uint8 id\nPair[] pairs"),
+            ("t/Pair", "int8 a\nstd_msgs/Int8 b"),
+            ("t/T", "Row[] rows"),
+        ],
+    );
+    let plan = Plan::compile(
+        &registry.get(&name("t/T")).unwrap(),
+        &Selection::Whole,
+        Wire::Ros1,
+    )
+    .unwrap();
+    let payload = [1, 0, 0, 0, 5, 2, 0, 0, 0, 1, 2, 3, 4];
+    let wanted = [
+        "structures t/Row 1",
+        "begin t/Row",
+        "scalar Byte 5",
+        "array ExtensionObject 2",
+        "scalar SByte 1",
+        "scalar SByte 2",
+        "scalar SByte 3",
+        "scalar SByte 4",
+        "end",
+    ];
+    assert_eq!(read(&plan, &payload).unwrap(), wanted);
+}
+
+#[test]
+fn a_ros_2_time_as_a_topic_is_one_date_time() {
+    let registry = Registry::bundle(Dialect::Ros2);
+    let time = registry
+        .standard_type(BuiltinType::DateTime, false)
+        .unwrap();
+    let plan = Plan::compile(&registry.get(&time).unwrap(), &Selection::Whole, Wire::Cdr).unwrap();
+    let payload = [0, 1, 0, 0, 0xFF, 0xFF, 0xFF, 0xFF, 0, 0, 0, 0];
+    assert_eq!(
+        read(&plan, &payload).unwrap(),
+        ["scalar DateTime 116444735990000000"]
+    );
+    assert_eq!(plan.leaves().first().unwrap().path, "data");
+}

@@ -1,0 +1,314 @@
+//! Which nodes the address space has: decided from the mapping before the server is built.
+
+use std::collections::{BTreeMap, HashSet};
+
+use mappings::{Mapping, NodeIdText, SpaceId, TopicId, Variable};
+use messages::Rank;
+use opcua::types::{ByteString, DataTypeId, Identifier, NodeId, Variant, VariantTypeId};
+use uadp::BuiltinType;
+
+/// The nodes of the mapped topics and the namespaces they are in.
+#[derive(Debug)]
+pub(crate) struct Layout {
+    /// The NamespaceArray: index 0 is OPC UA's, index 1 the application's (OPC 10000-5, 6.3.1).
+    pub(crate) namespaces: Vec<String>,
+    pub(crate) topics: Vec<TopicNode>,
+}
+
+/// The nodes of one topic.
+#[derive(Debug, Clone)]
+pub(crate) struct TopicNode {
+    pub(crate) topic: TopicId,
+    pub(crate) node: NodeId,
+    pub(crate) name: String,
+    /// One for each field of the DataSet. The only field of a topic that is one value has the topic's own node.
+    pub(crate) fields: Vec<FieldNode>,
+    /// The fields are component variables of the topic's variable, which has them all as a Variant array.
+    pub(crate) compound: bool,
+}
+
+/// The node of one field of a DataSet.
+#[derive(Debug, Clone)]
+pub(crate) struct FieldNode {
+    pub(crate) node: NodeId,
+    pub(crate) name: String,
+    pub(crate) shape: Shape,
+}
+
+/// What values a variable takes; nothing is known of those a mapping leaves open.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Shape(pub(crate) Option<(BuiltinType, bool)>);
+
+/// Why a mapping cannot be served as it is written.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(crate) enum LayoutError {
+    #[error(
+        "namespace index {index} is to be {wanted}, but in this server it is {actual}; \
+         give {wanted} another index in the mapping"
+    )]
+    Index { index: u16, wanted: String, actual: String },
+    #[error("namespace {uri} is to have the indexes {first} and {second}: a server has a URI once")]
+    Twice { uri: String, first: u16, second: u16 },
+    #[error("the node {node} of {topic} is in namespace {index}, which the mapping gives no URI")]
+    NoUri { topic: TopicId, node: NodeId, index: u16 },
+    #[error("the node {node} of {topic} is the node of another variable already")]
+    Duplicate { topic: TopicId, node: NodeId },
+    #[error("namespace index {0} is higher than a server with {MOST_NAMESPACES} namespaces has")]
+    TooHigh(u16),
+}
+
+impl Layout {
+    /// The nodes of `mapping`.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new).
+    pub(crate) fn of(mapping: &Mapping) -> Result<Self, LayoutError> {
+        let topics = mapping.variables().iter().map(TopicNode::of).collect();
+        Self::new(&mapping.server().application_uri, mapping.namespaces(), topics)
+    }
+
+    /// Gives every namespace its index and checks that the nodes can be there together.
+    ///
+    /// Indexes that the mapping skips are filled, since the NamespaceArray has no holes.
+    ///
+    /// # Errors
+    /// An index that cannot be had, or a node that cannot.
+    pub(crate) fn new(
+        application_uri: &str,
+        wanted: &BTreeMap<u16, String>,
+        topics: Vec<TopicNode>,
+    ) -> Result<Self, LayoutError> {
+        let layout = Self { namespaces: namespace_array(application_uri, wanted)?, topics };
+        let mut taken = HashSet::new();
+        for topic in &layout.topics {
+            let known = usize::from(topic.node.namespace) < layout.namespaces.len();
+            if topic.node.namespace == 0 || !known {
+                return Err(LayoutError::NoUri {
+                    topic: topic.topic,
+                    node: topic.node.clone(),
+                    index: topic.node.namespace,
+                });
+            }
+            for node in topic.nodes() {
+                if !taken.insert(node.clone()) {
+                    return Err(LayoutError::Duplicate { topic: topic.topic, node: node.clone() });
+                }
+            }
+        }
+        Ok(layout)
+    }
+}
+
+fn namespace_array(
+    application_uri: &str,
+    wanted: &BTreeMap<u16, String>,
+) -> Result<Vec<String>, LayoutError> {
+    let fixed = [OPC_UA_URI, application_uri];
+    let highest = wanted.keys().next_back().copied().unwrap_or_default().max(1);
+    if highest >= MOST_NAMESPACES {
+        return Err(LayoutError::TooHigh(highest));
+    }
+    let mut array = Vec::new();
+    for index in 0..=highest {
+        let uri = match (fixed.get(usize::from(index)), wanted.get(&index)) {
+            (Some(actual), Some(wanted)) if wanted != actual => {
+                return Err(LayoutError::Index {
+                    index,
+                    wanted: wanted.clone(),
+                    actual: (*actual).to_owned(),
+                });
+            }
+            (Some(actual), _) => (*actual).to_owned(),
+            (None, Some(wanted)) => wanted.clone(),
+            (None, None) => format!("urn:ua-bridge:unused:{index}"),
+        };
+        if let Some(first) = array.iter().position(|earlier| *earlier == uri) {
+            let first = u16::try_from(first).unwrap_or(u16::MAX);
+            return Err(LayoutError::Twice { uri, first, second: index });
+        }
+        array.push(uri);
+    }
+    Ok(array)
+}
+
+impl TopicNode {
+    fn of(variable: &Variable) -> Self {
+        let leaves = variable.fields.iter().map(|leaf| {
+            let array = match leaf.rank {
+                Rank::Scalar => false,
+                Rank::Array { .. } => true,
+            };
+            (leaf.path.clone(), Shape(Some((leaf.builtin, array))))
+        });
+        let fields = match variable.value_type {
+            Some(shape) => vec![(variable.name.clone(), Shape(Some(shape)))],
+            None => leaves.collect(),
+        };
+        Self::new(variable.topic, node_id(&variable.node), variable.name.clone(), fields)
+    }
+
+    /// A topic whose DataSet has `fields`, in order: the path of each in the message, and its shape. None or one is
+    /// a topic that is one value.
+    pub(crate) fn new(topic: TopicId, node: NodeId, name: String, fields: Vec<(String, Shape)>) -> Self {
+        let compound = fields.len() > 1;
+        let fields = if compound {
+            fields
+                .into_iter()
+                .map(|(path, shape)| FieldNode { node: component(&node, &path), name: path, shape })
+                .collect()
+        } else {
+            let shape = fields.first().map_or(Shape(None), |(_, shape)| *shape);
+            vec![FieldNode { node: node.clone(), name: name.clone(), shape }]
+        };
+        Self { topic, node, name, fields, compound }
+    }
+
+    /// Clients may write what the OPC UA side produces.
+    pub(crate) fn writable(&self) -> bool {
+        self.topic.space == SpaceId::UA
+    }
+
+    /// Every node of the topic, its own first.
+    pub(crate) fn nodes(&self) -> impl Iterator<Item = &NodeId> {
+        let components = if self.compound { self.fields.as_slice() } else { &[] };
+        std::iter::once(&self.node).chain(components.iter().map(|field| &field.node))
+    }
+}
+
+fn node_id(text: &NodeIdText) -> NodeId {
+    let identifier = match &text.identifier {
+        mappings::Identifier::Numeric(number) => Identifier::Numeric(*number),
+        mappings::Identifier::String(text) => Identifier::String(text.as_str().into()),
+        // The mapping has checked the two texts.
+        mappings::Identifier::Guid(text) => Identifier::Guid(text.parse().unwrap_or_default()),
+        mappings::Identifier::Opaque(text) => {
+            Identifier::ByteString(ByteString::from_base64(text).unwrap_or_default())
+        }
+    };
+    NodeId { namespace: text.namespace, identifier }
+}
+
+fn component(parent: &NodeId, path: &str) -> NodeId {
+    let identifier = match &parent.identifier {
+        Identifier::Numeric(number) => number.to_string(),
+        Identifier::String(text) => text.to_string(),
+        Identifier::Guid(guid) => guid.to_string(),
+        Identifier::ByteString(bytes) => bytes.as_base64(),
+    };
+    NodeId::new(parent.namespace, format!("{identifier}.{path}"))
+}
+
+impl Shape {
+    /// The DataType attribute: the builtin types have the numbers of their encoding ids (OPC 10000-6, 5.1.2).
+    pub(crate) fn data_type(self) -> NodeId {
+        match self.0 {
+            Some((builtin, _)) => NodeId::new(0, u32::from(builtin.id())),
+            None => DataTypeId::BaseDataType.into(),
+        }
+    }
+
+    /// The ValueRank attribute: -1 scalar, 1 array of one dimension, -2 any (OPC 10000-3, 8.6).
+    pub(crate) fn value_rank(self) -> i32 {
+        match self.0 {
+            Some((_, false)) => -1,
+            Some((_, true)) => 1,
+            None => -2,
+        }
+    }
+
+    /// Whether a variable of this shape may have this value.
+    pub(crate) fn accepts(self, value: &Variant) -> bool {
+        let Some((builtin, array)) = self.0 else {
+            return true;
+        };
+        match value.type_id() {
+            VariantTypeId::Empty => false,
+            VariantTypeId::Scalar(scalar) => !array && scalar.encoding_mask() == builtin.id(),
+            VariantTypeId::Array(element, dimensions) => {
+                array && dimensions.is_none_or(|d| d.len() == 1) && element.encoding_mask() == builtin.id()
+            }
+        }
+    }
+}
+
+pub(crate) const OPC_UA_URI: &str = "http://opcfoundation.org/UA/";
+/// A mapping with a higher index is a slip of the keyboard, not a server.
+const MOST_NAMESPACES: u16 = 1_000;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn topic(space: u16, namespace: u16, identifier: u16) -> TopicNode {
+        TopicNode::new(
+            TopicId::new(space, namespace, identifier).unwrap(),
+            NodeId::new(namespace, u32::from(identifier)),
+            "x".to_owned(),
+            vec![("data".to_owned(), Shape(Some((BuiltinType::Double, false))))],
+        )
+    }
+
+    fn uris(pairs: &[(u16, &str)]) -> BTreeMap<u16, String> {
+        pairs.iter().map(|(index, uri)| (*index, (*uri).to_owned())).collect()
+    }
+
+    #[test]
+    fn each_uri_has_the_index_of_the_mapping() {
+        let layout = Layout::new("urn:app", &uris(&[(2, "urn:two"), (5, "urn:five")]), vec![topic(1, 5, 10)]).unwrap();
+        assert_eq!(layout.namespaces.len(), 6);
+        assert_eq!(layout.namespaces[0], OPC_UA_URI);
+        assert_eq!(layout.namespaces[1], "urn:app");
+        assert_eq!(layout.namespaces[2], "urn:two");
+        assert_eq!(layout.namespaces[5], "urn:five");
+    }
+
+    #[test]
+    fn an_index_that_cannot_be_had_is_refused_with_both_uris() {
+        let error = Layout::new("urn:app", &uris(&[(1, "urn:mine")]), vec![]).unwrap_err();
+        let message = error.to_string();
+        assert!(message.contains("urn:mine") && message.contains("urn:app"), "{message}");
+        assert!(Layout::new("urn:app", &uris(&[(1, "urn:app")]), vec![]).is_ok());
+    }
+
+    #[test]
+    fn a_uri_with_two_indexes_is_refused() {
+        let error = Layout::new("urn:app", &uris(&[(2, "urn:x"), (4, "urn:x")]), vec![]).unwrap_err();
+        assert_eq!(error, LayoutError::Twice { uri: "urn:x".to_owned(), first: 2, second: 4 });
+    }
+
+    #[test]
+    fn a_node_in_a_namespace_without_uri_and_a_node_twice_are_refused() {
+        let none = Layout::new("urn:app", &uris(&[]), vec![topic(1, 5, 10)]).unwrap_err();
+        assert!(matches!(none, LayoutError::NoUri { index: 5, .. }), "{none}");
+        let twice = Layout::new("urn:app", &uris(&[(5, "urn:x")]), vec![topic(1, 5, 10), topic(2, 5, 10)]).unwrap_err();
+        assert!(matches!(twice, LayoutError::Duplicate { .. }), "{twice}");
+    }
+
+    #[test]
+    fn the_fields_of_a_message_are_components_named_by_their_path() {
+        let fields = [("pose.x", BuiltinType::Double), ("name", BuiltinType::String)]
+            .map(|(path, builtin)| (path.to_owned(), Shape(Some((builtin, false)))));
+        let topic = TopicNode::new(
+            TopicId::new(1, 5, 10).unwrap(),
+            NodeId::new(5, 10),
+            "pose".to_owned(),
+            fields.to_vec(),
+        );
+        let nodes: Vec<String> = topic.nodes().map(ToString::to_string).collect();
+        assert_eq!(nodes, ["ns=5;i=10", "ns=5;s=10.pose.x", "ns=5;s=10.name"]);
+    }
+
+    #[test]
+    fn a_shape_accepts_its_own_type_and_rank_only() {
+        let scalar = Shape(Some((BuiltinType::Int32, false)));
+        let array = Shape(Some((BuiltinType::Int32, true)));
+        assert!(scalar.accepts(&Variant::from(1i32)));
+        assert!(!scalar.accepts(&Variant::from(true)));
+        assert!(!scalar.accepts(&Variant::from(vec![1i32])));
+        assert!(!scalar.accepts(&Variant::Empty));
+        assert!(array.accepts(&Variant::from(vec![1i32])));
+        assert!(!array.accepts(&Variant::from(vec![1.0f64])));
+        assert!(!array.accepts(&Variant::from(1i32)));
+        assert!(Shape(None).accepts(&Variant::from("anything")));
+    }
+}

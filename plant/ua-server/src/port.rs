@@ -1,0 +1,220 @@
+//! The server as the local side of the bridge shell.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge_node::{Delivery, Failure, FailureKind, Port, PortEvent};
+use mappings::{Mapping, SpaceId, TopicId};
+use opcua::server::ServerHandle;
+use opcua::server::address_space::AddressSpace;
+use opcua::server::node_manager::memory::{
+    CoreNodeManagerBuilder, InMemoryNodeManagerBuilder, InMemoryNodeManagerImplBuilder,
+};
+use opcua::server::node_manager::ServerContext;
+use tokio::runtime::Runtime;
+use tokio::sync::mpsc;
+use tokio::task::JoinHandle;
+use tokio::time::{Interval, MissedTickBehavior};
+use tracing::{info, warn};
+use uadp::BuiltinType;
+
+use crate::endpoint::{self, EndpointUrl};
+use crate::layout::Layout;
+use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
+use crate::pki::Pki;
+use crate::space::Space;
+
+/// What [`ServerPort::start`] needs besides the mapping.
+pub(crate) struct Setup {
+    pub(crate) url: EndpointUrl,
+    pub(crate) pki: Pki,
+    pub(crate) trust_any_client: bool,
+}
+
+/// The OPC UA side of the space.
+pub(crate) struct ServerPort {
+    space: Space,
+    handle: ServerHandle,
+    /// The server's own threads: signing for a client takes longer than a value should wait. Taken at the end.
+    runtime: Option<Runtime>,
+    serving: Option<JoinHandle<Result<(), String>>>,
+    writes: mpsc::Receiver<ClientWrite>,
+    /// The topics clients can write, not yet said to have a producer.
+    live: VecDeque<TopicId>,
+    pki: Pki,
+    look: Interval,
+}
+
+impl ServerPort {
+    /// Builds the address space of `mapping` and listens.
+    ///
+    /// # Errors
+    /// A mapping that cannot be served, an address that cannot be listened on, a certificate store that cannot be
+    /// used.
+    pub(crate) fn start(mapping: &Mapping, setup: Setup) -> Result<Self, Failure> {
+        let unavailable = |error: String| Failure::new(FailureKind::Unavailable, error);
+        let configuration = |error: String| Failure::new(FailureKind::Configuration, error);
+        let io = |error: String| Failure::new(FailureKind::Io, error);
+
+        let layout = Layout::of(mapping).map_err(|error| configuration(error.to_string()))?;
+        let described = mapping.server();
+        setup
+            .pki
+            .ensure_own(&described.application_uri, &setup.url.advertised_host())
+            .map_err(|error| io(error.to_string()))?;
+        let listener = setup.url.bind().map_err(|error| unavailable(error.to_string()))?;
+        let port = listener.local_addr().map_err(|error| io(error.to_string()))?.port();
+
+        let (writes_in, writes) = mpsc::channel(MOST_WRITES);
+        let (created, created_items) = mpsc::channel(MOST_CREATED);
+        let exits = Exits { writes: writes_in, created };
+        if setup.trust_any_client {
+            warn!("every client certificate is trusted, and kept as trusted: for tests only");
+        }
+        let nodes = NodesBuilder { layout: Arc::new(layout), exits };
+        let layout = Arc::clone(&nodes.layout);
+        let (server, handle) = endpoint::server(described, &setup.url, port)
+            .pki_dir(setup.pki.root())
+            .trust_client_certs(setup.trust_any_client)
+            .with_node_manager(InMemoryNodeManagerBuilder::new(CoreNodeManagerBuilder))
+            .with_node_manager(InMemoryNodeManagerBuilder::new(nodes))
+            .build()
+            .map_err(configuration)?;
+        let manager = handle
+            .node_managers()
+            .get_of_type::<SpaceManager>()
+            .ok_or_else(|| configuration("the server has no node manager for the space".to_owned()))?;
+        check_namespaces(&layout, &manager).map_err(configuration)?;
+
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(SERVER_THREADS)
+            .thread_name("opcua")
+            .enable_all()
+            .build()
+            .map_err(|error| io(format!("cannot start the server's threads: {error}")))?;
+        let listener = {
+            let _inside = runtime.enter();
+            tokio::net::TcpListener::from_std(listener).map_err(|error| io(error.to_string()))?
+        };
+        let serving = runtime.spawn(server.run_with(listener));
+        let subscriptions = Arc::clone(handle.subscriptions());
+        drop(runtime.spawn(look_again(Arc::clone(&manager), Arc::clone(&subscriptions), created_items)));
+        info!(
+            topics = layout.topics.len(),
+            pki = %setup.pki.root().display(),
+            "serving at {} (port {port})",
+            setup.url
+        );
+        let mut look = tokio::time::interval(LOOK_AT_REJECTED);
+        look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        Ok(Self {
+            space: Space::new(&layout, manager, subscriptions),
+            handle,
+            runtime: Some(runtime),
+            serving: Some(serving),
+            writes,
+            live: layout.topics.iter().map(|node| node.topic).filter(|topic| topic.space == SpaceId::UA).collect(),
+            pki: setup.pki,
+            look,
+        })
+    }
+}
+
+impl Port for ServerPort {
+    async fn recv(&mut self) -> PortEvent {
+        if let Some(topic) = self.live.pop_front() {
+            return PortEvent::Live { topic, live: true };
+        }
+        loop {
+            tokio::select! {
+                Some(write) = self.writes.recv() => {
+                    let ClientWrite { topic, block, source } = write;
+                    return PortEvent::Sample { topic, payload: block, received: source };
+                }
+                ended = ended(&mut self.serving) => return PortEvent::Ended(ended),
+                _ = self.look.tick() => self.pki.report_rejected(),
+            }
+        }
+    }
+
+    fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
+        self.space.update(sample.topic, &sample.payload, (sample.source, sample.status))
+    }
+
+    fn wanted(&mut self, _topic: TopicId, _shape: &[(BuiltinType, bool)]) {
+        // Values of every type have a node.
+    }
+
+    fn silent(&mut self, topic: TopicId, silent: bool) {
+        self.space.set_silent(topic, silent);
+    }
+
+    async fn shutdown(mut self) {
+        self.handle.cancel();
+        if let Some(serving) = &mut self.serving
+            && tokio::time::timeout(SHUTDOWN, serving).await.is_err()
+        {
+            warn!("clients kept their connections; they are dropped");
+        }
+        if let Some(runtime) = self.runtime.take() {
+            runtime.shutdown_background();
+        }
+    }
+}
+
+impl Drop for ServerPort {
+    fn drop(&mut self) {
+        if let Some(runtime) = self.runtime.take() {
+            // A runtime may not be waited for inside another one.
+            runtime.shutdown_background();
+        }
+    }
+}
+
+/// Ready, once, when the server has ended by itself.
+async fn ended(serving: &mut Option<JoinHandle<Result<(), String>>>) -> String {
+    let Some(running) = serving else {
+        return std::future::pending().await;
+    };
+    let result = running.await;
+    *serving = None;
+    match result {
+        Ok(Ok(())) => "the OPC UA server has ended".to_owned(),
+        Ok(Err(error)) => format!("the OPC UA server has ended: {error}"),
+        Err(error) => format!("the OPC UA server has ended: {error}"),
+    }
+}
+
+struct NodesBuilder {
+    layout: Arc<Layout>,
+    exits: Exits,
+}
+
+impl InMemoryNodeManagerImplBuilder for NodesBuilder {
+    type Impl = SpaceNodes;
+
+    fn build(self, context: ServerContext, address_space: &mut AddressSpace) -> SpaceNodes {
+        SpaceNodes::build(&self.layout, self.exits, &context, address_space)
+    }
+}
+
+/// Holds the server to the indexes of the mapping: it hands them out itself.
+fn check_namespaces(layout: &Layout, manager: &SpaceManager) -> Result<(), String> {
+    let wanted = layout.namespaces.iter().skip(1);
+    for ((index, uri), (expected, wanted)) in manager.inner().served_namespaces().zip((1u16..).zip(wanted)) {
+        if index != expected || uri != wanted {
+            return Err(format!("namespace {wanted} is to have index {expected}, but in this server it has {index}"));
+        }
+    }
+    Ok(())
+}
+
+const SERVER_THREADS: usize = 2;
+/// How many values clients wrote wait for the run loop; a client is refused when that many do.
+const MOST_WRITES: usize = 1_024;
+/// How many monitored items wait for their second look.
+const MOST_CREATED: usize = 10_000;
+const LOOK_AT_REJECTED: Duration = Duration::from_secs(1);
+/// Within the 2 s a port has to end.
+const SHUTDOWN: Duration = Duration::from_millis(1_500);

@@ -1,0 +1,177 @@
+//! The values of the other spaces, as they come, into the address space.
+
+use std::collections::HashMap;
+use std::sync::Arc;
+
+use mappings::TopicId;
+use opcua::server::SubscriptionCache;
+use opcua::types::{Array, DateTime, StatusCode, Variant, VariantScalarTypeId};
+use uadp::{Fields, Timestamp};
+
+use crate::layout::{Layout, Shape, TopicNode};
+use crate::nodes::{self, SpaceManager, Stamp, Stored};
+use crate::value;
+
+/// The writing end of the address space for values that come from the space.
+pub(crate) struct Space {
+    manager: Arc<SpaceManager>,
+    subscriptions: Arc<SubscriptionCache>,
+    topics: HashMap<TopicId, Known>,
+    unmapped: usize,
+}
+
+/// A topic of another space, and what was last heard of it.
+struct Known {
+    node: TopicNode,
+    mapped: bool,
+    /// The last sample's fields and stamp.
+    last: Option<(Vec<Variant>, Stamp)>,
+    silent: bool,
+    /// The statuses of the nodes as they are in the address space.
+    statuses: Vec<StatusCode>,
+}
+
+impl Space {
+    pub(crate) fn new(layout: &Layout, manager: Arc<SpaceManager>, subscriptions: Arc<SubscriptionCache>) -> Self {
+        let topics = layout.topics.iter().map(|node| (node.topic, Known::new(node.clone(), true))).collect();
+        Self { manager, subscriptions, topics, unmapped: 0 }
+    }
+
+    /// Takes in a sample: the fields of its DataSet as a key frame carries them.
+    ///
+    /// # Errors
+    /// Why it is not shown: fields that are malformed or not those of the mapping, or too many unmapped topics.
+    pub(crate) fn update(
+        &mut self,
+        topic: TopicId,
+        block: &[u8],
+        (source, status): (Option<Timestamp>, u16),
+    ) -> Result<(), &'static str> {
+        let fields = Fields::parse(block)
+            .and_then(|fields| fields.map(|field| Ok(value::from_field(&field?))).collect::<Result<Vec<_>, _>>())
+            .map_err(|_| "malformed fields")?;
+        if !self.topics.contains_key(&topic) {
+            self.add_unmapped(topic, &fields)?;
+        }
+        let Some(known) = self.topics.get_mut(&topic) else {
+            return Err("unknown topic");
+        };
+        let fields = known.fit(fields)?;
+        if !known.mapped {
+            known.retype(&fields, &self.manager);
+        }
+        let stamp = Stamp {
+            status: StatusCode::from(uadp::StatusCode::from_status(status).0),
+            source,
+            server: DateTime::now(),
+        };
+        known.silent = false;
+        known.last = Some((fields.clone(), stamp));
+        let values = known.stored(fields, stamp);
+        self.manager.inner().store(self.manager.address_space(), &self.subscriptions, values);
+        Ok(())
+    }
+
+    /// Marks the last value of a topic as no longer kept up, or as kept up again. The value and its source timestamp
+    /// stay (OPC 10000-8, 6.3.2); a topic that never had one goes on waiting.
+    pub(crate) fn set_silent(&mut self, topic: TopicId, silent: bool) {
+        let Some(known) = self.topics.get_mut(&topic) else {
+            return;
+        };
+        if known.silent == silent {
+            return;
+        }
+        known.silent = silent;
+        let Some((fields, stamp)) = known.last.clone() else {
+            return;
+        };
+        let status = if silent { StatusCode::UncertainLastUsableValue } else { stamp.status };
+        let values = known.stored(fields, Stamp { status, server: DateTime::now(), ..stamp });
+        self.manager.inner().store(self.manager.address_space(), &self.subscriptions, values);
+    }
+
+    /// A topic nobody mapped gets a node of its own when its first value comes.
+    fn add_unmapped(&mut self, topic: TopicId, fields: &[Variant]) -> Result<(), &'static str> {
+        if self.unmapped >= MOST_UNMAPPED {
+            return Err("too many unmapped topics");
+        }
+        self.unmapped += 1;
+        let name = topic.to_string();
+        let shape = match fields {
+            [only] => shape_of(only),
+            _ => Shape(None),
+        };
+        let node = TopicNode::new(topic, nodes::unmapped_node(topic), name.clone(), vec![(name, shape)]);
+        nodes::add_topic(&mut self.manager.address_space().write(), &node, &nodes::unmapped_folder());
+        self.topics.insert(topic, Known::new(node, false));
+        Ok(())
+    }
+}
+
+impl Known {
+    fn new(node: TopicNode, mapped: bool) -> Self {
+        Self { node, mapped, last: None, silent: false, statuses: Vec::new() }
+    }
+
+    /// The fields as the topic's nodes take them. A topic of which nothing is known beforehand takes several as one
+    /// Variant array.
+    fn fit(&self, mut fields: Vec<Variant>) -> Result<Vec<Variant>, &'static str> {
+        let open = !self.mapped || matches!(self.node.fields.as_slice(), [field] if field.shape == Shape(None));
+        if open && fields.len() != 1 {
+            let values = fields.drain(..).map(|field| Variant::Variant(Box::new(field))).collect();
+            let array = Array { value_type: VariantScalarTypeId::Variant, values, dimensions: None };
+            fields.push(Variant::Array(Box::new(array)));
+        }
+        if open {
+            return Ok(fields);
+        }
+        if fields.len() != self.node.fields.len() {
+            return Err("other fields than mapped");
+        }
+        let fits = self.node.fields.iter().zip(&fields).all(|(field, value)| {
+            let in_place_of_a_value = matches!(value, Variant::Empty | Variant::StatusCode(_));
+            in_place_of_a_value || field.shape.accepts(value)
+        });
+        if fits { Ok(fields) } else { Err("another type than mapped") }
+    }
+
+    /// The node of an unmapped topic has the type of what came last.
+    fn retype(&mut self, fields: &[Variant], manager: &SpaceManager) {
+        let (Some(field), [value]) = (self.node.fields.first_mut(), fields) else {
+            return;
+        };
+        let shape = shape_of(value);
+        if shape != field.shape {
+            field.shape = shape;
+            nodes::retype(&mut manager.address_space().write(), &field.node, shape);
+        }
+    }
+
+    /// The values of the topic's nodes, with those marked whose status changes.
+    fn stored(&mut self, fields: Vec<Variant>, stamp: Stamp) -> Vec<Stored> {
+        let values = nodes::topic_values(&self.node, fields, stamp);
+        let before = std::mem::take(&mut self.statuses);
+        self.statuses = values.iter().map(|(_, value)| value.status()).collect();
+        values
+            .into_iter()
+            .enumerate()
+            .map(|(at, (node, value))| {
+                let flipped = before.get(at).is_some_and(|status| *status != value.status());
+                Stored { node, value, flipped }
+            })
+            .collect()
+    }
+}
+
+fn shape_of(value: &Variant) -> Shape {
+    use opcua::types::VariantTypeId;
+    let (scalar, array) = match value.type_id() {
+        VariantTypeId::Empty => return Shape(None),
+        VariantTypeId::Scalar(scalar) => (scalar, false),
+        VariantTypeId::Array(scalar, _) => (scalar, true),
+    };
+    Shape(uadp::BuiltinType::from_id(scalar.encoding_mask()).map(|builtin| (builtin, array)))
+}
+
+/// How many topics without a mapping are shown. Anyone who reaches the group can make them up.
+const MOST_UNMAPPED: usize = 1_000;

@@ -1,0 +1,436 @@
+//! One UDP socket for a multicast group or a unicast address.
+
+use std::io;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+
+use socket2::{Domain, Protocol, Socket, Type};
+use tokio::net::UdpSocket;
+use tracing::info;
+
+use crate::interface::{Interface, InterfaceError};
+
+/// A UDP socket that hears and sends the datagrams of one PubSub connection.
+#[derive(Debug)]
+pub struct Udp {
+    receiver: UdpSocket,
+    /// Sends from a port of its own, so that several processes of one host share the group's port and still tell
+    /// each other apart by the source address.
+    sender: UdpSocket,
+    targets: Vec<SocketAddr>,
+    local: SocketAddr,
+}
+
+/// Where to listen and send, and how.
+#[derive(Debug, Clone)]
+pub struct Options {
+    /// A multicast group, or a unicast address to listen at, with its port.
+    pub address: SocketAddr,
+    /// The interface to join and send on, by name or address. `None`: the system's choice.
+    pub interface: Option<String>,
+    /// Routers a multicast datagram may pass; 1 stays in the subnet, 0 in this host.
+    pub ttl: u32,
+    /// Whether other processes of this host hear what is sent to the group.
+    pub loopback: bool,
+    /// Bytes the kernel may hold for us; the system may grant less, which is logged.
+    pub receive_buffer: usize,
+    /// Unicast addresses to send to instead of `address`, where multicast cannot be had.
+    pub peers: Vec<SocketAddr>,
+}
+
+/// Why a socket could not be made.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum OpenError {
+    /// The interface asked for is not here.
+    #[error(transparent)]
+    Interface(#[from] InterfaceError),
+    /// IPv6 groups are not supported.
+    #[error("{0}: IPv6 is not supported, give an IPv4 address")]
+    Ipv6(SocketAddr),
+    /// Another program holds the port and does not share it.
+    #[error(
+        "UDP port {} is taken by a program that does not share it (find it with `ss -ulpn`); end it or give another port",
+        .0.port()
+    )]
+    PortTaken(SocketAddr),
+    /// The group could not be joined.
+    #[error(
+        "cannot join {group} on {interface}: {source}; is the interface up, with multicast on?"
+    )]
+    Join {
+        /// The multicast group.
+        group: Ipv4Addr,
+        /// The interface as it was to be used.
+        interface: String,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// Anything else the system refused.
+    #[error("cannot {what} for {address}: {source}")]
+    Socket {
+        /// What was being done.
+        what: &'static str,
+        /// The address it was done for.
+        address: SocketAddr,
+        /// What the system said.
+        source: io::Error,
+    },
+}
+
+/// Why a datagram was not sent. None of these ends the socket: the next datagram may go.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, thiserror::Error)]
+#[non_exhaustive]
+pub enum SendError {
+    /// The kernel's send buffer is full.
+    #[error("the send buffer is full")]
+    Busy,
+    /// Larger than a UDP datagram may be.
+    #[error("larger than a UDP datagram")]
+    TooBig,
+    /// No route, interface down, or a unicast peer that refused.
+    #[error("the network is unreachable")]
+    Unreachable,
+    /// The system gave another error.
+    #[error("the system refused the datagram")]
+    Refused,
+}
+
+impl Options {
+    /// The usual options for `address`: TTL 1, heard by this host too, 4 MiB receive buffer, no peers.
+    #[must_use]
+    pub const fn new(address: SocketAddr) -> Self {
+        Self {
+            address,
+            interface: None,
+            ttl: 1,
+            loopback: true,
+            receive_buffer: 4 << 20,
+            peers: Vec::new(),
+        }
+    }
+}
+
+impl Udp {
+    /// Opens the socket, joins the group when the address is one, and logs group and interface.
+    ///
+    /// Must be called within a tokio runtime.
+    ///
+    /// # Errors
+    /// [`OpenError`] names the interface, port or group that is at fault.
+    pub fn open(options: &Options) -> Result<Self, OpenError> {
+        let address = options.address;
+        let IpAddr::V4(ip) = address.ip() else {
+            return Err(OpenError::Ipv6(address));
+        };
+        let interface = options
+            .interface
+            .as_deref()
+            .map(Interface::find)
+            .transpose()?;
+        let receiver = receiver(options, ip, interface.as_ref())?;
+        let sender = sender(options, interface.as_ref())?;
+        let shown = interface
+            .as_ref()
+            .map_or_else(|| "the default interface".to_owned(), ToString::to_string);
+        if ip.is_multicast() {
+            info!(group = %address, interface = %shown, ttl = options.ttl, "joined the multicast group");
+        } else {
+            info!(address = %address, interface = %shown, "listening for unicast datagrams");
+        }
+        let local = sender.local_addr().map_err(|source| OpenError::Socket {
+            what: "read the local address",
+            address,
+            source,
+        })?;
+        let targets = if options.peers.is_empty() {
+            vec![address]
+        } else {
+            options.peers.clone()
+        };
+        Ok(Self {
+            receiver,
+            sender,
+            targets,
+            local,
+        })
+    }
+
+    /// Waits for a datagram and gives its length and sender. Cancel-safe: nothing is lost when dropped.
+    ///
+    /// A datagram larger than `buffer` is cut to it; 65 536 bytes hold any.
+    ///
+    /// # Errors
+    /// What the system says; the socket stays usable.
+    pub async fn recv(&self, buffer: &mut [u8]) -> io::Result<(usize, SocketAddr)> {
+        self.receiver.recv_from(buffer).await
+    }
+
+    /// Takes a datagram that is already there.
+    ///
+    /// # Errors
+    /// `WouldBlock` when there is none.
+    pub fn try_recv(&self, buffer: &mut [u8]) -> io::Result<(usize, SocketAddr)> {
+        self.receiver.try_recv_from(buffer)
+    }
+
+    /// Sends one datagram to the group (or to each peer) without waiting.
+    ///
+    /// # Errors
+    /// The first [`SendError`] of its targets; the others are still tried.
+    pub fn try_send(&self, datagram: &[u8]) -> Result<(), SendError> {
+        let mut result = Ok(());
+        for target in &self.targets {
+            // Past tokio's readiness: a datagram socket is nearly always writable, and a full one says so itself.
+            let sent = socket2::SockRef::from(&self.sender).send_to(datagram, &(*target).into());
+            if let Err(error) = sent
+                && result.is_ok()
+            {
+                result = Err(send_error(&error));
+            }
+        }
+        result
+    }
+
+    /// The address that our own datagrams carry as their source, as far as it is known before sending: the IP may
+    /// be unspecified when no interface was named.
+    #[must_use]
+    pub const fn source(&self) -> SocketAddr {
+        self.local
+    }
+}
+
+fn send_error(error: &io::Error) -> SendError {
+    let unreachable = [
+        io::ErrorKind::NetworkUnreachable,
+        io::ErrorKind::HostUnreachable,
+        io::ErrorKind::NetworkDown,
+        io::ErrorKind::ConnectionRefused,
+    ];
+    if error.kind() == io::ErrorKind::WouldBlock {
+        SendError::Busy
+    } else if unreachable.contains(&error.kind()) {
+        SendError::Unreachable
+    } else if error.raw_os_error() == Some(EMSGSIZE) {
+        SendError::TooBig
+    } else {
+        SendError::Refused
+    }
+}
+
+/// Linux's number for "message too long", which std has no `ErrorKind` for.
+const EMSGSIZE: i32 = 90;
+
+fn receiver(
+    options: &Options,
+    ip: Ipv4Addr,
+    interface: Option<&Interface>,
+) -> Result<UdpSocket, OpenError> {
+    let address = options.address;
+    let at = |what| {
+        move |source| OpenError::Socket {
+            what,
+            address,
+            source,
+        }
+    };
+    let socket =
+        Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP)).map_err(at("make a socket"))?;
+    if ip.is_multicast() {
+        // All programs of one host listen at the same port of the group.
+        socket
+            .set_reuse_address(true)
+            .map_err(at("share the port"))?;
+    }
+    socket
+        .set_nonblocking(true)
+        .map_err(at("set non-blocking mode"))?;
+    socket
+        .set_recv_buffer_size(options.receive_buffer)
+        .map_err(at("set the receive buffer"))?;
+    // Bound to the group itself, so that datagrams of other groups at this port stay away.
+    socket.bind(&address.into()).map_err(|source| {
+        if source.kind() == io::ErrorKind::AddrInUse {
+            OpenError::PortTaken(address)
+        } else {
+            OpenError::Socket {
+                what: "bind",
+                address,
+                source,
+            }
+        }
+    })?;
+    if ip.is_multicast() {
+        join(&socket, ip, interface)?;
+    }
+    let granted = socket.recv_buffer_size().unwrap_or_default();
+    if granted < options.receive_buffer {
+        info!(
+            wanted = options.receive_buffer,
+            granted,
+            "the system grants a smaller receive buffer: raise net.core.rmem_max against lost bursts"
+        );
+    }
+    UdpSocket::from_std(socket.into()).map_err(at("register the socket"))
+}
+
+fn join(socket: &Socket, group: Ipv4Addr, interface: Option<&Interface>) -> Result<(), OpenError> {
+    let on = interface.map_or(Ipv4Addr::UNSPECIFIED, |interface| interface.address);
+    socket
+        .join_multicast_v4(&group, &on)
+        .map_err(|source| OpenError::Join {
+            group,
+            interface: interface
+                .map_or_else(|| "the default interface".to_owned(), ToString::to_string),
+            source,
+        })?;
+    // Off, so that a group somebody else on this host joined on another interface is not heard here.
+    socket
+        .set_multicast_all_v4(false)
+        .or_else(|error| {
+            if error.kind() == io::ErrorKind::Unsupported {
+                Ok(())
+            } else {
+                Err(error)
+            }
+        })
+        .map_err(|source| OpenError::Join {
+            group,
+            interface: on.to_string(),
+            source,
+        })
+}
+
+fn sender(options: &Options, interface: Option<&Interface>) -> Result<UdpSocket, OpenError> {
+    let address = options.address;
+    let at = |what| {
+        move |source| OpenError::Socket {
+            what,
+            address,
+            source,
+        }
+    };
+    let socket =
+        Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP)).map_err(at("make a socket"))?;
+    socket
+        .set_nonblocking(true)
+        .map_err(at("set non-blocking mode"))?;
+    socket
+        .set_multicast_ttl_v4(options.ttl)
+        .map_err(at("set the TTL"))?;
+    socket
+        .set_multicast_loop_v4(options.loopback)
+        .map_err(at("set multicast loopback"))?;
+    let from = interface.map_or(Ipv4Addr::UNSPECIFIED, |interface| interface.address);
+    if interface.is_some() {
+        socket
+            .set_multicast_if_v4(&from)
+            .map_err(at("choose the interface"))?;
+    }
+    socket
+        .bind(&SocketAddr::from((from, 0)).into())
+        .map_err(at("bind the sender"))?;
+    UdpSocket::from_std(socket.into()).map_err(at("register the socket"))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    fn on_loopback(address: &str) -> Options {
+        Options {
+            interface: Some("127.0.0.1".into()),
+            ttl: 0,
+            ..Options::new(address.parse().unwrap())
+        }
+    }
+
+    fn run<T>(future: impl Future<Output = T>) -> T {
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .unwrap();
+        runtime.block_on(async {
+            tokio::time::timeout(Duration::from_secs(5), future)
+                .await
+                .expect("in time")
+        })
+    }
+
+    /// A port nobody holds now. Multicast ports are shared, so two tests must not meet on one group.
+    fn free_port() -> u16 {
+        std::net::UdpSocket::bind("127.0.0.1:0")
+            .unwrap()
+            .local_addr()
+            .unwrap()
+            .port()
+    }
+
+    #[test]
+    fn every_member_of_the_group_hears_a_datagram_with_its_sender() {
+        run(async {
+            let options = on_loopback(&format!("239.255.40.1:{}", free_port()));
+            let (a, b) = (Udp::open(&options).unwrap(), Udp::open(&options).unwrap());
+            a.try_send(b"cover").unwrap();
+            for member in [&a, &b] {
+                let mut buffer = [0; 64];
+                let (len, from) = member.recv(&mut buffer).await.unwrap();
+                assert_eq!((&buffer[..len], from), (&b"cover"[..], a.source()));
+            }
+        });
+    }
+
+    #[test]
+    fn unicast_peers_get_what_the_group_would() {
+        run(async {
+            let listener = Udp::open(&on_loopback(&format!("127.0.0.1:{}", free_port()))).unwrap();
+            let mut options = on_loopback(&format!("239.255.40.2:{}", free_port()));
+            options.peers = vec![listener.receiver.local_addr().unwrap()];
+            Udp::open(&options).unwrap().try_send(b"1").unwrap();
+            let mut buffer = [0; 8];
+            assert_eq!(listener.recv(&mut buffer).await.unwrap().0, 1);
+        });
+    }
+
+    #[test]
+    fn a_port_that_is_not_shared_is_named() {
+        run(async {
+            let holder = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+            let address = holder.local_addr().unwrap();
+            let error = Udp::open(&on_loopback(&address.to_string())).unwrap_err();
+            assert!(
+                matches!(&error, OpenError::PortTaken(at) if *at == address),
+                "{error}"
+            );
+            assert!(
+                error.to_string().contains(&address.port().to_string()),
+                "{error}"
+            );
+        });
+    }
+
+    #[test]
+    fn a_datagram_too_big_is_refused_and_the_next_one_goes() {
+        run(async {
+            let udp = Udp::open(&on_loopback(&format!("239.255.40.3:{}", free_port()))).unwrap();
+            assert_eq!(udp.try_send(&vec![0; 70_000]), Err(SendError::TooBig));
+            udp.try_send(b"small").unwrap();
+            let mut buffer = [0; 16];
+            assert_eq!(udp.recv(&mut buffer).await.unwrap().0, 5);
+        });
+    }
+
+    #[test]
+    fn a_missing_interface_is_an_error_that_lists_the_present_ones() {
+        run(async {
+            let mut options = on_loopback("239.255.40.4:4840");
+            options.interface = Some("nosuch0".into());
+            let error = Udp::open(&options).unwrap_err().to_string();
+            assert!(
+                error.contains("nosuch0") && error.contains("127.0.0.1"),
+                "{error}"
+            );
+        });
+    }
+}

@@ -1,0 +1,88 @@
+//! What makes reading or writing fail, with the offending value.
+
+use crate::BuiltinType;
+
+/// Why bytes are not a UADP message this crate reads.
+///
+/// [`Unsupported`](Self::Unsupported) is our limit; every other variant is the sender's fault or a cut datagram.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum DecodeError {
+    /// The bytes end before the named item does.
+    #[error("{0} is cut off")]
+    Truncated(&'static str),
+    /// A value the standard reserves; receivers skip the message (OPC 10000-14, 7.2.4.4.2 and 7.2.4.5.4).
+    #[error("{field} has the reserved value {value:#x}")]
+    Reserved {
+        /// The field of the standard's tables.
+        field: &'static str,
+        /// What stood there, reserved bits only where the field is a set of flags.
+        value: u32,
+    },
+    /// Allowed by the standard, not read by this crate.
+    #[error("{0} not supported")]
+    Unsupported(&'static str),
+    /// A count that not even the smallest elements could reach in the bytes that are left.
+    #[error("{field} {value} does not fit in the bytes left")]
+    Limit {
+        /// The counting field.
+        field: &'static str,
+        /// The count.
+        value: u32,
+    },
+    /// So many bytes stand after the end of the message and are not zero padding.
+    #[error("{0} bytes after the end of the message")]
+    TrailingBytes(usize),
+    /// The named text is not UTF-8.
+    #[error("{0} is not UTF-8")]
+    Text(&'static str),
+}
+
+/// Why a message could not be written. The buffer then holds an unfinished message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum EncodeError {
+    /// The value does not fit in the length field the standard gives it.
+    #[error("{what} of {len} is too big")]
+    TooBig {
+        /// What is too big.
+        what: &'static str,
+        /// Its length: bytes of a text or message, else a count.
+        len: usize,
+    },
+    /// The payload header names another number of DataSetMessages than were written.
+    #[error("{announced} DataSetMessages announced, {written} written")]
+    MessageCount {
+        /// DataSetWriterIds in the payload header, or one without it.
+        announced: usize,
+        /// DataSetMessages finished.
+        written: usize,
+    },
+    /// A call that has no place here, such as a field while an array is open.
+    #[error("{0}")]
+    Misplaced(&'static str),
+    /// An element of another type than its array.
+    #[error("{found:?} in an array of {expected:?}")]
+    ElementType {
+        /// Element type the array was opened with.
+        expected: BuiltinType,
+        /// Type of the value given.
+        found: BuiltinType,
+    },
+    /// The bytes of a packed array are not `count` elements of a fixed-size type.
+    #[error("{bytes} bytes are not {count} elements of {element:?}")]
+    PackedSize {
+        /// Element type.
+        element: BuiltinType,
+        /// Elements announced.
+        count: usize,
+        /// Bytes given.
+        bytes: usize,
+    },
+    /// DataValue, Variant and DiagnosticInfo are not written as values of a Variant.
+    #[error("{0:?} not supported")]
+    Unsupported(BuiltinType),
+    /// Structures are nested deeper than [`FieldEncoder::MAX_DEPTH`](crate::FieldEncoder::MAX_DEPTH).
+    #[error("structures nested too deep")]
+    TooDeep,
+}

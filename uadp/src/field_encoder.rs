@@ -1,0 +1,340 @@
+//! Writing the fields of a key frame, structures included.
+
+use crate::encoder::{Offsets, Progress};
+use crate::scalar::{BINARY_BODY, Scalar};
+use crate::{BuiltinType, EncodeError, NodeId, Variant, variant, writer};
+
+/// Appends the fields of one key frame (OPC 10000-14, 7.2.4.5.5).
+///
+/// Between [`begin_structure`](Self::begin_structure) and [`end_structure`](Self::end_structure) the same calls
+/// write the fields of the structure: values without the encoding byte of a Variant (OPC 10000-6, 5.2.6).
+#[derive(Debug)]
+#[must_use = "a key frame is complete with `finish`"]
+pub struct FieldEncoder<'m> {
+    buf: &'m mut Vec<u8>,
+    progress: &'m mut Progress,
+    offsets: Offsets,
+    /// Where the FieldCount stands.
+    count_at: usize,
+    fields: usize,
+    /// Elements an open array still wants, and their type.
+    wanted: u32,
+    element: BuiltinType,
+    depth: usize,
+    /// The open structures, outermost first; `depth` of them are in use.
+    outer: [Outer; MAX_DEPTH],
+}
+
+/// What is open around a structure.
+#[derive(Debug, Clone, Copy)]
+struct Outer {
+    /// Where the length of the structure's body stands.
+    length_at: u32,
+    /// Elements wanted behind the structure.
+    wanted: u32,
+}
+
+const MAX_DEPTH: usize = 8;
+
+impl<'m> FieldEncoder<'m> {
+    /// How deep structures may stand in structures.
+    pub const MAX_DEPTH: usize = MAX_DEPTH;
+
+    #[inline]
+    pub(crate) fn new(buf: &'m mut Vec<u8>, progress: &'m mut Progress, offsets: Offsets) -> Self {
+        let count_at = buf.len();
+        buf.extend_from_slice(&[0, 0]);
+        Self {
+            buf,
+            progress,
+            offsets,
+            count_at,
+            fields: 0,
+            wanted: 0,
+            element: BuiltinType::ExtensionObject,
+            depth: 0,
+            outer: [Outer {
+                length_at: 0,
+                wanted: 0,
+            }; MAX_DEPTH],
+        }
+    }
+
+    /// Position in the buffer of the DataSetMessageSequenceNumber (UInt16).
+    #[inline]
+    #[must_use]
+    pub const fn sequence_offset(&self) -> Option<usize> {
+        self.offsets.sequence_number
+    }
+
+    /// Position in the buffer of the DataSetMessage's Timestamp (Int64).
+    #[inline]
+    #[must_use]
+    pub const fn timestamp_offset(&self) -> Option<usize> {
+        self.offsets.timestamp
+    }
+
+    /// A field without a value.
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] inside a structure or while an array wants elements.
+    pub fn null(&mut self) -> Result<(), EncodeError> {
+        self.variant(&Variant::Null)
+    }
+
+    /// A field of one value; inside a structure, its next field.
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] while an array wants elements, [`EncodeError::TooBig`] for a text or byte string
+    /// longer than 2^31-1 bytes.
+    #[inline]
+    pub fn scalar(&mut self, value: Scalar<'_>) -> Result<(), EncodeError> {
+        self.begin_value()?;
+        match self.depth {
+            0 => value.write::<true>(self.buf),
+            _ => value.write::<false>(self.buf),
+        }
+    }
+
+    /// A field as it was read, or as it shall be read.
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] inside a structure or while an array wants elements, [`EncodeError::TooBig`] as
+    /// for [`scalar`](Self::scalar).
+    #[inline]
+    pub fn variant(&mut self, value: &Variant<'_>) -> Result<(), EncodeError> {
+        if self.depth != 0 {
+            return Err(EncodeError::Misplaced("Variant inside a structure"));
+        }
+        self.begin_value()?;
+        value.write(self.buf)
+    }
+
+    /// An array of `count` fixed-size elements given as on the wire: little-endian, back to back.
+    ///
+    /// # Errors
+    /// [`EncodeError::PackedSize`] when `bytes` are not so many elements or the type has no fixed size,
+    /// [`EncodeError::Misplaced`] while an array wants elements.
+    #[inline]
+    pub fn packed_array(
+        &mut self,
+        element: BuiltinType,
+        count: usize,
+        bytes: &[u8],
+    ) -> Result<(), EncodeError> {
+        let size = element
+            .fixed_size()
+            .and_then(|size| size.checked_mul(count));
+        if size != Some(bytes.len()) {
+            return Err(EncodeError::PackedSize {
+                element,
+                count,
+                bytes: bytes.len(),
+            });
+        }
+        self.begin_array(element, count)?;
+        self.buf.extend_from_slice(bytes);
+        Ok(())
+    }
+
+    /// Opens an array; exactly `count` calls of [`element`](Self::element) follow.
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] while another array wants elements, [`EncodeError::Unsupported`] for elements
+    /// that are no [`Scalar`], [`EncodeError::TooBig`] past 2^31-1 elements.
+    pub fn array(&mut self, element: BuiltinType, count: usize) -> Result<(), EncodeError> {
+        if let BuiltinType::DataValue | BuiltinType::Variant | BuiltinType::DiagnosticInfo = element
+        {
+            return Err(EncodeError::Unsupported(element));
+        }
+        let wanted = u32::try_from(count).map_err(|_| EncodeError::TooBig {
+            what: "array",
+            len: count,
+        })?;
+        self.begin_array(element, count)?;
+        self.wanted = wanted;
+        self.element = element;
+        Ok(())
+    }
+
+    /// The next element of the open array.
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] when no array wants elements, [`EncodeError::ElementType`] when the value is of
+    /// another type than the array, [`EncodeError::TooBig`] as for [`scalar`](Self::scalar).
+    #[inline]
+    pub fn element(&mut self, value: Scalar<'_>) -> Result<(), EncodeError> {
+        let left = self.wanted.checked_sub(1).ok_or(NO_ARRAY)?;
+        let found = value.builtin_type();
+        if found != self.element {
+            return Err(EncodeError::ElementType {
+                expected: self.element,
+                found,
+            });
+        }
+        self.wanted = left;
+        value.write::<false>(self.buf)
+    }
+
+    /// Opens an array of `count` structures; each is a [`begin_structure`](Self::begin_structure) and an
+    /// [`end_structure`](Self::end_structure).
+    ///
+    /// # Errors
+    /// As for [`array`](Self::array).
+    pub fn structures(&mut self, count: usize) -> Result<(), EncodeError> {
+        self.array(BuiltinType::ExtensionObject, count)
+    }
+
+    /// Inside a structure, the length of an array of `count` structures by value: their fields follow inline, one
+    /// structure after the other (OPC 10000-6, 5.2.6).
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] outside of a structure or while an array wants elements, [`EncodeError::TooBig`]
+    /// past 2^31-1 structures.
+    pub fn inline_structures(&mut self, count: usize) -> Result<(), EncodeError> {
+        if self.depth == 0 {
+            return Err(EncodeError::Misplaced("inline structures outside of a structure"));
+        }
+        self.begin_array(BuiltinType::ExtensionObject, count)
+    }
+
+    /// Opens an ExtensionObject with a binary body: the next of the open array of structures, or with no array
+    /// open a value of its own. `type_id` names the binary encoding of the structure's type.
+    ///
+    /// # Errors
+    /// [`EncodeError::TooDeep`] past [`MAX_DEPTH`](Self::MAX_DEPTH), [`EncodeError::ElementType`] in an array of
+    /// another type.
+    pub fn begin_structure(&mut self, type_id: NodeId<'_>) -> Result<(), EncodeError> {
+        if self.depth == MAX_DEPTH {
+            return Err(EncodeError::TooDeep);
+        }
+        let found = BuiltinType::ExtensionObject;
+        match self.wanted.checked_sub(1) {
+            Some(left) if self.element == found => self.wanted = left,
+            Some(_) => {
+                return Err(EncodeError::ElementType {
+                    expected: self.element,
+                    found,
+                });
+            }
+            None => {
+                self.begin_value()?;
+                if self.depth == 0 {
+                    self.buf.push(found.id());
+                }
+            }
+        }
+        type_id.write(self.buf)?;
+        self.buf.push(BINARY_BODY);
+        let len = self.buf.len();
+        let length_at = u32::try_from(len).map_err(|_| EncodeError::TooBig {
+            what: "buffer",
+            len,
+        })?;
+        self.buf.extend_from_slice(&[0; 4]);
+        if let Some(outer) = self.outer.get_mut(self.depth) {
+            *outer = Outer {
+                length_at,
+                wanted: self.wanted,
+            };
+        }
+        self.depth += 1;
+        self.wanted = 0;
+        Ok(())
+    }
+
+    /// Closes the innermost structure.
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] when none is open or an array in it wants elements, [`EncodeError::TooBig`] for a
+    /// body longer than 2^31-1 bytes.
+    pub fn end_structure(&mut self) -> Result<(), EncodeError> {
+        if self.wanted != 0 {
+            return Err(ELEMENTS_WANTED);
+        }
+        let depth = self.depth.checked_sub(1).ok_or(NO_STRUCTURE)?;
+        let Outer { length_at, wanted } = self.outer.get(depth).copied().ok_or(NO_STRUCTURE)?;
+        let length_at = length_at as usize;
+        let len = self.buf.len() - length_at - 4;
+        let length = writer::int32_length(len, "ExtensionObject body")?;
+        writer::patch(self.buf, length_at, length);
+        self.depth = depth;
+        self.wanted = wanted;
+        // Only an array of ExtensionObjects can be open around a structure.
+        self.element = BuiltinType::ExtensionObject;
+        Ok(())
+    }
+
+    /// All fields at once: a block as [`Fields::bytes`](crate::Fields::bytes) gives it, copied unread.
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] after another field or when the block is shorter than its FieldCount.
+    pub fn fields_block(&mut self, block: &[u8]) -> Result<(), EncodeError> {
+        self.begin_value()?;
+        if self.fields != 1 || self.depth != 0 {
+            return Err(EncodeError::Misplaced("block of fields after a field"));
+        }
+        let Some(count) = block.first_chunk() else {
+            return Err(EncodeError::Misplaced(
+                "block of fields without a FieldCount",
+            ));
+        };
+        self.fields = u16::from_le_bytes(*count).into();
+        self.buf.truncate(self.count_at);
+        self.buf.extend_from_slice(block);
+        Ok(())
+    }
+
+    /// Ends the key frame.
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] while a structure or an array is open, [`EncodeError::TooBig`] past 65535 fields
+    /// or, among several DataSetMessages, past 65535 bytes.
+    #[inline]
+    pub fn finish(self) -> Result<(), EncodeError> {
+        if self.wanted != 0 {
+            return Err(ELEMENTS_WANTED);
+        }
+        if self.depth != 0 {
+            return Err(EncodeError::Misplaced(
+                "end of the message inside a structure",
+            ));
+        }
+        let count = u16::try_from(self.fields).map_err(|_| EncodeError::TooBig {
+            what: "FieldCount",
+            len: self.fields,
+        })?;
+        writer::patch(self.buf, self.count_at, count.to_le_bytes());
+        self.progress.message_finished(self.buf)
+    }
+
+    /// Counts a value that starts a field, unless it stands inside a structure.
+    #[inline]
+    const fn begin_value(&mut self) -> Result<(), EncodeError> {
+        if self.wanted != 0 {
+            return Err(ELEMENTS_WANTED);
+        }
+        if self.depth == 0 {
+            self.fields += 1;
+        }
+        Ok(())
+    }
+
+    #[inline]
+    fn begin_array(&mut self, element: BuiltinType, count: usize) -> Result<(), EncodeError> {
+        let [a, b, c, d] = writer::int32_length(count, "array")?;
+        self.begin_value()?;
+        match self.depth {
+            0 => self
+                .buf
+                .extend_from_slice(&[element.id() | variant::ARRAY, a, b, c, d]),
+            _ => self.buf.extend_from_slice(&[a, b, c, d]),
+        }
+        Ok(())
+    }
+}
+
+const ELEMENTS_WANTED: EncodeError = EncodeError::Misplaced("an open array wants more elements");
+const NO_ARRAY: EncodeError = EncodeError::Misplaced("element without an open array");
+const NO_STRUCTURE: EncodeError =
+    EncodeError::Misplaced("end of a structure none of which is open");

@@ -1,0 +1,274 @@
+//! Variant: a value together with its type, or a one-dimensional array of such.
+
+use crate::reader::Reader;
+use crate::scalar::Scalar;
+use crate::{BuiltinType, DecodeError, EncodeError, writer};
+
+/// A field's value (OPC 10000-6, 5.2.2.16).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Variant<'a> {
+    /// No value and no type: encoding byte 0.
+    Null,
+    /// One value.
+    Scalar(Scalar<'a>),
+    /// A one-dimensional array, which may be null or empty.
+    Array(Array<'a>),
+}
+
+/// A one-dimensional array whose elements were checked when it was made.
+///
+/// Equality compares the elements as they stand on the wire.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Array<'a> {
+    element: BuiltinType,
+    null: bool,
+    len: usize,
+    bytes: &'a [u8],
+}
+
+/// The elements of an [`Array`].
+#[derive(Debug, Clone)]
+pub struct Elements<'a> {
+    element: BuiltinType,
+    left: usize,
+    reader: Reader<'a>,
+}
+
+impl<'a> Variant<'a> {
+    /// Type of the value or of the elements; `None` for the null Variant.
+    #[must_use]
+    pub const fn builtin_type(&self) -> Option<BuiltinType> {
+        match self {
+            Self::Null => None,
+            Self::Scalar(scalar) => Some(scalar.builtin_type()),
+            Self::Array(array) => Some(array.element),
+        }
+    }
+
+    #[inline]
+    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        let encoding = reader.u8("Variant")?;
+        let Some(builtin) = BuiltinType::from_id(encoding & TYPE_ID) else {
+            return Self::read_untyped(encoding);
+        };
+        match encoding & !TYPE_ID {
+            0 => Scalar::read(builtin, reader).map(Self::Scalar),
+            ARRAY => Array::read(builtin, reader).map(Self::Array),
+            MATRIX => Err(DecodeError::Unsupported("multi-dimensional array")),
+            _ => Err(DecodeError::Reserved {
+                field: "Variant encoding",
+                value: encoding.into(),
+            }),
+        }
+    }
+
+    #[cold]
+    fn read_untyped(encoding: u8) -> Result<Self, DecodeError> {
+        match encoding {
+            0 => Ok(Self::Null),
+            // To be taken as ByteStrings of a type yet to come (OPC 10000-6, 5.2.2.16).
+            _ if matches!(encoding & TYPE_ID, 26..=31) => Err(DecodeError::Unsupported(
+                "Variant of an unassigned builtin type",
+            )),
+            _ => Err(DecodeError::Reserved {
+                field: "Variant encoding",
+                value: encoding.into(),
+            }),
+        }
+    }
+
+    #[inline]
+    pub(crate) fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
+        match self {
+            Self::Null => {
+                out.push(0);
+                Ok(())
+            }
+            Self::Scalar(scalar) => scalar.write::<true>(out),
+            Self::Array(array) => {
+                out.push(array.element.id() | ARRAY);
+                array.write(out)
+            }
+        }
+    }
+}
+
+impl<'a> From<Scalar<'a>> for Variant<'a> {
+    fn from(scalar: Scalar<'a>) -> Self {
+        Self::Scalar(scalar)
+    }
+}
+
+impl<'a> From<Array<'a>> for Variant<'a> {
+    fn from(array: Array<'a>) -> Self {
+        Self::Array(array)
+    }
+}
+
+impl<'a> Array<'a> {
+    /// The null array, which is not the empty one.
+    #[must_use]
+    pub const fn null(element: BuiltinType) -> Self {
+        Self {
+            element,
+            null: true,
+            len: 0,
+            bytes: &[],
+        }
+    }
+
+    /// An array of `len` elements from their encodings, back to back.
+    ///
+    /// # Errors
+    /// Fails when the bytes are not exactly that many well-formed elements.
+    pub fn new(element: BuiltinType, len: usize, bytes: &'a [u8]) -> Result<Self, DecodeError> {
+        let mut reader = Reader::new(bytes);
+        let array = Self::read_elements(element, len, &mut reader)?;
+        match reader.remaining() {
+            0 => Ok(array),
+            left => Err(DecodeError::TrailingBytes(left)),
+        }
+    }
+
+    /// Type of every element.
+    #[inline]
+    #[must_use]
+    pub const fn element(&self) -> BuiltinType {
+        self.element
+    }
+
+    /// Number of elements, 0 for the null array.
+    #[inline]
+    #[must_use]
+    pub const fn len(&self) -> usize {
+        self.len
+    }
+
+    /// True without elements, whether null or empty.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// True for the null array (length -1 on the wire).
+    #[must_use]
+    pub const fn is_null(&self) -> bool {
+        self.null
+    }
+
+    /// The elements as on the wire, without the length: little-endian, back to back.
+    #[inline]
+    #[must_use]
+    pub const fn bytes(&self) -> &'a [u8] {
+        self.bytes
+    }
+
+    /// The elements one by one.
+    #[inline]
+    #[must_use]
+    pub const fn iter(&self) -> Elements<'a> {
+        Elements {
+            element: self.element,
+            left: self.len,
+            reader: Reader::new(self.bytes),
+        }
+    }
+
+    /// Int32 length and elements (OPC 10000-6, 5.2.5).
+    pub(crate) fn read(element: BuiltinType, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        match reader.length("array length")? {
+            Some(len) => Self::read_elements(element, len, reader),
+            None => Ok(Self::null(element)),
+        }
+    }
+
+    fn read_elements(
+        element: BuiltinType,
+        len: usize,
+        reader: &mut Reader<'a>,
+    ) -> Result<Self, DecodeError> {
+        if matches!(
+            element,
+            BuiltinType::DataValue | BuiltinType::Variant | BuiltinType::DiagnosticInfo
+        ) {
+            return Err(DecodeError::Unsupported(element.name()));
+        }
+        let limit = DecodeError::Limit {
+            field: "array length",
+            value: u32::try_from(len).unwrap_or(u32::MAX),
+        };
+        let least = len.checked_mul(element.min_size()).ok_or(limit)?;
+        if least > reader.remaining() {
+            return Err(limit);
+        }
+        let bytes = if element.fixed_size().is_some() {
+            reader.bytes(least, "array")?
+        } else {
+            let before = *reader;
+            for _ in 0..len {
+                Scalar::read(element, reader)?;
+            }
+            reader.since(&before)
+        };
+        Ok(Self {
+            element,
+            null: false,
+            len,
+            bytes,
+        })
+    }
+
+    /// Int32 length and elements.
+    pub(crate) fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
+        let length = match self.null {
+            true => writer::NULL_LENGTH,
+            false => writer::int32_length(self.len, "array")?,
+        };
+        out.reserve(length.len() + self.bytes.len());
+        out.extend_from_slice(&length);
+        out.extend_from_slice(self.bytes);
+        Ok(())
+    }
+}
+
+impl<'a> IntoIterator for Array<'a> {
+    type Item = Scalar<'a>;
+    type IntoIter = Elements<'a>;
+
+    fn into_iter(self) -> Elements<'a> {
+        self.iter()
+    }
+}
+
+impl<'a> IntoIterator for &Array<'a> {
+    type Item = Scalar<'a>;
+    type IntoIter = Elements<'a>;
+
+    fn into_iter(self) -> Elements<'a> {
+        self.iter()
+    }
+}
+
+impl<'a> Iterator for Elements<'a> {
+    type Item = Scalar<'a>;
+
+    #[inline]
+    fn next(&mut self) -> Option<Scalar<'a>> {
+        self.left = self.left.checked_sub(1)?;
+        // The elements were read once when the array was made: this does not fail.
+        Scalar::read(self.element, &mut self.reader).ok()
+    }
+
+    fn size_hint(&self) -> (usize, Option<usize>) {
+        (self.left, Some(self.left))
+    }
+}
+
+impl ExactSizeIterator for Elements<'_> {}
+
+/// Bits 0 to 5 of the encoding byte.
+const TYPE_ID: u8 = 0x3F;
+/// Bit 7: the value is an array.
+pub(crate) const ARRAY: u8 = 0x80;
+/// Bits 7 and 6: dimensions follow the elements.
+const MATRIX: u8 = 0xC0;

@@ -1,0 +1,64 @@
+//! Appending to a buffer, and patching what only the end of a section tells.
+
+use crate::{BuiltinType, EncodeError};
+
+/// A fixed-size value, with the encoding byte of a Variant before it when `TAGGED`: one reserve, one copy.
+#[inline]
+pub(crate) fn fixed<const TAGGED: bool, const N: usize>(
+    out: &mut Vec<u8>,
+    builtin: BuiltinType,
+    value: [u8; N],
+) {
+    if TAGGED {
+        // Sized for the longest fixed value, the Guid; the compiler keeps the part in use only.
+        let mut cell = [0; 17];
+        if let Some((tag, rest)) = cell.split_first_mut() {
+            *tag = builtin.id();
+            if let Some(place) = rest.first_chunk_mut::<N>() {
+                *place = value;
+            }
+        }
+        out.extend_from_slice(cell.get(..=N).unwrap_or_default());
+    } else {
+        out.extend_from_slice(&value);
+    }
+}
+
+/// Length of a String, ByteString, body or array as the standard's Int32.
+#[inline]
+pub(crate) fn int32_length(len: usize, what: &'static str) -> Result<[u8; 4], EncodeError> {
+    match i32::try_from(len) {
+        Ok(length) => Ok(length.to_le_bytes()),
+        Err(_) => Err(EncodeError::TooBig { what, len }),
+    }
+}
+
+/// String or ByteString (OPC 10000-6, 5.2.2.4 and 5.2.2.7); `None` is null.
+#[inline]
+pub(crate) fn byte_string(
+    out: &mut Vec<u8>,
+    value: Option<&[u8]>,
+    what: &'static str,
+) -> Result<(), EncodeError> {
+    match value {
+        Some(bytes) => {
+            let length = int32_length(bytes.len(), what)?;
+            out.reserve(length.len() + bytes.len());
+            out.extend_from_slice(&length);
+            out.extend_from_slice(bytes);
+        }
+        None => out.extend_from_slice(&NULL_LENGTH),
+    }
+    Ok(())
+}
+
+/// Replaces the `N` bytes at `at`, which the caller wrote before.
+#[inline]
+pub(crate) fn patch<const N: usize>(out: &mut [u8], at: usize, value: [u8; N]) {
+    if let Some(place) = out.get_mut(at..).and_then(<[u8]>::first_chunk_mut) {
+        *place = value;
+    }
+}
+
+/// Length of a null String, ByteString or array.
+pub(crate) const NULL_LENGTH: [u8; 4] = (-1_i32).to_le_bytes();
