@@ -1,2 +1,183 @@
-//! Placeholder of the skeleton.
-fn main() {}
+//! The fault-tolerant product assembly line, with simulated robots and the programs people run.
+//!
+//! One binary is all the demo's own processes: started plainly it starts the others, which are hidden subcommands of
+//! it, and the two bridges and the OPC UA server that stand beside it. The robots know one another through the topics
+//! of the space alone; what they print is for the timeline.
+//!
+//! Reading order: `robots::niryo` and `robots::turtlebot` (what the robots decide), `line` (the values they share),
+//! `supervisor`, `orchestra` (who starts and watches them all).
+
+mod clock;
+mod event;
+mod line;
+mod master;
+mod orchestra;
+mod pace;
+mod robots;
+mod stop;
+mod supervisor;
+
+use std::io::Write as _;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+
+use crate::orchestra::Plan;
+use crate::pace::Speed;
+
+/// Plays the fault-tolerant product assembly line on this machine: a ROS 1 arm and a ROS 2 robot that know one another
+/// through the space alone. Nothing leaves the loopback interface.
+#[derive(Debug, Parser)]
+#[command(name = "demo", version, args_conflicts_with_subcommands = true)]
+struct Arguments {
+    #[command(subcommand)]
+    role: Option<Role>,
+    #[command(flatten)]
+    plan: PlanArguments,
+}
+
+#[derive(Debug, Args)]
+struct PlanArguments {
+    /// Divides all times of the story
+    #[arg(long, value_name = "FACTOR", default_value = "1")]
+    speed: Speed,
+    /// How many covers lie in the storage
+    #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=1000))]
+    covers: u32,
+    /// The second of the story at which the supervisor switches the conveyor off
+    #[arg(long, value_name = "SECONDS", default_value = "25", value_parser = seconds)]
+    conveyor_off_at: f64,
+    /// Print one JSON object on standard output, and the timeline on standard error
+    #[arg(long)]
+    json: bool,
+}
+
+/// The demo's own processes.
+#[derive(Debug, Subcommand)]
+enum Role {
+    #[command(hide = true)]
+    Master,
+    #[command(hide = true)]
+    Niryo {
+        #[arg(long)]
+        covers: u32,
+        #[arg(long)]
+        speed: Speed,
+    },
+    #[command(hide = true)]
+    Turtlebot {
+        #[arg(long)]
+        speed: Speed,
+    },
+    #[command(hide = true)]
+    Supervisor {
+        #[arg(long, value_parser = seconds)]
+        conveyor_off_at: f64,
+        #[arg(long)]
+        speed: Speed,
+        #[arg(long)]
+        pki: PathBuf,
+    },
+}
+
+fn seconds(text: &str) -> Result<f64, &'static str> {
+    let seconds: f64 = text.parse().map_err(|_| "not a number")?;
+    if (0.0..=86_400.0).contains(&seconds) {
+        Ok(seconds)
+    } else {
+        Err("from 0 to 86400 seconds")
+    }
+}
+
+fn main() -> ExitCode {
+    let arguments = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) => {
+            let code = if error.use_stderr() { USAGE } else { 0 };
+            // When nothing can be printed the exit code still says it.
+            error.print().ok();
+            return ExitCode::from(code);
+        }
+    };
+    let runtime = match tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+    {
+        Ok(runtime) => runtime,
+        Err(error) => return complain(&anyhow::Error::new(error)),
+    };
+    match arguments.role {
+        None => {
+            let PlanArguments {
+                speed,
+                covers,
+                conveyor_off_at,
+                json,
+            } = arguments.plan;
+            let plan = Plan {
+                covers,
+                speed,
+                conveyor_off_at,
+                json,
+            };
+            ExitCode::from(runtime.block_on(Box::pin(orchestra::play(plan))))
+        }
+        Some(role) => match runtime.block_on(Box::pin(play_role(role))) {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => complain(&error),
+        },
+    }
+}
+
+async fn play_role(role: Role) -> anyhow::Result<()> {
+    // RustDDS reports at level error what is part of every orderly end.
+    let filter = tracing_subscriber::EnvFilter::new("info,rustdds=off,ros2_client=warn,opcua=warn");
+    tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .init();
+    match role {
+        Role::Master => master::run().await,
+        Role::Niryo { covers, speed } => robots::niryo_node::run(covers, speed).await,
+        Role::Turtlebot { speed } => robots::turtlebot_node::run(speed).await,
+        Role::Supervisor {
+            conveyor_off_at,
+            speed,
+            pki,
+        } => supervisor::run(speed.real(conveyor_off_at), pki).await,
+    }
+}
+
+fn complain(error: &anyhow::Error) -> ExitCode {
+    // When nothing can be printed the exit code still says it.
+    writeln!(std::io::stderr(), "error: {error:#}").ok();
+    ExitCode::FAILURE
+}
+
+/// `EX_USAGE` of `sysexits.h`.
+const USAGE: u8 = 64;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_arguments_are_as_clap_wants_them() {
+        use clap::CommandFactory as _;
+        Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn what_makes_no_story_is_refused() {
+        for arguments in [
+            ["--covers", "0"],
+            ["--speed", "0"],
+            ["--conveyor-off-at", "-1"],
+            ["--conveyor-off-at", "nan"],
+        ] {
+            let refused = Arguments::try_parse_from(["demo"].into_iter().chain(arguments));
+            assert!(refused.is_err(), "{arguments:?}");
+        }
+    }
+}

@@ -1,0 +1,158 @@
+//! What the demo's own processes tell the one that started them: a line of JSON on standard output per event.
+//!
+//! This is for the timeline only. The robots hear of one another through the space.
+
+use std::io::{self, Write as _};
+
+use serde::{Deserialize, Serialize};
+
+use crate::clock::wall_nanos;
+use crate::line::Name;
+use crate::robots::niryo::NiryoEvent;
+use crate::robots::turtlebot::TurtlebotEvent;
+
+/// An event and when it was, in nanoseconds since 1970.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Stamped {
+    pub(crate) at_ns: i64,
+    pub(crate) event: Event,
+}
+
+/// Something that happened in a child process.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub(crate) enum Event {
+    Master(MasterEvent),
+    Niryo(NiryoEvent),
+    Turtlebot(TurtlebotEvent),
+    Supervisor(SupervisorEvent),
+}
+
+/// From the ROS master.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "master", rename_all = "snake_case")]
+pub(crate) enum MasterEvent {
+    Listening { uri: String },
+}
+
+/// From the OPC UA client.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "supervisor", rename_all = "snake_case")]
+pub(crate) enum SupervisorEvent {
+    Connected,
+    /// These values have not come to the server yet.
+    Awaits {
+        names: Vec<Name>,
+    },
+    /// It has written the switch of the conveyor.
+    Switched {
+        on: bool,
+    },
+    /// The server has a new value; the stamp is the server's.
+    Saw {
+        name: Name,
+        value: Value,
+    },
+}
+
+/// The two kinds of values of the line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub(crate) enum Value {
+    Boolean(bool),
+    Number(u32),
+}
+
+impl std::fmt::Display for Value {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Boolean(value) => value.fmt(f),
+            Self::Number(value) => value.fmt(f),
+        }
+    }
+}
+
+/// Tells of an event that happens now. Fails when nobody listens any more.
+pub(crate) fn tell(event: impl Into<Event>) -> io::Result<()> {
+    tell_at(wall_nanos(), event)
+}
+
+/// Tells of an event that happened at `at_ns`.
+pub(crate) fn tell_at(at_ns: i64, event: impl Into<Event>) -> io::Result<()> {
+    let mut line = serde_json::to_vec(&Stamped {
+        at_ns,
+        event: event.into(),
+    })?;
+    line.push(b'\n');
+    let mut out = io::stdout().lock();
+    out.write_all(&line)?;
+    out.flush()
+}
+
+impl From<MasterEvent> for Event {
+    fn from(event: MasterEvent) -> Self {
+        Self::Master(event)
+    }
+}
+
+impl From<NiryoEvent> for Event {
+    fn from(event: NiryoEvent) -> Self {
+        Self::Niryo(event)
+    }
+}
+
+impl From<TurtlebotEvent> for Event {
+    fn from(event: TurtlebotEvent) -> Self {
+        Self::Turtlebot(event)
+    }
+}
+
+impl From<SupervisorEvent> for Event {
+    fn from(event: SupervisorEvent) -> Self {
+        Self::Supervisor(event)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::robots::niryo::WaitCause;
+
+    #[test]
+    fn every_kind_of_event_comes_back_as_it_was_told() {
+        let events: [Event; 6] = [
+            MasterEvent::Listening {
+                uri: "http://127.0.0.1:1/".to_owned(),
+            }
+            .into(),
+            NiryoEvent::Waits {
+                cause: WaitCause::ParkFree,
+            }
+            .into(),
+            NiryoEvent::StorageEmpty.into(),
+            TurtlebotEvent::Unloaded { total: 3 }.into(),
+            SupervisorEvent::Saw {
+                name: Name::ParkBusy,
+                value: Value::Boolean(true),
+            }
+            .into(),
+            SupervisorEvent::Saw {
+                name: Name::CoversInStorage,
+                value: Value::Number(4),
+            }
+            .into(),
+        ];
+        for event in events {
+            let stamped = Stamped {
+                at_ns: 1_700_000_000_123_456_789,
+                event,
+            };
+            let text = serde_json::to_string(&stamped).unwrap();
+            assert_eq!(
+                serde_json::from_str::<Stamped>(&text).unwrap(),
+                stamped,
+                "{text}"
+            );
+        }
+    }
+}

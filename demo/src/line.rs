@@ -1,0 +1,86 @@
+//! The names of the line's values: as ROS topics, the same in both ROS spaces, and as nodes of the OPC UA server.
+
+use serde::{Deserialize, Serialize};
+
+/// One value of the line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "PascalCase")]
+pub(crate) enum Name {
+    /// Boolean, written by a supervisor.
+    ConveyorSwitch,
+    /// Boolean, from Niryo Ned.
+    ConveyorRunning,
+    /// UInt32, from Niryo Ned.
+    CoversInStorage,
+    /// UInt32, from Niryo Ned: covers placed on the conveyor so far.
+    CoversOnConveyor,
+    /// UInt32, from Niryo Ned: covers placed on TurtleBot3 so far.
+    CoversOnTurtleBot3,
+    /// Boolean, from TurtleBot3.
+    ParkBusy,
+    /// Boolean, from TurtleBot3.
+    BucketBusy,
+}
+
+impl Name {
+    pub(crate) const ALL: [Self; 7] = [
+        Self::ConveyorSwitch,
+        Self::ConveyorRunning,
+        Self::CoversInStorage,
+        Self::CoversOnConveyor,
+        Self::CoversOnTurtleBot3,
+        Self::ParkBusy,
+        Self::BucketBusy,
+    ];
+
+    /// The ROS topic, without the leading slash.
+    pub(crate) const fn ros_topic(self) -> &'static str {
+        match self {
+            Self::ConveyorSwitch => "conveyor/switch",
+            Self::ConveyorRunning => "conveyor/running",
+            Self::CoversInStorage => "storage/covers",
+            Self::CoversOnConveyor => "conveyor/covers",
+            Self::CoversOnTurtleBot3 => "turtlebot3/covers",
+            Self::ParkBusy => "park/busy",
+            Self::BucketBusy => "bucket/busy",
+        }
+    }
+
+    /// The numeric identifier of the node in namespace [`NAMESPACE`].
+    pub(crate) const fn node(self) -> u32 {
+        match self {
+            Self::ConveyorSwitch => 1,
+            Self::ConveyorRunning => 10,
+            Self::CoversInStorage => 11,
+            Self::CoversOnConveyor => 12,
+            Self::CoversOnTurtleBot3 => 13,
+            Self::ParkBusy => 20,
+            Self::BucketBusy => 21,
+        }
+    }
+
+    /// The program that produces the value.
+    pub(crate) const fn producer(self) -> &'static str {
+        match self {
+            Self::ConveyorSwitch => "the supervisor",
+            Self::ConveyorRunning
+            | Self::CoversInStorage
+            | Self::CoversOnConveyor
+            | Self::CoversOnTurtleBot3 => "Niryo Ned",
+            Self::ParkBusy | Self::BucketBusy => "TurtleBot3",
+        }
+    }
+}
+
+impl std::fmt::Display for Name {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        std::fmt::Debug::fmt(self, f)
+    }
+}
+
+/// Where the OPC UA server has the values.
+pub(crate) const NAMESPACE: &str = "urn:ua-bridge:assembly-line";
+/// Where the OPC UA server listens.
+pub(crate) const ENDPOINT: &str = "opc.tcp://127.0.0.1:4840";
+/// The DDS domain of TurtleBot3.
+pub(crate) const DOMAIN: u16 = 2;

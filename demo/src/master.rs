@@ -1,0 +1,21 @@
+//! The ROS master of the demo.
+
+use std::net::{Ipv4Addr, SocketAddr};
+
+use anyhow::Context as _;
+use tcpros::Core;
+
+use crate::event::{MasterEvent, tell};
+use crate::stop::Stop;
+
+/// Runs a master on a free port of 127.0.0.1 until it is told to end.
+pub(crate) async fn run() -> anyhow::Result<()> {
+    let mut stop = Stop::new()?;
+    let core = Core::start(SocketAddr::from((Ipv4Addr::LOCALHOST, 0)))
+        .context("cannot listen on 127.0.0.1")?;
+    tell(MasterEvent::Listening {
+        uri: core.uri().to_owned(),
+    })?;
+    stop.wait().await;
+    Ok(())
+}

@@ -1,0 +1,81 @@
+//! Why the demo did not come to its end.
+
+use std::io;
+use std::path::PathBuf;
+use std::process::ExitStatus;
+
+use thiserror::Error;
+
+/// What went wrong, and what to do about it.
+#[derive(Debug, Error)]
+pub(crate) enum Failure {
+    #[error(
+        "these programs are missing beside the demo: {}; `cargo build --workspace --bins` makes \
+         them", list(.0)
+    )]
+    Missing(Vec<PathBuf>),
+    #[error(
+        "127.0.0.1:4840 is taken, where the demo's OPC UA server is to listen; end the program \
+         that listens there (`ss -ltnp 'sport = :4840'` names it)"
+    )]
+    PortTaken,
+    #[error("{what}: {source}")]
+    Io {
+        what: &'static str,
+        #[source]
+        source: io::Error,
+    },
+    #[error(
+        "{name} ended before the line was done ({status}){}\nthe logs of all programs are in {}",
+        indented(.last_lines), .logs.display()
+    )]
+    ChildEnded {
+        name: &'static str,
+        status: ExitStatus,
+        last_lines: String,
+        logs: PathBuf,
+    },
+    #[error("the line has not begun after {seconds} s: {standing}\nthe logs are in {}", .logs.display())]
+    NotBegun {
+        seconds: u64,
+        standing: String,
+        logs: PathBuf,
+    },
+    #[error("the line is stuck: {standing}\nthe logs are in {}", .logs.display())]
+    Stuck { standing: String, logs: PathBuf },
+    #[error("interrupted: {standing}")]
+    Interrupted { standing: String },
+}
+
+impl Failure {
+    /// For `map_err` on IO.
+    pub(crate) fn io(what: &'static str) -> impl FnOnce(io::Error) -> Self {
+        move |source| Self::Io { what, source }
+    }
+
+    /// The exit code of `sysexits.h` that says whose it is to mend; 1 for a line that did not finish.
+    pub(crate) const fn exit_code(&self) -> u8 {
+        match self {
+            Self::Missing(_) | Self::PortTaken => 69,
+            Self::Io { .. } => 74,
+            Self::ChildEnded { .. } | Self::NotBegun { .. } | Self::Stuck { .. } => 1,
+            Self::Interrupted { .. } => 130,
+        }
+    }
+}
+
+fn list(paths: &[PathBuf]) -> String {
+    let names: Vec<String> = paths
+        .iter()
+        .map(|path| path.display().to_string())
+        .collect();
+    names.join(", ")
+}
+
+fn indented(lines: &str) -> String {
+    if lines.is_empty() {
+        return ", without a word in its log".to_owned();
+    }
+    let lines: Vec<String> = lines.lines().map(|line| format!("\n  | {line}")).collect();
+    format!("; its last lines:{}", lines.concat())
+}

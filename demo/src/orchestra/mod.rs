@@ -1,0 +1,426 @@
+//! The demo itself: starts the programs of the cell, watches the story they make together, and ends them.
+
+mod failure;
+mod programs;
+mod report;
+mod status;
+mod story;
+mod timeline;
+
+use std::fs;
+use std::net::{Ipv4Addr, TcpListener};
+use std::path::PathBuf;
+use std::time::Duration;
+
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::sync::mpsc;
+use tokio::time::{Instant, interval, sleep_until, timeout_at};
+
+use self::failure::Failure;
+use self::programs::{Program, Programs, Stage};
+use self::report::Hops;
+use self::story::Story;
+use self::timeline::{Timeline, Who};
+use crate::clock::wall_nanos;
+use crate::event::{Event, MasterEvent};
+use crate::line::{DOMAIN, ENDPOINT};
+use crate::pace::{Speed, overdue_after};
+
+/// What the story is to be.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Plan {
+    pub(crate) covers: u32,
+    pub(crate) speed: Speed,
+    /// In seconds of the story.
+    pub(crate) conveyor_off_at: f64,
+    pub(crate) json: bool,
+}
+
+/// Plays the story and prints it. Returns the exit code.
+pub(crate) async fn play(plan: Plan) -> u8 {
+    let mut timeline = Timeline::open(plan.json);
+    let mut story = Story::new(plan.covers, plan.speed);
+    let mut hops = Hops::default();
+    let outcome = perform(plan, &mut timeline, &mut story, &mut hops).await;
+    let printed = conclude(plan, &mut timeline, (&story, hops), outcome.as_ref().err());
+    match (outcome, printed) {
+        (Err(failure), _) => failure.exit_code(),
+        // Nobody reads any more, as with `| head`.
+        (Ok(()), Err(_)) => 74,
+        (Ok(()), Ok(())) => 0,
+    }
+}
+
+fn conclude(
+    plan: Plan,
+    timeline: &mut Timeline,
+    (story, hops): (&Story, Hops),
+    failure: Option<&Failure>,
+) -> std::io::Result<()> {
+    timeline.print_all(story)?;
+    let report = report::Report::of(story, hops);
+    if story.began() {
+        timeline.print_text(&report.table(story))?;
+    }
+    if let Some(failure) = failure {
+        timeline.print_text(&format!("error: {failure}\n"))?;
+    }
+    if plan.json {
+        use std::io::Write as _;
+        let mut out = std::io::stdout().lock();
+        serde_json::to_writer(&mut out, &report)?;
+        out.write_all(b"\n")?;
+        out.flush()?;
+    }
+    Ok(())
+}
+
+async fn perform(
+    plan: Plan,
+    timeline: &mut Timeline,
+    story: &mut Story,
+    hops: &mut Hops,
+) -> Result<(), Failure> {
+    let binaries = Binaries::find()?;
+    let interrupt = Interrupt::listen()?;
+    // Found out here, where it can be said in one line.
+    drop(TcpListener::bind((Ipv4Addr::LOCALHOST, 4840)).map_err(|_| Failure::PortTaken)?);
+    let (programs, reports) =
+        Programs::prepare().map_err(Failure::io("cannot make a directory for the logs"))?;
+    let mut stage = Director {
+        plan,
+        binaries,
+        programs,
+        reports,
+        interrupt,
+        timeline,
+        story,
+    };
+    let outcome = stage.direct(hops).await;
+    // Nothing is heard from here on, and nobody is to wait with telling it.
+    stage.reports.close();
+    stage.programs.end().await;
+    if outcome.is_ok()
+        && let Err(error) = stage.programs.clean_up()
+    {
+        tracing::debug!(%error, "the logs were not removed");
+    }
+    outcome
+}
+
+/// The programs that are started.
+struct Binaries {
+    demo: PathBuf,
+    bridge_ros1: PathBuf,
+    bridge_ros2: PathBuf,
+    server: PathBuf,
+}
+
+impl Binaries {
+    /// Those beside this one.
+    fn find() -> Result<Self, Failure> {
+        let demo = std::env::current_exe().map_err(Failure::io("the demo cannot find itself"))?;
+        let beside =
+            |name: &str| demo.with_file_name(format!("{name}{}", std::env::consts::EXE_SUFFIX));
+        let (bridge_ros1, bridge_ros2) = (beside("bridge-ros1"), beside("bridge-ros2"));
+        let server = beside("ua-server");
+        let missing: Vec<PathBuf> = [&bridge_ros1, &bridge_ros2, &server]
+            .into_iter()
+            .filter(|path| !path.is_file())
+            .cloned()
+            .collect();
+        if missing.is_empty() {
+            Ok(Self {
+                demo,
+                bridge_ros1,
+                bridge_ros2,
+                server,
+            })
+        } else {
+            Err(Failure::Missing(missing))
+        }
+    }
+}
+
+struct Interrupt {
+    interrupt: Signal,
+    terminate: Signal,
+}
+
+impl Interrupt {
+    fn listen() -> Result<Self, Failure> {
+        let listen = |kind| signal(kind).map_err(Failure::io("cannot listen for Ctrl-C"));
+        let (interrupt, terminate) = (
+            listen(SignalKind::interrupt())?,
+            listen(SignalKind::terminate())?,
+        );
+        Ok(Self {
+            interrupt,
+            terminate,
+        })
+    }
+
+    async fn come(&mut self) {
+        tokio::select! {
+            _ = self.interrupt.recv() => {}
+            _ = self.terminate.recv() => {}
+        }
+    }
+}
+
+/// Everything the run has at hand.
+struct Director<'a> {
+    plan: Plan,
+    binaries: Binaries,
+    programs: Programs,
+    reports: mpsc::Receiver<programs::Report>,
+    interrupt: Interrupt,
+    timeline: &'a mut Timeline,
+    story: &'a mut Story,
+}
+
+impl Director<'_> {
+    async fn direct(&mut self, hops: &mut Hops) -> Result<(), Failure> {
+        let begin_by = Instant::now() + BEGIN_WITHIN;
+        self.introduce()?;
+        self.start_own("ros-master", &["master"], &[], Stage::Master)?;
+        let master_uri = self.master_uri(begin_by).await?;
+        let (ros1_port, ros2_port) = self.start_cell(&master_uri)?;
+
+        self.watch(begin_by, |story| story.began()).await?;
+        let overdue = overdue_after(self.plan.covers, self.plan.conveyor_off_at);
+        let finish_by = Instant::now() + self.plan.speed.real(overdue) + SPARE;
+        self.watch(finish_by, Story::finished).await?;
+        // The last counts may be on their way to the server; the covers have arrived with or without them.
+        match self.watch(Instant::now() + SPARE, Story::settled).await {
+            Ok(()) | Err(Failure::Stuck { .. }) => {}
+            Err(failure) => return Err(failure),
+        }
+        *hops = self.ask_bridges(ros1_port, ros2_port).await;
+        Ok(())
+    }
+
+    fn introduce(&mut self) -> Result<(), Failure> {
+        let Plan {
+            covers,
+            speed,
+            conveyor_off_at,
+            ..
+        } = self.plan;
+        let text = format!(
+            "The fault-tolerant product assembly line: {covers} covers, conveyor off at second \
+             {conveyor_off_at}, speed {}.\nTimes are seconds of the story; the OPC UA server is \
+             at {ENDPOINT}, the logs in {}.\n\n",
+            speed.factor(),
+            self.programs.directory().display()
+        );
+        self.timeline
+            .print_text(&text)
+            .map_err(Failure::io("cannot print"))
+    }
+
+    async fn master_uri(&mut self, by: Instant) -> Result<String, Failure> {
+        while let Some(report) = self.next_report(by).await? {
+            if let Event::Master(MasterEvent::Listening { uri }) = report {
+                return Ok(uri);
+            }
+        }
+        Err(self.not_begun())
+    }
+
+    /// Starts all but the master. Returns the ports at which the bridges give out their figures.
+    fn start_cell(&mut self, master_uri: &str) -> Result<(u16, u16), Failure> {
+        let mapping = self.programs.directory().join("assembly-line.yaml");
+        fs::write(&mapping, MAPPING).map_err(Failure::io("cannot write the mapping"))?;
+        let mapping = mapping.display().to_string();
+        let pki = |of: &str| self.programs.directory().join(of).display().to_string();
+        let (server_pki, client_pki) = (pki("server-pki"), pki("supervisor-pki"));
+        let (ros1_port, ros2_port) = (free_port()?, free_port()?);
+        let domain = DOMAIN.to_string();
+        let ros1 = [
+            ("ROS_MASTER_URI", master_uri),
+            ("ROS_HOSTNAME", "127.0.0.1"),
+        ];
+        let ros2 = [("ROS_LOCALHOST_ONLY", "1"), ("ROS_DOMAIN_ID", &domain)];
+
+        let server = self.binaries.server.clone();
+        let arguments = [&mapping, "--interface", LOOPBACK, "--endpoint", ENDPOINT];
+        let arguments = [&arguments[..], &["--pki", &server_pki]].concat();
+        self.start("ua-server", server, &arguments, &[])?;
+        let path = self.binaries.bridge_ros1.clone();
+        let metrics = format!("127.0.0.1:{ros1_port}");
+        let arguments = [&mapping, "--interface", LOOPBACK, "--metrics", &metrics];
+        self.start("bridge-ros1", path, &arguments, &ros1)?;
+        let path = self.binaries.bridge_ros2.clone();
+        let metrics = format!("127.0.0.1:{ros2_port}");
+        let arguments = [&mapping, "--interface", LOOPBACK, "--metrics", &metrics];
+        self.start("bridge-ros2", path, &arguments, &ros2)?;
+
+        let speed = self.plan.speed.factor().to_string();
+        let covers = self.plan.covers.to_string();
+        let off_at = self.plan.conveyor_off_at.to_string();
+        let arguments = ["niryo", "--covers", &covers, "--speed", &speed];
+        self.start_own("niryo-ned", &arguments, &ros1, Stage::Robots)?;
+        let arguments = ["turtlebot", "--speed", &speed];
+        self.start_own("turtlebot3", &arguments, &ros2, Stage::Robots)?;
+        let arguments = [
+            "supervisor",
+            "--conveyor-off-at",
+            &off_at,
+            "--speed",
+            &speed,
+        ];
+        let arguments = [&arguments[..], &["--pki", &client_pki]].concat();
+        self.start_own("supervisor", &arguments, &[], Stage::Robots)?;
+        Ok((ros1_port, ros2_port))
+    }
+
+    fn start_own(
+        &mut self,
+        name: &'static str,
+        arguments: &[&str],
+        environment: &[(&'static str, &str)],
+        stage: Stage,
+    ) -> Result<(), Failure> {
+        self.programs.start(Program {
+            name,
+            path: self.binaries.demo.clone(),
+            arguments: arguments.iter().copied().map(str::to_owned).collect(),
+            environment: owned(environment),
+            tells: true,
+            stage,
+        })
+    }
+
+    fn start(
+        &mut self,
+        name: &'static str,
+        path: PathBuf,
+        arguments: &[&str],
+        environment: &[(&'static str, &str)],
+    ) -> Result<(), Failure> {
+        self.programs.start(Program {
+            name,
+            path,
+            arguments: arguments.iter().copied().map(str::to_owned).collect(),
+            environment: owned(environment),
+            tells: false,
+            stage: Stage::Bridges,
+        })
+    }
+
+    /// Takes events until the story has come to where it should be.
+    async fn watch(&mut self, by: Instant, there: impl Fn(&Story) -> bool) -> Result<(), Failure> {
+        while !there(self.story) {
+            if self.next_report(by).await?.is_none() {
+                return Err(if self.story.began() {
+                    self.stuck()
+                } else {
+                    self.not_begun()
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// The next event, `None` when the time is over. Prints what is due meanwhile.
+    async fn next_report(&mut self, by: Instant) -> Result<Option<Event>, Failure> {
+        let mut print = interval(PRINT_EVERY);
+        loop {
+            tokio::select! {
+                report = self.reports.recv() => match report {
+                    Some(programs::Report::Told(stamped)) => {
+                        self.story.observe(&stamped);
+                        self.timeline.add(&stamped);
+                        return Ok(Some(stamped.event));
+                    }
+                    Some(programs::Report::Garbled { name, line }) => {
+                        self.note(format!("{name} says what is no event: {line}"));
+                    }
+                    Some(programs::Report::Ended { name, status }) => {
+                        let last_lines = self.programs.last_lines(name);
+                        let logs = self.programs.directory().to_owned();
+                        return Err(Failure::ChildEnded { name, status, last_lines, logs });
+                    }
+                    // The programs hold a sender, so it does not end before them.
+                    None => return Ok(None),
+                },
+                () = sleep_until(by) => return Ok(None),
+                () = self.interrupt.come() => {
+                    return Err(Failure::Interrupted { standing: self.story.standing() });
+                }
+                _ = print.tick() => {
+                    self.timeline
+                        .print_before(wall_nanos(), self.story)
+                        .map_err(Failure::io("cannot print"))?;
+                }
+            }
+        }
+    }
+
+    /// The hops, of which each bridge has measured its own.
+    async fn ask_bridges(&mut self, ros1_port: u16, ros2_port: u16) -> Hops {
+        let by = Instant::now() + SPARE;
+        let both = async { tokio::join!(status::fetch(ros1_port), status::fetch(ros2_port)) };
+        let Ok((ros1, ros2)) = timeout_at(by, both).await else {
+            return Hops::default();
+        };
+        let mut hops = Hops::default();
+        match ros1 {
+            Ok(status) => hops.pb1 = status.hops.get("out").copied(),
+            Err(error) => self.note(format!("bridge-ros1 gives no figures: {error}")),
+        }
+        match ros2 {
+            Ok(status) => {
+                hops.tr0 = status.hops.get("network").copied();
+                hops.pb2 = status.hops.get("in").copied();
+            }
+            Err(error) => self.note(format!("bridge-ros2 gives no figures: {error}")),
+        }
+        hops
+    }
+
+    fn note(&mut self, what: String) {
+        self.timeline.note(wall_nanos(), Who::Demo, what);
+    }
+
+    fn not_begun(&self) -> Failure {
+        Failure::NotBegun {
+            seconds: BEGIN_WITHIN.as_secs(),
+            standing: self.story.standing(),
+            logs: self.programs.directory().to_owned(),
+        }
+    }
+
+    fn stuck(&self) -> Failure {
+        Failure::Stuck {
+            standing: self.story.standing(),
+            logs: self.programs.directory().to_owned(),
+        }
+    }
+}
+
+fn owned(environment: &[(&'static str, &str)]) -> Vec<(&'static str, String)> {
+    environment
+        .iter()
+        .map(|(key, value)| (*key, (*value).to_owned()))
+        .collect()
+}
+
+/// A port that nobody listens on now.
+fn free_port() -> Result<u16, Failure> {
+    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0));
+    let address = listener.and_then(|listener| listener.local_addr());
+    Ok(address
+        .map_err(Failure::io("no free port on 127.0.0.1"))?
+        .port())
+}
+
+const MAPPING: &str = include_str!("../../../mappings/assembly-line.yaml");
+/// The interface of the PubSub group, by address, because its name is not the same everywhere.
+const LOOPBACK: &str = "127.0.0.1";
+/// How long the programs may take to find one another.
+const BEGIN_WITHIN: Duration = Duration::from_mins(1);
+/// For what does not get faster with the story.
+const SPARE: Duration = Duration::from_secs(10);
+const PRINT_EVERY: Duration = Duration::from_millis(50);

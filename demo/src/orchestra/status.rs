@@ -1,0 +1,120 @@
+//! The figures that the bridges give out over HTTP.
+
+use std::collections::BTreeMap;
+use std::net::{Ipv4Addr, SocketAddr};
+use std::time::Duration;
+
+use http_body_util::{BodyExt as _, Empty, Limited};
+use hyper::Request;
+use hyper::body::Bytes;
+use hyper::header::HOST;
+use hyper_util::rt::TokioIo;
+use serde::Deserialize;
+use thiserror::Error;
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+
+use super::report::Hop;
+
+/// Delays per hop, by the bridges' own names: `out`, `origin`, `network`, `in`.
+#[derive(Debug, Default, Deserialize)]
+pub(crate) struct Status {
+    pub(crate) hops: BTreeMap<String, Hop>,
+}
+
+/// Asks a bridge for its status page.
+pub(crate) async fn fetch(port: u16) -> Result<Status, StatusError> {
+    timeout(LIMIT, request(port))
+        .await
+        .map_err(|_| StatusError::Timeout)?
+}
+
+async fn request(port: u16) -> Result<Status, StatusError> {
+    let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
+    let stream = TcpStream::connect(address)
+        .await
+        .map_err(StatusError::Connect)?;
+    let (mut sender, connection) =
+        hyper::client::conn::http1::handshake(TokioIo::new(stream)).await?;
+    let request = Request::get("/status")
+        .header(HOST, address.to_string())
+        .body(Empty::<Bytes>::new())
+        .map_err(|error| StatusError::Answer(error.to_string()))?;
+    let answer = async {
+        let response = sender.send_request(request).await?;
+        if !response.status().is_success() {
+            return Err(StatusError::Answer(response.status().to_string()));
+        }
+        let body = Limited::new(response.into_body(), MAX_BODY).collect().await;
+        let body = body
+            .map_err(|error| StatusError::Answer(error.to_string()))?
+            .to_bytes();
+        serde_json::from_slice(&body).map_err(|error| StatusError::Answer(error.to_string()))
+    };
+    tokio::pin!(connection, answer);
+    tokio::select! {
+        biased;
+        answer = &mut answer => answer,
+        // The connection is done when the last byte is read; the answer may not be.
+        ended = &mut connection => { ended?; answer.await }
+    }
+}
+
+/// Why there are no figures.
+#[derive(Debug, Error)]
+pub(crate) enum StatusError {
+    #[error("nobody listens there: {0}")]
+    Connect(#[source] std::io::Error),
+    #[error("HTTP failed: {0}")]
+    Http(#[from] hyper::Error),
+    #[error("the answer was not understood: {0}")]
+    Answer(String),
+    #[error("no answer within {LIMIT:?}")]
+    Timeout,
+}
+
+const LIMIT: Duration = Duration::from_secs(2);
+const MAX_BODY: usize = 1024 * 1024;
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+    use tokio::net::TcpListener;
+
+    use super::*;
+
+    async fn answered(answer: &'static str) -> Result<Status, StatusError> {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let serve = async {
+            let (mut stream, _) = listener.accept().await.unwrap();
+            let mut request = [0; 1024];
+            let read = stream.read(&mut request).await.unwrap();
+            assert!(request[..read].starts_with(b"GET /status HTTP/1.1\r\n"));
+            stream.write_all(answer.as_bytes()).await.unwrap();
+        };
+        tokio::join!(fetch(port), serve).0
+    }
+
+    #[tokio::test]
+    async fn the_hops_are_read_from_the_page_and_the_rest_is_left() {
+        let page = "HTTP/1.1 200 OK\r\nconnection: close\r\n\r\n\
+            {\"program\":\"bridge-ros1\",\"hops\":{\"out\":{\"count\":3,\"negative\":0,\
+            \"p50_us\":1.5,\"p99_us\":2.5,\"max_us\":3.5}}}";
+        let status = answered(page).await.unwrap();
+        let hop = Hop {
+            p50_us: 1.5,
+            p99_us: 2.5,
+            max_us: 3.5,
+            count: 3,
+        };
+        assert_eq!(status.hops.get("out"), Some(&hop));
+    }
+
+    #[tokio::test]
+    async fn a_page_that_is_not_there_is_an_error() {
+        let page = "HTTP/1.1 404 Not Found\r\ncontent-length: 0\r\n\r\n";
+        assert!(matches!(answered(page).await, Err(StatusError::Answer(_))));
+        assert!(matches!(answered("").await, Err(StatusError::Http(_))));
+    }
+}

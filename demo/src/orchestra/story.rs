@@ -1,0 +1,317 @@
+//! What the events of all processes come to: how many covers have arrived, what is stuck, and how late values were.
+
+use std::collections::BTreeMap;
+
+use crate::event::{Event, Stamped, SupervisorEvent, Value};
+use crate::line::Name;
+use crate::pace::Speed;
+use crate::robots::niryo::{NiryoEvent, WaitCause};
+use crate::robots::turtlebot::TurtlebotEvent;
+
+/// The line as its events tell it. Events of different processes may come in any order.
+#[derive(Debug)]
+pub(crate) struct Story {
+    covers: u32,
+    speed: Speed,
+    /// When the supervisor worked the switch for the first time: second 0.
+    began_at: Option<i64>,
+    switched_off_at: Option<i64>,
+    conveyor_stopped_at: Option<i64>,
+    placed_on_conveyor: BTreeMap<u32, i64>,
+    placed_on_turtlebot: BTreeMap<u32, i64>,
+    left_park: BTreeMap<u32, i64>,
+    unloaded: u32,
+    server: BTreeMap<Name, Vec<(i64, Value)>>,
+    awaited: Vec<Name>,
+    connected: bool,
+    arm: &'static str,
+    turtlebot: &'static str,
+}
+
+impl Story {
+    pub(crate) const fn new(covers: u32, speed: Speed) -> Self {
+        Self {
+            covers,
+            speed,
+            began_at: None,
+            switched_off_at: None,
+            conveyor_stopped_at: None,
+            placed_on_conveyor: BTreeMap::new(),
+            placed_on_turtlebot: BTreeMap::new(),
+            left_park: BTreeMap::new(),
+            unloaded: 0,
+            server: BTreeMap::new(),
+            awaited: Vec::new(),
+            connected: false,
+            arm: "has not heard the switch of its conveyor",
+            turtlebot: "stands at the park",
+        }
+    }
+
+    pub(crate) fn observe(&mut self, stamped: &Stamped) {
+        let at = stamped.at_ns;
+        match &stamped.event {
+            Event::Master(_) => {}
+            Event::Niryo(event) => self.observe_niryo(*event, at),
+            Event::Turtlebot(event) => self.observe_turtlebot(*event, at),
+            Event::Supervisor(SupervisorEvent::Connected) => self.connected = true,
+            Event::Supervisor(SupervisorEvent::Awaits { names }) => self.awaited.clone_from(names),
+            Event::Supervisor(SupervisorEvent::Switched { on }) => {
+                self.began_at.get_or_insert(at);
+                if !on {
+                    self.switched_off_at.get_or_insert(at);
+                }
+            }
+            Event::Supervisor(SupervisorEvent::Saw { name, value }) => {
+                self.awaited.retain(|awaited| awaited != name);
+                self.server.entry(*name).or_default().push((at, *value));
+            }
+        }
+    }
+
+    fn observe_niryo(&mut self, event: NiryoEvent, at: i64) {
+        self.arm = match event {
+            NiryoEvent::ConveyorStarted => "is at work",
+            NiryoEvent::ConveyorStopped { .. } => {
+                self.conveyor_stopped_at.get_or_insert(at);
+                "is at work"
+            }
+            NiryoEvent::Picked { .. } => "holds a cover",
+            NiryoEvent::PlacedOnConveyor { total } => {
+                self.placed_on_conveyor.insert(total, at);
+                "has placed a cover on the conveyor"
+            }
+            NiryoEvent::PlacedOnTurtlebot { total } => {
+                self.placed_on_turtlebot.insert(total, at);
+                "has placed a cover on TurtleBot3"
+            }
+            NiryoEvent::Waits { cause } => waits(cause),
+            NiryoEvent::StorageEmpty => "has placed all covers",
+        };
+    }
+
+    fn observe_turtlebot(&mut self, event: TurtlebotEvent, at: i64) {
+        self.turtlebot = match event {
+            TurtlebotEvent::CoverInBucket { .. } => "has a cover in its bucket",
+            TurtlebotEvent::LeavesPark { placed } => {
+                self.left_park.insert(placed, at);
+                "is on its way to the worker"
+            }
+            TurtlebotEvent::Unloaded { total } => {
+                self.unloaded = self.unloaded.max(total);
+                "is on its way back to the park"
+            }
+            TurtlebotEvent::BackAtPark => "stands at the park",
+        };
+    }
+
+    pub(crate) const fn began(&self) -> bool {
+        self.began_at.is_some()
+    }
+
+    /// Seconds of the story at a moment, once it has begun.
+    pub(crate) fn seconds(&self, at_ns: i64) -> Option<f64> {
+        Some(self.speed.story_seconds(at_ns - self.began_at?))
+    }
+
+    pub(crate) const fn covers(&self) -> u32 {
+        self.covers
+    }
+
+    pub(crate) fn by_conveyor(&self) -> u32 {
+        last(&self.placed_on_conveyor)
+    }
+
+    pub(crate) const fn by_turtlebot(&self) -> u32 {
+        self.unloaded
+    }
+
+    pub(crate) fn delivered(&self) -> u32 {
+        self.by_conveyor() + self.by_turtlebot()
+    }
+
+    pub(crate) fn finished(&self) -> bool {
+        self.delivered() == self.covers
+    }
+
+    /// All covers have arrived, and the server has the final counts.
+    pub(crate) fn settled(&self) -> bool {
+        let at_server = |name, count| {
+            let last = self.server.get(&name).and_then(|values| values.last());
+            last.is_some_and(|(_, value)| *value == Value::Number(count))
+        };
+        self.finished()
+            && at_server(Name::CoversOnConveyor, self.by_conveyor())
+            && at_server(Name::CoversOnTurtleBot3, last(&self.placed_on_turtlebot))
+    }
+
+    /// When the supervisor switched the conveyor off, in seconds of the story.
+    pub(crate) fn conveyor_off_at(&self) -> Option<f64> {
+        self.seconds(self.switched_off_at?)
+    }
+
+    /// Nanoseconds from the stop of the conveyor at Niryo Ned to the server's value saying so.
+    pub(crate) fn server_saw_off_after(&self) -> Option<i64> {
+        let stopped = self.conveyor_stopped_at?;
+        let values = self.server.get(&Name::ConveyorRunning)?;
+        let off = |(at, value): &&(i64, Value)| *value == Value::Boolean(false) && *at >= stopped;
+        values.iter().find(off).map(|(at, _)| at - stopped)
+    }
+
+    /// Nanoseconds from each cover placed to the count at the server.
+    pub(crate) fn place_to_counter(&self) -> Vec<i64> {
+        [
+            (&self.placed_on_conveyor, Name::CoversOnConveyor),
+            (&self.placed_on_turtlebot, Name::CoversOnTurtleBot3),
+        ]
+        .into_iter()
+        .flat_map(|(placed, name)| {
+            let seen = self
+                .server
+                .get(&name)
+                .map(Vec::as_slice)
+                .unwrap_or_default();
+            placed.iter().filter_map(move |(count, placed_at)| {
+                let value = Value::Number(*count);
+                seen.iter()
+                    .find(|(_, seen)| *seen == value)
+                    .map(|(at, _)| at - placed_at)
+            })
+        })
+        .collect()
+    }
+
+    /// Nanoseconds from each cover placed on TurtleBot3 to its departure.
+    pub(crate) fn place_to_move(&self) -> Vec<i64> {
+        let left = |(count, placed): (&u32, &i64)| Some(self.left_park.get(count)? - placed);
+        self.placed_on_turtlebot.iter().filter_map(left).collect()
+    }
+
+    /// Where everything stands, for somebody who wonders why nothing moves.
+    pub(crate) fn standing(&self) -> String {
+        if !self.connected {
+            return "no OPC UA session with the server".to_owned();
+        }
+        if !self.began() {
+            let missing: Vec<String> = self
+                .awaited
+                .iter()
+                .map(|name| format!("{name} (from {})", name.producer()))
+                .collect();
+            return format!("the server has no value of {}", missing.join(", "));
+        }
+        format!(
+            "{} of {} covers have arrived; Niryo Ned {}; TurtleBot3 {}",
+            self.delivered(),
+            self.covers,
+            self.arm,
+            self.turtlebot
+        )
+    }
+}
+
+const fn waits(cause: WaitCause) -> &'static str {
+    match cause {
+        WaitCause::ParkFree => "holds a cover and waits: TurtleBot3 is not at the park",
+        WaitCause::BucketBusy => "holds a cover and waits: the bucket is busy",
+        WaitCause::Unknown => "holds a cover and waits: it has not heard of TurtleBot3",
+    }
+}
+
+fn last(counts: &BTreeMap<u32, i64>) -> u32 {
+    counts.last_key_value().map_or(0, |(count, _)| *count)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn told(events: &[(i64, Event)]) -> Story {
+        let mut story = Story::new(2, Speed::new(1.0).unwrap());
+        for (at_ns, event) in events {
+            story.observe(&Stamped {
+                at_ns: *at_ns,
+                event: event.clone(),
+            });
+        }
+        story
+    }
+
+    fn saw(name: Name, value: Value) -> Event {
+        SupervisorEvent::Saw { name, value }.into()
+    }
+
+    #[test]
+    fn a_cover_on_turtlebot3_has_not_arrived_before_it_is_unloaded() {
+        let mut events = vec![
+            (1, NiryoEvent::PlacedOnConveyor { total: 1 }.into()),
+            (2, NiryoEvent::PlacedOnTurtlebot { total: 1 }.into()),
+        ];
+        assert_eq!(told(&events).delivered(), 1);
+        events.push((3, TurtlebotEvent::Unloaded { total: 1 }.into()));
+        let story = told(&events);
+        assert!(story.finished() && !story.settled());
+        events.push((4, saw(Name::CoversOnConveyor, Value::Number(1))));
+        events.push((5, saw(Name::CoversOnTurtleBot3, Value::Number(1))));
+        assert!(told(&events).settled());
+    }
+
+    #[test]
+    fn delays_do_not_depend_on_the_order_in_which_events_are_read() {
+        let mut events = vec![
+            (100, NiryoEvent::PlacedOnConveyor { total: 1 }.into()),
+            (130, saw(Name::CoversOnConveyor, Value::Number(1))),
+            (200, NiryoEvent::PlacedOnTurtlebot { total: 1 }.into()),
+            (270, saw(Name::CoversOnTurtleBot3, Value::Number(1))),
+            (900, TurtlebotEvent::LeavesPark { placed: 1 }.into()),
+        ];
+        for _ in 0..2 {
+            let story = told(&events);
+            assert_eq!(story.place_to_counter(), [30, 70]);
+            assert_eq!(story.place_to_move(), [700]);
+            events.reverse();
+        }
+    }
+
+    #[test]
+    fn the_conveyor_standing_still_at_first_is_not_the_stop() {
+        let story = told(&[
+            (10, saw(Name::ConveyorRunning, Value::Boolean(false))),
+            (20, SupervisorEvent::Switched { on: true }.into()),
+            (30, saw(Name::ConveyorRunning, Value::Boolean(true))),
+            (
+                25_000_000_020,
+                SupervisorEvent::Switched { on: false }.into(),
+            ),
+            (
+                25_000_000_100,
+                NiryoEvent::ConveyorStopped {
+                    holding_cover: true,
+                }
+                .into(),
+            ),
+            (
+                25_000_000_400,
+                saw(Name::ConveyorRunning, Value::Boolean(false)),
+            ),
+        ]);
+        assert_eq!(story.server_saw_off_after(), Some(300));
+        assert_eq!(story.conveyor_off_at(), Some(25.0));
+    }
+
+    #[test]
+    fn who_is_waited_for_is_named() {
+        let awaits = SupervisorEvent::Awaits {
+            names: vec![Name::ParkBusy, Name::BucketBusy],
+        };
+        let story = told(&[
+            (1, SupervisorEvent::Connected.into()),
+            (2, awaits.into()),
+            (3, saw(Name::BucketBusy, Value::Boolean(false))),
+        ]);
+        assert_eq!(
+            story.standing(),
+            "the server has no value of ParkBusy (from TurtleBot3)"
+        );
+    }
+}

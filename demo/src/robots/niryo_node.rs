@@ -1,0 +1,170 @@
+//! Niryo Ned as a ROS 1 node.
+
+use std::io;
+
+use anyhow::Context as _;
+use bytes::Bytes;
+use tcpros::{
+    Inbox, InboxEvent, Node, NodeOptions, Publisher, PublisherOptions, SubscriberOptions,
+    Subscription, TopicType, Wanted,
+};
+use tokio::time::{Instant, interval, sleep_until};
+
+use super::niryo::{Counts, Heard, Niryo, NiryoEvent};
+use super::{REPEAT, far_away};
+use crate::clock::wall_nanos;
+use crate::event::tell_at;
+use crate::line::Name;
+use crate::pace::{Pace, Speed};
+use crate::stop::Stop;
+
+/// Runs the node until it is told to end.
+pub(crate) async fn run(covers: u32, speed: Speed) -> anyhow::Result<()> {
+    let mut stop = Stop::new()?;
+    let node = Node::start(NodeOptions::from_env("niryo_ned"))?;
+    let outputs = Outputs::advertise(&node)?;
+    let mut inbox = Inbox::new();
+    let _subscriptions = subscribe(&node, &inbox)?;
+    let started = Instant::now();
+    let mut niryo = Niryo::new(covers, Pace::at(speed));
+    let mut repeat = interval(REPEAT);
+    loop {
+        let wake = niryo
+            .timeout()
+            .map_or_else(|| far_away(started), |at| started + at);
+        let heard = tokio::select! {
+            (name, event) = inbox.recv() => heard(name, &event),
+            () = sleep_until(wake) => Some(Heard::Nothing),
+            _ = repeat.tick() => { outputs.publish(niryo.counts()); None }
+            () = stop.wait() => break,
+        };
+        let Some(heard) = heard else { continue };
+        let before = niryo.counts();
+        let events = niryo.handle(heard, started.elapsed());
+        // The stamp is of what the arm did; publishing it comes after.
+        let stamp = wall_nanos();
+        if niryo.counts() != before {
+            outputs.publish(niryo.counts());
+        }
+        tell(stamp, &events).context("the demo does not listen any more")?;
+    }
+    node.shutdown().await;
+    Ok(())
+}
+
+fn tell(stamp: i64, events: &[NiryoEvent]) -> io::Result<()> {
+    events.iter().try_for_each(|event| tell_at(stamp, *event))
+}
+
+fn heard(name: Name, event: &InboxEvent) -> Option<Heard> {
+    let InboxEvent::Message(message) = event else {
+        return None;
+    };
+    let Some(value) = read_bool(&message.bytes) else {
+        tracing::warn!(%name, bytes = message.bytes.len(), "a message is no std_msgs/Bool");
+        return None;
+    };
+    match name {
+        Name::ConveyorSwitch => Some(Heard::Switch(value)),
+        Name::ParkBusy => Some(Heard::Park(value)),
+        Name::BucketBusy => Some(Heard::Bucket(value)),
+        Name::ConveyorRunning
+        | Name::CoversInStorage
+        | Name::CoversOnConveyor
+        | Name::CoversOnTurtleBot3 => None,
+    }
+}
+
+fn read_bool(message: &[u8]) -> Option<bool> {
+    match message {
+        [value] => Some(*value != 0),
+        _ => None,
+    }
+}
+
+fn subscribe(node: &Node, inbox: &Inbox<Name>) -> anyhow::Result<Vec<Subscription>> {
+    let wanted = Wanted {
+        type_name: Some(BOOL.0.to_owned()),
+        md5sum: Some(BOOL.1.to_owned()),
+    };
+    [Name::ConveyorSwitch, Name::ParkBusy, Name::BucketBusy]
+        .into_iter()
+        .map(|name| {
+            let topic = format!("/{}", name.ros_topic());
+            let options = SubscriberOptions::default();
+            Ok(node.subscribe(&topic, wanted.clone(), options, name, inbox)?)
+        })
+        .collect()
+}
+
+/// The latched topics of the arm.
+struct Outputs {
+    running: Publisher,
+    storage: Publisher,
+    conveyor: Publisher,
+    turtlebot: Publisher,
+}
+
+impl Outputs {
+    fn advertise(node: &Node) -> anyhow::Result<Self> {
+        let advertise = |name: Name, (type_name, md5sum, definition): (&str, &str, &str)| {
+            let topic_type = TopicType {
+                name: type_name.to_owned(),
+                md5sum: md5sum.to_owned(),
+                definition: definition.to_owned(),
+            };
+            let options = PublisherOptions {
+                latch: true,
+                ..PublisherOptions::default()
+            };
+            node.advertise(&format!("/{}", name.ros_topic()), topic_type, options)
+        };
+        Ok(Self {
+            running: advertise(Name::ConveyorRunning, BOOL)?,
+            storage: advertise(Name::CoversInStorage, UINT32)?,
+            conveyor: advertise(Name::CoversOnConveyor, UINT32)?,
+            turtlebot: advertise(Name::CoversOnTurtleBot3, UINT32)?,
+        })
+    }
+
+    fn publish(&self, counts: Counts) {
+        let running = Bytes::copy_from_slice(&[u8::from(counts.conveyor_running)]);
+        let number = |count: u32| Bytes::copy_from_slice(&count.to_le_bytes());
+        for (publisher, message) in [
+            (&self.running, running),
+            (&self.storage, number(counts.in_storage)),
+            (&self.conveyor, number(counts.on_conveyor)),
+            (&self.turtlebot, number(counts.on_turtlebot)),
+        ] {
+            let published = publisher.publish(message);
+            if published.dropped_oldest > 0 {
+                tracing::warn!(topic = publisher.topic(), "a subscriber does not keep up");
+            }
+        }
+    }
+}
+
+/// Type name, checksum and definition of the two ROS types of the line.
+const BOOL: (&str, &str, &str) = (
+    "std_msgs/Bool",
+    "8b94c1b53db61fb6aed406028ad6332a",
+    "bool data\n",
+);
+const UINT32: (&str, &str, &str) = (
+    "std_msgs/UInt32",
+    "304a39449588c7f8ce2df6e8001c5fce",
+    "uint32 data\n",
+);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_message_of_another_length_is_no_bool() {
+        assert_eq!(read_bool(&[1]), Some(true));
+        assert_eq!(read_bool(&[0]), Some(false));
+        assert_eq!(read_bool(&[]), None);
+        assert_eq!(read_bool(&[1, 0, 0, 0]), None);
+    }
+}

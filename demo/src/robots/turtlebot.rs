@@ -1,0 +1,284 @@
+//! The business program of TurtleBot3, without sockets and clock.
+//!
+//! It knows one thing of the line: how many covers have been placed on it so far. That count stands in for the sensor
+//! of its bucket, and being a state, not an edge, it does no harm when it comes late or twice.
+
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+
+use crate::pace::Pace;
+
+/// What TurtleBot3 tells the line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Status {
+    /// It stands at the park.
+    pub(crate) park_busy: bool,
+    /// There is a cover in its bucket.
+    pub(crate) bucket_busy: bool,
+}
+
+/// What TurtleBot3 does, for the timeline.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "turtlebot", rename_all = "snake_case")]
+pub(crate) enum TurtlebotEvent {
+    /// `placed` is the count that says so.
+    CoverInBucket {
+        placed: u32,
+    },
+    LeavesPark {
+        placed: u32,
+    },
+    /// `total` covers have been delivered so far.
+    Unloaded {
+        total: u32,
+    },
+    BackAtPark,
+}
+
+/// The robot on its way between park and worker.
+#[derive(Clone, Debug)]
+pub(crate) struct Turtlebot {
+    pace: Pace,
+    placed: u32,
+    delivered: u32,
+    place: Place,
+}
+
+/// Times are since the program's start.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Place {
+    Park,
+    Loading { until: Duration },
+    ToWorker { until: Duration, placed: u32 },
+    AtWorker { until: Duration, placed: u32 },
+    ToPark { until: Duration },
+}
+
+impl Turtlebot {
+    /// A robot at the park with an empty bucket.
+    pub(crate) const fn new(pace: Pace) -> Self {
+        Self {
+            pace,
+            placed: 0,
+            delivered: 0,
+            place: Place::Park,
+        }
+    }
+
+    /// Takes the count of covers placed on it, `None` when only time has passed.
+    pub(crate) fn handle(&mut self, placed: Option<u32>, now: Duration) -> Vec<TurtlebotEvent> {
+        if let Some(placed) = placed {
+            self.placed = placed;
+        }
+        let mut events = Vec::new();
+        while let Some(event) = self.step(now) {
+            events.push(event);
+        }
+        events
+    }
+
+    pub(crate) const fn status(&self) -> Status {
+        Status {
+            park_busy: matches!(self.place, Place::Park | Place::Loading { .. }),
+            bucket_busy: self.placed > self.delivered,
+        }
+    }
+
+    /// When to come back if nothing is heard.
+    pub(crate) const fn timeout(&self) -> Option<Duration> {
+        match self.place {
+            Place::Park => None,
+            Place::Loading { until }
+            | Place::ToWorker { until, .. }
+            | Place::AtWorker { until, .. }
+            | Place::ToPark { until } => Some(until),
+        }
+    }
+
+    fn step(&mut self, now: Duration) -> Option<TurtlebotEvent> {
+        if self.timeout().is_some_and(|until| now < until) {
+            return None;
+        }
+        let (place, event) = match self.place {
+            Place::Park if self.status().bucket_busy => (
+                Place::Loading {
+                    until: now + self.pace.load,
+                },
+                TurtlebotEvent::CoverInBucket {
+                    placed: self.placed,
+                },
+            ),
+            Place::Park => return None,
+            Place::Loading { .. } => (
+                Place::ToWorker {
+                    until: now + self.pace.drive,
+                    placed: self.placed,
+                },
+                TurtlebotEvent::LeavesPark {
+                    placed: self.placed,
+                },
+            ),
+            Place::ToWorker { placed, .. } => {
+                self.place = Place::AtWorker {
+                    until: now + self.pace.unload,
+                    placed,
+                };
+                return self.step(now);
+            }
+            Place::AtWorker { placed, .. } => {
+                self.delivered = placed;
+                (
+                    Place::ToPark {
+                        until: now + self.pace.drive,
+                    },
+                    TurtlebotEvent::Unloaded { total: placed },
+                )
+            }
+            Place::ToPark { .. } => (Place::Park, TurtlebotEvent::BackAtPark),
+        };
+        self.place = place;
+        Some(event)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pace::Speed;
+
+    const fn s(seconds: u64) -> Duration {
+        Duration::from_secs(seconds)
+    }
+
+    fn turtlebot() -> Turtlebot {
+        Turtlebot::new(Pace::at(Speed::new(1.0).unwrap()))
+    }
+
+    fn run_until(robot: &mut Turtlebot, end: Duration) -> Vec<(Duration, TurtlebotEvent)> {
+        let mut events = Vec::new();
+        while let Some(at) = robot.timeout().filter(|at| *at <= end) {
+            events.extend(robot.handle(None, at).into_iter().map(|event| (at, event)));
+        }
+        events
+    }
+
+    #[test]
+    fn it_waits_at_the_park_with_an_empty_bucket() {
+        let mut robot = turtlebot();
+        assert_eq!(robot.handle(Some(0), s(1)), []);
+        assert_eq!(
+            robot.status(),
+            Status {
+                park_busy: true,
+                bucket_busy: false
+            }
+        );
+        assert_eq!(robot.timeout(), None);
+    }
+
+    #[test]
+    fn a_cover_in_the_bucket_is_driven_to_the_worker_and_the_robot_comes_back() {
+        let mut robot = turtlebot();
+        assert_eq!(
+            robot.handle(Some(1), s(10)),
+            [TurtlebotEvent::CoverInBucket { placed: 1 }]
+        );
+        assert_eq!(
+            robot.status(),
+            Status {
+                park_busy: true,
+                bucket_busy: true
+            }
+        );
+        assert_eq!(
+            run_until(&mut robot, s(12)),
+            [(s(12), TurtlebotEvent::LeavesPark { placed: 1 })]
+        );
+        assert_eq!(
+            robot.status(),
+            Status {
+                park_busy: false,
+                bucket_busy: true
+            }
+        );
+        assert_eq!(
+            run_until(&mut robot, s(22)),
+            [(s(22), TurtlebotEvent::Unloaded { total: 1 })]
+        );
+        assert_eq!(
+            robot.status(),
+            Status {
+                park_busy: false,
+                bucket_busy: false
+            }
+        );
+        assert_eq!(
+            run_until(&mut robot, s(60)),
+            [(s(29), TurtlebotEvent::BackAtPark)]
+        );
+        assert_eq!(
+            robot.status(),
+            Status {
+                park_busy: true,
+                bucket_busy: false
+            }
+        );
+    }
+
+    #[test]
+    fn a_repeated_count_is_no_second_cover() {
+        let mut robot = turtlebot();
+        robot.handle(Some(1), s(0));
+        for second in 1..60 {
+            run_until(&mut robot, s(second));
+            robot.handle(Some(1), s(second));
+        }
+        assert_eq!(
+            robot.status(),
+            Status {
+                park_busy: true,
+                bucket_busy: false
+            }
+        );
+        assert_eq!(robot.timeout(), None);
+    }
+
+    #[test]
+    fn a_count_that_rises_on_the_way_is_the_next_trip() {
+        let mut robot = turtlebot();
+        robot.handle(Some(1), s(0));
+        run_until(&mut robot, s(5));
+        robot.handle(Some(2), s(5));
+        let events: Vec<_> = run_until(&mut robot, s(60))
+            .into_iter()
+            .map(|(_, e)| e)
+            .collect();
+        assert_eq!(
+            events,
+            [
+                TurtlebotEvent::Unloaded { total: 1 },
+                TurtlebotEvent::BackAtPark,
+                TurtlebotEvent::CoverInBucket { placed: 2 },
+                TurtlebotEvent::LeavesPark { placed: 2 },
+                TurtlebotEvent::Unloaded { total: 2 },
+                TurtlebotEvent::BackAtPark,
+            ]
+        );
+    }
+
+    #[test]
+    fn counts_missed_while_nothing_was_heard_are_delivered_together() {
+        let mut robot = turtlebot();
+        robot.handle(Some(2), s(0));
+        let events: Vec<_> = run_until(&mut robot, s(60))
+            .into_iter()
+            .map(|(_, e)| e)
+            .collect();
+        assert!(
+            events.contains(&TurtlebotEvent::Unloaded { total: 2 }),
+            "{events:?}"
+        );
+        assert!(!robot.status().bucket_busy);
+    }
+}

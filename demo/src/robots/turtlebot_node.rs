@@ -1,0 +1,131 @@
+//! TurtleBot3 as a ROS 2 node.
+
+use std::net::{IpAddr, Ipv4Addr};
+
+use anyhow::{Context as _, anyhow};
+use futures_util::StreamExt as _;
+use ros2_client::qos::{Durability, History, WhenFull};
+use ros2_client::{
+    Context, MessageTypeName, Name as RosName, Node, NodeName, NodeOptions, Publisher, QosProfile,
+    Subscription,
+};
+use rustdds::DomainParticipantBuilder;
+use tokio::time::{Instant, interval, sleep_until};
+
+use super::turtlebot::{Status, Turtlebot};
+use super::{REPEAT, far_away};
+use crate::clock::wall_nanos;
+use crate::event::tell_at;
+use crate::line::{DOMAIN, Name};
+use crate::pace::{Pace, Speed};
+use crate::stop::Stop;
+
+/// Runs the node until it is told to end.
+pub(crate) async fn run(speed: Speed) -> anyhow::Result<()> {
+    let mut stop = Stop::new()?;
+    let mut node = join()?;
+    let outputs = Outputs {
+        park: publisher(&mut node, Name::ParkBusy)?,
+        bucket: publisher(&mut node, Name::BucketBusy)?,
+    };
+    let covers = subscription(&mut node)?;
+    let mut covers = std::pin::pin!(covers.async_stream());
+    let started = Instant::now();
+    let mut robot = Turtlebot::new(Pace::at(speed));
+    let mut repeat = interval(REPEAT);
+    loop {
+        let wake = robot
+            .timeout()
+            .map_or_else(|| far_away(started), |at| started + at);
+        let placed = tokio::select! {
+            sample = covers.next() => match sample {
+                Some(Ok((count, _))) => Some(count),
+                Some(Err(error)) => {
+                    tracing::warn!(?error, "a count was not read");
+                    continue;
+                }
+                None => return Err(anyhow!("the subscription of the count of covers has ended")),
+            },
+            () = sleep_until(wake) => None,
+            _ = repeat.tick() => { outputs.publish(robot.status()); continue }
+            () = stop.wait() => return Ok(()),
+        };
+        let before = robot.status();
+        let events = robot.handle(placed, started.elapsed());
+        // The stamp is of what the robot did; publishing it comes after.
+        let stamp = wall_nanos();
+        if robot.status() != before {
+            outputs.publish(robot.status());
+        }
+        for event in events {
+            tell_at(stamp, event).context("the demo does not listen any more")?;
+        }
+    }
+}
+
+/// Joins the domain on the loopback interface alone.
+fn join() -> anyhow::Result<Node> {
+    let participant = DomainParticipantBuilder::new(DOMAIN)
+        .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])
+        .same_host_loopback(true)
+        .build()
+        .with_context(|| format!("cannot join DDS domain {DOMAIN}"))?;
+    let context = Context::from_domain_participant(participant)
+        .map_err(|error| anyhow!("cannot make a ROS 2 context: {error}"))?;
+    let name = NodeName::new("/", "turtlebot3").map_err(|error| anyhow!("{error:?}"))?;
+    let options = NodeOptions::new()
+        .start_parameter_services(false)
+        .enable_rosout(false);
+    context
+        .new_node(name, options)
+        .map_err(|error| anyhow!("cannot make a ROS 2 node: {error}"))
+}
+
+/// The last value counts, and who comes late gets it.
+const STATE: QosProfile = QosProfile::publisher_default()
+    .reliability_reliable(WhenFull::Fail)
+    .durability(Durability::TransientLocal)
+    .history(History::KeepLast { depth: 1 });
+
+fn topic(node: &Node, name: Name, type_name: &str) -> anyhow::Result<rustdds::Topic> {
+    let ros_name = RosName::parse(&format!("/{}", name.ros_topic()))
+        .map_err(|error| anyhow!("{name} has no ROS 2 name: {error:?}"))?;
+    node.create_topic(
+        &ros_name,
+        MessageTypeName::new("std_msgs", type_name),
+        &STATE,
+    )
+    .map_err(|error| anyhow!("cannot make the topic of {name}: {error}"))
+}
+
+fn publisher(node: &mut Node, name: Name) -> anyhow::Result<Publisher<bool>> {
+    let topic = topic(node, name, "Bool")?;
+    node.create_publisher(&topic, Some(STATE))
+        .map_err(|error| anyhow!("cannot publish {name}: {error}"))
+}
+
+fn subscription(node: &mut Node) -> anyhow::Result<Subscription<u32>> {
+    let name = Name::CoversOnTurtleBot3;
+    let topic = topic(node, name, "UInt32")?;
+    node.create_subscription(&topic, Some(STATE))
+        .map_err(|error| anyhow!("cannot subscribe {name}: {error}"))
+}
+
+struct Outputs {
+    park: Publisher<bool>,
+    bucket: Publisher<bool>,
+}
+
+impl Outputs {
+    fn publish(&self, status: Status) {
+        for (name, publisher, value) in [
+            (Name::BucketBusy, &self.bucket, status.bucket_busy),
+            (Name::ParkBusy, &self.park, status.park_busy),
+        ] {
+            if let Err(error) = publisher.publish(value) {
+                // It is repeated soon.
+                tracing::warn!(%name, ?error, "a state was not published");
+            }
+        }
+    }
+}

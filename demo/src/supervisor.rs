@@ -1,0 +1,287 @@
+//! The supervisor: an OPC UA client that works the switch of the conveyor and watches all values.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context as _, anyhow, bail};
+use opcua::client::{ClientBuilder, DataChangeCallback, IdentityToken, MonitoredItem, Session};
+use opcua::types::{
+    DataValue, Identifier, MessageSecurityMode, MonitoredItemCreateRequest, MonitoringMode,
+    MonitoringParameters, NodeId, StatusCode, TimestampsToReturn, UserTokenPolicy, Variant,
+    WriteValue,
+};
+use tokio::sync::mpsc;
+use tokio::time::{Instant, sleep, sleep_until, timeout};
+
+use crate::clock::wall_nanos;
+use crate::event::{SupervisorEvent, Value, tell, tell_at};
+use crate::line::{ENDPOINT, NAMESPACE, Name};
+use crate::stop::Stop;
+
+/// Starts the line when all its values are at the server, switches the conveyor off after `off_after`, and watches
+/// until it is told to end.
+pub(crate) async fn run(off_after: Duration, pki: PathBuf) -> anyhow::Result<()> {
+    let mut stop = Stop::new()?;
+    tokio::select! {
+        result = supervise(off_after, pki) => result,
+        () = stop.wait() => Ok(()),
+    }
+}
+
+async fn supervise(off_after: Duration, pki: PathBuf) -> anyhow::Result<()> {
+    let session = connect(pki).await?;
+    let namespace = namespace_index(&session).await?;
+    tell(SupervisorEvent::Connected)?;
+    let mut values = subscribe(&session, namespace).await?;
+    let mut watch = Watch::new();
+
+    while !watch.complete() {
+        let (name, value) = values.recv().await.ok_or_else(subscription_ended)?;
+        watch.see(name, &value)?;
+    }
+    let mut off_at = Instant::now() + off_after;
+    if !off_after.is_zero() {
+        switch(&session, namespace, true).await?;
+        off_at = Instant::now() + off_after;
+    }
+    let mut switched_off = false;
+    loop {
+        tokio::select! {
+            value = values.recv() => {
+                let (name, value) = value.ok_or_else(subscription_ended)?;
+                watch.see(name, &value)?;
+            }
+            () = sleep_until(off_at), if !switched_off => {
+                switch(&session, namespace, false).await?;
+                switched_off = true;
+            }
+        }
+    }
+}
+
+fn subscription_ended() -> anyhow::Error {
+    anyhow!("the OPC UA server has ended the subscription")
+}
+
+/// Connects as soon as the server listens.
+async fn connect(pki: PathBuf) -> anyhow::Result<Arc<Session>> {
+    let mut client = ClientBuilder::new()
+        .application_name("Supervisor of the assembly line")
+        .application_uri("urn:ua-bridge:demo:supervisor")
+        .product_uri("urn:ua-bridge:demo")
+        .pki_dir(pki)
+        .create_sample_keypair(false)
+        .trust_server_certs(false)
+        .session_retry_initial(Duration::from_millis(100))
+        .session_retry_max(Duration::from_secs(1))
+        .session_retry_limit(-1)
+        .request_timeout(REQUEST_LIMIT)
+        .min_publish_interval(PUBLISHING_INTERVAL)
+        .client()
+        .map_err(|errors| {
+            anyhow!(
+                "the OPC UA client is not set up well: {}",
+                errors.join("; ")
+            )
+        })?;
+    let (session, events) = client
+        .connect_to_endpoint_directly(
+            (
+                ENDPOINT,
+                "None",
+                MessageSecurityMode::None,
+                UserTokenPolicy::anonymous(),
+            ),
+            IdentityToken::Anonymous,
+        )
+        .map_err(|error| anyhow!("{ENDPOINT} is no endpoint to connect to: {error}"))?;
+    // It ends with the session, and the session with the process.
+    drop(events.spawn());
+    match timeout(CONNECT_LIMIT, session.wait_for_connection()).await {
+        Ok(true) => Ok(session),
+        Ok(false) => bail!("the connection to {ENDPOINT} was given up"),
+        Err(_) => bail!("no OPC UA session at {ENDPOINT} within {CONNECT_LIMIT:?}"),
+    }
+}
+
+async fn namespace_index(session: &Session) -> anyhow::Result<u16> {
+    let namespaces = session
+        .read_namespace_array()
+        .await
+        .map_err(|error| anyhow!("the namespaces of the OPC UA server cannot be read: {error}"))?;
+    namespaces
+        .get_index(NAMESPACE)
+        .ok_or_else(|| anyhow!("the OPC UA server has no namespace {NAMESPACE}"))
+}
+
+/// Subscribes all values of the line. The queue holds more than a line produces while the timeline is written.
+async fn subscribe(
+    session: &Session,
+    namespace: u16,
+) -> anyhow::Result<mpsc::Receiver<(Name, DataValue)>> {
+    let (sender, receiver) = mpsc::channel(1024);
+    let callback = DataChangeCallback::new(move |value, item: &MonitoredItem| {
+        let node = &item.item_to_monitor().node_id;
+        let name = Name::ALL.into_iter().find(|name| is(node, *name));
+        if let Some(name) = name
+            && sender.try_send((name, value)).is_err()
+        {
+            tracing::warn!(%name, "a change was lost: the timeline is not read");
+        }
+    });
+    let subscription = session
+        .create_subscription(PUBLISHING_INTERVAL, 1000, 100, 0, 0, true, callback)
+        .await
+        .map_err(|error| anyhow!("no subscription at the OPC UA server: {error}"))?;
+    let items = Name::ALL.into_iter().map(|name| {
+        MonitoredItemCreateRequest::new(
+            NodeId::new(namespace, name.node()).into(),
+            MonitoringMode::Reporting,
+            MonitoringParameters {
+                // Every change, as it comes.
+                sampling_interval: 0.0,
+                queue_size: 100,
+                discard_oldest: true,
+                ..MonitoringParameters::default()
+            },
+        )
+    });
+    let created = session
+        .create_monitored_items(subscription, TimestampsToReturn::Both, items.collect())
+        .await
+        .map_err(|error| anyhow!("the values cannot be monitored: {error}"))?;
+    for (name, item) in Name::ALL.into_iter().zip(created) {
+        let status = item.result.status_code;
+        if !status.is_good() {
+            bail!("{name} cannot be monitored: {status}");
+        }
+    }
+    Ok(receiver)
+}
+
+fn is(node: &NodeId, name: Name) -> bool {
+    matches!(&node.identifier, Identifier::Numeric(number) if *number == name.node())
+}
+
+/// Writes the switch; retries, because a write is what the whole story hangs on.
+async fn switch(session: &Session, namespace: u16, on: bool) -> anyhow::Result<()> {
+    let value = DataValue::value_only(Variant::Boolean(on));
+    let node = NodeId::new(namespace, Name::ConveyorSwitch.node());
+    let mut write = WriteValue::value_attr(node, Variant::Boolean(on));
+    write.value = value;
+    let mut problem = String::new();
+    for _ in 0..WRITE_ATTEMPTS {
+        let stamp = wall_nanos();
+        match session.write(std::slice::from_ref(&write)).await {
+            Ok(results) if results.iter().all(StatusCode::is_good) && !results.is_empty() => {
+                tell_at(stamp, SupervisorEvent::Switched { on })?;
+                return Ok(());
+            }
+            Ok(results) => {
+                problem = results
+                    .first()
+                    .map_or_else(String::new, ToString::to_string)
+            }
+            Err(error) => problem = error.to_string(),
+        }
+        tracing::warn!(problem, "the switch was not written");
+        sleep(Duration::from_millis(200)).await;
+    }
+    Err(anyhow!("{problem}")).context("the OPC UA server does not take the switch of the conveyor")
+}
+
+/// The last value seen of each variable.
+struct Watch {
+    last: std::collections::BTreeMap<Name, Value>,
+}
+
+impl Watch {
+    const fn new() -> Self {
+        Self {
+            last: std::collections::BTreeMap::new(),
+        }
+    }
+
+    /// Whether every value that the robots produce has come to the server.
+    fn complete(&self) -> bool {
+        self.missing().is_empty()
+    }
+
+    fn missing(&self) -> Vec<Name> {
+        let needed = Name::ALL
+            .into_iter()
+            .filter(|name| *name != Name::ConveyorSwitch);
+        needed
+            .filter(|name| !self.last.contains_key(name))
+            .collect()
+    }
+
+    /// Tells of a value when it is good and new.
+    fn see(&mut self, name: Name, data: &DataValue) -> anyhow::Result<()> {
+        let status = data.status.unwrap_or(StatusCode::Good);
+        if !status.is_good() {
+            tracing::info!(%name, %status, "no good value");
+            if !self.complete() {
+                tell(SupervisorEvent::Awaits {
+                    names: self.missing(),
+                })?;
+            }
+            return Ok(());
+        }
+        let value = match data.value {
+            Some(Variant::Boolean(value)) => Value::Boolean(value),
+            Some(Variant::UInt32(value)) => Value::Number(value),
+            _ => bail!(
+                "{name} is {:?} at the OPC UA server, no Boolean or UInt32",
+                data.value
+            ),
+        };
+        if self.last.insert(name, value) != Some(value) {
+            let stamp = server_time(data).unwrap_or_else(wall_nanos);
+            tell_at(stamp, SupervisorEvent::Saw { name, value })?;
+        }
+        Ok(())
+    }
+}
+
+/// When the server got the value, in nanoseconds since 1970; in steps of 100 ns.
+fn server_time(data: &DataValue) -> Option<i64> {
+    let ticks = data.server_timestamp.as_ref()?.ticks();
+    ticks.checked_sub(UNIX_EPOCH_TICKS)?.checked_mul(100)
+}
+
+/// 1970 in 100 ns since 1601.
+const UNIX_EPOCH_TICKS: i64 = 116_444_736_000_000_000;
+const PUBLISHING_INTERVAL: Duration = Duration::from_millis(10);
+const CONNECT_LIMIT: Duration = Duration::from_mins(1);
+const REQUEST_LIMIT: Duration = Duration::from_secs(5);
+const WRITE_ATTEMPTS: u32 = 10;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use opcua::types::DateTime;
+
+    #[test]
+    fn server_time_counts_from_1970() {
+        let data = DataValue {
+            server_timestamp: Some(DateTime::ymd_hms_nano(2001, 9, 9, 1, 46, 40, 123_456_700)),
+            ..DataValue::default()
+        };
+        assert_eq!(server_time(&data), Some(1_000_000_000_123_456_700));
+        assert_eq!(server_time(&DataValue::default()), None);
+    }
+
+    #[test]
+    fn the_line_starts_when_all_values_but_the_switch_are_there() {
+        let mut watch = Watch::new();
+        for name in Name::ALL {
+            assert_eq!(watch.complete(), watch.last.len() == 6, "{name}");
+            if name != Name::ConveyorSwitch {
+                watch.last.insert(name, Value::Number(0));
+            }
+        }
+        assert!(watch.complete());
+    }
+}
