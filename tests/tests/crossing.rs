@@ -230,6 +230,39 @@ fn an_opc_ua_client_reads_what_either_ros_publishes() {
 }
 
 #[test]
+fn a_cell_without_ros_1_crosses_between_ros_2_and_the_server() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _programs = (cell.bridge_ros2(&[PLANT]), cell.ua_server(&[PLANT]));
+    let mut switch = cell.cyclone(
+        "ros2_sub.py",
+        &["/ua_0_2_30", "std_msgs/Bool", "--domain", "2"],
+    );
+    let _sends = in_ros2(
+        &cell,
+        "/wheels/joint_states",
+        "sensor_msgs/JointState",
+        &joints(),
+    );
+    let positions = eventually("the positions are good", SOON, || {
+        let lines = cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=2;s=21.position"])?;
+        (lines[0]["status"] == "Good").then(|| lines[0]["value"].clone())
+    });
+    assert_eq!(positions, joints()["position"]);
+
+    let write = [SERVER_ENDPOINT, "ns=2;i=30", "Boolean", "true"];
+    assert_eq!(
+        cell.asyncua_once("opcua_write.py", &write)[0]["status"],
+        "Good"
+    );
+    assert_eq!(
+        switch.wait_for_json("the switch in ROS 2", SOON, value),
+        json!({"data": true})
+    );
+}
+
+#[test]
 fn a_value_whose_writer_is_gone_is_uncertain_and_still_there() {
     let Some(cell) = Cell::with(BOTH) else {
         return;

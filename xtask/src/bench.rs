@@ -13,7 +13,10 @@ use crate::{
 pub(crate) fn hop(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     let namespaces = Namespaces::try_out();
     ensure!(namespaces != Namespaces::Refused, "{REFUSED}");
-    peers::install(workspace);
+    ensure!(
+        peers::install(workspace) == Ended::WELL,
+        "the measurement needs all peers"
+    );
     step("building the programs with optimisation (some minutes the first time)");
     let packages = [
         "-p",

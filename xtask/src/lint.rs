@@ -52,7 +52,16 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
     let deny = Deny::find(workspace)?;
     check(
         "licences, sources and duplicates of dependencies",
-        &mut deny.command(workspace, &["check", "bans", "licenses", "sources"]),
+        &mut deny.command(
+            workspace,
+            &[
+                "check",
+                "--hide-inclusion-graph",
+                "bans",
+                "licenses",
+                "sources",
+            ],
+        ),
     )?;
     match deny.fetch(workspace)? {
         Ok(()) => check(

@@ -23,6 +23,7 @@ cargo xtask <verb>
 
   demo [ARGS]                    build the programs and run the assembly line; ARGS go to it (--help lists them)
   test [--no-install] [FILTER..] install the peers of the tests (apt, pip), then run all tests whose name contains a FILTER
+  peers                          only install the peers
   lint                           formatting, clippy, licences and sources of dependencies, documentation
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
 ";
@@ -47,6 +48,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         }
         ["demo", rest @ ..] => demo::run(&Workspace::find()?, rest),
         ["test", rest @ ..] => test::run(&Workspace::find()?, rest),
+        ["peers"] => Ok(peers::run(&Workspace::find()?)),
         ["lint"] => lint::run(&Workspace::find()?),
         ["bench", "hop", rest @ ..] => bench::hop(&Workspace::find()?, rest),
         _ => {

@@ -9,7 +9,7 @@ use std::{
 use anyhow::{Context as _, ensure};
 
 use crate::{
-    shell::{line, run, step, succeeds},
+    shell::{Ended, line, run as must, step, succeeds},
     workspace::Workspace,
 };
 
@@ -32,13 +32,24 @@ const APT: &[&str] = &[
 ];
 
 /// Installs what is missing. What cannot be installed is told; its tests then skip themselves, or fail with `CI=true`.
-pub(crate) fn install(workspace: &Workspace) {
-    if let Err(error) = apt() {
-        eprintln!("xtask: the peers from apt are not complete: {error:#}");
+pub(crate) fn install(workspace: &Workspace) -> Ended {
+    let mut ended = Ended::WELL;
+    for (place, result) in [("apt", apt()), ("PyPI", venv(workspace))] {
+        if let Err(error) = result {
+            eprintln!("xtask: the peers from {place} are not complete: {error:#}");
+            ended = Ended::BADLY;
+        }
     }
-    if let Err(error) = venv(workspace) {
-        eprintln!("xtask: the peers from PyPI are not complete: {error:#}");
+    ended
+}
+
+/// `cargo xtask peers`: installs them and says when they are all there.
+pub(crate) fn run(workspace: &Workspace) -> Ended {
+    let ended = install(workspace);
+    if ended == Ended::WELL {
+        step("all peers of the tests are there");
     }
+    ended
 }
 
 /// The Python that has the peers of PyPI.
@@ -70,7 +81,7 @@ fn apt() -> anyhow::Result<()> {
             .args(["DEBIAN_FRONTEND=noninteractive", "apt-get"])
             .args(arguments);
         println!("    {}", line(&command));
-        run(&mut command)?;
+        must(&mut command)?;
     }
     Ok(())
 }
@@ -113,18 +124,22 @@ fn venv(workspace: &Workspace) -> anyhow::Result<()> {
     } else {
         Path::new("python3")
     };
-    run(Command::new(python3)
-        .args(["-m", "venv", "--clear"])
-        .arg(&folder))?;
-    run(Command::new(python(workspace))
-        .args([
-            "-m",
-            "pip",
-            "install",
-            "--disable-pip-version-check",
-            "--requirement",
-        ])
-        .arg(&requirements))?;
+    must(
+        Command::new(python3)
+            .args(["-m", "venv", "--clear"])
+            .arg(&folder),
+    )?;
+    must(
+        Command::new(python(workspace))
+            .args([
+                "-m",
+                "pip",
+                "install",
+                "--disable-pip-version-check",
+                "--requirement",
+            ])
+            .arg(&requirements),
+    )?;
     fs::write(&installed, wanted)
         .with_context(|| format!("{} cannot be written", installed.display()))
 }

@@ -29,6 +29,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
         return Ok(Ended::USAGE);
     }
     if options.is_empty() {
+        // What is missing skips its own tests, or fails them with CI=true; the others run.
         peers::install(workspace);
     }
     step("building the programs and the tests (some minutes the first time)");
