@@ -1,2 +1,157 @@
-//! Placeholder of the skeleton.
-fn main() {}
+//! `bridge-ros1`: carries topics between a ROS 1 graph and the space.
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use bridge_core::Local;
+use bridge_node::{Arguments, Context, Failure, FailureKind, Program};
+use bridge_ros1::{PortOptions, Ros1Port};
+use clap::{ArgMatches, Command, CommandFactory, FromArgMatches, Parser};
+use mappings::{Mapping, SpaceId};
+use tcpros::{NodeError, NodeOptions};
+use tracing::warn;
+
+fn main() -> ExitCode {
+    bridge_node::run::<BridgeRos1>()
+}
+
+/// The command line: what clap reads, and the words that ROS gives a meaning to.
+#[derive(Debug)]
+struct BridgeRos1 {
+    flags: Flags,
+    /// `from:=to` and `__name:=value`, which `roslaunch` puts anywhere.
+    words: Vec<String>,
+}
+
+/// Carries topics between a ROS 1 graph and the space of OPC UA PubSub.
+///
+/// The ROS master is found by ROS_MASTER_URI, and this node by ROS_HOSTNAME or ROS_IP. Remappings such as `from:=to`
+/// and `__name:=bridge` are taken as every ROS node does.
+#[derive(Debug, Parser)]
+#[command(name = "bridge-ros1", version)]
+struct Flags {
+    #[command(flatten)]
+    arguments: Arguments,
+}
+
+impl Parser for BridgeRos1 {
+    fn try_parse() -> Result<Self, clap::Error> {
+        Self::of(std::env::args().collect())
+    }
+}
+
+impl BridgeRos1 {
+    fn of(arguments: Vec<String>) -> Result<Self, clap::Error> {
+        let (words, rest): (Vec<_>, Vec<_>) = arguments
+            .into_iter()
+            .partition(|argument| argument.contains(":="));
+        Ok(Self {
+            flags: Flags::try_parse_from(rest)?,
+            words,
+        })
+    }
+
+    fn node_options(&self) -> NodeOptions {
+        let mut options = NodeOptions::from_env(NODE_NAME);
+        let unknown = options.apply_arguments(&self.words);
+        // `roslaunch` adds `__log:=`, which names a file for a log we write to stderr.
+        for word in unknown.iter().filter(|word| !word.starts_with("__log:=")) {
+            warn!(
+                word,
+                "not a word this program knows: it has no private parameters"
+            );
+        }
+        options
+    }
+}
+
+impl CommandFactory for BridgeRos1 {
+    fn command() -> Command {
+        Flags::command()
+    }
+
+    fn command_for_update() -> Command {
+        Flags::command_for_update()
+    }
+}
+
+impl FromArgMatches for BridgeRos1 {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        Ok(Self {
+            flags: Flags::from_arg_matches(matches)?,
+            words: Vec::new(),
+        })
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        self.flags.update_from_arg_matches(matches)
+    }
+}
+
+impl Program for BridgeRos1 {
+    type Port = Ros1Port;
+
+    const NAME: &'static str = "bridge-ros1";
+    const LOCAL: Local = Local::Ros1;
+
+    fn arguments(&self) -> &Arguments {
+        &self.flags.arguments
+    }
+
+    fn own(&self, _mapping: &Mapping) -> Result<SpaceId, Failure> {
+        Ok(SpaceId::ROS1)
+    }
+
+    async fn start(self, context: Context) -> Result<Ros1Port, Failure> {
+        let options = PortOptions {
+            node: self.node_options(),
+            own: context.own,
+            mapping: context.mapping,
+            packages: std::env::var_os("ROS_PACKAGE_PATH")
+                .map(|list| std::env::split_paths(&list).collect::<Vec<PathBuf>>())
+                .unwrap_or_default(),
+        };
+        Ros1Port::start(options).map_err(|error| {
+            let kind = if matches!(error, NodeError::Name(_) | NodeError::MasterUri(_)) {
+                FailureKind::Usage
+            } else {
+                FailureKind::Unavailable
+            };
+            Failure::new(kind, error.to_string())
+        })
+    }
+}
+
+/// How the bridge appears in `rosnode list`.
+const NODE_NAME: &str = "ua_bridge_ros1";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parsed(arguments: &[&str]) -> BridgeRos1 {
+        let all = std::iter::once(&"bridge-ros1").chain(arguments);
+        BridgeRos1::of(all.map(|word| (*word).to_owned()).collect()).unwrap()
+    }
+
+    #[test]
+    fn the_command_line_is_well_formed() {
+        BridgeRos1::command().debug_assert();
+    }
+
+    #[test]
+    fn words_of_roslaunch_may_stand_anywhere() {
+        let program = parsed(&["__name:=cell", "map.yaml", "/a:=/b", "__log:=/tmp/x.log"]);
+        assert_eq!(program.arguments().mapping, Some(PathBuf::from("map.yaml")));
+        let options = program.node_options();
+        assert_eq!(options.name, "cell");
+        assert_eq!(options.remappings, [("/a".to_owned(), "/b".to_owned())]);
+    }
+
+    #[test]
+    fn without_words_the_node_has_its_own_name() {
+        let program = parsed(&[]);
+        assert_eq!(program.node_options().name, NODE_NAME);
+        assert_eq!(program.own(&Mapping::default()), Ok(SpaceId::ROS1));
+    }
+}

@@ -42,7 +42,7 @@ pub use crate::header::{ConnectionHeader, HeaderError};
 pub use crate::inbox::{Inbox, InboxEvent, Message, Peer};
 pub use crate::master::{Graph, MasterError};
 pub use crate::names::NameError;
-pub use crate::node::{MasterState, Node, NodeError};
+pub use crate::node::{GraphReader, MasterState, Node, NodeError};
 pub use crate::options::NodeOptions;
 pub use crate::publisher::{Published, Publisher, PublisherOptions, TopicType};
 pub use crate::rpc::RpcError;

@@ -101,14 +101,17 @@ impl Node {
     }
 
     /// Waits until the master tells this node to shut down, which it does when another node takes its name, and
-    /// returns the reason given. Cancel-safe.
-    pub async fn shutdown_requested(&self) -> String {
+    /// gives the reason. Cancel-safe, and free to outlive the borrow of the node.
+    pub fn shutdown_requested(&self) -> impl Future<Output = String> + Send + use<> {
         let mut asked = self.inner.shutdown.subscribe();
-        let reason = asked.wait_for(Option::is_some).await;
-        reason
-            .ok()
-            .and_then(|reason| reason.clone())
-            .unwrap_or_default()
+        async move {
+            let reason = asked.wait_for(Option::is_some).await;
+            match reason.map(|reason| reason.clone()) {
+                Ok(reason) => reason.unwrap_or_default(),
+                // The node is gone, and nobody can ask it any more.
+                Err(_) => std::future::pending().await,
+            }
+        }
     }
 
     /// Publishes a topic. Fails when the name is no ROS name, when this node already publishes it, or when the type
@@ -190,6 +193,13 @@ impl Node {
         self.inner.master.graph().await
     }
 
+    /// Asks the same in another task, which may outlive the node.
+    pub fn graph_reader(&self) -> GraphReader {
+        GraphReader {
+            master: self.inner.master.clone(),
+        }
+    }
+
     /// Withdraws everything from the master and ends: connections to subscribers after their queues are written,
     /// all within two seconds. What could not be withdrawn is logged.
     pub async fn shutdown(mut self) {
@@ -213,6 +223,19 @@ impl Node {
 impl Drop for Node {
     fn drop(&mut self) {
         self.inner.close();
+    }
+}
+
+/// Asks the master of a node who publishes and subscribes what.
+#[derive(Clone, Debug)]
+pub struct GraphReader {
+    master: Master,
+}
+
+impl GraphReader {
+    /// The graph as the master knows it now. Takes a few seconds at most; fails while there is no master.
+    pub async fn read(&self) -> Result<Graph, MasterError> {
+        self.master.graph().await
     }
 }
 

@@ -83,6 +83,11 @@ impl Publisher {
         &self.hub.topic
     }
 
+    /// The type that a subscriber was turned away with last, such as `std_msgs/Float32`.
+    pub fn refused_type(&self) -> Option<String> {
+        lock(&self.hub.state).refused_type.clone()
+    }
+
     /// Messages that slow subscribers have lost so far.
     pub fn dropped(&self) -> u64 {
         self.hub.dropped.load(Ordering::Relaxed)
@@ -114,6 +119,7 @@ pub(crate) struct Hub {
 struct HubState {
     subscribers: Vec<Arc<Subscriber>>,
     latched: Option<Bytes>,
+    refused_type: Option<String>,
     closed: bool,
 }
 
@@ -231,6 +237,7 @@ impl Hub {
         };
         // As roscpp and rospy do it: the checksum decides. Names alone differ where packages were renamed.
         if !fits(Some(md5sum), &ours.md5sum) {
+            lock(&self.state).refused_type = request.type_name().map(str::to_owned);
             return Err(format!(
                 "Client [{}] wants topic {} to have datatype/md5sum [{}/{md5sum}], but our version has [{}/{}]. Dropping connection.",
                 request.caller_id(),
@@ -306,6 +313,17 @@ mod tests {
         assert_eq!(
             (reply.caller_id(), reply.get("topic"), reply.latching()),
             ("/n", Some("/chatter"), true)
+        );
+    }
+
+    #[test]
+    fn the_type_a_subscriber_was_turned_away_with_is_remembered() {
+        let hub = hub(false);
+        let error = hub.reply_to(&request("0123").with("type", "std_msgs/Bool"), "/n");
+        assert!(error.unwrap_err().contains("[std_msgs/Bool/0123]"));
+        assert_eq!(
+            lock(&hub.state).refused_type.as_deref(),
+            Some("std_msgs/Bool")
         );
     }
 

@@ -1,0 +1,248 @@
+//! Message definitions: those built in, those of publishers' connection headers, and those of the ROS packages the
+//! program is told of.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use messages::{DefinitionError, Dialect, MessageType, NameError, Registry, TypeName};
+use tcpros::ConnectionHeader;
+use tracing::{info, warn};
+use uadp::BuiltinType;
+
+/// Finds message types by name; a type once found stays.
+#[derive(Debug)]
+pub(crate) struct Definitions {
+    registry: Registry,
+    /// Folders with packages somewhere below them, as `ROS_PACKAGE_PATH` lists; first match wins.
+    packages: Vec<PathBuf>,
+}
+
+impl Definitions {
+    pub(crate) fn new(packages: Vec<PathBuf>) -> Self {
+        Self {
+            registry: Registry::bundle(Dialect::Ros1),
+            packages,
+        }
+    }
+
+    /// The type a publisher has: by the text in its header, else the known type of that name and checksum.
+    pub(crate) fn of_publisher(
+        &mut self,
+        header: &ConnectionHeader,
+    ) -> Result<Arc<MessageType>, Unusable> {
+        let name: TypeName = header.type_name().unwrap_or_default().parse()?;
+        let md5sum = header.md5sum().unwrap_or("*");
+        let fits = |found: &MessageType| md5sum == "*" || found.md5() == md5sum;
+        let text = header.message_definition().unwrap_or_default();
+        if !text.trim().is_empty() || md5sum == EMPTY {
+            match self.registry.add_ros1_definition(&name, text) {
+                Ok(found) if fits(&found) => return Ok(found),
+                // Some writers of bags and bridges send a text that is not the one of their checksum.
+                Ok(_) | Err(_) if self.registry.get(&name).is_ok_and(|known| fits(&known)) => {}
+                Ok(found) => {
+                    return Err(Unusable::Checksum {
+                        name,
+                        theirs: md5sum.to_owned(),
+                        ours: found.md5().to_owned(),
+                    });
+                }
+                Err(error) => return Err(error.into()),
+            }
+        }
+        let known = self.get(&name)?;
+        if fits(&known) {
+            Ok(known)
+        } else {
+            let ours = known.md5().to_owned();
+            Err(Unusable::Checksum {
+                name,
+                theirs: md5sum.to_owned(),
+                ours,
+            })
+        }
+    }
+
+    /// The type of that name with all it needs. One that is not known yet is looked for in the packages.
+    pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
+        for _ in 0..MAX_FILES {
+            match self.registry.get(name) {
+                Err(DefinitionError::Unknown {
+                    name: missing,
+                    needed_by,
+                    suggestion,
+                }) => {
+                    let Some((file, text)) = self.find(&missing) else {
+                        return Err(DefinitionError::Unknown {
+                            name: missing,
+                            needed_by,
+                            suggestion,
+                        });
+                    };
+                    self.registry.add(&missing, &text)?;
+                    info!(message_type = %missing, file = %file.display(), "definition read");
+                }
+                found => return found,
+            }
+        }
+        self.registry.get(name)
+    }
+
+    /// The ROS type that carries one value of that type, and nothing else.
+    pub(crate) fn standard_type(&self, builtin: BuiltinType, array: bool) -> Option<TypeName> {
+        self.registry.standard_type(builtin, array)
+    }
+
+    fn find(&self, name: &TypeName) -> Option<(PathBuf, String)> {
+        let mut budget = MAX_FOLDERS;
+        for root in &self.packages {
+            let Some(file) = find_below(root, name, MAX_DEPTH, &mut budget) else {
+                continue;
+            };
+            let mut text = String::new();
+            match File::open(&file).and_then(|open| open.take(MAX_BYTES).read_to_string(&mut text))
+            {
+                Ok(_) => return Some((file, text)),
+                Err(error) => warn!(file = %file.display(), %error, "definition not readable"),
+            }
+        }
+        None
+    }
+}
+
+/// Why what a publisher sends cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum Unusable {
+    #[error(transparent)]
+    Name(#[from] NameError),
+    #[error(transparent)]
+    Definition(#[from] DefinitionError),
+    #[error("{name} has checksum {theirs} there and {ours} by its definition")]
+    Checksum {
+        name: TypeName,
+        theirs: String,
+        ours: String,
+    },
+}
+
+/// `<package>/msg/<Name>.msg` at or below a folder. Packages lie flat in an installation and nested in a workspace.
+fn find_below(folder: &Path, name: &TypeName, depth: usize, budget: &mut usize) -> Option<PathBuf> {
+    *budget = budget.checked_sub(1)?;
+    // Neither part of a type name can hold a separator or a dot.
+    let message = Path::new("msg").join(format!("{}.msg", name.name()));
+    let flat = folder.join(name.package()).join(&message);
+    if flat.is_file() {
+        return Some(flat);
+    }
+    if folder
+        .file_name()
+        .is_some_and(|last| last == name.package())
+    {
+        let own = folder.join(&message);
+        if own.is_file() {
+            return Some(own);
+        }
+    }
+    // Packages do not hold packages.
+    if depth == 0 || folder.join("package.xml").is_file() {
+        return None;
+    }
+    let mut below: Vec<PathBuf> = std::fs::read_dir(folder)
+        .ok()?
+        .filter_map(|entry| {
+            entry
+                .ok()
+                .filter(|entry| entry.file_type().is_ok_and(|t| t.is_dir()))
+        })
+        .map(|entry| entry.path())
+        .collect();
+    below.sort();
+    below
+        .into_iter()
+        .find_map(|folder| find_below(&folder, name, depth - 1, budget))
+}
+
+/// The checksum of a definition without fields, such as std_msgs/Empty.
+const EMPTY: &str = "d41d8cd98f00b204e9800998ecf8427e";
+/// More types than any message needs.
+const MAX_FILES: usize = 512;
+/// More than any `.msg` file has.
+const MAX_BYTES: u64 = 1 << 20;
+/// How deep a package may lie in a workspace.
+const MAX_DEPTH: usize = 4;
+/// Folders looked at for one type; a large installation has some hundreds.
+const MAX_FOLDERS: usize = 20_000;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn header(name: &str, md5sum: &str, text: &str) -> ConnectionHeader {
+        ConnectionHeader::default()
+            .with("type", name)
+            .with("md5sum", md5sum)
+            .with("message_definition", text)
+    }
+
+    #[test]
+    fn a_type_nobody_has_heard_of_is_learned_from_its_publisher() {
+        let mut definitions = Definitions::new(vec![]);
+        let text = "robot_msgs/Joint[] joints\n\
+            ================================================================================\n\
+            MSG: robot_msgs/Joint\nstring name\nfloat64 angle\n";
+        let found = definitions
+            .of_publisher(&header("robot_msgs/Arm", "*", text))
+            .unwrap();
+        assert_eq!(found.leaves()[0].path, "joints");
+        let joint = definitions
+            .get(&"robot_msgs/Joint".parse().unwrap())
+            .unwrap();
+        assert_eq!(joint.leaves()[1].path, "angle");
+    }
+
+    #[test]
+    fn a_publisher_without_a_text_is_known_by_its_checksum() {
+        let mut definitions = Definitions::new(vec![]);
+        let string = "992ce8a1687cec8c8bd883ec73ca41d1";
+        let found = definitions
+            .of_publisher(&header("std_msgs/String", string, ""))
+            .unwrap();
+        assert_eq!(found.md5(), string);
+        let other = definitions.of_publisher(&header("std_msgs/String", &"0".repeat(32), ""));
+        assert!(matches!(other, Err(Unusable::Checksum { .. })));
+    }
+
+    #[test]
+    fn a_text_that_is_not_that_of_the_checksum_is_not_believed() {
+        let mut definitions = Definitions::new(vec![]);
+        let lie = header("robot_msgs/Arm", &"0".repeat(32), "int32 a\n");
+        assert!(matches!(
+            definitions.of_publisher(&lie),
+            Err(Unusable::Checksum { .. })
+        ));
+        let bool = definitions.get(&"std_msgs/Bool".parse().unwrap()).unwrap();
+        let wrong_text = header("std_msgs/Bool", bool.md5(), "int32 a\n");
+        assert_eq!(
+            definitions.of_publisher(&wrong_text).unwrap().definition(),
+            bool.definition()
+        );
+    }
+
+    #[test]
+    fn a_message_without_fields_has_a_type() {
+        let found = Definitions::new(vec![]).of_publisher(&header("std_msgs/Empty", EMPTY, ""));
+        assert_eq!(found.unwrap().leaves().len(), 0);
+    }
+
+    #[test]
+    fn a_type_is_found_in_a_package_deep_in_a_workspace() {
+        let root = std::env::temp_dir().join(format!("packages-{}", std::process::id()));
+        let folder = root.join("src/repository/robot_msgs/msg");
+        std::fs::create_dir_all(&folder).unwrap();
+        std::fs::write(folder.join("Leg.msg"), "float64 knee\n").unwrap();
+        let found = Definitions::new(vec![root.clone()]).get(&"robot_msgs/Leg".parse().unwrap());
+        std::fs::remove_dir_all(&root).unwrap();
+        assert_eq!(found.unwrap().leaves()[0].path, "knee");
+    }
+}

@@ -1,0 +1,540 @@
+//! The port: the topics of a ROS 1 graph tied to the values of the space.
+//!
+//! One task owns everything; [`Ros1Port::recv`](Port::recv) is its only wait.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use bridge_node::{Delivery, Port, PortEvent, timestamp};
+use mappings::{Mapping, SpaceId, TopicId};
+use messages::{MessageType, Selection, TypeName};
+use tcpros::{
+    Graph, Inbox, InboxEvent, Message, Node, NodeError, NodeOptions, Peer, SubscriberOptions,
+    TopicType, Wanted,
+};
+use tracing::{info, warn};
+use uadp::BuiltinType;
+
+use crate::definitions::Definitions;
+use crate::sink::{Open, Sink};
+use crate::source::{Met, Source};
+use crate::watcher::{Seen, Watcher};
+
+/// What a [`Ros1Port`] is started with.
+#[derive(Debug, Clone)]
+pub struct PortOptions {
+    /// The node to be, and where its master is.
+    pub node: NodeOptions,
+    /// The space whose values are produced in the graph.
+    pub own: SpaceId,
+    /// The cell.
+    pub mapping: Arc<Mapping>,
+    /// Where to look for message definitions that are not built in, as `ROS_PACKAGE_PATH` lists.
+    pub packages: Vec<PathBuf>,
+}
+
+/// The ROS 1 side of a bridge.
+#[derive(Debug)]
+pub struct Ros1Port {
+    node: Node,
+    own: SpaceId,
+    mapping: Arc<Mapping>,
+    definitions: Definitions,
+    watcher: Watcher,
+    graph: Graph,
+    /// Topics we read; a source never goes away, so that its index names it.
+    sources: Vec<Source>,
+    source_of: BTreeMap<String, usize>,
+    inbox: Inbox<usize>,
+    /// Topics we write.
+    sinks: HashMap<TopicId, Sink>,
+    /// What `recv` hands out next; filled by one message or by one pass over the topics.
+    events: VecDeque<PortEvent>,
+    /// What was already told, so that it is told once.
+    told: BTreeSet<(String, &'static str)>,
+}
+
+impl Ros1Port {
+    /// Starts the node, and subscribes and publishes what the mapping names. The master may come later. Must be
+    /// called inside a tokio runtime.
+    ///
+    /// # Errors
+    /// [`NodeError`].
+    pub fn start(options: PortOptions) -> Result<Self, NodeError> {
+        let PortOptions {
+            node,
+            own,
+            mapping,
+            packages,
+        } = options;
+        let master = node.master_uri.clone();
+        let node = Node::start(node)?;
+        info!(node = node.name(), uri = node.uri(), master, space = %own, "started the ROS 1 node");
+        let mut port = Self {
+            watcher: Watcher::of(&node),
+            node,
+            own,
+            mapping: Arc::clone(&mapping),
+            definitions: Definitions::new(packages),
+            graph: Graph::default(),
+            sources: Vec::new(),
+            source_of: BTreeMap::new(),
+            inbox: Inbox::new(),
+            sinks: HashMap::new(),
+            events: VecDeque::new(),
+            told: BTreeSet::new(),
+        };
+        port.take_bindings(&mapping)?;
+        Ok(port)
+    }
+
+    fn take_bindings(&mut self, mapping: &Mapping) -> Result<(), NodeError> {
+        for (variable, binding) in mapping.bindings(self.own) {
+            let topic = variable.topic;
+            let name = binding.message_type.clone();
+            let selection = binding.selection.clone();
+            if topic.space == self.own {
+                let ros_topic = self.node.resolve(&binding.ros_topic)?;
+                let index = self.source(ros_topic, Some(name));
+                if let Some(source) = self.sources.get_mut(index) {
+                    source.values.push((topic, selection));
+                }
+                self.subscribe(index)?;
+            } else {
+                let ros_topic = binding.ros_topic.clone();
+                self.sinks.insert(
+                    topic,
+                    Sink::mapped(ros_topic, name, selection, variable.overflow),
+                );
+                self.open_sink(topic);
+            }
+        }
+        Ok(())
+    }
+
+    /// The index of the source of that topic, made when there is none.
+    fn source(&mut self, ros_topic: String, expected: Option<TypeName>) -> usize {
+        let next = self.sources.len();
+        let index = *self.source_of.entry(ros_topic.clone()).or_insert(next);
+        if index == next {
+            self.sources
+                .push(Source::new(ros_topic, expected, Vec::new()));
+        }
+        index
+    }
+
+    fn subscribe(&mut self, index: usize) -> Result<(), NodeError> {
+        let Some(source) = self
+            .sources
+            .get_mut(index)
+            .filter(|s| s.subscription.is_none())
+        else {
+            return Ok(());
+        };
+        // Any checksum: a publisher of another is told of by us, who know the mapping, and not refused by itself.
+        let wanted = Wanted {
+            type_name: source.expected.as_ref().map(ToString::to_string),
+            md5sum: None,
+        };
+        let options = SubscriberOptions::default();
+        let subscription =
+            self.node
+                .subscribe(&source.ros_topic, wanted, options, index, &self.inbox)?;
+        source.subscription = Some(subscription);
+        Ok(())
+    }
+
+    fn taken(&mut self, index: usize, event: InboxEvent) {
+        match event {
+            InboxEvent::Message(message) => self.message(index, message),
+            InboxEvent::Peer {
+                connected: true,
+                peer,
+                ..
+            } => {
+                self.meet(index, &peer);
+            }
+            InboxEvent::Peer {
+                connected: false,
+                peer,
+                publishers,
+            } => {
+                self.with_live(index, |source| source.part(&peer, publishers));
+            }
+            InboxEvent::Dropped(count) => self.lost(index, "read too slowly", count),
+        }
+    }
+
+    fn message(&mut self, index: usize, message: Message) {
+        let Message {
+            bytes,
+            peer,
+            received,
+        } = message;
+        let known = self
+            .sources
+            .get(index)
+            .and_then(|source| source.knows(&peer));
+        if !known.unwrap_or_else(|| self.meet(index, &peer)) {
+            self.lost(index, "publisher of another type", 1);
+            return;
+        }
+        let received = timestamp(received);
+        let values = self
+            .sources
+            .get(index)
+            .map_or(&[][..], |source| &source.values);
+        for (topic, _) in values {
+            let payload = bytes.clone();
+            self.events.push_back(PortEvent::Sample {
+                topic: *topic,
+                payload,
+                received,
+            });
+        }
+    }
+
+    /// Takes a publisher in; says whether its messages can be read.
+    fn meet(&mut self, index: usize, peer: &Arc<Peer>) -> bool {
+        let Some(source) = self
+            .sources
+            .get(index)
+            .filter(|source| source.knows(peer).is_none())
+        else {
+            return false;
+        };
+        let ros_topic = source.ros_topic.clone();
+        let found = self.definitions.of_publisher(&peer.header);
+        if let Err(error) = &found {
+            self.tell_once(&ros_topic, "unreadable type", || {
+                format!("messages of {} are dropped: {error}", peer.caller_id)
+            });
+        }
+        let mut met = Met::Stranger;
+        // The type first, so that the Router knows it when the topic comes alive.
+        let was_live = self.sources.get(index).is_some_and(Source::is_live);
+        let understood = found.is_ok();
+        if let Some(source) = self.sources.get_mut(index) {
+            met = source.meet(peer, found.ok());
+        }
+        match met {
+            Met::Known => {}
+            Met::Bound(message_type) => self.bound(index, &message_type),
+            Met::Stranger => {
+                if understood {
+                    self.tell_stranger(index, peer);
+                }
+                return false;
+            }
+        }
+        self.report_live(index, was_live);
+        true
+    }
+
+    fn bound(&mut self, index: usize, message_type: &Arc<MessageType>) {
+        let Some(source) = self.sources.get(index) else {
+            return;
+        };
+        for (topic, selection) in &source.values {
+            self.events.push_back(PortEvent::Bound {
+                topic: *topic,
+                message_type: Arc::clone(message_type),
+                selection: selection.clone(),
+            });
+        }
+    }
+
+    fn tell_stranger(&mut self, index: usize, peer: &Peer) {
+        let Some(source) = self.sources.get(index) else {
+            return;
+        };
+        let ros_topic = source.ros_topic.clone();
+        let ours = source
+            .expected
+            .clone()
+            .or_else(|| source.bound.as_ref().map(|b| b.name().clone()));
+        self.tell_once(&ros_topic, "publisher of another type", || {
+            format!(
+                "messages of {} are dropped: it publishes {} and the topic crosses as {}",
+                peer.caller_id,
+                peer.header.type_name().unwrap_or("?"),
+                ours.map_or_else(|| "another type".to_owned(), |name| name.to_string()),
+            )
+        });
+    }
+
+    /// Changes a source and reports when that makes it live or ends it.
+    fn with_live(&mut self, index: usize, change: impl FnOnce(&mut Source)) {
+        let Some(source) = self.sources.get_mut(index) else {
+            return;
+        };
+        let before = source.is_live();
+        change(source);
+        self.report_live(index, before);
+    }
+
+    fn report_live(&mut self, index: usize, before: bool) {
+        let Some(source) = self.sources.get(index).filter(|s| s.is_live() != before) else {
+            return;
+        };
+        let live = source.is_live();
+        let values = source.values.iter();
+        self.events.extend(values.map(|(topic, _)| PortEvent::Live {
+            topic: *topic,
+            live,
+        }));
+    }
+
+    fn lost(&mut self, index: usize, why: &'static str, count: u64) {
+        let Some(source) = self.sources.get(index) else {
+            return;
+        };
+        for (topic, _) in &source.values {
+            self.events.push_back(PortEvent::Lost {
+                topic: Some(*topic),
+                why,
+                count,
+            });
+        }
+    }
+
+    /// Compares the graph with what is open. `None`: there is no master, and all stays as it is.
+    fn look(&mut self, graph: Option<Graph>) {
+        if let Some(graph) = graph {
+            self.graph = graph;
+            self.find_sources();
+        }
+        let topics: Vec<TopicId> = self.sinks.keys().copied().collect();
+        for topic in topics {
+            self.reconcile_sink(topic);
+        }
+    }
+
+    /// Subscribes topics of our space that somebody publishes under their own name, and lets go of those nobody does.
+    fn find_sources(&mut self) {
+        let mut found = Vec::new();
+        for (ros_topic, publishers) in &self.graph.publishers {
+            let topic = ros_topic
+                .strip_prefix('/')
+                .and_then(|name| name.parse::<TopicId>().ok());
+            let Some(topic) = topic.filter(|topic| topic.space == self.own) else {
+                continue;
+            };
+            let bound = self
+                .mapping
+                .variable(topic)
+                .is_some_and(|v| v.binding(self.own).is_some());
+            if !bound && publishers.iter().any(|name| name != self.node.name()) {
+                found.push((ros_topic.clone(), topic));
+            }
+        }
+        for (ros_topic, topic) in found {
+            let new = !self.source_of.contains_key(&ros_topic);
+            if new && self.sources.len() >= MAX_TOPICS {
+                self.tell_once("", "too many topics", || {
+                    format!("more than {MAX_TOPICS} topics of this space: the rest is left alone")
+                });
+                return;
+            }
+            let index = self.source(ros_topic, None);
+            if let Some(source) = self.sources.get_mut(index)
+                && new
+            {
+                source.values.push((topic, Selection::Whole));
+            }
+            if let Err(error) = self.subscribe(index) {
+                self.tell_once(&topic.to_string(), "not subscribed", || error.to_string());
+            }
+        }
+        for source in &mut self.sources {
+            let published = self.graph.publishers.contains_key(&source.ros_topic);
+            let connected = source
+                .subscription
+                .as_ref()
+                .is_some_and(|s| s.publishers() > 0);
+            // A master that has just restarted does not name all who publish.
+            if source.expected.is_none() && !published && !connected && !source.is_live() {
+                source.subscription = None;
+            }
+        }
+    }
+
+    fn reconcile_sink(&mut self, topic: TopicId) {
+        let Some(sink) = self.sinks.get_mut(&topic) else {
+            return;
+        };
+        if let Some(open) = &mut sink.open {
+            let count = open.publisher.dropped().saturating_sub(open.reported);
+            if count > 0 {
+                open.reported += count;
+                let why = "subscriber too slow";
+                self.events.push_back(PortEvent::Lost {
+                    topic: Some(topic),
+                    why,
+                    count,
+                });
+            }
+        }
+        if !sink.serves() {
+            self.open_sink(topic);
+        }
+    }
+
+    /// Opens a sink in the best type there is; one that is open in a lesser type is opened anew.
+    fn open_sink(&mut self, topic: TopicId) {
+        let Some(sink) = self.sinks.get(&topic) else {
+            return;
+        };
+        let ros_topic = sink.ros_topic.clone();
+        // Once it is ours, the type the master names is the one we gave.
+        let subscribed = sink.open.is_none() && self.graph.subscribers.contains_key(&ros_topic);
+        let asked_for = self.graph.types.get(&ros_topic).filter(|_| subscribed);
+        let mut found = None;
+        for name in sink.candidates(asked_for.map(String::as_str)) {
+            match self.definitions.get(&name) {
+                Ok(message_type) => {
+                    found = Some(message_type);
+                    break;
+                }
+                Err(error) => {
+                    self.tell_once(&ros_topic, "unknown type", || {
+                        format!("no value can be written in the type asked for: {error}")
+                    });
+                }
+            }
+        }
+        let Some(message_type) = found else { return };
+        let Some(sink) = self.sinks.get_mut(&topic) else {
+            return;
+        };
+        let open_as = sink.open.as_ref().map(|open| open.message_type.name());
+        if open_as == Some(message_type.name()) {
+            return;
+        }
+        // The node publishes a topic in one type.
+        sink.open = None;
+        let topic_type = TopicType {
+            name: message_type.name().to_string(),
+            md5sum: message_type.md5().to_owned(),
+            definition: message_type.definition().to_owned(),
+        };
+        match self.node.advertise(&ros_topic, topic_type, sink.options()) {
+            Ok(publisher) => {
+                info!(topic = publisher.topic(), message_type = %message_type.name(), "advertised");
+                let open = Open {
+                    message_type: Arc::clone(&message_type),
+                    publisher,
+                    reported: 0,
+                };
+                sink.open = Some(open);
+                let selection = sink.selection();
+                self.events.push_back(PortEvent::Bound {
+                    topic,
+                    message_type,
+                    selection,
+                });
+            }
+            Err(error) => {
+                self.tell_once(&ros_topic, "not published", || error.to_string());
+            }
+        }
+    }
+
+    /// Logs something about a topic the first time it happens.
+    fn tell_once(&mut self, topic: &str, what: &'static str, message: impl FnOnce() -> String) {
+        if self.told.len() < MAX_TOLD && self.told.insert((topic.to_owned(), what)) {
+            warn!(topic, "{}", message());
+        }
+    }
+}
+
+impl Port for Ros1Port {
+    async fn recv(&mut self) -> PortEvent {
+        loop {
+            if let Some(event) = self.events.pop_front() {
+                return event;
+            }
+            // Both are cancel-safe. The graph first, so that a flood of samples does not keep new topics out.
+            tokio::select! {
+                biased;
+                seen = self.watcher.recv() => match seen {
+                    Seen::Graph(graph) => self.look(graph),
+                    Seen::Ended(reason) => {
+                        let name = self.node.name();
+                        return PortEvent::Ended(format!("the ROS 1 node {name} was told to shut down: {reason}"));
+                    }
+                },
+                (index, event) = self.inbox.recv() => self.taken(index, event),
+            }
+        }
+    }
+
+    fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
+        if sample.status & STATUS_BAD != 0 {
+            return Err("bad status");
+        }
+        let Some(Sink {
+            open: Some(open), ..
+        }) = self.sinks.get(&sample.topic)
+        else {
+            return Err("no publisher yet");
+        };
+        // What slow subscribers lose by it is reported with the next look at the graph.
+        let _published = open.publisher.publish(sample.payload);
+        Ok(())
+    }
+
+    fn wanted(&mut self, topic: TopicId, shape: &[(BuiltinType, bool)]) {
+        if topic.space == self.own {
+            return;
+        }
+        if !self.sinks.contains_key(&topic) {
+            if self.sinks.len() >= MAX_TOPICS {
+                self.tell_once("", "too many values", || {
+                    format!("more than {MAX_TOPICS} values of other spaces: the rest is left alone")
+                });
+                return;
+            }
+            let sink = Sink::by_name(topic, self.mapping.variable(topic));
+            self.sinks.insert(topic, sink);
+        }
+        let standard = match shape {
+            [(builtin, array)] => self.definitions.standard_type(*builtin, *array),
+            _ => None,
+        };
+        if let Some(sink) = self
+            .sinks
+            .get_mut(&topic)
+            .filter(|sink| sink.open.is_none())
+        {
+            sink.standard = standard;
+            self.open_sink(topic);
+        }
+    }
+
+    fn silent(&mut self, topic: TopicId, silent: bool) {
+        // ROS 1 has no word for it; the last value stays with its subscribers.
+        tracing::debug!(%topic, silent, "the writer in the space");
+    }
+
+    async fn shutdown(self) {
+        let Self {
+            node,
+            sinks,
+            sources,
+            watcher,
+            ..
+        } = self;
+        drop(watcher);
+        node.shutdown().await;
+        drop((sinks, sources));
+    }
+}
+
+/// The severity bit of a Bad StatusCode (OPC 10000-4, 7.39.1) in its upper 16 bits.
+const STATUS_BAD: u16 = 0x8000;
+/// Topics of the space that are read, and likewise written: anybody in the graph can invent names.
+const MAX_TOPICS: usize = 4096;
+/// Peculiarities told; a graph with more of them is told about no further ones.
+const MAX_TOLD: usize = 4096;
