@@ -24,6 +24,10 @@ pub struct Outlet {
     audience: Audience,
     /// Samples for which the send window had no room, oldest first.
     waiting: VecDeque<Sample>,
+    /// Since when the send window has no room.
+    full_since: Option<Instant>,
+    /// Bytes written since every reader had acknowledged everything.
+    in_flight: usize,
 }
 
 #[derive(Debug)]
@@ -79,6 +83,28 @@ impl Outlet {
             offered,
             audience: Audience::Nobody { held: None },
             waiting: VecDeque::new(),
+            full_since: None,
+            in_flight: 0,
+        }
+    }
+
+    /// Whether another writer should take over ([`replace_writer`](Self::replace_writer)): a reader of a state topic
+    /// has acknowledged nothing for so long that the others see an old value. Events are worth waiting for instead.
+    #[must_use]
+    pub fn is_stuck(&self, now: Instant) -> bool {
+        self.offered == Offered::KeepLatest
+            && self
+                .full_since
+                .is_some_and(|since| now.duration_since(since) >= STUCK_AFTER)
+    }
+
+    /// Puts a new writer of the same topic and policies in place. What waits is written once its readers know it.
+    pub fn replace_writer(&mut self, writer: Writer, now: Instant) {
+        self.writer = writer;
+        self.full_since = None;
+        self.in_flight = 0;
+        if let Audience::Present { since, .. } = &mut self.audience {
+            *since = now + SETTLE;
         }
     }
 
@@ -124,7 +150,7 @@ impl Outlet {
         if !self.waiting.is_empty() {
             return self.queue(sample, self.offered.waiting_room());
         }
-        match self.write(sample)? {
+        match self.write(sample, now)? {
             Some(unsent) => self.queue(unsent, self.offered.waiting_room()),
             None if size > reliable_size => Err(Refusal::TooLarge(reliable_size)),
             None => Ok(()),
@@ -140,7 +166,7 @@ impl Outlet {
             return Ok(());
         }
         while let Some(sample) = self.waiting.pop_front() {
-            if let Some(unsent) = self.write(sample)? {
+            if let Some(unsent) = self.write(sample, now)? {
                 self.waiting.push_front(unsent);
                 break;
             }
@@ -221,14 +247,33 @@ impl Outlet {
     }
 
     /// Gives a sample to RustDDS; returns it when the send window is full.
-    fn write(&self, sample: Sample) -> Result<Option<Sample>, Refusal> {
+    fn write(&mut self, sample: Sample, now: Instant) -> Result<Option<Sample>, Refusal> {
         let Sample { payload, source } = sample;
+        let size = payload.len();
+        if self.in_flight > 0 && self.in_flight + size > MAX_IN_FLIGHT {
+            // The answer is immediate with a wait of zero.
+            match self.writer.wait_for_acknowledgments(Duration::ZERO) {
+                Ok(true) => self.in_flight = 0,
+                Ok(false) => {
+                    self.full_since.get_or_insert(now);
+                    return Ok(Some(Sample { payload, source }));
+                }
+                Err(_) => return Err(Refusal::Failed),
+            }
+        }
         match self.writer.write(payload, source) {
-            Ok(()) => Ok(None),
-            Err(WriteError::WouldBlock { data }) => Ok(Some(Sample {
-                payload: data,
-                source,
-            })),
+            Ok(()) => {
+                self.full_since = None;
+                self.in_flight += size;
+                Ok(None)
+            }
+            Err(WriteError::WouldBlock { data }) => {
+                self.full_since.get_or_insert(now);
+                Ok(Some(Sample {
+                    payload: data,
+                    source,
+                }))
+            }
             Err(
                 WriteError::Serialization { .. }
                 | WriteError::Poisoned { .. }
@@ -254,6 +299,11 @@ impl std::fmt::Debug for Outlet {
 const SETTLE: Duration = Duration::from_millis(250);
 /// Samples that may wait for that, at least.
 const SETTLING_ROOM: usize = 512;
+/// How long a state topic may lag behind for the sake of one reader. A reader that was killed, or lost its radio link,
+/// holds up RustDDS' writer until its lease ends, 10 to 20 s later.
+const STUCK_AFTER: Duration = Duration::from_millis(500);
+/// Memory a topic may take for readers that do not acknowledge; the send window counts samples, whatever their size.
+const MAX_IN_FLIGHT: usize = 64 * 1024 * 1024;
 /// Measured: one sample in ten of 1 MiB reached a Fast DDS reader with the system's default socket buffers, and all of
 /// 262 kB did.
 const FAST_DDS_SIZE: usize = 256 * 1024;

@@ -1,35 +1,38 @@
 //! The port: the topics of a DDS domain tied to the values of the space.
 //!
 //! One task owns everything; [`Ros2Port::recv`](Port::recv) is its only wait. Endpoints are made in
-//! [`reconcile`](Ros2Port::reconcile), which compares what the domain holds with what is open: every 200 ms, and soon
+//! [`reconcile`], which compares what the domain holds with what is open: every 200 ms, and soon
 //! after RustDDS reports a change.
+
+mod reconcile;
+mod schedule;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::future::poll_fn;
 use std::path::PathBuf;
-use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
-use std::time::Duration;
 
 use bridge_node::{Delivery, Port, PortEvent, now};
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{MessageType, Selection, TypeName};
+use messages::TypeName;
 use rustdds::{DomainParticipantStatusEvent, DomainParticipantStatusListener, StatusEvented};
-use tokio::time::{Instant, Sleep};
+use tokio::time::Instant;
 use tracing::{debug, info, warn};
 use uadp::BuiltinType;
 
 use crate::definitions::Definitions;
 use crate::domain::{Domain, DomainError, DomainOptions};
-use crate::graph::{Endpoint, Graph, dds_topic, ros_topic};
+use crate::graph::{Graph, dds_topic};
 use crate::inbox::{Inbox, Taken};
-use crate::outlet::{Outlet, Refusal};
-use crate::qos::Requested;
+use crate::outlet::Refusal;
 use crate::raw::{Payload, Reader};
-use crate::sink::{Open, Sink};
-use crate::source::{Reading, Source, same_participant};
+use crate::sink::Sink;
+use crate::source::{Source, same_participant};
+
+use reconcile::MAX_BATCH;
+use schedule::Schedule;
 
 /// What a [`Ros2Port`] is started with.
 #[derive(Debug, Clone)]
@@ -67,18 +70,6 @@ pub struct Ros2Port {
     /// What was already told, so that it is told once.
     told: BTreeSet<(String, &'static str)>,
     schedule: Schedule,
-}
-
-/// When to look again.
-struct Schedule {
-    timer: Pin<Box<Sleep>>,
-    reconciled: Instant,
-    /// Something changed: reconcile soon.
-    changed: bool,
-    /// Endpoints are left to be made.
-    unfinished: bool,
-    /// Samples wait in an outlet.
-    waiting: bool,
 }
 
 impl Ros2Port {
@@ -249,311 +240,6 @@ impl Ros2Port {
         self.schedule.waiting = waiting;
     }
 
-    /// Makes what is open fit what the domain holds, at most [`MAX_BATCH`] endpoints at a time: RustDDS' discovery
-    /// takes commands from a bounded queue and drops what does not fit.
-    fn reconcile(&mut self, now: Instant) {
-        self.schedule.reconciled = now;
-        self.schedule.changed = false;
-        self.schedule.unfinished = false;
-        self.budget = MAX_BATCH;
-        while self.retired.front().is_some_and(|(until, _)| *until <= now) {
-            self.retired.pop_front();
-        }
-        self.graph = Graph::snapshot(self.domain.participant());
-        self.find_topics_of_the_space();
-        for index in 0..self.sources.len() {
-            self.reconcile_source(index, now);
-        }
-        let topics: Vec<TopicId> = self.sinks.keys().copied().collect();
-        for topic in topics {
-            self.reconcile_sink(topic, now);
-        }
-    }
-
-    /// Zero configuration: a topic named in our part of the space crosses as soon as somebody writes it.
-    fn find_topics_of_the_space(&mut self) {
-        let found: Vec<(String, TopicId)> = self
-            .graph
-            .written_topics()
-            .filter(|topic| !self.source_of.contains_key(*topic))
-            .filter_map(|topic| Some((topic.to_owned(), ros_topic(topic)?.parse().ok()?)))
-            .filter(|(_, topic): &(_, TopicId)| topic.space == self.own)
-            .collect();
-        for (dds_topic, topic) in found {
-            if self.is_tied(topic) {
-                self.tell_once(&dds_topic, "tied elsewhere", || {
-                    format!("{topic} comes from another ROS topic, as the mapping says; this one is left alone")
-                });
-                continue;
-            }
-            if self.sources.len() >= MAX_TOPICS {
-                self.tell_once("", "too many topics", || {
-                    format!("more than {MAX_TOPICS} topics of the space: the rest is left alone")
-                });
-                return;
-            }
-            let types: Vec<String> = self
-                .graph
-                .writers(&dds_topic)
-                .iter()
-                .map(|writer| writer.type_name.clone())
-                .collect();
-            let known = types
-                .iter()
-                .find_map(|name| self.message_type(topic, &dds_topic, name));
-            if let Some(message_type) = known {
-                let index = self.source(dds_topic, message_type.name().clone());
-                if let Some(source) = self.sources.get_mut(index) {
-                    source.values.push((topic, Selection::Whole));
-                }
-            }
-        }
-    }
-
-    /// Whether the mapping gives this value to another ROS topic of our domain.
-    fn is_tied(&self, topic: TopicId) -> bool {
-        self.mapping
-            .variable(topic)
-            .is_some_and(|variable| variable.binding(self.own).is_some())
-    }
-
-    /// The type a peer names, or `None` after saying once why it cannot be used.
-    fn message_type(
-        &mut self,
-        topic: TopicId,
-        dds_topic: &str,
-        dds_type: &str,
-    ) -> Option<Arc<MessageType>> {
-        let found = match TypeName::from_dds(dds_type) {
-            Ok(name) => self
-                .definitions
-                .get(&name)
-                .map_err(|error| error.to_string()),
-            Err(error) => Err(error.to_string()),
-        };
-        match found {
-            Ok(message_type) => Some(message_type),
-            Err(error) => {
-                let first = self.tell_once(dds_topic, "unknown type", || {
-                    format!(
-                        "the topic cannot cross: {error}. Start the bridge where the ROS workspace that defines it \
-                         is sourced (AMENT_PREFIX_PATH), or map the topic to a known type"
-                    )
-                });
-                if first {
-                    self.events
-                        .push_back(lost(topic, "type without a definition", 1));
-                }
-                None
-            }
-        }
-    }
-
-    fn reconcile_source(&mut self, index: usize, now: Instant) {
-        let Some(source) = self.sources.get_mut(index) else {
-            return;
-        };
-        let writers = self.graph.writers(&source.dds_topic);
-        let ours = source.meet(writers);
-        let strange = writers
-            .iter()
-            .find(|writer| !ours.contains(writer))
-            .cloned();
-        let requested = Requested::from_writers(&ours);
-        match source.reading {
-            Reading::Pending => self.open_source(index, requested),
-            Reading::Open {
-                requested: before, ..
-            } if before != requested && !ours.is_empty() => {
-                self.reopen_source(index, requested, now);
-            }
-            Reading::Open { slot, .. } => self
-                .inbox
-                .retain_writers(slot, |writer| writers.iter().any(|w| w.guid == *writer)),
-        }
-        self.set_live(index, !ours.is_empty());
-        if let Some(stranger) = strange {
-            self.tell_stranger(index, &stranger);
-        }
-    }
-
-    fn open_source(&mut self, index: usize, requested: Requested) {
-        let Some(source) = self.sources.get(index) else {
-            return;
-        };
-        let (topic, name) = (source.dds_topic.clone(), source.message_type.clone());
-        let message_type = match self.definitions.get(&name) {
-            Ok(message_type) => message_type,
-            Err(error) => {
-                self.tell_once(&topic, "unknown type", || {
-                    format!("the topic cannot cross: {error}")
-                });
-                return;
-            }
-        };
-        let Some(reader) = self.make(|domain| domain.reader(&topic, &name.dds(), requested)) else {
-            return;
-        };
-        let slot = self.inbox.insert(index, reader);
-        if let Some(source) = self.sources.get_mut(index) {
-            source.reading = Reading::Open { slot, requested };
-            info!(topic, message_type = %name, ?requested, "subscribed");
-            for (topic, selection) in &source.values {
-                self.events.push_back(PortEvent::Bound {
-                    topic: *topic,
-                    message_type: Arc::clone(&message_type),
-                    selection: selection.clone(),
-                });
-            }
-        }
-    }
-
-    /// Another QoS needs another reader. The one before stays for a while: it fills the cache both share, until the
-    /// writers have matched the new one.
-    fn reopen_source(&mut self, index: usize, requested: Requested, now: Instant) {
-        let Some(source) = self.sources.get(index) else {
-            return;
-        };
-        let Reading::Open { slot, .. } = source.reading else {
-            return;
-        };
-        let (topic, dds_type) = (source.dds_topic.clone(), source.message_type.dds());
-        let Some(reader) = self.make(|domain| domain.reader(&topic, &dds_type, requested)) else {
-            return;
-        };
-        if let Some(before) = self.inbox.replace(slot, reader) {
-            self.retired.push_back((now + RETIRE_AFTER, before));
-        }
-        if let Some(source) = self.sources.get_mut(index) {
-            source.reading = Reading::Open { slot, requested };
-            debug!(
-                topic,
-                ?requested,
-                "subscribed anew, as its publishers changed"
-            );
-        }
-    }
-
-    fn set_live(&mut self, index: usize, live: bool) {
-        let Some(source) = self.sources.get_mut(index) else {
-            return;
-        };
-        if source.live == live || source.reading == Reading::Pending {
-            return;
-        }
-        source.live = live;
-        for (topic, _) in &source.values {
-            self.events.push_back(PortEvent::Live {
-                topic: *topic,
-                live,
-            });
-        }
-    }
-
-    fn tell_stranger(&mut self, index: usize, stranger: &Endpoint) {
-        let Some(source) = self.sources.get(index) else {
-            return;
-        };
-        let (topic, name) = (source.dds_topic.clone(), source.message_type.to_string());
-        self.tell_once(&topic, "publisher of another type", || {
-            format!(
-                "a publisher has type {}, but the topic crosses as {name}: its messages are dropped",
-                stranger.type_name
-            )
-        });
-    }
-
-    fn reconcile_sink(&mut self, topic: TopicId, now: Instant) {
-        let Some(sink) = self.sinks.get_mut(&topic) else {
-            return;
-        };
-        let readers = self.graph.readers(&sink.dds_topic);
-        if let Some(open) = &mut sink.open {
-            match open.outlet.set_readers(readers, now) {
-                Ok(()) => {}
-                Err(refusal) => self.events.push_back(lost(topic, refusal.label(), 1)),
-            }
-            self.schedule.waiting |= open.outlet.is_waiting();
-        }
-        if !sink.serves(readers) {
-            self.open_sink(topic);
-        }
-    }
-
-    /// Opens a sink in the best type there is; one that is open in a lesser type is opened anew.
-    fn open_sink(&mut self, topic: TopicId) {
-        let Some(sink) = self.sinks.get(&topic) else {
-            return;
-        };
-        let (dds_topic, offered, selection) =
-            (sink.dds_topic.clone(), sink.offered, sink.selection());
-        let mut found = None;
-        for name in sink.candidates(self.graph.readers(&sink.dds_topic)) {
-            match self.definitions.get(&name) {
-                Ok(message_type) => {
-                    found = Some(message_type);
-                    break;
-                }
-                Err(error) => {
-                    self.tell_once(&dds_topic, "unknown type", || {
-                        format!("no value can be written in the type asked for: {error}")
-                    });
-                }
-            }
-        }
-        let Some(message_type) = found else { return };
-        let dds_type = message_type.name().dds();
-        if self.is_open_as(topic, &message_type) {
-            self.tell_once(&dds_topic, "subscriber of another type", || {
-                format!("a subscriber asks for another type than {dds_type}, in which the topic is written")
-            });
-            return;
-        }
-        let Some(writer) = self.make(|domain| domain.writer(&dds_topic, &dds_type, offered)) else {
-            return;
-        };
-        info!(topic = dds_topic, message_type = %message_type.name(), ?offered, "advertised");
-        let mut outlet = Outlet::new(writer, offered);
-        if let Err(refusal) = outlet.set_readers(self.graph.readers(&dds_topic), Instant::now()) {
-            self.events.push_back(lost(topic, refusal.label(), 1));
-        }
-        if let Some(sink) = self.sinks.get_mut(&topic) {
-            sink.open = Some(Open {
-                message_type: Arc::clone(&message_type),
-                outlet,
-            });
-        }
-        self.events.push_back(PortEvent::Bound {
-            topic,
-            message_type,
-            selection,
-        });
-    }
-
-    fn is_open_as(&self, topic: TopicId, message_type: &MessageType) -> bool {
-        self.sinks
-            .get(&topic)
-            .and_then(|sink| sink.open.as_ref())
-            .is_some_and(|open| open.message_type.name() == message_type.name())
-    }
-
-    /// Makes an endpoint if the budget allows; `None` when it does not, or when RustDDS fails, which is told once.
-    fn make<E>(&mut self, make: impl FnOnce(&Domain) -> Result<E, DomainError>) -> Option<E> {
-        let Some(left) = self.budget.checked_sub(1) else {
-            self.schedule.unfinished = true;
-            return None;
-        };
-        self.budget = left;
-        match make(&self.domain) {
-            Ok(endpoint) => Some(endpoint),
-            Err(error) => {
-                let text = error.to_string();
-                self.tell_once(&text, "endpoint", || text.clone());
-                None
-            }
-        }
-    }
-
     /// Logs something about a topic the first time it happens; says whether it was.
     fn tell_once(
         &mut self,
@@ -670,53 +356,6 @@ impl std::fmt::Debug for Ros2Port {
     }
 }
 
-impl Schedule {
-    fn new() -> Self {
-        Self {
-            timer: Box::pin(tokio::time::sleep(Duration::ZERO)),
-            reconciled: Instant::now(),
-            changed: true,
-            unfinished: false,
-            waiting: false,
-        }
-    }
-
-    fn next_reconcile(&self) -> Instant {
-        self.reconciled
-            + match (self.unfinished, self.changed) {
-                (true, _) => BATCH_PAUSE,
-                (false, true) => SETTLE,
-                (false, false) => POLL,
-            }
-    }
-
-    fn next(&self, now: Instant) -> Instant {
-        let reconcile = self.next_reconcile();
-        if self.waiting {
-            reconcile.min(now + FLUSH)
-        } else {
-            reconcile
-        }
-    }
-
-    fn arm(&mut self, now: Instant) {
-        let next = self.next(now);
-        self.timer.as_mut().reset(next);
-    }
-
-    /// Whether there is something to do; otherwise the task is woken when there is.
-    fn is_due(&mut self, cx: &mut Context<'_>) -> bool {
-        // `publish` and discovery make it earlier than it was set for.
-        if self.changed || self.unfinished || self.waiting {
-            let now = Instant::now();
-            if self.next(now) < self.timer.deadline() {
-                self.arm(now);
-            }
-        }
-        self.timer.as_mut().poll(cx).is_ready()
-    }
-}
-
 fn lost(topic: TopicId, why: &'static str, count: u64) -> PortEvent {
     PortEvent::Lost {
         topic: Some(topic),
@@ -749,18 +388,6 @@ fn dds_time(time: uadp::Timestamp) -> rustdds::Timestamp {
 const NANOS: u64 = 1_000_000_000;
 /// The severity bit of a Bad StatusCode (OPC 10000-4, 7.39.1) in its upper 16 bits.
 const STATUS_BAD: u16 = 0x8000;
-/// How often the domain is looked at when nothing is reported.
-const POLL: Duration = Duration::from_millis(200);
-/// After a change: how long to let further ones come.
-const SETTLE: Duration = Duration::from_millis(20);
-/// Between two batches of endpoints.
-const BATCH_PAUSE: Duration = Duration::from_millis(100);
-/// How often a full send window is tried again.
-const FLUSH: Duration = Duration::from_millis(2);
-/// How long a replaced reader hears on.
-const RETIRE_AFTER: Duration = Duration::from_secs(2);
-/// Endpoints made in one go. RustDDS queues two commands for each, and has room for 1024.
-const MAX_BATCH: usize = 200;
 /// Topics of the space that are read, and likewise written: anybody in the domain can invent names.
 const MAX_TOPICS: usize = 4096;
 /// Peculiarities told; a domain with more of them is told about no further ones.

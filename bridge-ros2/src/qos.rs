@@ -98,12 +98,12 @@ impl Offered {
 /// the memory of a topic that carries large messages.
 pub const READER_DEPTH: i32 = 256;
 
-/// RustDDS prunes a writer's history by a timer (4 s), to the depth when every reader acknowledged, else to this
-/// window. So this many old values, at most, reach a late joiner before the last one; and so many values may go by
-/// before a reader that vanished without a word (10 to 20 s of lease) holds up the topic.
+/// RustDDS prunes a writer's history by a timer (4 s): to the depth when every reader acknowledged, else, as with any
+/// best-effort reader, to this window. So this many old values, at most, reach a late joiner before the last one.
 const KEEP_LATEST_WINDOW: i32 = 256;
 const DROP_OLDEST_DEPTH: i32 = 100;
-const DROP_OLDEST_WINDOW: i32 = 1024;
+/// Ten seconds of lease at 1 kHz, and some: what a reader that vanished without a word leaves unacknowledged.
+const DROP_OLDEST_WINDOW: i32 = 16_384;
 
 fn limits(max_samples: i32) -> ResourceLimits {
     ResourceLimits {

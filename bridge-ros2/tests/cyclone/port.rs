@@ -248,3 +248,29 @@ async fn a_thousand_topics_are_advertised_in_batches_and_disposed_within_two_sec
     eprintln!("disposed in {:?}", begin.elapsed());
     assert!(begin.elapsed() < Duration::from_millis(2100));
 }
+
+#[tokio::test]
+#[ignore = "needs Cyclone DDS"]
+async fn a_subscriber_that_is_killed_does_not_keep_the_newest_value_from_the_others() {
+    let mut port = port(30, Mapping::default());
+    let topic: TopicId = "ua_1_2_3".parse().unwrap();
+    let subscribe = "sub --topic ua_1_2_3 --type std_msgs/String --domain 30 --count 100000 --timeout 60 --depth 5000";
+    let mut killed = Peer::start(subscribe);
+    let mut other = Peer::start(subscribe);
+    port.wanted(topic, &[(BuiltinType::String, false)]);
+    line(&mut port, &mut killed).await;
+    line(&mut port, &mut other).await;
+    idle(&mut port, Duration::from_millis(500)).await;
+    drop(killed);
+    // More than the send window holds, so that an unacknowledging reader stops the writer.
+    let mut refused = 0;
+    for number in 0..1000 {
+        refused += u32::from(port.publish(delivery(topic, &number.to_string())).is_err());
+        idle(&mut port, Duration::from_millis(1)).await;
+    }
+    assert!(refused > 0, "the writer never stopped");
+    let deadline = Instant::now() + Duration::from_secs(3);
+    while line(&mut port, &mut other).await["value"] != "999" {
+        assert!(Instant::now() < deadline, "the newest value is late");
+    }
+}

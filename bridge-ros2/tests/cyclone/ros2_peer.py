@@ -71,8 +71,8 @@ def subscribe(args, participant, topic):
             sys.exit(1)
         waiter.wait(duration(milliseconds=100))
         for sample in reader.take(N=1000):
-            if not dataclasses.is_dataclass(sample):
-                continue
+            if not isinstance(sample, TYPES[args.type]):
+                continue  # a writer left
             received += 1
             show(args, sample)
 

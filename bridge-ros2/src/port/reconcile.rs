@@ -1,0 +1,363 @@
+//! Making what is open fit what the domain holds.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge_node::PortEvent;
+use mappings::TopicId;
+use messages::{MessageType, Selection, TypeName};
+use tokio::time::Instant;
+use tracing::{debug, info, warn};
+
+use super::{MAX_TOPICS, Ros2Port, lost};
+use crate::domain::{Domain, DomainError};
+use crate::graph::{Endpoint, Graph, ros_topic};
+use crate::outlet::Outlet;
+use crate::qos::Requested;
+use crate::sink::{Open, Sink};
+use crate::source::Reading;
+
+impl Ros2Port {
+    /// Makes what is open fit what the domain holds, at most [`MAX_BATCH`] endpoints at a time: RustDDS' discovery
+    /// takes commands from a bounded queue and drops what does not fit.
+    pub(super) fn reconcile(&mut self, now: Instant) {
+        self.schedule.reconciled = now;
+        self.schedule.changed = false;
+        self.schedule.unfinished = false;
+        self.budget = MAX_BATCH;
+        while self.retired.front().is_some_and(|(until, _)| *until <= now) {
+            self.retired.pop_front();
+        }
+        self.graph = Graph::snapshot(self.domain.participant());
+        self.find_topics_of_the_space();
+        for index in 0..self.sources.len() {
+            self.reconcile_source(index, now);
+        }
+        let topics: Vec<TopicId> = self.sinks.keys().copied().collect();
+        for topic in topics {
+            self.reconcile_sink(topic, now);
+        }
+    }
+
+    /// Zero configuration: a topic named in our part of the space crosses as soon as somebody writes it.
+    fn find_topics_of_the_space(&mut self) {
+        let found: Vec<(String, TopicId)> = self
+            .graph
+            .written_topics()
+            .filter(|topic| !self.source_of.contains_key(*topic))
+            .filter_map(|topic| Some((topic.to_owned(), ros_topic(topic)?.parse().ok()?)))
+            .filter(|(_, topic): &(_, TopicId)| topic.space == self.own)
+            .collect();
+        for (dds_topic, topic) in found {
+            if self.is_tied(topic) {
+                self.tell_once(&dds_topic, "tied elsewhere", || {
+                    format!("{topic} comes from another ROS topic, as the mapping says; this one is left alone")
+                });
+                continue;
+            }
+            if self.sources.len() >= MAX_TOPICS {
+                self.tell_once("", "too many topics", || {
+                    format!("more than {MAX_TOPICS} topics of the space: the rest is left alone")
+                });
+                return;
+            }
+            let types: Vec<String> = self
+                .graph
+                .writers(&dds_topic)
+                .iter()
+                .map(|writer| writer.type_name.clone())
+                .collect();
+            let known = types
+                .iter()
+                .find_map(|name| self.message_type(topic, &dds_topic, name));
+            if let Some(message_type) = known {
+                let index = self.source(dds_topic, message_type.name().clone());
+                if let Some(source) = self.sources.get_mut(index) {
+                    source.values.push((topic, Selection::Whole));
+                }
+            }
+        }
+    }
+
+    /// Whether the mapping gives this value to another ROS topic of our domain.
+    fn is_tied(&self, topic: TopicId) -> bool {
+        self.mapping
+            .variable(topic)
+            .is_some_and(|variable| variable.binding(self.own).is_some())
+    }
+
+    /// The type a peer names, or `None` after saying once why it cannot be used.
+    fn message_type(
+        &mut self,
+        topic: TopicId,
+        dds_topic: &str,
+        dds_type: &str,
+    ) -> Option<Arc<MessageType>> {
+        let found = match TypeName::from_dds(dds_type) {
+            Ok(name) => self
+                .definitions
+                .get(&name)
+                .map_err(|error| error.to_string()),
+            Err(error) => Err(error.to_string()),
+        };
+        match found {
+            Ok(message_type) => Some(message_type),
+            Err(error) => {
+                let first = self.tell_once(dds_topic, "unknown type", || {
+                    format!(
+                        "the topic cannot cross: {error}. Start the bridge where the ROS workspace that defines it \
+                         is sourced (AMENT_PREFIX_PATH), or map the topic to a known type"
+                    )
+                });
+                if first {
+                    self.events
+                        .push_back(lost(topic, "type without a definition", 1));
+                }
+                None
+            }
+        }
+    }
+
+    fn reconcile_source(&mut self, index: usize, now: Instant) {
+        let Some(source) = self.sources.get_mut(index) else {
+            return;
+        };
+        let writers = self.graph.writers(&source.dds_topic);
+        let ours = source.meet(writers);
+        let strange = writers
+            .iter()
+            .find(|writer| !ours.contains(writer))
+            .cloned();
+        let requested = Requested::from_writers(&ours);
+        match source.reading {
+            Reading::Pending => self.open_source(index, requested),
+            Reading::Open {
+                requested: before, ..
+            } if before != requested && !ours.is_empty() => {
+                self.reopen_source(index, requested, now);
+            }
+            Reading::Open { slot, .. } => self
+                .inbox
+                .retain_writers(slot, |writer| writers.iter().any(|w| w.guid == *writer)),
+        }
+        self.set_live(index, !ours.is_empty());
+        if let Some(stranger) = strange {
+            self.tell_stranger(index, &stranger);
+        }
+    }
+
+    fn open_source(&mut self, index: usize, requested: Requested) {
+        let Some(source) = self.sources.get(index) else {
+            return;
+        };
+        let (topic, name) = (source.dds_topic.clone(), source.message_type.clone());
+        let message_type = match self.definitions.get(&name) {
+            Ok(message_type) => message_type,
+            Err(error) => {
+                self.tell_once(&topic, "unknown type", || {
+                    format!("the topic cannot cross: {error}")
+                });
+                return;
+            }
+        };
+        let Some(reader) = self.make(|domain| domain.reader(&topic, &name.dds(), requested)) else {
+            return;
+        };
+        let slot = self.inbox.insert(index, reader);
+        if let Some(source) = self.sources.get_mut(index) {
+            source.reading = Reading::Open { slot, requested };
+            info!(topic, message_type = %name, ?requested, "subscribed");
+            for (topic, selection) in &source.values {
+                self.events.push_back(PortEvent::Bound {
+                    topic: *topic,
+                    message_type: Arc::clone(&message_type),
+                    selection: selection.clone(),
+                });
+            }
+        }
+    }
+
+    /// Another QoS needs another reader. The one before stays for a while: it fills the cache both share, until the
+    /// writers have matched the new one.
+    fn reopen_source(&mut self, index: usize, requested: Requested, now: Instant) {
+        let Some(source) = self.sources.get(index) else {
+            return;
+        };
+        let Reading::Open { slot, .. } = source.reading else {
+            return;
+        };
+        let (topic, dds_type) = (source.dds_topic.clone(), source.message_type.dds());
+        let Some(reader) = self.make(|domain| domain.reader(&topic, &dds_type, requested)) else {
+            return;
+        };
+        if let Some(before) = self.inbox.replace(slot, reader) {
+            self.retired.push_back((now + RETIRE_AFTER, before));
+        }
+        if let Some(source) = self.sources.get_mut(index) {
+            source.reading = Reading::Open { slot, requested };
+            debug!(
+                topic,
+                ?requested,
+                "subscribed anew, as its publishers changed"
+            );
+        }
+    }
+
+    fn set_live(&mut self, index: usize, live: bool) {
+        let Some(source) = self.sources.get_mut(index) else {
+            return;
+        };
+        if source.live == live || source.reading == Reading::Pending {
+            return;
+        }
+        source.live = live;
+        for (topic, _) in &source.values {
+            self.events.push_back(PortEvent::Live {
+                topic: *topic,
+                live,
+            });
+        }
+    }
+
+    fn tell_stranger(&mut self, index: usize, stranger: &Endpoint) {
+        let Some(source) = self.sources.get(index) else {
+            return;
+        };
+        let (topic, name) = (source.dds_topic.clone(), source.message_type.to_string());
+        self.tell_once(&topic, "publisher of another type", || {
+            format!(
+                "a publisher has type {}, but the topic crosses as {name}: its messages are dropped",
+                stranger.type_name
+            )
+        });
+    }
+
+    fn reconcile_sink(&mut self, topic: TopicId, now: Instant) {
+        let Some(sink) = self.sinks.get_mut(&topic) else {
+            return;
+        };
+        let readers = self.graph.readers(&sink.dds_topic);
+        if let Some(open) = &mut sink.open {
+            match open.outlet.set_readers(readers, now) {
+                Ok(()) => {}
+                Err(refusal) => self.events.push_back(lost(topic, refusal.label(), 1)),
+            }
+            self.schedule.waiting |= open.outlet.is_waiting();
+            if open.outlet.is_stuck(now) {
+                self.replace_writer(topic, now);
+                return;
+            }
+        }
+        if !sink.serves(readers) {
+            self.open_sink(topic);
+        }
+    }
+
+    /// A reader that acknowledges nothing must not keep a value from the others.
+    fn replace_writer(&mut self, topic: TopicId, now: Instant) {
+        let Some(Sink {
+            open: Some(open),
+            dds_topic,
+            offered,
+            ..
+        }) = self.sinks.get(&topic)
+        else {
+            return;
+        };
+        let (dds_topic, offered) = (dds_topic.clone(), *offered);
+        let dds_type = open.message_type.name().dds();
+        let Some(writer) = self.make(|domain| domain.writer(&dds_topic, &dds_type, offered)) else {
+            return;
+        };
+        warn!(
+            topic = dds_topic,
+            "a subscriber does not acknowledge; advertised anew for the others"
+        );
+        if let Some(open) = self
+            .sinks
+            .get_mut(&topic)
+            .and_then(|sink| sink.open.as_mut())
+        {
+            open.outlet.replace_writer(writer, now);
+        }
+    }
+
+    /// Opens a sink in the best type there is; one that is open in a lesser type is opened anew.
+    pub(super) fn open_sink(&mut self, topic: TopicId) {
+        let Some(sink) = self.sinks.get(&topic) else {
+            return;
+        };
+        let (dds_topic, offered, selection) =
+            (sink.dds_topic.clone(), sink.offered, sink.selection());
+        let mut found = None;
+        for name in sink.candidates(self.graph.readers(&sink.dds_topic)) {
+            match self.definitions.get(&name) {
+                Ok(message_type) => {
+                    found = Some(message_type);
+                    break;
+                }
+                Err(error) => {
+                    self.tell_once(&dds_topic, "unknown type", || {
+                        format!("no value can be written in the type asked for: {error}")
+                    });
+                }
+            }
+        }
+        let Some(message_type) = found else { return };
+        let dds_type = message_type.name().dds();
+        if self.is_open_as(topic, &message_type) {
+            self.tell_once(&dds_topic, "subscriber of another type", || {
+                format!("a subscriber asks for another type than {dds_type}, in which the topic is written")
+            });
+            return;
+        }
+        let Some(writer) = self.make(|domain| domain.writer(&dds_topic, &dds_type, offered)) else {
+            return;
+        };
+        info!(topic = dds_topic, message_type = %message_type.name(), ?offered, "advertised");
+        let mut outlet = Outlet::new(writer, offered);
+        if let Err(refusal) = outlet.set_readers(self.graph.readers(&dds_topic), Instant::now()) {
+            self.events.push_back(lost(topic, refusal.label(), 1));
+        }
+        if let Some(sink) = self.sinks.get_mut(&topic) {
+            sink.open = Some(Open {
+                message_type: Arc::clone(&message_type),
+                outlet,
+            });
+        }
+        self.events.push_back(PortEvent::Bound {
+            topic,
+            message_type,
+            selection,
+        });
+    }
+
+    fn is_open_as(&self, topic: TopicId, message_type: &MessageType) -> bool {
+        self.sinks
+            .get(&topic)
+            .and_then(|sink| sink.open.as_ref())
+            .is_some_and(|open| open.message_type.name() == message_type.name())
+    }
+
+    /// Makes an endpoint if the budget allows; `None` when it does not, or when RustDDS fails, which is told once.
+    fn make<E>(&mut self, make: impl FnOnce(&Domain) -> Result<E, DomainError>) -> Option<E> {
+        let Some(left) = self.budget.checked_sub(1) else {
+            self.schedule.unfinished = true;
+            return None;
+        };
+        self.budget = left;
+        match make(&self.domain) {
+            Ok(endpoint) => Some(endpoint),
+            Err(error) => {
+                let text = error.to_string();
+                self.tell_once(&text, "endpoint", || text.clone());
+                None
+            }
+        }
+    }
+}
+
+/// How long a replaced reader hears on.
+const RETIRE_AFTER: Duration = Duration::from_secs(2);
+/// Endpoints made in one go. RustDDS queues two commands for each, and has room for 1024.
+pub(super) const MAX_BATCH: usize = 200;
