@@ -101,16 +101,7 @@ impl ServerPort {
             })?;
         check_namespaces(&layout, &manager).map_err(configuration)?;
 
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(SERVER_THREADS)
-            .thread_name("opcua")
-            .enable_all()
-            .build()
-            .map_err(|error| io(format!("cannot start the server's threads: {error}")))?;
-        let listener = {
-            let _inside = runtime.enter();
-            tokio::net::TcpListener::from_std(listener).map_err(|error| io(error.to_string()))?
-        };
+        let (runtime, listener) = threads(listener).map_err(|error| io(error.to_string()))?;
         let serving = runtime.spawn(server.run_with(listener));
         let subscriptions = Arc::clone(handle.subscriptions());
         drop(runtime.spawn(look_again(
@@ -198,6 +189,20 @@ impl Drop for ServerPort {
             runtime.shutdown_background();
         }
     }
+}
+
+/// The server's own threads, and the listener as they take it.
+fn threads(listener: std::net::TcpListener) -> std::io::Result<(Runtime, tokio::net::TcpListener)> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(SERVER_THREADS)
+        .thread_name("opcua")
+        .enable_all()
+        .build()?;
+    let listener = {
+        let _inside = runtime.enter();
+        tokio::net::TcpListener::from_std(listener)?
+    };
+    Ok((runtime, listener))
 }
 
 /// Ready, once, when the server has ended by itself.

@@ -212,6 +212,10 @@ mod tests {
     use super::*;
 
     /// One value of every builtin type that a field can have, with the server's form of it.
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one entry for each of the builtin types"
+    )]
     fn samples() -> Vec<(Scalar<'static>, Variant)> {
         let guid_bytes = [
             0x91, 0x2B, 0x96, 0x72, 0x75, 0xFA, 0xE6, 0x4A, 0x8D, 0x28, 0xB4, 0x04, 0xDC, 0x7D,
