@@ -48,7 +48,7 @@ def plain(value):
 
 def described(data):
     # The name of the code proper: the lower half carries info bits, such as that of a queue that overflowed.
-    status = ua.StatusCode(data.StatusCode_.value & 0xFFFF0000) if data.StatusCode_ else ua.StatusCode(0)
+    status = ua.StatusCode(data.StatusCode.value & 0xFFFF0000) if data.StatusCode else ua.StatusCode(0)
     return {
         "value": plain(data.Value) if data.Value is not None else None,
         "type": data.Value.VariantType.name if data.Value is not None else None,
@@ -77,7 +77,7 @@ class Printer:
 
 async def read(client, node):
     params = ua.ReadParameters()
-    params.TimestampsToReturn_ = ua.TimestampsToReturn.Both
+    params.TimestampsToReturn = ua.TimestampsToReturn.Both
     wanted = ua.ReadValueId()
     wanted.NodeId = ua.NodeId.from_string(node)
     wanted.AttributeId = ua.AttributeIds.Value
@@ -89,7 +89,7 @@ async def write(client, request):
     data = ua.DataValue(ua.Variant(request["value"], ua.VariantType[request["type"]]))
     params = ua.WriteParameters()
     item = ua.WriteValue()
-    item.NodeId_ = ua.NodeId.from_string(request["node"])
+    item.NodeId = ua.NodeId.from_string(request["node"])
     item.AttributeId = ua.AttributeIds.Value
     item.Value = data
     params.NodesToWrite = [item]

@@ -46,11 +46,23 @@ pub(crate) enum LayoutError {
         "namespace index {index} is to be {wanted}, but in this server it is {actual}; \
          give {wanted} another index in the mapping"
     )]
-    Index { index: u16, wanted: String, actual: String },
+    Index {
+        index: u16,
+        wanted: String,
+        actual: String,
+    },
     #[error("namespace {uri} is to have the indexes {first} and {second}: a server has a URI once")]
-    Twice { uri: String, first: u16, second: u16 },
+    Twice {
+        uri: String,
+        first: u16,
+        second: u16,
+    },
     #[error("the node {node} of {topic} is in namespace {index}, which the mapping gives no URI")]
-    NoUri { topic: TopicId, node: NodeId, index: u16 },
+    NoUri {
+        topic: TopicId,
+        node: NodeId,
+        index: u16,
+    },
     #[error("the node {node} of {topic} is the node of another variable already")]
     Duplicate { topic: TopicId, node: NodeId },
     #[error("namespace index {0} is higher than a server with {MOST_NAMESPACES} namespaces has")]
@@ -64,7 +76,11 @@ impl Layout {
     /// As [`new`](Self::new).
     pub(crate) fn of(mapping: &Mapping) -> Result<Self, LayoutError> {
         let topics = mapping.variables().iter().map(TopicNode::of).collect();
-        Self::new(&mapping.server().application_uri, mapping.namespaces(), topics)
+        Self::new(
+            &mapping.server().application_uri,
+            mapping.namespaces(),
+            topics,
+        )
     }
 
     /// Gives every namespace its index and checks that the nodes can be there together.
@@ -78,7 +94,10 @@ impl Layout {
         wanted: &BTreeMap<u16, String>,
         topics: Vec<TopicNode>,
     ) -> Result<Self, LayoutError> {
-        let layout = Self { namespaces: namespace_array(application_uri, wanted)?, topics };
+        let layout = Self {
+            namespaces: namespace_array(application_uri, wanted)?,
+            topics,
+        };
         let mut taken = HashSet::new();
         for topic in &layout.topics {
             let known = usize::from(topic.node.namespace) < layout.namespaces.len();
@@ -91,7 +110,10 @@ impl Layout {
             }
             for node in topic.nodes() {
                 if !taken.insert(node.clone()) {
-                    return Err(LayoutError::Duplicate { topic: topic.topic, node: node.clone() });
+                    return Err(LayoutError::Duplicate {
+                        topic: topic.topic,
+                        node: node.clone(),
+                    });
                 }
             }
         }
@@ -104,7 +126,12 @@ fn namespace_array(
     wanted: &BTreeMap<u16, String>,
 ) -> Result<Vec<String>, LayoutError> {
     let fixed = [OPC_UA_URI, application_uri];
-    let highest = wanted.keys().next_back().copied().unwrap_or_default().max(1);
+    let highest = wanted
+        .keys()
+        .next_back()
+        .copied()
+        .unwrap_or_default()
+        .max(1);
     if highest >= MOST_NAMESPACES {
         return Err(LayoutError::TooHigh(highest));
     }
@@ -124,7 +151,11 @@ fn namespace_array(
         };
         if let Some(first) = array.iter().position(|earlier| *earlier == uri) {
             let first = u16::try_from(first).unwrap_or(u16::MAX);
-            return Err(LayoutError::Twice { uri, first, second: index });
+            return Err(LayoutError::Twice {
+                uri,
+                first,
+                second: index,
+            });
         }
         array.push(uri);
     }
@@ -144,23 +175,47 @@ impl TopicNode {
             Some(shape) => vec![(variable.name.clone(), Shape(Some(shape)))],
             None => leaves.collect(),
         };
-        Self::new(variable.topic, node_id(&variable.node), variable.name.clone(), fields)
+        Self::new(
+            variable.topic,
+            node_id(&variable.node),
+            variable.name.clone(),
+            fields,
+        )
     }
 
     /// A topic whose DataSet has `fields`, in order: the path of each in the message, and its shape. None or one is
     /// a topic that is one value.
-    pub(crate) fn new(topic: TopicId, node: NodeId, name: String, fields: Vec<(String, Shape)>) -> Self {
+    pub(crate) fn new(
+        topic: TopicId,
+        node: NodeId,
+        name: String,
+        fields: Vec<(String, Shape)>,
+    ) -> Self {
         let compound = fields.len() > 1;
         let fields = if compound {
             fields
                 .into_iter()
-                .map(|(path, shape)| FieldNode { node: component(&node, &path), name: path, shape })
+                .map(|(path, shape)| FieldNode {
+                    node: component(&node, &path),
+                    name: path,
+                    shape,
+                })
                 .collect()
         } else {
             let shape = fields.first().map_or(Shape(None), |(_, shape)| *shape);
-            vec![FieldNode { node: node.clone(), name: name.clone(), shape }]
+            vec![FieldNode {
+                node: node.clone(),
+                name: name.clone(),
+                shape,
+            }]
         };
-        Self { topic, node, name, fields, compound }
+        Self {
+            topic,
+            node,
+            name,
+            fields,
+            compound,
+        }
     }
 
     /// Clients may write what the OPC UA side produces.
@@ -170,7 +225,11 @@ impl TopicNode {
 
     /// Every node of the topic, its own first.
     pub(crate) fn nodes(&self) -> impl Iterator<Item = &NodeId> {
-        let components = if self.compound { self.fields.as_slice() } else { &[] };
+        let components = if self.compound {
+            self.fields.as_slice()
+        } else {
+            &[]
+        };
         std::iter::once(&self.node).chain(components.iter().map(|field| &field.node))
     }
 }
@@ -185,7 +244,10 @@ fn node_id(text: &NodeIdText) -> NodeId {
             Identifier::ByteString(ByteString::from_base64(text).unwrap_or_default())
         }
     };
-    NodeId { namespace: text.namespace, identifier }
+    NodeId {
+        namespace: text.namespace,
+        identifier,
+    }
 }
 
 fn component(parent: &NodeId, path: &str) -> NodeId {
@@ -225,7 +287,9 @@ impl Shape {
             VariantTypeId::Empty => false,
             VariantTypeId::Scalar(scalar) => !array && scalar.encoding_mask() == builtin.id(),
             VariantTypeId::Array(element, dimensions) => {
-                array && dimensions.is_none_or(|d| d.len() == 1) && element.encoding_mask() == builtin.id()
+                array
+                    && dimensions.is_none_or(|d| d.len() == 1)
+                    && element.encoding_mask() == builtin.id()
             }
         }
     }
@@ -249,12 +313,20 @@ mod tests {
     }
 
     fn uris(pairs: &[(u16, &str)]) -> BTreeMap<u16, String> {
-        pairs.iter().map(|(index, uri)| (*index, (*uri).to_owned())).collect()
+        pairs
+            .iter()
+            .map(|(index, uri)| (*index, (*uri).to_owned()))
+            .collect()
     }
 
     #[test]
     fn each_uri_has_the_index_of_the_mapping() {
-        let layout = Layout::new("urn:app", &uris(&[(2, "urn:two"), (5, "urn:five")]), vec![topic(1, 5, 10)]).unwrap();
+        let layout = Layout::new(
+            "urn:app",
+            &uris(&[(2, "urn:two"), (5, "urn:five")]),
+            vec![topic(1, 5, 10)],
+        )
+        .unwrap();
         assert_eq!(layout.namespaces.len(), 6);
         assert_eq!(layout.namespaces[0], OPC_UA_URI);
         assert_eq!(layout.namespaces[1], "urn:app");
@@ -266,28 +338,50 @@ mod tests {
     fn an_index_that_cannot_be_had_is_refused_with_both_uris() {
         let error = Layout::new("urn:app", &uris(&[(1, "urn:mine")]), vec![]).unwrap_err();
         let message = error.to_string();
-        assert!(message.contains("urn:mine") && message.contains("urn:app"), "{message}");
+        assert!(
+            message.contains("urn:mine") && message.contains("urn:app"),
+            "{message}"
+        );
         assert!(Layout::new("urn:app", &uris(&[(1, "urn:app")]), vec![]).is_ok());
     }
 
     #[test]
     fn a_uri_with_two_indexes_is_refused() {
-        let error = Layout::new("urn:app", &uris(&[(2, "urn:x"), (4, "urn:x")]), vec![]).unwrap_err();
-        assert_eq!(error, LayoutError::Twice { uri: "urn:x".to_owned(), first: 2, second: 4 });
+        let error =
+            Layout::new("urn:app", &uris(&[(2, "urn:x"), (4, "urn:x")]), vec![]).unwrap_err();
+        assert_eq!(
+            error,
+            LayoutError::Twice {
+                uri: "urn:x".to_owned(),
+                first: 2,
+                second: 4
+            }
+        );
     }
 
     #[test]
     fn a_node_in_a_namespace_without_uri_and_a_node_twice_are_refused() {
         let none = Layout::new("urn:app", &uris(&[]), vec![topic(1, 5, 10)]).unwrap_err();
-        assert!(matches!(none, LayoutError::NoUri { index: 5, .. }), "{none}");
-        let twice = Layout::new("urn:app", &uris(&[(5, "urn:x")]), vec![topic(1, 5, 10), topic(2, 5, 10)]).unwrap_err();
+        assert!(
+            matches!(none, LayoutError::NoUri { index: 5, .. }),
+            "{none}"
+        );
+        let twice = Layout::new(
+            "urn:app",
+            &uris(&[(5, "urn:x")]),
+            vec![topic(1, 5, 10), topic(2, 5, 10)],
+        )
+        .unwrap_err();
         assert!(matches!(twice, LayoutError::Duplicate { .. }), "{twice}");
     }
 
     #[test]
     fn the_fields_of_a_message_are_components_named_by_their_path() {
-        let fields = [("pose.x", BuiltinType::Double), ("name", BuiltinType::String)]
-            .map(|(path, builtin)| (path.to_owned(), Shape(Some((builtin, false)))));
+        let fields = [
+            ("pose.x", BuiltinType::Double),
+            ("name", BuiltinType::String),
+        ]
+        .map(|(path, builtin)| (path.to_owned(), Shape(Some((builtin, false)))));
         let topic = TopicNode::new(
             TopicId::new(1, 5, 10).unwrap(),
             NodeId::new(5, 10),

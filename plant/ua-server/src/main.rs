@@ -51,7 +51,8 @@ impl Program for UaServer {
     const NAME: &'static str = "ua-server";
     const LOCAL: bridge_core::Local = bridge_core::Local::Fields;
     // The libraries say at level info what they do for each client, and at level error what a bad client did.
-    const QUIET: &'static str = "opcua_server=warn,opcua_crypto=warn,opcua_core=warn,opcua_nodes=warn,opcua_types=off";
+    const QUIET: &'static str =
+        "opcua_server=warn,opcua_crypto=warn,opcua_core=warn,opcua_nodes=warn,opcua_types=off";
 
     fn arguments(&self) -> &Arguments {
         &self.arguments
@@ -67,13 +68,23 @@ impl Program for UaServer {
             None => {
                 let endpoint = context.mapping.server().endpoint.to_string();
                 endpoint.parse().map_err(|error| {
-                    Failure::new(FailureKind::Configuration, format!("server.endpoint {endpoint}: {error}"))
+                    Failure::new(
+                        FailureKind::Configuration,
+                        format!("server.endpoint {endpoint}: {error}"),
+                    )
                 })?
             }
         };
-        let root = self.pki.unwrap_or_else(|| pki::default_root(|name| std::env::var(name).ok()));
-        let pki = Pki::open(root).map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
-        let setup = Setup { url, pki, trust_any_client: self.trust_any_client_certificate };
+        let root = self
+            .pki
+            .unwrap_or_else(|| pki::default_root(|name| std::env::var(name).ok()));
+        let pki =
+            Pki::open(root).map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
+        let setup = Setup {
+            url,
+            pki,
+            trust_any_client: self.trust_any_client_certificate,
+        };
         ServerPort::start(&context.mapping, setup)
     }
 }

@@ -13,12 +13,14 @@ use opcua::nodes::{NodeType, ObjectBuilder, VariableBuilder};
 use opcua::server::address_space::{AccessLevel, AddressSpace};
 use opcua::server::diagnostics::NamespaceMetadata;
 use opcua::server::node_manager::memory::{InMemoryNodeManager, InMemoryNodeManagerImpl};
-use opcua::server::node_manager::{MonitoredItemRef, ParsedWriteValue, RequestContext, ServerContext, WriteNode};
+use opcua::server::node_manager::{
+    MonitoredItemRef, ParsedWriteValue, RequestContext, ServerContext, WriteNode,
+};
 use opcua::server::{CreateMonitoredItem, MonitoredItemHandle, SubscriptionCache};
 use opcua::sync::{Mutex, RwLock};
 use opcua::types::{
-    AttributeId, DataEncoding, DataValue, DateTime, LocalizedText, NodeId, NumericRange, ObjectId, QualifiedName,
-    StatusCode, TimestampsToReturn, VariableTypeId, Variant,
+    AttributeId, DataEncoding, DataValue, DateTime, LocalizedText, NodeId, NumericRange, ObjectId,
+    QualifiedName, StatusCode, TimestampsToReturn, VariableTypeId, Variant,
 };
 use tokio::sync::mpsc;
 use uadp::Timestamp;
@@ -84,7 +86,13 @@ impl SpaceNodes {
             add_topic(address_space, topic, &origin_folder(topic.topic.space));
             places.insert(topic.node.clone(), (at, None));
             if topic.compound {
-                places.extend(topic.fields.iter().enumerate().map(|(f, field)| (field.node.clone(), (at, Some(f)))));
+                places.extend(
+                    topic
+                        .fields
+                        .iter()
+                        .enumerate()
+                        .map(|(f, field)| (field.node.clone(), (at, Some(f)))),
+                );
             }
         }
         Self {
@@ -98,7 +106,9 @@ impl SpaceNodes {
 
     /// The namespaces of these nodes with the indexes the server gave them.
     pub(crate) fn served_namespaces(&self) -> impl Iterator<Item = (u16, &str)> {
-        self.namespaces.iter().map(|ns| (ns.namespace_index, ns.namespace_uri.as_str()))
+        self.namespaces
+            .iter()
+            .map(|ns| (ns.namespace_index, ns.namespace_uri.as_str()))
     }
 
     /// Stores `values` and tells who watches them.
@@ -109,8 +119,14 @@ impl SpaceNodes {
         values: Vec<Stored>,
     ) {
         let mut address_space = address_space.write();
-        for Stored { node, value, flipped } in values {
-            let flipped = flipped && value.value == current_data_value(&address_space, &node).and_then(|v| v.value);
+        for Stored {
+            node,
+            value,
+            flipped,
+        } in values
+        {
+            let flipped = flipped
+                && value.value == current_data_value(&address_space, &node).and_then(|v| v.value);
             if let Some(NodeType::Variable(variable)) = address_space.find_mut(&node) {
                 variable.set_data_value(value.clone());
                 self.notify(subscriptions, &node, value, flipped);
@@ -121,7 +137,13 @@ impl SpaceNodes {
     /// The server compares values alone for an item without filter, though a status that changed is to be reported
     /// too (OPC 10000-4, 7.22.2: the default trigger is StatusValue). A null value in between makes it report both;
     /// clients with a queue of one see only the second.
-    fn notify(&self, subscriptions: &SubscriptionCache, node: &NodeId, value: DataValue, flipped: bool) {
+    fn notify(
+        &self,
+        subscriptions: &SubscriptionCache,
+        node: &NodeId,
+        value: DataValue,
+        flipped: bool,
+    ) {
         let mut notifier = subscriptions.data_notifier();
         let Some(mut items) = notifier.notify_for(node, AttributeId::Value) else {
             return;
@@ -130,7 +152,10 @@ impl SpaceNodes {
             let unfiltered = self.unfiltered.lock();
             for (handle, _) in items.entries() {
                 if unfiltered.contains(handle) {
-                    let between = DataValue { value: Some(Variant::Empty), ..value };
+                    let between = DataValue {
+                        value: Some(Variant::Empty),
+                        ..value
+                    };
                     items.data_value_to_item(between, handle);
                 }
             }
@@ -146,32 +171,66 @@ impl SpaceNodes {
     ) -> Result<(), StatusCode> {
         if write.attribute_id != AttributeId::Value {
             let exists = address_space.node_exists(&write.node_id);
-            return Err(if exists { StatusCode::BadNotWritable } else { StatusCode::BadNodeIdUnknown });
+            return Err(if exists {
+                StatusCode::BadNotWritable
+            } else {
+                StatusCode::BadNodeIdUnknown
+            });
         }
         let Some((topic, field)) = self.place(&write.node_id) else {
             let exists = address_space.node_exists(&write.node_id);
-            return Err(if exists { StatusCode::BadNotWritable } else { StatusCode::BadNodeIdUnknown });
+            return Err(if exists {
+                StatusCode::BadNotWritable
+            } else {
+                StatusCode::BadNodeIdUnknown
+            });
         };
         if !topic.writable() {
             return Err(StatusCode::BadNotWritable);
         }
-        if write.value.status.is_some_and(|status| status != StatusCode::Good) {
+        if write
+            .value
+            .status
+            .is_some_and(|status| status != StatusCode::Good)
+        {
             return Err(StatusCode::BadWriteNotSupported);
         }
-        let value = write.value.value.as_ref().ok_or(StatusCode::BadTypeMismatch)?;
+        let value = write
+            .value
+            .value
+            .as_ref()
+            .ok_or(StatusCode::BadTypeMismatch)?;
         let fields = new_fields(address_space, topic, field, (value, &write.index_range))?;
         let now = DateTime::now();
         let (time, picoseconds) = match write.value.source_timestamp {
-            Some(time) => (time, write.value.source_picoseconds.unwrap_or_default().min(9_999)),
+            Some(time) => (
+                time,
+                write
+                    .value
+                    .source_picoseconds
+                    .unwrap_or_default()
+                    .min(9_999),
+            ),
             None => (now, 0),
         };
         let block = Bytes::from(value::fields_block(&fields)?);
-        let source = Timestamp { time: value::ticks(time), picoseconds };
+        let source = Timestamp {
+            time: value::ticks(time),
+            picoseconds,
+        };
         self.exits
             .writes
-            .try_send(ClientWrite { topic: topic.topic, block, source })
+            .try_send(ClientWrite {
+                topic: topic.topic,
+                block,
+                source,
+            })
             .map_err(|_| StatusCode::BadResourceUnavailable)?;
-        let stamp = Stamp { status: StatusCode::Good, source: Some(source), server: now };
+        let stamp = Stamp {
+            status: StatusCode::Good,
+            source: Some(source),
+            server: now,
+        };
         for (node, value) in topic_values(topic, fields, stamp) {
             if let Some(NodeType::Variable(variable)) = address_space.find_mut(&node) {
                 variable.set_data_value(value.clone());
@@ -212,16 +271,26 @@ pub(crate) struct Stamp {
 /// The values of a topic's nodes, its own first, from the values of its fields.
 ///
 /// A field that is a StatusCode where another type is due has no value but that status (OPC 10000-14, 7.2.4.5.5).
-pub(crate) fn topic_values(topic: &TopicNode, fields: Vec<Variant>, stamp: Stamp) -> Vec<(NodeId, DataValue)> {
+pub(crate) fn topic_values(
+    topic: &TopicNode,
+    fields: Vec<Variant>,
+    stamp: Stamp,
+) -> Vec<(NodeId, DataValue)> {
     let mut values = Vec::with_capacity(1 + fields.len());
     if topic.compound {
-        let whole = fields.iter().map(|field| Variant::Variant(Box::new(field.clone()))).collect();
+        let whole = fields
+            .iter()
+            .map(|field| Variant::Variant(Box::new(field.clone())))
+            .collect();
         let array = opcua::types::Array {
             value_type: opcua::types::VariantScalarTypeId::Variant,
             values: whole,
             dimensions: None,
         };
-        values.push((topic.node.clone(), data_value(Variant::Array(Box::new(array)), stamp)));
+        values.push((
+            topic.node.clone(),
+            data_value(Variant::Array(Box::new(array)), stamp),
+        ));
     }
     for (field, value) in topic.fields.iter().zip(fields) {
         let value = if let Variant::StatusCode(status) = value
@@ -241,7 +310,9 @@ fn data_value(value: Variant, stamp: Stamp) -> DataValue {
         value: Some(value),
         status: Some(stamp.status),
         source_timestamp: stamp.source.map(|source| value::date_time(source.time)),
-        source_picoseconds: stamp.source.map(|source| source.picoseconds),
+        // asyncua takes the picoseconds for the first bytes of the server timestamp (its order of the fields is not
+        // that of OPC 10000-6, 5.2.2.17), so there are none: 100 ns are left, and clients read right times.
+        source_picoseconds: None,
         server_timestamp: Some(stamp.server),
         server_picoseconds: None,
     }
@@ -276,8 +347,16 @@ fn new_fields(
             .collect(),
     };
     let fit = fields.len() == topic.fields.len()
-        && topic.fields.iter().zip(&fields).all(|(field, value)| field.shape.accepts(value));
-    if fit { Ok(fields) } else { Err(StatusCode::BadTypeMismatch) }
+        && topic
+            .fields
+            .iter()
+            .zip(&fields)
+            .all(|(field, value)| field.shape.accepts(value));
+    if fit {
+        Ok(fields)
+    } else {
+        Err(StatusCode::BadTypeMismatch)
+    }
 }
 
 /// The elements of a Variant array.
@@ -288,7 +367,13 @@ fn members(value: Variant) -> Result<Vec<Variant>, StatusCode> {
     Ok(array
         .values
         .into_iter()
-        .map(|value| if let Variant::Variant(inner) = value { *inner } else { value })
+        .map(|value| {
+            if let Variant::Variant(inner) = value {
+                *inner
+            } else {
+                value
+            }
+        })
         .collect())
 }
 
@@ -302,7 +387,12 @@ fn current_data_value(address_space: &AddressSpace, node: &NodeId) -> Option<Dat
     let NodeType::Variable(variable) = address_space.find(node)? else {
         return None;
     };
-    Some(variable.value(TimestampsToReturn::Both, &NumericRange::None, &DataEncoding::Binary, 0.0))
+    Some(variable.value(
+        TimestampsToReturn::Both,
+        &NumericRange::None,
+        &DataEncoding::Binary,
+        0.0,
+    ))
 }
 
 #[async_trait]
@@ -325,8 +415,12 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
     ) {
         let address_space = address_space.read();
         for item in items {
-            let value =
-                address_space.read(context, item.item_to_monitor(), 0.0, TimestampsToReturn::Both);
+            let value = address_space.read(
+                context,
+                item.item_to_monitor(),
+                0.0,
+                TimestampsToReturn::Both,
+            );
             if value.status() != StatusCode::BadAttributeIdInvalid {
                 item.set_initial_value(value);
             }
@@ -343,7 +437,10 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
                 }
             }
             // A value that comes between this look and the item's being there is only seen by a second look.
-            let _missed = self.exits.created.try_send((item.item_to_monitor().node_id.clone(), item.handle()));
+            let _missed = self
+                .exits
+                .created
+                .try_send((item.item_to_monitor().node_id.clone(), item.handle()));
         }
     }
 
@@ -398,31 +495,42 @@ pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, fol
     let (type_, rank) = if topic.compound {
         (Shape(None).data_type(), 1)
     } else {
-        let shape = topic.fields.first().map_or(Shape(None), |field| field.shape);
+        let shape = topic
+            .fields
+            .first()
+            .map_or(Shape(None), |field| field.shape);
         (shape.data_type(), shape.value_rank())
     };
-    VariableBuilder::new(&topic.node, name(&topic.node, &topic.name), LocalizedText::from(topic.name.as_str()))
-        .description(LocalizedText::from(topic.topic.to_string()))
-        .data_type(type_)
-        .value_rank(rank)
-        .access_level(access(writable))
-        .user_access_level(access(writable))
-        .has_type_definition(VariableTypeId::BaseDataVariableType)
-        .organized_by(folder.clone())
-        .insert(address_space);
+    VariableBuilder::new(
+        &topic.node,
+        name(&topic.node, &topic.name),
+        LocalizedText::from(topic.name.as_str()),
+    )
+    .description(LocalizedText::from(topic.topic.to_string()))
+    .data_type(type_)
+    .value_rank(rank)
+    .access_level(access(writable))
+    .user_access_level(access(writable))
+    .has_type_definition(VariableTypeId::BaseDataVariableType)
+    .organized_by(folder.clone())
+    .insert(address_space);
     wait_for_data(address_space, &topic.node);
     if !topic.compound {
         return;
     }
     for field in &topic.fields {
-        VariableBuilder::new(&field.node, name(&field.node, &field.name), LocalizedText::from(field.name.as_str()))
-            .data_type(field.shape.data_type())
-            .value_rank(field.shape.value_rank())
-            .access_level(access(writable))
-            .user_access_level(access(writable))
-            .has_type_definition(VariableTypeId::BaseDataVariableType)
-            .component_of(topic.node.clone())
-            .insert(address_space);
+        VariableBuilder::new(
+            &field.node,
+            name(&field.node, &field.name),
+            LocalizedText::from(field.name.as_str()),
+        )
+        .data_type(field.shape.data_type())
+        .value_rank(field.shape.value_rank())
+        .access_level(access(writable))
+        .user_access_level(access(writable))
+        .has_type_definition(VariableTypeId::BaseDataVariableType)
+        .component_of(topic.node.clone())
+        .insert(address_space);
         wait_for_data(address_space, &field.node);
     }
 }
@@ -448,20 +556,37 @@ fn wait_for_data(address_space: &mut AddressSpace, node: &NodeId) {
 }
 
 fn access(writable: bool) -> AccessLevel {
-    if writable { AccessLevel::CURRENT_READ | AccessLevel::CURRENT_WRITE } else { AccessLevel::CURRENT_READ }
+    if writable {
+        AccessLevel::CURRENT_READ | AccessLevel::CURRENT_WRITE
+    } else {
+        AccessLevel::CURRENT_READ
+    }
 }
 
 fn add_folders(layout: &Layout, address_space: &mut AddressSpace) {
     let folder = |node: &NodeId, name: &str, parent: NodeId, address_space: &mut AddressSpace| {
-        ObjectBuilder::new(node, QualifiedName::new(node.namespace, name), LocalizedText::from(name))
-            .is_folder()
-            .organized_by(parent)
-            .insert(address_space);
+        ObjectBuilder::new(
+            node,
+            QualifiedName::new(node.namespace, name),
+            LocalizedText::from(name),
+        )
+        .is_folder()
+        .organized_by(parent)
+        .insert(address_space);
     };
     let root = NodeId::new(APPLICATION, "UaSpace");
-    folder(&root, "UaSpace", ObjectId::ObjectsFolder.into(), address_space);
+    folder(
+        &root,
+        "UaSpace",
+        ObjectId::ObjectsFolder.into(),
+        address_space,
+    );
     folder(&unmapped_folder(), "Unmapped", root.clone(), address_space);
-    let spaces: HashSet<SpaceId> = layout.topics.iter().map(|topic| topic.topic.space).collect();
+    let spaces: HashSet<SpaceId> = layout
+        .topics
+        .iter()
+        .map(|topic| topic.topic.space)
+        .collect();
     for space in spaces {
         let name = match space {
             SpaceId::UA => "OPC UA".to_owned(),

@@ -19,7 +19,9 @@ pub(crate) struct Pki {
 #[derive(Debug, thiserror::Error)]
 pub(crate) enum PkiError {
     /// A directory cannot be made or read.
-    #[error("the certificate store {path} cannot be used: {source}; name another directory with --pki")]
+    #[error(
+        "the certificate store {path} cannot be used: {source}; name another directory with --pki"
+    )]
     Directory {
         path: PathBuf,
         #[source]
@@ -132,7 +134,11 @@ impl Pki {
 
 /// Where the store is when nobody says so: systemd's state directory, the user's, or the system's.
 pub(crate) fn default_root(variable: impl Fn(&str) -> Option<String>) -> PathBuf {
-    let given = |name| variable(name).filter(|value| !value.is_empty()).map(PathBuf::from);
+    let given = |name| {
+        variable(name)
+            .filter(|value| !value.is_empty())
+            .map(PathBuf::from)
+    };
     if let Some(state) = given("STATE_DIRECTORY") {
         return state.join("pki");
     }
@@ -159,7 +165,13 @@ fn certificate_data(application_uri: &str, host: &str) -> X509Data {
         country: "XX".to_owned(),
         state: "-".to_owned(),
         // Without the addresses of the computer's name: they are asked of a name service, which may not answer.
-        alt_host_names: X509Data::alt_host_names(application_uri, Some(addresses), true, true, false),
+        alt_host_names: X509Data::alt_host_names(
+            application_uri,
+            Some(addresses),
+            true,
+            true,
+            false,
+        ),
         certificate_duration_days: CERTIFICATE_DAYS,
     }
 }
@@ -207,7 +219,8 @@ mod tests {
     use super::*;
 
     fn scratch(name: &str) -> PathBuf {
-        let path = std::env::temp_dir().join(format!("ua-server-pki-{}-{name}", std::process::id()));
+        let path =
+            std::env::temp_dir().join(format!("ua-server-pki-{}-{name}", std::process::id()));
         drop(fs::remove_dir_all(&path));
         path
     }
@@ -238,7 +251,10 @@ mod tests {
         use std::os::unix::fs::PermissionsExt as _;
         let root = scratch("mode");
         Pki::open(root.clone()).unwrap();
-        let mode = fs::metadata(root.join("private")).unwrap().permissions().mode();
+        let mode = fs::metadata(root.join("private"))
+            .unwrap()
+            .permissions()
+            .mode();
         assert_eq!(mode & 0o077, 0);
         fs::remove_dir_all(root).unwrap();
     }
@@ -248,8 +264,14 @@ mod tests {
         let root = scratch("half");
         let pki = Pki::open(root.clone()).unwrap();
         fs::write(root.join(OWN_KEY), "key").unwrap();
-        let error = pki.ensure_own("urn:a", "localhost").unwrap_err().to_string();
-        assert!(error.contains("private.pem") && error.contains("cert.der"), "{error}");
+        let error = pki
+            .ensure_own("urn:a", "localhost")
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains("private.pem") && error.contains("cert.der"),
+            "{error}"
+        );
         fs::remove_dir_all(root).unwrap();
     }
 
@@ -261,18 +283,35 @@ mod tests {
             fs::write(root.join("rejected").join(format!("{n}.der")), "x").unwrap();
         }
         pki.report_rejected();
-        assert_eq!(fs::read_dir(root.join("rejected")).unwrap().count(), REJECTED_KEPT);
+        assert_eq!(
+            fs::read_dir(root.join("rejected")).unwrap().count(),
+            REJECTED_KEPT
+        );
         fs::remove_dir_all(root).unwrap();
     }
 
     #[test]
     fn the_store_is_in_the_state_directory_of_the_user_or_the_system() {
         let with = |pairs: &'static [(&str, &str)]| {
-            default_root(move |name| pairs.iter().find(|(key, _)| *key == name).map(|(_, value)| (*value).to_owned()))
+            default_root(move |name| {
+                pairs
+                    .iter()
+                    .find(|(key, _)| *key == name)
+                    .map(|(_, value)| (*value).to_owned())
+            })
         };
-        assert_eq!(with(&[("XDG_STATE_HOME", "/s"), ("HOME", "/h")]), Path::new("/s/ua-bridge/pki"));
-        assert_eq!(with(&[("HOME", "/h")]), Path::new("/h/.local/state/ua-bridge/pki"));
+        assert_eq!(
+            with(&[("XDG_STATE_HOME", "/s"), ("HOME", "/h")]),
+            Path::new("/s/ua-bridge/pki")
+        );
+        assert_eq!(
+            with(&[("HOME", "/h")]),
+            Path::new("/h/.local/state/ua-bridge/pki")
+        );
         assert_eq!(with(&[]), Path::new("/var/lib/ua-bridge/pki"));
-        assert_eq!(with(&[("STATE_DIRECTORY", "/var/lib/x"), ("HOME", "/h")]), Path::new("/var/lib/x/pki"));
+        assert_eq!(
+            with(&[("STATE_DIRECTORY", "/var/lib/x"), ("HOME", "/h")]),
+            Path::new("/var/lib/x/pki")
+        );
     }
 }

@@ -8,10 +8,10 @@ use bridge_node::{Delivery, Failure, FailureKind, Port, PortEvent};
 use mappings::{Mapping, SpaceId, TopicId};
 use opcua::server::ServerHandle;
 use opcua::server::address_space::AddressSpace;
+use opcua::server::node_manager::ServerContext;
 use opcua::server::node_manager::memory::{
     CoreNodeManagerBuilder, InMemoryNodeManagerBuilder, InMemoryNodeManagerImplBuilder,
 };
-use opcua::server::node_manager::ServerContext;
 use tokio::runtime::Runtime;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
@@ -63,16 +63,28 @@ impl ServerPort {
             .pki
             .ensure_own(&described.application_uri, &setup.url.advertised_host())
             .map_err(|error| io(error.to_string()))?;
-        let listener = setup.url.bind().map_err(|error| unavailable(error.to_string()))?;
-        let port = listener.local_addr().map_err(|error| io(error.to_string()))?.port();
+        let listener = setup
+            .url
+            .bind()
+            .map_err(|error| unavailable(error.to_string()))?;
+        let port = listener
+            .local_addr()
+            .map_err(|error| io(error.to_string()))?
+            .port();
 
         let (writes_in, writes) = mpsc::channel(MOST_WRITES);
         let (created, created_items) = mpsc::channel(MOST_CREATED);
-        let exits = Exits { writes: writes_in, created };
+        let exits = Exits {
+            writes: writes_in,
+            created,
+        };
         if setup.trust_any_client {
             warn!("every client certificate is trusted, and kept as trusted: for tests only");
         }
-        let nodes = NodesBuilder { layout: Arc::new(layout), exits };
+        let nodes = NodesBuilder {
+            layout: Arc::new(layout),
+            exits,
+        };
         let layout = Arc::clone(&nodes.layout);
         let (server, handle) = endpoint::server(described, &setup.url, port)
             .pki_dir(setup.pki.root())
@@ -84,22 +96,19 @@ impl ServerPort {
         let manager = handle
             .node_managers()
             .get_of_type::<SpaceManager>()
-            .ok_or_else(|| configuration("the server has no node manager for the space".to_owned()))?;
+            .ok_or_else(|| {
+                configuration("the server has no node manager for the space".to_owned())
+            })?;
         check_namespaces(&layout, &manager).map_err(configuration)?;
 
-        let runtime = tokio::runtime::Builder::new_multi_thread()
-            .worker_threads(SERVER_THREADS)
-            .thread_name("opcua")
-            .enable_all()
-            .build()
-            .map_err(|error| io(format!("cannot start the server's threads: {error}")))?;
-        let listener = {
-            let _inside = runtime.enter();
-            tokio::net::TcpListener::from_std(listener).map_err(|error| io(error.to_string()))?
-        };
+        let (runtime, listener) = threads(listener).map_err(|error| io(error.to_string()))?;
         let serving = runtime.spawn(server.run_with(listener));
         let subscriptions = Arc::clone(handle.subscriptions());
-        drop(runtime.spawn(look_again(Arc::clone(&manager), Arc::clone(&subscriptions), created_items)));
+        drop(runtime.spawn(look_again(
+            Arc::clone(&manager),
+            Arc::clone(&subscriptions),
+            created_items,
+        )));
         info!(
             topics = layout.topics.len(),
             pki = %setup.pki.root().display(),
@@ -114,7 +123,12 @@ impl ServerPort {
             runtime: Some(runtime),
             serving: Some(serving),
             writes,
-            live: layout.topics.iter().map(|node| node.topic).filter(|topic| topic.space == SpaceId::UA).collect(),
+            live: layout
+                .topics
+                .iter()
+                .map(|node| node.topic)
+                .filter(|topic| topic.space == SpaceId::UA)
+                .collect(),
             pki: setup.pki,
             look,
         })
@@ -123,6 +137,7 @@ impl ServerPort {
 
 impl Port for ServerPort {
     async fn recv(&mut self) -> PortEvent {
+        self.space.settle();
         if let Some(topic) = self.live.pop_front() {
             return PortEvent::Live { topic, live: true };
         }
@@ -139,7 +154,11 @@ impl Port for ServerPort {
     }
 
     fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
-        self.space.update(sample.topic, &sample.payload, (sample.source, sample.status))
+        self.space.update(
+            sample.topic,
+            &sample.payload,
+            (sample.source, sample.status),
+        )
     }
 
     fn wanted(&mut self, _topic: TopicId, _shape: &[(BuiltinType, bool)]) {
@@ -172,6 +191,20 @@ impl Drop for ServerPort {
     }
 }
 
+/// The server's own threads, and the listener as they take it.
+fn threads(listener: std::net::TcpListener) -> std::io::Result<(Runtime, tokio::net::TcpListener)> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(SERVER_THREADS)
+        .thread_name("opcua")
+        .enable_all()
+        .build()?;
+    let listener = {
+        let _inside = runtime.enter();
+        tokio::net::TcpListener::from_std(listener)?
+    };
+    Ok((runtime, listener))
+}
+
 /// Ready, once, when the server has ended by itself.
 async fn ended(serving: &mut Option<JoinHandle<Result<(), String>>>) -> String {
     let Some(running) = serving else {
@@ -202,9 +235,15 @@ impl InMemoryNodeManagerImplBuilder for NodesBuilder {
 /// Holds the server to the indexes of the mapping: it hands them out itself.
 fn check_namespaces(layout: &Layout, manager: &SpaceManager) -> Result<(), String> {
     let wanted = layout.namespaces.iter().skip(1);
-    for ((index, uri), (expected, wanted)) in manager.inner().served_namespaces().zip((1u16..).zip(wanted)) {
+    for ((index, uri), (expected, wanted)) in manager
+        .inner()
+        .served_namespaces()
+        .zip((1u16..).zip(wanted))
+    {
         if index != expected || uri != wanted {
-            return Err(format!("namespace {wanted} is to have index {expected}, but in this server it has {index}"));
+            return Err(format!(
+                "namespace {wanted} is to have index {expected}, but in this server it has {index}"
+            ));
         }
     }
     Ok(())

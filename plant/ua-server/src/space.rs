@@ -18,6 +18,8 @@ pub(crate) struct Space {
     subscriptions: Arc<SubscriptionCache>,
     topics: HashMap<TopicId, Known>,
     unmapped: usize,
+    /// Topics whose writer speaks again, without a sample so far.
+    returned: Vec<TopicId>,
 }
 
 /// A topic of another space, and what was last heard of it.
@@ -32,9 +34,23 @@ struct Known {
 }
 
 impl Space {
-    pub(crate) fn new(layout: &Layout, manager: Arc<SpaceManager>, subscriptions: Arc<SubscriptionCache>) -> Self {
-        let topics = layout.topics.iter().map(|node| (node.topic, Known::new(node.clone(), true))).collect();
-        Self { manager, subscriptions, topics, unmapped: 0 }
+    pub(crate) fn new(
+        layout: &Layout,
+        manager: Arc<SpaceManager>,
+        subscriptions: Arc<SubscriptionCache>,
+    ) -> Self {
+        let topics = layout
+            .topics
+            .iter()
+            .map(|node| (node.topic, Known::new(node.clone(), true)))
+            .collect();
+        Self {
+            manager,
+            subscriptions,
+            topics,
+            unmapped: 0,
+            returned: Vec::new(),
+        }
     }
 
     /// Takes in a sample: the fields of its DataSet as a key frame carries them.
@@ -48,7 +64,11 @@ impl Space {
         (source, status): (Option<Timestamp>, u16),
     ) -> Result<(), &'static str> {
         let fields = Fields::parse(block)
-            .and_then(|fields| fields.map(|field| Ok(value::from_field(&field?))).collect::<Result<Vec<_>, _>>())
+            .and_then(|fields| {
+                fields
+                    .map(|field| Ok(value::from_field(&field?)))
+                    .collect::<Result<Vec<_>, _>>()
+            })
             .map_err(|_| "malformed fields")?;
         if !self.topics.contains_key(&topic) {
             self.add_unmapped(topic, &fields)?;
@@ -66,9 +86,12 @@ impl Space {
             server: DateTime::now(),
         };
         known.silent = false;
+        self.returned.retain(|returned| *returned != topic);
         known.last = Some((fields.clone(), stamp));
         let values = known.stored(fields, stamp);
-        self.manager.inner().store(self.manager.address_space(), &self.subscriptions, values);
+        self.manager
+            .inner()
+            .store(self.manager.address_space(), &self.subscriptions, values);
         Ok(())
     }
 
@@ -82,12 +105,43 @@ impl Space {
             return;
         }
         known.silent = silent;
+        if silent {
+            self.set_status(topic, Some(StatusCode::UncertainLastUsableValue));
+        } else {
+            // Most likely a sample follows at once, which says more than the one before.
+            self.returned.push(topic);
+        }
+    }
+
+    /// Gives the last values their own status back where a writer speaks again but has nothing new to say.
+    pub(crate) fn settle(&mut self) {
+        for topic in std::mem::take(&mut self.returned) {
+            if self.topics.get(&topic).is_some_and(|known| !known.silent) {
+                self.set_status(topic, None);
+            }
+        }
+    }
+
+    /// Shows the last sample anew, under another status than its own or, without one, under its own.
+    fn set_status(&mut self, topic: TopicId, status: Option<StatusCode>) {
+        let Some(known) = self.topics.get_mut(&topic) else {
+            return;
+        };
         let Some((fields, stamp)) = known.last.clone() else {
             return;
         };
-        let status = if silent { StatusCode::UncertainLastUsableValue } else { stamp.status };
-        let values = known.stored(fields, Stamp { status, server: DateTime::now(), ..stamp });
-        self.manager.inner().store(self.manager.address_space(), &self.subscriptions, values);
+        let status = status.unwrap_or(stamp.status);
+        let values = known.stored(
+            fields,
+            Stamp {
+                status,
+                server: DateTime::now(),
+                ..stamp
+            },
+        );
+        self.manager
+            .inner()
+            .store(self.manager.address_space(), &self.subscriptions, values);
     }
 
     /// A topic nobody mapped gets a node of its own when its first value comes.
@@ -101,8 +155,17 @@ impl Space {
             [only] => shape_of(only),
             _ => Shape(None),
         };
-        let node = TopicNode::new(topic, nodes::unmapped_node(topic), name.clone(), vec![(name, shape)]);
-        nodes::add_topic(&mut self.manager.address_space().write(), &node, &nodes::unmapped_folder());
+        let node = TopicNode::new(
+            topic,
+            nodes::unmapped_node(topic),
+            name.clone(),
+            vec![(name, shape)],
+        );
+        nodes::add_topic(
+            &mut self.manager.address_space().write(),
+            &node,
+            &nodes::unmapped_folder(),
+        );
         self.topics.insert(topic, Known::new(node, false));
         Ok(())
     }
@@ -110,16 +173,30 @@ impl Space {
 
 impl Known {
     fn new(node: TopicNode, mapped: bool) -> Self {
-        Self { node, mapped, last: None, silent: false, statuses: Vec::new() }
+        Self {
+            node,
+            mapped,
+            last: None,
+            silent: false,
+            statuses: Vec::new(),
+        }
     }
 
     /// The fields as the topic's nodes take them. A topic of which nothing is known beforehand takes several as one
     /// Variant array.
     fn fit(&self, mut fields: Vec<Variant>) -> Result<Vec<Variant>, &'static str> {
-        let open = !self.mapped || matches!(self.node.fields.as_slice(), [field] if field.shape == Shape(None));
+        let open = !self.mapped
+            || matches!(self.node.fields.as_slice(), [field] if field.shape == Shape(None));
         if open && fields.len() != 1 {
-            let values = fields.drain(..).map(|field| Variant::Variant(Box::new(field))).collect();
-            let array = Array { value_type: VariantScalarTypeId::Variant, values, dimensions: None };
+            let values = fields
+                .drain(..)
+                .map(|field| Variant::Variant(Box::new(field)))
+                .collect();
+            let array = Array {
+                value_type: VariantScalarTypeId::Variant,
+                values,
+                dimensions: None,
+            };
             fields.push(Variant::Array(Box::new(array)));
         }
         if open {
@@ -132,7 +209,11 @@ impl Known {
             let in_place_of_a_value = matches!(value, Variant::Empty | Variant::StatusCode(_));
             in_place_of_a_value || field.shape.accepts(value)
         });
-        if fits { Ok(fields) } else { Err("another type than mapped") }
+        if fits {
+            Ok(fields)
+        } else {
+            Err("another type than mapped")
+        }
     }
 
     /// The node of an unmapped topic has the type of what came last.
@@ -156,8 +237,14 @@ impl Known {
             .into_iter()
             .enumerate()
             .map(|(at, (node, value))| {
-                let flipped = before.get(at).is_some_and(|status| *status != value.status());
-                Stored { node, value, flipped }
+                let flipped = before
+                    .get(at)
+                    .is_some_and(|status| *status != value.status());
+                Stored {
+                    node,
+                    value,
+                    flipped,
+                }
             })
             .collect()
     }

@@ -6,8 +6,9 @@
 
 use opcua::types::type_loader::{ByteStringBody, XmlBody};
 use opcua::types::{
-    Array, BinaryEncodable as _, ByteString, ContextOwned, DateTime, ExpandedNodeId, ExtensionObject, Guid,
-    Identifier, LocalizedText, NodeId, QualifiedName, StatusCode, UAString, Variant, VariantScalarTypeId, XmlElement,
+    Array, BinaryEncodable as _, ByteString, ContextOwned, DateTime, ExpandedNodeId,
+    ExtensionObject, Guid, Identifier, LocalizedText, NodeId, QualifiedName, StatusCode, UAString,
+    Variant, VariantScalarTypeId, XmlElement,
 };
 use uadp::{BuiltinType, ExtensionBody, Scalar};
 
@@ -34,11 +35,17 @@ pub(crate) fn fields_block(fields: &[Variant]) -> Result<Vec<u8>, StatusCode> {
     let context = context.context();
     let mut block = Vec::from(count.to_le_bytes());
     for field in fields {
-        field.encode(&mut block, &context).map_err(|_| StatusCode::BadNotSupported)?;
+        field
+            .encode(&mut block, &context)
+            .map_err(|_| StatusCode::BadNotSupported)?;
     }
     let readable = uadp::Fields::parse(&block)
         .is_ok_and(|mut parsed| parsed.len() == fields.len() && parsed.all(|field| field.is_ok()));
-    if readable { Ok(block) } else { Err(StatusCode::BadNotSupported) }
+    if readable {
+        Ok(block)
+    } else {
+        Err(StatusCode::BadNotSupported)
+    }
 }
 
 /// What a field never set is sent as beside those that are: zero, empty, or null where the type has such.
@@ -76,7 +83,9 @@ pub(crate) fn zero(shape: Option<(BuiltinType, bool)>) -> Variant {
         BuiltinType::QualifiedName => Variant::from(QualifiedName::null()),
         BuiltinType::LocalizedText => Variant::from(LocalizedText::null()),
         BuiltinType::ExtensionObject => Variant::ExtensionObject(ExtensionObject::null()),
-        BuiltinType::DataValue | BuiltinType::Variant | BuiltinType::DiagnosticInfo => Variant::Empty,
+        BuiltinType::DataValue | BuiltinType::Variant | BuiltinType::DiagnosticInfo => {
+            Variant::Empty
+        }
     }
 }
 
@@ -130,9 +139,10 @@ fn extension_object(object: uadp::ExtensionObject<'_>) -> ExtensionObject {
     match object.body {
         // The server's type has no room for a type id without a body.
         ExtensionBody::None => ExtensionObject::null(),
-        ExtensionBody::Binary(bytes) => {
-            ExtensionObject::new(ByteStringBody::new(ByteString::from(bytes.to_vec()), type_id))
-        }
+        ExtensionBody::Binary(bytes) => ExtensionObject::new(ByteStringBody::new(
+            ByteString::from(bytes.to_vec()),
+            type_id,
+        )),
         ExtensionBody::Xml(text) => ExtensionObject::new(XmlBody::new(
             text.as_bytes().to_vec(),
             type_id,
@@ -148,7 +158,10 @@ fn node_id(node: uadp::NodeId<'_>) -> NodeId {
         uadp::Identifier::Guid(value) => Identifier::Guid(guid(value)),
         uadp::Identifier::Opaque(bytes) => Identifier::ByteString(byte_string(bytes)),
     };
-    NodeId { namespace: node.namespace, identifier }
+    NodeId {
+        namespace: node.namespace,
+        identifier,
+    }
 }
 
 fn guid(value: uadp::Guid) -> Guid {
@@ -199,8 +212,15 @@ mod tests {
     use super::*;
 
     /// One value of every builtin type that a field can have, with the server's form of it.
+    #[expect(
+        clippy::too_many_lines,
+        reason = "one entry for each of the builtin types"
+    )]
     fn samples() -> Vec<(Scalar<'static>, Variant)> {
-        let guid_bytes = [0x91, 0x2B, 0x96, 0x72, 0x75, 0xFA, 0xE6, 0x4A, 0x8D, 0x28, 0xB4, 0x04, 0xDC, 0x7D, 0xAF, 0x63];
+        let guid_bytes = [
+            0x91, 0x2B, 0x96, 0x72, 0x75, 0xFA, 0xE6, 0x4A, 0x8D, 0x28, 0xB4, 0x04, 0xDC, 0x7D,
+            0xAF, 0x63,
+        ];
         let guid_text: Guid = "72962b91-fa75-4ae6-8d28-b404dc7daf63".parse().unwrap();
         let body = ByteStringBody::new(ByteString::from(vec![1, 2, 3]), NodeId::new(5, 77));
         vec![
@@ -210,7 +230,10 @@ mod tests {
             (Scalar::Int16(-300), Variant::Int16(-300)),
             (Scalar::UInt16(60_000), Variant::UInt16(60_000)),
             (Scalar::Int32(-70_000), Variant::Int32(-70_000)),
-            (Scalar::UInt32(4_000_000_000), Variant::UInt32(4_000_000_000)),
+            (
+                Scalar::UInt32(4_000_000_000),
+                Variant::UInt32(4_000_000_000),
+            ),
             (Scalar::Int64(i64::MIN), Variant::Int64(i64::MIN)),
             (Scalar::UInt64(u64::MAX), Variant::UInt64(u64::MAX)),
             (Scalar::Float(1.5), Variant::Float(1.5)),
@@ -220,16 +243,28 @@ mod tests {
                 Scalar::DateTime(uadp::DateTime(134_234_948_967_890_123)),
                 Variant::from(DateTime::from(134_234_948_967_890_123i64)),
             ),
-            (Scalar::Guid(uadp::Guid(guid_bytes)), Variant::from(guid_text.clone())),
-            (Scalar::ByteString(Some(&[0, 255])), Variant::ByteString(ByteString::from(vec![0, 255]))),
-            (Scalar::XmlElement(Some("<a/>")), Variant::XmlElement(XmlElement::from("<a/>"))),
+            (
+                Scalar::Guid(uadp::Guid(guid_bytes)),
+                Variant::from(guid_text.clone()),
+            ),
+            (
+                Scalar::ByteString(Some(&[0, 255])),
+                Variant::ByteString(ByteString::from(vec![0, 255])),
+            ),
+            (
+                Scalar::XmlElement(Some("<a/>")),
+                Variant::XmlElement(XmlElement::from("<a/>")),
+            ),
             (
                 Scalar::NodeId(uadp::NodeId::string(3, "pump")),
                 Variant::from(NodeId::new(3, "pump")),
             ),
             (
                 Scalar::ExpandedNodeId(uadp::ExpandedNodeId {
-                    node_id: uadp::NodeId { namespace: 0, identifier: uadp::Identifier::Guid(uadp::Guid(guid_bytes)) },
+                    node_id: uadp::NodeId {
+                        namespace: 0,
+                        identifier: uadp::Identifier::Guid(uadp::Guid(guid_bytes)),
+                    },
                     namespace_uri: Some("urn:x"),
                     server_index: 2,
                 }),
@@ -244,11 +279,17 @@ mod tests {
                 Variant::StatusCode(StatusCode::BadNodeIdUnknown),
             ),
             (
-                Scalar::QualifiedName(uadp::QualifiedName { namespace: 4, name: Some("q") }),
+                Scalar::QualifiedName(uadp::QualifiedName {
+                    namespace: 4,
+                    name: Some("q"),
+                }),
                 Variant::from(QualifiedName::new(4, "q")),
             ),
             (
-                Scalar::LocalizedText(uadp::LocalizedText { locale: Some("de"), text: Some("ein") }),
+                Scalar::LocalizedText(uadp::LocalizedText {
+                    locale: Some("de"),
+                    text: Some("ein"),
+                }),
                 Variant::from(LocalizedText::new("de", "ein")),
             ),
             (
@@ -276,8 +317,15 @@ mod tests {
             let block = fields_block(std::slice::from_ref(server)).unwrap();
             assert_eq!(only_field(&block), uadp::Variant::Scalar(*wire));
         }
-        let types: Vec<u8> = samples.iter().map(|(wire, _)| wire.builtin_type().id()).collect();
-        assert_eq!(types, (1..=22).collect::<Vec<u8>>(), "a type without a sample");
+        let types: Vec<u8> = samples
+            .iter()
+            .map(|(wire, _)| wire.builtin_type().id())
+            .collect();
+        assert_eq!(
+            types,
+            (1..=22).collect::<Vec<u8>>(),
+            "a type without a sample"
+        );
     }
 
     #[test]
@@ -309,8 +357,16 @@ mod tests {
 
     #[test]
     fn a_matrix_does_not_go_out_to_the_space() {
-        let matrix = Array::new_multi(VariantScalarTypeId::Int32, vec![Variant::Int32(1); 4], vec![2, 2]).unwrap();
-        assert_eq!(fields_block(&[Variant::Array(Box::new(matrix))]), Err(StatusCode::BadNotSupported));
+        let matrix = Array::new_multi(
+            VariantScalarTypeId::Int32,
+            vec![Variant::Int32(1); 4],
+            vec![2, 2],
+        )
+        .unwrap();
+        assert_eq!(
+            fields_block(&[Variant::Array(Box::new(matrix))]),
+            Err(StatusCode::BadNotSupported)
+        );
     }
 
     #[test]
@@ -319,7 +375,10 @@ mod tests {
         for builtin in BuiltinType::ALL.into_iter().take(22) {
             for array in [false, true] {
                 let value = zero(Some((builtin, array)));
-                assert!(Shape(Some((builtin, array))).accepts(&value), "{builtin} {array}");
+                assert!(
+                    Shape(Some((builtin, array))).accepts(&value),
+                    "{builtin} {array}"
+                );
                 assert!(fields_block(&[value]).is_ok(), "{builtin} {array}");
             }
         }
