@@ -75,6 +75,7 @@ impl Programs {
                 reports,
                 end,
                 running: Vec::new(),
+                listeners: JoinSet::new(),
             },
             receiver,
         ))
