@@ -84,3 +84,50 @@ pub(crate) const NAMESPACE: &str = "urn:ua-bridge:assembly-line";
 pub(crate) const ENDPOINT: &str = "opc.tcp://127.0.0.1:4840";
 /// The DDS domain of TurtleBot3.
 pub(crate) const DOMAIN: u16 = 2;
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use mappings::{Identifier, Mapping, SpaceId};
+
+    use super::*;
+
+    #[test]
+    fn the_names_are_those_of_the_shipped_mapping() {
+        let text = include_str!("../../mappings/assembly-line.yaml");
+        let checked = Mapping::from_yaml(text, "assembly-line.yaml");
+        let mapping = checked.mapping.expect("the shipped mapping is in order");
+        assert_eq!(
+            mapping.namespaces().get(&2).map(String::as_str),
+            Some(NAMESPACE)
+        );
+        assert_eq!(mapping.server().endpoint.to_string(), ENDPOINT);
+        assert_eq!(mapping.space_of_domain(DOMAIN), SpaceId::new(2));
+        let mapped: BTreeMap<String, _> = mapping
+            .variables()
+            .iter()
+            .map(|variable| (variable.name.clone(), variable))
+            .collect();
+        assert_eq!(mapped.len(), Name::ALL.len());
+        for name in Name::ALL {
+            let variable = mapped[&name.to_string()];
+            assert_eq!(variable.node.namespace, 2, "{name}");
+            assert_eq!(
+                variable.node.identifier,
+                Identifier::Numeric(name.node()),
+                "{name}"
+            );
+            for space in [1, 2] {
+                let binding = variable.binding(SpaceId::new(space).unwrap()).unwrap();
+                assert_eq!(binding.ros_topic, format!("/{}", name.ros_topic()));
+            }
+            let producer = match variable.topic.triple().0 {
+                0 => "the supervisor",
+                1 => "Niryo Ned",
+                _ => "TurtleBot3",
+            };
+            assert_eq!(name.producer(), producer, "{name}");
+        }
+    }
+}

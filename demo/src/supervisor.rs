@@ -254,7 +254,7 @@ fn server_time(data: &DataValue) -> Option<i64> {
 /// 1970 in 100 ns since 1601.
 const UNIX_EPOCH_TICKS: i64 = 116_444_736_000_000_000;
 const PUBLISHING_INTERVAL: Duration = Duration::from_millis(10);
-const CONNECT_LIMIT: Duration = Duration::from_mins(1);
+const CONNECT_LIMIT: Duration = Duration::from_secs(60);
 const REQUEST_LIMIT: Duration = Duration::from_secs(5);
 const WRITE_ATTEMPTS: u32 = 10;
 

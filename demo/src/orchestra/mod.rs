@@ -420,7 +420,7 @@ const MAPPING: &str = include_str!("../../../mappings/assembly-line.yaml");
 /// The interface of the PubSub group, by address, because its name is not the same everywhere.
 const LOOPBACK: &str = "127.0.0.1";
 /// How long the programs may take to find one another.
-const BEGIN_WITHIN: Duration = Duration::from_mins(1);
+const BEGIN_WITHIN: Duration = Duration::from_secs(60);
 /// For what does not get faster with the story.
 const SPARE: Duration = Duration::from_secs(10);
 const PRINT_EVERY: Duration = Duration::from_millis(50);

@@ -57,6 +57,7 @@ pub(crate) struct Programs {
     reports: mpsc::Sender<Report>,
     end: watch::Sender<Option<Stage>>,
     running: Vec<(Stage, JoinSet<()>)>,
+    listeners: JoinSet<()>,
 }
 
 impl Programs {
@@ -74,6 +75,7 @@ impl Programs {
                 reports,
                 end,
                 running: Vec::new(),
+                listeners: JoinSet::new(),
             },
             receiver,
         ))
@@ -117,7 +119,8 @@ impl Programs {
             .map_err(Failure::io("cannot start a program"))?;
         let mut tasks = JoinSet::new();
         if let Some(stdout) = child.stdout.take() {
-            tasks.spawn(listen(program.name, stdout, self.reports.clone()));
+            self.listeners
+                .spawn(listen(program.name, stdout, self.reports.clone()));
         }
         let end = self.end.subscribe();
         tasks.spawn(attend(
@@ -139,6 +142,8 @@ impl Programs {
             }
         }
         self.running.clear();
+        // What a child has started may still hold its standard output open.
+        self.listeners.shutdown().await;
     }
 
     /// The last lines of a program's log.
