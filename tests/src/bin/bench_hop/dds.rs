@@ -1,0 +1,52 @@
+//! The DDS end of a path: a raw reliable reader; nothing is decoded but the text's end.
+
+use std::net::{IpAddr, Ipv4Addr};
+use std::time::Duration;
+
+use bridge_ros2::domain::{Domain, DomainOptions};
+use bridge_ros2::qos::Requested;
+use bridge_ros2::raw::Reader as RawReader;
+use futures_util::StreamExt;
+use tokio::runtime::Runtime;
+
+/// A reader of one topic of std_msgs/String in domain 2.
+pub(crate) struct Reader {
+    // Before the domain it lives in, which is dropped last.
+    reader: RawReader,
+    runtime: Runtime,
+    _domain: Domain,
+}
+
+impl Reader {
+    pub(crate) fn new(topic: &str) -> Self {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let options = DomainOptions {
+            domain: 2,
+            networks: vec![IpAddr::V4(Ipv4Addr::LOCALHOST)],
+            node: "bench".to_owned(),
+        };
+        let domain = Domain::join(&options).unwrap();
+        let reader = domain
+            .reader(topic, "std_msgs::msg::dds_::String_", Requested::from_writers(&[]))
+            .unwrap();
+        Self { reader, runtime, _domain: domain }
+    }
+
+    /// Takes samples until one holds the text; false when none did in time.
+    pub(crate) fn wait_for(&self, text: &str, patience: Duration) -> bool {
+        let mut samples = self.reader.as_async_stream();
+        self.runtime.block_on(async {
+            let found = async {
+                while let Some(sample) = samples.next().await {
+                    let bytes = sample.unwrap().into_value().into_bytes();
+                    // Header, length, text, NUL, padding.
+                    if bytes.get(8..8 + text.len()) == Some(text.as_bytes()) {
+                        return true;
+                    }
+                }
+                false
+            };
+            tokio::time::timeout(patience, found).await.unwrap_or(false)
+        })
+    }
+}
