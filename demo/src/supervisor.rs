@@ -40,10 +40,9 @@ async fn supervise(off_after: Duration, pki: PathBuf) -> anyhow::Result<()> {
         let (name, value) = values.recv().await.ok_or_else(subscription_ended)?;
         watch.see(name, &value)?;
     }
-    let mut off_at = Instant::now() + off_after;
+    let off_at = Instant::now() + off_after;
     if !off_after.is_zero() {
         switch(&session, namespace, true).await?;
-        off_at = Instant::now() + off_after;
     }
     let mut switched_off = false;
     loop {

@@ -59,7 +59,7 @@ fn conclude(
 ) -> std::io::Result<()> {
     timeline.print_all(story)?;
     let report = report::Report::of(story, hops);
-    if story.began() {
+    if story.delivered() > 0 {
         timeline.print_text(&report.table(story))?;
     }
     if let Some(failure) = failure {
@@ -100,7 +100,8 @@ async fn perform(
     // Nothing is heard from here on, and nobody is to wait with telling it.
     stage.reports.close();
     stage.programs.end().await;
-    if outcome.is_ok()
+    // The logs are for those who wonder what went wrong.
+    if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
         && let Err(error) = stage.programs.clean_up()
     {
         tracing::debug!(%error, "the logs were not removed");

@@ -14,6 +14,7 @@ use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::failure::Failure;
+use crate::clock::wall_nanos;
 use crate::event::Stamped;
 
 /// What comes from the children.
@@ -64,7 +65,12 @@ impl Programs {
     /// Makes the directory for logs and the receiver of the reports. When nobody takes reports, children wait with
     /// telling them.
     pub(crate) fn prepare() -> io::Result<(Self, mpsc::Receiver<Report>)> {
-        let name = format!("ua-bridge-demo-{}", std::process::id());
+        // Process ids come again; logs of a run that failed stay.
+        let name = format!(
+            "ua-bridge-demo-{}-{}",
+            wall_nanos() / 1_000_000,
+            std::process::id()
+        );
         let directory = std::env::temp_dir().join(name);
         fs::create_dir(&directory)?;
         let (reports, receiver) = mpsc::channel(1024);
@@ -250,7 +256,6 @@ mod tests {
             .unwrap()
     }
 
-    /// One test, because the directory is named by the process.
     #[tokio::test]
     async fn children_are_heard_missed_and_ended() {
         let (mut programs, mut reports) = Programs::prepare().unwrap();
