@@ -177,8 +177,9 @@ async fn follow(
             }
             Err(error) => return LinkError::Io(error),
         }
-        // All messages that this read completes have the same time: it was read once for them.
-        let received = clock::utc();
+        // One look at the clock serves all messages that this read completes. They still differ: a stamp tells one
+        // sample from the next.
+        let mut received = clock::utc();
         loop {
             match frames.next() {
                 Ok(Some(bytes)) => {
@@ -189,6 +190,7 @@ async fn follow(
                         peer: Arc::clone(&peer),
                         received,
                     });
+                    received += Duration::from_nanos(1);
                     if ahead >= TURN {
                         // One read may bring more than the inbox holds: its consumer gets to run in between.
                         ahead = 0;

@@ -558,8 +558,12 @@ async fn a_burst_longer_than_the_queue_reaches_a_consumer_that_keeps_up() {
         stream.write_all(&burst).await.unwrap();
         stream
     });
+    let mut before = std::time::SystemTime::UNIX_EPOCH;
     for n in 0..20_000u32 {
-        assert_eq!(message(&mut inbox).await.bytes, n.to_le_bytes().as_slice());
+        let message = message(&mut inbox).await;
+        assert_eq!(message.bytes, n.to_le_bytes().as_slice());
+        assert!(message.received > before, "two messages have one time");
+        before = message.received;
     }
     drop(sending);
 }
