@@ -35,6 +35,16 @@ fn every_shipped_document_is_without_findings() {
 }
 
 #[test]
+fn the_readme_shows_the_minimal_document_as_it_is() {
+    let minimal = std::fs::read_to_string(folder().join("minimal.yaml")).unwrap();
+    let readme = std::fs::read_to_string(folder().join("../README.md")).unwrap();
+    assert!(
+        readme.contains(&minimal),
+        "the README's first mapping is not minimal.yaml"
+    );
+}
+
+#[test]
 fn the_assembly_line_names_each_value_on_both_sides() {
     let mapping = load(&folder().join("assembly-line.yaml"));
     assert_eq!(mapping.pubsub().interface.as_deref(), Some("lo"));
