@@ -143,7 +143,8 @@ impl Router {
                 return self.refuse(topic, Reason::Untyped, detail);
             }
         };
-        let header = data_set_header(writer.expected_sequence(), received);
+        let stamp = writer.stamp(received);
+        let header = data_set_header(writer.expected_sequence(), stamp);
         match encode(&mut encoded, topic, &header, now.utc, &sample) {
             Ok(()) => {}
             Err((reason, detail)) => {

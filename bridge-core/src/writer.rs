@@ -9,6 +9,8 @@ use uadp::Timestamp;
 pub(crate) struct Writer {
     /// The sequence number of the next DataSetMessage.
     sequence: u16,
+    /// When the last sample was taken, as its message says.
+    taken: Option<Timestamp>,
     /// When anything was last sent for it.
     sent: Instant,
     /// When its value was last sent.
@@ -58,6 +60,7 @@ impl Writer {
     pub(crate) const fn new(now: Instant) -> Self {
         Self {
             sequence: 0,
+            taken: None,
             sent: now,
             value_sent: now,
             live: true,
@@ -71,6 +74,20 @@ impl Writer {
         let sequence = self.sequence;
         self.sequence = sequence.wrapping_add(1);
         sequence
+    }
+
+    /// The stamp for a sample taken at `taken`: that, or just after the sample before if it is not later.
+    ///
+    /// Two samples never share a stamp, since readers know repetitions by it. A clock that was set back is followed.
+    pub(crate) fn stamp(&mut self, taken: Timestamp) -> Timestamp {
+        let stamp = match self.taken.map(|last| last.unix_nanos()) {
+            Some(last) if (0..STEP_BACK).contains(&(last - taken.unix_nanos())) => {
+                Timestamp::from_unix_nanos(last + 1)
+            }
+            _ => taken,
+        };
+        self.taken = Some(stamp);
+        stamp
     }
 
     /// The number a keep-alive carries: that of the next message to expect (OPC 10000-14 7.2.4.5.8).
@@ -132,6 +149,9 @@ impl Writer {
         Some(if repeats_first { repeat } else { keep_alive })
     }
 }
+
+/// Samples of one topic come from several publishers, whose stamps may cross by as much; in nanoseconds.
+const STEP_BACK: i128 = 1_000_000_000;
 
 fn patch(bytes: &mut [u8], at: usize, with: &[u8]) {
     if let Some(place) = bytes.get_mut(at..at.saturating_add(with.len())) {
@@ -211,6 +231,16 @@ mod tests {
             writer.due(SECOND, SECOND).is_some(),
             "a sample shows that it has one again"
         );
+    }
+
+    #[test]
+    fn two_samples_never_share_a_stamp_and_a_clock_set_back_is_followed() {
+        let (mut writer, _) = writer();
+        let at = |nanos| Timestamp::from_unix_nanos(1_700_000_000_000_000_000 + nanos);
+        let stamps = [5, 5, 3, 900].map(|nanos| writer.stamp(at(nanos)));
+        assert_eq!(stamps, [at(5), at(6), at(7), at(900)]);
+        let an_hour_back = at(-3_600_000_000_000);
+        assert_eq!(writer.stamp(an_hour_back), an_hour_back);
     }
 
     #[test]

@@ -11,10 +11,10 @@ use uadp::{BuiltinType, Timestamp};
 ///
 /// The shell polls [`recv`](Self::recv) beside the socket, and hands over what the Router lets pass. Topic names are
 /// resolved once, when a port subscribes; the samples carry the [`TopicId`].
-pub trait Port {
+pub trait Port: Send + 'static {
     /// The next thing that happened on this side. Cancel-safe: dropping the future loses nothing. Pends while there
     /// is nothing.
-    fn recv(&mut self) -> impl Future<Output = PortEvent>;
+    fn recv(&mut self) -> impl Future<Output = PortEvent> + Send;
 
     /// Publishes a sample of another space. Never waits.
     ///
@@ -34,7 +34,7 @@ pub trait Port {
     fn silent(&mut self, topic: TopicId, silent: bool);
 
     /// Withdraws every registration and ends. Bounded by 2 s.
-    fn shutdown(self) -> impl Future<Output = ()>;
+    fn shutdown(self) -> impl Future<Output = ()> + Send;
 }
 
 /// One value of another space on its way to the local side.

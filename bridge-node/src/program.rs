@@ -152,7 +152,10 @@ fn serve<P: Program>(program: P, mapping: Arc<Mapping>) -> Result<(), Failure> {
             requests,
             dry_run: arguments.dry_run,
         };
-        shell.run(stop).await
+        // As a task of its own: waking the future given to `block_on` costs a system call each time.
+        tokio::spawn(shell.run(stop)).await.unwrap_or_else(|error| {
+            Err(Failure::new(FailureKind::Io, format!("the program broke off: {error}")))
+        })
     })
 }
 
@@ -177,7 +180,7 @@ fn open(arguments: &Arguments, mapping: &Mapping) -> Result<Udp, Failure> {
 }
 
 /// Ready at the first SIGINT or SIGTERM.
-fn stopped() -> Result<impl Future<Output = ()>, Failure> {
+fn stopped() -> Result<impl Future<Output = ()> + Send + 'static, Failure> {
     let listen = |kind| {
         signal(kind).map_err(|error| {
             Failure::new(

@@ -31,7 +31,10 @@ impl<P: Port> Shell<P> {
     /// Carries samples until `stop` is ready or the port cannot go on, then shuts the port down.
     ///
     /// All branches of the `select!` are cancel-safe: a socket and bounded channels that hold what was not taken.
-    pub(crate) async fn run(mut self, stop: impl Future<Output = ()>) -> Result<(), Failure> {
+    pub(crate) async fn run(
+        mut self,
+        stop: impl Future<Output = ()> + Send,
+    ) -> Result<(), Failure> {
         let mut stop = std::pin::pin!(stop);
         let mut timer = std::pin::pin!(tokio::time::sleep(FAR));
         // Any UDP datagram fits.
@@ -56,7 +59,9 @@ impl<P: Port> Shell<P> {
             self.drain();
         };
         let status = Status::of(self.program, self.own, &self.router);
-        info!(status = %status.json(), "ending");
+        let [topics, sent, delivered, dropped] = status.summary();
+        info!(topics, sent, delivered, dropped, "ending");
+        debug!(status = %status.json(), "the last status");
         self.port.shutdown().await;
         ended
     }

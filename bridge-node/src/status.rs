@@ -56,6 +56,17 @@ impl Status {
         }
     }
 
+    /// How many topics there are, and how many samples were sent, delivered and dropped, routine drops included.
+    pub(crate) fn summary(&self) -> [u64; 4] {
+        let all = || self.topics.values().chain([&self.others]);
+        [
+            self.topics.len().try_into().unwrap_or(u64::MAX),
+            all().map(|topic| topic.sent).sum(),
+            all().map(|topic| topic.delivered).sum(),
+            all().flat_map(|topic| topic.dropped.values()).sum(),
+        ]
+    }
+
     /// One JSON object.
     pub(crate) fn json(&self) -> String {
         // All keys are strings and no number is special, so there is nothing that could fail.

@@ -207,11 +207,10 @@ impl Node {
         let mut draining = self.inner.draining.subscribe();
         self.inner.close();
         self.inner.changed.notify_one();
+        // What the two give is a lock that must not be held while the other waits; an error is the end as well.
         let done = async {
-            tokio::join!(
-                settled.wait_for(|settled| *settled),
-                draining.wait_for(|open| *open == 0)
-            )
+            let _settled = settled.wait_for(|settled| *settled).await.is_ok();
+            let _drained = draining.wait_for(|open| *open == 0).await.is_ok();
         };
         if timeout(SHUTDOWN_LIMIT, done).await.is_err() {
             events::shutdown_incomplete(SHUTDOWN_LIMIT);

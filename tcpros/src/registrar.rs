@@ -33,7 +33,10 @@ pub(crate) async fn run(node: Arc<Inner>) {
         let closed = node.is_closed();
         match registrar.turn(closed).await {
             Ok(()) => {
-                registrar.found();
+                // While closing, a turn may have had nothing to ask the master.
+                if !closed {
+                    registrar.found();
+                }
                 wait = TICK;
             }
             Err(error) => {
