@@ -236,7 +236,7 @@ mod tests {
     #[test]
     fn two_samples_never_share_a_stamp_and_a_clock_set_back_is_followed() {
         let (mut writer, _) = writer();
-        let at = |nanos| Timestamp::from_unix_nanos(1_700_000_000_000_000_000 + nanos);
+        let at = |nanos: i128| Timestamp::from_unix_nanos(1_700_000_000_000_000_000 + nanos);
         let stamps = [5, 5, 3, 900].map(|nanos| writer.stamp(at(nanos)));
         assert_eq!(stamps, [at(5), at(6), at(7), at(900)]);
         let an_hour_back = at(-3_600_000_000_000);
