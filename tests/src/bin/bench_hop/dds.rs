@@ -19,7 +19,10 @@ pub(crate) struct Reader {
 
 impl Reader {
     pub(crate) fn new(topic: &str) -> Self {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .unwrap();
         let options = DomainOptions {
             domain: 2,
             networks: vec![IpAddr::V4(Ipv4Addr::LOCALHOST)],
@@ -27,14 +30,22 @@ impl Reader {
         };
         let domain = Domain::join(&options).unwrap();
         let reader = domain
-            .reader(topic, "std_msgs::msg::dds_::String_", Requested::from_writers(&[]))
+            .reader(
+                topic,
+                "std_msgs::msg::dds_::String_",
+                Requested::from_writers(&[]),
+            )
             .unwrap();
-        Self { reader, runtime, _domain: domain }
+        Self {
+            reader,
+            runtime,
+            _domain: domain,
+        }
     }
 
     /// Takes samples until one holds the text; false when none did in time.
     pub(crate) fn wait_for(&self, text: &str, patience: Duration) -> bool {
-        let mut samples = self.reader.as_async_stream();
+        let mut samples = std::pin::pin!(self.reader.as_async_stream());
         self.runtime.block_on(async {
             let found = async {
                 while let Some(sample) = samples.next().await {

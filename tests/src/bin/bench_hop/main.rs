@@ -24,7 +24,11 @@ fn main() -> ExitCode {
             println!("bench-hop [ROUNDS]   messages per path and size, 3000 unless told");
             ExitCode::SUCCESS
         }
-        rounds => bench(rounds.and_then(|rounds| rounds.parse().ok()).unwrap_or(3000)),
+        rounds => bench(
+            rounds
+                .and_then(|rounds| rounds.parse().ok())
+                .unwrap_or(3000),
+        ),
     }
 }
 
@@ -54,13 +58,17 @@ trait Path {
 }
 
 fn bench(rounds: usize) -> ExitCode {
-    let Some(cell) = Cell::with(&[Peer::Ros1]) else { return ExitCode::FAILURE };
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return ExitCode::FAILURE;
+    };
     let _core = cell.roscore();
     let mut floor = Floor::new();
     let (mut relay, _relay) = ros1::Relay::new(&cell);
     let mut bridge1 = Bridge1::new(&cell);
     let mut bridge2 = Bridge2::new(&cell);
-    println!("one message at a time, {rounds} per size and path, the paths in turn; microseconds\n");
+    println!(
+        "one message at a time, {rounds} per size and path, the paths in turn; microseconds\n"
+    );
     println!("| payload | path | p50 | p99 | p50 / floor | p99 / floor |");
     println!("|---|---|---|---|---|---|");
     for (size, shown) in [(16, "16 B"), (1024, "1 KiB"), (64_000, "64 kB")] {
@@ -114,13 +122,19 @@ impl Floor {
     fn new() -> Self {
         let group = SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 41), 4841);
         let me = std::env::current_exe().unwrap();
-        let mut relay =
-            Started::new("floor", &me).args(["relay".to_owned(), group.to_string()]).start();
+        let mut relay = Started::new("floor", &me)
+            .args(["relay".to_owned(), group.to_string()])
+            .start();
         let address = relay.wait_for_line("127.0.0.1:", Duration::from_secs(10));
         let address = address.split_whitespace().last().unwrap().to_owned();
         let stream = TcpStream::connect(address).unwrap();
         stream.set_nodelay(true).unwrap();
-        Self { stream, receiver: receiver(group), buffer: vec![0; 70_000], _relay: relay }
+        Self {
+            stream,
+            receiver: receiver(group),
+            buffer: vec![0; 70_000],
+            _relay: relay,
+        }
     }
 }
 
@@ -148,7 +162,12 @@ impl Bridge1 {
         let group = SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 42), 4842);
         let bridge = cell.bridge_ros1(&["--address", &format!("opc.udp://{group}")]);
         let publisher = ros1::Publisher::new("/bench_bridge", "/ua_1_5_10");
-        Self { publisher, receiver: receiver(group), buffer: vec![0; 70_000], _bridge: bridge }
+        Self {
+            publisher,
+            receiver: receiver(group),
+            buffer: vec![0; 70_000],
+            _bridge: bridge,
+        }
     }
 }
 
@@ -187,10 +206,16 @@ impl Bridge2 {
             _bridge: bridge,
         };
         let text = "are you there";
-        system_tests::eventually("bridge-ros2 carries a first message", Duration::from_secs(20), || {
-            path.send(text);
-            path.reader.wait_for(text, Duration::from_millis(200)).then_some(())
-        });
+        system_tests::eventually(
+            "bridge-ros2 carries a first message",
+            Duration::from_secs(20),
+            || {
+                path.send(text);
+                path.reader
+                    .wait_for(text, Duration::from_millis(200))
+                    .then_some(())
+            },
+        );
         path
     }
 
@@ -199,14 +224,20 @@ impl Bridge2 {
         self.sequence = self.sequence.wrapping_add(1);
         let header = NetworkHeader {
             publisher_id: Some(PublisherId::UInt16(1)),
-            group: Some(GroupHeader { writer_group_id: Some(5), ..GroupHeader::default() }),
+            group: Some(GroupHeader {
+                writer_group_id: Some(5),
+                ..GroupHeader::default()
+            }),
             ..NetworkHeader::default()
         };
         let mut message =
             NetworkMessageEncoder::new(&mut self.datagram, &header, Some(&[11])).unwrap();
         let sequence_number = Some(self.sequence);
         let mut frame = message
-            .key_frame(&DataSetHeader { sequence_number, ..DataSetHeader::default() })
+            .key_frame(&DataSetHeader {
+                sequence_number,
+                ..DataSetHeader::default()
+            })
             .unwrap();
         frame.scalar(Scalar::String(Some(text))).unwrap();
         frame.finish().unwrap();
@@ -222,7 +253,11 @@ impl Path for Bridge2 {
 
     fn pass(&mut self, text: &str) {
         self.send(text);
-        assert!(self.reader.wait_for(text, PATIENCE), "bridge-ros2 lost {}", &text[..16]);
+        assert!(
+            self.reader.wait_for(text, PATIENCE),
+            "bridge-ros2 lost {}",
+            &text[..16]
+        );
     }
 }
 
@@ -243,7 +278,9 @@ fn receiver(group: SocketAddrV4) -> UdpSocket {
     socket.set_reuse_address(true).unwrap();
     socket.set_recv_buffer_size(4 << 20).unwrap();
     socket.bind(&group.into()).unwrap();
-    socket.join_multicast_v4(group.ip(), &Ipv4Addr::LOCALHOST).unwrap();
+    socket
+        .join_multicast_v4(group.ip(), &Ipv4Addr::LOCALHOST)
+        .unwrap();
     socket.set_read_timeout(Some(PATIENCE)).unwrap();
     socket.into()
 }
@@ -252,7 +289,9 @@ fn sender() -> UdpSocket {
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP)).unwrap();
     socket.set_multicast_if_v4(&Ipv4Addr::LOCALHOST).unwrap();
     socket.set_multicast_ttl_v4(0).unwrap();
-    socket.bind(&SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0).into()).unwrap();
+    socket
+        .bind(&SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0).into())
+        .unwrap();
     socket.into()
 }
 

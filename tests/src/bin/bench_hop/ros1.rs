@@ -19,7 +19,12 @@ impl Publisher {
     pub(crate) fn new(node: &str, topic: &str) -> Self {
         let data = TcpListener::bind("127.0.0.1:0").unwrap();
         let uri = serve_slave_api(data.local_addr().unwrap().port());
-        xml_rpc(MASTER, "registerPublisher", &[node, topic, "std_msgs/String", &uri]).unwrap();
+        xml_rpc(
+            MASTER,
+            "registerPublisher",
+            &[node, topic, "std_msgs/String", &uri],
+        )
+        .unwrap();
         let (found, subscriber) = mpsc::channel();
         let node = node.to_owned();
         std::thread::spawn(move || {
@@ -27,7 +32,10 @@ impl Publisher {
             stream.set_nodelay(true).unwrap();
             let mut header = Vec::new();
             read_frame(&mut stream, &mut header);
-            frame(&mut stream, &connection_header(&[("callerid", &node), ("latching", "0")]));
+            frame(
+                &mut stream,
+                &connection_header(&[("callerid", &node), ("latching", "0")]),
+            );
             found.send(stream).unwrap();
         });
         let stream = subscriber
@@ -58,7 +66,12 @@ impl Relay {
             let reply = xml_rpc(
                 MASTER,
                 "registerSubscriber",
-                &["/bench_end", "/bench_out", "std_msgs/String", "http://127.0.0.1:1/"],
+                &[
+                    "/bench_end",
+                    "/bench_out",
+                    "std_msgs/String",
+                    "http://127.0.0.1:1/",
+                ],
             )?;
             let from = reply.find("http://")?;
             let len = reply[from..].find('<')?;
@@ -67,17 +80,35 @@ impl Relay {
         let address = uri.trim_start_matches("http://").trim_end_matches('/');
         let protocols = "<array><data><value><array><data><value><string>TCPROS</string></value>\
                          </data></array></value></data></array>";
-        let reply =
-            xml_rpc(address, "requestTopic", &["/bench_end", "/bench_out", protocols]).unwrap();
-        let port = integers(&reply).into_iter().find(|number| *number > 1).unwrap();
+        let reply = xml_rpc(
+            address,
+            "requestTopic",
+            &["/bench_end", "/bench_out", protocols],
+        )
+        .unwrap();
+        let port = integers(&reply)
+            .into_iter()
+            .find(|number| *number > 1)
+            .unwrap();
         let mut subscription = TcpStream::connect(("127.0.0.1", port)).unwrap();
         subscription.set_nodelay(true).unwrap();
         subscription.set_read_timeout(Some(PATIENCE)).unwrap();
-        let header = [("callerid", "/bench_end"), ("topic", "/bench_out"), ("tcp_nodelay", "1")];
+        let header = [
+            ("callerid", "/bench_end"),
+            ("topic", "/bench_out"),
+            ("tcp_nodelay", "1"),
+        ];
         frame(&mut subscription, &connection_header(&header));
         let mut buffer = Vec::new();
         read_frame(&mut subscription, &mut buffer);
-        (Self { publisher, subscription, buffer }, child)
+        (
+            Self {
+                publisher,
+                subscription,
+                buffer,
+            },
+            child,
+        )
     }
 }
 
@@ -127,7 +158,9 @@ fn serve_slave_api(data_port: u16) -> String {
     let uri = format!("http://{}/", listener.local_addr().unwrap());
     std::thread::spawn(move || {
         while let Ok((mut stream, _)) = listener.accept() {
-            let Some(request) = read_request(&mut stream) else { continue };
+            let Some(request) = read_request(&mut stream) else {
+                continue;
+            };
             let value = if request.contains("requestTopic") {
                 format!(
                     "<array><data><value>TCPROS</value><value>127.0.0.1</value><value><i4>{data_port}</i4></value></data></array>"
@@ -168,5 +201,7 @@ fn read_request(stream: &mut TcpStream) -> Option<String> {
 }
 
 fn integers(xml: &str) -> Vec<u16> {
-    xml.split(['<', '>']).filter_map(|part| part.trim().parse().ok()).collect()
+    xml.split(['<', '>'])
+        .filter_map(|part| part.trim().parse().ok())
+        .collect()
 }
