@@ -121,8 +121,15 @@ async fn a_topic_whose_publisher_leaves_is_reported_dead() {
     let mut port = port();
     let mut peer = writes(&cell, "/ua_2_1_1", "std_msgs/Bool", &["--value", "true"]);
     assert!(live(&mut port, topic("ua_2_1_1")).await);
+    let left = Instant::now();
     peer.tell("leave");
     assert!(!live(&mut port, topic("ua_2_1_1")).await);
+    // By its word: the end of its lease would tell after 10 s.
+    assert!(
+        left.elapsed() < Duration::from_secs(5),
+        "{:?}",
+        left.elapsed()
+    );
 }
 
 #[tokio::test]
