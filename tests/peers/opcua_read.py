@@ -1,4 +1,4 @@
-"""Reads nodes of an OPC UA server: one JSON line per node, status and timestamps included."""
+"""Reads nodes of an OPC UA server: one JSON line per node, status and timestamps included; or the nodes below."""
 
 import argparse
 import asyncio
@@ -13,6 +13,10 @@ async def run(args):
     async with await opcua_session.client_of(args) as client:
         for text in args.node:
             node = client.get_node(text)
+            if args.children:
+                found = await node.get_children()
+                lifetime.say(node=text, children=[child.nodeid.to_string() for child in found])
+                continue
             wanted = ua.ReadValueId(node.nodeid, ua.AttributeIds.Value)
             parameters = ua.ReadParameters()
             parameters.TimestampsToReturn = ua.TimestampsToReturn.Both
@@ -24,6 +28,7 @@ async def run(args):
 def main():
     parser = argparse.ArgumentParser()
     opcua_session.add_arguments(parser)
+    parser.add_argument("--children", action="store_true", help="the nodes below, instead of the values")
     parser.add_argument("node", nargs="+", help="as OPC UA writes it: ns=2;i=10")
     args = parser.parse_args()
     lifetime.bound(args.limit)

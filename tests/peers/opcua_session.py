@@ -61,11 +61,13 @@ def plain(value):
 def described(node, data):
     """What a DataValue says, as a JSON object."""
     variant = data.Value
+    # The lower half has bits about the value's way, such as that of a queue that overflowed, and is no part of the name.
+    code = data.StatusCode.value & 0xFFFF0000 if data.StatusCode is not None else 0
     return {
         "node": node,
         "value": plain(variant.Value) if variant is not None else None,
         "type": variant.VariantType.name if variant is not None else None,
-        "status": data.StatusCode.name if data.StatusCode is not None else "Good",
+        "status": ua.StatusCode(code).name,
         "source_timestamp": plain(data.SourceTimestamp),
         "server_timestamp": plain(data.ServerTimestamp),
     }

@@ -1,8 +1,10 @@
-"""A Cyclone DDS writer with ROS 2 names. Values come as JSON from --value or standard input."""
+"""A Cyclone DDS writer with ROS 2 names. Values come as JSON from --value or standard input.
+
+It stays after the last value; a line on standard input then makes it leave in order.
+"""
 
 import argparse
 import json
-import threading
 import time
 
 from cyclonedds.domain import DomainParticipant
@@ -58,7 +60,7 @@ def main():
             sent += 1
         turn += 1
     lifetime.say(sent=sent)
-    threading.Event().wait()
+    lifetime.told().wait()
 
 
 main()

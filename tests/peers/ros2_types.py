@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from cyclonedds.core import Policy, Qos
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.annotations import final
-from cyclonedds.idl.types import float64, int32, sequence, uint32
+from cyclonedds.idl.types import float64, int32, sequence, uint8, uint32
 from cyclonedds.util import duration
 
 
@@ -58,12 +58,21 @@ class JointState(IdlStruct, typename="sensor_msgs.msg.dds_.JointState_"):
     effort: sequence[float64] = field(default_factory=list)
 
 
+@dataclass
+@final
+class Unheard(IdlStruct, typename="nobody_msgs.msg.dds_.Unheard_"):
+    """A type no bridge has a definition of."""
+
+    data: uint8 = 0
+
+
 TYPES = {
     "std_msgs/Bool": Bool,
     "std_msgs/UInt32": UInt32,
     "std_msgs/Float64": Float64,
     "std_msgs/String": String,
     "sensor_msgs/JointState": JointState,
+    "nobody_msgs/Unheard": Unheard,
 }
 
 

@@ -90,7 +90,13 @@ impl Cell {
     /// An asyncua script of `peers/` that stays and has said it is ready.
     #[must_use]
     pub fn asyncua(&self, script: &str, args: &[&str]) -> Child {
-        self.python(script, args).start().ready(START)
+        self.asyncua_started(script, args).start().ready(START)
+    }
+
+    /// An asyncua script of `peers/`, not started yet.
+    #[must_use]
+    pub fn asyncua_started(&self, script: &str, args: &[&str]) -> Started {
+        self.python(script, args)
     }
 
     /// An asyncua script of `peers/` that ends by itself; the JSON lines it printed.

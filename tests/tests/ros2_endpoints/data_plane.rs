@@ -1,0 +1,262 @@
+//! Bytes between our endpoints and the peer.
+
+use std::num::NonZeroU16;
+use std::time::{Duration, Instant};
+
+use bridge_ros2::domain::Domain;
+use bridge_ros2::graph::Graph;
+use bridge_ros2::inbox::{Inbox, Taken};
+use bridge_ros2::outlet::Outlet;
+use bridge_ros2::qos::{Offered, Requested};
+use bridge_ros2::raw::Payload;
+use serde_json::Value;
+use system_tests::{Cell, Peer, eventually};
+
+use crate::peer::{SOON, heard, is_string, options, reads, string, writes};
+
+const STRING: &str = "std_msgs::msg::dds_::String_";
+const TEXT: &str = "std_msgs/String";
+/// What the peer writes.
+const THEIRS: (&str, &str) = ("/ua_2_1_1", "rt/ua_2_1_1");
+/// What we write.
+const OURS: (&str, &str) = ("/ua_1_1_1", "rt/ua_1_1_1");
+const LATCHED: [&str; 4] = ["--durability", "transient_local", "--depth", "1"];
+
+fn now() -> tokio::time::Instant {
+    tokio::time::Instant::now()
+}
+
+fn join() -> Domain {
+    Domain::join(&options()).unwrap()
+}
+
+/// What fits the writers of the peer's topic, once there are some.
+fn writers(domain: &Domain) -> Requested {
+    eventually("a writer is discovered", SOON, || {
+        let graph = Graph::snapshot(domain.participant());
+        let writers = graph.writers(THEIRS.1);
+        (!writers.is_empty()).then(|| Requested::from_writers(writers))
+    })
+}
+
+fn inbox(domain: &Domain, requested: Requested) -> Inbox<()> {
+    let mut inbox = Inbox::new();
+    inbox.insert((), domain.reader(THEIRS.1, STRING, requested).unwrap());
+    inbox
+}
+
+/// The next sample, and how many were lost before it.
+async fn sample(inbox: &mut Inbox<()>) -> (Vec<u8>, u64) {
+    match tokio::time::timeout(SOON, inbox.recv()).await.unwrap() {
+        Taken::Sample {
+            payload, missing, ..
+        } => (payload.into_bytes().to_vec(), missing),
+        Taken::Unreadable { why, .. } => panic!("{why}"),
+    }
+}
+
+fn outlet(domain: &Domain, offered: Offered) -> Outlet {
+    Outlet::new(domain.writer(OURS.1, STRING, offered).unwrap(), offered)
+}
+
+fn meet_readers(domain: &Domain, outlet: &mut Outlet) {
+    eventually("a reader is discovered", SOON, || {
+        let graph = Graph::snapshot(domain.participant());
+        let readers = graph.readers(OURS.1);
+        outlet.set_readers(readers, now()).unwrap();
+        (!readers.is_empty()).then_some(())
+    });
+}
+
+fn offer(outlet: &mut Outlet, text: &str) {
+    let payload = Payload::to_write(string(text).into()).unwrap();
+    outlet.offer(payload, None, now()).unwrap();
+}
+
+/// Flushes until nothing waits.
+async fn sent(outlet: &mut Outlet) {
+    let deadline = now() + SOON;
+    while outlet.is_waiting() {
+        assert!(now() < deadline, "still waiting");
+        outlet.flush(now()).unwrap();
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+}
+
+#[tokio::test]
+async fn a_message_arrives_with_its_byte_order_in_front() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let domain = join();
+    let more = ["--wait-readers", "1", "--value", "\"hello\""];
+    let _peer = writes(&cell, THEIRS.0, TEXT, &more);
+    let mut inbox = inbox(&domain, writers(&domain));
+    let (bytes, missing) = sample(&mut inbox).await;
+    assert_eq!(bytes[..2], [0, 1]);
+    assert!(is_string(&bytes, "hello"), "{bytes:?}");
+    assert_eq!(missing, 0);
+}
+
+#[tokio::test]
+async fn five_thousand_messages_at_1_khz_arrive_in_order_without_loss() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let domain = join();
+    let more = [
+        "--wait-readers",
+        "1",
+        "--numbered",
+        "5000",
+        "--rate",
+        "1000",
+    ];
+    let _peer = writes(&cell, THEIRS.0, TEXT, &more);
+    let mut inbox = inbox(&domain, writers(&domain));
+    for expected in 0..5_000 {
+        let (bytes, missing) = sample(&mut inbox).await;
+        assert_eq!(missing, 0, "before {expected}");
+        assert!(
+            is_string(&bytes, &expected.to_string()),
+            "{expected} is {bytes:?}"
+        );
+    }
+}
+
+#[tokio::test]
+async fn five_thousand_messages_at_1_khz_are_written_without_loss() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let domain = join();
+    let mut out = outlet(&domain, Offered::DropOldest(NonZeroU16::new(1000).unwrap()));
+    let mut peer = reads(&cell, OURS.0, TEXT, &[]);
+    meet_readers(&domain, &mut out);
+    let begin = Instant::now();
+    for number in 0..5_000_u32 {
+        offer(&mut out, &number.to_string());
+        tokio::time::sleep_until((begin + Duration::from_millis(u64::from(number))).into()).await;
+        out.flush(now()).unwrap();
+    }
+    sent(&mut out).await;
+    peer.wait_for_line("\"4999\"", SOON);
+    let expected: Vec<String> = (0..5_000).map(|number: u32| number.to_string()).collect();
+    assert_eq!(heard(&peer), expected);
+}
+
+#[tokio::test]
+async fn a_late_joiner_gets_the_last_value_and_no_older_one() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let domain = join();
+    let mut out = outlet(&domain, Offered::KeepLatest);
+    for value in ["first", "second", "last"] {
+        offer(&mut out, value);
+    }
+    let mut early = reads(&cell, OURS.0, TEXT, &LATCHED);
+    meet_readers(&domain, &mut out);
+    sent(&mut out).await;
+    early.wait_for_line("\"last\"", SOON);
+    assert_eq!(heard(&early), ["last"]);
+
+    let mut later = reads(&cell, OURS.0, TEXT, &LATCHED);
+    later.wait_for_line("\"last\"", SOON);
+    assert_eq!(heard(&later), ["last"]);
+}
+
+#[tokio::test]
+async fn a_transient_local_value_from_before_our_time_is_read() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let more = [&LATCHED[..], &["--value", "\"old\""]].concat();
+    let mut peer = writes(&cell, THEIRS.0, TEXT, &more);
+    peer.wait_for_line("\"sent\"", SOON);
+    let domain = join();
+    let mut inbox = inbox(&domain, writers(&domain));
+    let (bytes, _) = sample(&mut inbox).await;
+    assert!(is_string(&bytes, "old"), "{bytes:?}");
+}
+
+#[tokio::test]
+async fn large_messages_of_odd_length_cross_both_ways() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let domain = join();
+    let large = "x".repeat(100_001);
+    let value = Value::from(large.as_str()).to_string();
+    let more = ["--wait-readers", "1", "--value", &value];
+    let _peer = writes(&cell, THEIRS.0, TEXT, &more);
+    let mut inbox = inbox(&domain, writers(&domain));
+    let (bytes, _) = sample(&mut inbox).await;
+    assert!(is_string(&bytes, &large), "{} bytes", bytes.len());
+
+    let mut out = outlet(&domain, Offered::KeepLatest);
+    let peer = reads(&cell, OURS.0, TEXT, &[]);
+    meet_readers(&domain, &mut out);
+    let lengths: Vec<usize> = (99_991..100_001).collect();
+    for length in &lengths {
+        offer(&mut out, &"y".repeat(*length));
+    }
+    sent(&mut out).await;
+    let texts = eventually("the large messages arrive", SOON, || {
+        Some(heard(&peer)).filter(|texts| texts.len() >= lengths.len())
+    });
+    assert!(
+        texts
+            .iter()
+            .all(|text| text.bytes().all(|byte| byte == b'y'))
+    );
+    let got: Vec<usize> = texts.iter().map(String::len).collect();
+    assert_eq!(got, lengths);
+}
+
+#[tokio::test]
+async fn a_replaced_reader_repeats_and_loses_nothing() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let domain = join();
+    let more = ["--wait-readers", "1", "--numbered", "300", "--rate", "100"];
+    let _peer = writes(&cell, THEIRS.0, TEXT, &more);
+    let requested = writers(&domain);
+    let mut inbox = Inbox::new();
+    let slot = inbox.insert((), domain.reader(THEIRS.1, STRING, requested).unwrap());
+    let mut retired = Vec::new();
+    for expected in 0..300 {
+        let (bytes, missing) = sample(&mut inbox).await;
+        assert_eq!(missing, 0, "before {expected}");
+        assert!(
+            is_string(&bytes, &expected.to_string()),
+            "{expected} is {bytes:?}"
+        );
+        if expected % 100 == 50 {
+            let reader = domain.reader(THEIRS.1, STRING, requested).unwrap();
+            retired.push(inbox.replace(slot, reader).unwrap());
+        }
+    }
+}
+
+#[tokio::test]
+async fn leaving_a_domain_ends_in_time() {
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    let domain = join();
+    let mut inbox = Inbox::new();
+    for n in 0..50 {
+        let topic = format!("rt/ua_2_1_{}", n + 1);
+        let requested = Requested::from_writers(&[]);
+        inbox.insert((), domain.reader(&topic, STRING, requested).unwrap());
+    }
+    let begin = Instant::now();
+    assert!(domain.leave(inbox).await);
+    assert!(
+        begin.elapsed() < Duration::from_secs(2),
+        "{:?}",
+        begin.elapsed()
+    );
+}

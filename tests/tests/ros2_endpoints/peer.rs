@@ -1,0 +1,63 @@
+//! The Cyclone DDS end, and payloads as both ends know them.
+
+use std::time::Duration;
+
+use bridge_ros2::domain::DomainOptions;
+use system_tests::{Cell, Child};
+
+/// Where the tests of one cell meet.
+pub(crate) const DOMAIN: u16 = 2;
+/// How long a peer may take.
+pub(crate) const SOON: Duration = Duration::from_secs(10);
+
+/// A participant on the cell's loopback.
+pub(crate) fn options() -> DomainOptions {
+    DomainOptions {
+        domain: DOMAIN,
+        networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
+        node: "endpoints".into(),
+    }
+}
+
+/// A Cyclone writer that has said it is ready; it stays until it is told a line, and then leaves in order.
+pub(crate) fn writes(cell: &Cell, topic: &str, kind: &str, more: &[&str]) -> Child {
+    let arguments = [&[topic, kind, "--domain", "2"], more].concat();
+    cell.cyclone_started("ros2_pub.py", &arguments)
+        .told()
+        .start()
+        .ready(SOON)
+}
+
+/// A Cyclone reader that has said it is ready.
+pub(crate) fn reads(cell: &Cell, topic: &str, kind: &str, more: &[&str]) -> Child {
+    cell.cyclone(
+        "ros2_sub.py",
+        &[&[topic, kind, "--domain", "2"], more].concat(),
+    )
+}
+
+/// The `data` of the samples a Cyclone reader has heard.
+pub(crate) fn heard(reader: &Child) -> Vec<String> {
+    reader
+        .values()
+        .iter()
+        .map(|value| value["data"].as_str().unwrap().to_owned())
+        .collect()
+}
+
+/// A `std_msgs/String` in little endian CDR, without padding behind it.
+pub(crate) fn string(text: &str) -> Vec<u8> {
+    let mut bytes = vec![0, 1, 0, 0];
+    bytes.extend_from_slice(&u32::try_from(text.len() + 1).unwrap().to_le_bytes());
+    bytes.extend_from_slice(text.as_bytes());
+    bytes.push(0);
+    bytes
+}
+
+/// Whether these are the bytes of a `std_msgs/String` with that text, padded or not.
+///
+/// The second half of the encapsulation header is not compared: writers may say the padding there.
+pub(crate) fn is_string(bytes: &[u8], text: &str) -> bool {
+    let wanted = string(text);
+    bytes[..2] == wanted[..2] && bytes[4..].starts_with(&wanted[4..])
+}

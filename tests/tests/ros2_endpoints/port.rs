@@ -1,0 +1,294 @@
+//! What the port reports and what its peers receive.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bridge_node::{Delivery, Port, PortEvent};
+use bridge_ros2::{PortOptions, Ros2Port};
+use mappings::{Mapping, SpaceId, TopicId};
+use nix::sys::signal::Signal;
+use serde_json::json;
+use system_tests::{Cell, Child, Peer};
+use uadp::BuiltinType;
+
+use crate::peer::{DOMAIN, SOON, heard, options, reads, string, writes};
+
+const LATCHED: [&str; 4] = ["--durability", "transient_local", "--depth", "1"];
+
+fn port() -> Ros2Port {
+    Ros2Port::start(PortOptions {
+        domain: options(),
+        own: SpaceId::new(DOMAIN).unwrap(),
+        mapping: Arc::new(Mapping::default()),
+        prefixes: Vec::new(),
+    })
+    .unwrap()
+}
+
+fn topic(name: &str) -> TopicId {
+    name.parse().unwrap()
+}
+
+/// The first event that `wanted` takes; others are let go. Fails after [`SOON`].
+async fn event<T>(port: &mut Ros2Port, mut wanted: impl FnMut(PortEvent) -> Option<T>) -> T {
+    let deadline = tokio::time::Instant::now() + SOON;
+    loop {
+        let event = tokio::time::timeout_at(deadline, port.recv())
+            .await
+            .unwrap();
+        if let Some(found) = wanted(event) {
+            return found;
+        }
+    }
+}
+
+async fn bound(port: &mut Ros2Port, topic: TopicId) -> String {
+    event(port, |event| match event {
+        PortEvent::Bound {
+            topic: bound,
+            message_type,
+            ..
+        } if bound == topic => Some(message_type.name().to_string()),
+        _ => None,
+    })
+    .await
+}
+
+async fn live(port: &mut Ros2Port, topic: TopicId) -> bool {
+    event(port, |event| match event {
+        PortEvent::Live { topic: of, live } if of == topic => Some(live),
+        _ => None,
+    })
+    .await
+}
+
+/// Runs the port until the condition holds. Fails after [`SOON`].
+async fn until(port: &mut Ros2Port, what: &str, mut condition: impl FnMut() -> bool) {
+    let deadline = Instant::now() + SOON;
+    while !condition() {
+        assert!(Instant::now() < deadline, "within {SOON:?} not so: {what}");
+        run(port, Duration::from_millis(5)).await;
+    }
+}
+
+/// Runs the port for a while without wanting anything of it.
+async fn run(port: &mut Ros2Port, time: Duration) {
+    let until = tokio::time::Instant::now() + time;
+    while tokio::time::timeout_at(until, port.recv()).await.is_ok() {}
+}
+
+fn last_is(reader: &Child, text: &str) -> bool {
+    heard(reader).last().is_some_and(|last| last == text)
+}
+
+fn delivery(topic: TopicId, text: &str) -> Delivery {
+    Delivery {
+        topic,
+        payload: string(text).into(),
+        source: None,
+        status: 0,
+    }
+}
+
+#[tokio::test]
+async fn a_topic_of_the_space_crosses_without_configuration_whatever_its_type() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut port = port();
+    let value = json!({"header": {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "base"},
+                       "name": ["a", "b"], "position": [1.0, 2.0]})
+    .to_string();
+    let more = ["--wait-readers", "1", "--value", &value];
+    let _peer = writes(&cell, "/ua_2_2_3", "sensor_msgs/JointState", &more);
+    let topic = topic("ua_2_2_3");
+    assert_eq!(bound(&mut port, topic).await, "sensor_msgs/JointState");
+    assert!(live(&mut port, topic).await);
+    let payload = event(&mut port, |event| match event {
+        PortEvent::Sample { payload, .. } => Some(payload),
+        _ => None,
+    })
+    .await;
+    assert_eq!(payload[..2], [0, 1]);
+    assert_eq!(payload[4..12], [1, 0, 0, 0, 2, 0, 0, 0]);
+}
+
+#[tokio::test]
+async fn a_topic_whose_publisher_leaves_is_reported_dead() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut port = port();
+    let mut peer = writes(&cell, "/ua_2_1_1", "std_msgs/Bool", &["--value", "true"]);
+    assert!(live(&mut port, topic("ua_2_1_1")).await);
+    let left = Instant::now();
+    peer.tell("leave");
+    assert!(!live(&mut port, topic("ua_2_1_1")).await);
+    // By its word: the end of its lease would tell after 10 s.
+    assert!(
+        left.elapsed() < Duration::from_secs(5),
+        "{:?}",
+        left.elapsed()
+    );
+}
+
+#[tokio::test]
+async fn a_value_nobody_asks_for_gets_the_standard_type_and_waits_for_late_joiners() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut port = port();
+    let topic = topic("ua_1_2_3");
+    port.wanted(topic, &[(BuiltinType::String, false)]);
+    assert_eq!(bound(&mut port, topic).await, "std_msgs/String");
+    port.publish(delivery(topic, "earlier")).unwrap();
+    port.publish(delivery(topic, "latched")).unwrap();
+    for _ in 0..2 {
+        let peer = reads(&cell, "/ua_1_2_3", "std_msgs/String", &LATCHED);
+        until(&mut port, "the latched value", || last_is(&peer, "latched")).await;
+        assert_eq!(heard(&peer), ["latched"]);
+    }
+}
+
+#[tokio::test]
+async fn a_subscriber_decides_the_type() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut port = port();
+    let _decides = reads(&cell, "/ua_0_2_3", "std_msgs/UInt32", &[]);
+    // No standard type fits two fields, so that this topic is bound when its subscriber is discovered, which came
+    // after the other one.
+    let _later = reads(&cell, "/ua_0_2_4", "std_msgs/Bool", &[]);
+    let two = [(BuiltinType::Double, false); 2];
+    port.wanted(topic("ua_0_2_4"), &two);
+    assert_eq!(bound(&mut port, topic("ua_0_2_4")).await, "std_msgs/Bool");
+
+    port.wanted(topic("ua_0_2_3"), &[(BuiltinType::Double, false)]);
+    assert_eq!(bound(&mut port, topic("ua_0_2_3")).await, "std_msgs/UInt32");
+}
+
+#[tokio::test]
+async fn a_subscriber_that_comes_later_changes_the_standard_type() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut port = port();
+    let topic = topic("ua_0_2_3");
+    port.wanted(topic, &[(BuiltinType::Double, false)]);
+    assert_eq!(bound(&mut port, topic).await, "std_msgs/Float64");
+    let _peer = reads(&cell, "/ua_0_2_3", "std_msgs/UInt32", &[]);
+    assert_eq!(bound(&mut port, topic).await, "std_msgs/UInt32");
+}
+
+#[tokio::test]
+async fn a_type_without_a_definition_is_counted_and_keeps_nobody_out() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut port = port();
+    let unheard = topic("ua_2_1_1");
+    let _unheard = writes(&cell, "/ua_2_1_1", "nobody_msgs/Unheard", &["--value", "1"]);
+    let why = event(&mut port, |event| match event {
+        PortEvent::Lost { topic, why, .. } if topic == Some(unheard) => Some(why),
+        _ => None,
+    })
+    .await;
+    assert_eq!(why, "type without a definition");
+    let _heard = writes(&cell, "/ua_2_1_2", "std_msgs/Bool", &["--value", "true"]);
+    assert_eq!(bound(&mut port, topic("ua_2_1_2")).await, "std_msgs/Bool");
+}
+
+#[tokio::test]
+async fn samples_of_another_type_than_the_topics_are_not_handed_up() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut port = port();
+    let topic = topic("ua_2_1_1");
+    let first = ["--repeat", "0", "--rate", "20", "--value", "true"];
+    let _first = writes(&cell, "/ua_2_1_1", "std_msgs/Bool", &first);
+    assert_eq!(bound(&mut port, topic).await, "std_msgs/Bool");
+    let other = ["--repeat", "0", "--rate", "50", "--value", "\"no\""];
+    let _other = writes(&cell, "/ua_2_1_1", "std_msgs/String", &other);
+    // Two seconds of both.
+    for _ in 0..40 {
+        let payload = event(&mut port, |event| match event {
+            PortEvent::Sample { payload, .. } => Some(payload),
+            _ => None,
+        })
+        .await;
+        assert_eq!(payload[4], 1, "{payload:?}");
+        assert!(payload.len() <= 8, "{payload:?}");
+    }
+}
+
+#[tokio::test]
+async fn a_bad_value_is_not_published() {
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    let mut port = port();
+    let topic = topic("ua_1_2_3");
+    port.wanted(topic, &[(BuiltinType::String, false)]);
+    assert_eq!(bound(&mut port, topic).await, "std_msgs/String");
+    let bad = Delivery {
+        status: 0x8032,
+        ..delivery(topic, "stale")
+    };
+    assert_eq!(port.publish(bad), Err("bad status"));
+    assert_eq!(port.publish(delivery(topic, "fresh")), Ok(()));
+}
+
+#[tokio::test]
+async fn a_thousand_topics_are_advertised_in_batches_and_disposed_within_two_seconds() {
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    let mut port = port();
+    for n in 1..=1000 {
+        let topic = TopicId::new(1, 1, n).unwrap();
+        port.wanted(topic, &[(BuiltinType::Boolean, false)]);
+    }
+    for _ in 0..1000 {
+        event(&mut port, |event| {
+            matches!(event, PortEvent::Bound { .. }).then_some(())
+        })
+        .await;
+    }
+    let begin = Instant::now();
+    port.shutdown().await;
+    assert!(
+        begin.elapsed() < Duration::from_millis(2100),
+        "{:?}",
+        begin.elapsed()
+    );
+}
+
+#[tokio::test]
+async fn a_subscriber_that_is_killed_does_not_keep_the_newest_value_from_the_others() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut port = port();
+    let topic = topic("ua_1_2_3");
+    let mut killed = reads(&cell, "/ua_1_2_3", "std_msgs/String", &LATCHED[..2]);
+    let other = reads(&cell, "/ua_1_2_3", "std_msgs/String", &LATCHED[..2]);
+    port.wanted(topic, &[(BuiltinType::String, false)]);
+    assert_eq!(bound(&mut port, topic).await, "std_msgs/String");
+    port.publish(delivery(topic, "before")).unwrap();
+    until(&mut port, "both hear", || {
+        last_is(&killed, "before") && last_is(&other, "before")
+    })
+    .await;
+    killed.signal(Signal::SIGKILL);
+    killed.wait_for_end(SOON);
+    // More than the send window holds, so that an unacknowledging reader stops the writer.
+    let mut refused = 0;
+    for number in 0..1000 {
+        refused += u32::from(port.publish(delivery(topic, &number.to_string())).is_err());
+        run(&mut port, Duration::from_millis(1)).await;
+    }
+    assert!(refused > 0, "the writer never stopped");
+    until(&mut port, "the newest value", || last_is(&other, "999")).await;
+}
