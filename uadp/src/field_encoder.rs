@@ -193,7 +193,9 @@ impl<'m> FieldEncoder<'m> {
     /// past 2^31-1 structures.
     pub fn inline_structures(&mut self, count: usize) -> Result<(), EncodeError> {
         if self.depth == 0 {
-            return Err(EncodeError::Misplaced("inline structures outside of a structure"));
+            return Err(EncodeError::Misplaced(
+                "inline structures outside of a structure",
+            ));
         }
         self.begin_array(BuiltinType::ExtensionObject, count)
     }

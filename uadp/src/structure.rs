@@ -14,7 +14,9 @@ impl<'a> StructureReader<'a> {
     /// Reads from the start of a body.
     #[must_use]
     pub const fn new(body: &'a [u8]) -> Self {
-        Self { reader: Reader::new(body) }
+        Self {
+            reader: Reader::new(body),
+        }
     }
 
     /// The next field, one value.
@@ -58,14 +60,17 @@ impl<'a> StructureReader<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder, NodeId};
+    use crate::{
+        DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder, NodeId,
+    };
     use crate::{ExtensionBody, Variant};
 
     #[test]
     fn what_was_written_into_a_structure_is_read_back() {
         let mut datagram = Vec::new();
         let mut message =
-            NetworkMessageEncoder::new(&mut datagram, &NetworkHeader::default(), Some(&[1])).unwrap();
+            NetworkMessageEncoder::new(&mut datagram, &NetworkHeader::default(), Some(&[1]))
+                .unwrap();
         let mut frame = message.key_frame(&DataSetHeader::default()).unwrap();
         frame.structures(1).unwrap();
         frame.begin_structure(NodeId::string(2, "a/B")).unwrap();
@@ -78,23 +83,43 @@ mod tests {
         frame.finish().unwrap();
         message.finish().unwrap();
 
-        let message = NetworkMessage::decode(&datagram).unwrap().messages().next().unwrap().unwrap();
+        let message = NetworkMessage::decode(&datagram)
+            .unwrap()
+            .messages()
+            .next()
+            .unwrap()
+            .unwrap();
         let fields: Vec<_> = Fields::parse(message.fields().unwrap().bytes())
             .unwrap()
             .collect::<Result<_, _>>()
             .unwrap();
-        let [Variant::Array(structures)] = fields[..] else { panic!("{fields:?}") };
-        let Some(Scalar::ExtensionObject(object)) = structures.iter().next() else { panic!() };
+        let [Variant::Array(structures)] = fields[..] else {
+            panic!("{fields:?}")
+        };
+        let Some(Scalar::ExtensionObject(object)) = structures.iter().next() else {
+            panic!()
+        };
         assert_eq!(object.type_id, NodeId::string(2, "a/B"));
-        let ExtensionBody::Binary(body) = object.body else { panic!("{object:?}") };
+        let ExtensionBody::Binary(body) = object.body else {
+            panic!("{object:?}")
+        };
         let mut structure = StructureReader::new(body);
         assert_eq!(structure.scalar(BuiltinType::Int16), Ok(Scalar::Int16(-3)));
         assert_eq!(structure.array(BuiltinType::Byte).unwrap().bytes(), [7, 8]);
         assert_eq!(structure.length(), Ok(Some(2)));
-        assert_eq!(structure.scalar(BuiltinType::String), Ok(Scalar::String(Some("x"))));
-        assert_eq!(structure.scalar(BuiltinType::String), Ok(Scalar::String(Some("y"))));
+        assert_eq!(
+            structure.scalar(BuiltinType::String),
+            Ok(Scalar::String(Some("x")))
+        );
+        assert_eq!(
+            structure.scalar(BuiltinType::String),
+            Ok(Scalar::String(Some("y")))
+        );
         assert_eq!(structure.remaining(), 0);
-        assert!(structure.scalar(BuiltinType::Byte).is_err(), "nothing is left");
+        assert!(
+            structure.scalar(BuiltinType::Byte).is_err(),
+            "nothing is left"
+        );
     }
 
     #[test]
