@@ -1,0 +1,312 @@
+//! From a datagram to the queues: header, loop rule, sequence, route, payload, in this order.
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use mappings::{PublisherIdRule, SpaceId, TopicId};
+use uadp::{
+    DataSetHeader, DataSetMessage, DecodeError, Fields, MessageKind, NetworkHeader, NetworkMessage,
+    PublisherId, Timestamp,
+};
+
+use super::{About, MAX_TOPICS, Router};
+use crate::counters::Reason;
+use crate::fields;
+use crate::hops::Hop;
+use crate::loop_rule::{Side, may_cross};
+use crate::output::{Delivery, Output};
+use crate::reader::{Held, Place};
+use crate::settings::{Local, Now};
+use crate::topic::{Item, Role, Topic};
+
+impl Router {
+    /// A datagram came from the UA side. What its messages hold is queued; what is wrong with it is counted.
+    pub fn handle_datagram(&mut self, datagram: &[u8], from: SocketAddr, now: Now) {
+        let message = match NetworkMessage::decode(datagram) {
+            Ok(message) => message,
+            Err(error) => {
+                self.drop_undecoded(None, from, &error);
+                return;
+            }
+        };
+        let header = message.header();
+        let (Some(space), Some(namespace)) = (
+            self.space_of(header, from),
+            header.group.and_then(|group| group.writer_group_id),
+        ) else {
+            return;
+        };
+        if !may_cross(self.settings.own, Side::Ua, space) {
+            self.drop_own(from);
+            return;
+        }
+        let sent = header.timestamp.map(|time| Timestamp {
+            time,
+            picoseconds: header.picoseconds.unwrap_or_default(),
+        });
+        for message in message.messages() {
+            match message {
+                Ok(message) => {
+                    let writer_id = message.writer_id.unwrap_or_default();
+                    let id = TopicId::new(u16::from(space.get()), namespace, writer_id);
+                    match id {
+                        Some(topic) => self.handle_message(topic, &message, (from, sent), now),
+                        None => self.count(About::sender(from), Reason::NotInSpace, 1, String::new),
+                    }
+                }
+                Err(error) => self.drop_undecoded(None, from, &error),
+            }
+        }
+    }
+
+    /// Gives the space a NetworkMessage comes from, or counts why it is none of ours to read.
+    fn space_of(&mut self, header: &NetworkHeader<'_>, from: SocketAddr) -> Option<SpaceId> {
+        let (number, exact) = match header.publisher_id {
+            Some(PublisherId::UInt16(number)) => (u64::from(number), true),
+            Some(PublisherId::Byte(number)) => (u64::from(number), false),
+            Some(PublisherId::UInt32(number)) => (u64::from(number), false),
+            Some(PublisherId::UInt64(number)) => (number, false),
+            Some(PublisherId::String(_)) | None => (u64::MAX, false),
+        };
+        let Some(space) = u16::try_from(number).ok().and_then(SpaceId::new) else {
+            self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
+            return None;
+        };
+        if exact || self.mapping.pubsub().publisher_id == PublisherIdRule::AnyWidth {
+            return Some(space);
+        }
+        self.count(About::sender(from), Reason::PublisherWidth, 1, || {
+            format!(
+                "PublisherId {number} is not a UInt16; if that writer is meant to be space {space}, \
+                 set `publisher_id: any_width`"
+            )
+        });
+        None
+    }
+
+    /// Counts a datagram with our own PublisherId: our own, or that of a rival.
+    fn drop_own(&mut self, from: SocketAddr) {
+        let own = self.settings.own;
+        let ours = self.settings.source.is_none_or(|source| {
+            source.port() == from.port()
+                && (source.ip().is_unspecified() || source.ip() == from.ip())
+        });
+        let reason = if ours {
+            Reason::Looped
+        } else {
+            Reason::SpaceTaken
+        };
+        self.count(About::sender(from), reason, 1, || {
+            format!(
+                "another program sends as space {own}: every sample is doubled; end one of them"
+            )
+        });
+    }
+
+    /// One DataSetMessage of another space: into the sequence, and on if it brings something new.
+    fn handle_message(
+        &mut self,
+        topic: TopicId,
+        message: &DataSetMessage<'_>,
+        (from, sent): (SocketAddr, Option<Timestamp>),
+        now: Now,
+    ) {
+        if !message.header.valid {
+            self.count(
+                About {
+                    topic: Some(topic),
+                    from: Some(from),
+                },
+                Reason::Invalid,
+                1,
+                || "the writer marked its DataSetMessage as invalid".to_owned(),
+            );
+            return;
+        }
+        let place = place(&message.header, from);
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            counters,
+            ..
+        }) = self.entry(topic, Some(from), now)
+        else {
+            self.count(About::sender(from), Reason::TooManyTopics, 1, || {
+                format!("more than {MAX_TOPICS} topics are in the space; {topic} is not followed")
+            });
+            return;
+        };
+        let was_silent = reader.heard(now.monotonic);
+        let admitted = match message.kind {
+            MessageKind::KeyFrame => Some(reader.admit(place)),
+            // It says that the writer lives, and that is all.
+            MessageKind::KeepAlive => None,
+            // Told apart below, by what the codec says of them.
+            MessageKind::DeltaFrame | MessageKind::Event => Some(Ok(0)),
+        };
+        if let Some(Ok(missing)) = admitted {
+            counters.missing += u64::from(missing);
+        }
+        if was_silent {
+            self.told.push_back(Output::Silent {
+                topic,
+                silent: false,
+            });
+            self.schedule(topic);
+        }
+        match admitted {
+            None => {}
+            Some(Err(reason)) => self.count(
+                About {
+                    topic: Some(topic),
+                    from: Some(from),
+                },
+                reason,
+                1,
+                String::new,
+            ),
+            Some(Ok(_)) => match message.fields() {
+                Ok(fields) => {
+                    self.record_way(place.stamp, sent, now);
+                    let sample = Sample {
+                        fields,
+                        source: place.stamp,
+                        status: message.header.status.unwrap_or_default(),
+                        arrived: now.utc,
+                    };
+                    self.route(topic, &sample, place, now);
+                }
+                Err(error) => self.drop_undecoded(Some(topic), from, &error),
+            },
+        }
+    }
+
+    /// Hands a sample on, or keeps it until its local type is known.
+    fn route(&mut self, topic: TopicId, sample: &Sample<'_>, place: Place, now: Now) {
+        let typed = self.settings.local == Local::Fields;
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            plan,
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        if typed || plan.is_some() {
+            reader.delivered(place);
+            self.deliver(topic, sample);
+            return;
+        }
+        if reader
+            .asked
+            .is_none_or(|asked| now.monotonic >= asked + ASK_AGAIN)
+        {
+            reader.asked = Some(now.monotonic);
+            let fields = sample.fields.clone();
+            let shape = fields
+                .filter_map(Result::ok)
+                .map(|field| fields::shape(&field))
+                .collect();
+            self.told.push_back(Output::Unbound { topic, shape });
+        }
+        let fields = sample.fields.bytes();
+        reader.held = (fields.len() <= MAX_HELD).then(|| Held {
+            fields: fields.to_vec(),
+            source: sample.source,
+            status: sample.status,
+            arrived: sample.arrived,
+        });
+        // Not yet a loss: the newest one waits. It is not told, since the port names topics without a type.
+        self.count(About::topic(topic), Reason::Untyped, 1, String::new);
+    }
+
+    pub(super) fn deliver(&mut self, topic: TopicId, sample: &Sample<'_>) {
+        let mut payload = self.buffer();
+        let written = match self
+            .topics
+            .get(&topic)
+            .and_then(|entry| entry.plan.as_ref())
+        {
+            Some(plan) => fields::write(plan, sample.fields.clone(), &mut payload),
+            None => fields::copy(&sample.fields, &mut payload),
+        };
+        if let Err((reason, detail)) = written {
+            self.recycle(payload);
+            self.count(About::topic(topic), reason, 1, || detail);
+            return;
+        }
+        let Sample {
+            source,
+            status,
+            arrived,
+            ..
+        } = *sample;
+        self.push(
+            topic,
+            Item::Delivery(Delivery {
+                topic,
+                payload,
+                source,
+                status,
+                arrived,
+            }),
+        );
+    }
+
+    fn record_way(&mut self, taken: Option<Timestamp>, sent: Option<Timestamp>, now: Now) {
+        // Stacks that never fill the stamps send zeros.
+        let filled = |stamp: &Timestamp| stamp.time.0 != 0;
+        let Some(sent) = sent.filter(filled) else {
+            return;
+        };
+        self.hops.record(Hop::Network, sent, now.utc);
+        if let Some(taken) = taken.filter(filled) {
+            self.hops.record(Hop::Origin, taken, sent);
+        }
+    }
+
+    fn drop_undecoded(&mut self, topic: Option<TopicId>, from: SocketAddr, error: &DecodeError) {
+        self.count(
+            About {
+                topic,
+                from: Some(from),
+            },
+            reason_of(error),
+            1,
+            || error.to_string(),
+        );
+    }
+}
+
+/// A key frame's content on its way to the local side.
+pub(super) struct Sample<'a> {
+    pub(super) fields: Fields<'a>,
+    pub(super) source: Option<Timestamp>,
+    pub(super) status: u16,
+    pub(super) arrived: Timestamp,
+}
+
+fn place(header: &DataSetHeader, from: SocketAddr) -> Place {
+    Place {
+        sequence: header.sequence_number,
+        stamp: header.timestamp.map(|time| Timestamp {
+            time,
+            picoseconds: header.picoseconds.unwrap_or_default(),
+        }),
+        fine: header.picoseconds.is_some(),
+        from,
+    }
+}
+
+const fn reason_of(error: &DecodeError) -> Reason {
+    if matches!(error, DecodeError::Unsupported(_)) {
+        Reason::Unsupported
+    } else {
+        Reason::Malformed
+    }
+}
+
+/// A sample that waits for its type is kept up to this size: whoever sends to the group can invent topics, and all of
+/// them together must not hold more than some megabytes. A larger value comes with its next repetition.
+const MAX_HELD: usize = 4_096;
+/// How long the port is left alone with a topic it found no type for.
+const ASK_AGAIN: Duration = Duration::from_secs(1);
