@@ -11,7 +11,7 @@ use crate::counters::Reason;
 #[derive(Debug)]
 #[non_exhaustive]
 pub enum Output {
-    /// A NetworkMessage to send. Give the buffer back with [`Router::recycle`].
+    /// A NetworkMessage to send. Give the buffer back with [`Router::recycle`](crate::Router::recycle).
     Datagram {
         /// The topic it carries.
         topic: TopicId,
@@ -20,7 +20,7 @@ pub enum Output {
     },
     /// A sample of another space to publish.
     Delivery(Delivery),
-    /// A value of another space came whose local type is not known: find one and [`bind`](Router::bind) it.
+    /// A value of another space came whose local type is not known: find one and [`bind`](crate::Router::bind) it.
     Unbound {
         /// Which value.
         topic: TopicId,

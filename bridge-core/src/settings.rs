@@ -25,7 +25,7 @@ pub enum Local {
     Ros1,
     /// A CDR with its 4 byte encapsulation header.
     Cdr,
-    /// A block of OPC UA fields as [`Fields::bytes`] gives it: an OPC UA server's side.
+    /// A block of OPC UA fields as [`Fields::bytes`](uadp::Fields::bytes) gives it: an OPC UA server's side.
     Fields,
 }
 

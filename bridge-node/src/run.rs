@@ -29,41 +29,41 @@ pub(crate) struct Shell<P> {
 
 impl<P: Port> Shell<P> {
     /// Carries samples until `stop` is ready or the port cannot go on, then shuts the port down.
-    ///
-    /// All branches of the `select!` are cancel-safe: a socket and bounded channels that hold what was not taken.
     pub(crate) async fn run(
         mut self,
         stop: impl Future<Output = ()> + Send,
     ) -> Result<(), Failure> {
-        let mut stop = std::pin::pin!(stop);
-        let mut timer = std::pin::pin!(tokio::time::sleep(FAR));
-        // Any UDP datagram fits.
-        let mut buffer = vec![0; 65_536];
-        let ended = loop {
-            self.arm(timer.as_mut());
-            tokio::select! {
-                () = &mut stop => break Ok(()),
-                heard = self.udp.recv(&mut buffer) => self.heard(heard, &buffer),
-                event = self.port.recv() => {
-                    if let Some(why) = self.port_event(event) {
-                        break Err(Failure::new(FailureKind::Unavailable, why));
-                    }
-                }
-                () = timer.as_mut() => self.router.handle_timeout(now()),
-                Some(reply) = self.requests.recv() => {
-                    let status = Status::of(self.program, self.own, &self.router);
-                    // Who asked may have gone; there is nobody else to tell.
-                    drop(reply.send(status));
-                }
-            }
-            self.drain();
-        };
-        let status = Status::of(self.program, self.own, &self.router);
+        let ended = self.carry(stop).await;
+        let status = self.status();
         let [topics, sent, delivered, dropped] = status.summary();
         info!(topics, sent, delivered, dropped, "ending");
         debug!(status = %status.json(), "the last status");
         self.port.shutdown().await;
         ended
+    }
+
+    /// All branches of the `select!` are cancel-safe: a socket and bounded channels that hold what was not taken.
+    async fn carry(&mut self, stop: impl Future<Output = ()> + Send) -> Result<(), Failure> {
+        let mut stop = std::pin::pin!(stop);
+        let mut timer = std::pin::pin!(tokio::time::sleep(FAR));
+        // Any UDP datagram fits.
+        let mut buffer = vec![0; 65_536];
+        loop {
+            self.arm(timer.as_mut());
+            tokio::select! {
+                () = &mut stop => return Ok(()),
+                heard = self.udp.recv(&mut buffer) => self.heard(heard, &buffer),
+                event = self.port.recv() => self.port_event(event)?,
+                () = timer.as_mut() => self.router.handle_timeout(now()),
+                // Who asked may have gone; there is nobody else to tell.
+                Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
+            }
+            self.drain();
+        }
+    }
+
+    fn status(&self) -> Status {
+        Status::of(self.program, self.own, &self.router)
     }
 
     fn arm(&self, mut timer: std::pin::Pin<&mut Sleep>) {
@@ -88,8 +88,8 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    /// Takes in what the port reports; gives the message to end with, if it is the end.
-    fn port_event(&mut self, event: PortEvent) -> Option<String> {
+    /// Takes in what the port reports; fails when the port cannot go on.
+    fn port_event(&mut self, event: PortEvent) -> Result<(), Failure> {
         match event {
             PortEvent::Sample {
                 topic,
@@ -109,9 +109,9 @@ impl<P: Port> Shell<P> {
             },
             PortEvent::Live { topic, live } => self.router.set_live(topic, live, now()),
             PortEvent::Lost { topic, why, count } => self.router.lost(topic, count, why),
-            PortEvent::Ended(why) => return Some(why),
+            PortEvent::Ended(why) => return Err(Failure::new(FailureKind::Unavailable, why)),
         }
-        None
+        Ok(())
     }
 
     fn drain(&mut self) {
