@@ -5,6 +5,7 @@
 
 mod arguments;
 mod clock;
+mod definitions;
 mod exit;
 mod logging;
 mod metrics;
@@ -15,6 +16,7 @@ mod status;
 
 pub use arguments::Arguments;
 pub use clock::{now, timestamp};
+pub use definitions::Definitions;
 pub use exit::{Failure, FailureKind};
 pub use logging::LogFormat;
 pub use port::{Delivery, Port, PortEvent};

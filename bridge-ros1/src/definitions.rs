@@ -1,20 +1,17 @@
 //! Message definitions: those built in, those of publishers' connection headers, and those of the ROS packages the
 //! program is told of.
 
-use std::fs::File;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use messages::{DefinitionError, Dialect, MessageType, NameError, Registry, TypeName};
+use messages::{DefinitionError, Dialect, MessageType, NameError, TypeName};
 use tcpros::ConnectionHeader;
-use tracing::{info, warn};
 use uadp::BuiltinType;
 
 /// Finds message types by name; a type once found stays.
 #[derive(Debug)]
 pub(crate) struct Definitions {
-    registry: Registry,
+    known: bridge_node::Definitions,
     /// Folders with packages somewhere below them, as `ROS_PACKAGE_PATH` lists; first match wins.
     packages: Vec<PathBuf>,
 }
@@ -22,7 +19,7 @@ pub(crate) struct Definitions {
 impl Definitions {
     pub(crate) fn new(packages: Vec<PathBuf>) -> Self {
         Self {
-            registry: Registry::bundle(Dialect::Ros1),
+            known: bridge_node::Definitions::new(Dialect::Ros1),
             packages,
         }
     }
@@ -37,10 +34,15 @@ impl Definitions {
         let fits = |found: &MessageType| md5sum == "*" || found.md5() == md5sum;
         let text = header.message_definition().unwrap_or_default();
         if !text.trim().is_empty() || md5sum == EMPTY {
-            match self.registry.add_ros1_definition(&name, text) {
+            match self.known.registry_mut().add_ros1_definition(&name, text) {
                 Ok(found) if fits(&found) => return Ok(found),
                 // Some writers of bags and bridges send a text that is not the one of their checksum.
-                Ok(_) | Err(_) if self.registry.get(&name).is_ok_and(|known| fits(&known)) => {}
+                Ok(_) | Err(_)
+                    if self
+                        .known
+                        .registry()
+                        .get(&name)
+                        .is_ok_and(|known| fits(&known)) => {}
                 Ok(found) => {
                     return Err(Unusable::Checksum {
                         name,
@@ -66,48 +68,18 @@ impl Definitions {
 
     /// The type of that name with all it needs. One that is not known yet is looked for in the packages.
     pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
-        for _ in 0..MAX_FILES {
-            match self.registry.get(name) {
-                Err(DefinitionError::Unknown {
-                    name: missing,
-                    needed_by,
-                    suggestion,
-                }) => {
-                    let Some((file, text)) = self.find(&missing) else {
-                        return Err(DefinitionError::Unknown {
-                            name: missing,
-                            needed_by,
-                            suggestion,
-                        });
-                    };
-                    self.registry.add(&missing, &text)?;
-                    info!(message_type = %missing, file = %file.display(), "definition read");
-                }
-                found => return found,
-            }
-        }
-        self.registry.get(name)
+        let packages = &self.packages;
+        self.known.find(name, |missing| {
+            let mut budget = MAX_FOLDERS;
+            packages
+                .iter()
+                .find_map(|root| find_below(root, missing, MAX_DEPTH, &mut budget))
+        })
     }
 
     /// The ROS type that carries one value of that type, and nothing else.
     pub(crate) fn standard_type(&self, builtin: BuiltinType, array: bool) -> Option<TypeName> {
-        self.registry.standard_type(builtin, array)
-    }
-
-    fn find(&self, name: &TypeName) -> Option<(PathBuf, String)> {
-        let mut budget = MAX_FOLDERS;
-        for root in &self.packages {
-            let Some(file) = find_below(root, name, MAX_DEPTH, &mut budget) else {
-                continue;
-            };
-            let mut text = String::new();
-            match File::open(&file).and_then(|open| open.take(MAX_BYTES).read_to_string(&mut text))
-            {
-                Ok(_) => return Some((file, text)),
-                Err(error) => warn!(file = %file.display(), %error, "definition not readable"),
-            }
-        }
-        None
+        self.known.registry().standard_type(builtin, array)
     }
 }
 
@@ -165,10 +137,6 @@ fn find_below(folder: &Path, name: &TypeName, depth: usize, budget: &mut usize) 
 
 /// The checksum of a definition without fields, such as std_msgs/Empty.
 const EMPTY: &str = "d41d8cd98f00b204e9800998ecf8427e";
-/// More types than any message needs.
-const MAX_FILES: usize = 512;
-/// More than any `.msg` file has.
-const MAX_BYTES: u64 = 1 << 20;
 /// How deep a package may lie in a workspace.
 const MAX_DEPTH: usize = 4;
 /// Folders looked at for one type; a large installation has some hundreds.

@@ -1,18 +1,15 @@
 //! Message definitions: those built in, and those of the ROS installation the program was started in.
 
-use std::fs::File;
-use std::io::Read;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use messages::{DefinitionError, Dialect, MessageType, Registry, TypeName};
-use tracing::{info, warn};
+use messages::{DefinitionError, Dialect, MessageType, TypeName};
 use uadp::BuiltinType;
 
 /// Finds message types by name; a type once found stays.
 #[derive(Debug)]
 pub(crate) struct Definitions {
-    registry: Registry,
+    known: bridge_node::Definitions,
     /// Folders that hold `share/<package>/msg/<Name>.msg`, first match wins.
     prefixes: Vec<PathBuf>,
 }
@@ -21,74 +18,35 @@ impl Definitions {
     /// With the built-in definitions and the prefixes of a ROS 2 installation, as `AMENT_PREFIX_PATH` lists them.
     pub(crate) fn new(prefixes: Vec<PathBuf>) -> Self {
         Self {
-            registry: Registry::bundle(Dialect::Ros2),
+            known: bridge_node::Definitions::new(Dialect::Ros2),
             prefixes,
         }
     }
 
-    /// The type of that name with all it needs.
-    ///
-    /// A type that is not built in is read from the prefixes: a few small files, once.
+    /// The type of that name with all it needs. One that is not built in is read from the prefixes.
     ///
     /// # Errors
     /// [`DefinitionError`].
     pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
-        for _ in 0..MAX_FILES {
-            match self.registry.get(name) {
-                Err(DefinitionError::Unknown {
-                    name: missing,
-                    needed_by,
-                    suggestion,
-                }) => {
-                    let Some((file, text)) = self.find(&missing) else {
-                        return Err(DefinitionError::Unknown {
-                            name: missing,
-                            needed_by,
-                            suggestion,
-                        });
-                    };
-                    self.registry.add(&missing, &text)?;
-                    info!(message_type = %missing, file = %file.display(), "definition read");
-                }
-                found => return found,
-            }
-        }
-        self.registry.get(name)
+        let prefixes = &self.prefixes;
+        self.known.find(name, |missing| {
+            // Neither part of a type name can hold a separator or a dot.
+            let file = PathBuf::from("share")
+                .join(missing.package())
+                .join("msg")
+                .join(format!("{}.msg", missing.name()));
+            prefixes
+                .iter()
+                .map(|prefix| prefix.join(&file))
+                .find(|file| file.is_file())
+        })
     }
 
     /// The ROS type that carries one value of that type, and nothing else.
     pub(crate) fn standard_type(&self, builtin: BuiltinType, array: bool) -> Option<TypeName> {
-        self.registry.standard_type(builtin, array)
-    }
-
-    fn find(&self, name: &TypeName) -> Option<(PathBuf, String)> {
-        self.prefixes.iter().find_map(|prefix| {
-            // Neither part of a type name can hold a separator or a dot.
-            let file = prefix
-                .join("share")
-                .join(name.package())
-                .join("msg")
-                .join(format!("{}.msg", name.name()));
-            let mut text = String::new();
-            let read = File::open(&file)
-                .ok()?
-                .take(MAX_BYTES)
-                .read_to_string(&mut text);
-            match read {
-                Ok(_) => Some((file, text)),
-                Err(error) => {
-                    warn!(file = %file.display(), %error, "definition not readable");
-                    None
-                }
-            }
-        })
+        self.known.registry().standard_type(builtin, array)
     }
 }
-
-/// More types than any message needs.
-const MAX_FILES: usize = 512;
-/// More than any `.msg` file has.
-const MAX_BYTES: u64 = 1 << 20;
 
 #[cfg(test)]
 mod tests {

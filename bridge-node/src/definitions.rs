@@ -1,0 +1,80 @@
+//! Message definitions for a port: those built in, and those in files beside a ROS installation.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use messages::{DefinitionError, Dialect, MessageType, Registry, TypeName};
+use tracing::{info, warn};
+
+/// Finds message types by name; a definition once read stays.
+#[derive(Debug)]
+pub struct Definitions {
+    registry: Registry,
+}
+
+impl Definitions {
+    /// With the built-in definitions of one ROS.
+    #[must_use]
+    pub fn new(dialect: Dialect) -> Self {
+        Self {
+            registry: Registry::bundle(dialect),
+        }
+    }
+
+    /// What is known by now.
+    #[must_use]
+    pub const fn registry(&self) -> &Registry {
+        &self.registry
+    }
+
+    /// For definitions that come another way than by files.
+    pub const fn registry_mut(&mut self) -> &mut Registry {
+        &mut self.registry
+    }
+
+    /// The type of that name with all it needs. `locate` says where the definition of a type that is not known yet
+    /// could be: a few small files are read, once.
+    ///
+    /// # Errors
+    /// [`DefinitionError`]; a file that cannot be read is logged and counts as not there.
+    pub fn find(
+        &mut self,
+        name: &TypeName,
+        locate: impl Fn(&TypeName) -> Option<PathBuf>,
+    ) -> Result<Arc<MessageType>, DefinitionError> {
+        for _ in 0..MAX_FILES {
+            let unknown = match self.registry.get(name) {
+                Err(unknown @ DefinitionError::Unknown { .. }) => unknown,
+                found => return found,
+            };
+            let DefinitionError::Unknown { name: missing, .. } = &unknown else {
+                return Err(unknown);
+            };
+            let Some((text, file)) = locate(missing).and_then(|file| Some((read(&file)?, file)))
+            else {
+                return Err(unknown);
+            };
+            self.registry.add(missing, &text)?;
+            info!(message_type = %missing, file = %file.display(), "definition read");
+        }
+        self.registry.get(name)
+    }
+}
+
+fn read(file: &Path) -> Option<String> {
+    let mut text = String::new();
+    match File::open(file).and_then(|open| open.take(MAX_BYTES).read_to_string(&mut text)) {
+        Ok(_) => Some(text),
+        Err(error) => {
+            warn!(file = %file.display(), %error, "definition not readable");
+            None
+        }
+    }
+}
+
+/// More types than any message needs.
+const MAX_FILES: usize = 512;
+/// More than any `.msg` file has.
+const MAX_BYTES: u64 = 1 << 20;
