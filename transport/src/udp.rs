@@ -23,7 +23,8 @@ pub struct Udp {
 /// Where to listen and send, and how.
 #[derive(Debug, Clone)]
 pub struct Options {
-    /// A multicast group, or a unicast address to listen at, with its port.
+    /// A multicast group with its port; or a unicast address: of this host to listen at, of another to send to while
+    /// listening at the same port here.
     pub address: SocketAddr,
     /// The interface to join and send on, by name or address. `None`: the system's choice.
     pub interface: Option<String>,
@@ -248,7 +249,15 @@ fn receiver(
         .set_recv_buffer_size(options.receive_buffer)
         .map_err(at("set the receive buffer"))?;
     // Bound to the group itself, so that datagrams of other groups at this port stay away.
-    socket.bind(&address.into()).map_err(|source| {
+    let bound = socket.bind(&address.into()).or_else(|error| {
+        // A unicast address of another host: there is sent, and here is listened at the same port.
+        if ip.is_multicast() || error.kind() != io::ErrorKind::AddrNotAvailable {
+            return Err(error);
+        }
+        let here = interface.map_or(Ipv4Addr::UNSPECIFIED, |interface| interface.address);
+        socket.bind(&SocketAddr::from((here, address.port())).into())
+    });
+    bound.map_err(|source| {
         if source.kind() == io::ErrorKind::AddrInUse {
             OpenError::PortTaken(address)
         } else {
@@ -390,6 +399,24 @@ mod tests {
             Udp::open(&options).unwrap().try_send(b"1").unwrap();
             let mut buffer = [0; 8];
             assert_eq!(listener.recv(&mut buffer).await.unwrap().0, 1);
+        });
+    }
+
+    #[test]
+    fn with_another_hosts_unicast_address_its_port_is_listened_at_here() {
+        run(async {
+            let port = free_port();
+            // An address for documentation, which no host has; nothing is sent to it.
+            let udp = Udp::open(&on_loopback(&format!("203.0.113.7:{port}"))).unwrap();
+            let other = std::net::UdpSocket::bind("127.0.0.1:0").unwrap();
+            other.send_to(b"cover", ("127.0.0.1", port)).unwrap();
+            let mut buffer = [0; 8];
+            let (len, from) = udp.recv(&mut buffer).await.unwrap();
+            assert_eq!(
+                (&buffer[..len], from),
+                (&b"cover"[..], other.local_addr().unwrap())
+            );
+            assert_eq!(udp.targets, [SocketAddr::from(([203, 0, 113, 7], port))]);
         });
     }
 
