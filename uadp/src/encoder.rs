@@ -2,8 +2,8 @@
 
 use crate::data_set_message as message;
 use crate::field_encoder::FieldEncoder;
-use crate::network_message as network;
-use crate::{DataSetHeader, EncodeError, GroupHeader, NetworkHeader, PublisherId, writer};
+use crate::header_writer::{self, Extras, Form, PayloadHeader, flag};
+use crate::{DataSetHeader, EncodeError, NetworkHeader, NetworkMessageType, writer};
 
 /// Appends one NetworkMessage to a buffer (OPC 10000-14, 7.2.4.4.2).
 ///
@@ -14,6 +14,11 @@ pub struct NetworkMessageEncoder<'b> {
     buf: &'b mut Vec<u8>,
     progress: Progress,
     timestamp_at: Option<usize>,
+    /// Where the NetworkMessage and its payload start in the buffer.
+    start: usize,
+    payload_at: usize,
+    /// The SecurityHeader promises a signature.
+    sealed: bool,
 }
 
 /// What is finished of the payload.
@@ -58,32 +63,37 @@ impl<'b> NetworkMessageEncoder<'b> {
         header: &NetworkHeader<'_>,
         writer_ids: Option<&[u16]>,
     ) -> Result<Self, EncodeError> {
-        write_flags(buf, header, writer_ids.is_some());
-        if let Some(publisher_id) = &header.publisher_id {
-            write_publisher_id(buf, publisher_id)?;
-        }
-        if let Some(class_id) = header.data_set_class_id {
-            buf.extend_from_slice(&class_id.0);
-        }
-        if let Some(group) = &header.group {
-            write_group_header(buf, group);
-        }
-        if let Some(ids) = writer_ids {
-            write_payload_header(buf, ids)?;
-        }
-        let timestamp_at = header.timestamp.map(|timestamp| {
-            let at = buf.len();
-            buf.extend_from_slice(&timestamp.0.to_le_bytes());
-            at
-        });
-        if let Some(picoseconds) = header.picoseconds {
-            buf.extend_from_slice(&picoseconds.to_le_bytes());
-        }
+        Self::with(buf, header, writer_ids, &Extras::default())
+    }
+
+    /// As [`new`](Self::new), with the headers few messages have.
+    ///
+    /// # Errors
+    /// As [`new`](Self::new), and [`EncodeError::TooBig`] for PromotedFields of more than 65535 bytes or a nonce of
+    /// more than 255.
+    pub fn with(
+        buf: &'b mut Vec<u8>,
+        header: &NetworkHeader<'_>,
+        writer_ids: Option<&[u16]>,
+        extras: &Extras<'_>,
+    ) -> Result<Self, EncodeError> {
+        let start = buf.len();
+        let ids = writer_ids.map_or(PayloadHeader::None, PayloadHeader::Count);
+        let timestamp_at = header_writer::write(
+            buf,
+            header,
+            ids,
+            Form {
+                message_type: NetworkMessageType::DataSet,
+                chunk: false,
+                extras,
+            },
+        )?;
+        let payload_at = buf.len();
         let announced = writer_ids.map_or(1, <[u16]>::len);
         let sizes_at = (announced > 1).then(|| {
-            let at = buf.len();
-            buf.resize(at + announced * 2, 0);
-            at
+            buf.resize(payload_at + announced * 2, 0);
+            payload_at
         });
         let progress = Progress {
             announced,
@@ -95,6 +105,11 @@ impl<'b> NetworkMessageEncoder<'b> {
             buf,
             progress,
             timestamp_at,
+            start,
+            payload_at,
+            sealed: extras
+                .security
+                .is_some_and(|security| security.is_secured()),
         })
     }
 
@@ -123,9 +138,18 @@ impl<'b> NetworkMessageEncoder<'b> {
     /// Ends the NetworkMessage.
     ///
     /// # Errors
-    /// [`EncodeError::MessageCount`] when an announced message was not written.
+    /// [`EncodeError::MessageCount`] when an announced message was not written, [`EncodeError::Misplaced`] when the
+    /// SecurityHeader promises a signature: that is [`finish_sealed`](Self::finish_sealed).
     #[inline]
     pub fn finish(self) -> Result<(), EncodeError> {
+        if self.sealed {
+            return Err(EncodeError::Misplaced("a secured message left unsealed"));
+        }
+        self.check_finished()
+    }
+
+    #[inline]
+    const fn check_finished(&self) -> Result<(), EncodeError> {
         let Progress {
             announced,
             written,
@@ -171,92 +195,6 @@ pub(crate) struct Offsets {
 }
 
 #[inline]
-fn write_flags(buf: &mut Vec<u8>, header: &NetworkHeader<'_>, payload_header: bool) {
-    let extended1 = header.publisher_id.map_or(0, |id| id.type_bits())
-        | flag(
-            header.data_set_class_id.is_some(),
-            network::DATA_SET_CLASS_ID,
-        )
-        | flag(header.timestamp.is_some(), network::TIMESTAMP)
-        | flag(header.picoseconds.is_some(), network::PICOSECONDS);
-    let uadp = network::VERSION
-        | flag(header.publisher_id.is_some(), network::PUBLISHER_ID)
-        | flag(header.group.is_some(), network::GROUP_HEADER)
-        | flag(payload_header, network::PAYLOAD_HEADER)
-        | flag(extended1 != 0, network::EXTENDED_FLAGS1);
-    match extended1 {
-        0 => buf.push(uadp),
-        _ => buf.extend_from_slice(&[uadp, extended1]),
-    }
-}
-
-#[inline]
-fn write_publisher_id(buf: &mut Vec<u8>, id: &PublisherId<'_>) -> Result<(), EncodeError> {
-    match *id {
-        PublisherId::Byte(id) => buf.push(id),
-        PublisherId::UInt16(id) => buf.extend_from_slice(&id.to_le_bytes()),
-        PublisherId::UInt32(id) => buf.extend_from_slice(&id.to_le_bytes()),
-        PublisherId::UInt64(id) => buf.extend_from_slice(&id.to_le_bytes()),
-        PublisherId::String(id) => {
-            return writer::byte_string(buf, Some(id.as_bytes()), "PublisherId");
-        }
-    }
-    Ok(())
-}
-
-#[inline]
-fn write_group_header(buf: &mut Vec<u8>, group: &GroupHeader) {
-    buf.push(
-        flag(group.writer_group_id.is_some(), network::WRITER_GROUP_ID)
-            | flag(group.group_version.is_some(), network::GROUP_VERSION)
-            | flag(
-                group.network_message_number.is_some(),
-                network::NETWORK_MESSAGE_NUMBER,
-            )
-            | flag(
-                group.sequence_number.is_some(),
-                network::GROUP_SEQUENCE_NUMBER,
-            ),
-    );
-    if let Some(id) = group.writer_group_id {
-        buf.extend_from_slice(&id.to_le_bytes());
-    }
-    if let Some(version) = group.group_version {
-        buf.extend_from_slice(&version.to_le_bytes());
-    }
-    if let Some(number) = group.network_message_number {
-        buf.extend_from_slice(&number.to_le_bytes());
-    }
-    if let Some(number) = group.sequence_number {
-        buf.extend_from_slice(&number.to_le_bytes());
-    }
-}
-
-#[inline]
-fn write_payload_header(buf: &mut Vec<u8>, ids: &[u16]) -> Result<(), EncodeError> {
-    if let [id] = ids {
-        let [low, high] = id.to_le_bytes();
-        buf.extend_from_slice(&[1, low, high]);
-        return Ok(());
-    }
-    let count = u8::try_from(ids.len()).map_err(|_| EncodeError::TooBig {
-        what: "DataSetWriterIds",
-        len: ids.len(),
-    })?;
-    if count == 0 {
-        return Err(EncodeError::MessageCount {
-            announced: 0,
-            written: 0,
-        });
-    }
-    buf.push(count);
-    for id in ids {
-        buf.extend_from_slice(&id.to_le_bytes());
-    }
-    Ok(())
-}
-
-#[inline]
 fn write_data_set_header(buf: &mut Vec<u8>, header: &DataSetHeader, kind: u8) -> Offsets {
     let flags2 = kind
         | flag(header.timestamp.is_some(), message::TIMESTAMP)
@@ -296,13 +234,5 @@ fn write_data_set_header(buf: &mut Vec<u8>, header: &DataSetHeader, kind: u8) ->
     Offsets {
         sequence_number,
         timestamp,
-    }
-}
-
-#[inline]
-const fn flag(present: bool, bit: u8) -> u8 {
-    match present {
-        true => bit,
-        false => 0,
     }
 }

@@ -9,8 +9,15 @@ use crate::BuiltinType;
 #[non_exhaustive]
 pub enum DecodeError {
     /// The bytes end before the named item does.
-    #[error("{0} is cut off")]
-    Truncated(&'static str),
+    #[error("{field} is cut off: {expected} bytes expected, {found} left")]
+    Truncated {
+        /// What was to be read, as the standard's tables name it.
+        field: &'static str,
+        /// Bytes it takes.
+        expected: usize,
+        /// Bytes there are.
+        found: usize,
+    },
     /// A value the standard reserves; receivers skip the message (OPC 10000-14, 7.2.4.4.2 and 7.2.4.5.4).
     #[error("{field} has the reserved value {value:#x}")]
     Reserved {
@@ -22,6 +29,9 @@ pub enum DecodeError {
     /// Allowed by the standard, not read by this crate.
     #[error("{0} not supported")]
     Unsupported(&'static str),
+    /// Not this way: the message is what the text says. Nobody's fault but the caller's.
+    #[error("the message is {0}")]
+    Misread(&'static str),
     /// A count that not even the smallest elements could reach in the bytes that are left.
     #[error("{field} {value} does not fit in the bytes left")]
     Limit {

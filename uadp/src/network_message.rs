@@ -1,55 +1,58 @@
 //! NetworkMessage: the header of a datagram, and where its DataSetMessages lie.
 
+use crate::header::{self, Flags};
 use crate::reader::Reader;
-use crate::{DataSetMessage, DateTime, DecodeError, Guid};
+use crate::{
+    DataSetMessage, DateTime, DecodeError, GroupHeader, Guid, NetworkHeader, NetworkMessageType,
+    PublisherId, SecurityHeader, Variant,
+};
 
-/// A datagram whose headers were read (OPC 10000-14, 7.2.4.4.2). Its DataSetMessages are read on demand.
+/// A datagram whose headers were read (OPC 10000-14, 7.2.4.4.2). What follows them is read on demand.
 ///
-/// Message security, chunks, PromotedFields, discovery messages and Actions are [`DecodeError::Unsupported`].
+/// The payload of a signed or encrypted message is readable once it was opened with the keys of its SecurityGroup,
+/// that of a chunk once it was reassembled. Actions are [`DecodeError::Unsupported`].
 #[derive(Debug, Clone)]
 pub struct NetworkMessage<'a> {
     header: NetworkHeader<'a>,
     writer_ids: Option<&'a [[u8; 2]]>,
     payload: Reader<'a>,
+    rest: Option<Rest<'a>>,
+    /// Where the payload starts.
+    payload_at: usize,
+    datagram: &'a [u8],
 }
 
-/// The header fields before the payload. What is `None` is not on the wire.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct NetworkHeader<'a> {
-    /// Who sends.
-    pub publisher_id: Option<PublisherId<'a>>,
-    /// DataSetClass all DataSetMessages belong to.
-    pub data_set_class_id: Option<Guid>,
-    /// The group header.
-    pub group: Option<GroupHeader>,
-    /// When the NetworkMessage was made.
-    pub timestamp: Option<DateTime>,
-    /// Refines the timestamp, in units of 10 ps.
-    pub picoseconds: Option<u16>,
+/// The headers few messages have.
+#[derive(Debug, Clone, Copy)]
+struct Rest<'a> {
+    message_type: NetworkMessageType,
+    chunk: bool,
+    promoted: Option<&'a [u8]>,
+    security: Option<SecurityHeader<'a>>,
+    /// Signed or encrypted, and not opened yet.
+    sealed: bool,
+    footer: &'a [u8],
 }
 
-/// Identity of a publisher; equal only with equal type and value (OPC 10000-14, 7.2.4.4.2).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-#[expect(missing_docs, reason = "the names are those of the builtin types")]
-pub enum PublisherId<'a> {
-    Byte(u8),
-    UInt16(u16),
-    UInt32(u32),
-    UInt64(u64),
-    String(&'a str),
+/// A piece of a DataSetMessage or discovery message too big for one NetworkMessage (OPC 10000-14, 7.2.4.4.4).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Chunk<'a> {
+    /// DataSetWriter of the whole; `None` without payload header, as in discovery messages.
+    pub writer_id: Option<u16>,
+    /// Which whole of the DataSetWriter this is a piece of.
+    pub message_sequence_number: u16,
+    /// Where the piece belongs in the whole, in bytes.
+    pub offset: u32,
+    /// Bytes of the whole.
+    pub total_size: u32,
+    /// The piece.
+    pub data: &'a [u8],
 }
 
-/// The group header (OPC 10000-14, 7.2.4.4.2).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
-pub struct GroupHeader {
-    /// WriterGroup within the publisher.
-    pub writer_group_id: Option<u16>,
-    /// VersionTime of the layout: seconds since 2000-01-01 UTC.
-    pub group_version: Option<u32>,
-    /// Number of this NetworkMessage among those of one publishing interval.
-    pub network_message_number: Option<u16>,
-    /// Counts the NetworkMessages of the WriterGroup.
-    pub sequence_number: Option<u16>,
+/// The PromotedFields of a NetworkMessage one by one (OPC 10000-14, 7.2.4.4.2). Ends after the first `Err`.
+#[derive(Debug, Clone)]
+pub struct PromotedFields<'a> {
+    reader: Reader<'a>,
 }
 
 /// The DataSetMessages of a [`NetworkMessage`], in the order of the DataSetWriterIds.
@@ -76,6 +79,8 @@ enum Step<'a> {
         writer_ids: &'a [[u8; 2]],
         sizes: &'a [[u8; 2]],
     },
+    /// The NetworkMessage has none to give.
+    Misread(DecodeError),
     Done,
 }
 
@@ -87,45 +92,82 @@ impl<'a> NetworkMessage<'a> {
     pub fn decode(datagram: &'a [u8]) -> Result<Self, DecodeError> {
         let mut reader = Reader::new(datagram);
         let flags = Flags::read(&mut reader)?;
-        let publisher_id = match flags.uadp & PUBLISHER_ID {
+        let publisher_id = match flags.uadp & header::PUBLISHER_ID {
             0 => None,
             _ => Some(PublisherId::read(
-                flags.extended1 & PUBLISHER_ID_TYPE,
+                flags.extended1 & header::PUBLISHER_ID_TYPE,
                 &mut reader,
             )?),
         };
-        let data_set_class_id = match flags.extended1 & DATA_SET_CLASS_ID {
+        let data_set_class_id = match flags.extended1 & header::DATA_SET_CLASS_ID {
             0 => None,
             _ => Some(Guid(reader.array("DataSetClassId")?)),
         };
-        let group = match flags.uadp & GROUP_HEADER {
+        let group = match flags.uadp & header::GROUP_HEADER {
             0 => None,
             _ => Some(GroupHeader::read(&mut reader)?),
         };
-        let writer_ids = match flags.uadp & PAYLOAD_HEADER {
+        let writer_ids = match flags.uadp & header::PAYLOAD_HEADER {
             0 => None,
+            _ if flags.extended2 & header::CHUNK != 0 => Some(reader.u16s(1, "DataSetWriterId")?),
             _ => Some(read_writer_ids(&mut reader)?),
         };
-        let timestamp = match flags.extended1 & TIMESTAMP {
+        let timestamp = match flags.extended1 & header::TIMESTAMP {
             0 => None,
             _ => Some(DateTime(reader.i64("Timestamp")?)),
         };
-        let picoseconds = match flags.extended1 & PICOSECONDS {
+        let picoseconds = match flags.extended1 & header::PICOSECONDS {
             0 => None,
             _ => Some(reader.u16("PicoSeconds")?),
         };
-        let header = NetworkHeader {
-            publisher_id,
-            data_set_class_id,
-            group,
-            timestamp,
-            picoseconds,
-        };
-        Ok(Self {
-            header,
+        let mut message = Self {
+            header: NetworkHeader {
+                publisher_id,
+                data_set_class_id,
+                group,
+                timestamp,
+                picoseconds,
+            },
             writer_ids,
             payload: reader,
-        })
+            rest: None,
+            payload_at: 0,
+            datagram,
+        };
+        if flags.extended1 & header::SECURITY != 0 || flags.extended2 != 0 {
+            message.read_rest(&flags)?;
+        }
+        message.payload_at = datagram.len() - message.payload.remaining() - message.footer().len();
+        Ok(message)
+    }
+
+    #[inline(never)]
+    fn read_rest(&mut self, flags: &Flags) -> Result<(), DecodeError> {
+        let promoted = match flags.extended2 & header::PROMOTED_FIELDS {
+            0 => None,
+            _ => {
+                let size = self.payload.u16("PromotedFields Size")?;
+                Some(self.payload.bytes(size.into(), "PromotedFields")?)
+            }
+        };
+        let security = match flags.extended1 & header::SECURITY {
+            0 => None,
+            _ => Some(SecurityHeader::read(&mut self.payload)?),
+        };
+        let sealed = security.is_some_and(|security| security.is_secured());
+        let mut footer = Reader::new(&[]);
+        if !sealed && let Some(size) = security.and_then(|security| security.footer_size) {
+            (self.payload, footer) = self.payload.split_end(size.into(), "SecurityFooter")?;
+        }
+        self.rest = Some(Rest {
+            message_type: flags.message_type(),
+            chunk: flags.extended2 & header::CHUNK != 0,
+            promoted,
+            security,
+            sealed,
+            footer: footer.rest(),
+        });
+        Ok(())
     }
 
     /// The header fields.
@@ -143,23 +185,177 @@ impl<'a> NetworkMessage<'a> {
             .map(|ids| ids.iter().map(|id| u16::from_le_bytes(*id)))
     }
 
-    /// The DataSetMessages. Without payload header that is one, without a DataSetWriterId.
+    /// What the NetworkMessage is for.
+    #[must_use]
+    pub fn message_type(&self) -> NetworkMessageType {
+        self.rest
+            .map_or_else(Default::default, |rest| rest.message_type)
+    }
+
+    /// True for a chunk: read it with [`chunk`](Self::chunk).
     #[inline]
     #[must_use]
-    pub const fn messages(&self) -> Messages<'a> {
-        let step = match self.writer_ids {
-            None => Step::Single { writer_id: None },
-            Some([id]) => Step::Single {
+    pub fn is_chunk(&self) -> bool {
+        self.rest.is_some_and(|rest| rest.chunk)
+    }
+
+    /// The SecurityHeader. Only what it says of `signed` and `encrypted` tells whether the message is secured.
+    #[must_use]
+    pub fn security(&self) -> Option<SecurityHeader<'a>> {
+        self.rest.and_then(|rest| rest.security)
+    }
+
+    /// The SecurityFooter, empty without one and as long as the message was not opened.
+    #[must_use]
+    pub fn footer(&self) -> &'a [u8] {
+        self.rest.map_or(&[], |rest| rest.footer)
+    }
+
+    /// True while the payload is signed or encrypted and was not opened.
+    #[inline]
+    #[must_use]
+    pub fn is_sealed(&self) -> bool {
+        self.rest.is_some_and(|rest| rest.sealed)
+    }
+
+    /// The PromotedFields; `None` when they are not enabled.
+    #[must_use]
+    pub fn promoted_fields(&self) -> Option<PromotedFields<'a>> {
+        let promoted = self.rest?.promoted?;
+        Some(PromotedFields {
+            reader: Reader::new(promoted),
+        })
+    }
+
+    /// What stands behind the headers. Of a sealed message that is the ciphertext, the footer and the signature.
+    #[must_use]
+    pub const fn payload(&self) -> &'a [u8] {
+        self.payload.rest()
+    }
+
+    /// All bytes, from the first flags on.
+    #[must_use]
+    pub const fn datagram(&self) -> &'a [u8] {
+        self.datagram
+    }
+
+    /// The same message with the payload and footer that opening it gave.
+    pub(crate) fn opened<'b>(&self, payload: &'b [u8], footer: &'b [u8]) -> NetworkMessage<'b>
+    where
+        'a: 'b,
+    {
+        NetworkMessage {
+            payload: Reader::new(payload),
+            rest: self.rest.map(|rest| Rest {
+                sealed: false,
+                footer,
+                ..rest
+            }),
+            ..self.clone()
+        }
+    }
+
+    /// The piece of a chunk NetworkMessage.
+    ///
+    /// # Errors
+    /// [`DecodeError::Misread`] when it is no chunk or still sealed. Else fails when the header of the chunk is cut off,
+    /// the piece is empty, or reaches past the end of the whole.
+    pub fn chunk(&self) -> Result<Chunk<'a>, DecodeError> {
+        if self.is_sealed() {
+            return Err(SEALED);
+        }
+        if !self.is_chunk() {
+            return Err(DecodeError::Misread("no chunk"));
+        }
+        let mut payload = self.payload;
+        let message_sequence_number = payload.u16("MessageSequenceNumber")?;
+        let offset = payload.u32("ChunkOffset")?;
+        let total_size = payload.u32("TotalSize")?;
+        let data = payload.rest();
+        let end = u32::try_from(data.len())
+            .ok()
+            .and_then(|len| offset.checked_add(len));
+        if data.is_empty() || end.is_none_or(|end| end > total_size) {
+            return Err(DecodeError::Limit {
+                field: "ChunkOffset",
+                value: offset,
+            });
+        }
+        Ok(Chunk {
+            writer_id: self.writer_ids().and_then(|mut ids| ids.next()),
+            message_sequence_number,
+            offset,
+            total_size,
+            data,
+        })
+    }
+
+    /// The DataSetMessages. Without payload header that is one, without a DataSetWriterId; where several are
+    /// configured without one, see [`data_set_message_at`](Self::data_set_message_at).
+    ///
+    /// A chunk, a discovery message and a sealed message give one [`DecodeError::Misread`].
+    #[inline]
+    #[must_use]
+    pub fn messages(&self) -> Messages<'a> {
+        let step = match (self.writer_ids, self.misread()) {
+            (_, Some(why)) => Step::Misread(why),
+            (None, None) => Step::Single { writer_id: None },
+            (Some([id]), None) => Step::Single {
                 writer_id: Some(u16::from_le_bytes(*id)),
             },
-            Some(writer_ids) => Step::Sizes { writer_ids },
+            (Some(writer_ids), None) => Step::Sizes { writer_ids },
         };
         Messages {
             step,
             payload: self.payload,
         }
     }
+
+    /// The DataSetMessage of `size` bytes that starts `offset` bytes into the NetworkMessage, as the DataSetReader of
+    /// a fixed layout has it configured (DataSetOffset and ConfiguredSize: OPC 10000-14, 6.3.1.3.3 and 6.3.1.3.5).
+    ///
+    /// # Errors
+    /// As for [`messages`](Self::messages); [`DecodeError::Truncated`] when it would not lie in the payload.
+    pub fn data_set_message_at(
+        &self,
+        offset: usize,
+        size: usize,
+    ) -> Result<DataSetMessage<'a>, DecodeError> {
+        if let Some(why) = self.misread() {
+            return Err(why);
+        }
+        let headers = self.payload_at;
+        let cut = DecodeError::Truncated {
+            field: "DataSetMessage",
+            expected: offset.saturating_add(size),
+            found: headers + self.payload.remaining(),
+        };
+        let start = offset.checked_sub(headers).ok_or(cut)?;
+        let end = start.checked_add(size).ok_or(cut)?;
+        let message = self.payload().get(start..end).ok_or(cut)?;
+        DataSetMessage::read(None, Reader::new(message))
+    }
+
+    #[inline]
+    fn misread(&self) -> Option<DecodeError> {
+        let rest = self.rest?;
+        if rest.sealed {
+            return Some(SEALED);
+        }
+        if rest.chunk {
+            return Some(DecodeError::Misread("a chunk, to be reassembled first"));
+        }
+        match rest.message_type {
+            NetworkMessageType::DataSet => None,
+            NetworkMessageType::Probe => Some(DecodeError::Misread("a discovery probe")),
+            NetworkMessageType::Announcement => {
+                Some(DecodeError::Misread("a discovery announcement"))
+            }
+        }
+    }
 }
+
+const SEALED: DecodeError = DecodeError::Misread("secured, to be opened with its keys first");
 
 impl<'a> Iterator for Messages<'a> {
     type Item = Result<DataSetMessage<'a>, DecodeError>;
@@ -167,6 +363,10 @@ impl<'a> Iterator for Messages<'a> {
     #[inline]
     fn next(&mut self) -> Option<Self::Item> {
         match self.step {
+            Step::Misread(why) => {
+                self.step = Step::Done;
+                Some(Err(why))
+            }
             Step::Single { writer_id } => {
                 self.step = Step::Done;
                 Some(DataSetMessage::read(writer_id, self.payload))
@@ -220,141 +420,22 @@ impl<'a> Messages<'a> {
 
 impl std::iter::FusedIterator for Messages<'_> {}
 
-/// The first one to three bytes; a byte left out is 0.
-struct Flags {
-    uadp: u8,
-    extended1: u8,
-}
+impl<'a> Iterator for PromotedFields<'a> {
+    type Item = Result<Variant<'a>, DecodeError>;
 
-impl Flags {
-    fn read(reader: &mut Reader<'_>) -> Result<Self, DecodeError> {
-        let uadp = reader.u8("UADPFlags")?;
-        if uadp & VERSION_MASK != VERSION {
-            return Err(DecodeError::Reserved {
-                field: "UADPVersion",
-                value: (uadp & VERSION_MASK).into(),
-            });
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.reader.remaining() == 0 {
+            return None;
         }
-        let extended1 = match uadp & EXTENDED_FLAGS1 {
-            0 => 0,
-            _ => reader.u8("ExtendedFlags1")?,
-        };
-        let publisher_id_type = extended1 & PUBLISHER_ID_TYPE;
-        if publisher_id_type > PUBLISHER_ID_STRING {
-            return Err(DecodeError::Reserved {
-                field: "PublisherId type",
-                value: publisher_id_type.into(),
-            });
+        let field = Variant::read(&mut self.reader);
+        if field.is_err() {
+            self.reader = Reader::new(&[]);
         }
-        let extended2 = match extended1 & EXTENDED_FLAGS2 {
-            0 => 0,
-            _ => reader.u8("ExtendedFlags2")?,
-        };
-        check_extended_flags2(extended2)?;
-        if extended1 & SECURITY != 0 {
-            return Err(DecodeError::Unsupported("message security"));
-        }
-        Ok(Self { uadp, extended1 })
+        Some(field)
     }
 }
 
-fn check_extended_flags2(flags: u8) -> Result<(), DecodeError> {
-    match (flags & MESSAGE_TYPE) >> 2 {
-        0 => {}
-        1 => return Err(DecodeError::Unsupported("discovery probe")),
-        2 => return Err(DecodeError::Unsupported("discovery announcement")),
-        reserved => {
-            return Err(DecodeError::Reserved {
-                field: "NetworkMessage type",
-                value: reserved.into(),
-            });
-        }
-    }
-    let reserved = flags & EXTENDED2_RESERVED;
-    if reserved != 0 {
-        return Err(DecodeError::Reserved {
-            field: "ExtendedFlags2",
-            value: reserved.into(),
-        });
-    }
-    if flags & CHUNK != 0 {
-        return Err(DecodeError::Unsupported("chunk"));
-    }
-    if flags & PROMOTED_FIELDS != 0 {
-        return Err(DecodeError::Unsupported("PromotedFields"));
-    }
-    if flags & ACTION_HEADER != 0 {
-        return Err(DecodeError::Unsupported("Action"));
-    }
-    Ok(())
-}
-
-impl<'a> PublisherId<'a> {
-    fn read(id_type: u8, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
-        Ok(match id_type {
-            PUBLISHER_ID_BYTE => Self::Byte(reader.u8("PublisherId")?),
-            PUBLISHER_ID_UINT16 => Self::UInt16(reader.u16("PublisherId")?),
-            PUBLISHER_ID_UINT32 => Self::UInt32(reader.u32("PublisherId")?),
-            PUBLISHER_ID_UINT64 => Self::UInt64(u64::from_le_bytes(reader.array("PublisherId")?)),
-            _ => match reader.text("PublisherId")? {
-                Some(text) => Self::String(text),
-                // A null String names no publisher.
-                None => {
-                    return Err(DecodeError::Reserved {
-                        field: "PublisherId length",
-                        value: u32::MAX,
-                    });
-                }
-            },
-        })
-    }
-
-    pub(crate) const fn type_bits(&self) -> u8 {
-        match self {
-            Self::Byte(_) => PUBLISHER_ID_BYTE,
-            Self::UInt16(_) => PUBLISHER_ID_UINT16,
-            Self::UInt32(_) => PUBLISHER_ID_UINT32,
-            Self::UInt64(_) => PUBLISHER_ID_UINT64,
-            Self::String(_) => PUBLISHER_ID_STRING,
-        }
-    }
-}
-
-impl GroupHeader {
-    fn read(reader: &mut Reader<'_>) -> Result<Self, DecodeError> {
-        let flags = reader.u8("GroupFlags")?;
-        let reserved = flags
-            & !(WRITER_GROUP_ID | GROUP_VERSION | NETWORK_MESSAGE_NUMBER | GROUP_SEQUENCE_NUMBER);
-        if reserved != 0 {
-            return Err(DecodeError::Reserved {
-                field: "GroupFlags",
-                value: reserved.into(),
-            });
-        }
-        let writer_group_id = match flags & WRITER_GROUP_ID {
-            0 => None,
-            _ => Some(reader.u16("WriterGroupId")?),
-        };
-        let group_version = match flags & GROUP_VERSION {
-            0 => None,
-            _ => Some(reader.u32("GroupVersion")?),
-        };
-        let network_message_number = match flags & NETWORK_MESSAGE_NUMBER {
-            0 => None,
-            _ => Some(reader.u16("NetworkMessageNumber")?),
-        };
-        let sequence_number = match flags & GROUP_SEQUENCE_NUMBER {
-            0 => None,
-            _ => Some(reader.u16("SequenceNumber")?),
-        };
-        Ok(Self {
-            writer_group_id,
-            group_version,
-            network_message_number,
-            sequence_number,
-        })
-    }
-}
+impl std::iter::FusedIterator for PromotedFields<'_> {}
 
 /// Count, never 0 (OPC 10000-14, 7.2.4.5.2), and DataSetWriterIds.
 fn read_writer_ids<'a>(reader: &mut Reader<'a>) -> Result<&'a [[u8; 2]], DecodeError> {
@@ -366,33 +447,3 @@ fn read_writer_ids<'a>(reader: &mut Reader<'a>) -> Result<&'a [[u8; 2]], DecodeE
         count => reader.u16s(count, "DataSetWriterIds"),
     }
 }
-
-pub(crate) const VERSION: u8 = 1;
-const VERSION_MASK: u8 = 0x0F;
-pub(crate) const PUBLISHER_ID: u8 = 0x10;
-pub(crate) const GROUP_HEADER: u8 = 0x20;
-pub(crate) const PAYLOAD_HEADER: u8 = 0x40;
-pub(crate) const EXTENDED_FLAGS1: u8 = 0x80;
-
-const PUBLISHER_ID_TYPE: u8 = 0x07;
-const PUBLISHER_ID_BYTE: u8 = 0;
-const PUBLISHER_ID_UINT16: u8 = 1;
-const PUBLISHER_ID_UINT32: u8 = 2;
-const PUBLISHER_ID_UINT64: u8 = 3;
-const PUBLISHER_ID_STRING: u8 = 4;
-pub(crate) const DATA_SET_CLASS_ID: u8 = 0x08;
-const SECURITY: u8 = 0x10;
-pub(crate) const TIMESTAMP: u8 = 0x20;
-pub(crate) const PICOSECONDS: u8 = 0x40;
-const EXTENDED_FLAGS2: u8 = 0x80;
-
-const CHUNK: u8 = 0x01;
-const PROMOTED_FIELDS: u8 = 0x02;
-const MESSAGE_TYPE: u8 = 0x1C;
-const ACTION_HEADER: u8 = 0x20;
-const EXTENDED2_RESERVED: u8 = 0xC0;
-
-pub(crate) const WRITER_GROUP_ID: u8 = 0x01;
-pub(crate) const GROUP_VERSION: u8 = 0x02;
-pub(crate) const NETWORK_MESSAGE_NUMBER: u8 = 0x04;
-pub(crate) const GROUP_SEQUENCE_NUMBER: u8 = 0x08;

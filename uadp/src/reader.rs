@@ -40,7 +40,11 @@ impl<'a> Reader<'a> {
                 self.rest = rest;
                 Ok(*head)
             }
-            None => Err(DecodeError::Truncated(what)),
+            None => Err(DecodeError::Truncated {
+                field: what,
+                expected: N,
+                found: self.rest.len(),
+            }),
         }
     }
 
@@ -55,8 +59,28 @@ impl<'a> Reader<'a> {
                 self.rest = rest;
                 Ok(head)
             }
-            None => Err(DecodeError::Truncated(what)),
+            None => Err(DecodeError::Truncated {
+                field: what,
+                expected: len,
+                found: self.rest.len(),
+            }),
         }
+    }
+
+    /// What stands before the last `len` bytes, and those.
+    pub(crate) fn split_end(
+        &self,
+        len: usize,
+        what: &'static str,
+    ) -> Result<(Self, Self), DecodeError> {
+        let cut = DecodeError::Truncated {
+            field: what,
+            expected: len,
+            found: self.rest.len(),
+        };
+        let at = self.rest.len().checked_sub(len).ok_or(cut)?;
+        let (head, tail) = self.rest.split_at_checked(at).ok_or(cut)?;
+        Ok((Self::new(head), Self::new(tail)))
     }
 
     /// `count` UInt16, unread.

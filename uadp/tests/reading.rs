@@ -39,7 +39,7 @@ fn a_heartbeat_has_no_fields_with_and_without_a_field_count() {
     assert_eq!(fields(&[0x01, 0, 0]), Ok(vec![]));
     assert_eq!(
         fields(&[0x01, 0]),
-        Err(DecodeError::Truncated("FieldCount"))
+        Err(DecodeError::Truncated { field: "FieldCount", .. })
     );
 }
 
@@ -122,7 +122,7 @@ fn a_message_cannot_read_into_its_neighbour() {
     let first = messages.first().unwrap().as_ref().unwrap();
     assert_eq!(
         first.fields().unwrap().next(),
-        Some(Err(DecodeError::Truncated("Byte")))
+        Some(Err(DecodeError::Truncated { field: "Byte", .. }))
     );
 }
 
@@ -132,14 +132,14 @@ fn sizes_past_the_datagram_and_bytes_behind_the_last_message_are_errors() {
     let errors: Vec<_> = messages(&long).into_iter().map(Result::err).collect();
     assert_eq!(
         errors,
-        [None, Some(DecodeError::Truncated("DataSetMessage"))]
+        [None, Some(DecodeError::Truncated { field: "DataSetMessage", .. })]
     );
     let short = [0x41, 2, 1, 0, 2, 0, 1, 0, 1, 0, 0x01, 0x01, 0];
     let errors: Vec<_> = messages(&short).into_iter().map(Result::err).collect();
     assert_eq!(errors, [None, None, Some(DecodeError::TrailingBytes(1))]);
     let cut = [0x41, 2, 1, 0, 2, 0, 1, 0, 1];
     let errors: Vec<_> = messages(&cut).into_iter().map(Result::err).collect();
-    assert_eq!(errors, [Some(DecodeError::Truncated("Sizes"))]);
+    assert_eq!(errors, [Some(DecodeError::Truncated { field: "Sizes", .. })]);
 }
 
 #[test]
