@@ -1,7 +1,7 @@
 //! DataSetMessage: one writer's header, and its fields read one by one.
 
 use crate::reader::Reader;
-use crate::{DateTime, DecodeError, Variant};
+use crate::{DataValue, DateTime, DecodeError, Variant};
 
 /// One DataSetMessage whose header was read (OPC 10000-14, 7.2.4.5.4).
 ///
@@ -44,15 +44,27 @@ pub struct DataSetHeader {
 pub enum MessageKind {
     /// All fields (OPC 10000-14, 7.2.4.5.5). Without fields it is a heartbeat.
     KeyFrame,
-    /// The changed fields (OPC 10000-14, 7.2.4.5.6). Its fields are not read.
+    /// The changed fields, each with its index (OPC 10000-14, 7.2.4.5.6).
     DeltaFrame,
-    /// The fields of one event (OPC 10000-14, 7.2.4.5.7). Its fields are not read.
+    /// The fields of one event (OPC 10000-14, 7.2.4.5.7).
     Event,
     /// A header only: the writer lives and has nothing new (OPC 10000-14, 7.2.4.5.8).
     KeepAlive,
 }
 
-/// The fields of a key frame, read one by one.
+/// How the fields of a DataSetMessage are encoded: DataSetFlags1 bits 1 and 2 (OPC 10000-14, 7.2.4.5.4).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum FieldEncoding {
+    /// Each with its type.
+    #[default]
+    Variant,
+    /// Without types, to be read with the DataSetMetaData (OPC 10000-14, 7.2.4.5.11).
+    RawData,
+    /// Each with its type, quality and times.
+    DataValue,
+}
+
+/// The Variants of a key frame or event, read one by one.
 ///
 /// Ends after the first `Err`. Zero bytes behind the last field are the padding to a ConfiguredSize
 /// (OPC 10000-14, 6.3.1.3.3) and skipped; others are a last [`DecodeError::TrailingBytes`].
@@ -64,11 +76,23 @@ pub struct Fields<'a> {
     left: u16,
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum FieldEncoding {
-    Variant,
-    RawData,
-    DataValue,
+/// The fields of any DataSetMessage but a RawData one, read one by one. Ends as [`Fields`] do.
+#[derive(Debug, Clone)]
+pub struct FieldValues<'a> {
+    reader: Reader<'a>,
+    next: u16,
+    left: u16,
+    indexed: bool,
+    encoding: FieldEncoding,
+}
+
+/// A field and which of the DataSet's it is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FieldValue<'a> {
+    /// Position in the DataSetMetaData, from 0.
+    pub index: u16,
+    /// The value; from a Variant only the value.
+    pub value: DataValue<'a>,
 }
 
 impl Default for DataSetHeader {
@@ -117,29 +141,124 @@ impl<'a> DataSetMessage<'a> {
         })
     }
 
-    /// The fields. A keep-alive and a heartbeat, with or without its FieldCount, have none.
+    /// How the fields are encoded.
+    #[inline]
+    #[must_use]
+    pub const fn encoding(&self) -> FieldEncoding {
+        self.encoding
+    }
+
+    /// What stands behind the header, padding included.
+    #[inline]
+    #[must_use]
+    pub const fn payload(&self) -> &'a [u8] {
+        self.payload.rest()
+    }
+
+    /// The fields of a Variant encoded key frame or event. A keep-alive and a heartbeat, with or without its
+    /// FieldCount, have none. [`values`](Self::values) reads the others too.
     ///
     /// # Errors
-    /// [`DecodeError::Unsupported`] for delta frames, events, and the RawData and DataValue field encodings;
+    /// [`DecodeError::Misread`] for delta frames and for the RawData and DataValue field encodings;
     /// else fails when the FieldCount is cut off or cannot be met by the bytes that follow.
     #[inline]
     pub fn fields(&self) -> Result<Fields<'a>, DecodeError> {
         match (self.kind, self.encoding) {
             (MessageKind::KeepAlive, _) => Ok(Fields::NONE),
-            (MessageKind::DeltaFrame, _) => Err(DecodeError::Unsupported("delta frame")),
-            (MessageKind::Event, _) => Err(DecodeError::Unsupported("event message")),
-            (MessageKind::KeyFrame, FieldEncoding::RawData) => {
-                Err(DecodeError::Unsupported("RawData field encoding"))
-            }
-            (MessageKind::KeyFrame, FieldEncoding::DataValue) => {
-                Err(DecodeError::Unsupported("DataValue field encoding"))
-            }
+            (_, FieldEncoding::RawData) => Err(RAW_DATA),
             // open62541 leaves out the FieldCount of a heartbeat, the tables of the standard do not.
-            (MessageKind::KeyFrame, FieldEncoding::Variant) if self.payload.remaining() == 0 => {
-                Ok(Fields::NONE)
+            (MessageKind::KeyFrame, _) if self.payload.remaining() == 0 => Ok(Fields::NONE),
+            (_, FieldEncoding::DataValue) => Err(DecodeError::Misread("encoded as DataValues")),
+            (MessageKind::DeltaFrame, FieldEncoding::Variant) => Err(DecodeError::Misread(
+                "a delta frame, its fields have indexes",
+            )),
+            (MessageKind::KeyFrame | MessageKind::Event, FieldEncoding::Variant) => {
+                Fields::parse(self.payload.rest())
             }
-            (MessageKind::KeyFrame, FieldEncoding::Variant) => Fields::parse(self.payload.rest()),
         }
+    }
+
+    /// The fields with their indexes, of a delta frame those it has.
+    ///
+    /// open62541 1.5 ends a delta frame with entries that change nothing: see [`FieldValue::is_filler`].
+    ///
+    /// # Errors
+    /// [`DecodeError::Misread`] for the RawData field encoding; else fails when the FieldCount is cut off or cannot be
+    /// met by the bytes that follow.
+    pub fn values(&self) -> Result<FieldValues<'a>, DecodeError> {
+        let mut reader = self.payload;
+        let count = match self.kind {
+            MessageKind::KeepAlive => 0,
+            _ if self.encoding == FieldEncoding::RawData => return Err(RAW_DATA),
+            MessageKind::KeyFrame if reader.remaining() == 0 => 0,
+            MessageKind::KeyFrame | MessageKind::DeltaFrame | MessageKind::Event => {
+                reader.u16("FieldCount")?
+            }
+        };
+        if usize::from(count) > reader.remaining() {
+            return Err(DecodeError::Limit {
+                field: "FieldCount",
+                value: count.into(),
+            });
+        }
+        Ok(FieldValues {
+            reader,
+            next: 0,
+            left: count,
+            indexed: self.kind == MessageKind::DeltaFrame,
+            encoding: self.encoding,
+        })
+    }
+}
+
+impl<'a> FieldValues<'a> {
+    fn read(&mut self) -> Result<FieldValue<'a>, DecodeError> {
+        let index = match self.indexed {
+            true => self.reader.u16("FieldIndex")?,
+            false => self.next,
+        };
+        self.next = self.next.wrapping_add(1);
+        let value = match self.encoding {
+            FieldEncoding::DataValue => DataValue::read(&mut self.reader)?,
+            FieldEncoding::Variant | FieldEncoding::RawData => {
+                Variant::read(&mut self.reader)?.into()
+            }
+        };
+        Ok(FieldValue { index, value })
+    }
+
+    fn stop(&mut self) {
+        self.left = 0;
+        self.reader = Reader::new(&[]);
+    }
+}
+
+impl<'a> Iterator for FieldValues<'a> {
+    type Item = Result<FieldValue<'a>, DecodeError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let Some(left) = self.left.checked_sub(1) else {
+            let padding = self.reader.rest();
+            self.stop();
+            return check_padding(padding).err().map(Err);
+        };
+        self.left = left;
+        let field = self.read();
+        if field.is_err() {
+            self.stop();
+        }
+        Some(field)
+    }
+}
+
+impl std::iter::FusedIterator for FieldValues<'_> {}
+
+impl FieldValue<'_> {
+    /// True for index 0 and a null Variant. In a delta frame that is what open62541 1.5 fills the frame up with to the
+    /// number of fields of the DataSet, so it is better not taken for a change of field 0.
+    #[must_use]
+    pub fn is_filler(&self) -> bool {
+        self.index == 0 && self.value == DataValue::from(Variant::Null)
     }
 }
 
@@ -265,8 +384,8 @@ impl Head {
         };
         let encoding = match flags1 & FIELD_ENCODING {
             0x00 => FieldEncoding::Variant,
-            0x02 => FieldEncoding::RawData,
-            0x04 => FieldEncoding::DataValue,
+            RAW_FIELDS => FieldEncoding::RawData,
+            DATA_VALUE_FIELDS => FieldEncoding::DataValue,
             _ => {
                 return Err(DecodeError::Reserved {
                     field: "field encoding",
@@ -316,6 +435,9 @@ impl Head {
     }
 }
 
+const RAW_DATA: DecodeError =
+    DecodeError::Misread("encoded as RawData, to be read with its DataSetMetaData");
+
 #[inline]
 fn read_kind(flags2: u8) -> Result<MessageKind, DecodeError> {
     let reserved = flags2 & FLAGS2_RESERVED;
@@ -327,8 +449,8 @@ fn read_kind(flags2: u8) -> Result<MessageKind, DecodeError> {
     }
     match flags2 & KIND {
         KIND_KEY_FRAME => Ok(MessageKind::KeyFrame),
-        1 => Ok(MessageKind::DeltaFrame),
-        2 => Ok(MessageKind::Event),
+        KIND_DELTA_FRAME => Ok(MessageKind::DeltaFrame),
+        KIND_EVENT => Ok(MessageKind::Event),
         KIND_KEEP_ALIVE => Ok(MessageKind::KeepAlive),
         4 | 5 => Err(DecodeError::Unsupported("Action")),
         kind => Err(DecodeError::Reserved {
@@ -355,8 +477,14 @@ pub(crate) const MAJOR_VERSION: u8 = 0x20;
 pub(crate) const MINOR_VERSION: u8 = 0x40;
 pub(crate) const FLAGS2: u8 = 0x80;
 
+/// Field encoding bits.
+pub(crate) const RAW_FIELDS: u8 = 0x02;
+pub(crate) const DATA_VALUE_FIELDS: u8 = 0x04;
+
 const KIND: u8 = 0x0F;
 pub(crate) const KIND_KEY_FRAME: u8 = 0;
+pub(crate) const KIND_DELTA_FRAME: u8 = 1;
+pub(crate) const KIND_EVENT: u8 = 2;
 pub(crate) const KIND_KEEP_ALIVE: u8 = 3;
 pub(crate) const TIMESTAMP: u8 = 0x10;
 pub(crate) const PICOSECONDS: u8 = 0x20;

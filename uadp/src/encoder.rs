@@ -1,8 +1,9 @@
 //! Writing a NetworkMessage: headers first, then one DataSetMessage after the other, in one pass.
 
 use crate::data_set_message as message;
-use crate::field_encoder::FieldEncoder;
-use crate::header_writer::{self, Extras, Form, PayloadHeader, flag};
+use crate::field_encoder::{DataValueEncoder, DeltaEncoder, FieldEncoder};
+use crate::header_writer::{self, Extras, Form, PayloadHeader};
+use crate::writer::flag;
 use crate::{DataSetHeader, EncodeError, NetworkHeader, NetworkMessageType, writer};
 
 /// Appends one NetworkMessage to a buffer (OPC 10000-14, 7.2.4.4.2).
@@ -19,6 +20,7 @@ pub struct NetworkMessageEncoder<'b> {
     payload_at: usize,
     /// The SecurityHeader promises a signature.
     sealed: bool,
+    payload_header: bool,
 }
 
 /// What is finished of the payload.
@@ -31,12 +33,17 @@ pub(crate) struct Progress {
     sizes_at: Option<usize>,
     /// Where the last finished DataSetMessage ends.
     end: usize,
+    /// Bytes every DataSetMessage is to take, 0 for as many as it needs.
+    configured_size: usize,
 }
 
 impl Progress {
     /// Counts the DataSetMessage that ends with the buffer and patches its size.
     #[inline]
-    pub(crate) fn message_finished(&mut self, buf: &mut [u8]) -> Result<(), EncodeError> {
+    pub(crate) fn message_finished(&mut self, buf: &mut Vec<u8>) -> Result<(), EncodeError> {
+        if self.configured_size != 0 {
+            self.fit(buf);
+        }
         if let Some(sizes_at) = self.sizes_at {
             let len = buf.len() - self.end;
             let size = u16::try_from(len).map_err(|_| EncodeError::TooBig {
@@ -48,6 +55,17 @@ impl Progress {
         self.written += 1;
         self.end = buf.len();
         Ok(())
+    }
+
+    /// Gives the DataSetMessage that ends with the buffer its ConfiguredSize.
+    #[cold]
+    fn fit(&self, buf: &mut Vec<u8>) {
+        let end = self.end + self.configured_size;
+        if buf.len() > end {
+            // Too long: cleared valid bit, and nothing behind it counts.
+            buf.truncate(self.end);
+        }
+        buf.resize(end, 0);
     }
 }
 
@@ -100,6 +118,7 @@ impl<'b> NetworkMessageEncoder<'b> {
             written: 0,
             sizes_at,
             end: buf.len(),
+            configured_size: 0,
         };
         Ok(Self {
             buf,
@@ -110,18 +129,100 @@ impl<'b> NetworkMessageEncoder<'b> {
             sealed: extras
                 .security
                 .is_some_and(|security| security.is_secured()),
+            payload_header: writer_ids.is_some(),
         })
     }
 
-    /// Opens a key frame. One left without [`FieldEncoder::finish`] is taken back by the next call.
+    /// Without payload header, so many DataSetMessages instead of one. Receivers find them by DataSetOffset
+    /// (OPC 10000-14, 6.3.1.3.5), so each is best given a [`configured_size`](Self::configured_size).
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] with a payload header.
+    pub const fn fixed_layout(mut self, count: usize) -> Result<Self, EncodeError> {
+        if self.payload_header {
+            return Err(EncodeError::Misplaced("a payload header in a fixed layout"));
+        }
+        self.progress.announced = count;
+        Ok(self)
+    }
+
+    /// Pads every following DataSetMessage with zeros to so many bytes; one that is longer becomes an invalid
+    /// message of that size (ConfiguredSize: OPC 10000-14, 6.3.1.3.3). 0 leaves the sizes alone.
+    pub fn configured_size(&mut self, size: u16) {
+        self.progress.configured_size = size.into();
+    }
+
+    /// Opens a key frame of Variants. One left without [`FieldEncoder::finish`] is taken back by the next call.
+    /// Finished without a field it is a heartbeat.
     ///
     /// # Errors
     /// [`EncodeError::MessageCount`] when all announced messages are written.
     #[inline]
     pub fn key_frame(&mut self, header: &DataSetHeader) -> Result<FieldEncoder<'_>, EncodeError> {
+        self.counted(header, message::KIND_KEY_FRAME, 0)
+    }
+
+    /// Opens an event (OPC 10000-14, 7.2.4.5.7).
+    ///
+    /// # Errors
+    /// As for [`key_frame`](Self::key_frame).
+    pub fn event(&mut self, header: &DataSetHeader) -> Result<FieldEncoder<'_>, EncodeError> {
+        self.counted(header, message::KIND_EVENT, 0)
+    }
+
+    /// Opens a delta frame of Variants (OPC 10000-14, 7.2.4.5.6).
+    ///
+    /// # Errors
+    /// As for [`key_frame`](Self::key_frame).
+    pub fn delta_frame(&mut self, header: &DataSetHeader) -> Result<DeltaEncoder<'_>, EncodeError> {
+        let fields = self.counted(header, message::KIND_DELTA_FRAME, 0)?;
+        Ok(DeltaEncoder::new(fields))
+    }
+
+    /// Opens a key frame of DataValues.
+    ///
+    /// # Errors
+    /// As for [`key_frame`](Self::key_frame).
+    pub fn data_values(
+        &mut self,
+        header: &DataSetHeader,
+    ) -> Result<DataValueEncoder<'_>, EncodeError> {
+        let encoding = message::DATA_VALUE_FIELDS;
+        let fields = self.counted(header, message::KIND_KEY_FRAME, encoding)?;
+        Ok(DataValueEncoder::new(fields, false))
+    }
+
+    /// Opens a delta frame of DataValues.
+    ///
+    /// # Errors
+    /// As for [`key_frame`](Self::key_frame).
+    pub fn delta_data_values(
+        &mut self,
+        header: &DataSetHeader,
+    ) -> Result<DataValueEncoder<'_>, EncodeError> {
+        let encoding = message::DATA_VALUE_FIELDS;
+        let fields = self.counted(header, message::KIND_DELTA_FRAME, encoding)?;
+        Ok(DataValueEncoder::new(fields, true))
+    }
+
+    /// Appends a key frame of RawData whose fields `write` appends.
+    ///
+    /// # Errors
+    /// As for [`key_frame`](Self::key_frame), and what `write` gives.
+    pub fn raw_key_frame(
+        &mut self,
+        header: &DataSetHeader,
+        write: impl FnOnce(&mut Vec<u8>) -> Result<(), EncodeError>,
+    ) -> Result<(), EncodeError> {
         self.begin_message()?;
-        let offsets = write_data_set_header(self.buf, header, message::KIND_KEY_FRAME);
-        Ok(FieldEncoder::new(self.buf, &mut self.progress, offsets))
+        write_data_set_header(
+            self.buf,
+            header,
+            message::KIND_KEY_FRAME,
+            message::RAW_FIELDS,
+        );
+        write(self.buf)?;
+        self.progress.message_finished(self.buf)
     }
 
     /// Appends a keep-alive. Its sequence number is the one the next message will have
@@ -131,8 +232,21 @@ impl<'b> NetworkMessageEncoder<'b> {
     /// [`EncodeError::MessageCount`] when all announced messages are written.
     pub fn keep_alive(&mut self, header: &DataSetHeader) -> Result<(), EncodeError> {
         self.begin_message()?;
-        write_data_set_header(self.buf, header, message::KIND_KEEP_ALIVE);
+        write_data_set_header(self.buf, header, message::KIND_KEEP_ALIVE, 0);
         self.progress.message_finished(self.buf)
+    }
+
+    /// A message that starts with a FieldCount.
+    #[inline]
+    fn counted(
+        &mut self,
+        header: &DataSetHeader,
+        kind: u8,
+        encoding: u8,
+    ) -> Result<FieldEncoder<'_>, EncodeError> {
+        self.begin_message()?;
+        let offsets = write_data_set_header(self.buf, header, kind, encoding);
+        Ok(FieldEncoder::new(self.buf, &mut self.progress, offsets))
     }
 
     /// Ends the NetworkMessage.
@@ -160,6 +274,12 @@ impl<'b> NetworkMessageEncoder<'b> {
             return Err(EncodeError::MessageCount { announced, written });
         }
         Ok(())
+    }
+
+    /// Position in the buffer of the payload: of the Sizes with several DataSetMessages, else of the DataSetMessage.
+    #[must_use]
+    pub const fn payload_offset(&self) -> usize {
+        self.payload_at
     }
 
     /// Position in the buffer of the NetworkMessage's Timestamp (Int64), for patching it before sending.
@@ -195,11 +315,17 @@ pub(crate) struct Offsets {
 }
 
 #[inline]
-fn write_data_set_header(buf: &mut Vec<u8>, header: &DataSetHeader, kind: u8) -> Offsets {
+fn write_data_set_header(
+    buf: &mut Vec<u8>,
+    header: &DataSetHeader,
+    kind: u8,
+    encoding: u8,
+) -> Offsets {
     let flags2 = kind
         | flag(header.timestamp.is_some(), message::TIMESTAMP)
         | flag(header.picoseconds.is_some(), message::PICOSECONDS);
-    let flags1 = flag(header.valid, message::VALID)
+    let flags1 = encoding
+        | flag(header.valid, message::VALID)
         | flag(header.sequence_number.is_some(), message::SEQUENCE_NUMBER)
         | flag(header.status.is_some(), message::STATUS)
         | flag(header.major_version.is_some(), message::MAJOR_VERSION)

@@ -40,6 +40,15 @@ pub enum DecodeError {
         /// The count.
         value: u32,
     },
+    /// Dimensions whose product is not the number of elements (OPC 10000-6, 5.2.2.16).
+    #[error("array dimensions do not fit its {elements} elements")]
+    Dimensions {
+        /// Elements there are.
+        elements: usize,
+    },
+    /// Values nested in values beyond the 100 levels that are read (OPC 10000-6, 5.2.2.12 and 5.2.2.16).
+    #[error("values nested deeper than 100 levels")]
+    TooDeep,
     /// So many bytes stand after the end of the message and are not zero padding.
     #[error("{0} bytes after the end of the message")]
     TrailingBytes(usize),
@@ -89,9 +98,6 @@ pub enum EncodeError {
         /// Bytes given.
         bytes: usize,
     },
-    /// DataValue, Variant and DiagnosticInfo are not written as values of a Variant.
-    #[error("{0:?} not supported")]
-    Unsupported(BuiltinType),
     /// Structures are nested deeper than [`FieldEncoder::MAX_DEPTH`](crate::FieldEncoder::MAX_DEPTH).
     #[error("structures nested too deep")]
     TooDeep,

@@ -2,14 +2,14 @@
 
 use crate::encoder::{Offsets, Progress};
 use crate::scalar::{BINARY_BODY, Scalar};
-use crate::{BuiltinType, EncodeError, NodeId, Variant, variant, writer};
+use crate::{BuiltinType, DataValue, EncodeError, NodeId, Variant, variant, writer};
 
-/// Appends the fields of one key frame (OPC 10000-14, 7.2.4.5.5).
+/// Appends the fields of one key frame or event as Variants (OPC 10000-14, 7.2.4.5.5 and 7.2.4.5.7).
 ///
 /// Between [`begin_structure`](Self::begin_structure) and [`end_structure`](Self::end_structure) the same calls
 /// write the fields of the structure: values without the encoding byte of a Variant (OPC 10000-6, 5.2.6).
 #[derive(Debug)]
-#[must_use = "a key frame is complete with `finish`"]
+#[must_use = "a message is complete with `finish`"]
 pub struct FieldEncoder<'m> {
     buf: &'m mut Vec<u8>,
     progress: &'m mut Progress,
@@ -23,6 +23,22 @@ pub struct FieldEncoder<'m> {
     depth: usize,
     /// The open structures, outermost first; `depth` of them are in use.
     outer: [Outer; MAX_DEPTH],
+}
+
+/// Appends the fields of one delta frame as Variants (OPC 10000-14, 7.2.4.5.6).
+#[derive(Debug)]
+#[must_use = "a message is complete with `finish`"]
+pub struct DeltaEncoder<'m> {
+    fields: FieldEncoder<'m>,
+    indexes: usize,
+}
+
+/// Appends the fields of one key or delta frame as DataValues.
+#[derive(Debug)]
+#[must_use = "a message is complete with `finish`"]
+pub struct DataValueEncoder<'m> {
+    fields: FieldEncoder<'m>,
+    delta: bool,
 }
 
 /// What is open around a structure.
@@ -140,13 +156,8 @@ impl<'m> FieldEncoder<'m> {
     /// Opens an array; exactly `count` calls of [`element`](Self::element) follow.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] while another array wants elements, [`EncodeError::Unsupported`] for elements
-    /// that are no [`Scalar`], [`EncodeError::TooBig`] past 2^31-1 elements.
+    /// [`EncodeError::Misplaced`] while another array wants elements, [`EncodeError::TooBig`] past 2^31-1 elements.
     pub fn array(&mut self, element: BuiltinType, count: usize) -> Result<(), EncodeError> {
-        if let BuiltinType::DataValue | BuiltinType::Variant | BuiltinType::DiagnosticInfo = element
-        {
-            return Err(EncodeError::Unsupported(element));
-        }
         let wanted = u32::try_from(count).map_err(|_| EncodeError::TooBig {
             what: "array",
             len: count,
@@ -333,6 +344,83 @@ impl<'m> FieldEncoder<'m> {
             _ => self.buf.extend_from_slice(&[a, b, c, d]),
         }
         Ok(())
+    }
+}
+
+impl<'m> DeltaEncoder<'m> {
+    pub(crate) const fn new(fields: FieldEncoder<'m>) -> Self {
+        Self { fields, indexes: 0 }
+    }
+
+    /// The changed field of that position in the DataSetMetaData, from 0; exactly one value is to be written to it.
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] when the field before did not get its one value.
+    pub fn field(&mut self, index: u16) -> Result<&mut FieldEncoder<'m>, EncodeError> {
+        self.check()?;
+        self.fields.buf.extend_from_slice(&index.to_le_bytes());
+        self.indexes += 1;
+        Ok(&mut self.fields)
+    }
+
+    /// Ends the delta frame.
+    ///
+    /// # Errors
+    /// As for [`field`](Self::field) and [`FieldEncoder::finish`].
+    pub fn finish(self) -> Result<(), EncodeError> {
+        self.check()?;
+        self.fields.finish()
+    }
+
+    const fn check(&self) -> Result<(), EncodeError> {
+        let open = self.fields.wanted != 0 || self.fields.depth != 0;
+        if open || self.fields.fields != self.indexes {
+            return Err(EncodeError::Misplaced(
+                "a changed field without exactly one value",
+            ));
+        }
+        Ok(())
+    }
+}
+
+impl<'m> DataValueEncoder<'m> {
+    pub(crate) const fn new(fields: FieldEncoder<'m>, delta: bool) -> Self {
+        Self { fields, delta }
+    }
+
+    /// The next field of a key frame.
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] in a delta frame, [`EncodeError::TooBig`] as for [`FieldEncoder::scalar`].
+    pub fn value(&mut self, value: &DataValue<'_>) -> Result<(), EncodeError> {
+        if self.delta {
+            return Err(EncodeError::Misplaced(
+                "a value without index in a delta frame",
+            ));
+        }
+        self.fields.begin_value()?;
+        value.write(self.fields.buf)
+    }
+
+    /// A changed field of a delta frame, by its position in the DataSetMetaData, from 0.
+    ///
+    /// # Errors
+    /// [`EncodeError::Misplaced`] in a key frame, [`EncodeError::TooBig`] as for [`FieldEncoder::scalar`].
+    pub fn changed(&mut self, index: u16, value: &DataValue<'_>) -> Result<(), EncodeError> {
+        if !self.delta {
+            return Err(EncodeError::Misplaced("an index in a key frame"));
+        }
+        self.fields.begin_value()?;
+        self.fields.buf.extend_from_slice(&index.to_le_bytes());
+        value.write(self.fields.buf)
+    }
+
+    /// Ends the frame.
+    ///
+    /// # Errors
+    /// As for [`FieldEncoder::finish`].
+    pub fn finish(self) -> Result<(), EncodeError> {
+        self.fields.finish()
     }
 }
 

@@ -3,7 +3,8 @@
 use crate::header::{
     self, GroupHeader, NetworkHeader, NetworkMessageType, PublisherId, SecurityHeader,
 };
-use crate::{EncodeError, Variant, writer};
+use crate::writer::{self, flag};
+use crate::{EncodeError, Variant};
 
 /// The headers few NetworkMessages have. The default has none.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -215,13 +216,5 @@ impl SecurityHeader<'_> {
             buf.extend_from_slice(&size.to_le_bytes());
         }
         Ok(())
-    }
-}
-
-#[inline]
-pub(crate) const fn flag(present: bool, bit: u8) -> u8 {
-    match present {
-        true => bit,
-        false => 0,
     }
 }

@@ -58,6 +58,7 @@ mod error;
 mod field_encoder;
 mod header;
 mod header_writer;
+mod nested;
 mod network_message;
 mod node_id;
 mod reader;
@@ -68,15 +69,18 @@ mod variant;
 mod writer;
 
 pub use builtin::{BuiltinType, Guid, StatusCode};
-pub use data_set_message::{DataSetHeader, DataSetMessage, Fields, MessageKind};
+pub use data_set_message::{
+    DataSetHeader, DataSetMessage, FieldEncoding, FieldValue, FieldValues, Fields, MessageKind,
+};
 pub use encoder::NetworkMessageEncoder;
 pub use error::{DecodeError, EncodeError};
-pub use field_encoder::FieldEncoder;
+pub use field_encoder::{DataValueEncoder, DeltaEncoder, FieldEncoder};
 pub use header::{GroupHeader, NetworkHeader, NetworkMessageType, PublisherId, SecurityHeader};
 pub use header_writer::Extras;
+pub use nested::{DataValue, DiagnosticInfo, Encoded};
 pub use network_message::{Chunk, Messages, NetworkMessage, PromotedFields};
 pub use node_id::{ExpandedNodeId, Identifier, NodeId};
 pub use scalar::{ExtensionBody, ExtensionObject, LocalizedText, QualifiedName, Scalar};
 pub use structure::StructureReader;
 pub use time::{DateTime, Timestamp};
-pub use variant::{Array, Elements, Variant};
+pub use variant::{Array, Elements, Matrix, Variant};

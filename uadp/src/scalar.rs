@@ -1,8 +1,9 @@
 //! One value of a builtin type.
 
+use crate::nested::{DataValue, Depth, DiagnosticInfo, Encoded};
 use crate::node_id::{ExpandedNodeId, NodeId};
 use crate::reader::Reader;
-use crate::{BuiltinType, DateTime, DecodeError, EncodeError, Guid, StatusCode, writer};
+use crate::{BuiltinType, DateTime, DecodeError, EncodeError, Guid, StatusCode, Variant, writer};
 
 /// A single value, borrowing from the datagram it was read from.
 ///
@@ -33,6 +34,10 @@ pub enum Scalar<'a> {
     QualifiedName(QualifiedName<'a>),
     LocalizedText(LocalizedText<'a>),
     ExtensionObject(ExtensionObject<'a>),
+    DataValue(Encoded<'a, DataValue<'a>>),
+    /// Only the element of an array: a Variant does not hold a Variant directly (OPC 10000-6, 5.2.2.16).
+    Variant(Encoded<'a, Variant<'a>>),
+    DiagnosticInfo(Encoded<'a, DiagnosticInfo<'a>>),
 }
 
 /// QualifiedName (OPC 10000-6, 5.2.2.13).
@@ -74,7 +79,7 @@ pub enum ExtensionBody<'a> {
 }
 
 impl<'a> Scalar<'a> {
-    /// Type of the value, never DataValue, Variant or DiagnosticInfo.
+    /// Type of the value.
     #[inline]
     #[must_use]
     pub const fn builtin_type(&self) -> BuiltinType {
@@ -101,12 +106,25 @@ impl<'a> Scalar<'a> {
             Self::QualifiedName(_) => BuiltinType::QualifiedName,
             Self::LocalizedText(_) => BuiltinType::LocalizedText,
             Self::ExtensionObject(_) => BuiltinType::ExtensionObject,
+            Self::DataValue(_) => BuiltinType::DataValue,
+            Self::Variant(_) => BuiltinType::Variant,
+            Self::DiagnosticInfo(_) => BuiltinType::DiagnosticInfo,
         }
     }
 
     /// One value in the binary encoding of OPC 10000-6, 5.2.2.
     #[inline]
     pub(crate) fn read(builtin: BuiltinType, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        Self::read_at(builtin, reader, Depth::FULL)
+    }
+
+    /// As [`read`](Self::read), inside of another value.
+    #[inline]
+    pub(crate) fn read_at(
+        builtin: BuiltinType,
+        reader: &mut Reader<'a>,
+        depth: Depth,
+    ) -> Result<Self, DecodeError> {
         Ok(match builtin {
             // The standard takes every byte but 0 as true (OPC 10000-6, 5.2.2.1).
             BuiltinType::Boolean => Self::Boolean(reader.u8("Boolean")? != 0),
@@ -131,8 +149,10 @@ impl<'a> Scalar<'a> {
             BuiltinType::QualifiedName => Self::QualifiedName(QualifiedName::read(reader)?),
             BuiltinType::LocalizedText => Self::LocalizedText(LocalizedText::read(reader)?),
             BuiltinType::ExtensionObject => Self::ExtensionObject(ExtensionObject::read(reader)?),
-            BuiltinType::DataValue | BuiltinType::Variant | BuiltinType::DiagnosticInfo => {
-                return Err(DecodeError::Unsupported(builtin.name()));
+            BuiltinType::DataValue => Self::DataValue(Encoded::read(reader, depth.inner()?)?),
+            BuiltinType::Variant => Self::Variant(Encoded::read(reader, depth.inner()?)?),
+            BuiltinType::DiagnosticInfo => {
+                Self::DiagnosticInfo(Encoded::read(reader, depth.inner()?)?)
             }
         })
     }
@@ -182,6 +202,12 @@ impl<'a> Scalar<'a> {
                 write_tag::<TAGGED>(out, builtin);
                 return object.write(out);
             }
+            Self::DataValue(value) => write_bytes::<TAGGED>(out, builtin, value.bytes()),
+            Self::Variant(_) if TAGGED => {
+                return Err(EncodeError::Misplaced("a Variant directly in a Variant"));
+            }
+            Self::Variant(value) => out.extend_from_slice(value.bytes()),
+            Self::DiagnosticInfo(value) => write_bytes::<TAGGED>(out, builtin, value.bytes()),
         }
         Ok(())
     }
@@ -192,6 +218,11 @@ fn write_tag<const TAGGED: bool>(out: &mut Vec<u8>, builtin: BuiltinType) {
     if TAGGED {
         out.push(builtin.id());
     }
+}
+
+fn write_bytes<const TAGGED: bool>(out: &mut Vec<u8>, builtin: BuiltinType, bytes: &[u8]) {
+    write_tag::<TAGGED>(out, builtin);
+    out.extend_from_slice(bytes);
 }
 
 fn write_text<const TAGGED: bool>(

@@ -1,5 +1,6 @@
-//! Variant: a value together with its type, or a one-dimensional array of such.
+//! Variant: a value together with its type, or an array of such in one or more dimensions.
 
+use crate::nested::Depth;
 use crate::reader::Reader;
 use crate::scalar::Scalar;
 use crate::{BuiltinType, DecodeError, EncodeError, writer};
@@ -13,6 +14,15 @@ pub enum Variant<'a> {
     Scalar(Scalar<'a>),
     /// A one-dimensional array, which may be null or empty.
     Array(Array<'a>),
+    /// An array that says its dimensions.
+    Matrix(Matrix<'a>),
+}
+
+/// A multi-dimensional array (OPC 10000-6, 5.2.2.16). The number of elements is the product of the dimensions.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Matrix<'a> {
+    elements: Array<'a>,
+    dimensions: &'a [[u8; 4]],
 }
 
 /// A one-dimensional array whose elements were checked when it was made.
@@ -42,19 +52,27 @@ impl<'a> Variant<'a> {
             Self::Null => None,
             Self::Scalar(scalar) => Some(scalar.builtin_type()),
             Self::Array(array) => Some(array.element),
+            Self::Matrix(matrix) => Some(matrix.elements.element),
         }
     }
 
     #[inline]
     pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        Self::read_at(reader, Depth::FULL)
+    }
+
+    /// As [`read`](Self::read), inside of another value.
+    #[inline]
+    pub(crate) fn read_at(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
         let encoding = reader.u8("Variant")?;
         let Some(builtin) = BuiltinType::from_id(encoding & TYPE_ID) else {
             return Self::read_untyped(encoding);
         };
         match encoding & !TYPE_ID {
-            0 => Scalar::read(builtin, reader).map(Self::Scalar),
-            ARRAY => Array::read(builtin, reader).map(Self::Array),
-            MATRIX => Err(DecodeError::Unsupported("multi-dimensional array")),
+            0 if builtin == BuiltinType::Variant => Err(VARIANT_IN_VARIANT),
+            0 => Scalar::read_at(builtin, reader, depth).map(Self::Scalar),
+            ARRAY => Array::read_at(builtin, reader, depth).map(Self::Array),
+            MATRIX => Matrix::read_at(builtin, reader, depth).map(Self::Matrix),
             _ => Err(DecodeError::Reserved {
                 field: "Variant encoding",
                 value: encoding.into(),
@@ -89,6 +107,10 @@ impl<'a> Variant<'a> {
                 out.push(array.element.id() | ARRAY);
                 array.write(out)
             }
+            Self::Matrix(matrix) => {
+                out.push(matrix.elements.element.id() | MATRIX);
+                matrix.write(out)
+            }
         }
     }
 }
@@ -102,6 +124,80 @@ impl<'a> From<Scalar<'a>> for Variant<'a> {
 impl<'a> From<Array<'a>> for Variant<'a> {
     fn from(array: Array<'a>) -> Self {
         Self::Array(array)
+    }
+}
+
+impl<'a> From<Matrix<'a>> for Variant<'a> {
+    fn from(matrix: Matrix<'a>) -> Self {
+        Self::Matrix(matrix)
+    }
+}
+
+impl<'a> Matrix<'a> {
+    /// A matrix of elements in row-major order; each dimension a little-endian Int32, the outermost first.
+    ///
+    /// # Errors
+    /// [`DecodeError::Dimensions`] when the product of the dimensions is not the number of elements, or one is
+    /// negative.
+    pub fn new(elements: Array<'a>, dimensions: &'a [[u8; 4]]) -> Result<Self, DecodeError> {
+        let elements_wanted = dimensions.iter().try_fold(1_usize, |product, dimension| {
+            let dimension = usize::try_from(i32::from_le_bytes(*dimension)).ok()?;
+            product.checked_mul(dimension)
+        });
+        // No dimensions at all say nothing about an array that is null or has one element.
+        match elements_wanted {
+            Some(wanted) if wanted == elements.len => Ok(Self {
+                elements,
+                dimensions,
+            }),
+            _ if dimensions.is_empty() && elements.is_empty() => Ok(Self {
+                elements,
+                dimensions,
+            }),
+            _ => Err(DecodeError::Dimensions {
+                elements: elements.len,
+            }),
+        }
+    }
+
+    /// The elements in row-major order.
+    #[inline]
+    #[must_use]
+    pub const fn elements(&self) -> Array<'a> {
+        self.elements
+    }
+
+    /// Size of each dimension, the outermost first.
+    #[must_use]
+    pub fn dimensions(&self) -> impl ExactSizeIterator<Item = u32> + Clone + use<'a> {
+        self.dimensions.iter().map(|size| u32::from_le_bytes(*size))
+    }
+
+    /// The elements as an array, then the dimensions as one.
+    fn read_at(
+        element: BuiltinType,
+        reader: &mut Reader<'a>,
+        depth: Depth,
+    ) -> Result<Self, DecodeError> {
+        let elements = Array::read_at(element, reader, depth)?;
+        let count = reader.length("ArrayDimensions")?.unwrap_or_default();
+        let (dimensions, _) = match count.checked_mul(4) {
+            Some(size) => reader.bytes(size, "ArrayDimensions")?.as_chunks(),
+            None => {
+                return Err(DecodeError::Dimensions {
+                    elements: elements.len,
+                });
+            }
+        };
+        Self::new(elements, dimensions)
+    }
+
+    fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
+        self.elements.write(out)?;
+        let count = writer::int32_length(self.dimensions.len(), "ArrayDimensions")?;
+        out.extend_from_slice(&count);
+        out.extend_from_slice(self.dimensions.as_flattened());
+        Ok(())
     }
 }
 
@@ -123,7 +219,7 @@ impl<'a> Array<'a> {
     /// Fails when the bytes are not exactly that many well-formed elements.
     pub fn new(element: BuiltinType, len: usize, bytes: &'a [u8]) -> Result<Self, DecodeError> {
         let mut reader = Reader::new(bytes);
-        let array = Self::read_elements(element, len, &mut reader)?;
+        let array = Self::read_elements(element, len, &mut reader, Depth::FULL)?;
         match reader.remaining() {
             0 => Ok(array),
             left => Err(DecodeError::TrailingBytes(left)),
@@ -176,8 +272,16 @@ impl<'a> Array<'a> {
 
     /// Int32 length and elements (OPC 10000-6, 5.2.5).
     pub(crate) fn read(element: BuiltinType, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        Self::read_at(element, reader, Depth::FULL)
+    }
+
+    fn read_at(
+        element: BuiltinType,
+        reader: &mut Reader<'a>,
+        depth: Depth,
+    ) -> Result<Self, DecodeError> {
         match reader.length("array length")? {
-            Some(len) => Self::read_elements(element, len, reader),
+            Some(len) => Self::read_elements(element, len, reader, depth),
             None => Ok(Self::null(element)),
         }
     }
@@ -186,13 +290,8 @@ impl<'a> Array<'a> {
         element: BuiltinType,
         len: usize,
         reader: &mut Reader<'a>,
+        depth: Depth,
     ) -> Result<Self, DecodeError> {
-        if matches!(
-            element,
-            BuiltinType::DataValue | BuiltinType::Variant | BuiltinType::DiagnosticInfo
-        ) {
-            return Err(DecodeError::Unsupported(element.name()));
-        }
         let limit = DecodeError::Limit {
             field: "array length",
             value: u32::try_from(len).unwrap_or(u32::MAX),
@@ -206,7 +305,7 @@ impl<'a> Array<'a> {
         } else {
             let before = *reader;
             for _ in 0..len {
-                Scalar::read(element, reader)?;
+                Scalar::read_at(element, reader, depth)?;
             }
             reader.since(&before)
         };
@@ -266,9 +365,14 @@ impl<'a> Iterator for Elements<'a> {
 
 impl ExactSizeIterator for Elements<'_> {}
 
+const VARIANT_IN_VARIANT: DecodeError = DecodeError::Reserved {
+    field: "Variant directly in a Variant",
+    value: 24,
+};
+
 /// Bits 0 to 5 of the encoding byte.
 const TYPE_ID: u8 = 0x3F;
 /// Bit 7: the value is an array.
 pub(crate) const ARRAY: u8 = 0x80;
 /// Bits 7 and 6: dimensions follow the elements.
-const MATRIX: u8 = 0xC0;
+pub(crate) const MATRIX: u8 = 0xC0;

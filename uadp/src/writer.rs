@@ -60,5 +60,14 @@ pub(crate) fn patch<const N: usize>(out: &mut [u8], at: usize, value: [u8; N]) {
     }
 }
 
+/// `bit` where what it announces is present.
+#[inline]
+pub(crate) const fn flag(present: bool, bit: u8) -> u8 {
+    match present {
+        true => bit,
+        false => 0,
+    }
+}
+
 /// Length of a null String, ByteString or array.
 pub(crate) const NULL_LENGTH: [u8; 4] = (-1_i32).to_le_bytes();

@@ -39,7 +39,10 @@ fn a_heartbeat_has_no_fields_with_and_without_a_field_count() {
     assert_eq!(fields(&[0x01, 0, 0]), Ok(vec![]));
     assert_eq!(
         fields(&[0x01, 0]),
-        Err(DecodeError::Truncated { field: "FieldCount", .. })
+        Err(DecodeError::Truncated {
+            field: "FieldCount",
+            ..
+        })
     );
 }
 
@@ -132,14 +135,23 @@ fn sizes_past_the_datagram_and_bytes_behind_the_last_message_are_errors() {
     let errors: Vec<_> = messages(&long).into_iter().map(Result::err).collect();
     assert_eq!(
         errors,
-        [None, Some(DecodeError::Truncated { field: "DataSetMessage", .. })]
+        [
+            None,
+            Some(DecodeError::Truncated {
+                field: "DataSetMessage",
+                ..
+            })
+        ]
     );
     let short = [0x41, 2, 1, 0, 2, 0, 1, 0, 1, 0, 0x01, 0x01, 0];
     let errors: Vec<_> = messages(&short).into_iter().map(Result::err).collect();
     assert_eq!(errors, [None, None, Some(DecodeError::TrailingBytes(1))]);
     let cut = [0x41, 2, 1, 0, 2, 0, 1, 0, 1];
     let errors: Vec<_> = messages(&cut).into_iter().map(Result::err).collect();
-    assert_eq!(errors, [Some(DecodeError::Truncated { field: "Sizes", .. })]);
+    assert_eq!(
+        errors,
+        [Some(DecodeError::Truncated { field: "Sizes", .. })]
+    );
 }
 
 #[test]

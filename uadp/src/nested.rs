@@ -1,0 +1,386 @@
+//! Values that hold values: DataValue, DiagnosticInfo, and Variants inside of Variants.
+
+use std::fmt;
+use std::marker::PhantomData;
+
+use crate::reader::Reader;
+use crate::{DateTime, DecodeError, EncodeError, StatusCode, Variant, writer};
+
+/// DataValue (OPC 10000-6, 5.2.2.17): a value with its quality and its times. What is `None` is not on the wire.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct DataValue<'a> {
+    /// The value.
+    pub value: Option<Variant<'a>>,
+    /// Quality; left out for Good.
+    pub status: Option<StatusCode>,
+    /// When the source took the value.
+    pub source_timestamp: Option<DateTime>,
+    /// Refines the source's time, in units of 10 ps.
+    pub source_picoseconds: Option<u16>,
+    /// When the server or publisher got the value.
+    pub server_timestamp: Option<DateTime>,
+    /// Refines the server's time, in units of 10 ps.
+    pub server_picoseconds: Option<u16>,
+}
+
+/// DiagnosticInfo (OPC 10000-6, 5.2.2.12). What is `None` is not on the wire; the first four are indexes into a
+/// table of strings that comes with the message that carries them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct DiagnosticInfo<'a> {
+    /// Name of the error.
+    pub symbolic_id: Option<i32>,
+    /// Namespace of the name.
+    pub namespace_uri: Option<i32>,
+    /// Language of the text.
+    pub locale: Option<i32>,
+    /// Text for a reader.
+    pub localized_text: Option<i32>,
+    /// More, in words of the sender. The inner `None` is the null String.
+    pub additional_info: Option<Option<&'a str>>,
+    /// StatusCode of the system below.
+    pub inner_status_code: Option<StatusCode>,
+    /// What the system below says.
+    pub inner: Option<Encoded<'a, DiagnosticInfo<'a>>>,
+}
+
+/// A value of type `T` as its bytes, which were checked when this was made: nesting needs no allocation.
+///
+/// Equality is that of the bytes.
+pub struct Encoded<'a, T> {
+    bytes: &'a [u8],
+    value: PhantomData<fn() -> T>,
+}
+
+/// What can stand inside of another value.
+pub(crate) trait Nest<'a>: Sized {
+    fn read_nested(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError>;
+}
+
+/// How many levels a value may still hold.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Depth(u8);
+
+impl Depth {
+    /// The standard asks decoders for 100 levels and for an error beyond what they have (OPC 10000-6, 5.2.2.12
+    /// and 5.2.2.16).
+    pub(crate) const FULL: Self = Self(100);
+
+    #[inline]
+    pub(crate) fn inner(self) -> Result<Self, DecodeError> {
+        match self.0.checked_sub(1) {
+            Some(left) => Ok(Self(left)),
+            None => Err(DecodeError::TooDeep),
+        }
+    }
+}
+
+#[expect(private_bounds, reason = "the three values that nest are all of them")]
+impl<'a, T: Nest<'a>> Encoded<'a, T> {
+    /// Checks that the bytes are exactly one value.
+    ///
+    /// # Errors
+    /// Fails where reading the value does, and for bytes behind it.
+    pub fn new(bytes: &'a [u8]) -> Result<Self, DecodeError> {
+        let mut reader = Reader::new(bytes);
+        let encoded = Self::read(&mut reader, Depth::FULL)?;
+        match reader.remaining() {
+            0 => Ok(encoded),
+            left => Err(DecodeError::TrailingBytes(left)),
+        }
+    }
+
+    /// The value; values inside of it are given as their bytes again.
+    ///
+    /// # Errors
+    /// None: the bytes were read once before. The type says so because nothing here may panic.
+    pub fn get(self) -> Result<T, DecodeError> {
+        T::read_nested(&mut Reader::new(self.bytes), Depth::FULL)
+    }
+
+    pub(crate) fn read(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
+        let before = *reader;
+        T::read_nested(reader, depth)?;
+        Ok(Self {
+            bytes: reader.since(&before),
+            value: PhantomData,
+        })
+    }
+}
+
+impl<'a, T> Encoded<'a, T> {
+    /// The value as on the wire.
+    #[must_use]
+    pub const fn bytes(self) -> &'a [u8] {
+        self.bytes
+    }
+}
+
+impl<'a> Encoded<'a, Variant<'a>> {
+    /// Writes a Variant into `buffer`, from its start, as the element of an array of Variants.
+    ///
+    /// # Errors
+    /// As writing the value does.
+    pub fn variant(value: &Variant<'_>, buffer: &'a mut Vec<u8>) -> Result<Self, EncodeError> {
+        buffer.clear();
+        value.write(buffer)?;
+        Ok(Self::written(buffer))
+    }
+}
+
+impl<'a> Encoded<'a, DataValue<'a>> {
+    /// Writes a DataValue into `buffer`, from its start.
+    ///
+    /// # Errors
+    /// As writing the value does.
+    pub fn data_value(value: &DataValue<'_>, buffer: &'a mut Vec<u8>) -> Result<Self, EncodeError> {
+        buffer.clear();
+        value.write(buffer)?;
+        Ok(Self::written(buffer))
+    }
+}
+
+impl<'a> Encoded<'a, DiagnosticInfo<'a>> {
+    /// Writes a DiagnosticInfo into `buffer`, from its start.
+    ///
+    /// # Errors
+    /// [`EncodeError::TooBig`] for a text that is too long.
+    pub fn diagnostic_info(
+        value: &DiagnosticInfo<'_>,
+        buffer: &'a mut Vec<u8>,
+    ) -> Result<Self, EncodeError> {
+        buffer.clear();
+        value.write(buffer)?;
+        Ok(Self::written(buffer))
+    }
+}
+
+impl<'a, T> Encoded<'a, T> {
+    const fn written(bytes: &'a [u8]) -> Self {
+        Self {
+            bytes,
+            value: PhantomData,
+        }
+    }
+}
+
+impl<T> Clone for Encoded<'_, T> {
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<T> Copy for Encoded<'_, T> {}
+
+impl<T> PartialEq for Encoded<'_, T> {
+    fn eq(&self, other: &Self) -> bool {
+        self.bytes == other.bytes
+    }
+}
+
+impl<T> Eq for Encoded<'_, T> {}
+
+#[expect(private_bounds, reason = "the three values that nest are all of them")]
+impl<'a, T: Nest<'a> + fmt::Debug> fmt::Debug for Encoded<'a, T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.get() {
+            Ok(value) => value.fmt(f),
+            Err(_) => self.bytes.fmt(f),
+        }
+    }
+}
+
+impl<'a> Nest<'a> for Variant<'a> {
+    fn read_nested(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
+        Self::read_at(reader, depth)
+    }
+}
+
+impl<'a> Nest<'a> for DataValue<'a> {
+    fn read_nested(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
+        Self::read_at(reader, depth)
+    }
+}
+
+impl<'a> DataValue<'a> {
+    #[inline]
+    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        Self::read_at(reader, Depth::FULL)
+    }
+
+    fn read_at(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
+        let mask = reader.u8("DataValue")?;
+        let reserved = mask & DATA_VALUE_RESERVED;
+        if reserved != 0 {
+            return Err(DecodeError::Reserved {
+                field: "DataValue encoding mask",
+                value: reserved.into(),
+            });
+        }
+        let value = match mask & VALUE {
+            0 => None,
+            _ => Some(Variant::read_at(reader, depth)?),
+        };
+        let status = match mask & STATUS {
+            0 => None,
+            _ => Some(StatusCode(reader.u32("DataValue Status")?)),
+        };
+        let (source_timestamp, source_picoseconds) =
+            read_time(mask & SOURCE_TIMESTAMP, mask & SOURCE_PICOSECONDS, reader)?;
+        let (server_timestamp, server_picoseconds) =
+            read_time(mask & SERVER_TIMESTAMP, mask & SERVER_PICOSECONDS, reader)?;
+        Ok(Self {
+            value,
+            status,
+            source_timestamp,
+            source_picoseconds,
+            server_timestamp,
+            server_picoseconds,
+        })
+    }
+
+    pub(crate) fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
+        let mask = writer::flag(self.value.is_some(), VALUE)
+            | writer::flag(self.status.is_some(), STATUS)
+            | writer::flag(self.source_timestamp.is_some(), SOURCE_TIMESTAMP)
+            | writer::flag(self.source_picoseconds.is_some(), SOURCE_PICOSECONDS)
+            | writer::flag(self.server_timestamp.is_some(), SERVER_TIMESTAMP)
+            | writer::flag(self.server_picoseconds.is_some(), SERVER_PICOSECONDS);
+        out.push(mask);
+        if let Some(value) = &self.value {
+            value.write(out)?;
+        }
+        if let Some(status) = self.status {
+            out.extend_from_slice(&status.0.to_le_bytes());
+        }
+        write_time(self.source_timestamp, self.source_picoseconds, out);
+        write_time(self.server_timestamp, self.server_picoseconds, out);
+        Ok(())
+    }
+}
+
+impl<'a> From<Variant<'a>> for DataValue<'a> {
+    fn from(value: Variant<'a>) -> Self {
+        Self {
+            value: Some(value),
+            ..Self::default()
+        }
+    }
+}
+
+fn read_time(
+    timestamp: u8,
+    picoseconds: u8,
+    reader: &mut Reader<'_>,
+) -> Result<(Option<DateTime>, Option<u16>), DecodeError> {
+    let timestamp = match timestamp {
+        0 => None,
+        _ => Some(DateTime(reader.i64("DataValue Timestamp")?)),
+    };
+    let picoseconds = match picoseconds {
+        0 => None,
+        _ => Some(reader.u16("DataValue PicoSeconds")?),
+    };
+    Ok((timestamp, picoseconds))
+}
+
+fn write_time(timestamp: Option<DateTime>, picoseconds: Option<u16>, out: &mut Vec<u8>) {
+    if let Some(timestamp) = timestamp {
+        out.extend_from_slice(&timestamp.0.to_le_bytes());
+    }
+    if let Some(picoseconds) = picoseconds {
+        out.extend_from_slice(&picoseconds.to_le_bytes());
+    }
+}
+
+impl<'a> Nest<'a> for DiagnosticInfo<'a> {
+    fn read_nested(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
+        let mask = reader.u8("DiagnosticInfo")?;
+        if mask & DIAGNOSTIC_RESERVED != 0 {
+            return Err(DecodeError::Reserved {
+                field: "DiagnosticInfo encoding mask",
+                value: (mask & DIAGNOSTIC_RESERVED).into(),
+            });
+        }
+        let mut index = |bit, what| match mask & bit {
+            0 => Ok(None),
+            _ => reader.i32(what).map(Some),
+        };
+        let symbolic_id = index(SYMBOLIC_ID, "DiagnosticInfo SymbolicId")?;
+        let namespace_uri = index(NAMESPACE_URI, "DiagnosticInfo NamespaceUri")?;
+        let locale = index(LOCALE, "DiagnosticInfo Locale")?;
+        let localized_text = index(LOCALIZED_TEXT, "DiagnosticInfo LocalizedText")?;
+        let additional_info = match mask & ADDITIONAL_INFO {
+            0 => None,
+            _ => Some(reader.text("DiagnosticInfo AdditionalInfo")?),
+        };
+        let inner_status_code = match mask & INNER_STATUS_CODE {
+            0 => None,
+            _ => Some(StatusCode(reader.u32("DiagnosticInfo InnerStatusCode")?)),
+        };
+        let inner = match mask & INNER {
+            0 => None,
+            _ => Some(Encoded::read(reader, depth.inner()?)?),
+        };
+        Ok(Self {
+            symbolic_id,
+            namespace_uri,
+            locale,
+            localized_text,
+            additional_info,
+            inner_status_code,
+            inner,
+        })
+    }
+}
+
+impl DiagnosticInfo<'_> {
+    fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
+        let indexes = [
+            (self.symbolic_id, SYMBOLIC_ID),
+            (self.namespace_uri, NAMESPACE_URI),
+            (self.locale, LOCALE),
+            (self.localized_text, LOCALIZED_TEXT),
+        ];
+        let mask = indexes
+            .iter()
+            .map(|(index, bit)| writer::flag(index.is_some(), *bit))
+            .fold(0, |mask, bit| mask | bit)
+            | writer::flag(self.additional_info.is_some(), ADDITIONAL_INFO)
+            | writer::flag(self.inner_status_code.is_some(), INNER_STATUS_CODE)
+            | writer::flag(self.inner.is_some(), INNER);
+        out.push(mask);
+        for (index, _) in indexes {
+            if let Some(index) = index {
+                out.extend_from_slice(&index.to_le_bytes());
+            }
+        }
+        if let Some(text) = self.additional_info {
+            let text = text.map(str::as_bytes);
+            writer::byte_string(out, text, "DiagnosticInfo AdditionalInfo")?;
+        }
+        if let Some(status) = self.inner_status_code {
+            out.extend_from_slice(&status.0.to_le_bytes());
+        }
+        if let Some(inner) = self.inner {
+            out.extend_from_slice(inner.bytes);
+        }
+        Ok(())
+    }
+}
+
+const VALUE: u8 = 0x01;
+const STATUS: u8 = 0x02;
+const SOURCE_TIMESTAMP: u8 = 0x04;
+const SERVER_TIMESTAMP: u8 = 0x08;
+const SOURCE_PICOSECONDS: u8 = 0x10;
+const SERVER_PICOSECONDS: u8 = 0x20;
+const DATA_VALUE_RESERVED: u8 = 0xC0;
+
+const SYMBOLIC_ID: u8 = 0x01;
+const NAMESPACE_URI: u8 = 0x02;
+const LOCALIZED_TEXT: u8 = 0x04;
+const LOCALE: u8 = 0x08;
+const ADDITIONAL_INFO: u8 = 0x10;
+const INNER_STATUS_CODE: u8 = 0x20;
+const INNER: u8 = 0x40;
+const DIAGNOSTIC_RESERVED: u8 = 0x80;
