@@ -179,7 +179,6 @@ impl<T> PartialEq for Encoded<'_, T> {
 
 impl<T> Eq for Encoded<'_, T> {}
 
-#[expect(private_bounds, reason = "the three values that nest are all of them")]
 impl<'a, T: Nest<'a> + fmt::Debug> fmt::Debug for Encoded<'a, T> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.get() {
