@@ -233,6 +233,12 @@ impl<'a> NetworkMessage<'a> {
         self.payload.rest()
     }
 
+    /// Where the payload starts in the datagram.
+    #[must_use]
+    pub const fn payload_offset(&self) -> usize {
+        self.payload_at
+    }
+
     /// All bytes, from the first flags on.
     #[must_use]
     pub const fn datagram(&self) -> &'a [u8] {

@@ -24,6 +24,11 @@ impl<'a> Reader<'a> {
         self.rest.len()
     }
 
+    /// How many bytes were read since `before`, an earlier copy of this reader.
+    pub(crate) const fn since_start(&self, before: &Self) -> usize {
+        before.rest.len().saturating_sub(self.rest.len())
+    }
+
     /// What was read since `before`, an earlier copy of this reader.
     pub(crate) fn since(&self, before: &Self) -> &'a [u8] {
         let read = before.rest.len().saturating_sub(self.rest.len());

@@ -1,0 +1,107 @@
+//! Measures the codec: without arguments wall time, with `count CASE N` just work for an instruction counter.
+
+mod ours;
+
+use std::hint::black_box;
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use ours::Payload;
+
+/// Of so many rounds the fastest counts: what is slower was disturbed.
+const ROUNDS: u32 = 15;
+const MESSAGES: u32 = 100_000;
+
+/// What is measured, by a name for tables and the command line.
+struct Case {
+    name: String,
+    work: Box<dyn FnMut(u32)>,
+}
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    match arguments[..] {
+        [] => {
+            wall(&mut cases());
+            ExitCode::SUCCESS
+        }
+        ["list"] => {
+            for case in cases() {
+                println!("{}", case.name);
+            }
+            ExitCode::SUCCESS
+        }
+        ["count", name, messages] => {
+            let mut cases = cases();
+            let case = cases.iter_mut().find(|case| case.name == name);
+            match (case, messages.parse()) {
+                (Some(case), Ok(messages)) => {
+                    (case.work)(messages);
+                    ExitCode::SUCCESS
+                }
+                _ => usage(),
+            }
+        }
+        _ => usage(),
+    }
+}
+
+fn usage() -> ExitCode {
+    eprintln!("usage: uadp-bench [list | count CASE MESSAGES]");
+    ExitCode::from(64)
+}
+
+fn cases() -> Vec<Case> {
+    let mut cases = Vec::new();
+    for payload in Payload::ALL {
+        let name = payload.name();
+        let mut datagram = Vec::with_capacity(2048);
+        cases.push(case("encode", name, move |messages| {
+            for number in 0..messages {
+                ours::encode(payload, number as u16, &mut datagram);
+                black_box(&datagram);
+            }
+        }));
+        let mut datagram = Vec::new();
+        ours::encode(payload, 7, &mut datagram);
+        cases.push(case("decode", name, move |messages| {
+            for _ in 0..messages {
+                black_box(ours::decode(black_box(&datagram)));
+            }
+        }));
+        if payload != Payload::Bytes {
+            let mut template = ours::template(payload);
+            cases.push(case("patch", name, move |messages| {
+                for number in 0..messages {
+                    ours::patch(payload, number as u16, &mut template);
+                    black_box(template.bytes());
+                }
+            }));
+        }
+    }
+    cases
+}
+
+fn case(what: &str, payload: &str, work: impl FnMut(u32) + 'static) -> Case {
+    Case {
+        name: format!("{what} {payload}"),
+        work: Box::new(work),
+    }
+}
+
+/// The cases in turn, so that all of them see the same machine.
+fn wall(cases: &mut [Case]) {
+    let mut best = vec![Duration::MAX; cases.len()];
+    for _ in 0..ROUNDS {
+        for (case, best) in cases.iter_mut().zip(&mut best) {
+            let start = Instant::now();
+            (case.work)(MESSAGES);
+            *best = start.elapsed().min(*best);
+        }
+    }
+    for (case, best) in cases.iter().zip(best) {
+        let nanos = best.as_secs_f64() * 1e9 / f64::from(MESSAGES);
+        println!("{:<32} {nanos:8.1} ns", case.name);
+    }
+}

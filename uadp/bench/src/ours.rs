@@ -1,0 +1,120 @@
+//! The payloads and what is measured of them, with `uadp`.
+
+use std::hint::black_box;
+
+use uadp::{
+    DataSetHeader, DateTime, GroupHeader, MessageTemplate, NetworkHeader, NetworkMessage,
+    NetworkMessageEncoder, PublisherId, Scalar, Variant,
+};
+
+/// What a message holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Payload {
+    /// One Double.
+    Double,
+    /// 20 Int32.
+    Ints,
+    /// A ByteString of 1 KiB.
+    Bytes,
+}
+
+impl Payload {
+    pub(crate) const ALL: [Self; 3] = [Self::Double, Self::Ints, Self::Bytes];
+
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Double => "1 Double",
+            Self::Ints => "20 Int32",
+            Self::Bytes => "1 KiB ByteString",
+        }
+    }
+}
+
+pub(crate) const BLOB: [u8; 1024] = [0x5A; 1024];
+
+/// Encodes message number `number` into the buffer, from its start.
+#[inline(never)]
+pub(crate) fn encode(payload: Payload, number: u16, datagram: &mut Vec<u8>) {
+    datagram.clear();
+    let header = NetworkHeader {
+        publisher_id: Some(PublisherId::UInt16(2)),
+        group: Some(GroupHeader {
+            writer_group_id: Some(5),
+            ..GroupHeader::default()
+        }),
+        ..NetworkHeader::default()
+    };
+    let data_set_header = DataSetHeader {
+        sequence_number: Some(number),
+        timestamp: Some(DateTime(134_234_948_967_890_123)),
+        status: Some(0),
+        ..DataSetHeader::default()
+    };
+    let mut message = NetworkMessageEncoder::new(datagram, &header, Some(&[10])).unwrap();
+    let mut fields = message.key_frame(&data_set_header).unwrap();
+    match payload {
+        Payload::Double => fields.scalar(Scalar::Double(f64::from(number))).unwrap(),
+        Payload::Ints => {
+            for index in 0..20 {
+                fields
+                    .scalar(Scalar::Int32(index + i32::from(number)))
+                    .unwrap();
+            }
+        }
+        Payload::Bytes => fields.scalar(Scalar::ByteString(Some(&BLOB))).unwrap(),
+    }
+    fields.finish().unwrap();
+    message.finish().unwrap();
+}
+
+/// Reads the headers and every field; the sum of what was seen.
+#[inline(never)]
+pub(crate) fn decode(datagram: &[u8]) -> u64 {
+    let network = NetworkMessage::decode(datagram).unwrap();
+    let mut seen = match network.header().publisher_id {
+        Some(PublisherId::UInt16(id)) => u64::from(id),
+        _ => 0,
+    };
+    for message in network.messages() {
+        let message = message.unwrap();
+        seen += u64::from(message.writer_id.unwrap_or_default());
+        seen += u64::from(message.header.sequence_number.unwrap_or_default());
+        for field in message.fields().unwrap() {
+            seen = seen.wrapping_add(match field.unwrap() {
+                Variant::Scalar(Scalar::Double(value)) => value.to_bits(),
+                Variant::Scalar(Scalar::Int32(value)) => value.unsigned_abs().into(),
+                Variant::Scalar(Scalar::ByteString(Some(bytes))) => {
+                    u64::from(*black_box(bytes).last().unwrap())
+                }
+                _ => 0,
+            });
+        }
+    }
+    seen
+}
+
+/// A template of the payload, for [`patch`].
+pub(crate) fn template(payload: Payload) -> MessageTemplate {
+    let mut datagram = Vec::new();
+    encode(payload, 0, &mut datagram);
+    MessageTemplate::new(datagram).unwrap()
+}
+
+/// Replaces the sequence number, the time and all fields.
+#[inline(never)]
+pub(crate) fn patch(payload: Payload, number: u16, template: &mut MessageTemplate) {
+    let mut message = template.message(0).unwrap();
+    message.sequence_number(number).unwrap();
+    message
+        .timestamp(DateTime(134_234_948_967_890_123))
+        .unwrap();
+    match payload {
+        Payload::Double => message.field(0, Scalar::Double(f64::from(number))).unwrap(),
+        Payload::Ints => {
+            let base = i32::from(number);
+            let values: [i32; 20] = std::array::from_fn(|index| base + index as i32);
+            message.fields(0, &values).unwrap();
+        }
+        Payload::Bytes => {}
+    }
+}
