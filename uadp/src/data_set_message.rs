@@ -5,16 +5,14 @@ use crate::{DataValue, DateTime, DecodeError, Variant};
 
 /// One DataSetMessage whose header was read (OPC 10000-14, 7.2.4.5.4).
 ///
-/// With [`header.valid`](DataSetHeader::valid) false the standard forbids to process the rest: skip it.
+/// Where [`is_valid`](Self::is_valid) is false the standard forbids to process the rest: skip it.
 #[derive(Debug, Clone)]
 pub struct DataSetMessage<'a> {
     /// DataSetWriter within the publisher; `None` without payload header.
     pub writer_id: Option<u16>,
-    /// The header fields.
-    pub header: DataSetHeader,
     /// What the payload is.
     pub kind: MessageKind,
-    encoding: FieldEncoding,
+    head: Head<'a>,
     payload: Reader<'a>,
 }
 
@@ -118,34 +116,46 @@ impl<'a> DataSetMessage<'a> {
     ) -> Result<Self, DecodeError> {
         let flags1 = reader.u8("DataSetFlags1")?;
         let valid = flags1 & VALID != 0;
-        let head = match Head::read(flags1, &mut reader) {
-            Ok(head) => head,
+        let (head, kind) = match Head::read(flags1, &mut reader) {
+            Ok(read) => read,
             // Nothing behind a cleared valid bit means anything, not even the flags.
-            Err(_) if !valid => Head::INVALID,
+            Err(_) if !valid => (Head::INVALID, MessageKind::KeyFrame),
             Err(error) => return Err(error),
         };
-        if valid && head.kind == MessageKind::KeepAlive {
+        if valid && kind == MessageKind::KeepAlive {
             check_padding(reader.rest())?;
         }
-        let Head {
-            header,
-            kind,
-            encoding,
-        } = head;
         Ok(Self {
             writer_id,
-            header,
             kind,
-            encoding,
+            head,
             payload: reader,
         })
+    }
+
+    /// The header fields.
+    #[inline]
+    #[must_use]
+    pub fn header(&self) -> DataSetHeader {
+        self.head.fields()
+    }
+
+    /// False: the publisher could not make the message; nothing else in it counts.
+    #[inline]
+    #[must_use]
+    pub const fn is_valid(&self) -> bool {
+        self.head.flags1 & VALID != 0
     }
 
     /// How the fields are encoded.
     #[inline]
     #[must_use]
     pub const fn encoding(&self) -> FieldEncoding {
-        self.encoding
+        match self.head.flags1 & FIELD_ENCODING {
+            RAW_FIELDS => FieldEncoding::RawData,
+            DATA_VALUE_FIELDS => FieldEncoding::DataValue,
+            _ => FieldEncoding::Variant,
+        }
     }
 
     /// What stands behind the header, padding included.
@@ -163,7 +173,7 @@ impl<'a> DataSetMessage<'a> {
     /// else fails when the FieldCount is cut off or cannot be met by the bytes that follow.
     #[inline]
     pub fn fields(&self) -> Result<Fields<'a>, DecodeError> {
-        match (self.kind, self.encoding) {
+        match (self.kind, self.encoding()) {
             (MessageKind::KeepAlive, _) => Ok(Fields::NONE),
             (_, FieldEncoding::RawData) => Err(RAW_DATA),
             // open62541 leaves out the FieldCount of a heartbeat, the tables of the standard do not.
@@ -189,7 +199,7 @@ impl<'a> DataSetMessage<'a> {
         let mut reader = self.payload;
         let count = match self.kind {
             MessageKind::KeepAlive => 0,
-            _ if self.encoding == FieldEncoding::RawData => return Err(RAW_DATA),
+            _ if self.encoding() == FieldEncoding::RawData => return Err(RAW_DATA),
             MessageKind::KeyFrame if reader.remaining() == 0 => 0,
             MessageKind::KeyFrame | MessageKind::DeltaFrame | MessageKind::Event => {
                 reader.u16("FieldCount")?
@@ -206,7 +216,7 @@ impl<'a> DataSetMessage<'a> {
             next: 0,
             left: count,
             indexed: self.kind == MessageKind::DeltaFrame,
-            encoding: self.encoding,
+            encoding: self.encoding(),
         })
     }
 }
@@ -355,85 +365,117 @@ impl<'a> Iterator for Fields<'a> {
 
 impl std::iter::FusedIterator for Fields<'_> {}
 
-struct Head {
-    header: DataSetHeader,
-    kind: MessageKind,
-    encoding: FieldEncoding,
+/// The flags and the header fields they announce, checked to be there.
+#[derive(Debug, Clone, Copy)]
+struct Head<'a> {
+    flags1: u8,
+    flags2: u8,
+    fields: &'a [u8],
 }
 
-impl Head {
+impl<'a> Head<'a> {
     const INVALID: Self = Self {
-        header: DataSetHeader {
-            valid: false,
-            sequence_number: None,
-            timestamp: None,
-            picoseconds: None,
-            status: None,
-            major_version: None,
-            minor_version: None,
-        },
-        kind: MessageKind::KeyFrame,
-        encoding: FieldEncoding::Variant,
+        flags1: 0,
+        flags2: 0,
+        fields: &[],
     };
 
     #[inline]
-    fn read(flags1: u8, reader: &mut Reader<'_>) -> Result<Self, DecodeError> {
+    fn read(flags1: u8, reader: &mut Reader<'a>) -> Result<(Self, MessageKind), DecodeError> {
         let flags2 = match flags1 & FLAGS2 {
             0 => 0,
             _ => reader.u8("DataSetFlags2")?,
         };
-        let encoding = match flags1 & FIELD_ENCODING {
-            0x00 => FieldEncoding::Variant,
-            RAW_FIELDS => FieldEncoding::RawData,
-            DATA_VALUE_FIELDS => FieldEncoding::DataValue,
-            _ => {
-                return Err(DecodeError::Reserved {
-                    field: "field encoding",
-                    value: 3,
-                });
-            }
-        };
+        if flags1 & FIELD_ENCODING == FIELD_ENCODING {
+            return Err(DecodeError::Reserved {
+                field: "field encoding",
+                value: 3,
+            });
+        }
         let kind = read_kind(flags2)?;
-        let sequence_number = match flags1 & SEQUENCE_NUMBER {
+        let sizes = [
+            (flags1 & SEQUENCE_NUMBER, 2),
+            (flags2 & TIMESTAMP, 8),
+            (flags2 & PICOSECONDS, 2),
+            (flags1 & STATUS, 2),
+            (flags1 & MAJOR_VERSION, 4),
+            (flags1 & MINOR_VERSION, 4),
+        ];
+        let mut size = 0;
+        for (present, bytes) in sizes {
+            size += match present {
+                0 => 0,
+                _ => bytes,
+            };
+        }
+        let head = Self {
+            flags1,
+            flags2,
+            fields: reader.rest(),
+        };
+        match reader.bytes(size, "DataSetMessage header") {
+            Ok(fields) => Ok((Self { fields, ..head }, kind)),
+            // Field by field, to name the one that is cut off.
+            Err(_) => Err(head.read_fields().err().unwrap_or(CUT_OFF)),
+        }
+    }
+
+    #[inline]
+    fn fields(&self) -> DataSetHeader {
+        match self.read_fields() {
+            Ok(fields) => fields,
+            // Only of an invalid message, which has nothing to read.
+            Err(_) => DataSetHeader {
+                valid: self.flags1 & VALID != 0,
+                ..DataSetHeader::default()
+            },
+        }
+    }
+
+    #[inline]
+    fn read_fields(&self) -> Result<DataSetHeader, DecodeError> {
+        let mut reader = Reader::new(self.fields);
+        let sequence_number = match self.flags1 & SEQUENCE_NUMBER {
             0 => None,
             _ => Some(reader.u16("DataSetMessageSequenceNumber")?),
         };
-        let timestamp = match flags2 & TIMESTAMP {
+        let timestamp = match self.flags2 & TIMESTAMP {
             0 => None,
             _ => Some(DateTime(reader.i64("DataSetMessage Timestamp")?)),
         };
-        let picoseconds = match flags2 & PICOSECONDS {
+        let picoseconds = match self.flags2 & PICOSECONDS {
             0 => None,
             _ => Some(reader.u16("DataSetMessage PicoSeconds")?),
         };
-        let status = match flags1 & STATUS {
+        let status = match self.flags1 & STATUS {
             0 => None,
             _ => Some(reader.u16("DataSetMessage Status")?),
         };
-        let major_version = match flags1 & MAJOR_VERSION {
+        let major_version = match self.flags1 & MAJOR_VERSION {
             0 => None,
             _ => Some(reader.u32("ConfigurationVersion MajorVersion")?),
         };
-        let minor_version = match flags1 & MINOR_VERSION {
+        let minor_version = match self.flags1 & MINOR_VERSION {
             0 => None,
             _ => Some(reader.u32("ConfigurationVersion MinorVersion")?),
         };
-        let header = DataSetHeader {
-            valid: flags1 & VALID != 0,
+        Ok(DataSetHeader {
+            valid: self.flags1 & VALID != 0,
             sequence_number,
             timestamp,
             picoseconds,
             status,
             major_version,
             minor_version,
-        };
-        Ok(Self {
-            header,
-            kind,
-            encoding,
         })
     }
 }
+
+const CUT_OFF: DecodeError = DecodeError::Truncated {
+    field: "DataSetMessage header",
+    expected: 0,
+    found: 0,
+};
 
 const RAW_DATA: DecodeError =
     DecodeError::Misread("encoded as RawData, to be read with its DataSetMetaData");

@@ -72,6 +72,7 @@ pub struct GroupHeader {
 }
 
 /// The first one to three bytes; a byte left out is 0.
+#[derive(Debug, Clone, Copy)]
 pub(crate) struct Flags {
     pub(crate) uadp: u8,
     pub(crate) extended1: u8,
@@ -136,6 +137,20 @@ fn reserved(field: &'static str, value: u8) -> DecodeError {
 }
 
 impl<'a> PublisherId<'a> {
+    /// Reads past an id and checks it.
+    #[inline]
+    pub(crate) fn skip(id_type: u8, reader: &mut Reader<'a>) -> Result<(), DecodeError> {
+        let size = match id_type {
+            PUBLISHER_ID_BYTE => 1,
+            PUBLISHER_ID_UINT16 => 2,
+            PUBLISHER_ID_UINT32 => 4,
+            PUBLISHER_ID_UINT64 => 8,
+            _ => return Self::read(id_type, reader).map(|_| ()),
+        };
+        reader.bytes(size, "PublisherId").map(|_| ())
+    }
+
+    #[inline]
     pub(crate) fn read(id_type: u8, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
         Ok(match id_type {
             PUBLISHER_ID_BYTE => Self::Byte(reader.u8("PublisherId")?),
@@ -167,10 +182,27 @@ impl<'a> PublisherId<'a> {
 }
 
 impl GroupHeader {
+    /// Reads past a group header and checks it.
+    #[inline]
+    pub(crate) fn skip(reader: &mut Reader<'_>) -> Result<(), DecodeError> {
+        let mut ahead = *reader;
+        let flags = ahead.u8("GroupFlags")?;
+        let size = usize::from(flags & WRITER_GROUP_ID) * 2
+            + usize::from(flags & GROUP_VERSION) * 2
+            + usize::from(flags & NETWORK_MESSAGE_NUMBER) / 2
+            + usize::from(flags & GROUP_SEQUENCE_NUMBER) / 4;
+        if flags & GROUP_RESERVED == 0 && ahead.bytes(size, "GroupHeader").is_ok() {
+            *reader = ahead;
+            return Ok(());
+        }
+        // The slow way names what is wrong.
+        Self::read(reader).map(|_| ())
+    }
+
+    #[inline]
     pub(crate) fn read(reader: &mut Reader<'_>) -> Result<Self, DecodeError> {
         let flags = reader.u8("GroupFlags")?;
-        let reserved = flags
-            & !(WRITER_GROUP_ID | GROUP_VERSION | NETWORK_MESSAGE_NUMBER | GROUP_SEQUENCE_NUMBER);
+        let reserved = flags & GROUP_RESERVED;
         if reserved != 0 {
             return Err(DecodeError::Reserved {
                 field: "GroupFlags",
@@ -274,6 +306,7 @@ pub(crate) const WRITER_GROUP_ID: u8 = 0x01;
 pub(crate) const GROUP_VERSION: u8 = 0x02;
 pub(crate) const NETWORK_MESSAGE_NUMBER: u8 = 0x04;
 pub(crate) const GROUP_SEQUENCE_NUMBER: u8 = 0x08;
+const GROUP_RESERVED: u8 = 0xF0;
 
 pub(crate) const SIGNED: u8 = 0x01;
 pub(crate) const ENCRYPTED: u8 = 0x02;

@@ -13,13 +13,16 @@ use crate::{
 /// that of a chunk once it was reassembled. Actions are [`DecodeError::Unsupported`].
 #[derive(Debug, Clone)]
 pub struct NetworkMessage<'a> {
-    header: NetworkHeader<'a>,
+    datagram: &'a [u8],
+    flags: Flags,
+    /// From these on the header fields follow, all of them in the datagram.
+    publisher_at: usize,
+    group_at: usize,
+    timestamp_at: usize,
+    payload_at: usize,
     writer_ids: Option<&'a [[u8; 2]]>,
     payload: Reader<'a>,
     rest: Option<Rest<'a>>,
-    /// Where the payload starts.
-    payload_at: usize,
-    datagram: &'a [u8],
 }
 
 /// The headers few messages have.
@@ -80,7 +83,7 @@ enum Step<'a> {
         sizes: &'a [[u8; 2]],
     },
     /// The NetworkMessage has none to give.
-    Misread(DecodeError),
+    Misread(&'static str),
     Done,
 }
 
@@ -89,92 +92,112 @@ impl<'a> NetworkMessage<'a> {
     ///
     /// # Errors
     /// Fails when a header is cut off, uses a reserved value, or announces what this crate does not read.
+    #[inline]
     pub fn decode(datagram: &'a [u8]) -> Result<Self, DecodeError> {
-        let mut reader = Reader::new(datagram);
+        let start = Reader::new(datagram);
+        let mut reader = start;
         let flags = Flags::read(&mut reader)?;
-        let publisher_id = match flags.uadp & header::PUBLISHER_ID {
-            0 => None,
-            _ => Some(PublisherId::read(
-                flags.extended1 & header::PUBLISHER_ID_TYPE,
-                &mut reader,
-            )?),
-        };
-        let data_set_class_id = match flags.extended1 & header::DATA_SET_CLASS_ID {
-            0 => None,
-            _ => Some(Guid(reader.array("DataSetClassId")?)),
-        };
-        let group = match flags.uadp & header::GROUP_HEADER {
-            0 => None,
-            _ => Some(GroupHeader::read(&mut reader)?),
-        };
+        let publisher_at = reader.since_start(&start);
+        if flags.uadp & header::PUBLISHER_ID != 0 {
+            PublisherId::skip(flags.extended1 & header::PUBLISHER_ID_TYPE, &mut reader)?;
+        }
+        if flags.extended1 & header::DATA_SET_CLASS_ID != 0 {
+            reader.bytes(16, "DataSetClassId")?;
+        }
+        let group_at = reader.since_start(&start);
+        if flags.uadp & header::GROUP_HEADER != 0 {
+            GroupHeader::skip(&mut reader)?;
+        }
         let writer_ids = match flags.uadp & header::PAYLOAD_HEADER {
             0 => None,
             _ if flags.extended2 & header::CHUNK != 0 => Some(reader.u16s(1, "DataSetWriterId")?),
             _ => Some(read_writer_ids(&mut reader)?),
         };
-        let timestamp = match flags.extended1 & header::TIMESTAMP {
-            0 => None,
-            _ => Some(DateTime(reader.i64("Timestamp")?)),
+        let timestamp_at = reader.since_start(&start);
+        if flags.extended1 & header::TIMESTAMP != 0 {
+            reader.bytes(8, "Timestamp")?;
+        }
+        if flags.extended1 & header::PICOSECONDS != 0 {
+            reader.bytes(2, "PicoSeconds")?;
+        }
+        let rest = match flags.extended1 & header::SECURITY != 0 || flags.extended2 != 0 {
+            true => Some(Rest::read(flags, &mut reader)?),
+            false => None,
         };
-        let picoseconds = match flags.extended1 & header::PICOSECONDS {
-            0 => None,
-            _ => Some(reader.u16("PicoSeconds")?),
-        };
-        let mut message = Self {
-            header: NetworkHeader {
-                publisher_id,
-                data_set_class_id,
-                group,
-                timestamp,
-                picoseconds,
-            },
+        let footer = rest.as_ref().map_or(0, |rest| rest.footer.len());
+        Ok(Self {
+            datagram,
+            flags,
+            publisher_at,
+            group_at,
+            timestamp_at,
+            payload_at: reader.since_start(&start) - footer,
             writer_ids,
             payload: reader,
-            rest: None,
-            payload_at: 0,
-            datagram,
-        };
-        if flags.extended1 & header::SECURITY != 0 || flags.extended2 != 0 {
-            message.read_rest(&flags)?;
-        }
-        message.payload_at = datagram.len() - message.payload.remaining() - message.footer().len();
-        Ok(message)
-    }
-
-    #[inline(never)]
-    fn read_rest(&mut self, flags: &Flags) -> Result<(), DecodeError> {
-        let promoted = match flags.extended2 & header::PROMOTED_FIELDS {
-            0 => None,
-            _ => {
-                let size = self.payload.u16("PromotedFields Size")?;
-                Some(self.payload.bytes(size.into(), "PromotedFields")?)
-            }
-        };
-        let security = match flags.extended1 & header::SECURITY {
-            0 => None,
-            _ => Some(SecurityHeader::read(&mut self.payload)?),
-        };
-        let sealed = security.is_some_and(|security| security.is_secured());
-        let mut footer = Reader::new(&[]);
-        if !sealed && let Some(size) = security.and_then(|security| security.footer_size) {
-            (self.payload, footer) = self.payload.split_end(size.into(), "SecurityFooter")?;
-        }
-        self.rest = Some(Rest {
-            message_type: flags.message_type(),
-            chunk: flags.extended2 & header::CHUNK != 0,
-            promoted,
-            security,
-            sealed,
-            footer: footer.rest(),
-        });
-        Ok(())
+            rest,
+        })
     }
 
     /// The header fields.
     #[inline]
     #[must_use]
-    pub const fn header(&self) -> &NetworkHeader<'a> {
-        &self.header
+    pub fn header(&self) -> NetworkHeader<'a> {
+        let mut times = self.reader_at(self.timestamp_at);
+        let timestamp = match self.flags.extended1 & header::TIMESTAMP {
+            0 => None,
+            _ => times.i64("Timestamp").ok().map(DateTime),
+        };
+        let picoseconds = match self.flags.extended1 & header::PICOSECONDS {
+            0 => None,
+            _ => times.u16("PicoSeconds").ok(),
+        };
+        NetworkHeader {
+            publisher_id: self.publisher_id(),
+            data_set_class_id: self.data_set_class_id(),
+            group: self.group(),
+            timestamp,
+            picoseconds,
+        }
+    }
+
+    /// Who sends; alone it costs less than the whole header.
+    #[inline]
+    #[must_use]
+    pub fn publisher_id(&self) -> Option<PublisherId<'a>> {
+        match self.flags.uadp & header::PUBLISHER_ID {
+            0 => None,
+            _ => {
+                let id_type = self.flags.extended1 & header::PUBLISHER_ID_TYPE;
+                PublisherId::read(id_type, &mut self.reader_at(self.publisher_at)).ok()
+            }
+        }
+    }
+
+    /// The group header; alone it costs less than the whole header.
+    #[inline]
+    #[must_use]
+    pub fn group(&self) -> Option<GroupHeader> {
+        match self.flags.uadp & header::GROUP_HEADER {
+            0 => None,
+            _ => GroupHeader::read(&mut self.reader_at(self.group_at)).ok(),
+        }
+    }
+
+    #[inline]
+    fn data_set_class_id(&self) -> Option<Guid> {
+        match self.flags.extended1 & header::DATA_SET_CLASS_ID {
+            0 => None,
+            // It ends where the group header starts.
+            _ => {
+                let mut reader = self.reader_at(self.group_at.checked_sub(16)?);
+                reader.array("DataSetClassId").ok().map(Guid)
+            }
+        }
+    }
+
+    #[inline]
+    fn reader_at(&self, at: usize) -> Reader<'a> {
+        Reader::new(self.datagram.get(at..).unwrap_or_default())
     }
 
     /// DataSetWriterIds of the payload header, at least one; `None` without payload header.
@@ -268,7 +291,7 @@ impl<'a> NetworkMessage<'a> {
     /// the piece is empty, or reaches past the end of the whole.
     pub fn chunk(&self) -> Result<Chunk<'a>, DecodeError> {
         if self.is_sealed() {
-            return Err(SEALED);
+            return Err(DecodeError::Misread(SEALED));
         }
         if !self.is_chunk() {
             return Err(DecodeError::Misread("no chunk"));
@@ -328,7 +351,7 @@ impl<'a> NetworkMessage<'a> {
         size: usize,
     ) -> Result<DataSetMessage<'a>, DecodeError> {
         if let Some(why) = self.misread() {
-            return Err(why);
+            return Err(DecodeError::Misread(why));
         }
         let headers = self.payload_at;
         let cut = DecodeError::Truncated {
@@ -343,25 +366,58 @@ impl<'a> NetworkMessage<'a> {
     }
 
     #[inline]
-    fn misread(&self) -> Option<DecodeError> {
-        let rest = self.rest?;
-        if rest.sealed {
+    fn misread(&self) -> Option<&'static str> {
+        self.rest.as_ref().and_then(Rest::misread)
+    }
+}
+
+impl<'a> Rest<'a> {
+    /// PromotedFields, SecurityHeader, and where neither signed nor encrypted the SecurityFooter.
+    #[cold]
+    fn read(flags: Flags, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        let promoted = match flags.extended2 & header::PROMOTED_FIELDS {
+            0 => None,
+            _ => {
+                let size = reader.u16("PromotedFields Size")?;
+                Some(reader.bytes(size.into(), "PromotedFields")?)
+            }
+        };
+        let security = match flags.extended1 & header::SECURITY {
+            0 => None,
+            _ => Some(SecurityHeader::read(reader)?),
+        };
+        let sealed = security.is_some_and(|security| security.is_secured());
+        let mut footer = Reader::new(&[]);
+        if !sealed && let Some(size) = security.and_then(|security| security.footer_size) {
+            (*reader, footer) = reader.split_end(size.into(), "SecurityFooter")?;
+        }
+        Ok(Self {
+            message_type: flags.message_type(),
+            chunk: flags.extended2 & header::CHUNK != 0,
+            promoted,
+            security,
+            sealed,
+            footer: footer.rest(),
+        })
+    }
+
+    #[cold]
+    const fn misread(&self) -> Option<&'static str> {
+        if self.sealed {
             return Some(SEALED);
         }
-        if rest.chunk {
-            return Some(DecodeError::Misread("a chunk, to be reassembled first"));
+        if self.chunk {
+            return Some("a chunk, to be reassembled first");
         }
-        match rest.message_type {
+        match self.message_type {
             NetworkMessageType::DataSet => None,
-            NetworkMessageType::Probe => Some(DecodeError::Misread("a discovery probe")),
-            NetworkMessageType::Announcement => {
-                Some(DecodeError::Misread("a discovery announcement"))
-            }
+            NetworkMessageType::Probe => Some("a discovery probe"),
+            NetworkMessageType::Announcement => Some("a discovery announcement"),
         }
     }
 }
 
-const SEALED: DecodeError = DecodeError::Misread("secured, to be opened with its keys first");
+const SEALED: &str = "secured, to be opened with its keys first";
 
 impl<'a> Iterator for Messages<'a> {
     type Item = Result<DataSetMessage<'a>, DecodeError>;
@@ -371,7 +427,7 @@ impl<'a> Iterator for Messages<'a> {
         match self.step {
             Step::Misread(why) => {
                 self.step = Step::Done;
-                Some(Err(why))
+                Some(Err(DecodeError::Misread(why)))
             }
             Step::Single { writer_id } => {
                 self.step = Step::Done;
@@ -444,6 +500,7 @@ impl<'a> Iterator for PromotedFields<'a> {
 impl std::iter::FusedIterator for PromotedFields<'_> {}
 
 /// Count, never 0 (OPC 10000-14, 7.2.4.5.2), and DataSetWriterIds.
+#[inline]
 fn read_writer_ids<'a>(reader: &mut Reader<'a>) -> Result<&'a [[u8; 2]], DecodeError> {
     match reader.u8("DataSetMessage Count")? {
         0 => Err(DecodeError::Reserved {

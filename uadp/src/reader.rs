@@ -25,11 +25,13 @@ impl<'a> Reader<'a> {
     }
 
     /// How many bytes were read since `before`, an earlier copy of this reader.
+    #[inline]
     pub(crate) const fn since_start(&self, before: &Self) -> usize {
         before.rest.len().saturating_sub(self.rest.len())
     }
 
     /// What was read since `before`, an earlier copy of this reader.
+    #[inline]
     pub(crate) fn since(&self, before: &Self) -> &'a [u8] {
         let read = before.rest.len().saturating_sub(self.rest.len());
         before.rest.get(..read).unwrap_or_default()
@@ -89,6 +91,7 @@ impl<'a> Reader<'a> {
     }
 
     /// `count` UInt16, unread.
+    #[inline]
     pub(crate) fn u16s(
         &mut self,
         count: u8,

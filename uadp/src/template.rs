@@ -385,7 +385,7 @@ impl MessagePatch<'_> {
 impl Slots {
     fn of(message: &DataSetMessage<'_>, datagram: &[u8]) -> Result<Self, DecodeError> {
         let payload_at = offset_of(message.payload(), datagram);
-        let header = &message.header;
+        let header = message.header();
         // The header's fields stand before the payload in a fixed order (OPC 10000-14, 7.2.4.5.4).
         let mut at = payload_at;
         let mut back = |present: bool, size: usize| {
