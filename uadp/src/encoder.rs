@@ -308,12 +308,13 @@ impl<'b> NetworkMessageEncoder<'b> {
 }
 
 /// Positions in the buffer of the header fields that are patched when a message is sent again.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Offsets {
     pub(crate) sequence_number: Option<usize>,
     pub(crate) timestamp: Option<usize>,
 }
 
+/// Appends the header of a DataSetMessage and, where it has one, room for the FieldCount.
 #[inline]
 fn write_data_set_header(
     buf: &mut Vec<u8>,
@@ -331,34 +332,41 @@ fn write_data_set_header(
         | flag(header.major_version.is_some(), message::MAJOR_VERSION)
         | flag(header.minor_version.is_some(), message::MINOR_VERSION)
         | flag(flags2 != 0, message::FLAGS2);
-    match flags2 {
-        0 => buf.push(flags1),
-        _ => buf.extend_from_slice(&[flags1, flags2]),
-    }
-    let sequence_number = header.sequence_number.map(|number| {
-        let at = buf.len();
-        buf.extend_from_slice(&number.to_le_bytes());
-        at
-    });
-    let timestamp = header.timestamp.map(|timestamp| {
-        let at = buf.len();
-        buf.extend_from_slice(&timestamp.0.to_le_bytes());
-        at
-    });
-    if let Some(picoseconds) = header.picoseconds {
-        buf.extend_from_slice(&picoseconds.to_le_bytes());
-    }
-    if let Some(status) = header.status {
-        buf.extend_from_slice(&status.to_le_bytes());
-    }
-    if let Some(version) = header.major_version {
-        buf.extend_from_slice(&version.to_le_bytes());
-    }
-    if let Some(version) = header.minor_version {
-        buf.extend_from_slice(&version.to_le_bytes());
-    }
-    Offsets {
-        sequence_number,
-        timestamp,
-    }
+    let start = buf.len();
+    writer::with_room::<32, _>(buf, |fixed| {
+        fixed.put([flags1]);
+        if flags2 != 0 {
+            fixed.put([flags2]);
+        }
+        let sequence_number = header.sequence_number.map(|number| {
+            let at = start + fixed.len();
+            fixed.put(number.to_le_bytes());
+            at
+        });
+        let timestamp = header.timestamp.map(|time| {
+            let at = start + fixed.len();
+            fixed.put(time.0.to_le_bytes());
+            at
+        });
+        if let Some(picoseconds) = header.picoseconds {
+            fixed.put(picoseconds.to_le_bytes());
+        }
+        if let Some(status) = header.status {
+            fixed.put(status.to_le_bytes());
+        }
+        if let Some(version) = header.major_version {
+            fixed.put(version.to_le_bytes());
+        }
+        if let Some(version) = header.minor_version {
+            fixed.put(version.to_le_bytes());
+        }
+        if encoding != message::RAW_FIELDS && kind != message::KIND_KEEP_ALIVE {
+            fixed.put([0; 2]);
+        }
+        Offsets {
+            sequence_number,
+            timestamp,
+        }
+    })
+    .unwrap_or_default()
 }

@@ -56,10 +56,10 @@ impl<'m> FieldEncoder<'m> {
     /// How deep structures may stand in structures.
     pub const MAX_DEPTH: usize = MAX_DEPTH;
 
+    /// The buffer ends with the room for the FieldCount.
     #[inline]
     pub(crate) fn new(buf: &'m mut Vec<u8>, progress: &'m mut Progress, offsets: Offsets) -> Self {
-        let count_at = buf.len();
-        buf.extend_from_slice(&[0, 0]);
+        let count_at = buf.len().saturating_sub(2);
         Self {
             buf,
             progress,

@@ -3,7 +3,7 @@
 use crate::header::{
     self, GroupHeader, NetworkHeader, NetworkMessageType, PublisherId, SecurityHeader,
 };
-use crate::writer::{self, flag};
+use crate::writer::{self, Room, flag};
 use crate::{EncodeError, Variant};
 
 /// The headers few NetworkMessages have. The default has none.
@@ -34,6 +34,11 @@ pub(crate) struct Form<'a> {
     pub(crate) extras: &'a Extras<'a>,
 }
 
+/// The most bytes of fixed size that stand together: flags, PublisherId, DataSetClassId and group header, or one
+/// DataSetWriterId, Timestamp and PicoSeconds behind them.
+const ROOM: usize = 64;
+type Fixed<'b> = Room<'b, ROOM>;
+
 /// Appends everything before the payload; the position of the Timestamp, if there is one.
 #[inline]
 pub(crate) fn write(
@@ -42,29 +47,19 @@ pub(crate) fn write(
     payload_header: PayloadHeader<'_>,
     form: Form<'_>,
 ) -> Result<Option<usize>, EncodeError> {
-    write_flags(buf, header, payload_header, form);
-    if let Some(publisher_id) = &header.publisher_id {
-        write_publisher_id(buf, publisher_id)?;
-    }
-    if let Some(class_id) = header.data_set_class_id {
-        buf.extend_from_slice(&class_id.0);
-    }
-    if let Some(group) = &header.group {
-        write_group_header(buf, group);
-    }
-    match payload_header {
-        PayloadHeader::None => {}
-        PayloadHeader::Count(ids) => write_payload_header(buf, ids)?,
-        PayloadHeader::Chunk(id) => buf.extend_from_slice(&id.to_le_bytes()),
-    }
-    let timestamp_at = header.timestamp.map(|timestamp| {
-        let at = buf.len();
-        buf.extend_from_slice(&timestamp.0.to_le_bytes());
-        at
-    });
-    if let Some(picoseconds) = header.picoseconds {
-        buf.extend_from_slice(&picoseconds.to_le_bytes());
-    }
+    let start = buf.len();
+    let timestamp_at = match (header.publisher_id, payload_header) {
+        (Some(PublisherId::String(_)), _) | (_, PayloadHeader::Count([] | [_, _, ..])) => {
+            write_in_parts(buf, header, payload_header, form)?
+        }
+        _ => writer::with_room(buf, |fixed| {
+            write_flags(fixed, header, payload_header, form);
+            write_ids(fixed, header);
+            write_writer_id(fixed, payload_header);
+            write_times(fixed, header).map(|at| start + at)
+        })
+        .flatten(),
+    };
     if let Some(fields) = form.extras.promoted_fields {
         write_promoted_fields(buf, fields)?;
     }
@@ -74,9 +69,79 @@ pub(crate) fn write(
     Ok(timestamp_at)
 }
 
+/// As the headers are written in [`write`], where the PublisherId is a String or there is not one DataSetWriterId.
+#[cold]
+fn write_in_parts(
+    buf: &mut Vec<u8>,
+    header: &NetworkHeader<'_>,
+    payload_header: PayloadHeader<'_>,
+    form: Form<'_>,
+) -> Result<Option<usize>, EncodeError> {
+    writer::with_room(buf, |fixed| {
+        write_flags(fixed, header, payload_header, form);
+    });
+    if let Some(PublisherId::String(id)) = header.publisher_id {
+        writer::byte_string(buf, Some(id.as_bytes()), "PublisherId")?;
+    }
+    writer::with_room(buf, |fixed| write_ids(fixed, header));
+    match payload_header {
+        PayloadHeader::Count(ids @ ([] | [_, _, ..])) => write_writer_ids(buf, ids)?,
+        one => {
+            writer::with_room(buf, |fixed: &mut Fixed<'_>| write_writer_id(fixed, one));
+        }
+    }
+    let start = buf.len();
+    let timestamp = writer::with_room(buf, |fixed| write_times(fixed, header));
+    Ok(timestamp.flatten().map(|at| start + at))
+}
+
+/// PublisherId unless it is a String, DataSetClassId and group header.
+#[inline]
+fn write_ids(fixed: &mut Fixed<'_>, header: &NetworkHeader<'_>) {
+    match header.publisher_id {
+        None | Some(PublisherId::String(_)) => {}
+        Some(PublisherId::Byte(id)) => fixed.put([id]),
+        Some(PublisherId::UInt16(id)) => fixed.put(id.to_le_bytes()),
+        Some(PublisherId::UInt32(id)) => fixed.put(id.to_le_bytes()),
+        Some(PublisherId::UInt64(id)) => fixed.put(id.to_le_bytes()),
+    }
+    if let Some(class_id) = header.data_set_class_id {
+        fixed.put(class_id.0);
+    }
+    if let Some(group) = &header.group {
+        write_group_header(fixed, group);
+    }
+}
+
+#[inline]
+fn write_writer_id(fixed: &mut Fixed<'_>, payload_header: PayloadHeader<'_>) {
+    match payload_header {
+        PayloadHeader::Count(&[id]) => {
+            let [low, high] = id.to_le_bytes();
+            fixed.put([1, low, high]);
+        }
+        PayloadHeader::Chunk(id) => fixed.put(id.to_le_bytes()),
+        PayloadHeader::None | PayloadHeader::Count(_) => {}
+    }
+}
+
+/// Timestamp and PicoSeconds; where in the room the Timestamp stands.
+#[inline]
+fn write_times(fixed: &mut Fixed<'_>, header: &NetworkHeader<'_>) -> Option<usize> {
+    let at = header.timestamp.map(|timestamp| {
+        let at = fixed.len();
+        fixed.put(timestamp.0.to_le_bytes());
+        at
+    });
+    if let Some(picoseconds) = header.picoseconds {
+        fixed.put(picoseconds.to_le_bytes());
+    }
+    at
+}
+
 #[inline]
 fn write_flags(
-    buf: &mut Vec<u8>,
+    fixed: &mut Fixed<'_>,
     header: &NetworkHeader<'_>,
     payload_header: PayloadHeader<'_>,
     form: Form<'_>,
@@ -108,30 +173,18 @@ fn write_flags(
             header::PAYLOAD_HEADER,
         )
         | flag(extended1 != 0, header::EXTENDED_FLAGS1);
-    match (extended1, extended2) {
-        (0, _) => buf.push(uadp),
-        (_, 0) => buf.extend_from_slice(&[uadp, extended1]),
-        _ => buf.extend_from_slice(&[uadp, extended1, extended2]),
+    fixed.put([uadp]);
+    if extended1 != 0 {
+        fixed.put([extended1]);
+    }
+    if extended2 != 0 {
+        fixed.put([extended2]);
     }
 }
 
 #[inline]
-fn write_publisher_id(buf: &mut Vec<u8>, id: &PublisherId<'_>) -> Result<(), EncodeError> {
-    match *id {
-        PublisherId::Byte(id) => buf.push(id),
-        PublisherId::UInt16(id) => buf.extend_from_slice(&id.to_le_bytes()),
-        PublisherId::UInt32(id) => buf.extend_from_slice(&id.to_le_bytes()),
-        PublisherId::UInt64(id) => buf.extend_from_slice(&id.to_le_bytes()),
-        PublisherId::String(id) => {
-            return writer::byte_string(buf, Some(id.as_bytes()), "PublisherId");
-        }
-    }
-    Ok(())
-}
-
-#[inline]
-fn write_group_header(buf: &mut Vec<u8>, group: &GroupHeader) {
-    buf.push(
+fn write_group_header(fixed: &mut Fixed<'_>, group: &GroupHeader) {
+    fixed.put([
         flag(group.writer_group_id.is_some(), header::WRITER_GROUP_ID)
             | flag(group.group_version.is_some(), header::GROUP_VERSION)
             | flag(
@@ -142,28 +195,23 @@ fn write_group_header(buf: &mut Vec<u8>, group: &GroupHeader) {
                 group.sequence_number.is_some(),
                 header::GROUP_SEQUENCE_NUMBER,
             ),
-    );
+    ]);
     if let Some(id) = group.writer_group_id {
-        buf.extend_from_slice(&id.to_le_bytes());
+        fixed.put(id.to_le_bytes());
     }
     if let Some(version) = group.group_version {
-        buf.extend_from_slice(&version.to_le_bytes());
+        fixed.put(version.to_le_bytes());
     }
     if let Some(number) = group.network_message_number {
-        buf.extend_from_slice(&number.to_le_bytes());
+        fixed.put(number.to_le_bytes());
     }
     if let Some(number) = group.sequence_number {
-        buf.extend_from_slice(&number.to_le_bytes());
+        fixed.put(number.to_le_bytes());
     }
 }
 
-#[inline]
-fn write_payload_header(buf: &mut Vec<u8>, ids: &[u16]) -> Result<(), EncodeError> {
-    if let [id] = ids {
-        let [low, high] = id.to_le_bytes();
-        buf.extend_from_slice(&[1, low, high]);
-        return Ok(());
-    }
+/// Count and DataSetWriterIds, unless it is just one.
+fn write_writer_ids(buf: &mut Vec<u8>, ids: &[u16]) -> Result<(), EncodeError> {
     let count = u8::try_from(ids.len()).map_err(|_| EncodeError::TooBig {
         what: "DataSetWriterIds",
         len: ids.len(),

@@ -2,6 +2,48 @@
 
 use crate::{BuiltinType, EncodeError};
 
+/// Room at the end of a buffer for a few small values: a buffer that may grow at every value costs more.
+pub(crate) struct Room<'b, const CAPACITY: usize> {
+    bytes: &'b mut [u8; CAPACITY],
+    len: usize,
+}
+
+impl<const CAPACITY: usize> Room<'_, CAPACITY> {
+    /// Bytes used.
+    #[inline]
+    pub(crate) const fn len(&self) -> usize {
+        self.len
+    }
+
+    /// The next value. `CAPACITY` has to hold all of them.
+    #[inline]
+    pub(crate) fn put<const N: usize>(&mut self, value: [u8; N]) {
+        let place = self.bytes.get_mut(self.len..);
+        let place = place.and_then(<[u8]>::first_chunk_mut);
+        debug_assert!(place.is_some(), "{CAPACITY} bytes are too few");
+        if let Some(place) = place {
+            *place = value;
+            self.len += N;
+        }
+    }
+}
+
+/// Appends what `fill` puts into the room, at most `CAPACITY` bytes.
+#[inline]
+pub(crate) fn with_room<const CAPACITY: usize, T>(
+    out: &mut Vec<u8>,
+    fill: impl FnOnce(&mut Room<'_, CAPACITY>) -> T,
+) -> Option<T> {
+    let start = out.len();
+    out.extend_from_slice(&[0; CAPACITY]);
+    let bytes = out.get_mut(start..)?.first_chunk_mut()?;
+    let mut room = Room { bytes, len: 0 };
+    let filled = fill(&mut room);
+    let end = start + room.len;
+    out.truncate(end);
+    Some(filled)
+}
+
 /// A fixed-size value, with the encoding byte of a Variant before it when `TAGGED`: one reserve, one copy.
 #[inline]
 pub(crate) fn fixed<const TAGGED: bool, const N: usize>(
