@@ -76,6 +76,7 @@ impl<'b> NetworkMessageEncoder<'b> {
     /// # Errors
     /// [`EncodeError::MessageCount`] when `writer_ids` is empty, [`EncodeError::TooBig`] when it is longer than 255
     /// or the PublisherId longer than a String can be.
+    #[inline]
     pub fn new(
         buf: &'b mut Vec<u8>,
         header: &NetworkHeader<'_>,
@@ -89,6 +90,7 @@ impl<'b> NetworkMessageEncoder<'b> {
     /// # Errors
     /// As [`new`](Self::new), and [`EncodeError::TooBig`] for PromotedFields of more than 65535 bytes or a nonce of
     /// more than 255.
+    #[inline]
     pub fn with(
         buf: &'b mut Vec<u8>,
         header: &NetworkHeader<'_>,

@@ -6,7 +6,7 @@ use std::hint::black_box;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use ours::Payload;
+use ours::{Config, Payload};
 
 /// Of so many rounds the fastest counts: what is slower was disturbed.
 const ROUNDS: u32 = 15;
@@ -57,14 +57,15 @@ fn cases() -> Vec<Case> {
     for payload in Payload::ALL {
         let name = payload.name();
         let mut datagram = Vec::with_capacity(2048);
+        let config = Config::new();
         cases.push(case("encode", name, move |messages| {
             for number in 0..messages {
-                ours::encode(payload, number as u16, &mut datagram);
+                ours::encode(payload, number as u16, &config, &mut datagram);
                 black_box(&datagram);
             }
         }));
         let mut datagram = Vec::new();
-        ours::encode(payload, 7, &mut datagram);
+        ours::encode(payload, 7, &Config::new(), &mut datagram);
         cases.push(case("decode", name, move |messages| {
             for _ in 0..messages {
                 black_box(ours::decode(black_box(&datagram)));

@@ -32,25 +32,46 @@ impl Payload {
 
 pub(crate) const BLOB: [u8; 1024] = [0x5A; 1024];
 
+/// What a writer is configured with: not known when the measurement is compiled.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Config {
+    header: NetworkHeader<'static>,
+    writer_id: u16,
+    data_set_header: DataSetHeader,
+}
+
+impl Config {
+    pub(crate) fn new() -> Self {
+        black_box(Self {
+            header: NetworkHeader {
+                publisher_id: Some(PublisherId::UInt16(2)),
+                group: Some(GroupHeader {
+                    writer_group_id: Some(5),
+                    ..GroupHeader::default()
+                }),
+                ..NetworkHeader::default()
+            },
+            writer_id: 10,
+            data_set_header: DataSetHeader {
+                sequence_number: Some(0),
+                timestamp: Some(DateTime(134_234_948_967_890_123)),
+                status: Some(0),
+                ..DataSetHeader::default()
+            },
+        })
+    }
+}
+
 /// Encodes message number `number` into the buffer, from its start.
 #[inline(never)]
-pub(crate) fn encode(payload: Payload, number: u16, datagram: &mut Vec<u8>) {
+pub(crate) fn encode(payload: Payload, number: u16, config: &Config, datagram: &mut Vec<u8>) {
     datagram.clear();
-    let header = NetworkHeader {
-        publisher_id: Some(PublisherId::UInt16(2)),
-        group: Some(GroupHeader {
-            writer_group_id: Some(5),
-            ..GroupHeader::default()
-        }),
-        ..NetworkHeader::default()
-    };
+    let ids = [config.writer_id];
+    let mut message = NetworkMessageEncoder::new(datagram, &config.header, Some(&ids)).unwrap();
     let data_set_header = DataSetHeader {
         sequence_number: Some(number),
-        timestamp: Some(DateTime(134_234_948_967_890_123)),
-        status: Some(0),
-        ..DataSetHeader::default()
+        ..config.data_set_header
     };
-    let mut message = NetworkMessageEncoder::new(datagram, &header, Some(&[10])).unwrap();
     let mut fields = message.key_frame(&data_set_header).unwrap();
     match payload {
         Payload::Double => fields.scalar(Scalar::Double(f64::from(number))).unwrap(),
@@ -96,7 +117,7 @@ pub(crate) fn decode(datagram: &[u8]) -> u64 {
 /// A template of the payload, for [`patch`].
 pub(crate) fn template(payload: Payload) -> MessageTemplate {
     let mut datagram = Vec::new();
-    encode(payload, 0, &mut datagram);
+    encode(payload, 0, &Config::new(), &mut datagram);
     MessageTemplate::new(datagram).unwrap()
 }
 
