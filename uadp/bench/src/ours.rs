@@ -92,7 +92,7 @@ pub(crate) fn encode(payload: Payload, number: u16, config: &Config, datagram: &
 #[inline(never)]
 pub(crate) fn decode(datagram: &[u8]) -> u64 {
     let network = NetworkMessage::decode(datagram).unwrap();
-    let mut seen = match network.header().publisher_id {
+    let mut seen = match network.publisher_id() {
         Some(PublisherId::UInt16(id)) => u64::from(id),
         _ => 0,
     };
