@@ -72,6 +72,7 @@ pub(crate) fn shape(field: &Variant<'_>) -> (BuiltinType, bool) {
         Variant::Null => (BuiltinType::Variant, false),
         Variant::Scalar(scalar) => (scalar.builtin_type(), false),
         Variant::Array(array) => (array.element(), true),
+        Variant::Matrix(matrix) => (matrix.elements().element(), true),
     }
 }
 
@@ -160,9 +161,14 @@ impl<'a> FieldSource<'a> {
         }
         match self.field()? {
             Variant::Array(array) if array.element() == expected => Ok(array),
-            other @ (Variant::Null | Variant::Scalar(_) | Variant::Array(_)) => {
-                Err(unexpected(expected, true, &other))
+            // ROS arrays have one dimension: the elements in row-major order.
+            Variant::Matrix(matrix) if matrix.elements().element() == expected => {
+                Ok(matrix.elements())
             }
+            other @ (Variant::Null
+            | Variant::Scalar(_)
+            | Variant::Array(_)
+            | Variant::Matrix(_)) => Err(unexpected(expected, true, &other)),
         }
     }
 }
@@ -174,9 +180,10 @@ impl<'a> Source<'a> for FieldSource<'a> {
         }
         match self.field()? {
             Variant::Scalar(scalar) if scalar.builtin_type() == expected => Ok(scalar),
-            other @ (Variant::Null | Variant::Scalar(_) | Variant::Array(_)) => {
-                Err(unexpected(expected, false, &other))
-            }
+            other @ (Variant::Null
+            | Variant::Scalar(_)
+            | Variant::Array(_)
+            | Variant::Matrix(_)) => Err(unexpected(expected, false, &other)),
         }
     }
 

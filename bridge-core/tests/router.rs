@@ -206,7 +206,7 @@ fn a_ros_message_becomes_a_key_frame_of_its_triple() {
         (message.writer_id, message.kind),
         (Some(10), MessageKind::KeyFrame)
     );
-    assert_eq!(message.header.timestamp, Some(bench.now.utc.time));
+    assert_eq!(message.header().timestamp, Some(bench.now.utc.time));
     let fields: Vec<_> = message.fields().unwrap().collect();
     assert_eq!(fields, [Ok(Variant::Scalar(Scalar::UInt32(7)))]);
 }
@@ -240,7 +240,7 @@ fn a_broken_ros_message_is_counted_and_told_and_the_next_one_crosses() {
         .unwrap()
         .unwrap();
     assert_eq!(
-        message.header.sequence_number,
+        message.header().sequence_number,
         Some(0),
         "a dropped sample uses up no number"
     );
@@ -435,8 +435,8 @@ fn a_state_is_repeated_with_its_time_and_its_readers_deliver_it_once() {
         let message = message.messages().next().unwrap().unwrap();
         (
             sent,
-            message.header.timestamp.unwrap(),
-            message.header.sequence_number.unwrap(),
+            message.header().timestamp.unwrap(),
+            message.header().sequence_number.unwrap(),
         )
     };
     let ((sent, taken, number), (sent_again, taken_again, next)) = (stamps(&first), stamps(&again));
@@ -510,7 +510,7 @@ fn events_keep_their_order_and_are_kept_alive_instead_of_repeated() {
         .unwrap();
     assert_eq!(message.kind, MessageKind::KeepAlive);
     assert_eq!(
-        message.header.sequence_number,
+        message.header().sequence_number,
         Some(4),
         "the number to expect next"
     );

@@ -31,7 +31,7 @@ impl Router {
         };
         let header = message.header();
         let (Some(space), Some(namespace)) = (
-            self.space_of(header, from),
+            self.space_of(&header, from),
             header.group.and_then(|group| group.writer_group_id),
         ) else {
             return;
@@ -111,7 +111,7 @@ impl Router {
         (from, sent): (SocketAddr, Option<Timestamp>),
         now: Now,
     ) {
-        if !message.header.valid {
+        if !message.is_valid() {
             self.count(
                 About {
                     topic: Some(topic),
@@ -123,7 +123,7 @@ impl Router {
             );
             return;
         }
-        let place = place(&message.header, from);
+        let place = place(&message.header(), from);
         let Some(Topic {
             role: Role::Theirs(reader),
             counters,
@@ -170,7 +170,7 @@ impl Router {
                     let sample = Sample {
                         fields,
                         source: place.stamp,
-                        status: message.header.status.unwrap_or_default(),
+                        status: message.header().status.unwrap_or_default(),
                         arrived: now.utc,
                     };
                     self.route(topic, &sample, place, now);
@@ -298,7 +298,7 @@ fn place(header: &DataSetHeader, from: SocketAddr) -> Place {
 }
 
 const fn reason_of(error: &DecodeError) -> Reason {
-    if matches!(error, DecodeError::Unsupported(_)) {
+    if matches!(error, DecodeError::Unsupported(_) | DecodeError::Misread(_)) {
         Reason::Unsupported
     } else {
         Reason::Malformed
