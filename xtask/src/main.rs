@@ -7,6 +7,7 @@
 
 mod bench;
 mod demo;
+mod instructions;
 mod lint;
 mod namespace;
 mod peers;
@@ -26,6 +27,7 @@ cargo xtask <verb>
   peers                          only install the peers
   lint                           formatting, clippy, licences and sources of dependencies, documentation
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
+  bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
 ";
 
 fn main() -> ExitCode {
@@ -50,6 +52,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["test", rest @ ..] => test::run(&Workspace::find()?, rest),
         ["peers"] => Ok(peers::run(&Workspace::find()?)),
         ["lint"] => lint::run(&Workspace::find()?),
+        ["bench", "uadp", rest @ ..] => instructions::run(&Workspace::find()?, rest),
         ["bench", "hop", rest @ ..] => bench::hop(&Workspace::find()?, rest),
         _ => {
             eprint!("xtask: there is no `{}`\n\n{VERBS}", arguments.join(" "));

@@ -28,6 +28,7 @@ const APT: &[&str] = &[
     "topic-tools",
     "tshark",
     "iproute2",
+    "valgrind",
     "python3-venv",
 ];
 

@@ -1,0 +1,150 @@
+//! `cargo xtask bench uadp`: wall time of the codec, and its instructions, which no busy machine changes.
+
+use std::{collections::BTreeMap, fmt::Write as _, fs, path::PathBuf, process::Command};
+
+use anyhow::{Context as _, bail, ensure};
+
+use crate::{
+    shell::{Ended, run as must, step, succeeds},
+    workspace::Workspace,
+};
+
+/// More instructions than the list has, by so many percent, are a step back. Compilers differ by less.
+const TOLERANCE: u64 = 10;
+/// The difference of two runs leaves out what starting costs.
+const FEW: u64 = 1_000;
+const MANY: u64 = 3_000;
+
+/// Measures. `--instructions` compares only the instructions with the list, `--update` writes the list anew.
+pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    let (wall, update) = match arguments {
+        [] => (true, false),
+        ["--instructions"] => (false, false),
+        ["--update"] => (false, true),
+        _ => {
+            eprintln!("xtask: bench uadp takes --instructions or --update");
+            return Ok(Ended::USAGE);
+        }
+    };
+    step("building the measurement with optimisation");
+    must(&mut workspace.cargo(&["build", "--release", "--locked", "-p", "uadp-bench"]))?;
+    let bench = workspace.target.join("release/uadp-bench");
+    if wall {
+        step("wall time, nanoseconds per message, the best of all rounds");
+        must(&mut Command::new(&bench))?;
+    }
+    ensure!(
+        succeeds("valgrind", &["--version"]),
+        "valgrind, which counts the instructions, is not installed: `cargo xtask peers` does that"
+    );
+    step("instructions per message");
+    let counted = count_all(&bench)?;
+    let list = List::of(workspace);
+    if update {
+        list.write(&counted)?;
+        return Ok(Ended::WELL);
+    }
+    list.compare(&counted)
+}
+
+fn count_all(bench: &PathBuf) -> anyhow::Result<BTreeMap<String, u64>> {
+    let output = Command::new(bench).arg("list").output()?;
+    let mut counted = BTreeMap::new();
+    for name in String::from_utf8(output.stdout)?.lines() {
+        let more = count(bench, name, MANY)? - count(bench, name, FEW)?;
+        counted.insert(name.to_owned(), more / (MANY - FEW));
+    }
+    Ok(counted)
+}
+
+fn count(bench: &PathBuf, name: &str, messages: u64) -> anyhow::Result<u64> {
+    let output = Command::new("valgrind")
+        .args(["--tool=callgrind", "--callgrind-out-file=/dev/null"])
+        .arg(bench)
+        .args(["count", name, &messages.to_string()])
+        .output()?;
+    let said = String::from_utf8_lossy(&output.stderr);
+    let collected = said
+        .lines()
+        .find_map(|line| line.split_once("Collected :"))
+        .and_then(|(_, count)| count.trim().parse().ok());
+    match collected {
+        Some(count) if output.status.success() => Ok(count),
+        _ => bail!("valgrind counted nothing for `{name}`:\n{said}"),
+    }
+}
+
+/// What the codec took when the list was last written.
+struct List {
+    path: PathBuf,
+}
+
+impl List {
+    fn of(workspace: &Workspace) -> Self {
+        Self {
+            path: workspace.root.join("uadp/bench/instructions.txt"),
+        }
+    }
+
+    fn write(&self, counted: &BTreeMap<String, u64>) -> anyhow::Result<()> {
+        let mut text = String::new();
+        for (name, count) in counted {
+            writeln!(text, "{count:6} {name}")?;
+        }
+        print!("{text}");
+        fs::write(&self.path, text).with_context(|| format!("{}", self.path.display()))
+    }
+
+    fn read(&self) -> anyhow::Result<BTreeMap<String, u64>> {
+        let text =
+            fs::read_to_string(&self.path).with_context(|| format!("{}", self.path.display()))?;
+        let entry = |line: &str| {
+            let (count, name) = line.trim().split_once(' ')?;
+            Some((name.to_owned(), count.parse().ok()?))
+        };
+        text.lines()
+            .map(|line| entry(line).with_context(|| format!("not COUNT NAME: {line}")))
+            .collect()
+    }
+
+    fn compare(&self, counted: &BTreeMap<String, u64>) -> anyhow::Result<Ended> {
+        let listed = self.read()?;
+        let mut ended = Ended::WELL;
+        for (name, count) in counted {
+            let verdict = match listed.get(name) {
+                Some(before) if *count > limit(*before) => {
+                    ended = Ended::BADLY;
+                    format!("TOO MANY, {before} are listed")
+                }
+                Some(before) => format!("{before} listed"),
+                None => {
+                    ended = Ended::BADLY;
+                    "not listed".to_owned()
+                }
+            };
+            println!("{count:6} {name:<32} {verdict}");
+        }
+        if ended != Ended::WELL {
+            println!(
+                "the list is {}; `cargo xtask bench uadp --update` writes it anew",
+                self.path.display()
+            );
+        }
+        Ok(ended)
+    }
+}
+
+const fn limit(listed: u64) -> u64 {
+    listed + listed * TOLERANCE / 100
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_tenth_more_than_listed_is_let_pass_and_no_more() {
+        assert_eq!(limit(100), 110);
+        assert_eq!(limit(57), 62);
+    }
+}
