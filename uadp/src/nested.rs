@@ -40,7 +40,7 @@ pub struct DiagnosticInfo<'a> {
     /// StatusCode of the system below.
     pub inner_status_code: Option<StatusCode>,
     /// What the system below says.
-    pub inner: Option<Encoded<'a, DiagnosticInfo<'a>>>,
+    pub inner: Option<Encoded<'a, Self>>,
 }
 
 /// A value of type `T` as its bytes, which were checked when this was made: nesting needs no allocation.
