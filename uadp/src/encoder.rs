@@ -20,6 +20,8 @@ pub struct NetworkMessageEncoder<'b> {
     payload_at: usize,
     /// The SecurityHeader promises a signature.
     sealed: bool,
+    /// Bytes of the SecurityFooter it promises.
+    footer_size: usize,
     payload_header: bool,
 }
 
@@ -131,6 +133,11 @@ impl<'b> NetworkMessageEncoder<'b> {
             sealed: extras
                 .security
                 .is_some_and(|security| security.is_secured()),
+            footer_size: extras
+                .security
+                .and_then(|security| security.footer_size)
+                .unwrap_or_default()
+                .into(),
             payload_header: writer_ids.is_some(),
         })
     }
@@ -255,13 +262,30 @@ impl<'b> NetworkMessageEncoder<'b> {
     ///
     /// # Errors
     /// [`EncodeError::MessageCount`] when an announced message was not written, [`EncodeError::Misplaced`] when the
-    /// SecurityHeader promises a signature: that is [`finish_sealed`](Self::finish_sealed).
+    /// SecurityHeader promises a footer, or a signature: that is [`finish_sealed`](Self::finish_sealed).
     #[inline]
     pub fn finish(self) -> Result<(), EncodeError> {
+        self.finish_with_footer(&[])
+    }
+
+    /// Ends the NetworkMessage with a SecurityFooter.
+    ///
+    /// # Errors
+    /// As for [`finish`](Self::finish), and [`EncodeError::Misplaced`] when the footer is not as long as the
+    /// SecurityHeader says.
+    #[inline]
+    pub fn finish_with_footer(self, footer: &[u8]) -> Result<(), EncodeError> {
         if self.sealed {
             return Err(EncodeError::Misplaced("a secured message left unsealed"));
         }
-        self.check_finished()
+        if self.footer_size != footer.len() {
+            return Err(EncodeError::Misplaced(
+                "a SecurityFooter of another size than the SecurityHeader says",
+            ));
+        }
+        self.check_finished()?;
+        self.buf.extend_from_slice(footer);
+        Ok(())
     }
 
     #[inline]

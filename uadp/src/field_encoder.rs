@@ -281,10 +281,12 @@ impl<'m> FieldEncoder<'m> {
     /// All fields at once: a block as [`Fields::bytes`](crate::Fields::bytes) gives it, copied unread.
     ///
     /// # Errors
-    /// [`EncodeError::Misplaced`] after another field or when the block is shorter than its FieldCount.
+    /// [`EncodeError::Misplaced`] after another field, in a delta frame, or when the block is shorter than its
+    /// FieldCount.
     pub fn fields_block(&mut self, block: &[u8]) -> Result<(), EncodeError> {
         self.begin_value()?;
-        if self.fields != 1 || self.depth != 0 {
+        // In a delta frame the FieldIndex stands there already.
+        if self.buf.len() != self.count_at + 2 {
             return Err(EncodeError::Misplaced("block of fields after a field"));
         }
         let Some(count) = block.first_chunk() else {

@@ -40,7 +40,7 @@ pub struct DiagnosticInfo<'a> {
     /// StatusCode of the system below.
     pub inner_status_code: Option<StatusCode>,
     /// What the system below says.
-    pub inner: Option<Encoded<'a, DiagnosticInfo<'a>>>,
+    pub inner: Option<Encoded<'a, Self>>,
 }
 
 /// A value of type `T` as its bytes, which were checked when this was made: nesting needs no allocation.
@@ -54,24 +54,49 @@ pub struct Encoded<'a, T> {
 /// What can stand inside of another value.
 pub(crate) trait Nest<'a>: Sized {
     fn read_nested(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError>;
+
+    /// Finds the end of a value and checks it on the way.
+    #[inline]
+    fn skip(reader: &mut Reader<'a>, depth: Depth) -> Result<(), DecodeError> {
+        Self::read_nested(reader, depth).map(|_| ())
+    }
 }
 
 /// How many levels a value may still hold.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Depth(u8);
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Depth {
+    /// So many.
+    Left(u8),
+    /// As many as it has: its bytes were checked before, and nothing follows them. Values inside of it are not walked
+    /// through once more, or going down level by level would take the square of their number.
+    Checked,
+}
 
 impl Depth {
     /// The standard asks decoders for 100 levels and for an error beyond what they have (OPC 10000-6, 5.2.2.12
     /// and 5.2.2.16).
-    pub(crate) const FULL: Self = Self(100);
+    pub(crate) const FULL: Self = Self::Left(100);
 
     #[inline]
     pub(crate) fn inner(self) -> Result<Self, DecodeError> {
-        match self.0.checked_sub(1) {
-            Some(left) => Ok(Self(left)),
-            None => Err(DecodeError::TooDeep),
+        match self {
+            Self::Left(0) => Err(DecodeError::TooDeep),
+            Self::Left(left) => Ok(Self::Left(left - 1)),
+            Self::Checked => Ok(Self::Checked),
         }
     }
+}
+
+/// Moves behind `count` values.
+pub(crate) fn skip<'a, T: Nest<'a>>(
+    count: usize,
+    reader: &mut Reader<'a>,
+    depth: Depth,
+) -> Result<(), DecodeError> {
+    for _ in 0..count {
+        T::skip(reader, depth.inner()?)?;
+    }
+    Ok(())
 }
 
 #[expect(private_bounds, reason = "the three values that nest are all of them")]
@@ -94,16 +119,16 @@ impl<'a, T: Nest<'a>> Encoded<'a, T> {
     /// # Errors
     /// None: the bytes were read once before. The type says so because nothing here may panic.
     pub fn get(self) -> Result<T, DecodeError> {
-        T::read_nested(&mut Reader::new(self.bytes), Depth::FULL)
+        T::read_nested(&mut Reader::new(self.bytes), Depth::Checked)
     }
 
     pub(crate) fn read(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
+        if depth == Depth::Checked {
+            return Ok(Self::written(reader.take_rest()));
+        }
         let before = *reader;
-        T::read_nested(reader, depth)?;
-        Ok(Self {
-            bytes: reader.since(&before),
-            value: PhantomData,
-        })
+        T::skip(reader, depth)?;
+        Ok(Self::written(reader.since(&before)))
     }
 }
 
@@ -192,6 +217,11 @@ impl<'a> Nest<'a> for Variant<'a> {
     fn read_nested(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
         Self::read_at(reader, depth)
     }
+
+    #[inline]
+    fn skip(reader: &mut Reader<'a>, depth: Depth) -> Result<(), DecodeError> {
+        Self::skip_at(reader, depth)
+    }
 }
 
 impl<'a> Nest<'a> for DataValue<'a> {
@@ -217,6 +247,11 @@ impl<'a> DataValue<'a> {
         }
         let value = match mask & VALUE {
             0 => None,
+            _ if depth == Depth::Checked => {
+                let (mut value, behind) = reader.split_end(size_behind_value(mask), "DataValue")?;
+                *reader = behind;
+                Some(Variant::read_at(&mut value, depth)?)
+            }
             _ => Some(Variant::read_at(reader, depth)?),
         };
         let status = match mask & STATUS {
@@ -264,6 +299,21 @@ impl<'a> From<Variant<'a>> for DataValue<'a> {
             ..Self::default()
         }
     }
+}
+
+/// Bytes of what follows the value of a DataValue.
+fn size_behind_value(mask: u8) -> usize {
+    [
+        (STATUS, 4),
+        (SOURCE_TIMESTAMP, 8),
+        (SOURCE_PICOSECONDS, 2),
+        (SERVER_TIMESTAMP, 8),
+        (SERVER_PICOSECONDS, 2),
+    ]
+    .iter()
+    .filter(|(bit, _)| mask & bit != 0)
+    .map(|(_, size)| size)
+    .sum()
 }
 
 fn read_time(

@@ -74,6 +74,14 @@ impl<'a> Reader<'a> {
         }
     }
 
+    /// All that is left.
+    #[inline]
+    pub(crate) const fn take_rest(&mut self) -> &'a [u8] {
+        let rest = self.rest;
+        self.rest = &[];
+        rest
+    }
+
     /// What stands before the last `len` bytes, and those.
     pub(crate) fn split_end(
         &self,

@@ -1,6 +1,6 @@
 //! One value of a builtin type.
 
-use crate::nested::{DataValue, Depth, DiagnosticInfo, Encoded};
+use crate::nested::{self, DataValue, Depth, DiagnosticInfo, Encoded};
 use crate::node_id::{ExpandedNodeId, NodeId};
 use crate::reader::Reader;
 use crate::{BuiltinType, DateTime, DecodeError, EncodeError, Guid, StatusCode, Variant, writer};
@@ -194,6 +194,28 @@ impl<'a> Scalar<'a> {
             | Self::Variant(_)
             | Self::DiagnosticInfo(_) => None,
         }
+    }
+
+    /// Moves behind `count` values and checks them on the way.
+    pub(crate) fn skip(
+        builtin: BuiltinType,
+        count: usize,
+        reader: &mut Reader<'a>,
+        depth: Depth,
+    ) -> Result<(), DecodeError> {
+        if builtin == BuiltinType::Variant {
+            return nested::skip::<Variant<'_>>(count, reader, depth);
+        }
+        if builtin == BuiltinType::DataValue {
+            return nested::skip::<DataValue<'_>>(count, reader, depth);
+        }
+        if builtin == BuiltinType::DiagnosticInfo {
+            return nested::skip::<DiagnosticInfo<'_>>(count, reader, depth);
+        }
+        for _ in 0..count {
+            Self::read_at(builtin, reader, depth)?;
+        }
+        Ok(())
     }
 
     /// The value in the binary encoding, after the encoding byte of a Variant when `TAGGED`.

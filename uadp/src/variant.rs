@@ -37,6 +37,8 @@ pub struct Array<'a> {
 }
 
 /// The elements of an [`Array`].
+///
+/// The bytes of a value that holds values are walked through to find the next element.
 #[derive(Debug, Clone)]
 pub struct Elements<'a> {
     element: BuiltinType,
@@ -77,6 +79,21 @@ impl<'a> Variant<'a> {
                 field: "Variant encoding",
                 value: encoding.into(),
             }),
+        }
+    }
+
+    /// Moves behind a Variant and checks it on the way.
+    #[inline]
+    pub(crate) fn skip_at(reader: &mut Reader<'a>, depth: Depth) -> Result<(), DecodeError> {
+        let encoding = reader.rest().first().copied().unwrap_or_default();
+        let size = match (encoding, BuiltinType::from_id(encoding)) {
+            (0, _) => Some(0),
+            (_, Some(builtin)) => builtin.fixed_size(),
+            (_, None) => None,
+        };
+        match size {
+            Some(size) if reader.bytes(1 + size, "Variant").is_ok() => Ok(()),
+            _ => Self::read_at(reader, depth).map(|_| ()),
         }
     }
 
@@ -179,6 +196,11 @@ impl<'a> Matrix<'a> {
         reader: &mut Reader<'a>,
         depth: Depth,
     ) -> Result<Self, DecodeError> {
+        // Where the dimensions start, only the elements before them tell.
+        let depth = match depth {
+            Depth::Checked => Depth::FULL,
+            left @ Depth::Left(_) => left,
+        };
         let elements = Array::read_at(element, reader, depth)?;
         let count = reader.length("ArrayDimensions")?.unwrap_or_default();
         let (dimensions, _) = match count.checked_mul(4) {
@@ -302,11 +324,11 @@ impl<'a> Array<'a> {
         }
         let bytes = if element.fixed_size().is_some() {
             reader.bytes(least, "array")?
+        } else if depth == Depth::Checked {
+            reader.take_rest()
         } else {
             let before = *reader;
-            for _ in 0..len {
-                Scalar::read_at(element, reader, depth)?;
-            }
+            Scalar::skip(element, len, reader, depth)?;
             reader.since(&before)
         };
         Ok(Self {
@@ -354,8 +376,12 @@ impl<'a> Iterator for Elements<'a> {
     #[inline]
     fn next(&mut self) -> Option<Scalar<'a>> {
         self.left = self.left.checked_sub(1)?;
+        let depth = match self.left {
+            0 => Depth::Checked,
+            _ => Depth::FULL,
+        };
         // The elements were read once when the array was made: this does not fail.
-        Scalar::read(self.element, &mut self.reader).ok()
+        Scalar::read_at(self.element, &mut self.reader, depth).ok()
     }
 
     fn size_hint(&self) -> (usize, Option<usize>) {
