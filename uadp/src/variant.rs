@@ -19,6 +19,8 @@ pub enum Variant<'a> {
 }
 
 /// A multi-dimensional array (OPC 10000-6, 5.2.2.16). The number of elements is the product of the dimensions.
+///
+/// One of fewer than two dimensions, or without elements, is written as an [`Array`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Matrix<'a> {
     elements: Array<'a>,
@@ -125,7 +127,11 @@ impl<'a> Variant<'a> {
                 array.write(out)
             }
             Self::Matrix(matrix) => {
-                out.push(matrix.elements.element.id() | MATRIX);
+                let form = match matrix.has_dimensions() {
+                    true => MATRIX,
+                    false => ARRAY,
+                };
+                out.push(matrix.elements.element.id() | form);
                 matrix.write(out)
             }
         }
@@ -214,8 +220,16 @@ impl<'a> Matrix<'a> {
         Self::new(elements, dimensions)
     }
 
+    /// ArrayDimensions are to be there only for two dimensions or more, none of them empty (OPC 10000-6, 5.2.2.16).
+    const fn has_dimensions(&self) -> bool {
+        self.dimensions.len() >= 2 && !self.elements.is_empty()
+    }
+
     fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
         self.elements.write(out)?;
+        if !self.has_dimensions() {
+            return Ok(());
+        }
         let count = writer::int32_length(self.dimensions.len(), "ArrayDimensions")?;
         out.extend_from_slice(&count);
         out.extend_from_slice(self.dimensions.as_flattened());
@@ -402,3 +416,27 @@ const TYPE_ID: u8 = 0x3F;
 pub(crate) const ARRAY: u8 = 0x80;
 /// Bits 7 and 6: dimensions follow the elements.
 pub(crate) const MATRIX: u8 = 0xC0;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn dimensions_are_written_of_two_or_more_that_hold_elements() {
+        let written = |elements: &[u8], dimensions: &[i32]| {
+            let dimensions: Vec<_> = dimensions.iter().map(|size| size.to_le_bytes()).collect();
+            let elements = Array::new(BuiltinType::Byte, elements.len(), elements).unwrap();
+            let matrix = Matrix::new(elements, &dimensions).unwrap();
+            let mut out = Vec::new();
+            Variant::from(matrix).write(&mut out).unwrap();
+            out
+        };
+        let two = [
+            &[0xC3, 2, 0, 0, 0, 7, 8][..],
+            &[2, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0],
+        ];
+        assert_eq!(written(&[7, 8], &[1, 2]), two.concat());
+        assert_eq!(written(&[7, 8], &[2]), [0x83, 2, 0, 0, 0, 7, 8]);
+        assert_eq!(written(&[], &[0, 3]), [0x83, 0, 0, 0, 0]);
+    }
+}
