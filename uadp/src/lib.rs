@@ -61,6 +61,7 @@ mod header_writer;
 mod nested;
 mod network_message;
 mod node_id;
+mod raw;
 mod reader;
 mod scalar;
 mod structure;
@@ -81,6 +82,11 @@ pub use header_writer::Extras;
 pub use nested::{DataValue, DiagnosticInfo, Encoded};
 pub use network_message::{Chunk, Messages, NetworkMessage, PromotedFields};
 pub use node_id::{ExpandedNodeId, Identifier, NodeId};
+pub use raw::{
+    RawArray, RawDialect, RawElements, RawField, RawFields, RawLayout, RawLayoutError,
+    RawLayoutFault, RawMembers, RawStructure, RawStructureType, RawValue, RawWriteError,
+    RawWriteFault,
+};
 pub use scalar::{ExtensionBody, ExtensionObject, LocalizedText, QualifiedName, Scalar};
 pub use structure::StructureReader;
 pub use template::{Fixed, MessagePatch, MessageTemplate, PatchError};

@@ -1,0 +1,497 @@
+//! Reading: everything is checked when its field is read, and borrowed from the payload.
+
+use super::layout::{Element, to_usize};
+use super::{Form, RawArray, RawDialect, RawField, RawLayout, RawStructure, RawStructureType};
+use super::{RawValue, SCALAR, WORD};
+use crate::reader::Reader;
+use crate::{Array, DecodeError, ExtensionBody, ExtensionObject, Matrix, Scalar, Variant};
+
+/// The fields of a RawData payload, read one by one.
+///
+/// Ends after the first `Err`. Zero bytes behind the last field are the padding to a ConfiguredSize
+/// (OPC 10000-14, 6.3.1.3.3) and skipped; others are a last [`DecodeError::TrailingBytes`].
+#[derive(Debug, Clone)]
+pub struct RawFields<'a> {
+    fields: std::slice::Iter<'a, RawField<'a>>,
+    form: Form,
+    reader: Reader<'a>,
+}
+
+/// The fields of a structure that are there, each with its position in [`RawStructure::fields`].
+///
+/// Ends after the first `Err`; bytes behind the last field are a last [`DecodeError::TrailingBytes`].
+#[derive(Debug, Clone)]
+pub struct RawMembers<'a> {
+    walk: Walk<'a>,
+    done: bool,
+}
+
+/// A way through the fields of a structure.
+#[derive(Debug, Clone)]
+pub(super) struct Walk<'a> {
+    structure: &'a RawStructure<'a>,
+    form: Form,
+    next: usize,
+    /// EncodingMask, shifted to the next optional field; SwitchField.
+    head: u32,
+    reader: Reader<'a>,
+}
+
+/// A field of a structure on the way.
+pub(super) struct Member<'a> {
+    index: usize,
+    pub(super) field: &'a RawField<'a>,
+    /// `None` for an optional field which is not there.
+    pub(super) value: Option<RawValue<'a>>,
+}
+
+/// What is read next: bytes of its own which end in padding, or all that is left.
+struct Place<'a> {
+    padded: bool,
+    reader: Reader<'a>,
+}
+
+/// What stands in front of the elements of an array.
+struct Extent<'a> {
+    null: bool,
+    count: usize,
+    dimensions: &'a [[u8; 4]],
+}
+
+impl<'a> RawLayout<'a> {
+    /// The fields of a payload, which is [`DataSetMessage::payload`](crate::DataSetMessage::payload) of a key frame of
+    /// RawData. One without bytes is a heartbeat and has none.
+    ///
+    /// A payload of another dialect, or of another version of the metadata, may well be read without an error: as
+    /// other values. What reveals it is checked: bytes of padding are zero, lengths are within their maximum, and no
+    /// bytes are left.
+    #[must_use]
+    pub fn read<'p>(&self, payload: &'p [u8], dialect: RawDialect) -> RawFields<'p>
+    where
+        'a: 'p,
+    {
+        let fields = match payload {
+            [] => [].iter(),
+            _ => self.fields().iter(),
+        };
+        RawFields {
+            fields,
+            form: Form::of(dialect),
+            reader: Reader::new(payload),
+        }
+    }
+}
+
+impl<'a> Iterator for RawFields<'a> {
+    type Item = Result<RawValue<'a>, DecodeError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let Some(field) = self.fields.next() else {
+            let padding = std::mem::replace(&mut self.reader, Reader::new(&[])).rest();
+            return match padding.iter().all(|byte| *byte == 0) {
+                true => None,
+                false => Some(Err(DecodeError::TrailingBytes(padding.len()))),
+            };
+        };
+        let value = read_field(field, self.form, &mut self.reader);
+        if value.is_err() {
+            self.fields = [].iter();
+            self.reader = Reader::new(&[]);
+        }
+        Some(value)
+    }
+}
+
+impl std::iter::FusedIterator for RawFields<'_> {}
+
+impl<'a> RawStructure<'a> {
+    /// The fields of a body that was read as this structure.
+    ///
+    /// # Errors
+    /// Fails when the EncodingMask or SwitchField is cut off or says what the structure does not have.
+    pub fn members<'p>(
+        &'p self,
+        body: &'p [u8],
+        dialect: RawDialect,
+    ) -> Result<RawMembers<'p>, DecodeError>
+    where
+        'a: 'p,
+    {
+        let walk = Walk::new(self, Form::of(dialect).nested(), Reader::new(body))?;
+        Ok(RawMembers { walk, done: false })
+    }
+}
+
+impl<'a> RawMembers<'a> {
+    fn step(&mut self) -> Result<Option<(usize, RawValue<'a>)>, DecodeError> {
+        while let Some(member) = self.walk.step()? {
+            if let Some(value) = member.value {
+                return Ok(Some((member.index, value)));
+            }
+        }
+        match self.walk.reader.remaining() {
+            0 => Ok(None),
+            left => Err(DecodeError::TrailingBytes(left)),
+        }
+    }
+}
+
+impl<'a> Iterator for RawMembers<'a> {
+    type Item = Result<(usize, RawValue<'a>), DecodeError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.done {
+            return None;
+        }
+        let member = self.step().transpose();
+        self.done = !matches!(member, Some(Ok(_)));
+        member
+    }
+}
+
+impl std::iter::FusedIterator for RawMembers<'_> {}
+
+impl<'a> Walk<'a> {
+    pub(super) fn new(
+        structure: &'a RawStructure<'a>,
+        form: Form,
+        mut reader: Reader<'a>,
+    ) -> Result<Self, DecodeError> {
+        let head = match structure.structure_type() {
+            RawStructureType::Structure => 0,
+            RawStructureType::StructureWithOptionalFields => {
+                let mask = reader.u32("EncodingMask")?;
+                let unassigned = u32::MAX
+                    .checked_shl(structure.optional())
+                    .unwrap_or_default();
+                match mask & unassigned {
+                    0 => mask,
+                    bits => return Err(reserved("EncodingMask", bits)),
+                }
+            }
+            RawStructureType::Union => {
+                let switch = reader.u32("SwitchField")?;
+                if to_usize(switch) > structure.fields().len() {
+                    return Err(reserved("SwitchField", switch));
+                }
+                switch
+            }
+        };
+        Ok(Self {
+            structure,
+            form,
+            next: 0,
+            head,
+            reader,
+        })
+    }
+
+    /// EncodingMask or SwitchField, before the first step.
+    pub(super) const fn head(&self) -> u32 {
+        self.head
+    }
+
+    pub(super) const fn remaining(&self) -> usize {
+        self.reader.remaining()
+    }
+
+    /// The next field; of a Union only the chosen one.
+    pub(super) fn step(&mut self) -> Result<Option<Member<'a>>, DecodeError> {
+        let index = match self.structure.structure_type() {
+            RawStructureType::Union => return self.step_union(),
+            RawStructureType::Structure | RawStructureType::StructureWithOptionalFields => {
+                self.next
+            }
+        };
+        let Some(field) = self.structure.fields().get(index) else {
+            return Ok(None);
+        };
+        self.next += 1;
+        let mut present = true;
+        if field.optional {
+            present = self.head & 1 != 0;
+            self.head >>= 1;
+        }
+        let value = match present {
+            true => Some(read_field(field, self.form, &mut self.reader)?),
+            false => {
+                if let Some(room) = field.absent_room(self.form) {
+                    check_zero(self.reader.bytes(room, PADDING)?)?;
+                }
+                None
+            }
+        };
+        Ok(Some(Member {
+            index,
+            field,
+            value,
+        }))
+    }
+
+    fn step_union(&mut self) -> Result<Option<Member<'a>>, DecodeError> {
+        if std::mem::replace(&mut self.next, 1) != 0 {
+            return Ok(None);
+        }
+        let room = self.structure.union_room(self.form);
+        let mut place = Place::new(room, &mut self.reader, "Union")?;
+        let member = match self.chosen() {
+            Some((index, field)) => Some(Member {
+                index,
+                field,
+                value: Some(read_field(field, self.form, &mut place.reader)?),
+            }),
+            None => None,
+        };
+        place.leave(&mut self.reader)?;
+        Ok(member)
+    }
+
+    /// The field a SwitchField names.
+    fn chosen(&self) -> Option<(usize, &'a RawField<'a>)> {
+        let index = to_usize(self.head).checked_sub(1)?;
+        Some((index, self.structure.fields().get(index)?))
+    }
+}
+
+impl<'a> Place<'a> {
+    /// The next `room` bytes, which `reader` then is behind; without that, what `reader` has.
+    fn new(
+        room: Option<usize>,
+        reader: &mut Reader<'a>,
+        what: &'static str,
+    ) -> Result<Self, DecodeError> {
+        Ok(match room {
+            Some(room) => Self {
+                padded: true,
+                reader: Reader::new(reader.bytes(room, what)?),
+            },
+            None => Self {
+                padded: false,
+                reader: *reader,
+            },
+        })
+    }
+
+    fn leave(self, reader: &mut Reader<'a>) -> Result<(), DecodeError> {
+        if self.padded {
+            return check_zero(self.reader.rest());
+        }
+        *reader = self.reader;
+        Ok(())
+    }
+}
+
+fn read_field<'a>(
+    field: &'a RawField<'a>,
+    form: Form,
+    reader: &mut Reader<'a>,
+) -> Result<RawValue<'a>, DecodeError> {
+    match field.value_rank {
+        SCALAR => read_element(field, form, reader).map(|value| Variant::Scalar(value).into()),
+        _ => read_array(field, form, reader),
+    }
+}
+
+/// A single value, or one element of an array.
+pub(super) fn read_element<'a>(
+    field: &'a RawField<'a>,
+    form: Form,
+    reader: &mut Reader<'a>,
+) -> Result<Scalar<'a>, DecodeError> {
+    match field.element() {
+        Some(Element::Fixed(_)) => Scalar::read(field.builtin, reader),
+        Some(Element::Text) => read_text(field, form, reader),
+        Some(Element::Structure(structure)) => read_structure(structure, form.nested(), reader),
+        // No layout holds such a field.
+        None => Err(DecodeError::Unsupported(field.builtin.name())),
+    }
+}
+
+fn read_text<'a>(
+    field: &RawField<'_>,
+    form: Form,
+    reader: &mut Reader<'a>,
+) -> Result<Scalar<'a>, DecodeError> {
+    let name = field.builtin.name();
+    let room = field.text_room(form);
+    let size = room.map(|room| room.saturating_add(WORD));
+    let mut place = Place::new(size, reader, name)?;
+    let mut ahead = place.reader;
+    if let (Some(length), Some(room)) = (ahead.length(name)?, room)
+        && length > room
+    {
+        return Err(limit(name, length));
+    }
+    let text = Scalar::read(field.builtin, &mut place.reader)?;
+    place.leave(reader)?;
+    Ok(text)
+}
+
+fn read_structure<'a>(
+    structure: &'a RawStructure<'a>,
+    form: Form,
+    reader: &mut Reader<'a>,
+) -> Result<Scalar<'a>, DecodeError> {
+    let before = *reader;
+    let mut walk = Walk::new(structure, form, before)?;
+    while walk.step()?.is_some() {}
+    *reader = walk.reader;
+    Ok(Scalar::ExtensionObject(ExtensionObject {
+        type_id: structure.type_id(),
+        body: ExtensionBody::Binary(reader.since(&before)),
+    }))
+}
+
+fn read_array<'a>(
+    field: &'a RawField<'a>,
+    form: Form,
+    reader: &mut Reader<'a>,
+) -> Result<RawValue<'a>, DecodeError> {
+    let extent = match field.value_rank {
+        1 => read_length(field, form, reader)?,
+        _ => read_dimensions(field, form, reader)?,
+    };
+    let mut place = Place::new(field.array_room(form), reader, "array")?;
+    let value = read_elements(field, form, &extent, &mut place.reader)?;
+    place.leave(reader)?;
+    Ok(value)
+}
+
+fn read_length<'a>(
+    field: &RawField<'_>,
+    form: Form,
+    reader: &mut Reader<'a>,
+) -> Result<Extent<'a>, DecodeError> {
+    const NAME: &str = "array length";
+    let length = reader.length(NAME)?;
+    if length.is_none() && form == Form::Open62541 {
+        return Err(reserved(NAME, u32::MAX));
+    }
+    let count = length.unwrap_or_default();
+    if field
+        .most_elements(form, 0)
+        .is_some_and(|most| count > to_usize(most))
+    {
+        return Err(limit(NAME, count));
+    }
+    Ok(Extent {
+        null: length.is_none(),
+        count,
+        dimensions: &[],
+    })
+}
+
+fn read_dimensions<'a>(
+    field: &RawField<'_>,
+    form: Form,
+    reader: &mut Reader<'a>,
+) -> Result<Extent<'a>, DecodeError> {
+    let rank = field.rank();
+    if form != Form::Open62541 {
+        const NAME: &str = "number of dimensions";
+        let found = reader.u32(NAME)?;
+        if to_usize(found) != rank {
+            return Err(reserved(NAME, found));
+        }
+    }
+    let (dimensions, _) = reader
+        .bytes(rank.saturating_mul(WORD), "dimensions")?
+        .as_chunks();
+    let mut count = 1_usize;
+    for (index, dimension) in dimensions.iter().enumerate() {
+        let dimension = i32::from_le_bytes(*dimension);
+        let Ok(size) = usize::try_from(dimension) else {
+            return Err(reserved("dimension", dimension.cast_unsigned()));
+        };
+        if field
+            .most_elements(form, index)
+            .is_some_and(|most| size > to_usize(most))
+        {
+            return Err(limit("dimension", size));
+        }
+        count = count.saturating_mul(size);
+    }
+    if count != 0 && field.array_room(form).is_some() && !rows_are_full(field, dimensions) {
+        return Err(DecodeError::Unsupported(SHORT_ROWS));
+    }
+    Ok(Extent {
+        null: false,
+        count,
+        dimensions,
+    })
+}
+
+/// True when all dimensions but the outermost are as long as they can be.
+fn rows_are_full(field: &RawField<'_>, dimensions: &[[u8; 4]]) -> bool {
+    let mut inner = dimensions.iter().zip(field.array_dimensions).skip(1);
+    inner.all(|(size, most)| u32::from_le_bytes(*size) == *most)
+}
+
+fn read_elements<'a>(
+    field: &'a RawField<'a>,
+    form: Form,
+    extent: &Extent<'a>,
+    reader: &mut Reader<'a>,
+) -> Result<RawValue<'a>, DecodeError> {
+    let Extent {
+        null,
+        count,
+        dimensions,
+    } = *extent;
+    let least = count.saturating_mul(field.least_element_size());
+    if least > reader.remaining() {
+        return Err(limit("array length", count));
+    }
+    let before = *reader;
+    match field.element() {
+        Some(Element::Fixed(_)) => {
+            reader.bytes(least, "array")?;
+        }
+        Some(Element::Text | Element::Structure(_)) | None => {
+            for _ in 0..count {
+                read_element(field, form, reader)?;
+            }
+        }
+    }
+    let bytes = reader.since(&before);
+    if field.structure.is_some() || field.text_room(form).is_some() {
+        return Ok(RawValue::Array(RawArray {
+            field,
+            form,
+            null,
+            len: count,
+            dimensions,
+            bytes,
+        }));
+    }
+    let array = match null {
+        true => Array::null(field.builtin),
+        false => Array::new(field.builtin, count, bytes)?,
+    };
+    Ok(match field.value_rank {
+        1 => Variant::Array(array).into(),
+        _ => Variant::Matrix(Matrix::new(array, dimensions)?).into(),
+    })
+}
+
+/// Inside of the payload nothing but zero pads.
+fn check_zero(padding: &[u8]) -> Result<(), DecodeError> {
+    match padding.iter().find(|byte| **byte != 0) {
+        Some(byte) => Err(reserved(PADDING, (*byte).into())),
+        None => Ok(()),
+    }
+}
+
+const fn reserved(field: &'static str, value: u32) -> DecodeError {
+    DecodeError::Reserved { field, value }
+}
+
+fn limit(field: &'static str, length: usize) -> DecodeError {
+    DecodeError::Limit {
+        field,
+        value: u32::try_from(length).unwrap_or(u32::MAX),
+    }
+}
+
+const PADDING: &str = "RawData padding";
+const SHORT_ROWS: &str = "padded RawData matrix with rows shorter than its ArrayDimensions";

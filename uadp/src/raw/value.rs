@@ -1,0 +1,155 @@
+//! What a field of RawData is read as.
+
+use super::read::read_element;
+use super::{Form, RawField};
+use crate::reader::Reader;
+use crate::{BuiltinType, Scalar, Variant};
+
+/// Value of a field.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum RawValue<'a> {
+    /// A single value, or an array or matrix whose elements stand back to back.
+    ///
+    /// A structure is an ExtensionObject whose body are its fields as they stand on the wire, padding included:
+    /// [`RawStructure::members`](super::RawStructure::members) reads them,
+    /// [`RawStructure::to_plain`](super::RawStructure::to_plain) makes the body of OPC 10000-6 of them.
+    Variant(Variant<'a>),
+    /// An array or matrix of structures or padded texts.
+    Array(RawArray<'a>),
+}
+
+/// An array or matrix of structures or padded texts, which no [`Array`](crate::Array) can borrow from the wire. Its
+/// elements were checked when it was read.
+///
+/// Equality is that of the elements and dimensions.
+#[derive(Debug, Clone, Copy)]
+pub struct RawArray<'a> {
+    pub(super) field: &'a RawField<'a>,
+    pub(super) form: Form,
+    pub(super) null: bool,
+    pub(super) len: usize,
+    /// Empty for a one-dimensional array.
+    pub(super) dimensions: &'a [[u8; 4]],
+    pub(super) bytes: &'a [u8],
+}
+
+/// The elements of a [`RawArray`].
+#[derive(Debug, Clone)]
+pub struct RawElements<'a> {
+    field: &'a RawField<'a>,
+    form: Form,
+    left: usize,
+    reader: Reader<'a>,
+}
+
+impl<'a> RawValue<'a> {
+    /// Type of the value or of the elements; `None` for the null Variant, which is never read.
+    #[must_use]
+    pub const fn builtin_type(&self) -> Option<BuiltinType> {
+        match self {
+            Self::Variant(variant) => variant.builtin_type(),
+            Self::Array(array) => Some(array.element()),
+        }
+    }
+
+    /// The value as a Variant; `None` for an array of structures or padded texts.
+    #[must_use]
+    pub const fn variant(self) -> Option<Variant<'a>> {
+        match self {
+            Self::Variant(variant) => Some(variant),
+            Self::Array(_) => None,
+        }
+    }
+}
+
+impl<'a> From<Variant<'a>> for RawValue<'a> {
+    fn from(variant: Variant<'a>) -> Self {
+        Self::Variant(variant)
+    }
+}
+
+impl<'a> RawArray<'a> {
+    /// Type of every element: String, ByteString or ExtensionObject.
+    #[must_use]
+    pub const fn element(&self) -> BuiltinType {
+        self.field.builtin
+    }
+
+    /// Number of elements, 0 for the null array.
+    #[must_use]
+    pub const fn len(&self) -> usize {
+        self.len
+    }
+
+    /// True without elements, whether null or empty.
+    #[must_use]
+    pub const fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// True for the null array (length -1 on the wire).
+    #[must_use]
+    pub const fn is_null(&self) -> bool {
+        self.null
+    }
+
+    /// Size of each dimension of a matrix, the outermost first; none for a one-dimensional array.
+    #[must_use]
+    pub fn dimensions(&self) -> impl ExactSizeIterator<Item = u32> + Clone + use<'a> {
+        self.dimensions.iter().map(|size| u32::from_le_bytes(*size))
+    }
+
+    /// The elements one by one, of a matrix in row-major order.
+    #[must_use]
+    pub const fn iter(&self) -> RawElements<'a> {
+        RawElements {
+            field: self.field,
+            form: self.form,
+            left: self.len,
+            reader: Reader::new(self.bytes),
+        }
+    }
+}
+
+impl PartialEq for RawArray<'_> {
+    fn eq(&self, other: &Self) -> bool {
+        self.element() == other.element()
+            && self.null == other.null
+            && self.dimensions == other.dimensions
+            && self.iter().eq(other.iter())
+    }
+}
+
+impl<'a> IntoIterator for RawArray<'a> {
+    type Item = Scalar<'a>;
+    type IntoIter = RawElements<'a>;
+
+    fn into_iter(self) -> RawElements<'a> {
+        self.iter()
+    }
+}
+
+impl<'a> IntoIterator for &RawArray<'a> {
+    type Item = Scalar<'a>;
+    type IntoIter = RawElements<'a>;
+
+    fn into_iter(self) -> RawElements<'a> {
+        self.iter()
+    }
+}
+
+impl<'a> Iterator for RawElements<'a> {
+    type Item = Scalar<'a>;
+
+    fn next(&mut self) -> Option<Scalar<'a>> {
+        self.left = self.left.checked_sub(1)?;
+        // The elements were read once when the array was: this does not fail.
+        read_element(self.field, self.form, &mut self.reader).ok()
+    }
+
+    fn size_hint(&self) -> (usize, Option<usize>) {
+        (self.left, Some(self.left))
+    }
+}
+
+impl ExactSizeIterator for RawElements<'_> {}
