@@ -181,14 +181,14 @@ mod other_stacks {
         let ids: Option<Vec<u16>> = network.writer_ids().map(Iterator::collect);
         let mut out = Vec::new();
         let mut encoder =
-            NetworkMessageEncoder::new(&mut out, network.header(), ids.as_deref()).unwrap();
+            NetworkMessageEncoder::new(&mut out, &network.header(), ids.as_deref()).unwrap();
         for message in network.messages() {
             let message = message.unwrap();
             let values = layout.read(message.payload(), dialect).map(Result::unwrap);
             let mut raw = Vec::new();
             layout.write(&mut raw, dialect, values).unwrap();
             encoder
-                .raw_key_frame(&message.header, |buf| {
+                .raw_key_frame(&message.header(), |buf| {
                     buf.extend_from_slice(&raw);
                     Ok(())
                 })

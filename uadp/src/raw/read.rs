@@ -38,13 +38,12 @@ pub(super) struct Walk<'a> {
 }
 
 /// A field of a structure on the way.
-pub(super) enum Member<'a> {
-    Present(RawValue<'a>),
-    /// An optional field which is not there.
-    Absent,
+pub(super) struct Member<'a> {
+    index: usize,
+    pub(super) field: &'a RawField<'a>,
+    /// `None` for an optional field which is not there.
+    pub(super) value: Option<RawValue<'a>>,
 }
-
-type Step<'a> = (usize, &'a RawField<'a>, Member<'a>);
 
 /// What is read next: bytes of its own which end in padding, or all that is left.
 struct Place<'a> {
@@ -125,9 +124,9 @@ impl<'a> RawStructure<'a> {
 
 impl<'a> RawMembers<'a> {
     fn step(&mut self) -> Result<Option<(usize, RawValue<'a>)>, DecodeError> {
-        while let Some((field, _, member)) = self.walk.step()? {
-            if let Member::Present(value) = member {
-                return Ok(Some((field, value)));
+        while let Some(member) = self.walk.step()? {
+            if let Some(value) = member.value {
+                return Ok(Some((member.index, value)));
             }
         }
         match self.walk.reader.remaining() {
@@ -196,8 +195,8 @@ impl<'a> Walk<'a> {
         self.reader.remaining()
     }
 
-    /// The next field and its position.
-    pub(super) fn step(&mut self) -> Result<Option<Step<'a>>, DecodeError> {
+    /// The next field; of a Union only the chosen one.
+    pub(super) fn step(&mut self) -> Result<Option<Member<'a>>, DecodeError> {
         let index = match self.structure.structure_type() {
             RawStructureType::Union => return self.step_union(),
             RawStructureType::Structure | RawStructureType::StructureWithOptionalFields => {
@@ -213,33 +212,38 @@ impl<'a> Walk<'a> {
             present = self.head & 1 != 0;
             self.head >>= 1;
         }
-        let member = match present {
-            true => Member::Present(read_field(field, self.form, &mut self.reader)?),
+        let value = match present {
+            true => Some(read_field(field, self.form, &mut self.reader)?),
             false => {
                 if let Some(room) = field.absent_room(self.form) {
                     check_zero(self.reader.bytes(room, PADDING)?)?;
                 }
-                Member::Absent
+                None
             }
         };
-        Ok(Some((index, field, member)))
+        Ok(Some(Member {
+            index,
+            field,
+            value,
+        }))
     }
 
-    fn step_union(&mut self) -> Result<Option<Step<'a>>, DecodeError> {
+    fn step_union(&mut self) -> Result<Option<Member<'a>>, DecodeError> {
         if std::mem::replace(&mut self.next, 1) != 0 {
             return Ok(None);
         }
         let room = self.structure.union_room(self.form);
         let mut place = Place::new(room, &mut self.reader, "Union")?;
-        let step = match self.chosen() {
-            Some((index, field)) => {
-                let value = read_field(field, self.form, &mut place.reader)?;
-                Some((index, field, Member::Present(value)))
-            }
+        let member = match self.chosen() {
+            Some((index, field)) => Some(Member {
+                index,
+                field,
+                value: Some(read_field(field, self.form, &mut place.reader)?),
+            }),
             None => None,
         };
         place.leave(&mut self.reader)?;
-        Ok(step)
+        Ok(member)
     }
 
     /// The field a SwitchField names.

@@ -1,7 +1,7 @@
 //! Writing: the exact types and lengths of the layout, and the padding.
 
 use super::layout::{Element, to_usize};
-use super::read::{Member, Walk};
+use super::read::Walk;
 use super::{Form, RawArray, RawDialect, RawField, RawLayout, RawStructure, RawStructureType};
 use super::{RawValue, SCALAR};
 use crate::reader::Reader;
@@ -305,10 +305,11 @@ fn write_structure(
         buf.extend_from_slice(&walk.head().to_le_bytes());
     }
     let start = buf.len();
-    while let Some((_, field, member)) = walk.step().map_err(RawWriteFault::Body)? {
-        match member {
-            Member::Present(value) => write_field(field, forms, value, buf)?,
-            Member::Absent => pad(buf, field.absent_room(forms.to).unwrap_or_default()),
+    while let Some(member) = walk.step().map_err(RawWriteFault::Body)? {
+        let field = member.field;
+        match member.value {
+            Some(value) => write_field(field, forms, value, buf)?,
+            None => pad(buf, field.absent_room(forms.to).unwrap_or_default()),
         }
     }
     if walk.remaining() != 0 {
