@@ -158,7 +158,8 @@ impl<'a> DataSetMessage<'a> {
         }
     }
 
-    /// What stands behind the header, padding included.
+    /// What stands behind the header, padding included. Of a RawData message that is what
+    /// [`RawLayout::read`](crate::RawLayout::read) takes.
     #[inline]
     #[must_use]
     pub const fn payload(&self) -> &'a [u8] {

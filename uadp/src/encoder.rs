@@ -214,7 +214,8 @@ impl<'b> NetworkMessageEncoder<'b> {
         Ok(DataValueEncoder::new(fields, true))
     }
 
-    /// Appends a key frame of RawData whose fields `write` appends.
+    /// Appends a key frame of RawData whose fields `write` appends, for instance with
+    /// [`RawLayout::write`](crate::RawLayout::write).
     ///
     /// # Errors
     /// As for [`key_frame`](Self::key_frame), and what `write` gives.

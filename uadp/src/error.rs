@@ -1,6 +1,6 @@
 //! What makes reading or writing fail, with the offending value.
 
-use crate::BuiltinType;
+use crate::{BuiltinType, RawWriteError};
 
 /// Why bytes are not a UADP message this crate reads.
 ///
@@ -98,6 +98,9 @@ pub enum EncodeError {
         /// Bytes given.
         bytes: usize,
     },
+    /// A value that the layout of RawData does not take.
+    #[error(transparent)]
+    Raw(#[from] RawWriteError),
     /// Structures are nested deeper than [`FieldEncoder::MAX_DEPTH`](crate::FieldEncoder::MAX_DEPTH).
     #[error("structures nested too deep")]
     TooDeep,
