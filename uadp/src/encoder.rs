@@ -4,7 +4,7 @@ use crate::data_set_message as message;
 use crate::field_encoder::{DataValueEncoder, DeltaEncoder, FieldEncoder};
 use crate::header_writer::{self, Extras, Form, PayloadHeader};
 use crate::writer::flag;
-use crate::{DataSetHeader, EncodeError, NetworkHeader, NetworkMessageType, writer};
+use crate::{DataSetHeader, EncodeError, NetworkHeader, NetworkMessageType, Seal, writer};
 
 /// Appends one NetworkMessage to a buffer (OPC 10000-14, 7.2.4.4.2).
 ///
@@ -287,6 +287,19 @@ impl<'b> NetworkMessageEncoder<'b> {
         self.check_finished()?;
         self.buf.extend_from_slice(footer);
         Ok(())
+    }
+
+    /// Ends a NetworkMessage that was begun with the [`header`](Seal::header) of this seal: encrypts the payload and
+    /// appends the signature (OPC 10000-14, 7.2.4.4.3).
+    ///
+    /// # Errors
+    /// As [`finish`](Self::finish); [`EncodeError::Misplaced`] when the SecurityHeader is not that of the seal.
+    pub fn finish_sealed(self, seal: Seal<'_>) -> Result<(), EncodeError> {
+        self.check_finished()?;
+        if !self.sealed {
+            return Err(EncodeError::Misplaced("a seal without SecurityHeader"));
+        }
+        seal.finish(self.buf, self.start, self.payload_at)
     }
 
     #[inline]

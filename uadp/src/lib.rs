@@ -64,6 +64,7 @@ mod node_id;
 mod raw;
 mod reader;
 mod scalar;
+mod security;
 mod structure;
 mod template;
 mod time;
@@ -88,6 +89,10 @@ pub use raw::{
     RawWriteFault,
 };
 pub use scalar::{ExtensionBody, ExtensionObject, LocalizedText, QualifiedName, Scalar};
+pub use security::{
+    KeyError, Keys, Opened, Opener, OpenerOptions, Seal, SealError, Sealer, SecurityError,
+    SecurityMode, SecurityPolicy,
+};
 pub use structure::StructureReader;
 pub use template::{Fixed, MessagePatch, MessageTemplate, PatchError};
 pub use time::{DateTime, Timestamp};

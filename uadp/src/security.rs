@@ -1,0 +1,101 @@
+//! Message security: who may have written a message, and who may read it (OPC 10000-14, 7.2.4.4.3).
+//!
+//! A SecurityGroup is a list of [`Keys`], each with a SecurityTokenId, that its members get from a Security Key
+//! Service. [`Opener`] is what a Subscriber holds of the group, [`Sealer`] what a Publisher does.
+
+mod error;
+mod keys;
+mod opener;
+mod replay;
+mod ring;
+mod sealer;
+
+pub use error::{KeyError, SealError, SecurityError};
+pub use keys::Keys;
+pub use opener::{Opened, Opener, OpenerOptions};
+pub use sealer::{Seal, Sealer};
+
+/// The algorithms of a SecurityGroup: HMAC-SHA2-256 signs, AES in counter mode encrypts (OPC 10000-7).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum SecurityPolicy {
+    /// AES with keys of 128 bits.
+    PubSubAes128Ctr,
+    /// AES with keys of 256 bits.
+    PubSubAes256Ctr,
+}
+
+/// What is done to messages; `MessageSecurityMode.None` is to have no [`Opener`] and no [`Sealer`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum SecurityMode {
+    /// Everybody can read them, members alone can have written them.
+    Sign,
+    /// Payload and footer are encrypted as well; the headers never are.
+    SignAndEncrypt,
+}
+
+impl SecurityPolicy {
+    /// The SecurityPolicyUri.
+    #[must_use]
+    pub const fn uri(self) -> &'static str {
+        match self {
+            Self::PubSubAes128Ctr => AES128_URI,
+            Self::PubSubAes256Ctr => AES256_URI,
+        }
+    }
+
+    /// The policy of a SecurityPolicyUri, if it is one for PubSub.
+    #[must_use]
+    pub fn from_uri(uri: &str) -> Option<Self> {
+        match uri {
+            AES128_URI => Some(Self::PubSubAes128Ctr),
+            AES256_URI => Some(Self::PubSubAes256Ctr),
+            _ => None,
+        }
+    }
+
+    /// Bytes of key data for one SecurityTokenId: SigningKey, EncryptingKey and KeyNonce.
+    #[must_use]
+    pub const fn key_data_length(self) -> usize {
+        SIGNING_KEY + self.encrypting_key_length() + KEY_NONCE
+    }
+
+    const fn encrypting_key_length(self) -> usize {
+        match self {
+            Self::PubSubAes128Ctr => 16,
+            Self::PubSubAes256Ctr => 32,
+        }
+    }
+}
+
+const AES128_URI: &str = "http://opcfoundation.org/UA/SecurityPolicy#PubSub-Aes128-CTR";
+const AES256_URI: &str = "http://opcfoundation.org/UA/SecurityPolicy#PubSub-Aes256-CTR";
+
+/// Bytes of the SigningKey and of the KeyNonce (OPC 10000-14, 7.2.4.4.3.1).
+const SIGNING_KEY: usize = 32;
+const KEY_NONCE: usize = 4;
+/// Bytes of the MessageNonce: a random half, and the sequence number as UInt32 (OPC 10000-14, 7.2.4.4.3.2).
+const MESSAGE_NONCE: usize = 8;
+/// Bytes of the signature.
+const SIGNATURE: usize = 32;
+
+/// A MessageNonce.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Nonce {
+    random: [u8; 4],
+    sequence: u32,
+}
+
+impl Nonce {
+    const fn from_bytes([a, b, c, d, sequence @ ..]: [u8; MESSAGE_NONCE]) -> Self {
+        Self {
+            random: [a, b, c, d],
+            sequence: u32::from_le_bytes(sequence),
+        }
+    }
+
+    const fn to_bytes(self) -> [u8; MESSAGE_NONCE] {
+        let [a, b, c, d] = self.random;
+        let [e, f, g, h] = self.sequence.to_le_bytes();
+        [a, b, c, d, e, f, g, h]
+    }
+}
