@@ -3,8 +3,11 @@
 //! `libfuzzer/` feeds them with inputs that reach new code; `corpus/` holds those found, and the tests run them all.
 
 mod decode;
+mod input;
+mod secured;
 
 pub use decode::decode;
+pub use secured::secured;
 
 /// The targets by their names, which are also those of their folders under `corpus/`.
-pub const TARGETS: &[(&str, fn(&[u8]))] = &[("decode", decode)];
+pub const TARGETS: &[(&str, fn(&[u8]))] = &[("decode", decode), ("secured", secured)];
