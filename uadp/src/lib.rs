@@ -52,6 +52,7 @@
 //! ```
 
 mod builtin;
+mod chunk;
 mod data_set_message;
 mod encoder;
 mod error;
@@ -60,7 +61,9 @@ mod header;
 mod header_writer;
 mod network_message;
 mod node_id;
+mod publisher_id;
 mod reader;
+mod reassembler;
 mod scalar;
 mod structure;
 mod time;
@@ -68,6 +71,7 @@ mod variant;
 mod writer;
 
 pub use builtin::{BuiltinType, Guid, StatusCode};
+pub use chunk::{ChunkBudget, ChunkError, Chunks, PlacedChunk, Whole};
 pub use data_set_message::{DataSetHeader, DataSetMessage, Fields, MessageKind};
 pub use encoder::NetworkMessageEncoder;
 pub use error::{DecodeError, EncodeError};
@@ -76,6 +80,10 @@ pub use header::{GroupHeader, NetworkHeader, NetworkMessageType, PublisherId, Se
 pub use header_writer::Extras;
 pub use network_message::{Chunk, Messages, NetworkMessage, PromotedFields};
 pub use node_id::{ExpandedNodeId, Identifier, NodeId};
+pub use publisher_id::OwnedPublisherId;
+pub use reassembler::{
+    ChunkRefusal, Reassembled, Reassembler, ReassemblyCounters, ReassemblyLimits,
+};
 pub use scalar::{ExtensionBody, ExtensionObject, LocalizedText, QualifiedName, Scalar};
 pub use structure::StructureReader;
 pub use time::{DateTime, Timestamp};
