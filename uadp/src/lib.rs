@@ -53,7 +53,9 @@
 
 mod builtin;
 mod chunk;
+mod configuration_version;
 mod data_set_message;
+mod delta;
 mod encoder;
 mod error;
 mod field_encoder;
@@ -63,8 +65,12 @@ mod network_message;
 mod node_id;
 mod publisher_id;
 mod reader;
+mod reader_state;
+mod reader_table;
 mod reassembler;
 mod scalar;
+mod sequence;
+mod state;
 mod structure;
 mod time;
 mod variant;
@@ -72,7 +78,9 @@ mod writer;
 
 pub use builtin::{BuiltinType, Guid, StatusCode};
 pub use chunk::{ChunkBudget, ChunkError, Chunks, PlacedChunk, Whole};
+pub use configuration_version::ConfigurationVersion;
 pub use data_set_message::{DataSetHeader, DataSetMessage, Fields, MessageKind};
+pub use delta::{DeltaNull, Merged};
 pub use encoder::NetworkMessageEncoder;
 pub use error::{DecodeError, EncodeError};
 pub use field_encoder::FieldEncoder;
@@ -81,10 +89,16 @@ pub use header_writer::Extras;
 pub use network_message::{Chunk, Messages, NetworkMessage, PromotedFields};
 pub use node_id::{ExpandedNodeId, Identifier, NodeId};
 pub use publisher_id::OwnedPublisherId;
+pub use reader_state::{
+    Accepted, Arrival, DataSetReaderState, ReaderCounters, ReaderDrop, ReaderSettings,
+};
+pub use reader_table::{ReaderKey, ReaderTable};
 pub use reassembler::{
     ChunkRefusal, Reassembled, Reassembler, ReassemblyCounters, ReassemblyLimits,
 };
 pub use scalar::{ExtensionBody, ExtensionObject, LocalizedText, QualifiedName, Scalar};
+pub use sequence::{SequenceCounter, SequenceOrder};
+pub use state::{PubSubState, StateEvent, StateMachine, StateRefused};
 pub use structure::StructureReader;
 pub use time::{DateTime, Timestamp};
 pub use variant::{Array, Elements, Variant};
