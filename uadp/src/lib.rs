@@ -75,6 +75,7 @@ mod structure;
 mod time;
 mod variant;
 mod writer;
+mod writer_state;
 
 pub use builtin::{BuiltinType, Guid, StatusCode};
 pub use chunk::{ChunkBudget, ChunkError, Chunks, PlacedChunk, Whole};
@@ -102,3 +103,4 @@ pub use state::{PubSubState, StateEvent, StateMachine, StateRefused};
 pub use structure::StructureReader;
 pub use time::{DateTime, Timestamp};
 pub use variant::{Array, Elements, Variant};
+pub use writer_state::{DataSetWriterState, WriterSettings, WriterSettingsError};
