@@ -52,7 +52,10 @@
 //! ```
 
 mod builtin;
+mod chunk;
+mod configuration_version;
 mod data_set_message;
+mod delta;
 mod encoder;
 mod error;
 mod field_encoder;
@@ -61,20 +64,30 @@ mod header_writer;
 mod nested;
 mod network_message;
 mod node_id;
+mod publisher_id;
 mod raw;
 mod reader;
+mod reader_state;
+mod reader_table;
+mod reassembler;
 mod scalar;
 mod security;
+mod sequence;
+mod state;
 mod structure;
 mod template;
 mod time;
 mod variant;
 mod writer;
+mod writer_state;
 
 pub use builtin::{BuiltinType, Guid, StatusCode};
+pub use chunk::{ChunkBudget, ChunkError, Chunks, PlacedChunk, Whole};
+pub use configuration_version::ConfigurationVersion;
 pub use data_set_message::{
     DataSetHeader, DataSetMessage, FieldEncoding, FieldValue, FieldValues, Fields, MessageKind,
 };
+pub use delta::{DeltaNull, Merged};
 pub use encoder::NetworkMessageEncoder;
 pub use error::{DecodeError, EncodeError};
 pub use field_encoder::{DataValueEncoder, DeltaEncoder, FieldEncoder};
@@ -83,17 +96,28 @@ pub use header_writer::Extras;
 pub use nested::{DataValue, DiagnosticInfo, Encoded};
 pub use network_message::{Chunk, Messages, NetworkMessage, PromotedFields};
 pub use node_id::{ExpandedNodeId, Identifier, NodeId};
+pub use publisher_id::OwnedPublisherId;
 pub use raw::{
     RawArray, RawDialect, RawElements, RawField, RawFields, RawLayout, RawLayoutError,
     RawLayoutFault, RawMembers, RawStructure, RawStructureType, RawValue, RawWriteError,
     RawWriteFault,
+};
+pub use reader_state::{
+    Accepted, Arrival, DataSetReaderState, ReaderCounters, ReaderDrop, ReaderSettings,
+};
+pub use reader_table::{ReaderKey, ReaderTable};
+pub use reassembler::{
+    ChunkRefusal, Reassembled, Reassembler, ReassemblyCounters, ReassemblyLimits,
 };
 pub use scalar::{ExtensionBody, ExtensionObject, LocalizedText, QualifiedName, Scalar};
 pub use security::{
     KeyError, Keys, Opened, Opener, OpenerOptions, Seal, SealError, Sealer, SecurityError,
     SecurityMode, SecurityPolicy,
 };
+pub use sequence::{SequenceCounter, SequenceOrder};
+pub use state::{PubSubState, StateEvent, StateMachine, StateRefused};
 pub use structure::StructureReader;
 pub use template::{Fixed, MessagePatch, MessageTemplate, PatchError};
 pub use time::{DateTime, Timestamp};
 pub use variant::{Array, Elements, Matrix, Variant};
+pub use writer_state::{DataSetWriterState, WriterSettings, WriterSettingsError};
