@@ -53,6 +53,7 @@
 
 mod builtin;
 mod data_set_message;
+pub mod discovery;
 mod encoder;
 mod error;
 mod field_encoder;
