@@ -1,6 +1,6 @@
 //! When a Publisher announces: once for many who ask, and never faster than it set out to, however many do.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::time::Duration;
 
 use super::probe::Probe;
@@ -37,7 +37,8 @@ pub struct Announcer {
     entries: BTreeMap<Subject, Entry>,
     /// How many of the entries are of subjects the Publisher does not have.
     unknown: usize,
-    window: Window,
+    /// When the last announcements were, no more than the rate allows in 500 ms.
+    sent: VecDeque<Duration>,
     sequence_number: u16,
     counters: AnnounceCounters,
 }
@@ -45,10 +46,11 @@ pub struct Announcer {
 /// How an [`Announcer`] answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct AnnounceLimits {
-    /// Time from the first probe to the announcement, in which others can ask for the same.
+    /// Time from the first probe to the announcement, in which others can ask for the same. Best another one for
+    /// every Publisher, since all of them are asked at once by [`Probe::FindApplications`].
     pub gather: Duration,
-    /// Most announcements in 500 ms. What is due beyond that waits.
-    pub rate: u32,
+    /// Most announcements in any 500 ms, at least 1. What is due beyond that waits.
+    pub rate: usize,
     /// Most DataSetWriters and WriterGroups the Publisher does not have that are answered in 500 ms, with a bad
     /// status. A probe for more of them is not answered.
     pub unknown: usize,
@@ -127,13 +129,6 @@ struct Entry {
     known: bool,
 }
 
-/// Announcements within 500 ms.
-#[derive(Debug, Clone, Copy)]
-struct Window {
-    end: Duration,
-    count: u32,
-}
-
 impl Announcer {
     /// A Publisher with these DataSetWriters: WriterGroupId and DataSetWriterId of each. Its first SequenceNumber is 0.
     #[must_use]
@@ -144,10 +139,7 @@ impl Announcer {
             groups: BTreeSet::new(),
             entries: BTreeMap::new(),
             unknown: 0,
-            window: Window {
-                end: Duration::ZERO,
-                count: 0,
-            },
+            sent: VecDeque::new(),
             sequence_number: 0,
             counters: AnnounceCounters::default(),
         };
@@ -233,10 +225,10 @@ impl Announcer {
     pub fn poll(&mut self, now: Duration) -> Option<DueAnnouncement> {
         self.forget(now);
         let (due, subject) = self.next()?;
-        if due > now || self.window.opens(&self.limits) > now {
+        if due.max(self.opens()) > now {
             return None;
         }
-        self.window.count_one(now);
+        self.count_sent(now);
         let writer_ids = match subject {
             Subject::DataSetWriterConfiguration(id) => self.writers_with(id, now),
             Subject::ApplicationInformation
@@ -263,7 +255,7 @@ impl Announcer {
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Duration> {
         let (due, _) = self.next()?;
-        Some(due.max(self.window.opens(&self.limits)))
+        Some(due.max(self.opens()))
     }
 
     /// What became of the subjects of probes.
@@ -360,6 +352,28 @@ impl Announcer {
             .collect()
     }
 
+    /// From when on the rate leaves room for one more.
+    fn opens(&self) -> Duration {
+        match self.sent.front() {
+            Some(oldest) if self.sent.len() >= self.rate() => oldest.saturating_add(SPACING),
+            _ => Duration::ZERO,
+        }
+    }
+
+    fn count_sent(&mut self, now: Duration) {
+        while self.sent.len() >= self.rate() {
+            self.sent.pop_front();
+        }
+        self.sent.push_back(now);
+    }
+
+    const fn rate(&self) -> usize {
+        match self.limits.rate {
+            0 => 1,
+            rate => rate,
+        }
+    }
+
     /// The subject is being announced: what is included, and never mind until it is asked for again.
     fn finish(&mut self, subject: Subject, now: Duration) -> Included {
         let Some(entry) = self.entries.get_mut(&subject) else {
@@ -387,24 +401,6 @@ impl Included {
     const fn add(&mut self, other: Self) {
         self.writer_groups |= other.writer_groups;
         self.data_set_writers |= other.data_set_writers;
-    }
-}
-
-impl Window {
-    /// From when on there is room for one more.
-    fn opens(&self, limits: &AnnounceLimits) -> Duration {
-        match self.count < limits.rate.max(1) {
-            true => Duration::ZERO,
-            false => self.end,
-        }
-    }
-
-    fn count_one(&mut self, now: Duration) {
-        if now >= self.end {
-            self.end = now.saturating_add(SPACING);
-            self.count = 0;
-        }
-        self.count += 1;
     }
 }
 
@@ -582,6 +578,31 @@ mod tests {
             sent.push((at, due(&mut announcer, at).len()));
         }
         assert_eq!(sent, [(ms(50), 2), (ms(550), 2), (ms(1050), 1)]);
+    }
+
+    #[test]
+    fn no_500_ms_have_more_announcements_than_the_rate() {
+        let limits = AnnounceLimits {
+            gather: Duration::ZERO,
+            rate: 2,
+            ..AnnounceLimits::default()
+        };
+        let mut announcer = Announcer::new([(1, 1)], limits);
+        for (subject, at) in [
+            (Subject::PublisherEndpoints, 0),
+            (Subject::PubSubConnections, 499),
+            (Subject::DataSetMetaData(1), 499),
+            (Subject::ApplicationInformation, 500),
+        ] {
+            announcer
+                .announce(subject, Included::default(), ms(at))
+                .unwrap();
+        }
+        let mut sent = Vec::new();
+        while let Some(at) = announcer.poll_timeout() {
+            sent.push((at, due(&mut announcer, at).len()));
+        }
+        assert_eq!(sent, [(ms(0), 1), (ms(499), 1), (ms(500), 1), (ms(999), 1)]);
     }
 
     #[test]

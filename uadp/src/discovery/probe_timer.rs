@@ -145,7 +145,7 @@ impl Default for ProbeLimits {
 
 /// 100 to 500 ms, evenly.
 fn delay(random: u32) -> Duration {
-    let spread = u64::from(random) * (SPREAD_NANOS + 1) >> 32;
+    let spread = (u64::from(random) * (SPREAD_NANOS + 1)) >> 32;
     SHORTEST_DELAY + Duration::from_nanos(spread)
 }
 

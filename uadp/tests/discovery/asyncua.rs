@@ -4,12 +4,12 @@
 use uadp::discovery::{
     ActionMetaData, ActionMethodDataType, ActionTargetDataType, Announced, Announcement,
     ApplicationDescription, ApplicationType, ConfigurationVersion, DataSetMetaDataType,
-    DataSetOrderingType, DatagramConnectionTransport2DataType, DatagramConnectionTransportDataType,
-    DatagramWriterGroupTransport2DataType, DatagramWriterGroupTransportDataType,
-    EndpointDescription, EnumField, FieldMetaData, KeyValuePair, List, MessageSecurityMode,
-    NetworkAddressUrlDataType, PubSubConnectionDataType, Settings, StructureType,
-    UadpDataSetWriterMessageDataType, UadpWriterGroupMessageDataType, UserTokenPolicy,
-    WriterGroupDataType,
+    DataSetOrderingType, DataSetWriterDataType, DatagramConnectionTransport2DataType,
+    DatagramConnectionTransportDataType, DatagramWriterGroupTransport2DataType,
+    DatagramWriterGroupTransportDataType, EndpointDescription, EnumField, FieldMetaData,
+    KeyValuePair, List, MessageSecurityMode, NetworkAddressUrlDataType, PubSubConnectionDataType,
+    Settings, StructureType, UadpDataSetWriterMessageDataType, UadpWriterGroupMessageDataType,
+    UserTokenPolicy, WriterGroupDataType,
 };
 use uadp::{
     BuiltinType, Guid, Identifier, LocalizedText, NodeId, QualifiedName, Scalar, StatusCode,
@@ -262,6 +262,12 @@ fn check_schema(meta_data: &DataSetMetaDataType<'_>) {
     assert_eq!(frame.max_string_length, 16);
     assert!(frame.is_optional);
 
+    assert_eq!(schema.structure(NodeId::string(1, "Mode")), None);
+    check_enumeration(meta_data);
+}
+
+fn check_enumeration(meta_data: &DataSetMetaDataType<'_>) {
+    let schema = &meta_data.schema;
     let mode = schema.enumeration(NodeId::string(1, "Mode")).unwrap();
     assert_eq!(mode.built_in_type, BuiltinType::Int32.id());
     let works: EnumField<'_> = mode.enum_definition.field(-7).unwrap();
@@ -273,7 +279,6 @@ fn check_schema(meta_data: &DataSetMetaDataType<'_>) {
     assert_eq!(frame.base_data_type.identifier, Identifier::Numeric(12));
     assert_eq!(frame.built_in_type, BuiltinType::String.id());
 
-    assert_eq!(schema.structure(NodeId::string(1, "Mode")), None);
     assert_eq!(schema.enumeration(NodeId::numeric(1, 3001)), None);
     assert_eq!(schema.simple_type(NodeId::NULL), None);
 }
@@ -320,7 +325,10 @@ fn check_writer_group(writer_group: &WriterGroupDataType<'_>) {
         UadpWriterGroupMessageDataType::from_object(&writer_group.message_settings),
         Ok(Some(message))
     );
-    let writer = writer_group.data_set_writers.get(0).unwrap();
+    check_writer(&writer_group.data_set_writers.get(0).unwrap());
+}
+
+fn check_writer(writer: &DataSetWriterDataType<'_>) {
     assert_eq!(writer.data_set_writer_id, 10);
     assert_eq!(writer.data_set_field_content_mask, 0x20);
     assert_eq!(writer.key_frame_count, 5);

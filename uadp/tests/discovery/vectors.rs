@@ -100,7 +100,11 @@ fn announcements_are_read_as_described_and_written_back() {
                 assert_eq!(json["statusCodes"], statuses);
             }
             Announced::PubSubConnection { status, .. } => assert_eq!(status, StatusCode::GOOD),
-            ref other => unreachable!("{other:?}"),
+            Announced::PubSubConnections(_)
+            | Announced::ApplicationDescription { .. }
+            | Announced::ApplicationStatus { .. }
+            | Announced::ActionResponder(_)
+            | Announced::ActionMetaData(_) => unreachable!("{found:?}"),
         }
         assert_eq!(datagram(&found), bytes, "{name}");
     }
