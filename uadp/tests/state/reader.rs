@@ -329,15 +329,14 @@ fn what_the_headers_say_is_found_in_datagrams() {
     let arrival = Arrival::of(&network.header(), 3, &message);
     assert_eq!(arrival.group, group);
     assert_eq!(arrival.position, 3);
-    assert_eq!(arrival.header, message.header);
-    match message.header.timestamp {
+    assert_eq!(arrival.header, message.header());
+    match message.header().timestamp {
         Some(own) => assert_eq!(arrival.timestamp.unwrap().time, own),
         None => assert_eq!(arrival.timestamp.unwrap().time, stamp),
     }
     // Its own Timestamp goes before that of the NetworkMessage.
-    let mut own = message.clone();
-    own.header.timestamp = Some(DateTime(5));
-    own.header.picoseconds = Some(6);
+    let with_time = [0x81, 0x30, 5, 0, 0, 0, 0, 0, 0, 0, 6, 0, 0, 0];
+    let own = DataSetMessage::decode(None, &with_time).unwrap();
     let arrival = Arrival::of(&network.header(), 0, &own);
     assert_eq!(
         arrival.timestamp,
