@@ -4,8 +4,9 @@ use serde_json::Value;
 use uadp::MessageKind::{DeltaFrame, Event, KeepAlive, KeyFrame};
 use uadp::PubSubState::{Disabled, Error, Operational, Paused, PreOperational};
 use uadp::{
-    Accepted, Arrival, ConfigurationVersion, DataSetReaderState, DateTime, DeltaNull, GroupHeader,
-    Merged, NetworkHeader, NetworkMessage, ReaderDrop, ReaderSettings, Timestamp,
+    Accepted, Arrival, ConfigurationVersion, DataSetMessage, DataSetReaderState, DateTime,
+    DeltaNull, GroupHeader, Merged, NetworkHeader, NetworkMessage, ReaderDrop, ReaderSettings,
+    Timestamp,
 };
 
 use crate::{datagram, description, message, ms, settings, start_reader, versioned};
