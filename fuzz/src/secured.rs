@@ -28,13 +28,14 @@ pub fn secured(data: &[u8]) {
             SecurityMode::SignAndEncrypt,
         ),
     };
+    let own = hash(data);
     let mut sealer = Sealer::new(mode);
     let mut opener = Opener::new(mode);
     sealer
-        .update_keys(7, keys(policy))
+        .update_keys(7, keys(policy, own))
         .expect("a token and keys");
     opener
-        .update_keys(7, keys(policy))
+        .update_keys(7, keys(policy, own))
         .expect("a token and keys");
     let mut sent: Vec<Sent> = Vec::new();
     let mut scratch = Vec::new();
