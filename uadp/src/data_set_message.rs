@@ -108,6 +108,15 @@ impl Default for DataSetHeader {
 }
 
 impl<'a> DataSetMessage<'a> {
+    /// Reads the header of a DataSetMessage that stands alone, as reassembled chunks give it. `writer_id` is the
+    /// DataSetWriterId of the chunks.
+    ///
+    /// # Errors
+    /// Fails as an item of [`NetworkMessage::messages`](crate::NetworkMessage::messages) does.
+    pub fn decode(writer_id: Option<u16>, bytes: &'a [u8]) -> Result<Self, DecodeError> {
+        Self::read(writer_id, Reader::new(bytes))
+    }
+
     /// Reads the header of the message that `reader` holds and nothing else.
     #[inline]
     pub(crate) fn read(

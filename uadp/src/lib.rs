@@ -52,7 +52,10 @@
 //! ```
 
 mod builtin;
+mod chunk;
+mod configuration_version;
 mod data_set_message;
+mod delta;
 mod encoder;
 mod error;
 mod field_encoder;
@@ -62,19 +65,29 @@ mod nested;
 mod network_message;
 mod node_id;
 mod raw;
+mod publisher_id;
 mod reader;
+mod reader_state;
+mod reader_table;
+mod reassembler;
 mod scalar;
 mod security;
+mod sequence;
+mod state;
 mod structure;
 mod template;
 mod time;
 mod variant;
 mod writer;
+mod writer_state;
 
 pub use builtin::{BuiltinType, Guid, StatusCode};
 pub use data_set_message::{
     DataSetHeader, DataSetMessage, FieldEncoding, FieldValue, FieldValues, Fields, MessageKind,
 };
+pub use chunk::{ChunkBudget, ChunkError, Chunks, PlacedChunk, Whole};
+pub use configuration_version::ConfigurationVersion;
+pub use delta::{DeltaNull, Merged};
 pub use encoder::NetworkMessageEncoder;
 pub use error::{DecodeError, EncodeError};
 pub use field_encoder::{DataValueEncoder, DeltaEncoder, FieldEncoder};
@@ -93,7 +106,18 @@ pub use security::{
     KeyError, Keys, Opened, Opener, OpenerOptions, Seal, SealError, Sealer, SecurityError,
     SecurityMode, SecurityPolicy,
 };
+pub use publisher_id::OwnedPublisherId;
+pub use reader_state::{
+    Accepted, Arrival, DataSetReaderState, ReaderCounters, ReaderDrop, ReaderSettings,
+};
+pub use reader_table::{ReaderKey, ReaderTable};
+pub use reassembler::{
+    ChunkRefusal, Reassembled, Reassembler, ReassemblyCounters, ReassemblyLimits,
+};
+pub use sequence::{SequenceCounter, SequenceOrder};
+pub use state::{PubSubState, StateEvent, StateMachine, StateRefused};
 pub use structure::StructureReader;
 pub use template::{Fixed, MessagePatch, MessageTemplate, PatchError};
 pub use time::{DateTime, Timestamp};
 pub use variant::{Array, Elements, Matrix, Variant};
+pub use writer_state::{DataSetWriterState, WriterSettings, WriterSettingsError};

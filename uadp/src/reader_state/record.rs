@@ -1,0 +1,106 @@
+//! Which sequence numbers of a writer were received.
+
+use crate::sequence::{Place, REACH, SequenceWindow};
+use crate::{Accepted, Arrival, MessageKind, ReaderDrop};
+
+/// The sequence numbers received so far.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Record {
+    pub(super) of: Numbers,
+    window: SequenceWindow,
+    /// Position of the last message in its NetworkMessage.
+    position: usize,
+}
+
+/// Whose sequence numbers tell the messages apart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Numbers {
+    DataSetMessages,
+    NetworkMessages,
+}
+
+impl Numbers {
+    /// The number that tells the message apart, if it has one.
+    pub(super) fn of(arrival: &Arrival) -> Option<(Self, u16)> {
+        let own = arrival.header.sequence_number;
+        let group = arrival.group.sequence_number;
+        own.map(|number| (Self::DataSetMessages, number))
+            .or_else(|| group.map(|number| (Self::NetworkMessages, number)))
+    }
+}
+
+impl Record {
+    pub(super) fn first(of: Numbers, number: u16, arrival: &Arrival) -> Self {
+        Self {
+            of,
+            window: match is_next_expected(of, arrival) {
+                true => SequenceWindow::before(number),
+                false => SequenceWindow::at(number),
+            },
+            position: arrival.position,
+        }
+    }
+
+    /// The record with the message in it, and how that stands to the ones before.
+    pub(super) fn place(
+        mut self,
+        number: u16,
+        arrival: &Arrival,
+        accept_late: bool,
+    ) -> Result<(Self, Accepted), ReaderDrop> {
+        if is_next_expected(self.of, arrival) {
+            return self.expect(number);
+        }
+        let mut accepted = Accepted::default();
+        match self.window.place(number) {
+            Place::Newer { missed } => {
+                // A NetworkMessage that is missing need not have had a message of this writer.
+                if self.of == Numbers::DataSetMessages {
+                    accepted.missed = missed;
+                }
+            }
+            // The next of several messages in one NetworkMessage.
+            Place::Seen if self.is_same_network_message(number, arrival) => {}
+            Place::Seen => return Err(ReaderDrop::Duplicate),
+            Place::Behind { by } if accept_late && by < REACH => {
+                accepted.late = true;
+                self.window.receive(number);
+                return Ok((self, accepted));
+            }
+            Place::Behind { by } => return Err(ReaderDrop::Stale { behind: by }),
+            Place::Invalid => return Err(ReaderDrop::OutOfWindow),
+        }
+        self.window.receive(number);
+        self.position = arrival.position;
+        Ok((self, accepted))
+    }
+
+    fn is_same_network_message(&self, number: u16, arrival: &Arrival) -> bool {
+        self.of == Numbers::NetworkMessages
+            && self.window.is_last(number)
+            && arrival.position > self.position
+    }
+
+    /// Takes note of a keep-alive: `next` is the number of the message to come.
+    fn expect(mut self, next: u16) -> Result<(Self, Accepted), ReaderDrop> {
+        let mut accepted = Accepted::default();
+        let last = next.wrapping_sub(1);
+        match self.window.place(last) {
+            Place::Newer { missed } => {
+                accepted.missed = missed.saturating_add(1);
+                self.window.expect(next);
+                Ok((self, accepted))
+            }
+            _ if self.window.is_last(last) => Ok((self, accepted)),
+            Place::Seen | Place::Behind { .. } => Err(ReaderDrop::Stale {
+                behind: self.window.distance(last),
+            }),
+            Place::Invalid => Err(ReaderDrop::OutOfWindow),
+        }
+    }
+}
+
+/// Keep-alives carry the DataSetMessageSequenceNumber of the next message (OPC 10000-14, 7.2.4.5.8).
+fn is_next_expected(of: Numbers, arrival: &Arrival) -> bool {
+    of == Numbers::DataSetMessages && arrival.kind == MessageKind::KeepAlive
+}

@@ -1,0 +1,230 @@
+//! One whole of which chunks are missing.
+
+use std::collections::BTreeMap;
+use std::hash::{DefaultHasher, Hasher};
+use std::time::Duration;
+
+use crate::publisher_id::OwnedPublisherId;
+use crate::{Chunk, NetworkMessage, NetworkMessageType, PublisherId};
+
+/// What tells one whole from another.
+#[derive(Debug)]
+pub(super) struct Key {
+    publisher_id: Option<OwnedPublisherId>,
+    writer: Writer,
+    message_sequence_number: u16,
+}
+
+/// The same for looking up, without owning the PublisherId.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct KeyRef<'a> {
+    publisher_id: Option<PublisherId<'a>>,
+    writer: Writer,
+    message_sequence_number: u16,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Writer {
+    group_id: Option<u16>,
+    message_type: NetworkMessageType,
+    writer_id: Option<u16>,
+    signed: bool,
+    encrypted: bool,
+}
+
+/// A whole in pieces.
+#[derive(Debug)]
+pub(super) struct Open {
+    pub(super) key: Key,
+    pub(super) total_size: u32,
+    /// When its first chunk came.
+    pub(super) since: Duration,
+    /// By offset; none touches another's bytes.
+    pieces: BTreeMap<u32, Box<[u8]>>,
+    /// Bytes of the pieces.
+    received: u32,
+}
+
+/// A whole that was complete, by what its chunks are known again.
+#[derive(Debug)]
+pub(super) struct Done {
+    pub(super) key: Key,
+    /// When it was complete.
+    pub(super) at: Duration,
+    total_size: u32,
+    /// The offsets of the pieces, rising, and their digests.
+    pieces: Box<[(u32, u64)]>,
+}
+
+/// What became of a chunk.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Insertion {
+    Taken,
+    /// The same bytes are there.
+    Duplicate,
+    /// Other bytes are in the same place.
+    Contradiction,
+    /// A part of its place is taken.
+    Overlap,
+    TooMany,
+}
+
+impl<'a> KeyRef<'a> {
+    pub(super) fn of(message: &NetworkMessage<'a>, chunk: &Chunk<'_>) -> Self {
+        let header = message.header();
+        let security = message.security().unwrap_or_default();
+        Self {
+            publisher_id: header.publisher_id,
+            writer: Writer {
+                group_id: header.group.and_then(|group| group.writer_group_id),
+                message_type: message.message_type(),
+                writer_id: chunk.writer_id,
+                signed: security.signed,
+                encrypted: security.encrypted,
+            },
+            message_sequence_number: chunk.message_sequence_number,
+        }
+    }
+
+    pub(super) fn is(&self, key: &Key) -> bool {
+        self.message_sequence_number == key.message_sequence_number && self.is_writer_of(key)
+    }
+
+    pub(super) fn is_writer_of(&self, key: &Key) -> bool {
+        let publisher_id = key.publisher_id.as_ref().map(OwnedPublisherId::as_id);
+        self.writer == key.writer && self.publisher_id == publisher_id
+    }
+
+    pub(super) fn to_key(self) -> Key {
+        Key {
+            publisher_id: self.publisher_id.map(Into::into),
+            writer: self.writer,
+            message_sequence_number: self.message_sequence_number,
+        }
+    }
+}
+
+impl Key {
+    /// Bytes it takes, roughly.
+    pub(super) fn cost(&self) -> usize {
+        let text = match &self.publisher_id {
+            Some(OwnedPublisherId::String(text)) => text.len(),
+            Some(
+                OwnedPublisherId::Byte(_)
+                | OwnedPublisherId::UInt16(_)
+                | OwnedPublisherId::UInt32(_)
+                | OwnedPublisherId::UInt64(_),
+            )
+            | None => 0,
+        };
+        text + KEY_COST
+    }
+}
+
+impl Open {
+    pub(super) const fn new(key: Key, total_size: u32, since: Duration) -> Self {
+        Self {
+            key,
+            total_size,
+            since,
+            pieces: BTreeMap::new(),
+            received: 0,
+        }
+    }
+
+    /// Keeps the piece, unless it is there or the whole has `limit` pieces.
+    pub(super) fn insert(&mut self, chunk: &Chunk<'_>, limit: usize) -> Insertion {
+        match self.pieces.get(&chunk.offset) {
+            Some(piece) if **piece == *chunk.data => return Insertion::Duplicate,
+            Some(piece) if piece.len() == chunk.data.len() => return Insertion::Contradiction,
+            Some(_) => return Insertion::Overlap,
+            None => {}
+        }
+        let Ok(len) = u32::try_from(chunk.data.len()) else {
+            return Insertion::Overlap;
+        };
+        if self.overlaps(chunk.offset, len) {
+            return Insertion::Overlap;
+        }
+        if self.pieces.len() >= limit {
+            return Insertion::TooMany;
+        }
+        self.pieces.insert(chunk.offset, chunk.data.into());
+        self.received += len;
+        Insertion::Taken
+    }
+
+    fn overlaps(&self, offset: u32, len: u32) -> bool {
+        let before = self.pieces.range(..offset).next_back();
+        let after = self.pieces.range(offset..).next();
+        before.is_some_and(|(at, piece)| *at as usize + piece.len() > offset as usize)
+            || after.is_some_and(|(at, _)| *at - offset < len)
+    }
+
+    /// True when no piece is missing: they do not overlap, so their number of bytes tells.
+    pub(super) const fn is_complete(&self) -> bool {
+        self.received == self.total_size
+    }
+
+    /// Replaces the contents of `out` by the pieces.
+    pub(super) fn write(&self, out: &mut Vec<u8>) {
+        out.clear();
+        out.reserve_exact(self.received as usize);
+        for piece in self.pieces.values() {
+            out.extend_from_slice(piece);
+        }
+    }
+
+    /// What is remembered of it.
+    pub(super) fn done(self, at: Duration) -> Done {
+        let pieces = self.pieces.iter();
+        Done {
+            key: self.key,
+            at,
+            total_size: self.total_size,
+            pieces: pieces.map(|(at, piece)| (*at, digest(piece))).collect(),
+        }
+    }
+
+    /// Bytes it takes, roughly.
+    pub(super) fn cost(&self) -> usize {
+        self.key.cost() + self.received as usize + self.pieces.len() * PIECE_COST
+    }
+}
+
+impl Done {
+    /// A whole of one piece.
+    pub(super) fn alone(key: Key, chunk: &Chunk<'_>, at: Duration) -> Self {
+        Self {
+            key,
+            at,
+            total_size: chunk.total_size,
+            pieces: Box::new([(chunk.offset, digest(chunk.data))]),
+        }
+    }
+
+    /// True when one of its pieces was this one.
+    pub(super) fn had(&self, chunk: &Chunk<'_>) -> bool {
+        let pieces = &self.pieces;
+        let found = pieces.binary_search_by_key(&chunk.offset, |(at, _)| *at);
+        let piece = found.ok().and_then(|at| pieces.get(at));
+        self.total_size == chunk.total_size
+            && piece.is_some_and(|(_, known)| *known == digest(chunk.data))
+    }
+
+    /// Bytes it takes, roughly.
+    pub(super) fn cost(&self) -> usize {
+        self.key.cost() + self.pieces.len() * size_of::<(u32, u64)>()
+    }
+}
+
+fn digest(piece: &[u8]) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    hasher.write(piece);
+    hasher.finish()
+}
+
+/// A key with its place in a queue, and the empty lists of a whole.
+const KEY_COST: usize = 160;
+/// A piece with its place in the tree and what the allocator adds.
+const PIECE_COST: usize = 96;
