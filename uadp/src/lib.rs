@@ -56,6 +56,7 @@ mod chunk;
 mod configuration_version;
 mod data_set_message;
 mod delta;
+pub mod discovery;
 mod encoder;
 mod error;
 mod field_encoder;

@@ -296,21 +296,21 @@ fn write_text<const TAGGED: bool>(
 }
 
 impl<'a> QualifiedName<'a> {
-    fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
         Ok(Self {
             namespace: reader.u16("QualifiedName NamespaceIndex")?,
             name: reader.text("QualifiedName Name")?,
         })
     }
 
-    fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
+    pub(crate) fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
         out.extend_from_slice(&self.namespace.to_le_bytes());
         writer::byte_string(out, self.name.map(str::as_bytes), "QualifiedName Name")
     }
 }
 
 impl<'a> LocalizedText<'a> {
-    fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
         let mask = reader.u8("LocalizedText")?;
         let reserved = mask & !(HAS_LOCALE | HAS_TEXT);
         if reserved != 0 {
@@ -330,7 +330,7 @@ impl<'a> LocalizedText<'a> {
         Ok(Self { locale, text })
     }
 
-    fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
+    pub(crate) fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
         let mut mask = 0;
         if self.locale.is_some() {
             mask |= HAS_LOCALE;
@@ -350,7 +350,7 @@ impl<'a> LocalizedText<'a> {
 }
 
 impl<'a> ExtensionObject<'a> {
-    fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+    pub(crate) fn read(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
         let type_id = NodeId::read(reader)?;
         let body = match reader.u8("ExtensionObject encoding")? {
             NO_BODY => ExtensionBody::None,
@@ -372,7 +372,7 @@ impl<'a> ExtensionObject<'a> {
         Ok(Self { type_id, body })
     }
 
-    fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
+    pub(crate) fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
         self.type_id.write(out)?;
         match self.body {
             ExtensionBody::None => {

@@ -1,0 +1,391 @@
+//! Discovery announcements: what a Publisher says of itself.
+
+use super::configuration::{PubSubConnectionDataType, WriterGroupDataType};
+use super::endpoint::{ApplicationDescription, EndpointDescription};
+use super::list::List;
+use super::meta_data::DataSetMetaDataType;
+use super::wire::{Structure, enumeration, structure};
+use super::{read_payload, write_headers};
+use crate::reader::Reader;
+use crate::{
+    DateTime, DecodeError, EncodeError, LocalizedText, NetworkMessage, NetworkMessageType, NodeId,
+    PublisherId, SecurityHeader, StatusCode,
+};
+
+/// A discovery announcement (OPC 10000-14, 7.2.4.6.3).
+///
+/// The PublisherId in the header of its NetworkMessage is that of the Publisher who announces.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Announcement<'a> {
+    /// One more with every announcement of the PublisherId. Of one sent in chunks it is their
+    /// MessageSequenceNumber too.
+    pub sequence_number: u16,
+    /// What is announced.
+    pub announced: Announced<'a>,
+}
+
+/// What an [`Announcement`] tells.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Announced<'a> {
+    /// The Endpoints of the Server beside the Publisher (OPC 10000-14, 7.2.4.6.6).
+    PublisherEndpoints {
+        /// The Endpoints.
+        endpoints: List<'a, EndpointDescription<'a>>,
+        /// Bad when it cannot tell.
+        status: StatusCode,
+    },
+    /// The content of the DataSet of a DataSetWriter (OPC 10000-14, 7.2.4.6.4).
+    DataSetMetaData {
+        /// The DataSetWriter.
+        writer_id: u16,
+        /// The metadata; what they say counts only when the status is good.
+        meta_data: DataSetMetaDataType<'a>,
+        /// Bad when it cannot tell, such as of a DataSetWriter it does not have.
+        status: StatusCode,
+    },
+    /// A WriterGroup with some of its DataSetWriters (OPC 10000-14, 7.2.4.6.9). It also answers the
+    /// [`Probe::WriterGroupConfiguration`](super::Probe), for which the standard has no announcement of its own.
+    DataSetWriterConfiguration {
+        /// The DataSetWriters it is about.
+        writer_ids: List<'a, u16>,
+        /// The group, with the DataSetWriters it is about only.
+        writer_group: WriterGroupDataType<'a>,
+        /// One for each DataSetWriterId, in their order.
+        statuses: List<'a, StatusCode>,
+    },
+    /// The PubSubConnections (OPC 10000-14, 7.2.4.6.8).
+    PubSubConnections(List<'a, PubSubConnectionDataType<'a>>),
+    /// One PubSubConnection with a status: not the form of the standard, which has an array and no status, but what
+    /// other stacks send under the same AnnouncementType. To be read, not to be sent.
+    PubSubConnection {
+        /// The connection.
+        connection: PubSubConnectionDataType<'a>,
+        /// Bad when it cannot tell.
+        status: StatusCode,
+    },
+    /// The application, as an answer to [`Probe::FindApplications`](super::Probe) too (OPC 10000-14, 7.2.4.6.5).
+    ApplicationDescription {
+        /// The application.
+        description: ApplicationDescription<'a>,
+        /// Capability identifiers of OPC 10000-12, Annex D.
+        capabilities: List<'a, Option<&'a str>>,
+    },
+    /// The state of the Publisher (OPC 10000-14, 7.2.4.6.7).
+    ApplicationStatus {
+        /// State of the PubSubConnection.
+        state: ConnectionState,
+        /// Times of a status that is sent cyclically; `None` of one that is sent on change.
+        cyclic: Option<CyclicStatus>,
+    },
+    /// The connections that answer Actions (OPC 10000-14, 7.2.4.6.10).
+    ActionResponder(List<'a, PubSubConnectionDataType<'a>>),
+    /// What goes into an Action and what comes out of it (OPC 10000-14, 7.2.4.6.11).
+    ActionMetaData(ActionMetaData<'a>),
+}
+
+structure! {
+    /// When a cyclic status was sent and when the next is to be expected (OPC 10000-14, 7.2.4.6.7).
+    CyclicStatus {
+        /// When the next status comes. Past it, the Publisher is to be taken for failed.
+        next_report_time: DateTime = "NextReportTime",
+        /// When this one was sent.
+        timestamp: DateTime = "Timestamp",
+    }
+
+    /// An Action and the targets it can be called on (OPC 10000-14, 7.2.4.6.11).
+    ActionMetaData<'a> {
+        /// DataSetWriter of the Action.
+        writer_id: u16 = "DataSetWriterId",
+        /// What it can be called on.
+        action_targets: List<'a, ActionTargetDataType<'a>> = "ActionTargets",
+        /// Content of requests; its name is that of the Action.
+        request: DataSetMetaDataType<'a> = "Request",
+        /// Content of responses, with the name and ConfigurationVersion of the request.
+        response: DataSetMetaDataType<'a> = "Response",
+        /// The Methods behind the targets, in their order; may be left out.
+        action_methods: List<'a, ActionMethodDataType<'a>> = "ActionMethods",
+    }
+
+    /// Something an Action can be called on (OPC 10000-14, 6.2.3.10.3).
+    ActionTargetDataType<'a> {
+        /// Unique among the targets of the Action.
+        action_target_id: u16 = "ActionTargetId",
+        /// Its name.
+        name: Option<&'a str> = "Name",
+        /// What it is, for people.
+        description: LocalizedText<'a> = "Description",
+    }
+
+    /// The Method behind a target of an Action (OPC 10000-14, 6.2.3.10).
+    ActionMethodDataType<'a> {
+        /// The Object.
+        object_id: NodeId<'a> = "ObjectId",
+        /// Its Method.
+        method_id: NodeId<'a> = "MethodId",
+    }
+}
+
+enumeration! {
+    /// PubSubState as it stands in an announcement (OPC 10000-14, 6.2.1).
+    ConnectionState {
+        /// Not enabled.
+        DISABLED = 0,
+        /// Enabled, but something above it is not.
+        PAUSED = 1,
+        /// Working.
+        OPERATIONAL = 2,
+        /// Enabled, but something is wrong.
+        ERROR = 3,
+        /// Enabled, and on the way to work.
+        PRE_OPERATIONAL = 4,
+    }
+}
+
+impl<'a> Announcement<'a> {
+    /// Reads the announcement of a NetworkMessage.
+    ///
+    /// # Errors
+    /// [`DecodeError::Misread`] when it is no announcement, a chunk, or still sealed; else as
+    /// [`decode_body`](Self::decode_body).
+    pub fn decode(message: &NetworkMessage<'a>) -> Result<Self, DecodeError> {
+        match message.message_type() {
+            NetworkMessageType::Announcement => Self::decode_body(read_payload(message)?),
+            NetworkMessageType::DataSet | NetworkMessageType::Probe => {
+                Err(DecodeError::Misread("no discovery announcement"))
+            }
+        }
+    }
+
+    /// Reads what stands behind the headers of an announcement, such as the whole of its chunks.
+    ///
+    /// # Errors
+    /// [`DecodeError::Reserved`] names a kind of announcement that is not known. Else fails when a field is cut off
+    /// or malformed, and for bytes behind the last one.
+    pub fn decode_body(body: &'a [u8]) -> Result<Self, DecodeError> {
+        let mut reader = Reader::new(body);
+        let announcement_type = reader.u8("AnnouncementType")?;
+        let sequence_number = reader.u16("SequenceNumber")?;
+        let announced = Announced::read(announcement_type, &mut reader)?;
+        match reader.remaining() {
+            0 => Ok(Self {
+                sequence_number,
+                announced,
+            }),
+            left => Err(DecodeError::TrailingBytes(left)),
+        }
+    }
+
+    /// Appends the whole NetworkMessage, up to the end of its payload. Without security the header is
+    /// [`SecurityHeader::NONE`].
+    ///
+    /// # Errors
+    /// [`EncodeError::TooBig`] when a text, array or nonce is too long for its length.
+    pub fn encode(
+        &self,
+        publisher_id: PublisherId<'_>,
+        security: SecurityHeader<'_>,
+        out: &mut Vec<u8>,
+    ) -> Result<(), EncodeError> {
+        write_headers(
+            NetworkMessageType::Announcement,
+            publisher_id,
+            security,
+            out,
+        )?;
+        self.encode_body(out)
+    }
+
+    /// Appends what stands behind the headers: what is cut in pieces when the NetworkMessage would be longer than the
+    /// DiscoveryMaxMessageSize (OPC 10000-14, 6.4.1.2.4 and 7.2.4.4.4).
+    ///
+    /// # Errors
+    /// [`EncodeError::TooBig`] when a text or array is too long for its length.
+    pub fn encode_body(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
+        out.push(self.announced.announcement_type());
+        out.extend_from_slice(&self.sequence_number.to_le_bytes());
+        self.announced.write(out)
+    }
+}
+
+impl<'a> Announced<'a> {
+    /// AnnouncementType, 1 to 7 (OPC 10000-14, 7.2.4.6.3).
+    #[must_use]
+    pub const fn announcement_type(&self) -> u8 {
+        match self {
+            Self::PublisherEndpoints { .. } => PUBLISHER_ENDPOINTS,
+            Self::DataSetMetaData { .. } => DATA_SET_META_DATA,
+            Self::DataSetWriterConfiguration { .. } => DATA_SET_WRITER_CONFIGURATION,
+            Self::PubSubConnections(_) | Self::PubSubConnection { .. } => PUB_SUB_CONNECTIONS,
+            Self::ApplicationDescription { .. } | Self::ApplicationStatus { .. } => {
+                APPLICATION_INFORMATION
+            }
+            Self::ActionResponder(_) => ACTION_RESPONDER,
+            Self::ActionMetaData(_) => ACTION_META_DATA,
+        }
+    }
+
+    fn read(announcement_type: u8, reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        Ok(match announcement_type {
+            PUBLISHER_ENDPOINTS => Self::PublisherEndpoints {
+                endpoints: List::read(reader, ENDPOINTS)?,
+                status: Structure::read(reader, STATUS_CODE)?,
+            },
+            DATA_SET_META_DATA => Self::DataSetMetaData {
+                writer_id: reader.u16("DataSetWriterId")?,
+                meta_data: Structure::read(reader, "MetaData")?,
+                status: Structure::read(reader, STATUS_CODE)?,
+            },
+            DATA_SET_WRITER_CONFIGURATION => Self::read_writer_configuration(reader)?,
+            PUB_SUB_CONNECTIONS => Self::read_connections(reader)?,
+            APPLICATION_INFORMATION => Self::read_application_information(reader)?,
+            ACTION_RESPONDER => Self::ActionResponder(List::read(reader, "ActionResponder")?),
+            ACTION_META_DATA => Self::ActionMetaData(Structure::read(reader, "ActionMetaData")?),
+            unknown => {
+                return Err(DecodeError::Reserved {
+                    field: "AnnouncementType",
+                    value: unknown.into(),
+                });
+            }
+        })
+    }
+
+    fn read_writer_configuration(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        let writer_ids: List<'a, u16> = List::read(reader, WRITER_IDS)?;
+        let writer_group = Structure::read(reader, "DataSetWriterConfig")?;
+        let statuses: List<'a, StatusCode> = List::read(reader, STATUS_CODES)?;
+        if statuses.len() != writer_ids.len() {
+            return Err(DecodeError::Reserved {
+                field: "number of statusCodes",
+                value: u32::try_from(statuses.len()).unwrap_or(u32::MAX),
+            });
+        }
+        Ok(Self::DataSetWriterConfiguration {
+            writer_ids,
+            writer_group,
+            statuses,
+        })
+    }
+
+    /// The standard's form, else that of others. What is neither is reported as the standard's gone wrong.
+    fn read_connections(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        let mut other = *reader;
+        let connections = List::read(reader, CONNECTIONS).map(Self::PubSubConnections);
+        if connections.is_ok() && reader.remaining() == 0 {
+            return connections;
+        }
+        match Self::read_single_connection(&mut other) {
+            Ok(connection) if other.remaining() == 0 => {
+                *reader = other;
+                Ok(connection)
+            }
+            Ok(_) | Err(_) => connections,
+        }
+    }
+
+    fn read_single_connection(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        Ok(Self::PubSubConnection {
+            connection: Structure::read(reader, CONNECTIONS)?,
+            status: Structure::read(reader, STATUS_CODE)?,
+        })
+    }
+
+    fn read_application_information(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        Ok(match reader.u16("ApplicationInformationType")? {
+            APPLICATION_DESCRIPTION => Self::ApplicationDescription {
+                description: Structure::read(reader, "ApplicationDescription")?,
+                capabilities: List::read(reader, CAPABILITIES)?,
+            },
+            APPLICATION_STATUS => {
+                let is_cyclic = bool::read(reader, "IsCyclic")?;
+                Self::ApplicationStatus {
+                    state: Structure::read(reader, "Status")?,
+                    cyclic: match is_cyclic {
+                        true => Some(Structure::read(reader, "CyclicStatus")?),
+                        false => None,
+                    },
+                }
+            }
+            unknown => {
+                return Err(DecodeError::Reserved {
+                    field: "ApplicationInformationType",
+                    value: unknown.into(),
+                });
+            }
+        })
+    }
+
+    fn write(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
+        match self {
+            Self::PublisherEndpoints { endpoints, status } => {
+                endpoints.write(out, ENDPOINTS)?;
+                status.write(out, STATUS_CODE)
+            }
+            Self::DataSetMetaData {
+                writer_id,
+                meta_data,
+                status,
+            } => {
+                out.extend_from_slice(&writer_id.to_le_bytes());
+                meta_data.write(out, "MetaData")?;
+                status.write(out, STATUS_CODE)
+            }
+            Self::DataSetWriterConfiguration {
+                writer_ids,
+                writer_group,
+                statuses,
+            } => {
+                if statuses.len() != writer_ids.len() {
+                    return Err(EncodeError::Misplaced(
+                        "another number of statuses than of DataSetWriterIds",
+                    ));
+                }
+                writer_ids.write(out, WRITER_IDS)?;
+                writer_group.write(out, "DataSetWriterConfig")?;
+                statuses.write(out, STATUS_CODES)
+            }
+            Self::PubSubConnections(connections) | Self::ActionResponder(connections) => {
+                connections.write(out, CONNECTIONS)
+            }
+            Self::PubSubConnection { connection, status } => {
+                connection.write(out, CONNECTIONS)?;
+                status.write(out, STATUS_CODE)
+            }
+            Self::ApplicationDescription {
+                description,
+                capabilities,
+            } => {
+                out.extend_from_slice(&APPLICATION_DESCRIPTION.to_le_bytes());
+                description.write(out, "ApplicationDescription")?;
+                capabilities.write(out, CAPABILITIES)
+            }
+            Self::ApplicationStatus { state, cyclic } => {
+                out.extend_from_slice(&APPLICATION_STATUS.to_le_bytes());
+                out.push(u8::from(cyclic.is_some()));
+                state.write(out, "Status")?;
+                match cyclic {
+                    Some(cyclic) => cyclic.write(out, "CyclicStatus"),
+                    None => Ok(()),
+                }
+            }
+            Self::ActionMetaData(action) => action.write(out, "ActionMetaData"),
+        }
+    }
+}
+
+const PUBLISHER_ENDPOINTS: u8 = 1;
+const DATA_SET_META_DATA: u8 = 2;
+const DATA_SET_WRITER_CONFIGURATION: u8 = 3;
+const PUB_SUB_CONNECTIONS: u8 = 4;
+const APPLICATION_INFORMATION: u8 = 5;
+const ACTION_RESPONDER: u8 = 6;
+const ACTION_META_DATA: u8 = 7;
+
+const APPLICATION_DESCRIPTION: u16 = 1;
+const APPLICATION_STATUS: u16 = 2;
+
+const ENDPOINTS: &str = "Endpoints";
+const STATUS_CODE: &str = "statusCode";
+const STATUS_CODES: &str = "statusCodes";
+const WRITER_IDS: &str = "DataSetWriterIds";
+const CONNECTIONS: &str = "PubSubConnections";
+const CAPABILITIES: &str = "Capabilities";

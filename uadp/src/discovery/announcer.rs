@@ -1,0 +1,639 @@
+//! When a Publisher announces: once for many who ask, and never faster than it set out to, however many do.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::time::Duration;
+
+use super::probe::Probe;
+
+/// What one Publisher has to announce, and when (OPC 10000-14, 7.2.4.6.12.2).
+///
+/// A subject that is asked for is announced once, a moment later, to all who asked in between, and again 500 ms after
+/// that at the earliest. DataSetWriters of one WriterGroup share the announcement of their configuration. Probes
+/// cannot make it send more than [`AnnounceLimits::rate`], nor remember more than its own subjects and
+/// [`AnnounceLimits::unknown`] of others.
+/// ```
+/// use std::time::Duration;
+/// use uadp::discovery::{AnnounceLimits, Announcer, List, Probe, Subject};
+///
+/// let ms = Duration::from_millis;
+/// let mut announcer = Announcer::new([(5, 10), (5, 11)], AnnounceLimits::default());
+/// announcer.handle_probe(&Probe::DataSetWriterConfiguration(List::new(&[11])), ms(0));
+/// announcer.handle_probe(&Probe::DataSetWriterConfiguration(List::new(&[10, 11])), ms(20));
+///
+/// assert_eq!(announcer.poll_timeout(), Some(ms(50)));
+/// let due = announcer.poll(ms(50)).unwrap();
+/// assert_eq!(due.subject, Subject::DataSetWriterConfiguration(11));
+/// assert_eq!(due.writer_ids, [10, 11]);
+/// assert_eq!(due.sequence_number, 0);
+/// assert_eq!(announcer.poll(ms(50)), None);
+/// ```
+#[derive(Debug, Clone)]
+pub struct Announcer {
+    limits: AnnounceLimits,
+    /// WriterGroupId of each DataSetWriterId.
+    writers: BTreeMap<u16, u16>,
+    groups: BTreeSet<u16>,
+    /// What is to be announced, or was too short a time ago to be announced again.
+    entries: BTreeMap<Subject, Entry>,
+    /// How many of the entries are of subjects the Publisher does not have.
+    unknown: usize,
+    /// When the last announcements were, no more than the rate allows in 500 ms.
+    sent: VecDeque<Duration>,
+    sequence_number: u16,
+    counters: AnnounceCounters,
+}
+
+/// How an [`Announcer`] answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct AnnounceLimits {
+    /// Time from the first probe to the announcement, in which others can ask for the same. Best another one for
+    /// every Publisher, since all of them are asked at once by [`Probe::FindApplications`].
+    pub gather: Duration,
+    /// Most announcements in any 500 ms, at least 1. What is due beyond that waits.
+    pub rate: usize,
+    /// Most DataSetWriters and WriterGroups the Publisher does not have that are answered in 500 ms, with a bad
+    /// status. A probe for more of them is not answered.
+    pub unknown: usize,
+}
+
+/// What can be announced.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Subject {
+    /// The application, as [`Announced::ApplicationDescription`](super::Announced).
+    ApplicationInformation,
+    /// The Endpoints, as [`Announced::PublisherEndpoints`](super::Announced).
+    PublisherEndpoints,
+    /// The connections, as [`Announced::PubSubConnections`](super::Announced).
+    PubSubConnections,
+    /// A WriterGroup, as [`Announced::DataSetWriterConfiguration`](super::Announced).
+    WriterGroupConfiguration(u16),
+    /// A DataSetWriter, as [`Announced::DataSetWriterConfiguration`](super::Announced).
+    DataSetWriterConfiguration(u16),
+    /// The content of the DataSet of a DataSetWriter, as [`Announced::DataSetMetaData`](super::Announced).
+    DataSetMetaData(u16),
+}
+
+/// What an announcement of connections or of a WriterGroup has in it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub struct Included {
+    /// The WriterGroups of connections.
+    pub writer_groups: bool,
+    /// The DataSetWriters of WriterGroups.
+    pub data_set_writers: bool,
+}
+
+/// An announcement to be sent now.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct DueAnnouncement {
+    /// What it is about. A DataSetWriter or WriterGroup the Publisher does not have gets a bad status.
+    pub subject: Subject,
+    /// What it has in it: all that any of those wants who asked.
+    pub included: Included,
+    /// Of DataSetWriter configuration the DataSetWriterIds, in rising order, all of one WriterGroup or all unknown;
+    /// else empty.
+    pub writer_ids: Vec<u16>,
+    /// Its SequenceNumber.
+    pub sequence_number: u16,
+}
+
+/// Why a subject is not planned to be announced.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, thiserror::Error)]
+#[non_exhaustive]
+pub enum AnnounceRefusal {
+    /// It is going to be announced anyway.
+    #[error("about to be announced anyway")]
+    Duplicate,
+    /// The Publisher does not have it, and was asked for too many others it does not have.
+    #[error("unknown, as are too many others")]
+    Unknown,
+}
+
+/// What became of the subjects [`handle_probe`](Announcer::handle_probe) found in probes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub struct AnnounceCounters {
+    /// Planned to be announced.
+    pub planned: u64,
+    /// Refused as [`AnnounceRefusal::Duplicate`].
+    pub duplicate: u64,
+    /// Refused as [`AnnounceRefusal::Unknown`].
+    pub unknown: u64,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Entry {
+    /// When it is to be announced; `None` when it was and nobody asked since.
+    due: Option<Duration>,
+    /// Not to be announced before.
+    earliest: Duration,
+    included: Included,
+    known: bool,
+}
+
+impl Announcer {
+    /// A Publisher with these DataSetWriters: WriterGroupId and DataSetWriterId of each. Its first SequenceNumber is 0.
+    #[must_use]
+    pub fn new(writers: impl IntoIterator<Item = (u16, u16)>, limits: AnnounceLimits) -> Self {
+        let mut announcer = Self {
+            limits,
+            writers: BTreeMap::new(),
+            groups: BTreeSet::new(),
+            entries: BTreeMap::new(),
+            unknown: 0,
+            sent: VecDeque::new(),
+            sequence_number: 0,
+            counters: AnnounceCounters::default(),
+        };
+        announcer.set_writers(writers);
+        announcer
+    }
+
+    /// Changes which DataSetWriters there are. Announcements that are planned are forgotten, since they may be of
+    /// others; the SequenceNumber goes on.
+    pub fn set_writers(&mut self, writers: impl IntoIterator<Item = (u16, u16)>) {
+        self.entries.clear();
+        self.unknown = 0;
+        self.writers.clear();
+        self.groups.clear();
+        for (group, writer) in writers {
+            self.writers.insert(writer, group);
+            self.groups.insert(group);
+        }
+    }
+
+    /// Plans the answers to a probe, which the caller found to be for this Publisher: by the PublisherId in its
+    /// header, and for connections by the TransportProfileUris. The [`counters`](Self::counters) say what was refused.
+    pub fn handle_probe(&mut self, probe: &Probe<'_>, now: Duration) {
+        self.forget(now);
+        match *probe {
+            Probe::FindApplications => self.ask(Subject::ApplicationInformation, now),
+            Probe::PublisherEndpoints => self.ask(Subject::PublisherEndpoints, now),
+            Probe::DataSetMetaData(writer_ids) => {
+                for id in writer_ids {
+                    self.ask(Subject::DataSetMetaData(id), now);
+                }
+            }
+            Probe::DataSetWriterConfiguration(writer_ids) => {
+                for id in writer_ids {
+                    self.ask(Subject::DataSetWriterConfiguration(id), now);
+                }
+            }
+            Probe::WriterGroupConfiguration {
+                writer_group_id,
+                include_data_set_writers,
+            } => {
+                let included = Included {
+                    writer_groups: false,
+                    data_set_writers: include_data_set_writers,
+                };
+                let planned = self.plan(
+                    Subject::WriterGroupConfiguration(writer_group_id),
+                    included,
+                    now,
+                );
+                self.count(planned);
+            }
+            Probe::PubSubConnections {
+                include_writer_groups,
+                include_data_set_writers,
+                ..
+            } => {
+                let included = Included {
+                    writer_groups: include_writer_groups,
+                    data_set_writers: include_writer_groups && include_data_set_writers,
+                };
+                let planned = self.plan(Subject::PubSubConnections, included, now);
+                self.count(planned);
+            }
+        }
+    }
+
+    /// Plans an announcement nobody asked for: after a change, or at the DiscoveryAnnounceRate.
+    ///
+    /// # Errors
+    /// [`AnnounceRefusal`] when it will not be sent, or not for this call alone.
+    pub fn announce(
+        &mut self,
+        subject: Subject,
+        included: Included,
+        now: Duration,
+    ) -> Result<(), AnnounceRefusal> {
+        self.forget(now);
+        self.plan(subject, included, now)
+    }
+
+    /// The next announcement that is due. To be called until `None`.
+    pub fn poll(&mut self, now: Duration) -> Option<DueAnnouncement> {
+        self.forget(now);
+        let (due, subject) = self.next()?;
+        if due.max(self.opens()) > now {
+            return None;
+        }
+        self.count_sent(now);
+        let writer_ids = match subject {
+            Subject::DataSetWriterConfiguration(id) => self.writers_with(id, now),
+            Subject::ApplicationInformation
+            | Subject::PublisherEndpoints
+            | Subject::PubSubConnections
+            | Subject::WriterGroupConfiguration(_)
+            | Subject::DataSetMetaData(_) => Vec::new(),
+        };
+        let included = self.finish(subject, now);
+        for id in &writer_ids {
+            self.finish(Subject::DataSetWriterConfiguration(*id), now);
+        }
+        let sequence_number = self.sequence_number;
+        self.sequence_number = sequence_number.wrapping_add(1);
+        Some(DueAnnouncement {
+            subject,
+            included,
+            writer_ids,
+            sequence_number,
+        })
+    }
+
+    /// When [`poll`](Self::poll) has something to announce; `None` when nothing is planned.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<Duration> {
+        let (due, _) = self.next()?;
+        Some(due.max(self.opens()))
+    }
+
+    /// What became of the subjects of probes.
+    #[must_use]
+    pub const fn counters(&self) -> &AnnounceCounters {
+        &self.counters
+    }
+
+    fn ask(&mut self, subject: Subject, now: Duration) {
+        let planned = self.plan(subject, Included::default(), now);
+        self.count(planned);
+    }
+
+    const fn count(&mut self, planned: Result<(), AnnounceRefusal>) {
+        let counter = match planned {
+            Ok(()) => &mut self.counters.planned,
+            Err(AnnounceRefusal::Duplicate) => &mut self.counters.duplicate,
+            Err(AnnounceRefusal::Unknown) => &mut self.counters.unknown,
+        };
+        *counter += 1;
+    }
+
+    fn plan(
+        &mut self,
+        subject: Subject,
+        included: Included,
+        now: Duration,
+    ) -> Result<(), AnnounceRefusal> {
+        let due = now.saturating_add(self.limits.gather);
+        if let Some(entry) = self.entries.get_mut(&subject) {
+            entry.included.add(included);
+            if entry.due.is_some() {
+                return Err(AnnounceRefusal::Duplicate);
+            }
+            entry.due = Some(due.max(entry.earliest));
+            return Ok(());
+        }
+        let known = self.has(subject);
+        if !known {
+            if self.unknown >= self.limits.unknown {
+                return Err(AnnounceRefusal::Unknown);
+            }
+            self.unknown += 1;
+        }
+        let entry = Entry {
+            due: Some(due),
+            earliest: now,
+            included,
+            known,
+        };
+        self.entries.insert(subject, entry);
+        Ok(())
+    }
+
+    fn has(&self, subject: Subject) -> bool {
+        match subject {
+            Subject::ApplicationInformation
+            | Subject::PublisherEndpoints
+            | Subject::PubSubConnections => true,
+            Subject::WriterGroupConfiguration(group) => self.groups.contains(&group),
+            Subject::DataSetWriterConfiguration(writer) | Subject::DataSetMetaData(writer) => {
+                self.writers.contains_key(&writer)
+            }
+        }
+    }
+
+    /// The most urgent subject. Of equally urgent ones those the Publisher has come first.
+    fn next(&self) -> Option<(Duration, Subject)> {
+        let planned = self.entries.iter().filter_map(|(subject, entry)| {
+            let due = entry.due?;
+            Some((due, !entry.known, *subject))
+        });
+        planned.min().map(|(due, _, subject)| (due, subject))
+    }
+
+    /// The DataSetWriters whose configuration can go with that of `id`: of the same WriterGroup, asked for, and not
+    /// announced within the last 500 ms.
+    fn writers_with(&self, id: u16, now: Duration) -> Vec<u16> {
+        let group = self.writers.get(&id);
+        let all =
+            Subject::DataSetWriterConfiguration(0)..=Subject::DataSetWriterConfiguration(u16::MAX);
+        self.entries
+            .range(all)
+            .filter(|(_, entry)| entry.due.is_some() && entry.earliest <= now)
+            .filter_map(|(subject, _)| match subject {
+                Subject::DataSetWriterConfiguration(id) => Some(*id),
+                Subject::ApplicationInformation
+                | Subject::PublisherEndpoints
+                | Subject::PubSubConnections
+                | Subject::WriterGroupConfiguration(_)
+                | Subject::DataSetMetaData(_) => None,
+            })
+            .filter(|id| self.writers.get(id) == group)
+            .collect()
+    }
+
+    /// From when on the rate leaves room for one more.
+    fn opens(&self) -> Duration {
+        match self.sent.front() {
+            Some(oldest) if self.sent.len() >= self.rate() => oldest.saturating_add(SPACING),
+            _ => Duration::ZERO,
+        }
+    }
+
+    fn count_sent(&mut self, now: Duration) {
+        while self.sent.len() >= self.rate() {
+            self.sent.pop_front();
+        }
+        self.sent.push_back(now);
+    }
+
+    const fn rate(&self) -> usize {
+        match self.limits.rate {
+            0 => 1,
+            rate => rate,
+        }
+    }
+
+    /// The subject is being announced: what is included, and never mind until it is asked for again.
+    fn finish(&mut self, subject: Subject, now: Duration) -> Included {
+        let Some(entry) = self.entries.get_mut(&subject) else {
+            return Included::default();
+        };
+        entry.due = None;
+        entry.earliest = now.saturating_add(SPACING);
+        std::mem::take(&mut entry.included)
+    }
+
+    /// Drops what was announced long enough ago.
+    fn forget(&mut self, now: Duration) {
+        let unknown = &mut self.unknown;
+        self.entries.retain(|_, entry| {
+            let keep = entry.due.is_some() || entry.earliest > now;
+            if !keep && !entry.known {
+                *unknown -= 1;
+            }
+            keep
+        });
+    }
+}
+
+impl Included {
+    const fn add(&mut self, other: Self) {
+        self.writer_groups |= other.writer_groups;
+        self.data_set_writers |= other.data_set_writers;
+    }
+}
+
+/// 50 ms to gather, 50 announcements and 8 unknown subjects in 500 ms.
+impl Default for AnnounceLimits {
+    fn default() -> Self {
+        Self {
+            gather: Duration::from_millis(50),
+            rate: 50,
+            unknown: 8,
+        }
+    }
+}
+
+/// Least time between two announcements of one subject.
+const SPACING: Duration = Duration::from_millis(500);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::discovery::List;
+
+    fn ms(millis: u64) -> Duration {
+        Duration::from_millis(millis)
+    }
+
+    fn announcer() -> Announcer {
+        Announcer::new([(5, 10), (5, 11), (6, 12)], AnnounceLimits::default())
+    }
+
+    fn due(announcer: &mut Announcer, now: Duration) -> Vec<(Subject, Vec<u16>)> {
+        std::iter::from_fn(|| announcer.poll(now))
+            .map(|due| (due.subject, due.writer_ids))
+            .collect()
+    }
+
+    #[test]
+    fn several_probes_for_one_subject_are_answered_once() {
+        let mut announcer = announcer();
+        let probe = Probe::DataSetMetaData(List::new(&[10]));
+        for millis in [0, 10, 49] {
+            announcer.handle_probe(&probe, ms(millis));
+        }
+        assert_eq!(due(&mut announcer, ms(49)), []);
+        assert_eq!(
+            due(&mut announcer, ms(50)),
+            [(Subject::DataSetMetaData(10), vec![])]
+        );
+        let counters = AnnounceCounters {
+            planned: 1,
+            duplicate: 2,
+            unknown: 0,
+        };
+        assert_eq!(*announcer.counters(), counters);
+        assert_eq!(announcer.poll_timeout(), None);
+    }
+
+    #[test]
+    fn the_same_subject_is_announced_again_500_ms_later_at_the_earliest() {
+        let mut announcer = announcer();
+        announcer.handle_probe(&Probe::PublisherEndpoints, ms(0));
+        assert_eq!(due(&mut announcer, ms(50)).len(), 1);
+        announcer.handle_probe(&Probe::PublisherEndpoints, ms(60));
+        announcer.handle_probe(&Probe::FindApplications, ms(60));
+        assert_eq!(
+            due(&mut announcer, ms(549)),
+            [(Subject::ApplicationInformation, vec![])]
+        );
+        assert_eq!(announcer.poll_timeout(), Some(ms(550)));
+        assert_eq!(
+            due(&mut announcer, ms(550)),
+            [(Subject::PublisherEndpoints, vec![])]
+        );
+        announcer.handle_probe(&Probe::PublisherEndpoints, ms(2000));
+        assert_eq!(announcer.poll_timeout(), Some(ms(2050)));
+    }
+
+    #[test]
+    fn data_set_writers_of_one_group_share_an_announcement() {
+        let mut announcer = announcer();
+        announcer.handle_probe(
+            &Probe::DataSetWriterConfiguration(List::new(&[12, 11])),
+            ms(0),
+        );
+        announcer.handle_probe(&Probe::DataSetWriterConfiguration(List::new(&[10])), ms(40));
+        assert_eq!(
+            due(&mut announcer, ms(50)),
+            [
+                (Subject::DataSetWriterConfiguration(11), vec![10, 11]),
+                (Subject::DataSetWriterConfiguration(12), vec![12]),
+            ]
+        );
+        // 10 went along, so it is not due by itself.
+        assert_eq!(announcer.poll_timeout(), None);
+    }
+
+    #[test]
+    fn what_was_announced_just_now_does_not_go_along() {
+        let mut announcer = announcer();
+        announcer.handle_probe(&Probe::DataSetWriterConfiguration(List::new(&[10])), ms(0));
+        assert_eq!(due(&mut announcer, ms(50)).len(), 1);
+        announcer.handle_probe(
+            &Probe::DataSetWriterConfiguration(List::new(&[10, 11])),
+            ms(100),
+        );
+        assert_eq!(
+            due(&mut announcer, ms(150)),
+            [(Subject::DataSetWriterConfiguration(11), vec![11])]
+        );
+        assert_eq!(
+            due(&mut announcer, ms(550)),
+            [(Subject::DataSetWriterConfiguration(10), vec![10])]
+        );
+    }
+
+    #[test]
+    fn one_announcement_of_connections_has_what_any_who_asked_wants() {
+        let mut announcer = announcer();
+        for (include_writer_groups, include_data_set_writers) in [(true, false), (false, true)] {
+            let probe = Probe::PubSubConnections {
+                transport_profile_uris: List::null(),
+                include_writer_groups,
+                include_data_set_writers,
+            };
+            announcer.handle_probe(&probe, ms(0));
+        }
+        let probe = Probe::WriterGroupConfiguration {
+            writer_group_id: 5,
+            include_data_set_writers: true,
+        };
+        announcer.handle_probe(&probe, ms(0));
+        let first = announcer.poll(ms(50)).unwrap();
+        assert_eq!(first.subject, Subject::PubSubConnections);
+        // DataSetWriters without their groups are nothing that can be included.
+        let groups = Included {
+            writer_groups: true,
+            data_set_writers: false,
+        };
+        assert_eq!(first.included, groups);
+        let second = announcer.poll(ms(50)).unwrap();
+        assert_eq!(second.subject, Subject::WriterGroupConfiguration(5));
+        assert!(second.included.data_set_writers);
+    }
+
+    #[test]
+    fn a_flood_of_probes_for_unknown_writers_gets_few_answers_and_the_known_one_first() {
+        let mut announcer = announcer();
+        let ids: Vec<u16> = (10..=60_000).collect();
+        for millis in 0..3 {
+            announcer.handle_probe(&Probe::DataSetMetaData(List::new(&ids)), ms(millis));
+        }
+        let answers = due(&mut announcer, ms(50));
+        assert_eq!(answers.len(), 3 + 8);
+        assert_eq!(answers[2], (Subject::DataSetMetaData(12), vec![]));
+        assert_eq!(answers[10], (Subject::DataSetMetaData(20), vec![]));
+        assert_eq!(announcer.counters().planned, 11);
+        assert_eq!(announcer.counters().duplicate, 2 * 11);
+        assert_eq!(announcer.counters().unknown, 3 * (59_991 - 11));
+        // 500 ms later there is room for others.
+        announcer.handle_probe(&Probe::DataSetMetaData(List::new(&ids[100..])), ms(550));
+        assert_eq!(due(&mut announcer, ms(600)).len(), 8);
+    }
+
+    #[test]
+    fn announcements_beyond_the_rate_wait() {
+        let ids: Vec<u16> = (1..=5).collect();
+        let limits = AnnounceLimits {
+            rate: 2,
+            ..AnnounceLimits::default()
+        };
+        let mut announcer = Announcer::new(ids.iter().map(|id| (1, *id)), limits);
+        announcer.handle_probe(&Probe::DataSetMetaData(List::new(&ids)), ms(0));
+        let mut sent = Vec::new();
+        while let Some(at) = announcer.poll_timeout() {
+            sent.push((at, due(&mut announcer, at).len()));
+        }
+        assert_eq!(sent, [(ms(50), 2), (ms(550), 2), (ms(1050), 1)]);
+    }
+
+    #[test]
+    fn no_500_ms_have_more_announcements_than_the_rate() {
+        let limits = AnnounceLimits {
+            gather: Duration::ZERO,
+            rate: 2,
+            ..AnnounceLimits::default()
+        };
+        let mut announcer = Announcer::new([(1, 1)], limits);
+        for (subject, at) in [
+            (Subject::PublisherEndpoints, 0),
+            (Subject::PubSubConnections, 499),
+            (Subject::DataSetMetaData(1), 499),
+            (Subject::ApplicationInformation, 500),
+        ] {
+            announcer
+                .announce(subject, Included::default(), ms(at))
+                .unwrap();
+        }
+        let mut sent = Vec::new();
+        while let Some(at) = announcer.poll_timeout() {
+            sent.push((at, due(&mut announcer, at).len()));
+        }
+        assert_eq!(sent, [(ms(0), 1), (ms(499), 1), (ms(500), 1), (ms(999), 1)]);
+    }
+
+    #[test]
+    fn sequence_numbers_count_announcements_and_wrap() {
+        let mut announcer = announcer();
+        let mut now = Duration::ZERO;
+        let mut numbers = Vec::new();
+        for _ in 0..=65_536 {
+            announcer
+                .announce(Subject::PublisherEndpoints, Included::default(), now)
+                .unwrap();
+            now = announcer.poll_timeout().unwrap();
+            numbers.push(announcer.poll(now).unwrap().sequence_number);
+        }
+        assert_eq!(numbers[..2], [0, 1]);
+        assert_eq!(numbers[65_534..], [65_534, 65_535, 0]);
+    }
+
+    #[test]
+    fn a_change_of_the_writers_forgets_what_is_planned() {
+        let mut announcer = announcer();
+        announcer.handle_probe(&Probe::DataSetMetaData(List::new(&[10, 99])), ms(0));
+        announcer.set_writers([(7, 99)]);
+        assert_eq!(announcer.poll_timeout(), None);
+        announcer.handle_probe(&Probe::DataSetMetaData(List::new(&[10, 99])), ms(0));
+        assert_eq!(
+            due(&mut announcer, ms(50)),
+            [
+                (Subject::DataSetMetaData(99), vec![]),
+                (Subject::DataSetMetaData(10), vec![]),
+            ]
+        );
+    }
+}

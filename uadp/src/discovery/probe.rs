@@ -1,0 +1,191 @@
+//! Discovery probes: what a Subscriber asks a Publisher.
+
+use super::list::List;
+use super::wire::Structure;
+use super::{read_payload, write_headers};
+use crate::reader::Reader;
+use crate::{
+    DecodeError, EncodeError, NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader,
+};
+
+/// A discovery probe (OPC 10000-14, 7.2.4.6.12).
+///
+/// The PublisherId in the header of its NetworkMessage is that of the Publisher who is asked. When probes are sent
+/// says [`ProbeTimer`](super::ProbeTimer), when they are answered [`Announcer`](super::Announcer).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Probe<'a> {
+    /// Asks for the Endpoints of the Server beside the Publisher.
+    PublisherEndpoints,
+    /// Asks for the DataSetMetaData of these DataSetWriters.
+    DataSetMetaData(List<'a, u16>),
+    /// Asks for the configuration of these DataSetWriters and their WriterGroups.
+    DataSetWriterConfiguration(List<'a, u16>),
+    /// Asks for the configuration of a WriterGroup, which comes as that of DataSetWriters
+    /// ([`Announced::DataSetWriterConfiguration`](super::Announced)).
+    WriterGroupConfiguration {
+        /// Which one.
+        writer_group_id: u16,
+        /// With its DataSetWriters.
+        include_data_set_writers: bool,
+    },
+    /// Asks for the PubSubConnections.
+    PubSubConnections {
+        /// Of these transport profiles only; null or empty for all.
+        transport_profile_uris: List<'a, Option<&'a str>>,
+        /// With their WriterGroups.
+        include_writer_groups: bool,
+        /// With the DataSetWriters of those.
+        include_data_set_writers: bool,
+    },
+    /// Asks every Publisher what application it is. The PublisherId in the header is null.
+    FindApplications,
+}
+
+impl<'a> Probe<'a> {
+    /// Reads the probe of a NetworkMessage.
+    ///
+    /// # Errors
+    /// [`DecodeError::Misread`] when it is no probe, a chunk, or still sealed; else as
+    /// [`decode_body`](Self::decode_body).
+    pub fn decode(message: &NetworkMessage<'a>) -> Result<Self, DecodeError> {
+        match message.message_type() {
+            NetworkMessageType::Probe => Self::decode_body(read_payload(message)?),
+            NetworkMessageType::DataSet | NetworkMessageType::Announcement => {
+                Err(DecodeError::Misread("no discovery probe"))
+            }
+        }
+    }
+
+    /// Reads what stands behind the headers of a probe, such as the whole of its chunks. Of the Endpoints probe both
+    /// forms are read: without further field, and as in version 1.04 with an array that is null or empty.
+    ///
+    /// # Errors
+    /// [`DecodeError::Reserved`] names a kind of probe that is not known. Else fails when a field is cut off or
+    /// malformed, and for bytes behind the last one.
+    pub fn decode_body(body: &'a [u8]) -> Result<Self, DecodeError> {
+        let mut reader = Reader::new(body);
+        let probe = match reader.u8("ProbeType")? {
+            PUBLISHER_INFORMATION => Self::read_publisher_information(&mut reader)?,
+            FIND_APPLICATIONS => Self::FindApplications,
+            unknown => {
+                return Err(DecodeError::Reserved {
+                    field: "ProbeType",
+                    value: unknown.into(),
+                });
+            }
+        };
+        match reader.remaining() {
+            0 => Ok(probe),
+            left => Err(DecodeError::TrailingBytes(left)),
+        }
+    }
+
+    fn read_publisher_information(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        Ok(match reader.u8("InformationType")? {
+            PUBLISHER_ENDPOINTS => {
+                skip_no_writer_ids(reader)?;
+                Self::PublisherEndpoints
+            }
+            DATA_SET_META_DATA => Self::DataSetMetaData(List::read(reader, WRITER_IDS)?),
+            DATA_SET_WRITER => Self::DataSetWriterConfiguration(List::read(reader, WRITER_IDS)?),
+            WRITER_GROUP => Self::WriterGroupConfiguration {
+                writer_group_id: reader.u16("WriterGroupId")?,
+                include_data_set_writers: bool::read(reader, "IncludeDataSetWriters")?,
+            },
+            PUB_SUB_CONNECTIONS => Self::PubSubConnections {
+                transport_profile_uris: List::read(reader, "TransportProfileUris")?,
+                include_writer_groups: bool::read(reader, "IncludeWriterGroups")?,
+                include_data_set_writers: bool::read(reader, "IncludeDataSetWriters")?,
+            },
+            unknown => {
+                return Err(DecodeError::Reserved {
+                    field: "InformationType",
+                    value: unknown.into(),
+                });
+            }
+        })
+    }
+
+    /// Appends the whole NetworkMessage, up to the end of its payload. `publisher_id` is that of the Publisher who is
+    /// asked; `None` is written as the Byte 0, which is no one's PublisherId (OPC 10000-14, 6.2.7.1), and is what
+    /// [`FindApplications`](Self::FindApplications) asks for. Without security the header is
+    /// [`SecurityHeader::NONE`].
+    ///
+    /// # Errors
+    /// [`EncodeError::TooBig`] when a text, array or nonce is too long for its length.
+    pub fn encode(
+        &self,
+        publisher_id: Option<PublisherId<'_>>,
+        security: SecurityHeader<'_>,
+        out: &mut Vec<u8>,
+    ) -> Result<(), EncodeError> {
+        let publisher_id = publisher_id.unwrap_or(PublisherId::Byte(0));
+        write_headers(NetworkMessageType::Probe, publisher_id, security, out)?;
+        self.encode_body(out)
+    }
+
+    /// Appends what stands behind the headers.
+    ///
+    /// # Errors
+    /// [`EncodeError::TooBig`] when a text or array is too long for its length.
+    pub fn encode_body(&self, out: &mut Vec<u8>) -> Result<(), EncodeError> {
+        match self {
+            Self::PublisherEndpoints => {
+                out.extend_from_slice(&[PUBLISHER_INFORMATION, PUBLISHER_ENDPOINTS]);
+            }
+            Self::DataSetMetaData(writer_ids) => {
+                out.extend_from_slice(&[PUBLISHER_INFORMATION, DATA_SET_META_DATA]);
+                writer_ids.write(out, WRITER_IDS)?;
+            }
+            Self::DataSetWriterConfiguration(writer_ids) => {
+                out.extend_from_slice(&[PUBLISHER_INFORMATION, DATA_SET_WRITER]);
+                writer_ids.write(out, WRITER_IDS)?;
+            }
+            Self::WriterGroupConfiguration {
+                writer_group_id,
+                include_data_set_writers,
+            } => {
+                out.extend_from_slice(&[PUBLISHER_INFORMATION, WRITER_GROUP]);
+                out.extend_from_slice(&writer_group_id.to_le_bytes());
+                out.push(u8::from(*include_data_set_writers));
+            }
+            Self::PubSubConnections {
+                transport_profile_uris,
+                include_writer_groups,
+                include_data_set_writers,
+            } => {
+                out.extend_from_slice(&[PUBLISHER_INFORMATION, PUB_SUB_CONNECTIONS]);
+                transport_profile_uris.write(out, "TransportProfileUris")?;
+                out.push(u8::from(*include_writer_groups));
+                out.push(u8::from(*include_data_set_writers));
+            }
+            Self::FindApplications => out.push(FIND_APPLICATIONS),
+        }
+        Ok(())
+    }
+}
+
+/// Version 1.04 ends the Endpoints probe with a null array of DataSetWriterIds.
+fn skip_no_writer_ids(reader: &mut Reader<'_>) -> Result<(), DecodeError> {
+    if reader.remaining() == 0 {
+        return Ok(());
+    }
+    match reader.length(WRITER_IDS)? {
+        None | Some(0) => Ok(()),
+        Some(count) => Err(DecodeError::Reserved {
+            field: "DataSetWriterIds of an Endpoints probe",
+            value: u32::try_from(count).unwrap_or(u32::MAX),
+        }),
+    }
+}
+
+const WRITER_IDS: &str = "DataSetWriterIds";
+
+const PUBLISHER_INFORMATION: u8 = 1;
+const FIND_APPLICATIONS: u8 = 2;
+
+const PUBLISHER_ENDPOINTS: u8 = 1;
+const DATA_SET_META_DATA: u8 = 2;
+const DATA_SET_WRITER: u8 = 3;
+const WRITER_GROUP: u8 = 4;
+const PUB_SUB_CONNECTIONS: u8 = 5;

@@ -1,0 +1,250 @@
+//! How a value that stands in a fixed place is read and written, and structures as lists of such places.
+
+use crate::reader::Reader;
+use crate::writer;
+use crate::{
+    DateTime, DecodeError, EncodeError, ExtensionBody, ExtensionObject, Guid, LocalizedText,
+    NodeId, QualifiedName, StatusCode, Variant,
+};
+
+/// A value whose type says how it is encoded: a builtin type, an array or a structure (OPC 10000-6, 5.2.6).
+pub(crate) trait Structure<'a>: Copy {
+    /// The default value of the type: null where there is one, else zero.
+    const NULL: Self;
+    /// Fewest bytes it takes: what an array length is held against before the elements are read.
+    const MIN_SIZE: usize;
+
+    /// `what` is for the error. A structure names its fields itself.
+    fn read(reader: &mut Reader<'a>, what: &'static str) -> Result<Self, DecodeError>;
+
+    /// Appends the encoding; `what` as in [`read`](Self::read).
+    fn write(&self, out: &mut Vec<u8>, what: &'static str) -> Result<(), EncodeError>;
+}
+
+/// Numbers, little-endian.
+macro_rules! number {
+    ($($number:ty)+) => { $(
+        impl Structure<'_> for $number {
+            const NULL: Self = 0 as Self;
+            const MIN_SIZE: usize = size_of::<Self>();
+
+            #[inline]
+            fn read(reader: &mut Reader<'_>, what: &'static str) -> Result<Self, DecodeError> {
+                reader.array(what).map(Self::from_le_bytes)
+            }
+
+            #[inline]
+            fn write(&self, out: &mut Vec<u8>, _: &'static str) -> Result<(), EncodeError> {
+                out.extend_from_slice(&self.to_le_bytes());
+                Ok(())
+            }
+        }
+    )+ };
+}
+
+number! { u8 u16 u32 i32 i64 f64 }
+
+/// Types that are one value of another type with a name.
+macro_rules! wrapped {
+    ($($wrapper:ident($inner:ty))+) => { $(
+        impl Structure<'_> for $wrapper {
+            const NULL: Self = Self(<$inner as Structure<'_>>::NULL);
+            const MIN_SIZE: usize = <$inner as Structure<'_>>::MIN_SIZE;
+
+            #[inline]
+            fn read(reader: &mut Reader<'_>, what: &'static str) -> Result<Self, DecodeError> {
+                Structure::read(reader, what).map(Self)
+            }
+
+            #[inline]
+            fn write(&self, out: &mut Vec<u8>, what: &'static str) -> Result<(), EncodeError> {
+                self.0.write(out, what)
+            }
+        }
+    )+ };
+}
+
+wrapped! { StatusCode(u32) DateTime(i64) }
+
+/// Builtin types that read and write themselves.
+macro_rules! builtin {
+    ($($builtin:ident: $null:expr, $min_size:literal;)+) => { $(
+        impl<'a> Structure<'a> for $builtin<'a> {
+            const NULL: Self = $null;
+            const MIN_SIZE: usize = $min_size;
+
+            #[inline]
+            fn read(reader: &mut Reader<'a>, _: &'static str) -> Result<Self, DecodeError> {
+                Self::read(reader)
+            }
+
+            #[inline]
+            fn write(&self, out: &mut Vec<u8>, _: &'static str) -> Result<(), EncodeError> {
+                Self::write(self, out)
+            }
+        }
+    )+ };
+}
+
+builtin! {
+    NodeId: Self::NULL, 2;
+    QualifiedName: Self { namespace: 0, name: None }, 6;
+    LocalizedText: Self { locale: None, text: None }, 1;
+    Variant: Self::Null, 1;
+    ExtensionObject: Self { type_id: NodeId::NULL, body: ExtensionBody::None }, 3;
+}
+
+impl Structure<'_> for bool {
+    const NULL: Self = false;
+    const MIN_SIZE: usize = 1;
+
+    fn read(reader: &mut Reader<'_>, what: &'static str) -> Result<Self, DecodeError> {
+        // Every value but 0 is true (OPC 10000-6, 5.2.2.1).
+        reader.u8(what).map(|byte| byte != 0)
+    }
+
+    fn write(&self, out: &mut Vec<u8>, _: &'static str) -> Result<(), EncodeError> {
+        out.push(u8::from(*self));
+        Ok(())
+    }
+}
+
+impl Structure<'_> for Guid {
+    const NULL: Self = Self([0; 16]);
+    const MIN_SIZE: usize = 16;
+
+    fn read(reader: &mut Reader<'_>, what: &'static str) -> Result<Self, DecodeError> {
+        reader.array(what).map(Self)
+    }
+
+    fn write(&self, out: &mut Vec<u8>, _: &'static str) -> Result<(), EncodeError> {
+        out.extend_from_slice(&self.0);
+        Ok(())
+    }
+}
+
+impl<'a> Structure<'a> for Option<&'a str> {
+    const NULL: Self = None;
+    const MIN_SIZE: usize = 4;
+
+    fn read(reader: &mut Reader<'a>, what: &'static str) -> Result<Self, DecodeError> {
+        reader.text(what)
+    }
+
+    fn write(&self, out: &mut Vec<u8>, what: &'static str) -> Result<(), EncodeError> {
+        writer::byte_string(out, self.map(str::as_bytes), what)
+    }
+}
+
+impl<'a> Structure<'a> for Option<&'a [u8]> {
+    const NULL: Self = None;
+    const MIN_SIZE: usize = 4;
+
+    fn read(reader: &mut Reader<'a>, what: &'static str) -> Result<Self, DecodeError> {
+        reader.byte_string(what)
+    }
+
+    fn write(&self, out: &mut Vec<u8>, what: &'static str) -> Result<(), EncodeError> {
+        writer::byte_string(out, *self, what)
+    }
+}
+
+/// Reads a value that takes up all the bytes.
+pub(crate) fn read_all<'a, T: Structure<'a>>(
+    bytes: &'a [u8],
+    what: &'static str,
+) -> Result<T, DecodeError> {
+    let mut reader = Reader::new(bytes);
+    let value = T::read(&mut reader, what)?;
+    match reader.remaining() {
+        0 => Ok(value),
+        left => Err(DecodeError::TrailingBytes(left)),
+    }
+}
+
+/// A structure of the standard: its fields, in the order of the wire, each with the name errors give it.
+macro_rules! structure {
+    ($(
+        $(#[$meta:meta])*
+        $name:ident $(<$lifetime:lifetime>)? {
+            $( $(#[$field_meta:meta])* $field:ident: $type:ty = $label:literal, )+
+        }
+    )+) => { $(
+        $(#[$meta])*
+        #[derive(Debug, Clone, Copy, PartialEq)]
+        pub struct $name $(<$lifetime>)? {
+            $( $(#[$field_meta])* pub $field: $type, )+
+        }
+
+        impl<'a> crate::discovery::wire::Structure<'a> for $name $(<$lifetime>)? {
+            const NULL: Self = Self {
+                $( $field: <$type as crate::discovery::wire::Structure<'a>>::NULL, )+
+            };
+            const MIN_SIZE: usize =
+                0 $( + <$type as crate::discovery::wire::Structure<'a>>::MIN_SIZE )+;
+
+            fn read(
+                reader: &mut crate::reader::Reader<'a>,
+                _: &'static str,
+            ) -> Result<Self, crate::DecodeError> {
+                Ok(Self {
+                    $( $field: crate::discovery::wire::Structure::read(
+                        reader,
+                        concat!(stringify!($name), " ", $label),
+                    )?, )+
+                })
+            }
+
+            fn write(&self, out: &mut Vec<u8>, _: &'static str) -> Result<(), crate::EncodeError> {
+                $( crate::discovery::wire::Structure::write(
+                    &self.$field,
+                    out,
+                    concat!(stringify!($name), " ", $label),
+                )?; )+
+                Ok(())
+            }
+        }
+
+        /// Every field null, or zero where its type knows no null.
+        impl $(<$lifetime>)? Default for $name $(<$lifetime>)? {
+            fn default() -> Self {
+                <Self as crate::discovery::wire::Structure<'_>>::NULL
+            }
+        }
+    )+ };
+}
+
+/// An enumeration of the standard: an Int32 of which other values than the named ones can come.
+macro_rules! enumeration {
+    ($(
+        $(#[$meta:meta])*
+        $name:ident { $( $(#[$value_meta:meta])* $constant:ident = $value:literal, )+ }
+    )+) => { $(
+        $(#[$meta])*
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+        pub struct $name(pub i32);
+
+        impl $name {
+            $( $(#[$value_meta])* pub const $constant: Self = Self($value); )+
+        }
+
+        impl crate::discovery::wire::Structure<'_> for $name {
+            const NULL: Self = Self(0);
+            const MIN_SIZE: usize = 4;
+
+            fn read(
+                reader: &mut crate::reader::Reader<'_>,
+                what: &'static str,
+            ) -> Result<Self, crate::DecodeError> {
+                reader.i32(what).map(Self)
+            }
+
+            fn write(&self, out: &mut Vec<u8>, _: &'static str) -> Result<(), crate::EncodeError> {
+                out.extend_from_slice(&self.0.to_le_bytes());
+                Ok(())
+            }
+        }
+    )+ };
+}
+
+pub(crate) use {enumeration, structure};

@@ -1,0 +1,263 @@
+//! Each kind of probe and announcement, and what is none.
+
+use uadp::discovery::{
+    Announced, Announcement, ApplicationDescription, ConfigurationVersion, ConnectionState,
+    CyclicStatus, DataSetMetaDataType, List, Probe, PubSubConnectionDataType, VersionMatch,
+    WriterGroupDataType,
+};
+use uadp::{
+    DataSetHeader, DateTime, DecodeError, EncodeError, NetworkMessage, PublisherId, SecurityHeader,
+    StatusCode,
+};
+
+use crate::{body, probe_body};
+
+#[test]
+fn probes_are_laid_out_as_in_the_tables() {
+    for (probe, bytes) in [
+        (Probe::PublisherEndpoints, &[1, 1][..]),
+        (
+            Probe::DataSetMetaData(List::new(&[10])),
+            &[1, 2, 1, 0, 0, 0, 10, 0],
+        ),
+        (
+            Probe::DataSetWriterConfiguration(List::new(&[])),
+            &[1, 3, 0, 0, 0, 0],
+        ),
+        (
+            Probe::WriterGroupConfiguration {
+                writer_group_id: 0x0105,
+                include_data_set_writers: true,
+            },
+            &[1, 4, 5, 1, 1],
+        ),
+        (
+            Probe::PubSubConnections {
+                transport_profile_uris: List::new(&[Some("u")]),
+                include_writer_groups: true,
+                include_data_set_writers: false,
+            },
+            &[1, 5, 1, 0, 0, 0, 1, 0, 0, 0, b'u', 1, 0],
+        ),
+        (Probe::FindApplications, &[2]),
+    ] {
+        assert_eq!(probe_body(&probe), bytes);
+        assert_eq!(Probe::decode_body(bytes), Ok(probe));
+    }
+}
+
+#[test]
+fn an_endpoints_probe_of_version_1_04_ends_with_no_ids() {
+    for ids in [[0xFF; 4], [0; 4]] {
+        let bytes = [&[1, 1][..], &ids].concat();
+        assert_eq!(Probe::decode_body(&bytes), Ok(Probe::PublisherEndpoints));
+    }
+    let ids = [1, 1, 1, 0, 0, 0, 10, 0];
+    assert!(Probe::decode_body(&ids).is_err(), "it asks for no writer");
+}
+
+#[test]
+fn an_unknown_kind_is_refused_by_its_name() {
+    let reserved = |field, value| DecodeError::Reserved { field, value };
+    for (bytes, error) in [
+        (&[0][..], reserved("ProbeType", 0)),
+        (&[3], reserved("ProbeType", 3)),
+        (&[1, 0], reserved("InformationType", 0)),
+        (&[1, 6], reserved("InformationType", 6)),
+    ] {
+        assert_eq!(Probe::decode_body(bytes), Err(error));
+    }
+    for (bytes, error) in [
+        (&[0, 0, 0][..], reserved("AnnouncementType", 0)),
+        (&[8, 0, 0], reserved("AnnouncementType", 8)),
+        (&[5, 0, 0, 0, 0], reserved("ApplicationInformationType", 0)),
+        (&[5, 0, 0, 3, 0], reserved("ApplicationInformationType", 3)),
+    ] {
+        assert_eq!(Announcement::decode_body(bytes), Err(error));
+    }
+}
+
+#[test]
+fn find_applications_asks_no_publisher_in_particular() {
+    let mut datagram = Vec::new();
+    Probe::FindApplications
+        .encode(None, SecurityHeader::NONE, &mut datagram)
+        .unwrap();
+    assert_eq!(datagram, [0x91, 0x90, 0x04, 0, 0, 0, 0, 0, 0, 0, 2]);
+    let message = NetworkMessage::decode(&datagram).unwrap();
+    assert_eq!(Probe::decode(&message), Ok(Probe::FindApplications));
+}
+
+#[test]
+fn application_information_says_what_it_is_or_how_it_is() {
+    let description = Announced::ApplicationDescription {
+        description: ApplicationDescription::default(),
+        capabilities: List::new(&[Some("NA")]),
+    };
+    let bytes = announced(description);
+    assert_eq!(bytes[..5], [5, 1, 0, 1, 0]);
+    assert_eq!(
+        bytes[bytes.len() - 10..],
+        [1, 0, 0, 0, 2, 0, 0, 0, b'N', b'A']
+    );
+
+    let on_change = Announced::ApplicationStatus {
+        state: ConnectionState::ERROR,
+        cyclic: None,
+    };
+    assert_eq!(announced(on_change), [5, 1, 0, 2, 0, 0, 3, 0, 0, 0]);
+    let cyclic = Announced::ApplicationStatus {
+        state: ConnectionState::OPERATIONAL,
+        cyclic: Some(CyclicStatus {
+            next_report_time: DateTime(2),
+            timestamp: DateTime(1),
+        }),
+    };
+    let times = [2, 0, 0, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0];
+    let status = [&[5, 1, 0, 2, 0, 1, 2, 0, 0, 0][..], &times].concat();
+    assert_eq!(announced(cyclic), status);
+}
+
+#[test]
+fn connections_are_an_array_without_a_status() {
+    let connections = [PubSubConnectionDataType::default(); 2];
+    let bytes = announced(Announced::PubSubConnections(List::new(&connections)));
+    assert_eq!(bytes[..7], [4, 1, 0, 2, 0, 0, 0]);
+    let one = (bytes.len() - 7) / 2;
+    assert_eq!(bytes[7..7 + one], bytes[7 + one..]);
+
+    // What others send instead is told apart, and what is neither is refused.
+    let single = announced(Announced::PubSubConnection {
+        connection: connections[0],
+        status: StatusCode::GOOD,
+    });
+    assert_eq!(single.len(), 3 + one + 4);
+    assert!(Announcement::decode_body(&bytes[..bytes.len() - 1]).is_err());
+    assert_eq!(
+        Announcement::decode_body(&[4, 1, 0, 0, 0, 0, 0, 9]),
+        Err(DecodeError::TrailingBytes(1))
+    );
+}
+
+#[test]
+fn every_data_set_writer_has_a_status() {
+    let uneven = Announcement {
+        sequence_number: 0,
+        announced: Announced::DataSetWriterConfiguration {
+            writer_ids: List::new(&[1, 2]),
+            writer_group: WriterGroupDataType::default(),
+            statuses: List::new(&[StatusCode::GOOD]),
+        },
+    };
+    let refused = uneven.encode_body(&mut Vec::new());
+    assert!(matches!(refused, Err(EncodeError::Misplaced(_))));
+
+    let mut bytes = announced(Announced::DataSetWriterConfiguration {
+        writer_ids: List::new(&[1]),
+        writer_group: WriterGroupDataType::default(),
+        statuses: List::new(&[StatusCode::GOOD]),
+    });
+    bytes.truncate(bytes.len() - 8);
+    bytes.extend([0; 4]);
+    let error = DecodeError::Reserved {
+        field: "number of statusCodes",
+        value: 0,
+    };
+    assert_eq!(Announcement::decode_body(&bytes), Err(error));
+}
+
+#[test]
+fn null_and_empty_lists_stay_apart() {
+    let with = |fields| {
+        announced(Announced::DataSetMetaData {
+            writer_id: 1,
+            meta_data: DataSetMetaDataType {
+                fields,
+                ..DataSetMetaDataType::default()
+            },
+            status: StatusCode::GOOD,
+        })
+    };
+    assert_ne!(with(List::null()), with(List::new(&[])));
+    assert_ne!(List::<u16>::null(), List::new(&[]));
+}
+
+#[test]
+fn other_messages_are_not_taken_for_discovery() {
+    let data = [0x01, 0x01, 0x00, 0x00];
+    let data = NetworkMessage::decode(&data).unwrap();
+    assert!(matches!(Probe::decode(&data), Err(DecodeError::Misread(_))));
+    assert!(matches!(
+        Announcement::decode(&data),
+        Err(DecodeError::Misread(_))
+    ));
+
+    let mut probe = Vec::new();
+    Probe::PublisherEndpoints
+        .encode(Some(PublisherId::Byte(1)), SecurityHeader::NONE, &mut probe)
+        .unwrap();
+    let message = NetworkMessage::decode(&probe).unwrap();
+    assert_eq!(
+        Announcement::decode(&message),
+        Err(DecodeError::Misread("no discovery announcement"))
+    );
+
+    let signed = SecurityHeader {
+        signed: true,
+        ..SecurityHeader::NONE
+    };
+    let mut sealed = Vec::new();
+    Probe::PublisherEndpoints
+        .encode(Some(PublisherId::Byte(1)), signed, &mut sealed)
+        .unwrap();
+    let message = NetworkMessage::decode(&sealed).unwrap();
+    assert!(matches!(
+        Probe::decode(&message),
+        Err(DecodeError::Misread(_))
+    ));
+
+    // ExtendedFlags2 bit 0 makes a chunk of it.
+    probe[2] |= 1;
+    let message = NetworkMessage::decode(&probe).unwrap();
+    assert_eq!(
+        Probe::decode(&message),
+        Err(DecodeError::Misread("a chunk, to be reassembled first"))
+    );
+}
+
+#[test]
+fn metadata_fit_messages_of_their_major_version() {
+    let version = ConfigurationVersion {
+        major: 10,
+        minor: 20,
+    };
+    for (major_version, minor_version, found) in [
+        (None, None, VersionMatch::Unsaid),
+        (Some(10), Some(20), VersionMatch::Same),
+        (Some(10), None, VersionMatch::Same),
+        (None, Some(20), VersionMatch::Same),
+        (Some(10), Some(21), VersionMatch::Minor),
+        (Some(10), Some(15), VersionMatch::Minor),
+        (Some(11), Some(20), VersionMatch::Major),
+        (Some(9), None, VersionMatch::Major),
+        (None, Some(21), VersionMatch::Major),
+    ] {
+        let header = DataSetHeader {
+            major_version,
+            minor_version,
+            ..DataSetHeader::default()
+        };
+        assert_eq!(version.compare(&header), found, "{header:?}");
+    }
+}
+
+/// The body with SequenceNumber 1, read back.
+fn announced(announced: Announced<'_>) -> Vec<u8> {
+    let announcement = Announcement {
+        sequence_number: 1,
+        announced,
+    };
+    let bytes = body(&announcement);
+    assert_eq!(Announcement::decode_body(&bytes), Ok(announcement));
+    bytes
+}
