@@ -150,7 +150,7 @@ impl Arrival {
             time,
             picoseconds: picoseconds.unwrap_or_default(),
         };
-        let header = message.header;
+        let header = message.header();
         let own = header.timestamp.map(|time| stamp(time, header.picoseconds));
         let network_stamp = network
             .timestamp

@@ -223,7 +223,7 @@ impl Reassembler {
         };
         self.counters.completed += 1;
         Ok(Some(Reassembled {
-            header: *message.header(),
+            header: message.header(),
             message_type: message.message_type(),
             writer_id: chunk.writer_id,
             message_sequence_number: chunk.message_sequence_number,
