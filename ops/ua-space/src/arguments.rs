@@ -1,0 +1,96 @@
+//! The words of the command line.
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+
+/// Looks into the space: datagrams of OPC UA PubSub as JSON and back.
+#[derive(Debug, Parser)]
+#[command(name = "ua-space", version)]
+pub(crate) struct Arguments {
+    #[command(subcommand)]
+    pub(crate) verb: Verb,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Verb {
+    /// Show what a datagram, or each datagram of a capture, holds
+    Decode(Decode),
+    /// Make datagrams from what `decode` shows
+    Encode(Encode),
+}
+
+/// Reads a datagram as hexadecimal text or as its bytes, or the UDP datagrams of a pcap or pcapng file.
+///
+/// One datagram is shown as a JSON object, those of a capture as one object a line. What is wrong with a datagram is
+/// said on stderr, with the offset of the byte; the exit code is 65 then.
+#[derive(Debug, Args)]
+#[command(verbatim_doc_comment)]
+pub(crate) struct Decode {
+    /// The file, or - for stdin
+    #[arg(value_name = "FILE")]
+    pub(crate) file: String,
+    /// Only datagrams from or to this UDP port of a capture. Without it: port 4840, and every other datagram that
+    /// is a NetworkMessage without a fault
+    #[arg(long, value_name = "PORT")]
+    pub(crate) port: Option<u16>,
+    /// Every line of hexadecimal text is a datagram
+    #[arg(long)]
+    pub(crate) lines: bool,
+    /// One JSON array instead of one object a line
+    #[arg(long)]
+    pub(crate) array: bool,
+    #[command(flatten)]
+    pub(crate) known: Known,
+}
+
+/// Writes the datagrams of a JSON object, of several one after the other or of an array, as hexadecimal text, a line
+/// each.
+#[derive(Debug, Args)]
+#[command(verbatim_doc_comment)]
+pub(crate) struct Encode {
+    /// The file, or - for stdin
+    #[arg(value_name = "FILE")]
+    pub(crate) file: String,
+    /// The bytes themselves, back to back
+    #[arg(long)]
+    pub(crate) raw: bool,
+    #[command(flatten)]
+    pub(crate) known: Known,
+}
+
+/// What a reader has to know besides the datagram.
+#[derive(Debug, Args)]
+pub(crate) struct Known {
+    /// Keys of secured messages: a JSON object or an array of objects with policy, securityTokenId, signingKey,
+    /// encryptingKey and keyNonce, and optionally publisherId and writerGroupId
+    #[arg(long, value_name = "FILE")]
+    pub(crate) keys: Option<PathBuf>,
+    /// Fields of RawData messages: a JSON array with builtInType, valueRank, arrayDimensions and maxStringLength of
+    /// each, or an array of objects with such a metaData and publisherId, writerGroupId or dataSetWriterId
+    #[arg(long, value_name = "FILE")]
+    pub(crate) metadata: Option<PathBuf>,
+    /// How RawData of padded texts and arrays is laid out
+    #[arg(long, value_name = "READING", value_enum, default_value_t = RawReading::Standard)]
+    pub(crate) raw_reading: RawReading,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum RawReading {
+    /// By OPC 10000-14
+    Standard,
+    /// As open62541 1.5 does it
+    Open62541,
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory as _;
+
+    use super::*;
+
+    #[test]
+    fn the_command_line_is_well_formed() {
+        Arguments::command().debug_assert();
+    }
+}

@@ -1,0 +1,450 @@
+//! From a datagram to its JSON.
+
+use std::time::Duration;
+
+use serde_json::json;
+use uadp::discovery::{Announcement, Probe};
+use uadp::{
+    ChunkRefusal, DateTime, DecodeError, Extras, NetworkMessage, NetworkMessageEncoder,
+    NetworkMessageType, PublisherId, Reassembled, Reassembler, ReassemblyLimits, SecurityHeader,
+};
+
+use crate::arguments::RawReading;
+use crate::fault::{Fault, Place, offset};
+use crate::keys::{self, KeyFile};
+use crate::metadata::{MetaDataFile, Writer};
+use crate::raw_data::Layout;
+use crate::values::show_variant;
+use crate::{discovery, hex, iso_time, messages, shape};
+
+/// What a reader knows besides the datagrams.
+#[derive(Debug)]
+pub(crate) struct Context {
+    pub(crate) keys: Option<KeyFile>,
+    pub(crate) metadata: MetaDataFile,
+    pub(crate) raw_reading: RawReading,
+}
+
+/// Puts chunks together, in the order of a file.
+#[derive(Debug)]
+pub(crate) struct Chunks {
+    reassembler: Reassembler,
+    now: Duration,
+    start: Option<i128>,
+}
+
+/// What was read of a datagram.
+#[derive(Debug, Default)]
+pub(crate) struct Reading {
+    pub(crate) shape: shape::Datagram,
+    pub(crate) faults: Vec<Fault>,
+    /// Why it was not opened, although there are keys.
+    pub(crate) refused: Option<String>,
+    /// What the chunk it is completes.
+    pub(crate) whole: Option<Box<Self>>,
+    /// What else there is to tell.
+    pub(crate) notes: Vec<String>,
+    /// The bytes the offsets of the faults count in: the datagram, as far as it was opened.
+    pub(crate) bytes: Vec<u8>,
+}
+
+impl Context {
+    /// Reads a datagram to its end, or to the first fault of each of its parts. With `chunks`, one that completes
+    /// a whole comes with that.
+    pub(crate) fn read(&self, datagram: &[u8], chunks: Option<&mut Chunks>) -> Reading {
+        let mut reading = Reading {
+            bytes: datagram.to_vec(),
+            ..Reading::default()
+        };
+        let message = match NetworkMessage::decode(datagram) {
+            Ok(message) => message,
+            Err(error) => {
+                reading.unreadable(datagram, error);
+                return reading;
+            }
+        };
+        match &self.keys {
+            Some(keys) if message.is_sealed() => self.open(&message, keys, &mut reading, chunks),
+            _ => self.show(&message, &mut reading, chunks),
+        }
+        reading
+    }
+
+    /// Shows a sealed message as it is once it is opened, or as far as that goes without.
+    fn open(
+        &self,
+        sealed: &NetworkMessage<'_>,
+        keys: &KeyFile,
+        reading: &mut Reading,
+        chunks: Option<&mut Chunks>,
+    ) {
+        let mut scratch = Vec::new();
+        let opened = keys.find(sealed).and_then(|keys| {
+            keys::open(keys, sealed, &mut scratch).map_err(|error| error.to_string())
+        });
+        match opened {
+            Ok(message) => {
+                reading.bytes.truncate(sealed.payload_offset());
+                reading.bytes.extend_from_slice(message.payload());
+                reading.bytes.extend_from_slice(message.footer());
+                self.show(&message, reading, chunks);
+            }
+            Err(why) => {
+                self.show(sealed, reading, None);
+                reading.refused = Some(why);
+            }
+        }
+    }
+
+    fn show(
+        &self,
+        message: &NetworkMessage<'_>,
+        reading: &mut Reading,
+        chunks: Option<&mut Chunks>,
+    ) {
+        reading.headers(message);
+        if message.is_sealed() {
+            reading.shape.sealed = Some(shape::Sealed {
+                hex: hex::text(message.payload()),
+                chunk: message.is_chunk(),
+            });
+        } else if message.is_chunk() {
+            reading.chunk(message);
+            if let Some(chunks) = chunks.filter(|_| reading.faults.is_empty()) {
+                self.put_together(message, reading, chunks);
+            }
+        } else {
+            match message.message_type() {
+                NetworkMessageType::DataSet => self.messages(message, reading),
+                message_type @ (NetworkMessageType::Probe | NetworkMessageType::Announcement) => {
+                    reading.discovery(message_type, message.payload(), message.payload_offset());
+                }
+            }
+        }
+        reading.shape.malformed = reading.faults.first().map(Fault::to_string);
+    }
+
+    fn messages(&self, message: &NetworkMessage<'_>, reading: &mut Reading) {
+        let (parts, stop) = messages::split(message);
+        self.parts(&parts, reading);
+        reading.faults.extend(stop);
+    }
+
+    fn parts(&self, parts: &[messages::Part<'_>], reading: &mut Reading) {
+        let mut shown = Vec::new();
+        for part in parts {
+            let layout = self.layout(&reading.shape, part.writer_id);
+            let (message, fault) = messages::read(part, layout.as_ref());
+            shown.push(message);
+            reading.faults.extend(fault);
+        }
+        reading.shape.data_set_messages = Some(shown);
+    }
+
+    fn put_together(
+        &self,
+        message: &NetworkMessage<'_>,
+        reading: &mut Reading,
+        chunks: &mut Chunks,
+    ) {
+        match chunks.reassembler.receive(message, chunks.now) {
+            Ok(Some(whole)) => reading.whole = Some(Box::new(self.read_whole(message, &whole))),
+            // A network may deliver twice.
+            Ok(None) | Err(ChunkRefusal::Duplicate) => {}
+            Err(refusal) => reading.notes.push(format!("not put together: {refusal}")),
+        }
+    }
+
+    /// What chunks hold together: one DataSetMessage, or what stands behind the headers of a discovery message.
+    fn read_whole(&self, last: &NetworkMessage<'_>, whole: &Reassembled<'_>) -> Reading {
+        let mut reading = Reading {
+            bytes: whole.bytes.to_vec(),
+            ..Reading::default()
+        };
+        reading.headers(last);
+        match whole.message_type {
+            NetworkMessageType::DataSet => {
+                let part = messages::Part {
+                    writer_id: whole.writer_id,
+                    offset: 0,
+                    bytes: whole.bytes,
+                };
+                self.parts(&[part], &mut reading);
+            }
+            message_type @ (NetworkMessageType::Probe | NetworkMessageType::Announcement) => {
+                reading.discovery(message_type, whole.bytes, 0);
+            }
+        }
+        if whole.writer_id.is_none() && !reading.faults.is_empty() {
+            // UA-.NETStandard cuts up the NetworkMessage and leaves the payload header out.
+            let other = self.read(whole.bytes, None);
+            if other.faults.is_empty() {
+                reading = other;
+            }
+        }
+        reading.shape.reassembled = Some(json!({
+            "messageSequenceNumber": whole.message_sequence_number,
+            "totalSize": whole.bytes.len(),
+        }));
+        reading.shape.malformed = reading.faults.first().map(Fault::to_string);
+        reading
+    }
+
+    /// How the RawData of a DataSetWriter is laid out, if that is known.
+    pub(crate) fn layout(
+        &self,
+        datagram: &shape::Datagram,
+        data_set_writer_id: Option<u16>,
+    ) -> Option<Layout<'_>> {
+        let group = datagram.group_header.as_ref();
+        let metadata = self.metadata.find(Writer {
+            publisher_id: datagram.publisher_id.as_ref(),
+            writer_group_id: group.and_then(|group| group.writer_group_id),
+            data_set_writer_id,
+        })?;
+        // What is no layout was refused when it was read.
+        Layout::new(metadata, self.raw_reading).ok()
+    }
+}
+
+impl Chunks {
+    /// Chunks that are up to a minute apart belong together: what is looked at may have been slow.
+    pub(crate) fn new() -> Self {
+        Self {
+            reassembler: Reassembler::new(ReassemblyLimits {
+                age: Duration::from_secs(60),
+                ..ReassemblyLimits::default()
+            }),
+            now: Duration::ZERO,
+            start: None,
+        }
+    }
+
+    /// Moves on to when the next datagram was captured, in nanoseconds since any time; never back.
+    pub(crate) fn at(&mut self, time: i128) {
+        let since = time - *self.start.get_or_insert(time);
+        let since = u64::try_from(since).unwrap_or_default();
+        self.now = self.now.max(Duration::from_nanos(since));
+    }
+
+    /// True when chunks were never put together because others did not come.
+    pub(crate) fn is_any_incomplete(&self) -> bool {
+        let counters = self.reassembler.counters();
+        self.reassembler.poll_timeout().is_some()
+            || counters.expired + counters.out_of_bytes + counters.out_of_places != 0
+            || counters.superseded + counters.contradicted != 0
+    }
+}
+
+impl Reading {
+    /// False for what other protocols might send by chance: not without fault, from nobody, or sealed in a way that
+    /// no policy has.
+    pub(crate) fn is_plausible(&self) -> bool {
+        let shape = &self.shape;
+        let names_its_sender = shape.publisher_id.is_some() || shape.group_header.is_some();
+        let sealed = shape.sealed.as_ref().zip(shape.security_header.as_ref());
+        let is_secured = sealed.is_none_or(|(sealed, header)| {
+            header.security_token_id != 0 && header.nonce.len() == 16 && sealed.hex.len() >= 64
+        });
+        self.faults.is_empty() && self.refused.is_none() && names_its_sender && is_secured
+    }
+
+    fn unreadable(&mut self, datagram: &[u8], error: DecodeError) {
+        let stop = |end| {
+            let prefix = datagram.get(..end)?;
+            Some((None, NetworkMessage::decode(prefix).err()?))
+        };
+        let fault = Fault {
+            place: Place::Headers,
+            error,
+            offset: offset(datagram.len(), (None, error), stop),
+        };
+        self.shape.malformed = Some(fault.to_string());
+        self.faults.push(fault);
+    }
+
+    fn headers(&mut self, message: &NetworkMessage<'_>) {
+        let header = message.header();
+        let shape = &mut self.shape;
+        shape.uadp_version = Some(1);
+        shape.network_message_type = match message.message_type() {
+            NetworkMessageType::DataSet => None,
+            NetworkMessageType::Probe => Some(shape::NetworkMessageType::DiscoveryProbe),
+            NetworkMessageType::Announcement => {
+                Some(shape::NetworkMessageType::DiscoveryAnnouncement)
+            }
+        };
+        shape.publisher_id = header.publisher_id.map(Into::into);
+        shape.data_set_class_id = header.data_set_class_id.map(|id| id.to_string());
+        shape.group_header = header.group.map(|group| shape::GroupHeader {
+            writer_group_id: group.writer_group_id,
+            group_version: group.group_version,
+            network_message_number: group.network_message_number,
+            sequence_number: group.sequence_number,
+        });
+        shape.data_set_writer_ids = message.writer_ids().map(Iterator::collect);
+        shape.timestamp = header.timestamp.map(show_timestamp);
+        shape.pico_seconds = header.picoseconds;
+        shape.security_header = message
+            .security()
+            .map(|security| show_security(&security, message));
+        self.promoted_fields(message);
+    }
+
+    fn promoted_fields(&mut self, message: &NetworkMessage<'_>) {
+        let Some(promoted) = message.promoted_fields() else {
+            return;
+        };
+        let mut shown = Vec::new();
+        for field in promoted {
+            match field.and_then(|field| show_variant(&field)) {
+                Ok(field) => shown.push(field),
+                Err(error) => self
+                    .faults
+                    .push(promoted_fault(message, shown.len(), error)),
+            }
+        }
+        self.shape.promoted_fields = Some(shown);
+    }
+
+    fn chunk(&mut self, message: &NetworkMessage<'_>) {
+        match message.chunk() {
+            Ok(chunk) => {
+                self.shape.chunk = Some(shape::Chunk {
+                    message_sequence_number: chunk.message_sequence_number,
+                    chunk_offset: chunk.offset,
+                    total_size: chunk.total_size,
+                    chunk_data_hex: hex::text(chunk.data),
+                });
+            }
+            Err(error) => {
+                let payload = message.payload().len();
+                let in_payload = if let DecodeError::Truncated { found, .. } = error {
+                    payload - found
+                } else {
+                    // The ChunkOffset, behind the MessageSequenceNumber.
+                    2
+                };
+                self.faults.push(Fault {
+                    place: Place::Chunk,
+                    error,
+                    offset: message.payload_offset() + in_payload,
+                });
+            }
+        }
+    }
+}
+
+impl Reading {
+    /// A body that stands `start` bytes behind the first.
+    fn discovery(&mut self, message_type: NetworkMessageType, body: &[u8], start: usize) {
+        let read: fn(&[u8]) -> Result<(), DecodeError>;
+        let shown = match message_type {
+            NetworkMessageType::Probe => {
+                read = |body| Probe::decode_body(body).map(|_| ());
+                discovery::show_probe(body).map(|shown| self.shape.probe = Some(shown))
+            }
+            NetworkMessageType::Announcement | NetworkMessageType::DataSet => {
+                read = |body| Announcement::decode_body(body).map(|_| ());
+                discovery::show_announcement(body)
+                    .map(|shown| self.shape.announcement = Some(shown))
+            }
+        };
+        if let Err(error) = shown {
+            let stop = |end| Some((None, read(body.get(..end)?).err()?));
+            self.faults.push(Fault {
+                place: Place::Discovery,
+                error,
+                offset: start + offset(body.len(), (None, error), stop),
+            });
+        }
+    }
+}
+
+fn promoted_fault(message: &NetworkMessage<'_>, field: usize, error: DecodeError) -> Fault {
+    let fields = promoted_range(message).unwrap_or_default();
+    let bytes = message.datagram().get(fields.clone()).unwrap_or_default();
+    let stop = (Some(field), error);
+    let read = |end| {
+        // A NetworkMessage of nothing but these fields.
+        let size = u16::try_from(end).ok()?.to_le_bytes();
+        let head = [0x81, 0x80, 0x02, size[0], size[1]];
+        let datagram = [&head, bytes.get(..end)?].concat();
+        let message = NetworkMessage::decode(&datagram).ok()?;
+        let mut read = 0;
+        for field in message.promoted_fields()? {
+            match field {
+                Ok(_) => read += 1,
+                Err(error) => return Some((Some(read), error)),
+            }
+        }
+        None
+    };
+    Fault {
+        place: Place::PromotedField(field),
+        error,
+        offset: fields.start + offset(bytes.len(), stop, read),
+    }
+}
+
+/// Where the PromotedFields stand: before the SecurityHeader, and behind headers that would be written the same again.
+fn promoted_range(message: &NetworkMessage<'_>) -> Option<std::ops::Range<usize>> {
+    let ids: Option<Vec<_>> = message.writer_ids().map(Iterator::collect);
+    let headers_with = |security| {
+        let extras = Extras {
+            promoted_fields: Some(&[]),
+            security,
+        };
+        let mut headers = Vec::new();
+        let encoder = NetworkMessageEncoder::with(
+            &mut headers,
+            &message.header(),
+            ids.as_deref().filter(|_| !message.is_chunk()),
+            &extras,
+        );
+        Some(encoder.ok()?.payload_offset())
+    };
+    let chunk_id = usize::from(message.is_chunk()) * ids.as_ref().map_or(0, |ids| ids.len() * 2);
+    let security = headers_with(message.security())? - headers_with(None)?;
+    let start = headers_with(None)? + chunk_id;
+    Some(start..message.payload_offset() - security)
+}
+
+impl From<PublisherId<'_>> for shape::PublisherId {
+    fn from(id: PublisherId<'_>) -> Self {
+        let (id_type, value) = match id {
+            PublisherId::Byte(id) => (shape::PublisherIdType::Byte, id.into()),
+            PublisherId::UInt16(id) => (shape::PublisherIdType::UInt16, id.into()),
+            PublisherId::UInt32(id) => (shape::PublisherIdType::UInt32, id.into()),
+            PublisherId::UInt64(id) => (shape::PublisherIdType::UInt64, id.to_string().into()),
+            PublisherId::String(id) => (shape::PublisherIdType::String, id.into()),
+        };
+        Self { id_type, value }
+    }
+}
+
+pub(crate) fn show_timestamp(time: DateTime) -> shape::Timestamp {
+    shape::Timestamp {
+        ticks100ns: Some(time.0),
+        iso: Some(iso_time::of_date_time(time)),
+    }
+}
+
+fn show_security(
+    security: &SecurityHeader<'_>,
+    message: &NetworkMessage<'_>,
+) -> shape::SecurityHeader {
+    shape::SecurityHeader {
+        signed: security.signed,
+        encrypted: security.encrypted,
+        footer_enabled: security.footer_size.is_some(),
+        force_key_reset: security.force_key_reset,
+        security_token_id: security.token_id,
+        nonce: hex::text(security.nonce),
+        footer_size: security.footer_size,
+        footer: security
+            .footer_size
+            .filter(|_| !message.is_sealed())
+            .map(|_| hex::text(message.footer())),
+    }
+}

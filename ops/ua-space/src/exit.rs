@@ -1,0 +1,51 @@
+//! How the program ends.
+
+use std::io;
+use std::process::ExitCode;
+
+/// Why a verb could not do what was asked.
+#[derive(Debug, thiserror::Error)]
+pub(crate) enum Failure {
+    /// A datagram, JSON, keys or metadata that are not what they should be.
+    #[error("{0}")]
+    Data(String),
+    /// Datagrams that were not; each was told of when it came.
+    #[error("some datagrams are malformed")]
+    Told,
+    /// A file that cannot be read, or an output that cannot be written.
+    #[error("{0}")]
+    Io(String),
+    /// Whoever read the output has seen enough.
+    #[error("the output was closed")]
+    Closed,
+}
+
+impl Failure {
+    pub(crate) fn reading(file: &str, error: &io::Error) -> Self {
+        Self::Io(format!("cannot read {file}: {error}"))
+    }
+}
+
+/// What went wrong with the output.
+impl From<io::Error> for Failure {
+    fn from(error: io::Error) -> Self {
+        if error.kind() == io::ErrorKind::BrokenPipe {
+            return Self::Closed;
+        }
+        Self::Io(format!("cannot write the output: {error}"))
+    }
+}
+
+/// As in `sysexits.h`.
+impl From<&Failure> for ExitCode {
+    fn from(failure: &Failure) -> Self {
+        match failure {
+            Failure::Data(_) | Failure::Told => Self::from(65),
+            Failure::Io(_) => Self::from(74),
+            Failure::Closed => Self::SUCCESS,
+        }
+    }
+}
+
+/// What was typed is none of the program's words.
+pub(crate) const USAGE: u8 = 64;

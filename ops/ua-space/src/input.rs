@@ -1,0 +1,104 @@
+//! What a file holds: one datagram, several, or a capture.
+
+use std::fs::File;
+use std::io::{self, BufReader, Read};
+
+use crate::capture::{Capture, CaptureError, is_capture};
+use crate::exit::Failure;
+use crate::hex;
+
+/// A file that was recognised.
+pub(crate) enum Input {
+    /// One datagram, as text or as it is.
+    Datagram(Vec<u8>),
+    /// One datagram a line, each with the number of its line.
+    Lines(Vec<(usize, Vec<u8>)>),
+    Capture(Capture<Box<dyn Read>>),
+}
+
+/// Opens a file, `-` for stdin. With `lines` every line of hexadecimal text is a datagram.
+pub(crate) fn open(file: &str, lines: bool) -> Result<Input, Failure> {
+    let reading = |error: io::Error| Failure::reading(name(file), &error);
+    let mut reader: Box<dyn Read> = match file {
+        "-" => Box::new(io::stdin().lock()),
+        path => Box::new(BufReader::new(File::open(path).map_err(reading)?)),
+    };
+    let mut start = Vec::new();
+    reader
+        .by_ref()
+        .take(4)
+        .read_to_end(&mut start)
+        .map_err(reading)?;
+    if let Some(magic) = start
+        .first_chunk()
+        .copied()
+        .filter(|magic| is_capture(*magic))
+    {
+        let capture = Capture::new(magic, reader).map_err(|error| failure(file, error))?;
+        return Ok(Input::Capture(capture));
+    }
+    let mut bytes = start;
+    reader
+        .take(MAX_BYTES)
+        .read_to_end(&mut bytes)
+        .map_err(reading)?;
+    let wrong = |what: String| Failure::Data(format!("{}: {what}", name(file)));
+    match text(&bytes) {
+        _ if bytes.iter().all(u8::is_ascii_whitespace) => Err(wrong("empty".to_owned())),
+        None if lines => Err(wrong("no text, so --lines has no lines".to_owned())),
+        None => Ok(Input::Datagram(bytes)),
+        Some(text) if text.trim_start().starts_with(['{', '[']) => {
+            let hint = "this is JSON; `ua-space encode` makes datagrams of it";
+            Err(wrong(hint.to_owned()))
+        }
+        Some(text) if lines => read_lines(text).map_err(|error| wrong(error.to_string())),
+        Some(text) => match hex::parse(text) {
+            Ok(bytes) if bytes.is_empty() => Err(wrong("no hexadecimal digits".to_owned())),
+            Ok(bytes) => Ok(Input::Datagram(bytes)),
+            Err(error) => Err(wrong(error.to_string())),
+        },
+    }
+}
+
+/// What to call the file in messages.
+pub(crate) fn name(file: &str) -> &str {
+    match file {
+        "-" => "stdin",
+        path => path,
+    }
+}
+
+/// What it means that a capture cannot be read on.
+pub(crate) fn failure(file: &str, error: CaptureError) -> Failure {
+    match error {
+        CaptureError::Io(error) => Failure::reading(name(file), &error),
+        error @ (CaptureError::CutOff(_) | CaptureError::Broken { .. }) => {
+            Failure::Data(format!("{}: {error}", name(file)))
+        }
+    }
+}
+
+/// Text, unless there are bytes that no text has. A datagram always has some: its counts and lengths are small
+/// numbers.
+fn text(bytes: &[u8]) -> Option<&str> {
+    let control = |byte: &u8| byte.is_ascii_control() && !byte.is_ascii_whitespace();
+    match bytes.iter().any(control) {
+        true => None,
+        false => str::from_utf8(bytes).ok(),
+    }
+}
+
+fn read_lines(text: &str) -> Result<Input, hex::HexError> {
+    let mut datagrams = Vec::new();
+    for (line, number) in text.lines().zip(1..) {
+        let mut datagram = Vec::new();
+        hex::parse_line(line, number, &mut datagram)?;
+        if !datagram.is_empty() {
+            datagrams.push((number, datagram));
+        }
+    }
+    Ok(Input::Lines(datagrams))
+}
+
+/// More than any datagram and its comments have.
+const MAX_BYTES: u64 = 1 << 30;

@@ -1,0 +1,70 @@
+//! JSON files with one object or several.
+
+use std::path::Path;
+
+use serde::de::DeserializeOwned;
+use serde_json::Deserializer;
+
+use crate::exit::Failure;
+
+/// The text of a file.
+pub(crate) fn read(path: &Path) -> Result<String, Failure> {
+    let name = path.display().to_string();
+    let bytes = std::fs::read(path).map_err(|error| Failure::reading(&name, &error))?;
+    String::from_utf8(bytes).map_err(|_| Failure::Data(format!("{name}: not UTF-8, so no JSON")))
+}
+
+/// The objects of an array, or one or more objects, one after the other. An error names line and column.
+pub(crate) fn one_or_many<T: DeserializeOwned>(text: &str) -> Result<Vec<T>, serde_json::Error> {
+    if text.trim_start().starts_with('[') {
+        return serde_json::from_str(text);
+    }
+    Deserializer::from_str(text).into_iter().collect()
+}
+
+/// What is wrong with JSON, without the names of all keys there might have been.
+pub(crate) fn explain(name: &str, error: &serde_json::Error) -> Failure {
+    let text = error.to_string();
+    let (what, place) = match text.rsplit_once(" at line ") {
+        Some((what, place)) => (what, format!(" at line {place}")),
+        None => (text.as_str(), String::new()),
+    };
+    let what = match what.split_once(", expected one of ") {
+        Some((what, _)) if what.starts_with("unknown field") => what,
+        _ => what,
+    };
+    Failure::Data(format!("{name}: {what}{place}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::shape;
+
+    #[test]
+    fn objects_are_read_however_they_are_put_together() {
+        for text in ["[1, 2]", " [1,2]\n", "1 2", "1\n2\n"] {
+            assert_eq!(one_or_many::<u8>(text).unwrap(), [1, 2], "{text}");
+        }
+        assert_eq!(one_or_many::<u8>("").unwrap(), Vec::<u8>::new());
+    }
+
+    #[test]
+    fn what_is_wrong_is_told_with_its_place() {
+        let error = one_or_many::<u8>("1\n\"x\"").unwrap_err();
+        assert_eq!(
+            explain("a.json", &error).to_string(),
+            "a.json: invalid type: string \"x\", expected u8 at line 2 column 3"
+        );
+        let error = one_or_many::<shape::PublisherId>("{\"typ\": 1}").unwrap_err();
+        assert_eq!(
+            explain("a.json", &error).to_string(),
+            "a.json: unknown field `typ`, expected `type` or `value` at line 1 column 6"
+        );
+        let error = one_or_many::<shape::Datagram>("\n{\"publisher\": 1}").unwrap_err();
+        assert_eq!(
+            explain("a.json", &error).to_string(),
+            "a.json: unknown field `publisher` at line 2 column 12"
+        );
+    }
+}

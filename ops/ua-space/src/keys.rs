@@ -1,0 +1,186 @@
+//! Keys of secured messages, from a file.
+
+use std::path::Path;
+use std::time::Duration;
+
+use serde::Deserialize;
+use serde::de::IgnoredAny;
+use uadp::{Keys, NetworkMessage, Opener, SecurityError, SecurityMode, SecurityPolicy};
+
+use crate::exit::Failure;
+use crate::shape::PublisherId;
+use crate::{hex, json_file, selector};
+
+/// The keys of a file.
+#[derive(Debug)]
+pub(crate) struct KeyFile {
+    name: String,
+    entries: Vec<Entry>,
+}
+
+#[derive(Debug)]
+struct Entry {
+    written: Written,
+    keys: Keys,
+}
+
+/// One key of a SecurityGroup, in its parts; those of text are hexadecimal.
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+struct Written {
+    /// SecurityPolicyUri.
+    policy: String,
+    security_token_id: u32,
+    signing_key: String,
+    encrypting_key: String,
+    key_nonce: String,
+    /// Only of this publisher and WriterGroup.
+    publisher_id: Option<selector::Publisher>,
+    writer_group_id: Option<u16>,
+    /// What the messages themselves say, and more that test vectors know of theirs.
+    #[serde(default, rename = "mode")]
+    _mode: IgnoredAny,
+    #[serde(default, rename = "payloadOffset")]
+    _payload_offset: IgnoredAny,
+    #[serde(default, rename = "signatureOffset")]
+    _signature_offset: IgnoredAny,
+    #[serde(default, rename = "signatureLength")]
+    _signature_length: IgnoredAny,
+    #[serde(default, rename = "decryptedPayload")]
+    _decrypted_payload: IgnoredAny,
+    #[serde(default, rename = "signatureVerifiedIndependently")]
+    _verified: IgnoredAny,
+}
+
+impl KeyFile {
+    /// Reads the keys; warns when others can read them as well.
+    pub(crate) fn read(path: &Path, warn: impl FnOnce(&str)) -> Result<Self, Failure> {
+        let name = path.display().to_string();
+        let text = json_file::read(path)?;
+        if let Some(mode) = others_may_read(path) {
+            warn(&format!(
+                "{name}: mode {mode:04o} lets others read the keys; chmod 600 {name}"
+            ));
+        }
+        let written: Vec<Written> =
+            json_file::one_or_many(&text).map_err(|error| json_file::explain(&name, &error))?;
+        let mut entries = Vec::new();
+        for (written, at) in written.into_iter().zip(0..) {
+            let keys = written.keys();
+            let keys = keys.map_err(|error| Failure::Data(format!("{name}: key {at}: {error}")))?;
+            entries.push(Entry { written, keys });
+        }
+        Ok(Self { name, entries })
+    }
+
+    /// The keys that open a sealed message.
+    ///
+    /// Each message is opened by itself, so that one sent twice is shown twice.
+    pub(crate) fn find(&self, message: &NetworkMessage<'_>) -> Result<&Keys, String> {
+        let token_id = message.security().map_or(0, |security| security.token_id);
+        let mut why = None;
+        for entry in self.entries.iter().filter(|entry| entry.fits(message)) {
+            match open(&entry.keys, message, &mut Vec::new()) {
+                Ok(_) => return Ok(&entry.keys),
+                Err(error) => why = Some(error),
+            }
+        }
+        Err(match why {
+            None => format!(
+                "no keys of SecurityTokenId {token_id} for this publisher in {}",
+                self.name
+            ),
+            Some(SecurityError::Signature) => format!(
+                "the signature is wrong: {} has other keys of SecurityTokenId {token_id}, or the datagram was changed",
+                self.name
+            ),
+            Some(error) => format!("not to be opened: {error}"),
+        })
+    }
+
+    /// The keys to secure a message with.
+    pub(crate) fn of(
+        &self,
+        token_id: u32,
+        publisher_id: Option<&PublisherId>,
+        writer_group_id: Option<u16>,
+    ) -> Option<&Keys> {
+        let wanted = |entry: &&Entry| entry.is_of(token_id, publisher_id, writer_group_id);
+        self.entries.iter().find(wanted).map(|entry| &entry.keys)
+    }
+
+    pub(crate) fn name(&self) -> &str {
+        &self.name
+    }
+}
+
+/// Opens a message, into `scratch` if it is encrypted.
+pub(crate) fn open<'a>(
+    keys: &Keys,
+    message: &NetworkMessage<'a>,
+    scratch: &'a mut Vec<u8>,
+) -> Result<NetworkMessage<'a>, SecurityError> {
+    let token_id = message.security().map_or(0, |security| security.token_id);
+    let mut opener = Opener::new(SecurityMode::Sign);
+    opener
+        .update_keys(token_id, [keys.clone()])
+        .map_err(|_| SecurityError::UnknownToken(token_id))?;
+    Ok(opener.open(message, Duration::ZERO, scratch)?.message)
+}
+
+impl Entry {
+    fn fits(&self, message: &NetworkMessage<'_>) -> bool {
+        let header = message.header();
+        let publisher_id = header.publisher_id.map(PublisherId::from);
+        self.is_of(
+            message.security().map_or(0, |security| security.token_id),
+            publisher_id.as_ref(),
+            header.group.and_then(|group| group.writer_group_id),
+        )
+    }
+
+    fn is_of(
+        &self,
+        token_id: u32,
+        publisher_id: Option<&PublisherId>,
+        writer_group_id: Option<u16>,
+    ) -> bool {
+        let written = &self.written;
+        written.security_token_id == token_id
+            && selector::publisher_fits(written.publisher_id.as_ref(), publisher_id)
+            && selector::number_fits(written.writer_group_id, writer_group_id)
+    }
+}
+
+impl Written {
+    fn keys(&self) -> Result<Keys, String> {
+        let policy = SecurityPolicy::from_uri(&self.policy)
+            .ok_or_else(|| format!("`{}` is no SecurityPolicy of PubSub", self.policy))?;
+        let mut key_data = Vec::new();
+        let parts = [
+            ("signingKey", &self.signing_key),
+            ("encryptingKey", &self.encrypting_key),
+            ("keyNonce", &self.key_nonce),
+        ];
+        for (key, part) in parts {
+            let bytes = hex::parse(part).map_err(|error| format!("{key}: {error}"))?;
+            key_data.extend(bytes);
+        }
+        Keys::from_bytes(policy, &key_data).map_err(|error| error.to_string())
+    }
+}
+
+/// The file's mode where it lets others read.
+#[cfg(unix)]
+fn others_may_read(path: &Path) -> Option<u32> {
+    use std::os::unix::fs::MetadataExt as _;
+
+    let metadata = std::fs::metadata(path).ok()?;
+    let mode = metadata.mode() & 0o7777;
+    (metadata.is_file() && mode & 0o077 != 0).then_some(mode)
+}
+
+#[cfg(not(unix))]
+const fn others_may_read(_path: &Path) -> Option<u32> {
+    None
+}

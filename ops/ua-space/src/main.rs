@@ -1,0 +1,63 @@
+//! `ua-space`: looks into the space.
+
+mod arguments;
+mod capture;
+mod decode;
+mod discovery;
+mod encode;
+mod exit;
+mod fault;
+mod hex;
+mod input;
+mod iso_time;
+mod json_file;
+mod keys;
+mod layout;
+mod messages;
+mod metadata;
+mod node_ids;
+mod packet;
+mod raw_data;
+mod report;
+mod selector;
+mod session;
+mod shape;
+mod status;
+mod structures;
+mod values;
+
+use std::process::ExitCode;
+
+use clap::Parser as _;
+use clap::error::ErrorKind;
+
+use arguments::{Arguments, Verb};
+use exit::Failure;
+
+fn main() -> ExitCode {
+    let arguments = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(usage) => {
+            // Nobody is left to tell when stdout or stderr is closed.
+            let _printed = usage.print();
+            let asked = [ErrorKind::DisplayHelp, ErrorKind::DisplayVersion];
+            return match asked.contains(&usage.kind()) {
+                true => ExitCode::SUCCESS,
+                false => ExitCode::from(exit::USAGE),
+            };
+        }
+    };
+    let ended = match &arguments.verb {
+        Verb::Decode(arguments) => session::decode(arguments),
+        Verb::Encode(arguments) => session::encode(arguments),
+    };
+    match ended {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            if let Failure::Data(what) | Failure::Io(what) = &failure {
+                report::warn(what);
+            }
+            (&failure).into()
+        }
+    }
+}

@@ -1,0 +1,242 @@
+//! The DataSetMessages of a payload.
+
+use uadp::{DataSetMessage, DecodeError, FieldEncoding, MessageKind, NetworkMessage};
+
+use crate::fault::{Fault, MessagePlace, Place, Stop, in_field, offset};
+use crate::raw_data::Layout;
+use crate::values::{show_data_value, show_variant};
+use crate::{decode, hex, shape};
+
+/// A DataSetMessage of a payload.
+pub(crate) struct Part<'a> {
+    pub(crate) writer_id: Option<u16>,
+    /// Where in the datagram it starts.
+    pub(crate) offset: usize,
+    pub(crate) bytes: &'a [u8],
+}
+
+/// The DataSetMessages of a payload, as many as there are before the first fault of their Sizes.
+pub(crate) fn split<'a>(message: &NetworkMessage<'a>) -> (Vec<Part<'a>>, Option<Fault>) {
+    let payload = message.payload();
+    let start = message.payload_offset();
+    let ids: Vec<_> = message.writer_ids().into_iter().flatten().collect();
+    if ids.len() < 2 {
+        let part = Part {
+            writer_id: ids.first().copied(),
+            offset: start,
+            bytes: payload,
+        };
+        return (vec![part], None);
+    }
+    let fault = |error, in_payload| Fault {
+        place: Place::Payload,
+        error,
+        offset: start + in_payload,
+    };
+    let cut = |field, expected, found| DecodeError::Truncated {
+        field,
+        expected,
+        found,
+    };
+    let Some((sizes, mut rest)) = payload.split_at_checked(ids.len() * 2) else {
+        let error = cut("Sizes", ids.len() * 2, payload.len());
+        return (Vec::new(), Some(fault(error, 0)));
+    };
+    let mut parts = Vec::new();
+    let (sizes, _) = sizes.as_chunks();
+    for (id, size) in ids.into_iter().zip(sizes) {
+        let size = usize::from(u16::from_le_bytes(*size));
+        let at = payload.len() - rest.len();
+        let Some((bytes, behind)) = rest.split_at_checked(size) else {
+            let error = cut("DataSetMessage", size, rest.len());
+            return (parts, Some(fault(error, at)));
+        };
+        parts.push(Part {
+            writer_id: Some(id),
+            offset: start + at,
+            bytes,
+        });
+        rest = behind;
+    }
+    let left = match rest.len() {
+        0 => None,
+        left => Some(fault(
+            DecodeError::TrailingBytes(left),
+            payload.len() - left,
+        )),
+    };
+    (parts, left)
+}
+
+/// Reads a DataSetMessage, one of RawData with its layout. The fields before a fault are shown.
+pub(crate) fn read(
+    part: &Part<'_>,
+    layout: Option<&Layout<'_>>,
+) -> (shape::DataSetMessage, Option<Fault>) {
+    let mut shown = shape::DataSetMessage::default();
+    let bytes = part.bytes;
+    let stop = match DataSetMessage::decode(part.writer_id, bytes) {
+        Ok(message) => {
+            show_header(&message, &mut shown);
+            let stop = read_fields(&message, layout, |field| shown.fields.push(field)).err();
+            show_rest(&message, layout, stop.is_some(), &mut shown);
+            if stop.is_none() {
+                shown.configured_size =
+                    configured_size(&message, bytes, layout, shown.fields.len());
+            }
+            // Nothing behind a cleared valid bit means anything.
+            stop.filter(|_| message.is_valid())
+        }
+        Err(error) => Some((None, error)),
+    };
+    let fault = stop.map(|stop| {
+        let (field, error) = stop;
+        let place = MessagePlace {
+            writer_id: part.writer_id,
+            field,
+        };
+        let in_message = offset(bytes.len(), stop, |end| {
+            read_prefix(bytes.get(..end)?, layout)
+        });
+        Fault {
+            place: Place::Message(place),
+            error,
+            offset: part.offset + in_message,
+        }
+    });
+    shown.malformed = fault.as_ref().map(Fault::to_string);
+    (shown, fault)
+}
+
+/// Where reading a piece of a DataSetMessage stops.
+fn read_prefix(bytes: &[u8], layout: Option<&Layout<'_>>) -> Option<Stop> {
+    match DataSetMessage::decode(None, bytes) {
+        Ok(message) => read_fields(&message, layout, |_| {}).err(),
+        Err(error) => Some((None, error)),
+    }
+}
+
+fn show_header(message: &DataSetMessage<'_>, shown: &mut shape::DataSetMessage) {
+    let header = message.header();
+    shown.valid = header.valid;
+    shown.kind = match message.kind {
+        MessageKind::KeyFrame => shape::MessageKind::KeyFrame,
+        MessageKind::DeltaFrame => shape::MessageKind::DeltaFrame,
+        MessageKind::Event => shape::MessageKind::Event,
+        MessageKind::KeepAlive => shape::MessageKind::KeepAlive,
+    };
+    shown.field_encoding = match message.encoding() {
+        FieldEncoding::Variant => shape::FieldEncoding::Variant,
+        FieldEncoding::RawData => shape::FieldEncoding::RawData,
+        FieldEncoding::DataValue => shape::FieldEncoding::DataValue,
+    };
+    shown.sequence_number = header.sequence_number;
+    shown.timestamp = header.timestamp.map(decode::show_timestamp);
+    shown.pico_seconds = header.picoseconds;
+    shown.status16 = header.status;
+    shown.major_version = header.major_version;
+    shown.minor_version = header.minor_version;
+}
+
+/// Shows the bytes of fields that are not shown otherwise.
+fn show_rest(
+    message: &DataSetMessage<'_>,
+    layout: Option<&Layout<'_>>,
+    stopped: bool,
+    shown: &mut shape::DataSetMessage,
+) {
+    let is_raw = is_raw(message);
+    if is_raw && let Some(layout) = layout {
+        shown.meta_data = Some(layout.metadata().to_vec());
+    }
+    if stopped && !message.is_valid() {
+        shown.fields.clear();
+    }
+    let unknown = is_raw && layout.is_none() && !message.payload().is_empty();
+    if unknown || (stopped && (is_raw || !message.is_valid())) {
+        shown.raw_data_hex = Some(hex::text(message.payload()));
+    }
+}
+
+fn is_raw(message: &DataSetMessage<'_>) -> bool {
+    message.encoding() == FieldEncoding::RawData && message.kind != MessageKind::KeepAlive
+}
+
+/// Gives the fields one by one.
+fn read_fields(
+    message: &DataSetMessage<'_>,
+    layout: Option<&Layout<'_>>,
+    mut each: impl FnMut(shape::Field),
+) -> Result<(), Stop> {
+    if is_raw(message) {
+        return match layout {
+            Some(layout) => layout.read(message.payload(), each),
+            None => Ok(()),
+        };
+    }
+    let values = message.values().map_err(|error| (None, error))?;
+    let is_delta = message.kind == MessageKind::DeltaFrame;
+    let is_data_value = message.encoding() == FieldEncoding::DataValue;
+    for (value, at) in values.zip(0..) {
+        let shown = value.and_then(|field| {
+            let value = match (is_data_value, &field.value.value) {
+                (false, Some(variant)) => show_variant(variant)?,
+                _ => show_data_value(&field.value)?,
+            };
+            Ok(shape::Field {
+                index: is_delta.then_some(field.index),
+                value,
+            })
+        });
+        each(shown.map_err(|error| in_field(at, error))?);
+    }
+    Ok(())
+}
+
+/// Bytes the message is padded to, if it is.
+fn configured_size(
+    message: &DataSetMessage<'_>,
+    bytes: &[u8],
+    layout: Option<&Layout<'_>>,
+    fields: usize,
+) -> Option<u16> {
+    let field_count = match message.kind {
+        MessageKind::KeyFrame | MessageKind::DeltaFrame | MessageKind::Event
+            if !is_raw(message) =>
+        {
+            2
+        }
+        MessageKind::KeyFrame
+        | MessageKind::DeltaFrame
+        | MessageKind::Event
+        | MessageKind::KeepAlive => 0,
+    };
+    let zeros = bytes.iter().rev().take_while(|byte| **byte == 0).count();
+    let least = bytes.len() - message.payload().len() + field_count;
+    if zeros == 0 || (is_raw(message) && layout.is_none()) {
+        return None;
+    }
+    let complete = |end: usize| {
+        let Some(Ok(message)) = bytes
+            .get(..end)
+            .map(|bytes| DataSetMessage::decode(None, bytes))
+        else {
+            return false;
+        };
+        let mut read = 0;
+        read_fields(&message, layout, |_| read += 1).is_ok() && read == fields
+    };
+    // The shortest prefix that holds everything; the bytes behind it are zeros.
+    let (mut end, mut short) = (bytes.len(), least.max(bytes.len() - zeros));
+    while short < end {
+        let middle = short + (end - short) / 2;
+        match complete(middle) {
+            true => end = middle,
+            false => short = middle + 1,
+        }
+    }
+    match end < bytes.len() {
+        true => u16::try_from(bytes.len()).ok(),
+        false => None,
+    }
+}

@@ -1,0 +1,78 @@
+//! What the fields of RawData messages are, from a file.
+
+use std::path::Path;
+
+use serde::Deserialize;
+use serde_json::{Map, Value};
+
+use crate::arguments::RawReading;
+use crate::exit::Failure;
+use crate::raw_data::Layout;
+use crate::shape::{FieldMetaData, PublisherId};
+use crate::{json_file, selector};
+
+/// The metadata of a file. Of several entries that fit a message the first counts.
+#[derive(Debug, Default)]
+pub(crate) struct MetaDataFile {
+    entries: Vec<Entry>,
+}
+
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+struct Entry {
+    publisher_id: Option<selector::Publisher>,
+    writer_group_id: Option<u16>,
+    data_set_writer_id: Option<u16>,
+    meta_data: Vec<FieldMetaData>,
+}
+
+/// Whose DataSetMessage it is.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Writer<'a> {
+    pub(crate) publisher_id: Option<&'a PublisherId>,
+    pub(crate) writer_group_id: Option<u16>,
+    pub(crate) data_set_writer_id: Option<u16>,
+}
+
+impl MetaDataFile {
+    /// Reads entries, or a list of fields that is for every message.
+    pub(crate) fn read(path: &Path, reading: RawReading) -> Result<Self, Failure> {
+        let text = json_file::read(path)?;
+        let read = match is_list_of_fields(&text) {
+            true => serde_json::from_str(&text).map(|meta_data| {
+                vec![Entry {
+                    publisher_id: None,
+                    writer_group_id: None,
+                    data_set_writer_id: None,
+                    meta_data,
+                }]
+            }),
+            false => json_file::one_or_many(&text),
+        };
+        let name = path.display().to_string();
+        let entries = read.map_err(|error| json_file::explain(&name, &error))?;
+        for (entry, at) in entries.iter().zip(0..) {
+            Layout::new(&entry.meta_data, reading)
+                .map_err(|wrong| Failure::Data(format!("{name}: entry {at}{wrong}")))?;
+        }
+        Ok(Self { entries })
+    }
+
+    /// The fields of a message, if they are known.
+    pub(crate) fn find(&self, writer: Writer<'_>) -> Option<&[FieldMetaData]> {
+        let fits = |entry: &&Entry| {
+            selector::publisher_fits(entry.publisher_id.as_ref(), writer.publisher_id)
+                && selector::number_fits(entry.writer_group_id, writer.writer_group_id)
+                && selector::number_fits(entry.data_set_writer_id, writer.data_set_writer_id)
+        };
+        self.entries
+            .iter()
+            .find(fits)
+            .map(|entry| entry.meta_data.as_slice())
+    }
+}
+
+fn is_list_of_fields(text: &str) -> bool {
+    let list: Option<Vec<Map<String, Value>>> = serde_json::from_str(text).ok();
+    list.is_some_and(|list| list.iter().all(|entry| entry.contains_key("builtInType")))
+}

@@ -1,0 +1,150 @@
+//! RawData by its metadata (OPC 10000-14, 7.2.4.5.11).
+
+use std::sync::LazyLock;
+
+use uadp::{
+    BuiltinType, DecodeError, Encoded, NodeId, RawDialect, RawField, RawLayout, RawStructure,
+    RawStructureType, RawValue, Variant,
+};
+
+use crate::arguments::RawReading;
+use crate::fault::{Stop, in_field};
+use crate::node_ids::OwnedNodeId;
+use crate::shape::{Field, FieldMetaData, FieldValue};
+use crate::values::{WrongValue, show_scalar, show_variant, variant_bytes};
+
+/// The fields of a DataSet, as far as RawData needs them.
+#[derive(Debug)]
+pub(crate) struct Layout<'a> {
+    metadata: &'a [FieldMetaData],
+    fields: Vec<RawField<'a>>,
+    dialect: RawDialect,
+}
+
+impl<'a> Layout<'a> {
+    /// Fails when the fields are none that RawData can have.
+    pub(crate) fn new(
+        metadata: &'a [FieldMetaData],
+        reading: RawReading,
+    ) -> Result<Self, WrongValue> {
+        let mut fields = Vec::new();
+        for (field, at) in metadata.iter().zip(0..) {
+            let field = raw_field(field);
+            fields.push(field.map_err(|wrong| wrong.at(&format!(".metaData[{at}]")))?);
+        }
+        RawLayout::new(&fields).map_err(|error| {
+            WrongValue::new(error.fault.to_string()).at(&format!(".metaData[{}]", error.field))
+        })?;
+        let dialect = match reading {
+            RawReading::Standard => RawDialect::Standard,
+            RawReading::Open62541 => RawDialect::Open62541,
+        };
+        Ok(Self {
+            metadata,
+            fields,
+            dialect,
+        })
+    }
+
+    pub(crate) const fn metadata(&self) -> &'a [FieldMetaData] {
+        self.metadata
+    }
+
+    /// Gives the fields of a payload one by one; on an error, how many were before it.
+    pub(crate) fn read(&self, payload: &[u8], mut each: impl FnMut(Field)) -> Result<(), Stop> {
+        let layout = RawLayout::new(&self.fields)
+            .map_err(|_| (None, DecodeError::Misread("not what its metadata says")))?;
+        for (value, at) in layout.read(payload, self.dialect).zip(0..) {
+            let value = value.and_then(|value| show_raw(&value));
+            let value = value.map_err(|error| in_field(at, error))?;
+            each(Field { index: None, value });
+        }
+        Ok(())
+    }
+
+    /// The payload of these fields.
+    pub(crate) fn write(&self, fields: &[Field]) -> Result<Vec<u8>, WrongValue> {
+        let mut buffers = Vec::new();
+        for (field, at) in fields.iter().zip(0..) {
+            let bytes = variant_bytes(&field.value);
+            buffers.push(bytes.map_err(|wrong| wrong.at(&format!(".fields[{at}].value")))?);
+        }
+        let mut values = Vec::new();
+        for bytes in &buffers {
+            values.push(Encoded::<Variant<'_>>::new(bytes)?.get()?);
+        }
+        let layout =
+            RawLayout::new(&self.fields).map_err(|error| WrongValue::new(error.to_string()))?;
+        let mut payload = Vec::new();
+        if !values.is_empty() {
+            layout
+                .write(&mut payload, self.dialect, values)
+                .map_err(|error| {
+                    let path = format!(".fields[{}]", error.field);
+                    WrongValue::new(error.fault.to_string()).at(&path)
+                })?;
+        }
+        Ok(payload)
+    }
+}
+
+fn raw_field(metadata: &FieldMetaData) -> Result<RawField<'_>, WrongValue> {
+    let builtin = BuiltinType::from_id(metadata.built_in_type)
+        .ok_or_else(|| WrongValue::new("1 to 25 are known").at(".builtInType"))?;
+    let structure = match (builtin, &metadata.data_type) {
+        (BuiltinType::ExtensionObject, Some(data_type)) => {
+            let known = structure(data_type);
+            let wrong = || WrongValue::new("of structures only i=884 and i=18814 are known here");
+            Some(known.ok_or_else(|| wrong().at(".dataType"))?)
+        }
+        _ => None,
+    };
+    Ok(RawField {
+        value_rank: metadata.value_rank,
+        array_dimensions: &metadata.array_dimensions,
+        max_string_length: metadata.max_string_length,
+        structure,
+        ..RawField::new(builtin)
+    })
+}
+
+fn show_raw(value: &RawValue<'_>) -> Result<FieldValue, DecodeError> {
+    let array = match value {
+        RawValue::Variant(variant) => return show_variant(variant),
+        RawValue::Array(array) => array,
+    };
+    let dimensions: Vec<_> = array.dimensions().collect();
+    Ok(FieldValue {
+        ua_type: Some(array.element().id()),
+        value: Some(array.iter().map(show_scalar).collect::<Result<_, _>>()?),
+        null_array: array.is_null(),
+        dimensions: (!dimensions.is_empty()).then_some(dimensions),
+        ..FieldValue::default()
+    })
+}
+
+/// The structures that RawData may hold among those that are known: all fields Doubles.
+fn structure(data_type: &str) -> Option<&'static RawStructure<'static>> {
+    static RANGE: Known = LazyLock::new(|| doubles(NodeId::numeric(0, 886), &DOUBLES[..2]));
+    static THREE_D_FRAME: Known = LazyLock::new(|| doubles(NodeId::numeric(0, 18823), &DOUBLES));
+    let node_id = OwnedNodeId::parse(data_type)?;
+    if node_id.node_id()? == NodeId::numeric(0, 884) {
+        RANGE.as_ref()
+    } else if node_id.node_id()? == NodeId::numeric(0, 18814) {
+        THREE_D_FRAME.as_ref()
+    } else {
+        None
+    }
+}
+
+type Known = LazyLock<Option<RawStructure<'static>>>;
+
+fn doubles(
+    encoding: NodeId<'static>,
+    fields: &'static [RawField<'static>],
+) -> Option<RawStructure<'static>> {
+    RawStructure::new(encoding, RawStructureType::Structure, fields).ok()
+}
+
+/// A ThreeDFrame holds two structures of three Doubles, which stand inline like six.
+static DOUBLES: [RawField<'static>; 6] = [RawField::new(BuiltinType::Double); 6];

@@ -1,0 +1,93 @@
+//! What the program says of datagrams: JSON on stdout, faults on stderr.
+
+use std::io::{self, BufWriter, StdoutLock, Write as _};
+
+use crate::decode::Reading;
+use crate::exit::Failure;
+use crate::{hex, layout};
+
+/// Where the output goes, and how it looks.
+pub(crate) struct Report {
+    out: BufWriter<StdoutLock<'static>>,
+    style: Style,
+    shown: usize,
+    faulty: usize,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Style {
+    /// One object, for people.
+    Single,
+    /// One object a line.
+    Lines,
+    /// One array of all objects.
+    Array,
+}
+
+impl Report {
+    pub(crate) fn new(style: Style) -> Self {
+        Self {
+            out: BufWriter::new(io::stdout().lock()),
+            style,
+            shown: 0,
+            faulty: 0,
+        }
+    }
+
+    /// Shows a datagram and tells what is wrong with it; `name` says which it is.
+    pub(crate) fn show(&mut self, name: &str, reading: &Reading) -> Result<(), Failure> {
+        if !reading.faults.is_empty() || reading.refused.is_some() {
+            self.faulty += 1;
+        }
+        for fault in &reading.faults {
+            let around = hex::around(&reading.bytes, fault.offset);
+            warn(&format!("{name}: {fault}\n{}", around.trim_end()));
+        }
+        for what in reading.refused.iter().chain(&reading.notes) {
+            warn(&format!("{name}: {what}"));
+        }
+        let unread = reading.shape.uadp_version.is_none();
+        if unread && self.style == Style::Single {
+            return Ok(());
+        }
+        let json = serde_json::to_string(&reading.shape)
+            .map_err(|error| Failure::Data(format!("{name}: {error}")))?;
+        let before = match (self.style, self.shown) {
+            (Style::Array, 0) => "[\n",
+            (Style::Array, _) => ",\n",
+            (Style::Single | Style::Lines, _) => "",
+        };
+        self.out.write_all(before.as_bytes())?;
+        match self.style {
+            Style::Single => writeln!(self.out, "{}", layout::lines(&json))?,
+            Style::Lines => writeln!(self.out, "{json}")?,
+            Style::Array => self.out.write_all(json.as_bytes())?,
+        }
+        self.shown += 1;
+        Ok(())
+    }
+
+    /// Datagrams shown so far.
+    pub(crate) const fn shown(&self) -> usize {
+        self.shown
+    }
+
+    /// Ends the output; fails when something was wrong with a datagram.
+    pub(crate) fn finish(mut self) -> Result<(), Failure> {
+        if self.style == Style::Array {
+            let end = if self.shown == 0 { "[]\n" } else { "\n]\n" };
+            self.out.write_all(end.as_bytes())?;
+        }
+        self.out.flush()?;
+        match self.faulty {
+            0 => Ok(()),
+            _ => Err(Failure::Told),
+        }
+    }
+}
+
+/// Tells something on stderr.
+pub(crate) fn warn(what: &str) {
+    // Nobody is left to tell when stderr is closed.
+    let _written = writeln!(io::stderr(), "{what}");
+}

@@ -1,0 +1,241 @@
+//! The verbs, from their arguments to the end.
+
+use std::borrow::Cow;
+use std::io::{self, Read, Write as _};
+use std::path::Path;
+
+use crate::arguments::{Decode, Encode, Known};
+use crate::capture::Capture;
+use crate::decode::{Chunks, Context, Reading};
+use crate::encode;
+use crate::exit::Failure;
+use crate::input::{self, Input};
+use crate::keys::KeyFile;
+use crate::metadata::MetaDataFile;
+use crate::packet::{self, Found, Fragments, Udp};
+use crate::report::{Report, Style, warn};
+use crate::{hex, iso_time, json_file, shape};
+
+/// `ua-space decode`.
+pub(crate) fn decode(arguments: &Decode) -> Result<(), Failure> {
+    let name = input::name(&arguments.file);
+    let context = context(&arguments.known)?;
+    let input = input::open(&arguments.file, arguments.lines)?;
+    let style = match &input {
+        _ if arguments.array => Style::Array,
+        Input::Datagram(_) => Style::Single,
+        Input::Lines(_) | Input::Capture(_) => Style::Lines,
+    };
+    let mut session = Session {
+        name,
+        port: arguments.port,
+        context,
+        chunks: Chunks::new(),
+        report: Report::new(style),
+        counters: Counters::default(),
+    };
+    let ended = session.run(input);
+    session.tell();
+    let finished = session.report.finish();
+    ended.and(finished)
+}
+
+/// `ua-space encode`.
+pub(crate) fn encode(arguments: &Encode) -> Result<(), Failure> {
+    let name = input::name(&arguments.file);
+    let context = context(&arguments.known)?;
+    let text = match arguments.file.as_str() {
+        "-" => io::read_to_string(io::stdin()).map_err(|error| Failure::reading(name, &error))?,
+        path => json_file::read(Path::new(path))?,
+    };
+    let datagrams: Vec<shape::Datagram> =
+        json_file::one_or_many(&text).map_err(|error| json_file::explain(name, &error))?;
+    if datagrams.is_empty() {
+        return Err(Failure::Data(format!("{name}: holds no datagram")));
+    }
+    let many = datagrams.len() > 1;
+    let mut out = io::stdout().lock();
+    for (datagram, number) in datagrams.iter().zip(1..) {
+        let bytes = encode::write(datagram, &context).map_err(|wrong| {
+            let number = if many {
+                format!(" datagram {number}:")
+            } else {
+                String::new()
+            };
+            Failure::Data(format!("{name}:{number} {wrong}"))
+        })?;
+        match arguments.raw {
+            true => out.write_all(&bytes)?,
+            false => writeln!(out, "{}", hex::text(&bytes))?,
+        }
+    }
+    out.flush()?;
+    Ok(())
+}
+
+fn context(known: &Known) -> Result<Context, Failure> {
+    let keys = known.keys.as_deref().map(|path| KeyFile::read(path, warn));
+    let metadata = known.metadata.as_deref();
+    let metadata = metadata.map(|path| MetaDataFile::read(path, known.raw_reading));
+    Ok(Context {
+        keys: keys.transpose()?,
+        metadata: metadata.transpose()?.unwrap_or_default(),
+        raw_reading: known.raw_reading,
+    })
+}
+
+/// `decode` on its way through a file.
+struct Session<'a> {
+    name: &'a str,
+    port: Option<u16>,
+    context: Context,
+    chunks: Chunks,
+    report: Report,
+    counters: Counters,
+}
+
+/// What is worth a line at the end.
+#[derive(Debug, Default)]
+struct Counters {
+    /// Secured, and shown as they are for want of keys.
+    sealed: usize,
+    /// Datagrams of other ports that are no NetworkMessages.
+    foreign: usize,
+    /// IP datagrams whose fragments are not all there.
+    incomplete: usize,
+    /// Packets of a link layer that is not read, and its number.
+    unknown_links: usize,
+    unknown_link: u16,
+    udp: usize,
+    packets: usize,
+}
+
+impl Session<'_> {
+    fn run(&mut self, input: Input) -> Result<(), Failure> {
+        match input {
+            Input::Datagram(datagram) => {
+                let reading = self.context.read(&datagram, None);
+                self.show(self.name, &reading)
+            }
+            Input::Lines(datagrams) => {
+                for (line, datagram) in datagrams {
+                    let reading = self.context.read(&datagram, Some(&mut self.chunks));
+                    self.show(&format!("{}: line {line}", self.name), &reading)?;
+                }
+                Ok(())
+            }
+            Input::Capture(capture) => self.capture(capture),
+        }
+    }
+
+    fn show(&mut self, name: &str, reading: &Reading) -> Result<(), Failure> {
+        if reading.shape.sealed.is_some() && reading.refused.is_none() {
+            self.counters.sealed += 1;
+        }
+        self.report.show(name, reading)?;
+        match &reading.whole {
+            Some(whole) => self.show(&format!("{name}: put together from chunks"), whole),
+            None => Ok(()),
+        }
+    }
+
+    fn capture(&mut self, mut capture: Capture<impl Read>) -> Result<(), Failure> {
+        let mut fragments = Fragments::default();
+        loop {
+            let packet = capture.next_packet();
+            self.counters.incomplete = fragments.incomplete();
+            let Some(packet) = packet.map_err(|error| input::failure(self.name, error))? else {
+                return Ok(());
+            };
+            self.counters.packets += 1;
+            match packet::udp(packet.link_type, &packet.data, &mut fragments) {
+                Found::Udp(udp) => {
+                    self.counters.udp += 1;
+                    self.datagram(packet.time, udp)?;
+                }
+                Found::UnknownLink => {
+                    self.counters.unknown_links += 1;
+                    self.counters.unknown_link = packet.link_type;
+                }
+                Found::Fragment | Found::Other => {}
+            }
+        }
+    }
+
+    fn datagram(&mut self, time: Option<i128>, udp: Udp<'_>) -> Result<(), Failure> {
+        let is_of = |port| [udp.source.port(), udp.destination.port()].contains(&port);
+        if self.port.is_some_and(|port| !is_of(port)) {
+            return Ok(());
+        }
+        if let Some(time) = time {
+            self.chunks.at(time);
+        }
+        let mut reading = self.context.read(&udp.payload, Some(&mut self.chunks));
+        if self.port.is_none() && !is_of(UADP_PORT) && !reading.is_plausible() {
+            self.counters.foreign += 1;
+            return Ok(());
+        }
+        let whole = reading.whole.as_mut().map(|whole| &mut whole.shape);
+        for shape in [Some(&mut reading.shape), whole].into_iter().flatten() {
+            shape.time = time.map(iso_time::of_unix_nanos);
+            shape.source = Some(udp.source.to_string());
+            shape.destination = Some(udp.destination.to_string());
+        }
+        if reading.shape.uadp_version.is_none() {
+            reading.shape.datagram_hex = Some(hex::text(&udp.payload));
+        }
+        let cut = match udp.missing {
+            0 => Cow::Borrowed(""),
+            missing => format!(" ({missing} bytes were not captured)").into(),
+        };
+        let (name, packet) = (self.name, self.counters.packets);
+        let (source, destination) = (udp.source, udp.destination);
+        let name = format!("{name}: packet {packet}, {source} to {destination}{cut}");
+        self.show(&name, &reading)
+    }
+
+    /// Says what the output does not show.
+    fn tell(&self) {
+        let Counters {
+            sealed,
+            foreign,
+            incomplete,
+            unknown_links,
+            unknown_link,
+            udp,
+            packets,
+        } = self.counters;
+        let told = [
+            (sealed, "secured, and shown as they are without --keys"),
+            (
+                foreign,
+                "datagrams of other ports than 4840 are no NetworkMessages; --port shows why",
+            ),
+            (incomplete, "IP datagrams lack fragments"),
+        ];
+        for (count, what) in told.iter().filter(|(count, _)| *count != 0) {
+            warn(&format!("{}: {count} {what}", self.name));
+        }
+        if unknown_links != 0 {
+            warn(&format!(
+                "{}: {unknown_links} packets of LINKTYPE {unknown_link}, which is not read",
+                self.name
+            ));
+        }
+        if self.chunks.is_any_incomplete() {
+            warn(&format!(
+                "{}: not every message has all its chunks",
+                self.name
+            ));
+        }
+        if packets != 0 && self.report.shown() == 0 {
+            warn(&format!(
+                "{}: nothing to show in {packets} packets, {udp} of them UDP",
+                self.name
+            ));
+        }
+    }
+}
+
+/// Where UADP is sent by convention (OPC 10000-14, 7.3.2).
+const UADP_PORT: u16 = 4840;

@@ -1,0 +1,146 @@
+//! The structures of the standard whose fields are shown; any other is shown as its bytes.
+
+use serde_json::{Map, Value};
+use uadp::{BuiltinType, StructureReader};
+
+use crate::values::{WrongValue, show_scalar, write_scalar};
+
+/// A structure's type and its fields, in order.
+#[derive(Debug)]
+pub(crate) struct Structure {
+    /// NodeId of the type in namespace 0.
+    pub(crate) data_type: u32,
+    /// NodeId of its binary encoding in namespace 0.
+    pub(crate) encoding: u32,
+    fields: &'static [(&'static str, Part)],
+}
+
+#[derive(Debug)]
+enum Part {
+    Value(BuiltinType),
+    Inline(&'static [(&'static str, Self)]),
+}
+
+impl Structure {
+    pub(crate) fn by_encoding(encoding: u32) -> Option<&'static Self> {
+        KNOWN.iter().find(|known| known.encoding == encoding)
+    }
+
+    pub(crate) fn by_data_type(data_type: u32) -> Option<&'static Self> {
+        KNOWN.iter().find(|known| known.data_type == data_type)
+    }
+
+    /// The fields of a body; `None` for a body that is not exactly those, or would not be written the same again.
+    pub(crate) fn show(&self, body: &[u8]) -> Option<Map<String, Value>> {
+        let mut reader = StructureReader::new(body);
+        let mut shown = show_fields(self.fields, &mut reader)?;
+        shown.insert(
+            "UaTypeId".to_owned(),
+            format!("i={}", self.data_type).into(),
+        );
+        let mut again = Vec::new();
+        self.write(&shown, &mut again).ok()?;
+        (again == body).then_some(shown)
+    }
+
+    /// Appends the body.
+    pub(crate) fn write(
+        &self,
+        json: &Map<String, Value>,
+        out: &mut Vec<u8>,
+    ) -> Result<(), WrongValue> {
+        write_fields(self.fields, &["UaTypeId"], json, out)
+    }
+}
+
+fn show_fields(
+    fields: &[(&str, Part)],
+    reader: &mut StructureReader<'_>,
+) -> Option<Map<String, Value>> {
+    let mut shown = Map::new();
+    for (name, part) in fields {
+        let value = match part {
+            Part::Value(builtin) => show_scalar(reader.scalar(*builtin).ok()?).ok()?,
+            Part::Inline(fields) => show_fields(fields, reader)?.into(),
+        };
+        shown.insert((*name).to_owned(), value);
+    }
+    Some(shown)
+}
+
+fn write_fields(
+    fields: &[(&str, Part)],
+    besides: &[&str],
+    json: &Map<String, Value>,
+    out: &mut Vec<u8>,
+) -> Result<(), WrongValue> {
+    let named = |key: &str| besides.contains(&key) || fields.iter().any(|(name, _)| *name == key);
+    if let Some(key) = json.keys().find(|key| !named(key)) {
+        return Err(WrongValue::new(format!(
+            "the structure has no field `{key}`"
+        )));
+    }
+    for (name, part) in fields {
+        let missing = || WrongValue::new(format!("the structure wants a field `{name}`"));
+        let value = json.get(*name).ok_or_else(missing)?;
+        let written = match part {
+            Part::Value(builtin) => write_scalar(*builtin, value, out),
+            Part::Inline(fields) => match value.as_object() {
+                Some(json) => write_fields(fields, &[], json, out),
+                None => Err(WrongValue::expected("an object", value)),
+            },
+        };
+        written.map_err(|wrong| wrong.at(&format!(".{name}")))?;
+    }
+    Ok(())
+}
+
+/// Numbers of OPC 10000-6, Annex A (NodeIds).
+const KNOWN: [Structure; 3] = [
+    Structure {
+        data_type: 884,
+        encoding: 886,
+        fields: RANGE,
+    },
+    Structure {
+        data_type: 887,
+        encoding: 889,
+        fields: EU_INFORMATION,
+    },
+    Structure {
+        data_type: 18814,
+        encoding: 18823,
+        fields: THREE_D_FRAME,
+    },
+];
+
+const RANGE: &[(&str, Part)] = &[
+    ("Low", Part::Value(BuiltinType::Double)),
+    ("High", Part::Value(BuiltinType::Double)),
+];
+
+const EU_INFORMATION: &[(&str, Part)] = &[
+    ("NamespaceUri", Part::Value(BuiltinType::String)),
+    ("UnitId", Part::Value(BuiltinType::Int32)),
+    ("DisplayName", Part::Value(BuiltinType::LocalizedText)),
+    ("Description", Part::Value(BuiltinType::LocalizedText)),
+];
+
+const THREE_D_FRAME: &[(&str, Part)] = &[
+    (
+        "CartesianCoordinates",
+        Part::Inline(&[
+            ("X", Part::Value(BuiltinType::Double)),
+            ("Y", Part::Value(BuiltinType::Double)),
+            ("Z", Part::Value(BuiltinType::Double)),
+        ]),
+    ),
+    (
+        "Orientation",
+        Part::Inline(&[
+            ("A", Part::Value(BuiltinType::Double)),
+            ("B", Part::Value(BuiltinType::Double)),
+            ("C", Part::Value(BuiltinType::Double)),
+        ]),
+    ),
+];

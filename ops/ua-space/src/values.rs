@@ -1,0 +1,69 @@
+//! Values of the builtin types as JSON and back, after OPC 10000-6, 5.4.2.
+//!
+//! Where that loses something it is kept: a null array has a key of its own, 64 bit integers are texts, DateTimes have
+//! seven digits. What is lost: the payload of a NaN, and which of several encodings of one NodeId was used.
+
+mod show;
+mod write;
+
+pub(crate) use show::{show_data_value, show_scalar, show_variant};
+pub(crate) use write::{data_value_bytes, variant_bytes, write_scalar};
+
+use std::fmt;
+
+use serde_json::Value;
+
+/// A value in the JSON that cannot be written, and where it stands.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct WrongValue {
+    path: String,
+    what: String,
+}
+
+impl WrongValue {
+    pub(crate) fn new(what: impl Into<String>) -> Self {
+        Self {
+            path: String::new(),
+            what: what.into(),
+        }
+    }
+
+    pub(crate) fn expected(what: &str, found: &Value) -> Self {
+        let mut found = found.to_string();
+        if found.chars().count() > SHOWN {
+            found = found.chars().take(SHOWN).collect();
+            found.push_str("...");
+        }
+        Self::new(format!("expected {what}, found {found}"))
+    }
+
+    /// Says in which part of what it stands, from the inside out.
+    pub(crate) fn at(mut self, part: &str) -> Self {
+        self.path.insert_str(0, part);
+        self
+    }
+}
+
+impl fmt::Display for WrongValue {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.path.as_str() {
+            "" => f.write_str(&self.what),
+            path => write!(f, "{path}: {}", self.what),
+        }
+    }
+}
+
+impl From<uadp::EncodeError> for WrongValue {
+    fn from(error: uadp::EncodeError) -> Self {
+        Self::new(error.to_string())
+    }
+}
+
+impl From<uadp::DecodeError> for WrongValue {
+    fn from(error: uadp::DecodeError) -> Self {
+        Self::new(error.to_string())
+    }
+}
+
+/// Characters of a wrong value that a message repeats.
+const SHOWN: usize = 40;
