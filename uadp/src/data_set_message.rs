@@ -403,33 +403,32 @@ impl<'a> Head<'a> {
             });
         }
         let kind = read_kind(flags2)?;
-        let size = usize::from(flags1 & SEQUENCE_NUMBER != 0) * 2
-            + usize::from(flags2 & TIMESTAMP != 0) * 8
-            + usize::from(flags2 & PICOSECONDS != 0) * 2
-            + usize::from(flags1 & STATUS != 0) * 2
-            + usize::from(flags1 & MAJOR_VERSION != 0) * 4
-            + usize::from(flags1 & MINOR_VERSION != 0) * 4;
-        let before = reader.rest();
-        let Ok(fields) = reader.bytes(size, "DataSetMessage header") else {
-            return Err(Self::cut_off(flags1, flags2, before));
-        };
+        let sizes = [
+            (flags1 & SEQUENCE_NUMBER, 2),
+            (flags2 & TIMESTAMP, 8),
+            (flags2 & PICOSECONDS, 2),
+            (flags1 & STATUS, 2),
+            (flags1 & MAJOR_VERSION, 4),
+            (flags1 & MINOR_VERSION, 4),
+        ];
+        let mut size = 0;
+        for (present, bytes) in sizes {
+            // Branches are predicted, so that the fields are read before the size is known; a sum of bits is waited for.
+            size += match present {
+                0 => 0,
+                _ => bytes,
+            };
+        }
         let head = Self {
             flags1,
             flags2,
-            fields,
+            fields: reader.rest(),
         };
-        Ok((head, kind))
-    }
-
-    /// Reads field by field, to name the one that is cut off.
-    #[cold]
-    fn cut_off(flags1: u8, flags2: u8, fields: &'a [u8]) -> DecodeError {
-        let head = Self {
-            flags1,
-            flags2,
-            fields,
-        };
-        head.read_fields().err().unwrap_or(CUT_OFF)
+        match reader.bytes(size, "DataSetMessage header") {
+            Ok(fields) => Ok((Self { fields, ..head }, kind)),
+            // Field by field, to name the one that is cut off.
+            Err(_) => Err(head.read_fields().err().unwrap_or(CUT_OFF)),
+        }
     }
 
     #[inline]
