@@ -95,9 +95,7 @@ pub(crate) fn read(
             writer_id: part.writer_id,
             field,
         };
-        let in_message = offset(bytes.len(), stop, |end| {
-            read_prefix(bytes.get(..end)?, layout)
-        });
+        let in_message = offset(bytes, stop, |bytes| stop_of(bytes, layout));
         Fault {
             place: Place::Message(place),
             error,
@@ -108,8 +106,8 @@ pub(crate) fn read(
     (shown, fault)
 }
 
-/// Where reading a piece of a DataSetMessage stops.
-fn read_prefix(bytes: &[u8], layout: Option<&Layout<'_>>) -> Option<Stop> {
+/// Where reading a DataSetMessage stops.
+fn stop_of(bytes: &[u8], layout: Option<&Layout<'_>>) -> Option<Stop> {
     match DataSetMessage::decode(None, bytes) {
         Ok(message) => read_fields(&message, layout, |_| {}).err(),
         Err(error) => Some((None, error)),
