@@ -28,13 +28,14 @@ pub fn secured(data: &[u8]) {
             SecurityMode::SignAndEncrypt,
         ),
     };
+    let own = hash(data);
     let mut sealer = Sealer::new(mode);
     let mut opener = Opener::new(mode);
     sealer
-        .update_keys(7, keys(policy))
+        .update_keys(7, keys(policy, own))
         .expect("a token and keys");
     opener
-        .update_keys(7, keys(policy))
+        .update_keys(7, keys(policy, own))
         .expect("a token and keys");
     let mut sent: Vec<Sent> = Vec::new();
     let mut scratch = Vec::new();
@@ -140,13 +141,22 @@ fn refuse(datagram: &[u8], opener: &mut Opener) {
     assert_eq!(before, format!("{opener:?}"), "refusing left a trace");
 }
 
-fn keys(policy: SecurityPolicy) -> Vec<Keys> {
+/// Keys of this input alone: a fuzzer keeps pieces of inputs, and a message sealed for another one would be genuine.
+fn keys(policy: SecurityPolicy, own: u64) -> Vec<Keys> {
     (0..3_u8)
         .map(|token| {
+            let own = own.to_le_bytes();
             let data: Vec<u8> = (0..policy.key_data_length())
-                .map(|at| token.wrapping_mul(37).wrapping_add(at as u8))
+                .map(|at| own[at % own.len()] ^ token.wrapping_mul(37).wrapping_add(at as u8))
                 .collect();
             Keys::from_bytes(policy, &data).expect("the length the policy asks for")
         })
         .collect()
+}
+
+/// FNV-1a.
+fn hash(data: &[u8]) -> u64 {
+    data.iter().fold(0xCBF2_9CE4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(*byte)).wrapping_mul(0x100_0000_01B3)
+    })
 }

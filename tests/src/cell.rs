@@ -20,6 +20,8 @@ pub enum Peer {
     Ros1,
     /// Cyclone DDS and asyncua, in the Python environment that `cargo xtask test` makes.
     Python,
+    /// Wireshark's tshark, from Debian or Ubuntu.
+    Tshark,
 }
 
 /// A network namespace with nothing in it but a loopback that carries multicast, and a folder for files.
@@ -34,6 +36,8 @@ pub struct Cell {
 }
 
 static ONLY: Mutex<()> = Mutex::new(());
+
+pub(crate) const TSHARK: &str = "/usr/bin/tshark";
 
 impl Cell {
     /// Puts this thread into a new network, or says why the test is skipped and gives `None`.
@@ -140,6 +144,7 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
             Path::new("/usr/lib/topic_tools/relay"),
         ],
         Peer::Python => &[python],
+        Peer::Tshark => &[Path::new(TSHARK)],
     };
     match needed.iter().find(|path| !path.exists()) {
         None => Ok(()),

@@ -9,6 +9,7 @@
 //! A peer that this machine does not have skips the test with the reason; with `CI=true` that is a failure.
 
 mod arrows;
+mod capture;
 mod cell;
 mod child;
 mod net;
@@ -17,6 +18,7 @@ mod programs;
 mod wait;
 
 pub use arrows::{forbidden, tree};
+pub use capture::{Capture, Dissected, hex, is_true};
 pub use cell::{Cell, Peer};
 pub use child::{Child, Started};
 pub use net::{GROUP, UadpSocket, http_get, metrics, xml_rpc};

@@ -82,6 +82,7 @@ mod probe_timer;
 mod settings;
 mod wire;
 
+pub use crate::ConfigurationVersion;
 pub use announcement::{
     ActionMetaData, ActionMethodDataType, ActionTargetDataType, Announced, Announcement,
     ConnectionState, CyclicStatus,
@@ -100,9 +101,9 @@ pub use endpoint::{
 };
 pub use list::{List, ListIter};
 pub use meta_data::{
-    ConfigurationVersion, DataSetMetaDataType, DataTypeSchemaHeader, EnumDefinition,
-    EnumDescription, EnumField, FieldMetaData, SimpleTypeDescription, StructureDefinition,
-    StructureDescription, StructureField, StructureType, VersionMatch,
+    DataSetMetaDataType, DataTypeSchemaHeader, EnumDefinition, EnumDescription, EnumField,
+    FieldMetaData, SimpleTypeDescription, StructureDefinition, StructureDescription,
+    StructureField, StructureType, VersionMatch,
 };
 pub use probe::Probe;
 pub use probe_timer::{ProbeLimits, ProbeStep, ProbeTimer};

@@ -65,8 +65,8 @@ mod header_writer;
 mod nested;
 mod network_message;
 mod node_id;
-mod raw;
 mod publisher_id;
+mod raw;
 mod reader;
 mod reader_state;
 mod reader_table;
@@ -83,11 +83,11 @@ mod writer;
 mod writer_state;
 
 pub use builtin::{BuiltinType, Guid, StatusCode};
+pub use chunk::{ChunkBudget, ChunkError, Chunks, PlacedChunk, Whole};
+pub use configuration_version::ConfigurationVersion;
 pub use data_set_message::{
     DataSetHeader, DataSetMessage, FieldEncoding, FieldValue, FieldValues, Fields, MessageKind,
 };
-pub use chunk::{ChunkBudget, ChunkError, Chunks, PlacedChunk, Whole};
-pub use configuration_version::ConfigurationVersion;
 pub use delta::{DeltaNull, Merged};
 pub use encoder::NetworkMessageEncoder;
 pub use error::{DecodeError, EncodeError};
@@ -97,23 +97,23 @@ pub use header_writer::Extras;
 pub use nested::{DataValue, DiagnosticInfo, Encoded};
 pub use network_message::{Chunk, Messages, NetworkMessage, PromotedFields};
 pub use node_id::{ExpandedNodeId, Identifier, NodeId};
+pub use publisher_id::OwnedPublisherId;
 pub use raw::{
     RawArray, RawDialect, RawElements, RawField, RawFields, RawLayout, RawLayoutError,
     RawLayoutFault, RawMembers, RawStructure, RawStructureType, RawValue, RawWriteError,
     RawWriteFault,
 };
-pub use scalar::{ExtensionBody, ExtensionObject, LocalizedText, QualifiedName, Scalar};
-pub use security::{
-    KeyError, Keys, Opened, Opener, OpenerOptions, Seal, SealError, Sealer, SecurityError,
-    SecurityMode, SecurityPolicy,
-};
-pub use publisher_id::OwnedPublisherId;
 pub use reader_state::{
     Accepted, Arrival, DataSetReaderState, ReaderCounters, ReaderDrop, ReaderSettings,
 };
 pub use reader_table::{ReaderKey, ReaderTable};
 pub use reassembler::{
     ChunkRefusal, Reassembled, Reassembler, ReassemblyCounters, ReassemblyLimits,
+};
+pub use scalar::{ExtensionBody, ExtensionObject, LocalizedText, QualifiedName, Scalar};
+pub use security::{
+    KeyError, Keys, Opened, Opener, OpenerOptions, Seal, SealError, Sealer, SecurityError,
+    SecurityMode, SecurityPolicy,
 };
 pub use sequence::{SequenceCounter, SequenceOrder};
 pub use state::{PubSubState, StateEvent, StateMachine, StateRefused};

@@ -2,10 +2,15 @@
 
 #![expect(clippy::unwrap_used, reason = "test code")]
 
+#[path = "common/everything.rs"]
+mod everything;
+
 use allocation_counter::measure;
+use everything::read_everything;
 use uadp::{
-    BuiltinType, DataSetHeader, DateTime, GroupHeader, NetworkHeader, NetworkMessage,
-    NetworkMessageEncoder, NodeId, PublisherId, Scalar, Variant,
+    Array, BuiltinType, DataSetHeader, DataValue, DateTime, Encoded, GroupHeader, Matrix,
+    NetworkHeader, NetworkMessage, NetworkMessageEncoder, NodeId, PublisherId, Scalar, StatusCode,
+    Variant,
 };
 
 #[test]
@@ -19,27 +24,19 @@ fn an_allocation_would_be_counted() {
 #[test]
 fn reading_allocates_nothing() {
     let mut datagram = Vec::new();
-    write(&mut datagram);
+    write(&mut datagram, &mut Vec::new());
+    let messages = NetworkMessage::decode(&datagram).unwrap().messages();
+    assert_eq!(messages.filter(Result::is_ok).count(), 5);
     let mut values = 0;
-    let allocations = measure(|| {
-        let network = NetworkMessage::decode(&datagram).unwrap();
-        for message in network.messages() {
-            for field in message.unwrap().fields().unwrap() {
-                values += match field.unwrap() {
-                    Variant::Array(array) => array.iter().count(),
-                    Variant::Null | Variant::Scalar(_) => 1,
-                };
-            }
-        }
-    });
-    assert_eq!(values, 11);
+    let allocations = measure(|| values = read_everything(&datagram));
+    assert!(values > 40, "{values} values read");
     assert_eq!(allocations.count_total, 0);
 }
 
 #[test]
 fn refusing_allocates_nothing() {
     let mut datagram = Vec::new();
-    write(&mut datagram);
+    write(&mut datagram, &mut Vec::new());
     let mut errors = 0;
     let allocations = measure(|| {
         for len in 0..datagram.len() {
@@ -49,8 +46,8 @@ fn refusing_allocates_nothing() {
                 continue;
             };
             for message in network.messages() {
-                match message.and_then(|message| message.fields()) {
-                    Ok(fields) => errors += fields.filter(Result::is_err).count(),
+                match message.and_then(|message| message.values()) {
+                    Ok(values) => errors += values.filter(Result::is_err).count(),
                     Err(_) => errors += 1,
                 }
             }
@@ -63,17 +60,19 @@ fn refusing_allocates_nothing() {
 #[test]
 fn writing_into_a_used_buffer_allocates_nothing() {
     let mut datagram = Vec::new();
-    write(&mut datagram);
+    let mut inner = Vec::new();
+    write(&mut datagram, &mut inner);
     let first = datagram.clone();
     let allocations = measure(|| {
         datagram.clear();
-        write(&mut datagram);
+        write(&mut datagram, &mut inner);
     });
     assert_eq!(datagram, first);
     assert_eq!(allocations.count_total, 0);
 }
 
-fn write(datagram: &mut Vec<u8>) {
+/// One DataSetMessage of every kind; `inner` takes the encodings of values in values.
+fn write(datagram: &mut Vec<u8>, inner: &mut Vec<u8>) {
     let header = NetworkHeader {
         publisher_id: Some(PublisherId::String("cell 4")),
         group: Some(GroupHeader {
@@ -87,8 +86,36 @@ fn write(datagram: &mut Vec<u8>) {
         timestamp: Some(DateTime(134_234_948_967_890_123)),
         ..DataSetHeader::default()
     };
-    let mut encoder = NetworkMessageEncoder::new(datagram, &header, Some(&[10, 11])).unwrap();
-    let mut fields = encoder.key_frame(&data_set_header).unwrap();
+    let ids = [10, 11, 12, 13, 14];
+    let mut encoder = NetworkMessageEncoder::new(datagram, &header, Some(&ids)).unwrap();
+    write_key_frame(&mut encoder, &data_set_header);
+    let mut fields = encoder.event(&data_set_header).unwrap();
+    let value = DataValue::from(Variant::from(Scalar::Boolean(true)));
+    let value = Encoded::data_value(&value, inner).unwrap();
+    fields.scalar(Scalar::DataValue(value)).unwrap();
+    fields.finish().unwrap();
+    let mut fields = encoder.delta_frame(&data_set_header).unwrap();
+    let elements = Array::new(BuiltinType::Byte, 4, &[1, 2, 3, 4]).unwrap();
+    let sizes = [2_u32.to_le_bytes(); 2];
+    let matrix = Matrix::new(elements, &sizes).unwrap();
+    fields.field(7).unwrap().variant(&matrix.into()).unwrap();
+    fields.finish().unwrap();
+    let bad = DataValue {
+        status: Some(StatusCode(0x8000_0000)),
+        source_timestamp: data_set_header.timestamp,
+        ..DataValue::default()
+    };
+    let mut fields = encoder.data_values(&data_set_header).unwrap();
+    fields.value(&bad).unwrap();
+    fields.finish().unwrap();
+    let mut fields = encoder.delta_data_values(&data_set_header).unwrap();
+    fields.changed(7, &bad).unwrap();
+    fields.finish().unwrap();
+    encoder.finish().unwrap();
+}
+
+fn write_key_frame(encoder: &mut NetworkMessageEncoder<'_>, header: &DataSetHeader) {
+    let mut fields = encoder.key_frame(header).unwrap();
     fields.scalar(Scalar::Double(2.5)).unwrap();
     fields.scalar(Scalar::String(Some("text"))).unwrap();
     fields
@@ -98,6 +125,13 @@ fn write(datagram: &mut Vec<u8>) {
     fields.array(BuiltinType::String, 2).unwrap();
     fields.element(Scalar::String(None)).unwrap();
     fields.element(Scalar::String(Some("text"))).unwrap();
+    fields.array(BuiltinType::Variant, 2).unwrap();
+    for bytes in [&[3, 7][..], &[0x98, 2, 0, 0, 0, 0, 4, 1, 1]] {
+        let value = Encoded::new(bytes).unwrap();
+        fields.element(Scalar::Variant(value)).unwrap();
+    }
+    let info = Encoded::new(&[0x40, 0x41, 1, 0, 0, 0, 0]).unwrap();
+    fields.scalar(Scalar::DiagnosticInfo(info)).unwrap();
     fields.structures(2).unwrap();
     for _ in 0..2 {
         fields.begin_structure(NodeId::numeric(2, 5001)).unwrap();
@@ -105,8 +139,4 @@ fn write(datagram: &mut Vec<u8>) {
         fields.end_structure().unwrap();
     }
     fields.finish().unwrap();
-    let mut fields = encoder.key_frame(&data_set_header).unwrap();
-    fields.scalar(Scalar::Boolean(true)).unwrap();
-    fields.finish().unwrap();
-    encoder.finish().unwrap();
 }

@@ -157,7 +157,7 @@ fn the_chunks_of_the_vectors_make_the_message_in_any_order() {
         let message = whole.data_set_message().unwrap();
         assert_eq!(message.writer_id, Some(5));
         assert_eq!(message.kind, MessageKind::KeyFrame);
-        assert_eq!(message.header.sequence_number, Some(77));
+        assert_eq!(message.header().sequence_number, Some(77));
         let fields: Vec<_> = message.fields().unwrap().map(Result::unwrap).collect();
         let value: Vec<u8> = (0..600_u32).map(|i| ((i * 3) & 255) as u8).collect();
         assert_eq!(
@@ -722,7 +722,7 @@ fn a_data_set_message_alone_is_read_like_one_in_a_network_message() {
     let bytes = composite();
     let message = DataSetMessage::decode(Some(5), &bytes).unwrap();
     assert_eq!(message.writer_id, Some(5));
-    assert_eq!(message.header.sequence_number, Some(77));
+    assert_eq!(message.header().sequence_number, Some(77));
     assert_eq!(message.fields().unwrap().len(), 1);
     assert_eq!(
         DataSetMessage::decode(None, &[]).err(),

@@ -1,10 +1,16 @@
 //! What a receiver meets on a network, datagram by datagram.
 
-#![expect(clippy::unwrap_used, reason = "test code")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
 
 use uadp::{
-    Array, BuiltinType, DataSetMessage, DecodeError, ExpandedNodeId, Fields, LocalizedText,
-    MessageKind, NetworkMessage, NodeId, PublisherId, QualifiedName, Scalar, Variant,
+    Array, BuiltinType, Chunk, DataSetMessage, DataValue, DateTime, DecodeError, DiagnosticInfo,
+    Encoded, ExpandedNodeId, FieldEncoding, FieldValue, Fields, LocalizedText, Matrix, MessageKind,
+    NetworkMessage, NetworkMessageType, NodeId, PublisherId, QualifiedName, Scalar, SecurityHeader,
+    StatusCode, Variant,
 };
 
 fn messages(datagram: &[u8]) -> Vec<Result<DataSetMessage<'_>, DecodeError>> {
@@ -27,6 +33,22 @@ fn fields(message: &[u8]) -> Result<Vec<String>, DecodeError> {
         .collect()
 }
 
+const fn cut(field: &'static str, expected: usize, found: usize) -> DecodeError {
+    DecodeError::Truncated {
+        field,
+        expected,
+        found,
+    }
+}
+
+/// The one message of these bytes after the smallest header, its values with their indexes.
+fn values(message: &[u8]) -> Result<Vec<String>, DecodeError> {
+    let datagram = [&[0x01], message].concat();
+    let message = messages(&datagram).remove(0)?;
+    let describe = |field: FieldValue<'_>| format!("{}: {:?}", field.index, field.value);
+    message.values()?.map(|field| field.map(describe)).collect()
+}
+
 /// The one field of a block.
 fn field(variant: &[u8]) -> Result<(), DecodeError> {
     let block = [&[1, 0], variant].concat();
@@ -37,13 +59,7 @@ fn field(variant: &[u8]) -> Result<(), DecodeError> {
 fn a_heartbeat_has_no_fields_with_and_without_a_field_count() {
     assert_eq!(fields(&[0x01]), Ok(vec![]));
     assert_eq!(fields(&[0x01, 0, 0]), Ok(vec![]));
-    assert_eq!(
-        fields(&[0x01, 0]),
-        Err(DecodeError::Truncated {
-            field: "FieldCount",
-            ..
-        })
-    );
+    assert_eq!(fields(&[0x01, 0]), Err(cut("FieldCount", 2, 1)));
 }
 
 #[test]
@@ -123,35 +139,20 @@ fn a_message_cannot_read_into_its_neighbour() {
     ];
     let messages = messages(&datagram);
     let first = messages.first().unwrap().as_ref().unwrap();
-    assert_eq!(
-        first.fields().unwrap().next(),
-        Some(Err(DecodeError::Truncated { field: "Byte", .. }))
-    );
+    assert_eq!(first.fields().unwrap().next(), Some(Err(cut("Byte", 1, 0))));
 }
 
 #[test]
 fn sizes_past_the_datagram_and_bytes_behind_the_last_message_are_errors() {
     let long = [0x41, 2, 1, 0, 2, 0, 1, 0, 9, 0, 0x01, 0x01];
     let errors: Vec<_> = messages(&long).into_iter().map(Result::err).collect();
-    assert_eq!(
-        errors,
-        [
-            None,
-            Some(DecodeError::Truncated {
-                field: "DataSetMessage",
-                ..
-            })
-        ]
-    );
+    assert_eq!(errors, [None, Some(cut("DataSetMessage", 9, 1))]);
     let short = [0x41, 2, 1, 0, 2, 0, 1, 0, 1, 0, 0x01, 0x01, 0];
     let errors: Vec<_> = messages(&short).into_iter().map(Result::err).collect();
     assert_eq!(errors, [None, None, Some(DecodeError::TrailingBytes(1))]);
-    let cut = [0x41, 2, 1, 0, 2, 0, 1, 0, 1];
-    let errors: Vec<_> = messages(&cut).into_iter().map(Result::err).collect();
-    assert_eq!(
-        errors,
-        [Some(DecodeError::Truncated { field: "Sizes", .. })]
-    );
+    let within = [0x41, 2, 1, 0, 2, 0, 1, 0, 1];
+    let errors: Vec<_> = messages(&within).into_iter().map(Result::err).collect();
+    assert_eq!(errors, [Some(cut("Sizes", 4, 3))]);
 }
 
 #[test]
@@ -247,21 +248,21 @@ fn reserved_encodings_of_values_are_refused() {
 }
 
 #[test]
-fn values_not_read_yet_are_named() {
+fn what_this_crate_does_not_read_is_named() {
     let unsupported = |what| Err(DecodeError::Unsupported(what));
-    assert_eq!(field(&[23, 0]), unsupported("DataValue"));
-    assert_eq!(field(&[24, 0]), unsupported("Variant"));
-    assert_eq!(field(&[25, 0]), unsupported("DiagnosticInfo"));
-    assert_eq!(field(&[0x98, 0, 0, 0, 0]), unsupported("Variant"));
-    assert_eq!(
-        field(&[0xC3, 0, 0, 0, 0]),
-        unsupported("multi-dimensional array")
-    );
-    assert_eq!(
-        field(&[26, 0, 0, 0, 0]),
-        unsupported("Variant of an unassigned builtin type")
-    );
+    for unassigned in 26..=31 {
+        for encoding in [unassigned, 0x80 | unassigned, 0xC0 | unassigned] {
+            assert_eq!(
+                field(&[encoding, 0, 0, 0, 0]),
+                unsupported("Variant of an unassigned builtin type"),
+                "encoding byte {encoding:#x}"
+            );
+        }
+    }
     assert_eq!(fields(&[0x81, 4]).map(|_| ()), unsupported("Action"));
+    assert_eq!(fields(&[0x81, 5]).map(|_| ()), unsupported("Action"));
+    let action_header = NetworkMessage::decode(&[0x81, 0x80, 0x20]).map(|_| ());
+    assert_eq!(action_header, unsupported("Action"));
 }
 
 #[test]
@@ -273,7 +274,7 @@ fn counts_are_held_against_the_bytes_that_are_left() {
             value: 3
         })
     );
-    for builtin in 1..=22 {
+    for builtin in 1..=25 {
         let huge = [0x80 | builtin, 0xFF, 0xFF, 0xFF, 0x7F, 0, 0];
         let limit = DecodeError::Limit {
             field: "array length",
@@ -392,4 +393,588 @@ fn a_keep_alive_may_be_padded_but_carries_nothing() {
     assert_eq!(message.fields().unwrap().len(), 0);
     let error = messages(&[0x01, 0x81, 0x03, 1]).remove(0).unwrap_err();
     assert_eq!(error, DecodeError::TrailingBytes(1));
+}
+
+/// An array of one element around `inner`, `levels` times.
+fn nested(levels: usize, opening: &[u8], inner: &[u8], closing: &[u8]) -> Vec<u8> {
+    [&opening.repeat(levels), inner, &closing.repeat(levels)].concat()
+}
+
+#[test]
+fn values_are_read_a_hundred_levels_deep_and_no_deeper() {
+    let array = [0x98, 1, 0, 0, 0];
+    let matrix = [0xD8, 1, 0, 0, 0];
+    let one_dimension = [1, 0, 0, 0, 1, 0, 0, 0];
+    for levels in [1, 2, 99, 100, 101, 1000] {
+        let expected = match levels {
+            ..=100 => Ok(()),
+            _ => Err(DecodeError::TooDeep),
+        };
+        let variants = nested(levels, &array, &[0], &[]);
+        assert_eq!(field(&variants), expected, "{levels} Variants in Variants");
+        let matrices = nested(levels, &matrix, &[0], &one_dimension);
+        assert_eq!(field(&matrices), expected, "{levels} Variants in matrices");
+        let data_values = nested(levels, &[23, 0x03], &[0], &[0; 4]);
+        assert_eq!(field(&data_values), expected, "{levels} DataValues");
+        let infos = [&[25], &nested(levels - 1, &[0x40], &[0], &[])[..]].concat();
+        assert_eq!(field(&infos), expected, "{levels} DiagnosticInfos");
+        let elements = [&[0x99, 1, 0, 0, 0], infos.get(1..).unwrap()].concat();
+        assert_eq!(field(&elements), expected, "{levels} DiagnosticInfos");
+    }
+}
+
+#[test]
+fn the_innermost_of_a_hundred_levels_is_reached() {
+    let block = [
+        &[1, 0],
+        &nested(99, &[0x98, 1, 0, 0, 0], &[0x98, 1, 0, 0, 0, 3, 7], &[])[..],
+    ];
+    let block = block.concat();
+    let mut value = Fields::parse(&block).unwrap().next().unwrap().unwrap();
+    for _ in 0..100 {
+        let Variant::Array(array) = value else {
+            unreachable!("{value:?} is no array")
+        };
+        let Some(Scalar::Variant(inner)) = array.iter().next() else {
+            unreachable!("{array:?} holds no Variant")
+        };
+        value = inner.get().unwrap();
+    }
+    assert_eq!(value, Scalar::Byte(7).into());
+
+    let infos = nested(99, &[0x41, 9, 0, 0, 0], &[0x01, 5, 0, 0, 0], &[]);
+    let mut info = Encoded::<DiagnosticInfo<'_>>::new(&infos).unwrap();
+    for _ in 0..99 {
+        info = info.get().unwrap().inner.unwrap();
+    }
+    let innermost = DiagnosticInfo {
+        symbolic_id: Some(5),
+        ..DiagnosticInfo::default()
+    };
+    assert_eq!(info.get(), Ok(innermost));
+}
+
+#[test]
+fn a_hundred_levels_take_little_stack() {
+    let read = || {
+        let array = [0x98, 1, 0, 0, 0];
+        let deep = nested(50, &[&array[..], &[23, 0x01]].concat(), &[0], &[]);
+        assert_eq!(field(&deep), Ok(()));
+    };
+    let thread = std::thread::Builder::new().stack_size(256 << 10);
+    thread.spawn(read).unwrap().join().unwrap();
+}
+
+#[test]
+fn a_variant_directly_in_a_variant_is_refused() {
+    let refused = Err(DecodeError::Reserved {
+        field: "Variant directly in a Variant",
+        value: 24,
+    });
+    assert_eq!(field(&[24, 0]), refused);
+    assert_eq!(field(&[0x98, 1, 0, 0, 0, 24, 0]), refused, "in an array");
+    assert_eq!(field(&[23, 0x01, 24, 0]), refused, "in a DataValue");
+    assert_eq!(field(&[0x98, 2, 0, 0, 0, 3, 7, 0]), Ok(()));
+}
+
+#[test]
+fn dimensions_have_to_fit_the_elements() {
+    let matrix = |elements: u8, dimensions: &[i32]| {
+        let mut bytes = vec![0xC3, elements, 0, 0, 0];
+        bytes.extend(0..elements);
+        bytes.extend(u32::try_from(dimensions.len()).unwrap().to_le_bytes());
+        bytes.extend(dimensions.iter().flat_map(|size| size.to_le_bytes()));
+        field(&bytes)
+    };
+    assert_eq!(matrix(6, &[2, 3]), Ok(()));
+    assert_eq!(matrix(6, &[1, 6, 1]), Ok(()));
+    assert_eq!(matrix(6, &[6]), Ok(()));
+    for dimensions in [
+        &[2, 2][..],
+        &[3, 3],
+        &[-2, -3],
+        &[6, 0],
+        &[],
+        &[i32::MAX, i32::MAX, i32::MAX],
+        &[65_536, 65_536, 65_536, 65_536],
+    ] {
+        let refused = Err(DecodeError::Dimensions { elements: 6 });
+        assert_eq!(matrix(6, dimensions), refused, "{dimensions:?}");
+    }
+    let promised = [0xC3, 1, 0, 0, 0, 7, 0xFF, 0xFF, 0xFF, 0x7F];
+    let missing = cut("ArrayDimensions", 0x7FFF_FFFF * 4, 0);
+    assert_eq!(field(&promised), Err(missing));
+    let elements = Array::new(BuiltinType::Byte, 2, &[1, 2]).unwrap();
+    let size = |size: i32| size.to_le_bytes();
+    let refused = Err(DecodeError::Dimensions { elements: 2 });
+    assert_eq!(Matrix::new(elements, &[size(3), size(1)]), refused);
+}
+
+#[test]
+fn a_matrix_gives_its_elements_row_by_row_and_its_dimensions_outermost_first() {
+    let block = [
+        1, 0, // FieldCount
+        0xC4, 6, 0, 0, 0, 1, 0, 2, 0, 3, 0, 4, 0, 5, 0, 6, 0, // six Int16
+        2, 0, 0, 0, 2, 0, 0, 0, 3, 0, 0, 0, // two rows of three
+    ];
+    let Some(Ok(Variant::Matrix(matrix))) = Fields::parse(&block).unwrap().next() else {
+        unreachable!("a matrix was written")
+    };
+    let elements: Vec<_> = matrix.elements().iter().collect();
+    assert_eq!(elements, [1, 2, 3, 4, 5, 6].map(Scalar::Int16));
+    assert_eq!(matrix.dimensions().collect::<Vec<_>>(), [2, 3]);
+}
+
+#[test]
+fn a_matrix_may_be_null_or_empty() {
+    let null = [0xFF; 4];
+    let block = [
+        &[3, 0][..],
+        &[&[0xC6][..], &null, &null].concat(), // null, no dimensions
+        &[0xC6, 0, 0, 0, 0, 0, 0, 0, 0],       // empty, no dimensions
+        &[0xC6, 0, 0, 0, 0, 2, 0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0], // no rows of three
+    ]
+    .concat();
+    let matrices: Vec<_> = Fields::parse(&block)
+        .unwrap()
+        .map(|field| match field.unwrap() {
+            Variant::Matrix(matrix) => matrix,
+            other => unreachable!("{other:?} is no matrix"),
+        })
+        .map(|matrix| (matrix.elements().is_null(), matrix.dimensions().collect()))
+        .collect();
+    assert_eq!(
+        matrices,
+        [(true, vec![]), (false, vec![]), (false, vec![0, 3])]
+    );
+}
+
+#[test]
+fn reserved_bits_of_what_holds_a_value_are_refused() {
+    let reserved = |field, value| Err(DecodeError::Reserved { field, value });
+    for bit in [0x40, 0x80] {
+        let refused = reserved("DataValue encoding mask", bit.into());
+        assert_eq!(field(&[23, bit]), refused);
+        assert_eq!(field(&[0x97, 1, 0, 0, 0, bit]), refused, "in an array");
+        assert_eq!(values(&[0x05, 1, 0, bit]), refused.map(|()| vec![]));
+    }
+    assert_eq!(
+        field(&[25, 0x80]),
+        reserved("DiagnosticInfo encoding mask", 0x80)
+    );
+    assert_eq!(
+        field(&[25, 0x40, 0x80]),
+        reserved("DiagnosticInfo encoding mask", 0x80)
+    );
+}
+
+#[test]
+fn a_data_value_is_what_its_mask_says() {
+    let full = [
+        0x3F, 3, 7, // Byte 7
+        0, 0, 0, 0x40, // Uncertain
+        1, 0, 0, 0, 0, 0, 0, 0, 2, 0, // SourceTimestamp and its PicoSeconds
+        3, 0, 0, 0, 0, 0, 0, 0, 4, 0, // ServerTimestamp and its PicoSeconds
+    ];
+    let read = |bytes: &'static [u8]| Encoded::<DataValue<'_>>::new(bytes).unwrap().get();
+    let value = Encoded::<DataValue<'_>>::new(&full).unwrap().get().unwrap();
+    assert_eq!(
+        value,
+        DataValue {
+            value: Some(Scalar::Byte(7).into()),
+            status: Some(StatusCode(0x4000_0000)),
+            source_timestamp: Some(DateTime(1)),
+            source_picoseconds: Some(2),
+            server_timestamp: Some(DateTime(3)),
+            server_picoseconds: Some(4),
+        }
+    );
+    let none = DataValue::default();
+    assert_eq!(read(&[0]), Ok(none));
+    assert_eq!(read(&[0x01, 0]), Ok(Variant::Null.into()));
+    let picoseconds = DataValue {
+        server_picoseconds: Some(5),
+        ..none
+    };
+    assert_eq!(read(&[0x20, 5, 0]), Ok(picoseconds), "without a timestamp");
+    for len in 0..full.len() {
+        let error = Encoded::<DataValue<'_>>::new(full.get(..len).unwrap()).unwrap_err();
+        assert!(matches!(error, DecodeError::Truncated { .. }), "{error}");
+    }
+}
+
+#[test]
+fn a_data_value_around_an_array_ends_behind_its_timestamps() {
+    let bytes = [
+        0x06, 0, 0, 0, 0x80, 9, 0, 0, 0, 0, 0, 0, 0, // Status Bad, SourceTimestamp
+    ];
+    let with_array = [&[0x07, 0x8C, 1, 0, 0, 0, 1, 0, 0, 0, b'x'], &bytes[1..]].concat();
+    let with_value = Encoded::<DataValue<'_>>::new(&with_array)
+        .unwrap()
+        .get()
+        .unwrap();
+    let without = Encoded::<DataValue<'_>>::new(&bytes)
+        .unwrap()
+        .get()
+        .unwrap();
+    let text = [1, 0, 0, 0, b'x'];
+    let array = Array::new(BuiltinType::String, 1, &text).unwrap();
+    assert_eq!(
+        with_value,
+        DataValue {
+            value: Some(array.into()),
+            ..without
+        }
+    );
+}
+
+#[test]
+fn a_diagnostic_info_is_what_its_mask_says() {
+    let bytes = [
+        0x7F, 1, 0, 0, 0, 2, 0, 0, 0, 3, 0, 0, 0, 4, 0, 0, 0, // SymbolicId to LocalizedText
+        1, 0, 0, 0, b'x', // AdditionalInfo
+        0, 0, 0x34, 0x80, // InnerStatusCode
+        0x10, 0xFF, 0xFF, 0xFF, 0xFF, // InnerDiagnosticInfo of a null AdditionalInfo
+    ];
+    let info = Encoded::<DiagnosticInfo<'_>>::new(&bytes)
+        .unwrap()
+        .get()
+        .unwrap();
+    let inner = info.inner.unwrap().get().unwrap();
+    let expected = DiagnosticInfo {
+        symbolic_id: Some(1),
+        namespace_uri: Some(2),
+        locale: Some(3),
+        localized_text: Some(4),
+        additional_info: Some(Some("x")),
+        inner_status_code: Some(StatusCode(0x8034_0000)),
+        inner: info.inner,
+    };
+    assert_eq!(info, expected);
+    let null = DiagnosticInfo {
+        additional_info: Some(None),
+        ..DiagnosticInfo::default()
+    };
+    assert_eq!(inner, null);
+}
+
+#[test]
+fn what_fills_up_a_delta_frame_is_told_from_a_change_to_null() {
+    let delta = [
+        0x81, 1, 4, 0, // delta frame of four fields
+        2, 0, 3, 7, // field 2 is Byte 7
+        1, 0, 0, // field 1 is null
+        0, 0, 3, 0, // field 0 is Byte 0
+        0, 0, 0, // nothing
+    ];
+    let datagram = [&[0x01], &delta[..]].concat();
+    let message = messages(&datagram).remove(0).unwrap();
+    assert_eq!(message.kind, MessageKind::DeltaFrame);
+    let fields: Vec<_> = message.values().unwrap().map(Result::unwrap).collect();
+    let told: Vec<_> = fields
+        .iter()
+        .map(|field| (field.index, field.is_filler()))
+        .collect();
+    assert_eq!(told, [(2, false), (1, false), (0, false), (0, true)]);
+}
+
+#[test]
+fn what_has_indexes_or_qualities_is_not_read_as_plain_fields() {
+    let misread = |what| Err(DecodeError::Misread(what));
+    let delta = [0x81, 1, 1, 0, 2, 0, 3, 7];
+    assert_eq!(
+        fields(&delta),
+        misread("a delta frame, its fields have indexes")
+    );
+    let data_values = [0x05, 1, 0, 0x01, 3, 7];
+    assert_eq!(fields(&data_values), misread("encoded as DataValues"));
+    let raw = misread("encoded as RawData, to be read with its DataSetMetaData");
+    assert_eq!(fields(&[0x03, 7]), raw);
+    assert_eq!(values(&[0x03, 7]), raw);
+    let byte: DataValue<'_> = Variant::from(Scalar::Byte(7)).into();
+    assert_eq!(values(&delta), Ok(vec![format!("2: {byte:?}")]));
+    assert_eq!(values(&data_values), Ok(vec![format!("0: {byte:?}")]));
+    let changed = [0x85, 1, 1, 0, 9, 0, 0x01, 3, 7];
+    assert_eq!(values(&changed), Ok(vec![format!("9: {byte:?}")]));
+}
+
+#[test]
+fn an_event_has_fields_and_always_a_field_count() {
+    let event = [0x01, 0x81, 2, 2, 0, 3, 7, 0];
+    let message = messages(&event).remove(0).unwrap();
+    assert_eq!(message.kind, MessageKind::Event);
+    let read: Vec<_> = message.fields().unwrap().map(Result::unwrap).collect();
+    assert_eq!(read, [Scalar::Byte(7).into(), Variant::Null]);
+    assert_eq!(fields(&[0x81, 2]), Err(cut("FieldCount", 2, 0)));
+    assert_eq!(values(&[0x81, 1]), Err(cut("FieldCount", 2, 0)), "delta");
+}
+
+#[test]
+fn the_values_of_a_heartbeat_and_of_a_keep_alive_are_none() {
+    assert_eq!(values(&[0x01]), Ok(vec![]));
+    assert_eq!(values(&[0x05]), Ok(vec![]), "of DataValues");
+    assert_eq!(fields(&[0x05]), Ok(vec![]), "of DataValues");
+    assert_eq!(values(&[0x01, 0, 0]), Ok(vec![]));
+    assert_eq!(values(&[0x81, 3]), Ok(vec![]));
+}
+
+#[test]
+fn values_end_as_fields_do() {
+    let null = DataValue::default();
+    assert_eq!(
+        values(&[0x05, 1, 0, 0, 0, 0]),
+        Ok(vec![format!("0: {null:?}")]),
+        "padding is skipped"
+    );
+    assert_eq!(
+        values(&[0x05, 1, 0, 0, 0, 9]),
+        Err(DecodeError::TrailingBytes(2))
+    );
+    assert_eq!(
+        values(&[0x05, 3, 0, 0, 0]),
+        Err(DecodeError::Limit {
+            field: "FieldCount",
+            value: 3
+        })
+    );
+    let datagram = [0x01, 0x05, 3, 0, 0, 0x80, 0];
+    let message = messages(&datagram).remove(0).unwrap();
+    assert_eq!(message.encoding(), FieldEncoding::DataValue);
+    let read: Vec<_> = message
+        .values()
+        .unwrap()
+        .map(|field| field.is_ok())
+        .collect();
+    assert_eq!(read, [true, false], "nothing behind an error");
+}
+
+#[test]
+fn a_secured_message_shows_its_headers_and_no_messages() {
+    for (flags, signed, encrypted) in [(1, true, false), (2, false, true), (3, true, true)] {
+        let datagram = [
+            0xC1, 0x10, 1, 5, 0, // DataSetWriterId 5, SecurityHeader
+            flags, 9, 0, 0, 0, 2, 0xAB, 0xCD, // token 9 and a nonce of two bytes
+            0x01, 1, 0, 0x03, 7, // what would be a key frame
+        ];
+        let message = NetworkMessage::decode(&datagram).unwrap();
+        let header = SecurityHeader {
+            signed,
+            encrypted,
+            token_id: 9,
+            nonce: &[0xAB, 0xCD],
+            ..SecurityHeader::NONE
+        };
+        assert_eq!(message.security(), Some(header));
+        assert!(header.is_secured() && message.is_sealed());
+        assert!(message.writer_ids().unwrap().eq([5]));
+        let sealed = DecodeError::Misread("secured, to be opened with its keys first");
+        let read: Vec<_> = message.messages().map(Result::unwrap_err).collect();
+        assert_eq!(read, [sealed]);
+        assert_eq!(message.chunk(), Err(sealed));
+        let start = datagram.len() - message.payload().len();
+        let placed = message.data_set_message_at(start, 5);
+        assert_eq!(placed.unwrap_err(), sealed);
+    }
+}
+
+#[test]
+fn a_security_header_without_security_hides_nothing() {
+    let datagram = [0x81, 0x10, 0, 0, 0, 0, 0, 0, 0x01, 1, 0, 0x03, 7];
+    let message = NetworkMessage::decode(&datagram).unwrap();
+    assert_eq!(message.security(), Some(SecurityHeader::NONE));
+    assert!(!message.is_sealed());
+    let fields = message
+        .messages()
+        .next()
+        .unwrap()
+        .unwrap()
+        .fields()
+        .unwrap();
+    assert_eq!(fields.len(), 1);
+    let reserved = NetworkMessage::decode(&[0x81, 0x10, 0x30, 0, 0, 0, 0, 0]).unwrap_err();
+    let bits = DecodeError::Reserved {
+        field: "SecurityFlags",
+        value: 0x30,
+    };
+    assert_eq!(reserved, bits);
+}
+
+#[test]
+fn the_footer_is_no_part_of_the_payload() {
+    let datagram = |size: u8| {
+        [
+            0x81, 0x10, 0x04, 0, 0, 0, 0, 0, size, 0, // SecurityHeader with a footer
+            0x01, 1, 0, 0x03, 7, 0xF1, 0xF2, // a key frame and two bytes more
+        ]
+    };
+    let with_footer = datagram(2);
+    let message = NetworkMessage::decode(&with_footer).unwrap();
+    assert_eq!(message.footer(), [0xF1, 0xF2]);
+    assert_eq!(message.payload(), [0x01, 1, 0, 0x03, 7]);
+    let fields = message
+        .messages()
+        .next()
+        .unwrap()
+        .unwrap()
+        .fields()
+        .unwrap();
+    assert!(fields.map(Result::unwrap).eq([Scalar::Byte(7).into()]));
+    assert_eq!(
+        message.data_set_message_at(10, 5).unwrap().kind,
+        MessageKind::KeyFrame
+    );
+    let into_footer = message.data_set_message_at(10, 6).unwrap_err();
+    assert_eq!(into_footer, cut("DataSetMessage", 16, 15));
+    let all = datagram(7);
+    assert_eq!(NetworkMessage::decode(&all).unwrap().payload(), []);
+}
+
+#[test]
+fn a_footer_longer_than_the_payload_is_refused() {
+    let datagram = [0x81, 0x10, 0x04, 0, 0, 0, 0, 0, 3, 0, 0x01, 0];
+    let error = NetworkMessage::decode(&datagram).unwrap_err();
+    assert_eq!(error, cut("SecurityFooter", 3, 2));
+}
+
+#[test]
+fn a_chunk_is_a_piece_that_lies_in_the_whole() {
+    let datagram = |offset: u32, total: u32, data: &[u8]| {
+        let offset = offset.to_le_bytes();
+        let total = total.to_le_bytes();
+        let header = [0xC1, 0x80, 0x01, 5, 0, 77, 0]; // DataSetWriterId 5, number 77
+        [&header[..], &offset, &total, data].concat()
+    };
+    let read = datagram(6, 10, &[1, 2, 3, 4]);
+    let message = NetworkMessage::decode(&read).unwrap();
+    assert!(message.is_chunk());
+    assert_eq!(
+        message.chunk(),
+        Ok(Chunk {
+            writer_id: Some(5),
+            message_sequence_number: 77,
+            offset: 6,
+            total_size: 10,
+            data: &[1, 2, 3, 4],
+        })
+    );
+    let messages: Vec<_> = message.messages().map(Result::unwrap_err).collect();
+    let misread = DecodeError::Misread("a chunk, to be reassembled first");
+    assert_eq!(messages, [misread]);
+    assert_eq!(message.data_set_message_at(7, 1).unwrap_err(), misread);
+    for (offset, total, data) in [
+        (7, 10, &[1, 2, 3, 4][..]),
+        (10, 10, &[1]),
+        (u32::MAX, u32::MAX, &[1]),
+        (0, 0, &[1]),
+        (5, 10, &[]),
+    ] {
+        let datagram = datagram(offset, total, data);
+        let limit = DecodeError::Limit {
+            field: "ChunkOffset",
+            value: offset,
+        };
+        let chunk = NetworkMessage::decode(&datagram).unwrap().chunk();
+        assert_eq!(chunk, Err(limit), "{offset} of {total}");
+    }
+    let short = NetworkMessage::decode(read.get(..14).unwrap()).unwrap();
+    assert_eq!(short.chunk(), Err(cut("TotalSize", 4, 3)));
+    let whole = NetworkMessage::decode(&[0x01, 0x01]).unwrap();
+    assert_eq!(whole.chunk(), Err(DecodeError::Misread("no chunk")));
+}
+
+#[test]
+fn promoted_fields_end_where_their_size_says() {
+    let datagram = [0x81, 0x80, 0x02, 4, 0, 3, 7, 3, 8, 0x01, 1, 0, 3, 9];
+    let message = NetworkMessage::decode(&datagram).unwrap();
+    let promoted = message.promoted_fields().unwrap().map(Result::unwrap);
+    assert!(promoted.eq([7, 8].map(|byte| Scalar::Byte(byte).into())));
+    let fields = message
+        .messages()
+        .next()
+        .unwrap()
+        .unwrap()
+        .fields()
+        .unwrap();
+    assert!(fields.map(Result::unwrap).eq([Scalar::Byte(9).into()]));
+
+    let none = NetworkMessage::decode(&[0x81, 0x80, 0x02, 0, 0, 0x01]).unwrap();
+    assert_eq!(none.promoted_fields().unwrap().count(), 0);
+    let absent = NetworkMessage::decode(&[0x01, 0x01]).unwrap();
+    assert!(absent.promoted_fields().is_none());
+}
+
+#[test]
+fn promoted_fields_past_the_end_are_refused() {
+    let error = NetworkMessage::decode(&[0x81, 0x80, 0x02, 4, 0, 3, 7, 3]).unwrap_err();
+    assert_eq!(error, cut("PromotedFields", 4, 3));
+    // Size 3 cuts the second field: the message behind it is read all the same.
+    let datagram = [0x81, 0x80, 0x02, 3, 0, 3, 7, 3, 0x01, 1, 0, 3, 9];
+    let message = NetworkMessage::decode(&datagram).unwrap();
+    let promoted: Vec<_> = message.promoted_fields().unwrap().collect();
+    assert_eq!(
+        promoted,
+        [Ok(Scalar::Byte(7).into()), Err(cut("Byte", 1, 0))]
+    );
+    assert!(message.messages().all(|message| message.is_ok()));
+}
+
+#[test]
+fn messages_of_a_fixed_layout_are_found_by_their_offsets() {
+    let datagram = [
+        0x21, 0x01, 5, 0, // WriterGroupId 5, no payload header
+        0x01, 1, 0, 0x03, 7, 0, 0, // Byte 7, two bytes of padding
+        0x00, 0xFF, // not valid
+        0x01, 1, 0, 0x03, 8, // Byte 8
+    ];
+    let network = NetworkMessage::decode(&datagram).unwrap();
+    let field = |offset, size| {
+        let message = network.data_set_message_at(offset, size)?;
+        assert_eq!(message.writer_id, None);
+        message.fields()?.next().transpose()
+    };
+    assert_eq!(field(4, 7), Ok(Some(Scalar::Byte(7).into())));
+    assert_eq!(field(13, 5), Ok(Some(Scalar::Byte(8).into())));
+    assert!(!network.data_set_message_at(11, 2).unwrap().header.valid);
+    for (offset, size) in [
+        (3, 5),
+        (0, 1),
+        (13, 6),
+        (19, 0),
+        (14, usize::MAX),
+        (usize::MAX, 1),
+    ] {
+        let missing = cut(
+            "DataSetMessage",
+            offset.saturating_add(size),
+            datagram.len(),
+        );
+        assert_eq!(
+            field(offset, size),
+            Err(missing),
+            "{size} bytes at {offset}"
+        );
+    }
+    let empty = network.data_set_message_at(4, 0).unwrap_err();
+    assert_eq!(empty, cut("DataSetFlags1", 1, 0));
+}
+
+#[test]
+fn discovery_messages_are_told_by_their_type() {
+    for (flags, message_type, what) in [
+        (0x04, NetworkMessageType::Probe, "a discovery probe"),
+        (
+            0x08,
+            NetworkMessageType::Announcement,
+            "a discovery announcement",
+        ),
+    ] {
+        let datagram = [0x81, 0x90, flags, 0, 0, 0, 0, 0, 0, 1];
+        let message = NetworkMessage::decode(&datagram).unwrap();
+        assert_eq!(message.message_type(), message_type);
+        assert_eq!(message.payload(), [1]);
+        let read: Vec<_> = message.messages().map(Result::unwrap_err).collect();
+        assert_eq!(read, [DecodeError::Misread(what)]);
+    }
+    let plain = NetworkMessage::decode(&[0x01, 0x01]).unwrap();
+    assert_eq!(plain.message_type(), NetworkMessageType::DataSet);
 }

@@ -3,8 +3,9 @@
 #![expect(clippy::wildcard_enum_match_arm, reason = "test code")]
 
 use uadp::{
-    BuiltinType, DataSetHeader, DateTime, EncodeError, ExtensionBody, FieldEncoder, Fields,
-    NetworkHeader, NetworkMessage, NetworkMessageEncoder, NodeId, Scalar, Variant,
+    BuiltinType, DataSetHeader, DataValue, DateTime, DecodeError, EncodeError, Encoded,
+    ExtensionBody, Extras, FieldEncoder, Fields, NetworkHeader, NetworkMessage,
+    NetworkMessageEncoder, NodeId, Scalar, SecurityHeader, StatusCode, Variant,
 };
 
 /// What a key frame of the smallest header becomes: bytes behind the header, or why not.
@@ -18,6 +19,17 @@ fn block(
     fields.finish()?;
     message.finish()?;
     Ok(out.split_off(2))
+}
+
+/// What one DataSetMessage behind the smallest header becomes, or why not.
+fn message(
+    write: impl FnOnce(&mut NetworkMessageEncoder<'_>) -> Result<(), EncodeError>,
+) -> Result<Vec<u8>, EncodeError> {
+    let mut out = Vec::new();
+    let mut message = NetworkMessageEncoder::new(&mut out, &NetworkHeader::default(), None)?;
+    write(&mut message)?;
+    message.finish()?;
+    Ok(out.split_off(1))
 }
 
 #[test]
@@ -189,10 +201,10 @@ fn calls_out_of_place_are_refused() {
         fields.fields_block(&[0, 0])
     });
     misplaced(|fields| fields.fields_block(&[0]));
-    assert_eq!(
-        block(|fields| fields.array(BuiltinType::Variant, 0)),
-        Err(EncodeError::Unsupported(BuiltinType::Variant))
-    );
+    misplaced(|fields| {
+        let value = Encoded::new(&[0]).unwrap();
+        fields.scalar(Scalar::Variant(value))
+    });
 }
 
 #[test]
@@ -327,4 +339,265 @@ fn the_offsets_point_at_what_a_repeated_message_changes() {
         (fields.sequence_offset(), fields.timestamp_offset()),
         (None, None)
     );
+}
+
+#[test]
+fn a_delta_frame_has_the_index_before_each_value() {
+    let bytes = message(|message| {
+        let mut delta = message.delta_frame(&DataSetHeader::default())?;
+        delta.field(3)?.scalar(Scalar::Byte(7))?;
+        delta
+            .field(0x102)?
+            .packed_array(BuiltinType::Byte, 1, &[8])?;
+        delta.finish()
+    });
+    let expected = [
+        &[0x81, 0x01, 2, 0][..],
+        &[3, 0, 3, 7],
+        &[2, 1, 0x83, 1, 0, 0, 0, 8],
+    ];
+    assert_eq!(bytes.unwrap(), expected.concat());
+}
+
+#[test]
+fn a_changed_field_has_exactly_one_value() {
+    type Write = fn(&mut FieldEncoder<'_>) -> Result<(), EncodeError>;
+    let misplaced = |write: Write| {
+        let bytes = message(|message| {
+            let mut delta = message.delta_frame(&DataSetHeader::default())?;
+            write(delta.field(0)?)?;
+            delta.finish()
+        });
+        assert!(matches!(bytes, Err(EncodeError::Misplaced(_))), "{bytes:?}");
+    };
+    misplaced(|_| Ok(()));
+    misplaced(|field| {
+        field.null()?;
+        field.null()
+    });
+    misplaced(|field| field.array(BuiltinType::Byte, 1));
+    misplaced(|field| field.begin_structure(NodeId::NULL));
+    misplaced(|field| field.fields_block(&[1, 0, 0]));
+}
+
+#[test]
+fn data_values_are_written_with_and_without_index() {
+    let value = DataValue {
+        value: Some(Scalar::Byte(7).into()),
+        status: Some(StatusCode(0x8034_0000)),
+        source_picoseconds: Some(5),
+        ..DataValue::default()
+    };
+    let encoded = [0x13, 3, 7, 0, 0, 0x34, 0x80, 5, 0];
+    let header = DataSetHeader::default();
+    let frame = message(|message| {
+        let mut fields = message.data_values(&header)?;
+        fields.value(&value)?;
+        fields.value(&DataValue::default())?;
+        fields.finish()
+    });
+    assert_eq!(frame.unwrap(), [&[0x05, 2, 0], &encoded[..], &[0]].concat());
+    let delta = message(|message| {
+        let mut fields = message.delta_data_values(&header)?;
+        fields.changed(4, &value)?;
+        fields.finish()
+    });
+    assert_eq!(
+        delta.unwrap(),
+        [&[0x85, 0x01, 1, 0, 4, 0], &encoded[..]].concat()
+    );
+    let with_index = message(|message| message.data_values(&header)?.changed(4, &value));
+    let without = message(|message| message.delta_data_values(&header)?.value(&value));
+    for misplaced in [with_index, without] {
+        assert!(matches!(misplaced, Err(EncodeError::Misplaced(_))));
+    }
+}
+
+#[test]
+fn events_and_raw_data_say_what_they_are() {
+    let header = DataSetHeader::default();
+    let event = message(|message| {
+        let mut fields = message.event(&header)?;
+        fields.scalar(Scalar::Byte(7))?;
+        fields.finish()
+    });
+    assert_eq!(event.unwrap(), [0x81, 0x02, 1, 0, 3, 7]);
+    let raw = message(|message| {
+        message.raw_key_frame(&header, |out| {
+            out.extend([7, 8]);
+            Ok(())
+        })
+    });
+    assert_eq!(raw.unwrap(), [0x03, 7, 8]);
+}
+
+#[test]
+fn an_array_of_variants_holds_any_of_them() {
+    let (mut first, mut second) = (Vec::new(), Vec::new());
+    let inner = Variant::from(Scalar::Byte(7));
+    let inner = Encoded::variant(&inner, &mut first).unwrap();
+    let bytes = block(|fields| {
+        fields.array(BuiltinType::Variant, 2)?;
+        fields.element(Scalar::Variant(inner))?;
+        let info = Encoded::new(&[0]).unwrap();
+        let info = Variant::from(Scalar::DiagnosticInfo(info));
+        let info = Encoded::variant(&info, &mut second)?;
+        fields.element(Scalar::Variant(info))
+    });
+    assert_eq!(bytes.unwrap(), [1, 0, 0x98, 2, 0, 0, 0, 3, 7, 25, 0]);
+}
+
+#[test]
+fn what_is_given_as_encoded_has_to_be_one_value() {
+    assert!(Encoded::<Variant<'_>>::new(&[3, 7]).is_ok());
+    assert_eq!(
+        Encoded::<Variant<'_>>::new(&[3, 7, 0]),
+        Err(DecodeError::TrailingBytes(1))
+    );
+    assert_eq!(
+        Encoded::<Variant<'_>>::new(&[]),
+        Err(DecodeError::Truncated {
+            field: "Variant",
+            expected: 1,
+            found: 0
+        })
+    );
+}
+
+/// A keep-alive behind this SecurityHeader, and the footer where there is one.
+fn secured(security: SecurityHeader<'_>, footer: Option<&[u8]>) -> Result<Vec<u8>, EncodeError> {
+    let mut out = Vec::new();
+    let extras = Extras {
+        security: Some(security),
+        ..Extras::default()
+    };
+    let header = NetworkHeader::default();
+    let mut message = NetworkMessageEncoder::with(&mut out, &header, None, &extras)?;
+    message.keep_alive(&DataSetHeader::default())?;
+    match footer {
+        Some(footer) => message.finish_with_footer(footer)?,
+        None => message.finish()?,
+    }
+    Ok(out)
+}
+
+#[test]
+fn a_footer_is_as_long_as_its_header_says() {
+    let two = SecurityHeader {
+        footer_size: Some(2),
+        ..SecurityHeader::NONE
+    };
+    let header = [0x81, 0x10, 0x04, 0, 0, 0, 0, 0, 2, 0];
+    assert_eq!(
+        secured(two, Some(&[8, 9])).unwrap(),
+        [&header[..], &[0x81, 0x03, 8, 9]].concat()
+    );
+    let wrong =
+        EncodeError::Misplaced("a SecurityFooter of another size than the SecurityHeader says");
+    assert_eq!(secured(two, Some(&[8])), Err(wrong));
+    assert_eq!(secured(two, None), Err(wrong));
+    assert_eq!(secured(SecurityHeader::NONE, Some(&[8])), Err(wrong));
+    assert!(secured(SecurityHeader::NONE, None).is_ok());
+}
+
+#[test]
+fn a_message_that_promises_a_signature_is_not_finished_without() {
+    for (signed, encrypted) in [(true, false), (false, true), (true, true)] {
+        let header = SecurityHeader {
+            signed,
+            encrypted,
+            ..SecurityHeader::NONE
+        };
+        let unsealed = EncodeError::Misplaced("a secured message left unsealed");
+        assert_eq!(secured(header, None), Err(unsealed));
+    }
+}
+
+#[test]
+fn headers_longer_than_their_size_fields_are_refused() {
+    let with = |extras: &Extras<'_>| {
+        let mut out = Vec::new();
+        let header = NetworkHeader::default();
+        NetworkMessageEncoder::with(&mut out, &header, Some(&[1]), extras).map(|_| ())
+    };
+    let too_big = |what, len| Err(EncodeError::TooBig { what, len });
+    let nulls = vec![Variant::Null; 65_536];
+    let promoted = |count: usize| Extras {
+        promoted_fields: Some(&nulls[..count]),
+        ..Extras::default()
+    };
+    assert_eq!(with(&promoted(65_535)), Ok(()));
+    assert_eq!(with(&promoted(65_536)), too_big("PromotedFields", 65_536));
+    let nonce = [0; 256];
+    let security = |len: usize| Extras {
+        security: Some(SecurityHeader {
+            nonce: &nonce[..len],
+            ..SecurityHeader::NONE
+        }),
+        ..Extras::default()
+    };
+    assert_eq!(with(&security(255)), Ok(()));
+    assert_eq!(with(&security(256)), too_big("MessageNonce", 256));
+}
+
+#[test]
+fn a_message_longer_than_its_configured_size_becomes_invalid_and_its_neighbours_stay() {
+    let mut out = Vec::new();
+    let ids = [1, 2, 3];
+    let mut network =
+        NetworkMessageEncoder::new(&mut out, &NetworkHeader::default(), Some(&ids)).unwrap();
+    network.configured_size(10);
+    for len in [2, 3, 2] {
+        let mut fields = network.key_frame(&DataSetHeader::default()).unwrap();
+        fields
+            .packed_array(BuiltinType::Byte, len, &vec![7; len])
+            .unwrap();
+        fields.finish().unwrap();
+    }
+    network.finish().unwrap();
+    let fitting = [0x01, 1, 0, 0x83, 2, 0, 0, 0, 7, 7];
+    let payload = [&[10, 0, 10, 0, 10, 0], &fitting[..], &[0; 10], &fitting].concat();
+    assert_eq!(out[8..], payload);
+    let read = NetworkMessage::decode(&out).unwrap();
+    let valid: Vec<_> = read
+        .messages()
+        .map(|message| message.unwrap().header.valid)
+        .collect();
+    assert_eq!(valid, [true, false, true]);
+}
+
+#[test]
+fn a_configured_size_holds_until_another_is_set() {
+    let mut out = Vec::new();
+    let header = NetworkHeader::default();
+    let network = NetworkMessageEncoder::new(&mut out, &header, None).unwrap();
+    let mut network = network.fixed_layout(4).unwrap();
+    for size in [Some(4), None, Some(0), Some(1)] {
+        if let Some(size) = size {
+            network.configured_size(size);
+        }
+        network.keep_alive(&DataSetHeader::default()).unwrap();
+    }
+    network.finish().unwrap();
+    let padded = [0x81, 0x03, 0, 0];
+    let expected = [&[0x01], &padded[..], &padded, &[0x81, 0x03], &[0]].concat();
+    assert_eq!(out, expected);
+}
+
+#[test]
+fn a_fixed_layout_has_no_payload_header_and_as_many_messages_as_it_says() {
+    let header = NetworkHeader::default();
+    let mut out = Vec::new();
+    let network = NetworkMessageEncoder::new(&mut out, &header, Some(&[1])).unwrap();
+    let misplaced = network.fixed_layout(1).map(|_| ());
+    assert!(matches!(misplaced, Err(EncodeError::Misplaced(_))));
+
+    let network = NetworkMessageEncoder::new(&mut out, &header, None).unwrap();
+    let mut network = network.fixed_layout(2).unwrap();
+    network.keep_alive(&DataSetHeader::default()).unwrap();
+    let missing = EncodeError::MessageCount {
+        announced: 2,
+        written: 1,
+    };
+    assert_eq!(network.finish(), Err(missing));
 }

@@ -2,8 +2,12 @@
 
 use super::configuration::KeyValuePair;
 use super::list::List;
-use super::wire::{enumeration, structure};
-use crate::{BuiltinType, DataSetHeader, Guid, LocalizedText, NodeId, QualifiedName};
+use super::wire::{Structure, enumeration, structure};
+use crate::reader::Reader;
+use crate::{
+    BuiltinType, ConfigurationVersion, DataSetHeader, DecodeError, EncodeError, Guid,
+    LocalizedText, NodeId, QualifiedName,
+};
 
 structure! {
     /// The content of a DataSet (OPC 10000-14, 6.2.3.2.3).
@@ -139,15 +143,6 @@ structure! {
         /// Id of the builtin type it is encoded as.
         built_in_type: u8 = "BuiltInType",
     }
-
-    /// When the content of a DataSet last changed (ConfigurationVersionDataType: OPC 10000-14, 6.2.3.2.6). Both are
-    /// VersionTimes: seconds since 2000-01-01 UTC.
-    ConfigurationVersion {
-        /// The last change that is more than fields added at the end.
-        major: u32 = "MajorVersion",
-        /// The last change at all.
-        minor: u32 = "MinorVersion",
-    }
 }
 
 enumeration! {
@@ -256,7 +251,24 @@ impl<'a> EnumDefinition<'a> {
     }
 }
 
-impl Eq for ConfigurationVersion {}
+/// ConfigurationVersionDataType (OPC 10000-14, 6.2.3.2.6).
+impl<'a> Structure<'a> for ConfigurationVersion {
+    const NULL: Self = Self { major: 0, minor: 0 };
+    const MIN_SIZE: usize = 8;
+
+    fn read(reader: &mut Reader<'a>, _: &'static str) -> Result<Self, DecodeError> {
+        Ok(Self {
+            major: reader.u32("MajorVersion")?,
+            minor: reader.u32("MinorVersion")?,
+        })
+    }
+
+    fn write(&self, out: &mut Vec<u8>, _: &'static str) -> Result<(), EncodeError> {
+        out.extend_from_slice(&self.major.to_le_bytes());
+        out.extend_from_slice(&self.minor.to_le_bytes());
+        Ok(())
+    }
+}
 
 impl ConfigurationVersion {
     /// Holds the version the metadata have against the one in the header of a DataSetMessage.

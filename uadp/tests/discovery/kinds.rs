@@ -226,6 +226,42 @@ fn other_messages_are_not_taken_for_discovery() {
 }
 
 #[test]
+fn an_announcement_in_chunks_is_read_from_the_whole_of_them() {
+    let announcement = Announcement {
+        sequence_number: 1,
+        announced: Announced::ApplicationDescription {
+            description: ApplicationDescription {
+                application_uri: Some("urn:cell:robot"),
+                ..ApplicationDescription::default()
+            },
+            capabilities: List::null(),
+        },
+    };
+    let sent = body(&announcement);
+    let total = u32::try_from(sent.len()).unwrap();
+    let mut whole = Vec::new();
+    for piece in sent.chunks(20) {
+        let offset = u32::try_from(whole.len()).unwrap();
+        // Version 1 with PublisherId Byte 7, SecurityHeader, chunk of an announcement; no security.
+        let headers = [0x91, 0x90, 0x09, 7, 0, 0, 0, 0, 0, 0];
+        let datagram = [
+            &headers[..],
+            &announcement.sequence_number.to_le_bytes(),
+            &offset.to_le_bytes(),
+            &total.to_le_bytes(),
+            piece,
+        ]
+        .concat();
+        let message = NetworkMessage::decode(&datagram).unwrap();
+        assert!(Announcement::decode(&message).is_err());
+        let chunk = message.chunk().unwrap();
+        assert_eq!((chunk.writer_id, chunk.message_sequence_number), (None, 1));
+        whole.extend_from_slice(chunk.data);
+    }
+    assert_eq!(Announcement::decode_body(&whole), Ok(announcement));
+}
+
+#[test]
 fn metadata_fit_messages_of_their_major_version() {
     let version = ConfigurationVersion {
         major: 10,

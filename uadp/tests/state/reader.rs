@@ -4,8 +4,9 @@ use serde_json::Value;
 use uadp::MessageKind::{DeltaFrame, Event, KeepAlive, KeyFrame};
 use uadp::PubSubState::{Disabled, Error, Operational, Paused, PreOperational};
 use uadp::{
-    Accepted, Arrival, ConfigurationVersion, DataSetReaderState, DateTime, DeltaNull, GroupHeader,
-    Merged, NetworkHeader, NetworkMessage, ReaderDrop, ReaderSettings, Timestamp,
+    Accepted, Arrival, ConfigurationVersion, DataSetMessage, DataSetReaderState, DateTime,
+    DeltaNull, GroupHeader, Merged, NetworkHeader, NetworkMessage, ReaderDrop, ReaderSettings,
+    Timestamp,
 };
 
 use crate::{datagram, description, message, ms, settings, start_reader, versioned};
@@ -270,7 +271,7 @@ fn the_delta_frames_of_open62541_are_taken_and_their_filler_wipes_nothing() {
         let datagram = datagram(&name);
         let network = NetworkMessage::decode(&datagram).unwrap();
         let message = network.messages().next().unwrap().unwrap();
-        let arrival = Arrival::of(network.header(), 0, &message);
+        let arrival = Arrival::of(&network.header(), 0, &message);
         let accepted = reader.receive(&arrival, ms(30 * round));
         assert_eq!(accepted, Ok(Accepted::default()), "{name}");
 
@@ -326,19 +327,18 @@ fn what_the_headers_say_is_found_in_datagrams() {
     let group = network.header().group.unwrap();
     let stamp = network.header().timestamp.unwrap();
     let message = network.messages().next().unwrap().unwrap();
-    let arrival = Arrival::of(network.header(), 3, &message);
+    let arrival = Arrival::of(&network.header(), 3, &message);
     assert_eq!(arrival.group, group);
     assert_eq!(arrival.position, 3);
-    assert_eq!(arrival.header, message.header);
-    match message.header.timestamp {
+    assert_eq!(arrival.header, message.header());
+    match message.header().timestamp {
         Some(own) => assert_eq!(arrival.timestamp.unwrap().time, own),
         None => assert_eq!(arrival.timestamp.unwrap().time, stamp),
     }
     // Its own Timestamp goes before that of the NetworkMessage.
-    let mut own = message.clone();
-    own.header.timestamp = Some(DateTime(5));
-    own.header.picoseconds = Some(6);
-    let arrival = Arrival::of(network.header(), 0, &own);
+    let with_time = [0x81, 0x30, 5, 0, 0, 0, 0, 0, 0, 0, 6, 0, 0, 0];
+    let own = DataSetMessage::decode(None, &with_time).unwrap();
+    let arrival = Arrival::of(&network.header(), 0, &own);
     assert_eq!(
         arrival.timestamp,
         Some(Timestamp {

@@ -2,59 +2,22 @@
 
 use serde_json::{Map, Value, json};
 use uadp::{
-    Array, BuiltinType, DecodeError, ExtensionBody, ExtensionObject, Identifier, MessageKind,
-    NetworkMessage, NodeId, PublisherId, Scalar, Variant,
+    Array, BuiltinType, DataSetMessage, DataValue, DecodeError, ExtensionBody, ExtensionObject,
+    FieldEncoding, GroupHeader, Identifier, MessageKind, NetworkMessage, NetworkMessageType,
+    NodeId, PublisherId, Scalar, Variant,
 };
 
-pub(crate) fn describe(datagram: &[u8]) -> Result<Value, DecodeError> {
-    let message = NetworkMessage::decode(datagram)?;
+/// The headers of a NetworkMessage and of the chunk in it.
+pub(crate) fn describe_headers(message: &NetworkMessage<'_>) -> Result<Value, DecodeError> {
     let header = message.header();
-    let mut group = Map::new();
-    if let Some(found) = header.group {
-        put(&mut group, "writerGroupId", found.writer_group_id);
-        put(&mut group, "groupVersion", found.group_version);
-        put(
-            &mut group,
-            "networkMessageNumber",
-            found.network_message_number,
-        );
-        put(&mut group, "sequenceNumber", found.sequence_number);
-    }
-    let mut messages = Vec::new();
-    for (data_set_message, id) in message.messages().zip(
-        message
-            .writer_ids()
-            .into_iter()
-            .flatten()
-            .map(Some)
-            .chain([None]),
-    ) {
-        let data_set_message = data_set_message?;
-        assert_eq!(data_set_message.writer_id, id);
-        let header = data_set_message.header;
-        let mut out = Map::new();
-        put(&mut out, "valid", Some(header.valid));
-        put(&mut out, "sequenceNumber", header.sequence_number);
-        put(&mut out, "timestamp", header.timestamp.map(|time| time.0));
-        put(&mut out, "picoSeconds", header.picoseconds);
-        put(&mut out, "status16", header.status);
-        put(&mut out, "majorVersion", header.major_version);
-        put(&mut out, "minorVersion", header.minor_version);
-        let kind = match data_set_message.kind {
-            MessageKind::KeyFrame => "keyFrame",
-            MessageKind::DeltaFrame => "deltaFrame",
-            MessageKind::Event => "event",
-            MessageKind::KeepAlive => "keepAlive",
-        };
-        put(&mut out, "type", Some(kind));
-        let fields = data_set_message.fields()?;
-        let len = fields.len();
+    let promoted = message.promoted_fields().map(|fields| {
         let fields = fields.map(|field| field.map(describe_variant));
-        let fields = fields.collect::<Result<Vec<_>, _>>()?;
-        assert_eq!(fields.len(), len);
-        put(&mut out, "fields", Some(fields));
-        messages.push(Value::Object(out));
-    }
+        fields.collect::<Result<Vec<_>, _>>()
+    });
+    let chunk = match message.is_chunk() {
+        true => Some(message.chunk()?),
+        false => None,
+    };
     Ok(json!({
         "publisherId": header.publisher_id.map(|id| match id {
             PublisherId::Byte(id) => json!(["Byte", id.to_string()]),
@@ -64,12 +27,121 @@ pub(crate) fn describe(datagram: &[u8]) -> Result<Value, DecodeError> {
             PublisherId::String(id) => json!(["String", id]),
         }),
         "dataSetClassId": header.data_set_class_id.map(|id| id.to_string()),
-        "groupHeader": header.group.map(|_| group),
+        "groupHeader": header.group.map(describe_group),
         "dataSetWriterIds": message.writer_ids().map(Iterator::collect::<Vec<_>>),
         "timestamp": header.timestamp.map(|time| time.0),
         "picoSeconds": header.picoseconds,
-        "dataSetMessages": messages,
+        "promotedFields": promoted.transpose()?,
+        "securityHeader": message.security().map(|header| json!({
+            "signed": header.signed,
+            "encrypted": header.encrypted,
+            "forceKeyReset": header.force_key_reset,
+            "securityTokenId": header.token_id,
+            "nonce": hex(header.nonce),
+            "footerSize": header.footer_size,
+            "footer": hex(message.footer()),
+        })),
+        "networkMessageType": match message.message_type() {
+            NetworkMessageType::DataSet => None,
+            NetworkMessageType::Probe => Some("discoveryProbe"),
+            NetworkMessageType::Announcement => Some("discoveryAnnouncement"),
+        },
+        "chunk": chunk.map(|chunk| json!({
+            "dataSetWriterId": chunk.writer_id,
+            "messageSequenceNumber": chunk.message_sequence_number,
+            "chunkOffset": chunk.offset,
+            "totalSize": chunk.total_size,
+            "chunkDataHex": hex(chunk.data),
+        })),
     }))
+}
+
+fn describe_group(group: GroupHeader) -> Value {
+    let mut out = Map::new();
+    put(&mut out, "writerGroupId", group.writer_group_id);
+    put(&mut out, "groupVersion", group.group_version);
+    let number = group.network_message_number;
+    put(&mut out, "networkMessageNumber", number);
+    put(&mut out, "sequenceNumber", group.sequence_number);
+    Value::Object(out)
+}
+
+/// The DataSetMessages, those of RawData without their fields.
+pub(crate) fn describe_messages(message: &NetworkMessage<'_>) -> Result<Value, DecodeError> {
+    let ids = message.writer_ids().into_iter().flatten().map(Some);
+    let mut messages = Vec::new();
+    for (data_set_message, id) in message.messages().zip(ids.chain([None])) {
+        let data_set_message = data_set_message?;
+        assert_eq!(data_set_message.writer_id, id);
+        messages.push(describe_message(&data_set_message)?);
+    }
+    Ok(Value::Array(messages))
+}
+
+fn describe_message(message: &DataSetMessage<'_>) -> Result<Value, DecodeError> {
+    let header = message.header;
+    let mut out = Map::new();
+    put(&mut out, "valid", Some(header.valid));
+    put(&mut out, "sequenceNumber", header.sequence_number);
+    put(&mut out, "timestamp", header.timestamp.map(|time| time.0));
+    put(&mut out, "picoSeconds", header.picoseconds);
+    put(&mut out, "status16", header.status);
+    put(&mut out, "majorVersion", header.major_version);
+    put(&mut out, "minorVersion", header.minor_version);
+    let kind = match message.kind {
+        MessageKind::KeyFrame => "keyFrame",
+        MessageKind::DeltaFrame => "deltaFrame",
+        MessageKind::Event => "event",
+        MessageKind::KeepAlive => "keepAlive",
+    };
+    put(&mut out, "type", Some(kind));
+    let encoding = match message.encoding() {
+        FieldEncoding::Variant => "Variant",
+        FieldEncoding::RawData => "RawData",
+        FieldEncoding::DataValue => "DataValue",
+    };
+    put(&mut out, "fieldEncoding", Some(encoding));
+    if message.encoding() != FieldEncoding::RawData {
+        put(&mut out, "fields", Some(describe_fields(message)?));
+    }
+    Ok(Value::Object(out))
+}
+
+fn describe_fields(message: &DataSetMessage<'_>) -> Result<Vec<Value>, DecodeError> {
+    let values = message.values()?.collect::<Result<Vec<_>, _>>()?;
+    if let Ok(fields) = message.fields() {
+        assert_eq!(fields.len(), values.len());
+        let plain = fields.map(|field| describe_variant(field.unwrap()));
+        let indexed = values.iter().filter_map(|field| field.value.value);
+        assert!(plain.eq(indexed.map(describe_variant)));
+    }
+    let mut out = Vec::new();
+    for (position, field) in values.into_iter().enumerate() {
+        let value = describe_data_value(field.value);
+        out.push(match message.kind {
+            MessageKind::DeltaFrame => json!({ "index": field.index, "value": value }),
+            _ => {
+                assert_eq!(usize::from(field.index), position);
+                value
+            }
+        });
+    }
+    Ok(out)
+}
+
+fn describe_data_value(value: DataValue<'_>) -> Value {
+    let mut out = match value.value.map(describe_variant) {
+        Some(Value::Object(value)) => value,
+        _ => Map::new(),
+    };
+    put(&mut out, "status", value.status.map(|status| status.0));
+    let source = value.source_timestamp.map(|time| time.0);
+    put(&mut out, "sourceTimestamp", source);
+    put(&mut out, "sourcePicoseconds", value.source_picoseconds);
+    let server = value.server_timestamp.map(|time| time.0);
+    put(&mut out, "serverTimestamp", server);
+    put(&mut out, "serverPicoseconds", value.server_picoseconds);
+    Value::Object(out)
 }
 
 fn put<T: Into<Value>>(map: &mut Map<String, Value>, key: &str, value: Option<T>) {
@@ -88,6 +160,11 @@ fn describe_variant(variant: Variant<'_>) -> Value {
             "type": array.element().name(),
             "value": array.iter().map(describe_scalar).collect::<Vec<_>>(),
         }),
+        Variant::Matrix(matrix) => {
+            let mut out = describe_variant(Variant::Array(matrix.elements()));
+            out["dimensions"] = matrix.dimensions().collect();
+            out
+        }
     }
 }
 
@@ -128,6 +205,9 @@ fn describe_scalar(scalar: Scalar<'_>) -> Value {
         }
         Scalar::LocalizedText(value) => json!({ "Locale": value.locale, "Text": value.text }),
         Scalar::ExtensionObject(value) => describe_structure(value),
+        Scalar::Variant(value) => describe_variant(value.get().unwrap()),
+        Scalar::DataValue(value) => panic!("no vector has a DataValue in a Variant: {value:?}"),
+        Scalar::DiagnosticInfo(value) => panic!("no vector has a DiagnosticInfo: {value:?}"),
     }
 }
 
@@ -180,6 +260,10 @@ fn string(bytes: &[u8]) -> (&str, &[u8]) {
     let (len, rest) = bytes.split_first_chunk().unwrap();
     let (text, rest) = rest.split_at(usize::try_from(i32::from_le_bytes(*len)).unwrap());
     (str::from_utf8(text).unwrap(), rest)
+}
+
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 pub(crate) fn base64(bytes: &[u8]) -> String {

@@ -5,20 +5,10 @@ use uadp::BuiltinType;
 
 use crate::found::base64;
 
-pub(crate) fn expected(json: &Value) -> Value {
-    for key in ["promotedFields", "securityHeader"] {
-        assert!(
-            json.get(key).is_none_or(Value::is_null),
-            "{key} in a vector that is read"
-        );
-    }
+/// The headers of a NetworkMessage and of the chunk in it.
+pub(crate) fn expected_headers(json: &Value) -> Value {
     assert_eq!(json["uadpVersion"], 1);
-    let messages: Vec<_> = json["dataSetMessages"]
-        .as_array()
-        .unwrap()
-        .iter()
-        .map(expected_message)
-        .collect();
+    let promoted = json["promotedFields"].as_array();
     json!({
         "publisherId": match &json["publisherId"] {
             Value::Null => Value::Null,
@@ -29,23 +19,76 @@ pub(crate) fn expected(json: &Value) -> Value {
         "dataSetWriterIds": json["dataSetWriterIds"],
         "timestamp": json["timestamp"]["ticks100ns"],
         "picoSeconds": json["picoSeconds"],
-        "dataSetMessages": messages,
+        "promotedFields": promoted.map(|fields| -> Vec<_> {
+            fields.iter().map(expected_variant).collect()
+        }),
+        "securityHeader": expected_security(&json["securityHeader"]),
+        "networkMessageType": json["networkMessageType"],
+        "chunk": match &json["chunk"] {
+            Value::Null => Value::Null,
+            chunk => {
+                let mut chunk = chunk.clone();
+                chunk["dataSetWriterId"] = json["dataSetWriterIds"][0].clone();
+                chunk
+            }
+        },
     })
 }
 
+fn expected_security(json: &Value) -> Value {
+    if json.is_null() {
+        return Value::Null;
+    }
+    let footer = json["footerEnabled"] == true;
+    json!({
+        "signed": json["signed"],
+        "encrypted": json["encrypted"],
+        "forceKeyReset": json["forceKeyReset"] == true,
+        "securityTokenId": json["securityTokenId"],
+        "nonce": json["nonce"],
+        "footerSize": footer.then(|| json["footerSize"].clone()),
+        "footer": if footer { json["footer"].clone() } else { json!("") },
+    })
+}
+
+/// The DataSetMessages, those of RawData without their fields.
+pub(crate) fn expected_messages(json: &Value) -> Value {
+    let messages = json["dataSetMessages"].as_array().unwrap();
+    messages.iter().map(expected_message).collect()
+}
+
 fn expected_message(json: &Value) -> Value {
-    assert_eq!(json["fieldEncoding"], "Variant");
     let mut out = json.as_object().unwrap().clone();
-    out.remove("fieldEncoding");
     out.remove("metaData");
     if let Some(timestamp) = out.get_mut("timestamp") {
         *timestamp = timestamp["ticks100ns"].take();
     }
+    if json["fieldEncoding"] == "RawData" {
+        out.remove("fields");
+        return Value::Object(out);
+    }
     let fields = json["fields"].as_array().unwrap().iter();
-    out["fields"] = fields
-        .map(|field| expected_variant(&field["value"]))
-        .collect();
+    out["fields"] = fields.map(expected_field).collect();
     Value::Object(out)
+}
+
+fn expected_field(json: &Value) -> Value {
+    let mut value = expected_variant(&json["value"]);
+    for (key, said) in json["value"].as_object().unwrap() {
+        match &**key {
+            "UaType" | "Value" | "Dimensions" => {}
+            "Status" | "StatusCode" => value["status"] = said["Code"].clone(),
+            "SourceTimestamp" => value["sourceTimestamp"] = json!(ticks(said.as_str().unwrap())),
+            "ServerTimestamp" => value["serverTimestamp"] = json!(ticks(said.as_str().unwrap())),
+            "SourcePicoseconds" => value["sourcePicoseconds"] = said.clone(),
+            "ServerPicoseconds" => value["serverPicoseconds"] = said.clone(),
+            other => panic!("{other} of a field"),
+        }
+    }
+    match json.get("index") {
+        Some(index) => json!({ "index": index, "value": value }),
+        None => value,
+    }
 }
 
 fn expected_variant(json: &Value) -> Value {
@@ -60,7 +103,11 @@ fn expected_variant(json: &Value) -> Value {
             .collect(),
         scalar => expected_scalar(builtin, scalar),
     };
-    json!({ "type": builtin.name(), "value": value })
+    let mut out = json!({ "type": builtin.name(), "value": value });
+    if let Some(dimensions) = json.get("Dimensions") {
+        out["dimensions"] = dimensions.clone();
+    }
+    out
 }
 
 fn expected_scalar(builtin: BuiltinType, json: &Value) -> Value {
@@ -85,6 +132,7 @@ fn expected_scalar(builtin: BuiltinType, json: &Value) -> Value {
             ))
         }
         BuiltinType::ExtensionObject => expected_structure(json),
+        BuiltinType::Variant => expected_variant(json),
         _ => json.clone(),
     }
 }

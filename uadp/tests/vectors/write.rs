@@ -1,32 +1,9 @@
-//! Writing a datagram that was read, in three ways that have to come to the same bytes.
+//! Three ways of writing the fields that were read, which have to come to the same bytes.
 
 use uadp::{
-    Array, BuiltinType, DecodeError, ExtensionBody, ExtensionObject, FieldEncoder, Fields,
-    MessageKind, NetworkMessage, NetworkMessageEncoder, NodeId, Scalar, Variant,
+    Array, BuiltinType, Encoded, ExtensionBody, ExtensionObject, FieldEncoder, Fields, Matrix,
+    NodeId, Scalar, Variant,
 };
-
-pub(crate) type WriteFields = fn(&mut FieldEncoder<'_>, Fields<'_>);
-
-pub(crate) fn rewrite(datagram: &[u8], fields: WriteFields) -> Result<Vec<u8>, DecodeError> {
-    let message = NetworkMessage::decode(datagram)?;
-    let writer_ids: Option<Vec<u16>> = message.writer_ids().map(Iterator::collect);
-    // Not from the start of the buffer: every position in it is relative.
-    let mut out = vec![0xAA; 3];
-    let mut encoder =
-        NetworkMessageEncoder::new(&mut out, message.header(), writer_ids.as_deref()).unwrap();
-    for data_set_message in message.messages() {
-        let data_set_message = data_set_message?;
-        if data_set_message.kind == MessageKind::KeepAlive {
-            encoder.keep_alive(&data_set_message.header).unwrap();
-            continue;
-        }
-        let mut field_encoder = encoder.key_frame(&data_set_message.header).unwrap();
-        fields(&mut field_encoder, data_set_message.fields()?);
-        field_encoder.finish().unwrap();
-    }
-    encoder.finish().unwrap();
-    Ok(out.split_off(3))
-}
 
 pub(crate) fn by_variant(encoder: &mut FieldEncoder<'_>, fields: Fields<'_>) {
     for field in fields {
@@ -57,6 +34,11 @@ pub(crate) fn by_parts(encoder: &mut FieldEncoder<'_>, fields: Fields<'_>) {
                     .unwrap();
             }
             Variant::Array(array) => write_elements(encoder, array),
+            Variant::Matrix(matrix) => {
+                let sizes: Vec<_> = matrix.dimensions().map(u32::to_le_bytes).collect();
+                let matrix = Matrix::new(matrix.elements(), &sizes).unwrap();
+                encoder.variant(&Variant::Matrix(matrix)).unwrap();
+            }
         }
     }
 }
@@ -73,6 +55,11 @@ fn write_elements(encoder: &mut FieldEncoder<'_>, array: Array<'_>) {
                 type_id,
                 body: ExtensionBody::Binary(body),
             }) => write_structure(encoder, type_id, body),
+            Scalar::Variant(value) => {
+                let mut buffer = Vec::new();
+                let value = Encoded::variant(&value.get().unwrap(), &mut buffer).unwrap();
+                encoder.element(Scalar::Variant(value)).unwrap();
+            }
             other => encoder.element(other).unwrap(),
         }
     }

@@ -1,0 +1,123 @@
+//! Wholes that travel in chunks, in any order, with others in between.
+
+use std::time::Duration;
+
+use uadp::{
+    ChunkBudget, Chunks, Extras, NetworkHeader, NetworkMessage, NetworkMessageType, PublisherId,
+    Reassembler, ReassemblyLimits, Whole,
+};
+
+use crate::input::Input;
+
+const LIMITS: ReassemblyLimits = ReassemblyLimits {
+    whole: 4096,
+    total: 16_384,
+    open: 6,
+    open_per_writer: 3,
+    pieces: 64,
+    age: Duration::from_millis(200),
+};
+
+/// More chunks than this add nothing.
+const CHUNKS: usize = 256;
+
+struct Sent {
+    datagram: Vec<u8>,
+    whole: usize,
+}
+
+/// Operations, a byte each: split a whole, deliver a chunk, deliver any datagram, let time pass. What comes out whole
+/// is what was split, and what is held stays within the limits.
+pub fn chunks(data: &[u8]) {
+    let mut input = Input::new(data);
+    let mut reassembler = Reassembler::new(LIMITS);
+    let mut wholes: Vec<Vec<u8>> = Vec::new();
+    let mut sent: Vec<Sent> = Vec::new();
+    let mut now = Duration::ZERO;
+    // Chunks of anybody can be put in between those of a whole: nothing is signed here.
+    let mut forged = false;
+    while !input.is_empty() {
+        match input.byte() % 4 {
+            0 if sent.len() < CHUNKS => split(&mut input, &mut wholes, &mut sent),
+            1 => {
+                let index = usize::from(input.byte());
+                if let Some(chunk) = sent.get(index) {
+                    let whole = wholes.get(chunk.whole).expect("split before");
+                    let came = deliver(&mut reassembler, &chunk.datagram, now);
+                    assert!(forged || came.is_none_or(|came| came == *whole));
+                }
+            }
+            2 => {
+                forged = true;
+                let datagram = [&[0xD1, 0x80, 0x01, 2][..], input.bytes()].concat();
+                deliver(&mut reassembler, &datagram, now);
+            }
+            3 => {
+                now += Duration::from_millis(input.byte().into());
+                reassembler.expire(now);
+                assert!(reassembler.poll_timeout().is_none_or(|at| at > now));
+            }
+            _ => {}
+        }
+        assert!(
+            reassembler.held() <= LIMITS.total,
+            "more is held than may be"
+        );
+    }
+}
+
+fn split(input: &mut Input<'_>, wholes: &mut Vec<Vec<u8>>, sent: &mut Vec<Sent>) {
+    let pattern = input.bytes();
+    let repeat = usize::from(input.byte() & 31) + 1;
+    let bytes = pattern.repeat(repeat);
+    let number = u16::try_from(wholes.len()).expect("few wholes");
+    let whole = Whole {
+        message_type: NetworkMessageType::DataSet,
+        writer_id: Some(u16::from(input.byte() & 1)),
+        message_sequence_number: number,
+        bytes: &bytes,
+    };
+    let budget = ChunkBudget {
+        network_message: usize::from(input.byte()) + 8,
+        ..ChunkBudget::IPV4
+    };
+    let header = NetworkHeader {
+        publisher_id: Some(PublisherId::Byte(2)),
+        ..NetworkHeader::default()
+    };
+    let Ok(mut chunks) = Chunks::new(&header, &Extras::default(), whole, budget) else {
+        return;
+    };
+    let mut buffer = Vec::new();
+    let before = sent.len();
+    while sent.len() < CHUNKS {
+        let Some(chunk) = chunks.append(&mut buffer, &Extras::default()) else {
+            break;
+        };
+        let start = chunk.expect("nothing is secured").start;
+        let datagram = buffer.split_off(start);
+        assert!(datagram.len() <= budget.network_message, "over the budget");
+        sent.push(Sent {
+            datagram,
+            whole: wholes.len(),
+        });
+    }
+    assert_chunks(sent.get(before..).unwrap_or_default());
+    wholes.push(bytes);
+}
+
+/// All but the last have as much of the whole (OPC 10000-14, 7.2.4.4.4).
+fn assert_chunks(sent: &[Sent]) {
+    let sizes: Vec<usize> = sent.iter().map(|chunk| chunk.datagram.len()).collect();
+    if let Some((last, others)) = sizes.split_last() {
+        assert!(others.windows(2).all(|pair| pair[0] == pair[1]));
+        assert!(others.iter().all(|size| size >= last));
+    }
+}
+
+fn deliver(reassembler: &mut Reassembler, datagram: &[u8], now: Duration) -> Option<Vec<u8>> {
+    let message = NetworkMessage::decode(datagram).ok()?;
+    let whole = reassembler.receive(&message, now).ok()??;
+    let _ = whole.data_set_message();
+    Some(whole.bytes.to_vec())
+}

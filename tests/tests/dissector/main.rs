@@ -1,0 +1,46 @@
+//! The Wireshark dissector in `docs/wireshark`: tshark has to show what was sent, and to point at what is wrong.
+
+mod messages;
+mod time;
+mod vectors;
+mod wrong;
+
+use system_tests::{Capture, Cell, Dissected, Peer};
+use vectors::Vector;
+
+/// A chunk that is wrong only to who knows what was meant: its bytes are those of another one that is right.
+const LOOKS_RIGHT: &str = "asyncua_chunk";
+
+/// tshark's view of one datagram.
+fn dissected(cell: &Cell, datagram: &[u8]) -> Dissected {
+    cell.dissect(&Capture::of([datagram]), &[]).remove(0)
+}
+
+#[test]
+fn every_vector_is_shown_as_described() {
+    let Some(cell) = Cell::with(&[Peer::Tshark]) else {
+        return;
+    };
+    let vectors = Vector::all();
+    let capture = Capture::of(vectors.iter().map(|vector| vector.datagram.clone()));
+    let shown = cell.dissect(&capture, &[]);
+    let mut differences = Vec::new();
+    let mut malformed = 0;
+    for (vector, shown) in vectors.iter().zip(&shown) {
+        assert!(!shown.has("uadp.dissector_bug"), "{}", vector.name);
+        if vector.is_malformed() && vector.name != LOOKS_RIGHT {
+            assert!(shown.has("uadp.malformed"), "{}", vector.name);
+            malformed += 1;
+            continue;
+        }
+        assert!(
+            !shown.has("uadp.malformed"),
+            "{}: {:?}",
+            vector.name,
+            shown.expert_infos()
+        );
+        differences.extend(vector.differences(shown));
+    }
+    assert!(differences.is_empty(), "{}", differences.join("\n"));
+    assert_eq!((vectors.len(), malformed), (195, 3));
+}
