@@ -270,6 +270,33 @@ fn metadata_is_chosen_by_publisher_group_and_writer() {
 }
 
 #[test]
+fn what_an_announcement_says_of_the_fields_is_metadata() {
+    let vector = Vector::load("composite_announce_metadata");
+    let announced = file("announced.hex", &vector.hex);
+    let shown: Value = serde_json::from_str(&run(&["decode", &announced]).quiet()).unwrap();
+    let fields = &shown["announcement"]["metaData"];
+    assert_eq!(fields[1]["name"], "pose");
+    let metadata = file("announced.json", fields.to_string());
+    // A Double, three Doubles, and a text of 32 bytes at most.
+    let pose = [1.0_f64, 2.0, 3.0].map(f64::to_le_bytes).concat();
+    let text = [&[2, 0, 0, 0][..], b"ok", &[0; 30]].concat();
+    let payload = [&0.5_f64.to_le_bytes()[..], &[3, 0, 0, 0], &pose, &text].concat();
+    // PublisherId 2234, one message of DataSetWriter 1, RawData.
+    let head = [0xD1, 0x01, 0xBA, 0x08, 1, 1, 0, 0x03];
+    let raw = file("announced.raw", [&head[..], &payload].concat());
+    let shown = run(&["decode", &raw, "--metadata", &metadata]).quiet();
+    let values: Vec<_> = fields_of(&shown)
+        .iter()
+        .map(|field| field["value"]["Value"].clone())
+        .collect();
+    assert_eq!(values, [json!(0.5), json!([1.0, 2.0, 3.0]), json!("ok")]);
+}
+
+fn fields_of(shown: &str) -> Vec<Value> {
+    fields(shown).as_array().unwrap().clone()
+}
+
+#[test]
 fn metadata_that_raw_data_cannot_have_is_refused_when_it_is_read() {
     let hex = file("refused_metadata.hex", Vector::load("raw_double").hex);
     for (metadata, said) in [

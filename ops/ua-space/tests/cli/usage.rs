@@ -214,6 +214,7 @@ fn values_survive_the_way_there_and_back() {
         { "UaType": 10, "Value": 3.4028235e38 },
         { "UaType": 11, "Value": -0.0 },
         { "UaType": 11, "Value": 5e-324 },
+        { "UaType": 11, "Value": 3.1415926518420854 },
         { "UaType": 11, "Value": "-Infinity" },
         { "UaType": 8, "Value": "-9223372036854775808" },
         { "UaType": 9, "Value": "18446744073709551615" },
@@ -312,6 +313,25 @@ fn padding_to_a_configured_size_is_kept() {
     assert_eq!(sizes, [json!(20), Value::Null, json!(9)]);
     assert_eq!(
         run_on(&["encode", "-"], shown.to_string().as_bytes()).quiet(),
+        hex
+    );
+}
+
+#[test]
+fn a_message_that_is_not_valid_is_kept_whatever_it_holds() {
+    // A cleared valid bit, then flags no message has; a good message behind it.
+    let hex = "f101020001050002 0a000b00 04000800 20ffeedd 010100062a000000".replace(' ', "");
+    let shown = run_on(&["decode", "-"], hex.as_bytes()).quiet();
+    let json: Value = serde_json::from_str(&shown).unwrap();
+    let messages = &json["dataSetMessages"];
+    assert_eq!(messages[0]["valid"], false);
+    assert_eq!(messages[0]["messageHex"], "20ffeedd");
+    assert_eq!(messages[0]["fields"], json!([]));
+    assert_eq!(messages[1]["fields"][0]["value"]["Value"], 42);
+    assert_eq!(
+        run_on(&["encode", "-"], shown.as_bytes())
+            .quiet()
+            .trim_end(),
         hex
     );
 }
