@@ -40,7 +40,8 @@ pub fn reader_state(data: &[u8]) {
                 if taken.is_ok() && plain && number.is_some() {
                     assert_ne!(last, number, "one message was taken twice");
                     last = number;
-                } else if taken.is_ok() {
+                } else if taken.is_ok() || number.is_none() {
+                    // What counts by other numbers starts them over.
                     last = None;
                 }
             }

@@ -186,7 +186,7 @@ impl<'a> DataSetMessage<'a> {
         match (self.kind, self.encoding()) {
             (MessageKind::KeepAlive, _) => Ok(Fields::NONE),
             (_, FieldEncoding::RawData) => Err(RAW_DATA),
-            // open62541 leaves out the FieldCount of a heartbeat, the tables of the standard do not.
+            // A heartbeat is its header (OPC 10000-14, 7.2.4.5.5); most peers know only the one with a FieldCount of 0.
             (MessageKind::KeyFrame, _) if self.payload.remaining() == 0 => Ok(Fields::NONE),
             (_, FieldEncoding::DataValue) => Err(DecodeError::Misread("encoded as DataValues")),
             (MessageKind::DeltaFrame, FieldEncoding::Variant) => Err(DecodeError::Misread(
@@ -506,7 +506,7 @@ fn read_kind(flags2: u8) -> Result<MessageKind, DecodeError> {
         KIND_DELTA_FRAME => Ok(MessageKind::DeltaFrame),
         KIND_EVENT => Ok(MessageKind::Event),
         KIND_KEEP_ALIVE => Ok(MessageKind::KeepAlive),
-        4 | 5 => Err(DecodeError::Unsupported("Action")),
+        5 | 6 => Err(DecodeError::Unsupported("Action")),
         kind => Err(DecodeError::Reserved {
             field: "DataSetMessage type",
             value: kind.into(),

@@ -327,7 +327,7 @@ fn read_time(
     };
     let picoseconds = match picoseconds {
         0 => None,
-        _ => Some(reader.u16("DataValue PicoSeconds")?),
+        _ => Some(reader.u16("DataValue PicoSeconds")?.min(MOST_PICOSECONDS)),
     };
     Ok((timestamp, picoseconds))
 }
@@ -424,6 +424,8 @@ const SERVER_TIMESTAMP: u8 = 0x08;
 const SOURCE_PICOSECONDS: u8 = 0x10;
 const SERVER_PICOSECONDS: u8 = 0x20;
 const DATA_VALUE_RESERVED: u8 = 0xC0;
+/// What decoders take more for (OPC 10000-6, 5.2.2.17).
+const MOST_PICOSECONDS: u16 = 9999;
 
 const SYMBOLIC_ID: u8 = 0x01;
 const NAMESPACE_URI: u8 = 0x02;
@@ -433,3 +435,20 @@ const ADDITIONAL_INFO: u8 = 0x10;
 const INNER_STATUS_CODE: u8 = 0x20;
 const INNER: u8 = 0x40;
 const DIAGNOSTIC_RESERVED: u8 = 0x80;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn picoseconds_of_a_whole_tick_and_more_are_read_as_the_most_there_are() {
+        let mask = SOURCE_PICOSECONDS | SERVER_PICOSECONDS;
+        let mut bytes = vec![mask];
+        for picoseconds in [9_998_u16, 10_000] {
+            bytes.extend_from_slice(&picoseconds.to_le_bytes());
+        }
+        let value = DataValue::read(&mut Reader::new(&bytes)).unwrap();
+        assert_eq!(value.source_picoseconds, Some(9_998));
+        assert_eq!(value.server_picoseconds, Some(9_999));
+    }
+}

@@ -19,7 +19,8 @@ pub use verdict::{Accepted, ReaderCounters, ReaderDrop};
 ///
 /// # What is new
 /// The DataSetMessageSequenceNumber tells by the window of OPC 10000-14, 7.2.3. Without it the SequenceNumber of the
-/// group header does, by which nothing lost is known; without either every message is new (6.2.9.6). A keep-alive
+/// group header does, by which nothing lost is known; without either every message is new (6.2.9.6). A writer that
+/// changes between the two is configured anew (7.2.4.5.4), so that its numbers start over. A keep-alive
 /// carries the number of the next message (7.2.4.5.8). A late message is dropped, or with
 /// [`accept_late`](ReaderSettings::accept_late) accepted once. A heartbeat is a key frame like any other.
 ///

@@ -212,7 +212,7 @@ impl Message {
 
     /// Checks that this is what was found.
     fn check(&self, found: &DataSetMessage<'_>) -> Result<(), TestCaseError> {
-        prop_assert_eq!(found.header, self.header);
+        prop_assert_eq!(found.header(), self.header);
         let kind = (found.kind, found.encoding());
         prop_assert_eq!(kind, self.payload.kind());
         if let Payload::Raw(bytes) = &self.payload {
@@ -477,7 +477,7 @@ proptest! {
     fn the_headers_come_back_as_they_were_written(sent in network()) {
         let datagram = sent.encode();
         let network = NetworkMessage::decode(&datagram).unwrap();
-        prop_assert_eq!(network.header(), &sent.header());
+        prop_assert_eq!(network.header(), sent.header());
         let ids: Option<Vec<u16>> = network.writer_ids().map(Iterator::collect);
         prop_assert_eq!(ids, sent.ids());
         prop_assert_eq!(network.security(), sent.security.as_ref().map(Security::header));
@@ -535,7 +535,7 @@ proptest! {
             if sent.size() <= size {
                 sent.check(&found)?;
             } else {
-                prop_assert!(!found.header.valid);
+                prop_assert!(!found.is_valid());
                 prop_assert_eq!(found.payload().len(), usize::from(size) - 1);
             }
         }
@@ -554,7 +554,7 @@ proptest! {
         let datagram = fixed.encode_sized(size);
         let network = NetworkMessage::decode(&datagram).unwrap();
         let mut out = Vec::new();
-        let encoder = NetworkMessageEncoder::new(&mut out, network.header(), None).unwrap();
+        let encoder = NetworkMessageEncoder::new(&mut out, &network.header(), None).unwrap();
         let mut encoder = encoder.fixed_layout(fixed.messages.len()).unwrap();
         encoder.configured_size(size);
         for message in fixed.read_sized(&network, size) {

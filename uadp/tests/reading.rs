@@ -168,7 +168,7 @@ fn an_invalid_message_is_yielded_as_such_whatever_stands_in_it() {
             .next()
             .unwrap()
             .unwrap();
-        assert!(!message.header.valid);
+        assert!(!message.is_valid());
     }
 }
 
@@ -206,10 +206,10 @@ fn reserved_values_are_refused() {
         reserved("PublisherId length", u32::MAX)
     );
     assert_eq!(
-        fields(&[0x81, 0x06]),
+        fields(&[0x81, 0x04]),
         Err(DecodeError::Reserved {
             field: "DataSetMessage type",
-            value: 6
+            value: 4
         })
     );
     assert_eq!(
@@ -259,8 +259,8 @@ fn what_this_crate_does_not_read_is_named() {
             );
         }
     }
-    assert_eq!(fields(&[0x81, 4]).map(|_| ()), unsupported("Action"));
     assert_eq!(fields(&[0x81, 5]).map(|_| ()), unsupported("Action"));
+    assert_eq!(fields(&[0x81, 6]).map(|_| ()), unsupported("Action"));
     let action_header = NetworkMessage::decode(&[0x81, 0x80, 0x20]).map(|_| ());
     assert_eq!(action_header, unsupported("Action"));
 }
@@ -934,7 +934,7 @@ fn messages_of_a_fixed_layout_are_found_by_their_offsets() {
     };
     assert_eq!(field(4, 7), Ok(Some(Scalar::Byte(7).into())));
     assert_eq!(field(13, 5), Ok(Some(Scalar::Byte(8).into())));
-    assert!(!network.data_set_message_at(11, 2).unwrap().header.valid);
+    assert!(!network.data_set_message_at(11, 2).unwrap().is_valid());
     for (offset, size) in [
         (3, 5),
         (0, 1),

@@ -325,7 +325,7 @@ fn the_offsets_point_at_what_a_repeated_message_changes() {
 
     let network = NetworkMessage::decode(&out[5..]).unwrap();
     assert_eq!(network.header().timestamp, Some(DateTime(4)));
-    let read = network.messages().next().unwrap().unwrap().header;
+    let read = network.messages().next().unwrap().unwrap().header();
     assert_eq!(
         (read.sequence_number, read.timestamp),
         (Some(5), Some(DateTime(6)))
@@ -561,7 +561,7 @@ fn a_message_longer_than_its_configured_size_becomes_invalid_and_its_neighbours_
     let read = NetworkMessage::decode(&out).unwrap();
     let valid: Vec<_> = read
         .messages()
-        .map(|message| message.unwrap().header.valid)
+        .map(|message| message.unwrap().is_valid())
         .collect();
     assert_eq!(valid, [true, false, true]);
 }

@@ -21,7 +21,7 @@ pub(crate) fn rewrite(datagram: &[u8], fields: WriteFields) -> Result<Vec<u8>, D
     let mut out = vec![0xAA; 3];
     let ids = writer_ids.as_deref();
     let mut encoder =
-        NetworkMessageEncoder::with(&mut out, network.header(), ids, &extras).unwrap();
+        NetworkMessageEncoder::with(&mut out, &network.header(), ids, &extras).unwrap();
     for message in network.messages() {
         rewrite_message(&message?, &mut encoder, fields)?;
     }
@@ -34,9 +34,12 @@ pub(crate) fn rewrite_message(
     encoder: &mut NetworkMessageEncoder<'_>,
     fields: WriteFields,
 ) -> Result<(), DecodeError> {
-    let header = &message.header;
+    let header = &message.header();
     match (message.kind, message.encoding()) {
         (MessageKind::KeepAlive, _) => encoder.keep_alive(header).unwrap(),
+        (MessageKind::KeyFrame, FieldEncoding::Variant) if message.payload().is_empty() => {
+            encoder.heartbeat(header).unwrap();
+        }
         (MessageKind::KeyFrame, FieldEncoding::Variant) => {
             let mut frame = encoder.key_frame(header).unwrap();
             fields(&mut frame, message.fields()?);

@@ -79,7 +79,7 @@ pub(crate) fn describe_messages(message: &NetworkMessage<'_>) -> Result<Value, D
 }
 
 fn describe_message(message: &DataSetMessage<'_>) -> Result<Value, DecodeError> {
-    let header = message.header;
+    let header = message.header();
     let mut out = Map::new();
     put(&mut out, "valid", Some(header.valid));
     put(&mut out, "sequenceNumber", header.sequence_number);
