@@ -15,8 +15,11 @@ pub use discovery::discovery;
 pub use reader_state::reader_state;
 pub use secured::secured;
 
+/// Panics when the codec does not keep its word on the input.
+pub type Target = fn(&[u8]);
+
 /// The targets by their names, which are also those of their folders under `corpus/`.
-pub const TARGETS: &[(&str, fn(&[u8]))] = &[
+pub const TARGETS: &[(&str, Target)] = &[
     ("chunks", chunks),
     ("decode", decode),
     ("discovery", discovery),

@@ -86,8 +86,10 @@ fn write_in_parts(
     writer::with_room(buf, |fixed| write_ids(fixed, header));
     match payload_header {
         PayloadHeader::Count(ids @ ([] | [_, _, ..])) => write_writer_ids(buf, ids)?,
-        one => {
-            writer::with_room(buf, |fixed: &mut Fixed<'_>| write_writer_id(fixed, one));
+        PayloadHeader::None | PayloadHeader::Count(_) | PayloadHeader::Chunk(_) => {
+            writer::with_room(buf, |fixed: &mut Fixed<'_>| {
+                write_writer_id(fixed, payload_header);
+            });
         }
     }
     let start = buf.len();

@@ -1,12 +1,25 @@
 //! UADP, the binary message mapping of OPC UA PubSub: NetworkMessages to and from bytes.
 //!
-//! Reads and writes data key frames and keep-alives (OPC 10000-14, 7.2.4) with fields encoded as Variants
-//! (OPC 10000-6, 5.2.2.16). What the standard has beyond that is [`DecodeError::Unsupported`]: delta frames, events,
-//! the DataValue and RawData field encodings, PromotedFields, chunks, message security, discovery messages,
-//! Actions, multi-dimensional arrays, and DataValue, Variant and DiagnosticInfo as values of a Variant.
+//! Everything in OPC 10000-14, 7.2.4 but Actions, in the versions 1.04 and 1.05, with the readings of the standard that
+//! peers differ in:
 //!
-//! No sockets, no clock, no thread: bytes in, values out. Reading borrows from the datagram and allocates nothing;
-//! writing appends to a buffer of the caller. No datagram makes either panic.
+//! | what | where |
+//! |---|---|
+//! | headers, read when asked for | [`NetworkMessage`], [`DataSetMessage`] |
+//! | fields as Variants or DataValues, in key frames, delta frames and events | [`DataSetMessage::fields`], [`DataSetMessage::values`] |
+//! | fields as RawData, by their metadata | [`RawLayout`] |
+//! | writing into a buffer of the caller | [`NetworkMessageEncoder`] |
+//! | a message of fixed layout, patched in place | [`MessageTemplate`] |
+//! | chunks | [`Chunks`], [`Reassembler`] |
+//! | message security: PubSub-Aes128-CTR and PubSub-Aes256-CTR | [`Opener`], [`Sealer`] |
+//! | probes and announcements, DataSetMetaData | [`discovery`] |
+//! | sequence numbers, timeouts and states | [`DataSetReaderState`], [`ReaderTable`], [`DataSetWriterState`] |
+//!
+//! Actions and Variants of the builtin types 26 to 31, which are not assigned yet, are [`DecodeError::Unsupported`].
+//!
+//! No sockets, no clock, no thread, no randomness: bytes, times and random numbers are parameters. Reading borrows from
+//! the datagram and allocates nothing; decrypting and reassembling use buffers that stay. Counts and lengths are held
+//! against the bytes that follow, nesting ends after 100 levels, and no datagram makes anything here panic.
 //!
 //! # Reading
 //! ```
@@ -122,3 +135,8 @@ pub use template::{Fixed, MessagePatch, MessageTemplate, PatchError};
 pub use time::{DateTime, Timestamp};
 pub use variant::{Array, Elements, Matrix, Variant};
 pub use writer_state::{DataSetWriterState, WriterSettings, WriterSettingsError};
+
+/// Runs the example of the README.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -1,6 +1,7 @@
 //! Measures the codec: without arguments wall time, with `count CASE N` just work for an instruction counter.
 
 mod ours;
+mod theirs;
 
 use std::hint::black_box;
 use std::process::ExitCode;
@@ -23,7 +24,9 @@ fn main() -> ExitCode {
     let arguments: Vec<&str> = arguments.iter().map(String::as_str).collect();
     match arguments[..] {
         [] => {
-            wall(&mut cases());
+            let mut both = cases();
+            both.extend(their_cases());
+            wall(&mut both);
             ExitCode::SUCCESS
         }
         ["list"] => {
@@ -80,6 +83,33 @@ fn cases() -> Vec<Case> {
                 }
             }));
         }
+    }
+    cases
+}
+
+/// Not counted, only timed.
+fn their_cases() -> Vec<Case> {
+    let mut cases = Vec::new();
+    for payload in Payload::ALL {
+        let message = theirs::message(payload);
+        let mut datagram = Vec::new();
+        ours::encode(payload, 1, &Config::new(), &mut datagram);
+        let written = theirs::encode(&message);
+        assert_eq!(
+            written.as_slice().len(),
+            datagram.len(),
+            "not the same message"
+        );
+        cases.push(case("zerodds encode", payload.name(), move |messages| {
+            for _ in 0..messages {
+                black_box(theirs::encode(&message));
+            }
+        }));
+        cases.push(case("zerodds decode", payload.name(), move |messages| {
+            for _ in 0..messages {
+                theirs::decode(black_box(&datagram));
+            }
+        }));
     }
     cases
 }
