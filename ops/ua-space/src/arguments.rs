@@ -15,17 +15,25 @@ pub(crate) struct Arguments {
 #[derive(Debug, Subcommand)]
 pub(crate) enum Verb {
     /// Show what a datagram, or each datagram of a capture, holds
+    ///
+    /// Reads a datagram as hexadecimal text or as its bytes, or the UDP datagrams of a pcap or pcapng file. One datagram
+    /// is shown as a JSON object, those of a capture as one object a line. What is wrong with a datagram is told on
+    /// stderr, with the offset of the byte.
+    ///
+    /// Exit codes: 0 done, 64 usage, 65 something is malformed or not to be opened, 74 a file that cannot be read or
+    /// an output that cannot be written.
     Decode(Decode),
-    /// Make datagrams from what `decode` shows
+    /// Make datagrams of what `decode` shows
+    ///
+    /// Writes the datagrams of a JSON object, of several one after the other or of an array, as hexadecimal text, a line
+    /// each. Flags and sizes follow from what is there.
+    ///
+    /// Exit codes: 0 done, 64 usage, 65 JSON that is no datagram, 74 a file that cannot be read or an output that cannot
+    /// be written.
     Encode(Encode),
 }
 
-/// Reads a datagram as hexadecimal text or as its bytes, or the UDP datagrams of a pcap or pcapng file.
-///
-/// One datagram is shown as a JSON object, those of a capture as one object a line. What is wrong with a datagram is
-/// said on stderr, with the offset of the byte; the exit code is 65 then.
 #[derive(Debug, Args)]
-#[command(verbatim_doc_comment)]
 pub(crate) struct Decode {
     /// The file, or - for stdin
     #[arg(value_name = "FILE")]
@@ -44,10 +52,7 @@ pub(crate) struct Decode {
     pub(crate) known: Known,
 }
 
-/// Writes the datagrams of a JSON object, of several one after the other or of an array, as hexadecimal text, a line
-/// each.
 #[derive(Debug, Args)]
-#[command(verbatim_doc_comment)]
 pub(crate) struct Encode {
     /// The file, or - for stdin
     #[arg(value_name = "FILE")]

@@ -5,7 +5,7 @@ use std::time::Duration;
 use serde_json::json;
 use uadp::discovery::{Announcement, Probe};
 use uadp::{
-    ChunkRefusal, DateTime, DecodeError, Extras, NetworkMessage, NetworkMessageEncoder,
+    ChunkRefusal, DateTime, DecodeError, Extras, Keys, NetworkMessage, NetworkMessageEncoder,
     NetworkMessageType, PublisherId, Reassembled, Reassembler, ReassemblyLimits, SecurityHeader,
 };
 
@@ -78,21 +78,48 @@ impl Context {
         reading: &mut Reading,
         chunks: Option<&mut Chunks>,
     ) {
+        let found = match keys.find(sealed) {
+            Ok(found) => found,
+            Err(why) => {
+                self.show(sealed, reading, None);
+                reading.refused = Some(why);
+                return;
+            }
+        };
+        // Where several keys share the one that signs, the right ones show by what comes out.
+        let reads = |keys: &&Keys| {
+            let mut tried = Reading {
+                bytes: sealed.datagram().to_vec(),
+                ..Reading::default()
+            };
+            self.show_opened(sealed, keys, &mut tried, None);
+            tried.faults.is_empty()
+        };
+        let right = match found.as_slice() {
+            [only] => Some(*only),
+            several => several.iter().copied().find(reads),
+        };
+        if let Some(keys) = right.or_else(|| found.first().copied()) {
+            self.show_opened(sealed, keys, reading, chunks);
+        }
+    }
+
+    fn show_opened(
+        &self,
+        sealed: &NetworkMessage<'_>,
+        keys: &Keys,
+        reading: &mut Reading,
+        chunks: Option<&mut Chunks>,
+    ) {
         let mut scratch = Vec::new();
-        let opened = keys.find(sealed).and_then(|keys| {
-            keys::open(keys, sealed, &mut scratch).map_err(|error| error.to_string())
-        });
-        match opened {
+        match keys::open(keys, sealed, &mut scratch) {
             Ok(message) => {
                 reading.bytes.truncate(sealed.payload_offset());
                 reading.bytes.extend_from_slice(message.payload());
                 reading.bytes.extend_from_slice(message.footer());
                 self.show(&message, reading, chunks);
             }
-            Err(why) => {
-                self.show(sealed, reading, None);
-                reading.refused = Some(why);
-            }
+            Err(why) => reading.refused = Some(why.to_string()),
         }
     }
 
@@ -250,14 +277,11 @@ impl Reading {
     }
 
     fn unreadable(&mut self, datagram: &[u8], error: DecodeError) {
-        let stop = |end| {
-            let prefix = datagram.get(..end)?;
-            Some((None, NetworkMessage::decode(prefix).err()?))
-        };
+        let stop = |bytes: &[u8]| Some((None, NetworkMessage::decode(bytes).err()?));
         let fault = Fault {
             place: Place::Headers,
             error,
-            offset: offset(datagram.len(), (None, error), stop),
+            offset: offset(datagram, (None, error), stop),
         };
         self.shape.malformed = Some(fault.to_string());
         self.faults.push(fault);
@@ -351,11 +375,11 @@ impl Reading {
             }
         };
         if let Err(error) = shown {
-            let stop = |end| Some((None, read(body.get(..end)?).err()?));
+            let stop = |bytes: &[u8]| Some((None, read(bytes).err()?));
             self.faults.push(Fault {
                 place: Place::Discovery,
                 error,
-                offset: start + offset(body.len(), (None, error), stop),
+                offset: start + offset(body, (None, error), stop),
             });
         }
     }
@@ -365,11 +389,10 @@ fn promoted_fault(message: &NetworkMessage<'_>, field: usize, error: DecodeError
     let fields = promoted_range(message).unwrap_or_default();
     let bytes = message.datagram().get(fields.clone()).unwrap_or_default();
     let stop = (Some(field), error);
-    let read = |end| {
+    let read = |bytes: &[u8]| {
         // A NetworkMessage of nothing but these fields.
-        let size = u16::try_from(end).ok()?.to_le_bytes();
-        let head = [0x81, 0x80, 0x02, size[0], size[1]];
-        let datagram = [&head, bytes.get(..end)?].concat();
+        let size = u16::try_from(bytes.len()).ok()?.to_le_bytes();
+        let datagram = [&[0x81, 0x80, 0x02, size[0], size[1]], bytes].concat();
         let message = NetworkMessage::decode(&datagram).ok()?;
         let mut read = 0;
         for field in message.promoted_fields()? {
@@ -383,7 +406,7 @@ fn promoted_fault(message: &NetworkMessage<'_>, field: usize, error: DecodeError
     Fault {
         place: Place::PromotedField(field),
         error,
-        offset: fields.start + offset(bytes.len(), stop, read),
+        offset: fields.start + offset(bytes, stop, read),
     }
 }
 

@@ -1,4 +1,8 @@
 //! From JSON to a datagram.
+//!
+//! What is written says what was read, in the usual way: flag bytes that announce nothing are left out, a true Boolean
+//! is 1, a NaN that of OPC 10000-6, 5.2.2.3, a NodeId has its shortest encoding, an array of dimensions only where there
+//! are two or more, a key frame always its FieldCount, a discovery message always its SecurityHeader.
 
 use std::str::FromStr;
 
@@ -354,6 +358,20 @@ impl Security {
     }
 }
 
+/// The bytes of a DataSetMessage by itself.
+pub(crate) fn message_bytes(
+    json: &shape::DataSetMessage,
+    layout: Option<&Layout<'_>>,
+) -> Result<Vec<u8>, WrongValue> {
+    let mut out = Vec::new();
+    let mut encoder = NetworkMessageEncoder::new(&mut out, &NetworkHeader::default(), None)?;
+    let headers = encoder.payload_offset();
+    let reading = layout.map_or(RawReading::Standard, Layout::reading);
+    write_message(json, layout, reading, &mut encoder)?;
+    encoder.finish()?;
+    Ok(out.split_off(headers))
+}
+
 fn write_message(
     json: &shape::DataSetMessage,
     known: Option<&Layout<'_>>,
@@ -366,6 +384,15 @@ fn write_message(
         return Err(WrongValue::new(format!("is malformed ({why})")));
     }
     encoder.configured_size(json.configured_size.unwrap_or_default());
+    if let Some(text) = &json.message_hex {
+        let message = bytes(text).map_err(|wrong| wrong.at(".messageHex"))?;
+        return Ok(encoder.raw_key_frame(&DataSetHeader::default(), |out| {
+            // In the place of the one byte of flags.
+            out.pop();
+            out.extend(message);
+            Ok(())
+        })?);
+    }
     let header = data_set_header(json)?;
     match (json.kind, json.field_encoding) {
         (MessageKind::KeepAlive, _) => Ok(encoder.keep_alive(&header)?),

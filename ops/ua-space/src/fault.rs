@@ -1,7 +1,7 @@
 //! What is wrong with a datagram, and at which byte.
 //!
-//! A decoding error names the field and not where it stands. It is found by decoding prefixes: reading goes strictly
-//! from left to right, so a fault shows as soon as the bytes reach it and not before.
+//! A decoding error names the field and not where it stands. That is found by reading again with other bytes behind a
+//! place: reading goes strictly from left to right, so as long as they are behind the fault they change nothing.
 
 use std::fmt;
 
@@ -38,19 +38,20 @@ pub(crate) struct MessagePlace {
 /// Why reading stopped: after how many parts, and the error.
 pub(crate) type Stop = (Option<usize>, DecodeError);
 
-/// Bytes before what made reading `length` bytes stop. `read` reads so many of them from the start.
+/// Bytes before what makes reading `bytes` stop. `read` tells where it stops in others like them.
 ///
-/// At most some 30 prefixes are read.
-pub(crate) fn offset(length: usize, stop: Stop, read: impl Fn(usize) -> Option<Stop>) -> usize {
+/// At most some 40 of those are read.
+pub(crate) fn offset(bytes: &[u8], stop: Stop, read: impl Fn(&[u8]) -> Option<Stop>) -> usize {
     let (_, error) = stop;
+    let shorter = |end: usize| read(bytes.get(..end)?);
     if let DecodeError::Truncated { found, .. } = error
-        && read(length.saturating_sub(1)) != Some(stop)
+        && shorter(bytes.len().saturating_sub(1)) != Some(stop)
     {
         // How many bytes were left says where they were missed; else what was read ends before the bytes do.
-        return length.saturating_sub(found);
+        return bytes.len().saturating_sub(found);
     }
     if let DecodeError::TrailingBytes(left) = error {
-        return length.saturating_sub(left);
+        return bytes.len().saturating_sub(left);
     }
     if let DecodeError::Reserved { field, .. } = error
         && field == "field encoding"
@@ -58,19 +59,48 @@ pub(crate) fn offset(length: usize, stop: Stop, read: impl Fn(usize) -> Option<S
         // Bits of the first byte, looked at after those of the second.
         return 0;
     }
-    // The longest prefix that does not show the fault ends inside of what is at fault, or before it.
-    let (mut before, mut end) = (0, length);
+    let end = end(bytes, stop, &read);
+    let last = end.saturating_sub(1);
+    // Without its last byte, what is at fault is cut off: that says where it starts.
+    if let Some((_, DecodeError::Truncated { found, .. })) = shorter(last) {
+        return last.saturating_sub(found);
+    }
+    end.saturating_sub(width(error))
+}
+
+/// Where what is at fault ends: what stands behind makes no difference. The length does not change, as counts are
+/// held against it.
+fn end(bytes: &[u8], stop: Stop, read: &impl Fn(&[u8]) -> Option<Stop>) -> usize {
+    let mut other = bytes.to_vec();
+    let (mut before, mut end) = (0, bytes.len());
     while end - before > 1 {
         let middle = before + (end - before) / 2;
-        match read(middle) == Some(stop) {
+        let stays = [0x00, 0xFF].into_iter().all(|filler| {
+            if let Some((head, tail)) = other.split_at_mut_checked(middle) {
+                head.copy_from_slice(bytes.get(..middle).unwrap_or_default());
+                tail.fill(filler);
+            }
+            read(&other) == Some(stop)
+        });
+        match stays {
             true => end = middle,
             false => before = middle,
         }
     }
-    if let Some((_, DecodeError::Truncated { found, .. })) = read(before) {
-        return before.saturating_sub(found);
+    end
+}
+
+/// Bytes of what is at fault, where nothing else tells.
+fn width(error: DecodeError) -> usize {
+    if let DecodeError::Limit { field, .. } = error {
+        return if field == "FieldCount" { 2 } else { 4 };
     }
-    before
+    if let DecodeError::Reserved { value, .. } = error
+        && value > 0xFF
+    {
+        return 4;
+    }
+    1
 }
 
 /// Where an error stands that came after so many fields: what is behind the last one is in none.
@@ -163,8 +193,7 @@ mod tests {
     }
 
     fn offset_in(bytes: &[u8]) -> usize {
-        let stop = read(bytes).unwrap();
-        offset(bytes.len(), stop, |end| read(&bytes[..end]))
+        offset(bytes, read(bytes).unwrap(), read)
     }
 
     #[test]

@@ -73,17 +73,21 @@ impl KeyFile {
         Ok(Self { name, entries })
     }
 
-    /// The keys that open a sealed message.
+    /// The keys with which the signature of a sealed message is right, at least one.
     ///
     /// Each message is opened by itself, so that one sent twice is shown twice.
-    pub(crate) fn find(&self, message: &NetworkMessage<'_>) -> Result<&Keys, String> {
+    pub(crate) fn find(&self, message: &NetworkMessage<'_>) -> Result<Vec<&Keys>, String> {
         let token_id = message.security().map_or(0, |security| security.token_id);
+        let mut found = Vec::new();
         let mut why = None;
         for entry in self.entries.iter().filter(|entry| entry.fits(message)) {
             match open(&entry.keys, message, &mut Vec::new()) {
-                Ok(_) => return Ok(&entry.keys),
+                Ok(_) => found.push(&entry.keys),
                 Err(error) => why = Some(error),
             }
+        }
+        if !found.is_empty() {
+            return Ok(found);
         }
         Err(match why {
             None => format!(

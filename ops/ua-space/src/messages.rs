@@ -5,7 +5,7 @@ use uadp::{DataSetMessage, DecodeError, FieldEncoding, MessageKind, NetworkMessa
 use crate::fault::{Fault, MessagePlace, Place, Stop, in_field, offset};
 use crate::raw_data::Layout;
 use crate::values::{show_data_value, show_variant};
-use crate::{decode, hex, shape};
+use crate::{decode, encode, hex, shape};
 
 /// A DataSetMessage of a payload.
 pub(crate) struct Part<'a> {
@@ -84,8 +84,10 @@ pub(crate) fn read(
                 shown.configured_size =
                     configured_size(&message, bytes, layout, shown.fields.len());
             }
-            // Nothing behind a cleared valid bit means anything.
-            stop.filter(|_| message.is_valid())
+            if !message.is_valid() {
+                return (show_invalid(shown, bytes, layout), None);
+            }
+            stop
         }
         Err(error) => Some((None, error)),
     };
@@ -95,9 +97,7 @@ pub(crate) fn read(
             writer_id: part.writer_id,
             field,
         };
-        let in_message = offset(bytes.len(), stop, |end| {
-            read_prefix(bytes.get(..end)?, layout)
-        });
+        let in_message = offset(bytes, stop, |bytes| stop_of(bytes, layout));
         Fault {
             place: Place::Message(place),
             error,
@@ -108,8 +108,8 @@ pub(crate) fn read(
     (shown, fault)
 }
 
-/// Where reading a piece of a DataSetMessage stops.
-fn read_prefix(bytes: &[u8], layout: Option<&Layout<'_>>) -> Option<Stop> {
+/// Where reading a DataSetMessage stops.
+fn stop_of(bytes: &[u8], layout: Option<&Layout<'_>>) -> Option<Stop> {
     match DataSetMessage::decode(None, bytes) {
         Ok(message) => read_fields(&message, layout, |_| {}).err(),
         Err(error) => Some((None, error)),
@@ -149,12 +149,26 @@ fn show_rest(
     if is_raw && let Some(layout) = layout {
         shown.meta_data = Some(layout.metadata().to_vec());
     }
-    if stopped && !message.is_valid() {
-        shown.fields.clear();
-    }
     let unknown = is_raw && layout.is_none() && !message.payload().is_empty();
-    if unknown || (stopped && (is_raw || !message.is_valid())) {
+    if unknown || (stopped && is_raw) {
         shown.raw_data_hex = Some(hex::text(message.payload()));
+    }
+}
+
+/// Nothing behind a cleared valid bit means anything, so it is shown only where it might: where it would be written
+/// the same again.
+fn show_invalid(
+    shown: shape::DataSetMessage,
+    bytes: &[u8],
+    layout: Option<&Layout<'_>>,
+) -> shape::DataSetMessage {
+    if encode::message_bytes(&shown, layout).is_ok_and(|again| again == bytes) {
+        return shown;
+    }
+    shape::DataSetMessage {
+        valid: false,
+        message_hex: Some(hex::text(bytes)),
+        ..shape::DataSetMessage::default()
     }
 }
 

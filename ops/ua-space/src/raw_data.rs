@@ -18,7 +18,7 @@ use crate::values::{WrongValue, show_scalar, show_variant, variant_bytes};
 pub(crate) struct Layout<'a> {
     metadata: &'a [FieldMetaData],
     fields: Vec<RawField<'a>>,
-    dialect: RawDialect,
+    reading: RawReading,
 }
 
 impl<'a> Layout<'a> {
@@ -35,15 +35,22 @@ impl<'a> Layout<'a> {
         RawLayout::new(&fields).map_err(|error| {
             WrongValue::new(error.fault.to_string()).at(&format!(".metaData[{}]", error.field))
         })?;
-        let dialect = match reading {
-            RawReading::Standard => RawDialect::Standard,
-            RawReading::Open62541 => RawDialect::Open62541,
-        };
         Ok(Self {
             metadata,
             fields,
-            dialect,
+            reading,
         })
+    }
+
+    pub(crate) const fn reading(&self) -> RawReading {
+        self.reading
+    }
+
+    const fn dialect(&self) -> RawDialect {
+        match self.reading {
+            RawReading::Standard => RawDialect::Standard,
+            RawReading::Open62541 => RawDialect::Open62541,
+        }
     }
 
     pub(crate) const fn metadata(&self) -> &'a [FieldMetaData] {
@@ -54,7 +61,7 @@ impl<'a> Layout<'a> {
     pub(crate) fn read(&self, payload: &[u8], mut each: impl FnMut(Field)) -> Result<(), Stop> {
         let layout = RawLayout::new(&self.fields)
             .map_err(|_| (None, DecodeError::Misread("not what its metadata says")))?;
-        for (value, at) in layout.read(payload, self.dialect).zip(0..) {
+        for (value, at) in layout.read(payload, self.dialect()).zip(0..) {
             let value = value.and_then(|value| show_raw(&value));
             let value = value.map_err(|error| in_field(at, error))?;
             each(Field { index: None, value });
@@ -78,7 +85,7 @@ impl<'a> Layout<'a> {
         let mut payload = Vec::new();
         if !values.is_empty() {
             layout
-                .write(&mut payload, self.dialect, values)
+                .write(&mut payload, self.dialect(), values)
                 .map_err(|error| {
                     let path = format!(".fields[{}]", error.field);
                     WrongValue::new(error.fault.to_string()).at(&path)

@@ -247,6 +247,9 @@ pub(crate) struct DataSetMessage {
     /// Bytes it is padded to with zeros.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) configured_size: Option<u16>,
+    /// All bytes of a message that is not valid, where the other keys do not tell them.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) message_hex: Option<String>,
     /// RawData as it stands, where no metadata says what it holds.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) raw_data_hex: Option<String>,
@@ -269,6 +272,7 @@ impl Default for DataSetMessage {
             major_version: None,
             minor_version: None,
             configured_size: None,
+            message_hex: None,
             raw_data_hex: None,
             meta_data: None,
             fields: Vec::new(),

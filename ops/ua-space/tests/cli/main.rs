@@ -1,12 +1,11 @@
 //! `ua-space` as its users run it.
 
-#![expect(
-    clippy::unwrap_used,
-    clippy::panic,
-    clippy::indexing_slicing,
-    reason = "test code"
-)]
+#![expect(clippy::unwrap_used, clippy::indexing_slicing, reason = "test code")]
 
+mod captures;
+mod malformed;
 mod normal;
 mod program;
+mod secured;
+mod usage;
 mod vectors;
