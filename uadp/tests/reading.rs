@@ -651,11 +651,52 @@ fn a_diagnostic_info_is_what_its_mask_says() {
         inner: info.inner,
     };
     assert_eq!(info, expected);
+    let none = DiagnosticInfo::default();
     let null = DiagnosticInfo {
         additional_info: Some(None),
-        ..DiagnosticInfo::default()
+        ..none
     };
     assert_eq!(inner, null);
+}
+
+#[test]
+fn each_index_of_a_diagnostic_info_has_its_bit() {
+    let none = DiagnosticInfo::default();
+    let nine = Some(9);
+    for (mask, expected) in [
+        (
+            0x01,
+            DiagnosticInfo {
+                symbolic_id: nine,
+                ..none
+            },
+        ),
+        (
+            0x02,
+            DiagnosticInfo {
+                namespace_uri: nine,
+                ..none
+            },
+        ),
+        (
+            0x04,
+            DiagnosticInfo {
+                localized_text: nine,
+                ..none
+            },
+        ),
+        (
+            0x08,
+            DiagnosticInfo {
+                locale: nine,
+                ..none
+            },
+        ),
+    ] {
+        let bytes = [mask, 9, 0, 0, 0];
+        let info = Encoded::<DiagnosticInfo<'_>>::new(&bytes).unwrap().get();
+        assert_eq!(info, Ok(expected), "mask {mask:#x}");
+    }
 }
 
 #[test]
@@ -775,6 +816,18 @@ fn a_secured_message_shows_its_headers_and_no_messages() {
         let placed = message.data_set_message_at(start, 5);
         assert_eq!(placed.unwrap_err(), sealed);
     }
+}
+
+#[test]
+fn the_footer_of_a_secured_message_is_part_of_what_is_sealed() {
+    let datagram = [
+        0x81, 0x10, 0x06, 9, 0, 0, 0, 0, 2, 0, // encrypted, with a footer of two bytes
+        1, 2, 3,
+    ];
+    let message = NetworkMessage::decode(&datagram).unwrap();
+    assert_eq!(message.security().unwrap().footer_size, Some(2));
+    assert_eq!(message.footer(), []);
+    assert_eq!(message.payload(), [1, 2, 3]);
 }
 
 #[test]
