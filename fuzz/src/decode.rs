@@ -59,7 +59,10 @@ fn is_readable(message: &DataSetMessage<'_>) -> bool {
 }
 
 fn visit(variant: Variant<'_>, depth: usize) -> bool {
-    assert!(depth <= 101, "nesting is bounded");
+    assert!(
+        depth <= usize::from(uadp::MAX_NESTING) + 1,
+        "nesting is bounded"
+    );
     match variant {
         Variant::Null => true,
         Variant::Scalar(scalar) => visit_scalar(scalar, depth),
@@ -105,7 +108,10 @@ fn visit_data_value(value: &DataValue<'_>, depth: usize) -> bool {
 }
 
 fn visit_diagnostic_info(info: &DiagnosticInfo<'_>, depth: usize) -> bool {
-    assert!(depth <= 101, "nesting is bounded");
+    assert!(
+        depth <= usize::from(uadp::MAX_NESTING) + 1,
+        "nesting is bounded"
+    );
     info.inner
         .is_none_or(|inner| visit_diagnostic_info(&inner.get().expect("checked"), depth + 1))
 }

@@ -132,3 +132,10 @@ fn the_server_knows_no_ros_library() {
 fn the_check_sees_what_a_shell_reaches() {
     assert!(forbidden(&tree("bridge-node"), IMPURE).contains(&"tokio".to_owned()));
 }
+
+#[test]
+fn nobody_depends_on_the_tools_of_ops() {
+    for program in ["bridge-ros1", "bridge-ros2", "ua-server"] {
+        does_not_reach(program, &["ua-space"]);
+    }
+}

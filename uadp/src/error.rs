@@ -46,8 +46,8 @@ pub enum DecodeError {
         /// Elements there are.
         elements: usize,
     },
-    /// Values nested in values beyond the 100 levels that are read (OPC 10000-6, 5.2.2.12 and 5.2.2.16).
-    #[error("values nested deeper than 100 levels")]
+    /// Values nested in values beyond [`MAX_NESTING`](crate::MAX_NESTING).
+    #[error("values nested deeper than {MAX_NESTING} levels", MAX_NESTING = crate::MAX_NESTING)]
     TooDeep,
     /// So many bytes stand after the end of the message and are not zero padding.
     #[error("{0} bytes after the end of the message")]

@@ -19,7 +19,7 @@
 //!
 //! No sockets, no clock, no thread, no randomness: bytes, times and random numbers are parameters. Reading borrows from
 //! the datagram and allocates nothing; decrypting and reassembling use buffers that stay. Counts and lengths are held
-//! against the bytes that follow, nesting ends after 100 levels, and no datagram makes anything here panic.
+//! against the bytes that follow, nesting ends at [`MAX_NESTING`], and no datagram makes anything here panic.
 //!
 //! # Reading
 //! ```
@@ -107,7 +107,7 @@ pub use error::{DecodeError, EncodeError};
 pub use field_encoder::{DataValueEncoder, DeltaEncoder, FieldEncoder};
 pub use header::{GroupHeader, NetworkHeader, NetworkMessageType, PublisherId, SecurityHeader};
 pub use header_writer::Extras;
-pub use nested::{DataValue, DiagnosticInfo, Encoded};
+pub use nested::{DataValue, DiagnosticInfo, Encoded, MAX_NESTING};
 pub use network_message::{Chunk, Messages, NetworkMessage, PromotedFields};
 pub use node_id::{ExpandedNodeId, Identifier, NodeId};
 pub use publisher_id::OwnedPublisherId;

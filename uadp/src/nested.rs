@@ -62,6 +62,12 @@ pub(crate) trait Nest<'a>: Sized {
     }
 }
 
+/// Levels of values in values that are read, beyond which there is [`DecodeError::TooDeep`].
+///
+/// Version 1.05 expects no decoder to take more than 10 levels of DiagnosticInfo, and at least 4 (OPC 10000-6,
+/// 5.2.2.12). Every level more would let a datagram that nests as deep cost a reader of all its values that much more.
+pub const MAX_NESTING: u8 = 10;
+
 /// How many levels a value may still hold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Depth {
@@ -73,9 +79,7 @@ pub(crate) enum Depth {
 }
 
 impl Depth {
-    /// The standard asks decoders for 100 levels and for an error beyond what they have (OPC 10000-6, 5.2.2.12
-    /// and 5.2.2.16).
-    pub(crate) const FULL: Self = Self::Left(100);
+    pub(crate) const FULL: Self = Self::Left(MAX_NESTING);
 
     #[inline]
     pub(crate) fn inner(self) -> Result<Self, DecodeError> {
