@@ -213,8 +213,21 @@ fn same(one: &NetworkMessage<'_>, other: &NetworkMessage<'_>) {
         assert_eq!(one.kind, other.kind);
         if let (Ok(one), Ok(other)) = (one.values(), other.values()) {
             for (one, other) in one.zip(other) {
+                let (one, other) = (one.expect("read before"), other.expect("written"));
+                assert_eq!(one.index, other.index);
+                let (one, other) = (as_written(one.value), other.value);
                 assert_eq!(format!("{one:?}"), format!("{other:?}"));
             }
         }
     }
+}
+
+/// A matrix of fewer than two dimensions, or without elements, is written as an array.
+fn as_written(mut value: DataValue<'_>) -> DataValue<'_> {
+    if let Some(Variant::Matrix(matrix)) = value.value
+        && (matrix.dimensions().len() < 2 || matrix.elements().is_empty())
+    {
+        value.value = Some(Variant::Array(matrix.elements()));
+    }
+    value
 }
