@@ -1377,7 +1377,7 @@ local function read_metadata(ctx, cur, tree)
         read_schema(ctx, cur, item)
         local name = text(ctx, cur, item, "metadata.name", "Name") or ""
         read_description(ctx, cur, item, "metadata.description")
-        local count = cur:count("Fields", 50) or 0
+        local count = cur:count("Fields", 42) or 0
         for _ = 1, count do
             read_field_metadata(ctx, cur, item)
         end

@@ -8,7 +8,11 @@ use uadp::{
     QualifiedName, Scalar, StatusCode, Variant,
 };
 
-use crate::{dissected, time::ticks, vectors::Vector};
+use crate::{
+    dissected,
+    time::ticks,
+    vectors::{Vector, unhex},
+};
 
 const NOON: DateTime = DateTime(134_234_948_967_890_123);
 
@@ -237,26 +241,12 @@ fn the_info_column_tells_kinds_sequence_numbers_and_fields() {
 }
 
 #[test]
-fn values_of_all_builtin_types_are_shown_under_their_types() {
+fn plain_values_are_shown_under_their_types() {
     let Some(cell) = Cell::with(&[Peer::Tshark]) else {
         return;
     };
     let guid = Guid::from_fields(1, 2, 3, [4; 8]);
-    let (mut variant, mut value, mut diagnostic) = (Vec::new(), Vec::new(), Vec::new());
-    let inner = Variant::Scalar(Scalar::UInt16(77));
-    let data_value = DataValue {
-        value: Some(inner),
-        status: Some(StatusCode(0x4090_0000)),
-        ..DataValue::default()
-    };
-    let diagnostic_info = DiagnosticInfo {
-        symbolic_id: Some(-1),
-        additional_info: Some(Some("more")),
-        inner_status_code: Some(StatusCode(0x8000_0000)),
-        ..DiagnosticInfo::default()
-    };
     let scalars = [
-        (Scalar::Boolean(true), "1"),
         (Scalar::SByte(-128), "-128"),
         (Scalar::Byte(255), "255"),
         (Scalar::Int16(-32_768), "-32768"),
@@ -268,6 +258,7 @@ fn values_of_all_builtin_types_are_shown_under_their_types() {
         (Scalar::Float(-0.5), "-0.5"),
         (Scalar::Double(1e300), "1e+300"),
         (Scalar::String(Some("grüß\"e\" 🤖")), "grüß\"e\" 🤖"),
+        (Scalar::String(Some("a\0b")), "a␀b"),
         (Scalar::Guid(guid), "00000001-0002-0003-0404-040404040404"),
         (Scalar::ByteString(Some(&[0, 1, 255])), "00:01:ff"),
         (Scalar::XmlElement(Some("<a/>")), "<a/>"),
@@ -278,32 +269,90 @@ fn values_of_all_builtin_types_are_shown_under_their_types() {
         for (scalar, _) in scalars {
             fields.scalar(scalar).unwrap();
         }
+        fields.scalar(Scalar::Boolean(true)).unwrap();
         fields.scalar(Scalar::DateTime(NOON)).unwrap();
-        fields
-            .scalar(Scalar::ExpandedNodeId(ExpandedNodeId {
-                node_id: NodeId::numeric(0, 7),
-                namespace_uri: Some("urn:x"),
-                server_index: 9,
-            }))
-            .unwrap();
-        fields
-            .scalar(Scalar::QualifiedName(QualifiedName {
-                namespace: 1,
-                name: Some("Speed"),
-            }))
-            .unwrap();
-        fields
-            .scalar(Scalar::LocalizedText(LocalizedText {
-                locale: Some("de"),
-                text: Some("auf"),
-            }))
-            .unwrap();
-        fields
-            .scalar(Scalar::ExtensionObject(ExtensionObject {
-                type_id: NodeId::numeric(3, 5),
-                body: ExtensionBody::Binary(&[1, 2, 3]),
-            }))
-            .unwrap();
+    });
+    let shown = dissected(&cell, &datagram);
+    assert!(shown.expert_infos().is_empty());
+    let fields = shown.parts("uadp.field");
+    for (field, (scalar, text)) in fields.iter().zip(scalars) {
+        let builtin = scalar.builtin_type();
+        let name = format!("field.{}", builtin.name().to_lowercase());
+        assert_shown(
+            field,
+            &[(&name, text), ("field.type", &builtin.id().to_string())],
+        );
+    }
+    let [boolean, time] = &fields[scalars.len()..] else {
+        panic!("{} fields", fields.len());
+    };
+    assert!(boolean.is_set("uadp.field.boolean"));
+    assert_eq!(ticks(&time.one("uadp.field.datetime").unwrap()), NOON.0);
+}
+
+#[test]
+fn values_of_several_parts_are_shown_part_by_part() {
+    let Some(cell) = Cell::with(&[Peer::Tshark]) else {
+        return;
+    };
+    let scalars = [
+        Scalar::ExpandedNodeId(ExpandedNodeId {
+            node_id: NodeId::numeric(0, 7),
+            namespace_uri: Some("urn:x"),
+            server_index: 9,
+        }),
+        Scalar::QualifiedName(QualifiedName {
+            namespace: 1,
+            name: Some("Speed"),
+        }),
+        Scalar::LocalizedText(LocalizedText {
+            locale: Some("de"),
+            text: Some("auf"),
+        }),
+        Scalar::ExtensionObject(ExtensionObject {
+            type_id: NodeId::numeric(3, 5),
+            body: ExtensionBody::Binary(&[1, 2, 3]),
+        }),
+    ];
+    let datagram = key_frame(|fields| {
+        for scalar in scalars {
+            fields.scalar(scalar).unwrap();
+        }
+    });
+    assert_shown(
+        &dissected(&cell, &datagram),
+        &[
+            ("field.expandednodeid", "svr=9;nsu=urn:x;i=7"),
+            ("field.qualifiedname", "1:Speed"),
+            ("field.localizedtext.locale", "de"),
+            ("field.localizedtext.text", "auf"),
+            ("field.extensionobject.type_id", "ns=3;i=5"),
+            ("field.extensionobject.body", "01:02:03"),
+        ],
+    );
+}
+
+#[test]
+fn values_in_values_are_shown_below_them() {
+    let Some(cell) = Cell::with(&[Peer::Tshark]) else {
+        return;
+    };
+    let inner = Variant::Scalar(Scalar::UInt16(77));
+    let data_value = DataValue {
+        value: Some(inner),
+        status: Some(StatusCode(0x4090_0000)),
+        ..DataValue::default()
+    };
+    let diagnostic_info = DiagnosticInfo {
+        symbolic_id: Some(-1),
+        locale: Some(3),
+        localized_text: Some(4),
+        additional_info: Some(Some("more")),
+        inner_status_code: Some(StatusCode(0x8000_0000)),
+        ..DiagnosticInfo::default()
+    };
+    let (mut variant, mut value, mut diagnostic) = (Vec::new(), Vec::new(), Vec::new());
+    let datagram = key_frame(|fields| {
         let encoded = Encoded::data_value(&data_value, &mut value).unwrap();
         fields.scalar(Scalar::DataValue(encoded)).unwrap();
         let encoded = Encoded::diagnostic_info(&diagnostic_info, &mut diagnostic).unwrap();
@@ -312,56 +361,24 @@ fn values_of_all_builtin_types_are_shown_under_their_types() {
         let nested = Array::new(BuiltinType::Variant, 1, encoded.bytes()).unwrap();
         fields.variant(&nested.into()).unwrap();
     });
-
     let shown = dissected(&cell, &datagram);
-    assert!(shown.expert_infos().is_empty());
-    let fields = shown.parts("uadp.field");
-    for (field, (scalar, text)) in fields.iter().zip(scalars) {
-        let name = format!("field.{}", scalar.builtin_type().name().to_lowercase());
-        if name == "field.boolean" {
-            assert!(field.is_set("uadp.field.boolean"));
-        } else {
-            assert_shown(field, &[(&name, text)]);
-        }
-        assert_shown(
-            field,
-            &[("field.type", &scalar.builtin_type().id().to_string())],
-        );
-    }
-    let rest = &fields[scalars.len()..];
-    assert_eq!(ticks(&rest[0].one("uadp.field.datetime").unwrap()), NOON.0);
-    assert_shown(&rest[1], &[("field.expandednodeid", "svr=9;nsu=urn:x;i=7")]);
-    assert_shown(&rest[2], &[("field.qualifiedname", "1:Speed")]);
+    let data_values = shown.parts("uadp.field.datavalue");
     assert_shown(
-        &rest[3],
-        &[
-            ("field.localizedtext.locale", "de"),
-            ("field.localizedtext.text", "auf"),
-        ],
-    );
-    assert_shown(
-        &rest[4],
-        &[
-            ("field.extensionobject.type_id", "ns=3;i=5"),
-            ("field.extensionobject.body", "01:02:03"),
-        ],
-    );
-    let inside = rest[5].parts("uadp.field.datavalue");
-    assert_shown(
-        &inside[0],
+        &data_values[0],
         &[("field.uint16", "77"), ("field.status", "0x40900000")],
     );
     assert_shown(
-        &rest[6],
+        &shown.parts("uadp.field.diagnosticinfo")[0],
         &[
             ("field.diagnosticinfo.symbolic_id", "-1"),
+            ("field.diagnosticinfo.locale", "3"),
+            ("field.diagnosticinfo.localized_text", "4"),
             ("field.diagnosticinfo.additional_info", "more"),
             ("field.diagnosticinfo.inner_status_code", "0x80000000"),
         ],
     );
-    let inside = rest[7].parts("uadp.field.variant");
-    assert_shown(&inside[0], &[("field.uint16", "77"), ("field.type", "5")]);
-    assert_eq!(rest.len(), 8);
+    let variants = shown.parts("uadp.field.variant");
+    assert_shown(&variants[0], &[("field.uint16", "77"), ("field.type", "5")]);
 }
 
 #[test]
@@ -602,6 +619,47 @@ fn an_announcement_names_its_fields_chunked_or_not() {
         let types = shown.all("uadp.metadata.field.builtin_type");
         assert_eq!(types, ["11", "11", "12"]);
     }
+}
+
+/// Described DataTypes in front of the name of DataSetMetaData, one of each kind, and one field with a property.
+const SCHEMA: &str = concat!(
+    "919108ba080000000000000201000a00", // announcement 1: DataSetMetaData of DataSetWriterId 10
+    "01000000050000007572 6e3a78",      // Namespaces: urn:x
+    "0100000001010a00 0100020000005054", // StructureDataTypes: ns=1;i=10, 1:PT
+    "01010b00 0016 00000000 01000000",  // its encoding, base type and kind; one field
+    "0100000078 00 000b ffffffff 01000000 02000000 00000000 00", // x, Double, dimensions [2]
+    "0100000001010c00 01000100000045 01000000", // EnumDataTypes: 1:E with one field
+    "0500000000000000 02 02000000 6f6e 00 02000000 6f6e 06", // 5, on
+    "0100000001010d00 01000100000053 000c 0c", // SimpleDataTypes: 1:S, a String
+    "0400000063656c6c 00 01000000",     // Name: cell; one field
+    "01000000 76 00 0000 0b 000b ffffffff ffffffff 00000000", // v, Double
+    "01000000000000000000000000000000", // DataSetFieldId
+    "01000000 0000 01000000 75 0c 01000000 43", // Properties: 0:u = "C"
+    "00000000000000000000000000000000 01000000 02000000 00000000", // class, version 1.2, Good
+);
+
+#[test]
+fn described_data_types_do_not_shift_what_follows_them() {
+    let Some(cell) = Cell::with(&[Peer::Tshark]) else {
+        return;
+    };
+    let shown = dissected(&cell, &unhex(&SCHEMA.replace(' ', "")));
+    assert!(shown.expert_infos().is_empty());
+    let types = shown.all("uadp.metadata.data_type");
+    assert_eq!(types, ["1:PT", "1:E", "1:S"]);
+    assert_shown(
+        &shown,
+        &[
+            ("metadata.namespace", "urn:x"),
+            ("metadata.name", "cell"),
+            ("metadata.field.name", "v"),
+            ("metadata.field.builtin_type", "11"),
+            ("metadata.field.property", "0:u"),
+            ("field.string", "C"),
+            ("metadata.major_version", "1"),
+            ("metadata.minor_version", "2"),
+        ],
+    );
 }
 
 #[test]
