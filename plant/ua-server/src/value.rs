@@ -1,14 +1,13 @@
 //! Values between the two codecs: UADP's borrowed Variants and the OPC UA server's owned ones.
 //!
 //! Inwards a null array becomes an empty one, which is all the server's type can say. Outwards values are encoded as
-//! they are (OPC 10000-6, 5.2.2.16), and what UADP does not carry (matrices, Variants in Variants, DataValues) is
-//! refused.
+//! they are (OPC 10000-6, 5.2.2.16), and what UADP does not carry, a Variant directly in a Variant, is refused.
 
 use opcua::types::type_loader::{ByteStringBody, XmlBody};
 use opcua::types::{
-    Array, BinaryEncodable as _, ByteString, ContextOwned, DateTime, ExpandedNodeId,
-    ExtensionObject, Guid, Identifier, LocalizedText, NodeId, QualifiedName, StatusCode, UAString,
-    Variant, VariantScalarTypeId, XmlElement,
+    Array, BinaryEncodable as _, ByteString, ContextOwned, DataValue, DateTime, DiagnosticInfo,
+    ExpandedNodeId, ExtensionObject, Guid, Identifier, LocalizedText, NodeId, QualifiedName,
+    StatusCode, UAString, Variant, VariantScalarTypeId, XmlElement,
 };
 use uadp::{BuiltinType, ExtensionBody, Scalar};
 
@@ -21,6 +20,15 @@ pub(crate) fn from_field(field: &uadp::Variant<'_>) -> Variant {
             value_type: scalar_type(array.element()),
             values: array.iter().map(|element| scalar(&element)).collect(),
             dimensions: None,
+        })),
+        uadp::Variant::Matrix(matrix) => Variant::Array(Box::new(Array {
+            value_type: scalar_type(matrix.elements().element()),
+            values: matrix
+                .elements()
+                .iter()
+                .map(|element| scalar(&element))
+                .collect(),
+            dimensions: Some(matrix.dimensions().collect()),
         })),
     }
 }
@@ -131,6 +139,45 @@ fn scalar(value: &Scalar<'_>) -> Variant {
             text: string(v.text),
         }),
         Scalar::ExtensionObject(v) => Variant::ExtensionObject(extension_object(v)),
+        // What is nested was checked with the message: getting it does not fail.
+        Scalar::Variant(v) => {
+            let inner = v.get().unwrap_or(uadp::Variant::Null);
+            Variant::Variant(Box::new(from_field(&inner)))
+        }
+        Scalar::DataValue(v) => {
+            Variant::DataValue(Box::new(data_value(&v.get().unwrap_or_default())))
+        }
+        Scalar::DiagnosticInfo(v) => {
+            Variant::DiagnosticInfo(Box::new(diagnostic_info(&v.get().unwrap_or_default())))
+        }
+    }
+}
+
+fn data_value(value: &uadp::DataValue<'_>) -> DataValue {
+    DataValue {
+        value: value.value.as_ref().map(from_field),
+        status: value.status.map(|status| StatusCode::from(status.0)),
+        source_timestamp: value.source_timestamp.map(date_time),
+        source_picoseconds: value.source_picoseconds,
+        server_timestamp: value.server_timestamp.map(date_time),
+        server_picoseconds: value.server_picoseconds,
+    }
+}
+
+fn diagnostic_info(info: &uadp::DiagnosticInfo<'_>) -> DiagnosticInfo {
+    DiagnosticInfo {
+        symbolic_id: info.symbolic_id,
+        namespace_uri: info.namespace_uri,
+        locale: info.locale,
+        localized_text: info.localized_text,
+        additional_info: info.additional_info.map(string),
+        inner_status_code: info
+            .inner_status_code
+            .map(|status| StatusCode::from(status.0)),
+        inner_diagnostic_info: info
+            .inner
+            .and_then(|inner| inner.get().ok())
+            .map(|inner| Box::new(diagnostic_info(&inner))),
     }
 }
 
@@ -356,17 +403,47 @@ mod tests {
     }
 
     #[test]
-    fn a_matrix_does_not_go_out_to_the_space() {
-        let matrix = Array::new_multi(
-            VariantScalarTypeId::Int32,
-            vec![Variant::Int32(1); 4],
-            vec![2, 2],
-        )
-        .unwrap();
-        assert_eq!(
-            fields_block(&[Variant::Array(Box::new(matrix))]),
-            Err(StatusCode::BadNotSupported)
+    fn a_matrix_keeps_its_dimensions_both_ways() {
+        let values = (0..6).map(Variant::Int32).collect::<Vec<_>>();
+        let matrix = Array::new_multi(VariantScalarTypeId::Int32, values, vec![2, 3]).unwrap();
+        let matrix = Variant::Array(Box::new(matrix));
+        let block = fields_block(std::slice::from_ref(&matrix)).unwrap();
+        let field = only_field(&block);
+        let uadp::Variant::Matrix(found) = field else {
+            panic!("{field:?} is no matrix");
+        };
+        assert_eq!(found.dimensions().collect::<Vec<_>>(), [2, 3]);
+        assert_eq!(from_field(&field), matrix);
+    }
+
+    #[test]
+    fn values_in_values_are_the_same_on_both_sides() {
+        let info = DiagnosticInfo {
+            symbolic_id: Some(3),
+            inner_diagnostic_info: Some(Box::new(DiagnosticInfo {
+                additional_info: Some(UAString::from("below")),
+                ..DiagnosticInfo::null()
+            })),
+            ..DiagnosticInfo::null()
+        };
+        let value = DataValue {
+            value: Some(Variant::Double(1.5)),
+            status: Some(StatusCode::BadNoCommunication),
+            source_timestamp: Some(date_time(uadp::DateTime(134_234_948_967_890_000))),
+            ..DataValue::null()
+        };
+        let variants = Array::new(
+            VariantScalarTypeId::Variant,
+            vec![Variant::Variant(Box::new(Variant::Boolean(true)))],
         );
+        for server in [
+            Variant::DiagnosticInfo(Box::new(info)),
+            Variant::DataValue(Box::new(value)),
+            Variant::Array(Box::new(variants.unwrap())),
+        ] {
+            let block = fields_block(std::slice::from_ref(&server)).unwrap();
+            assert_eq!(from_field(&only_field(&block)), server);
+        }
     }
 
     #[test]
