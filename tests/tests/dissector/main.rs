@@ -1,6 +1,7 @@
 //! The Wireshark dissector in `docs/wireshark`: tshark has to show what was sent, and to point at what is wrong.
 
 mod messages;
+mod sealed;
 mod time;
 mod vectors;
 mod wrong;

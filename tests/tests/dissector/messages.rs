@@ -16,7 +16,7 @@ use crate::{
 
 const NOON: DateTime = DateTime(134_234_948_967_890_123);
 
-fn header(publisher: u16, group: u16) -> NetworkHeader<'static> {
+pub(crate) fn header(publisher: u16, group: u16) -> NetworkHeader<'static> {
     NetworkHeader {
         publisher_id: Some(PublisherId::UInt16(publisher)),
         group: Some(GroupHeader {
@@ -27,7 +27,7 @@ fn header(publisher: u16, group: u16) -> NetworkHeader<'static> {
     }
 }
 
-fn numbered(sequence_number: u16) -> DataSetHeader {
+pub(crate) fn numbered(sequence_number: u16) -> DataSetHeader {
     DataSetHeader {
         sequence_number: Some(sequence_number),
         ..DataSetHeader::default()
@@ -53,7 +53,7 @@ pub(crate) fn key_frame(write: impl FnOnce(&mut FieldEncoder<'_>)) -> Vec<u8> {
     })
 }
 
-fn assert_shown(shown: &Dissected, expected: &[(&str, &str)]) {
+pub(crate) fn assert_shown(shown: &Dissected, expected: &[(&str, &str)]) {
     for (field, value) in expected {
         let name = format!("uadp.{field}");
         assert_eq!(shown.all(&name), [*value], "{name}");
