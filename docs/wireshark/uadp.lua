@@ -732,7 +732,8 @@ local VALUE = {}
 local LEAST = {
     1, 1, 1, 2, 2, 4, 4, 8, 8, 4, 8, 4, 8, 16, 4, 4, 2, 2, 4, 6, 1, 3, 1, 1, 1,
 }
--- Values in values, as deep as the standard asks decoders to go (OPC 10000-6, 5.2.2.12 and 5.2.2.16).
+-- Levels of values in values: the 100 of version 1.04 (OPC 10000-6, 5.2.2.12 and 5.2.2.16). A receiver may stop sooner,
+-- 1.05 expects 10, but what it refuses is worth seeing.
 local DEPTH = 100
 
 local function number(builtin, size, name, show)
