@@ -364,6 +364,7 @@ impl<'a> Iterator for Fields<'a> {
                 }
                 Some(field)
             }
+            None if self.reader.remaining() == 0 => None,
             None => {
                 let padding = self.reader.rest();
                 self.reader = Reader::new(&[]);
