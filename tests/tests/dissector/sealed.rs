@@ -41,7 +41,7 @@ fn the_headers_of_what_we_seal_are_shown_and_the_payload_if_it_is_only_signed() 
     let signed = sealed(&mut sealer(SecurityMode::Sign));
     let mut encrypting = sealer(SecurityMode::SignAndEncrypt);
     let encrypted = [sealed(&mut encrypting), sealed(&mut encrypting)];
-    let [first, second] = encrypted.clone();
+    let [first, second] = encrypted;
     let shown = cell.dissect(&Capture::of([signed.clone(), first, second]), &[]);
     let headers = [
         ("topic", "ua_2_5_10"),
