@@ -33,7 +33,10 @@ pub fn decode(datagram: &[u8]) {
 
 /// Visits every value, however deep; false when something cannot be read.
 fn is_readable(message: &DataSetMessage<'_>) -> bool {
-    let _ = message.header();
+    if message.is_valid() {
+        let number = message.header().sequence_number;
+        assert_eq!(message.sequence_number(), number);
+    }
     if let Ok(fields) = message.fields() {
         let block = fields.clone().checked_bytes();
         let mut good = true;

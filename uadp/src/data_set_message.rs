@@ -149,6 +149,19 @@ impl<'a> DataSetMessage<'a> {
         self.head.fields()
     }
 
+    /// The DataSetMessageSequenceNumber; alone it costs less than the whole header.
+    #[inline]
+    #[must_use]
+    pub fn sequence_number(&self) -> Option<u16> {
+        match self.head.flags1 & SEQUENCE_NUMBER {
+            0 => None,
+            // It is the first of the fields.
+            _ => Reader::new(self.head.fields)
+                .u16("DataSetMessageSequenceNumber")
+                .ok(),
+        }
+    }
+
     /// False: the publisher could not make the message; nothing else in it counts.
     #[inline]
     #[must_use]

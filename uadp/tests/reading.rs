@@ -1031,3 +1031,13 @@ fn discovery_messages_are_told_by_their_type() {
     let plain = NetworkMessage::decode(&[0x01, 0x01]).unwrap();
     assert_eq!(plain.message_type(), NetworkMessageType::DataSet);
 }
+
+#[test]
+fn the_sequence_number_alone_is_that_of_the_header() {
+    let numbered = [0x89, 0x10, 0x34, 0x12, 1, 2, 3, 4, 5, 6, 7, 8];
+    let message = DataSetMessage::decode(None, &numbered).unwrap();
+    assert_eq!(message.sequence_number(), Some(0x1234));
+    assert_eq!(message.header().sequence_number, Some(0x1234));
+    let without = DataSetMessage::decode(None, &[0x01]).unwrap();
+    assert_eq!(without.sequence_number(), None);
+}

@@ -99,7 +99,7 @@ pub(crate) fn decode(datagram: &[u8]) -> u64 {
     for message in network.messages() {
         let message = message.unwrap();
         seen += u64::from(message.writer_id.unwrap_or_default());
-        seen += u64::from(message.header().sequence_number.unwrap_or_default());
+        seen += u64::from(message.sequence_number().unwrap_or_default());
         for field in message.fields().unwrap() {
             seen = seen.wrapping_add(match field.unwrap() {
                 Variant::Scalar(Scalar::Double(value)) => value.to_bits(),
