@@ -15,9 +15,10 @@ use std::time::{Duration, Instant};
 use bridge_core::{Delivery, Hop, Local, Notice, Now, Output, Reason, Router, Settings, Verdict};
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{Dialect, Registry, Selection};
+use uadp::discovery::Probe;
 use uadp::{
-    BuiltinType, DataSetHeader, Fields, GroupHeader, MessageKind, NetworkHeader, NetworkMessage,
-    NetworkMessageEncoder, PublisherId, Scalar, Timestamp, Variant,
+    BuiltinType, DataSetHeader, Extras, Fields, GroupHeader, MessageKind, NetworkHeader,
+    NetworkMessage, NetworkMessageEncoder, PublisherId, Scalar, SecurityHeader, Timestamp, Variant,
 };
 
 /// One bridge under test and a clock that moves only when told.
@@ -383,6 +384,97 @@ fn every_message_of_a_datagram_is_handled_and_a_bad_one_hides_none() {
     bench.hear(&bytes);
     assert_eq!(bench.deliveries().len(), 2);
     assert_eq!(bench.dropped(Reason::Malformed), 1);
+}
+
+#[test]
+fn what_the_codec_reads_and_the_space_does_not_carry_is_counted_as_unsupported() {
+    let mut bench = Bench::new(1, Local::Fields);
+    let frame = Frame::new(10, 1, 42);
+    let written = |extras: &Extras<'_>, write: &dyn Fn(&mut NetworkMessageEncoder<'_>)| {
+        let mut bytes = Vec::new();
+        let mut message =
+            NetworkMessageEncoder::with(&mut bytes, &frame.network(), Some(&[10]), extras).unwrap();
+        write(&mut message);
+        message.finish().unwrap();
+        bytes
+    };
+    let none = Extras::default();
+    let event = written(&none, &|message| {
+        let mut fields = message.event(&frame.header).unwrap();
+        fields.scalar(Scalar::UInt32(42)).unwrap();
+        fields.finish().unwrap();
+    });
+    let delta = written(&none, &|message| {
+        let mut fields = message.delta_frame(&frame.header).unwrap();
+        let field = fields.field(0).unwrap();
+        field.scalar(Scalar::UInt32(42)).unwrap();
+        fields.finish().unwrap();
+    });
+    let data_value = written(&none, &|message| {
+        let mut fields = message.data_values(&frame.header).unwrap();
+        fields
+            .value(&Variant::from(Scalar::UInt32(42)).into())
+            .unwrap();
+        fields.finish().unwrap();
+    });
+    let raw = written(&none, &|message| {
+        let write = |buf: &mut Vec<u8>| {
+            buf.extend(42_u32.to_le_bytes());
+            Ok(())
+        };
+        let header = Frame::new(10, 2, 42).header;
+        message.raw_key_frame(&header, write).unwrap();
+    });
+    // A key frame whose SecurityHeader calls it signed.
+    let unsecured = Extras {
+        security: Some(SecurityHeader::NONE),
+        ..none
+    };
+    let mut signed = written(&unsecured, &|message| {
+        message.key_frame(&frame.header).unwrap().finish().unwrap();
+    });
+    // Flags, token and an empty nonce stand in front of the payload.
+    let security_flags = NetworkMessage::decode(&signed).unwrap().payload_offset() - 6;
+    signed[security_flags] |= 1;
+    let mut probe = Vec::new();
+    Probe::PublisherEndpoints
+        .encode(Some(frame.publisher), SecurityHeader::NONE, &mut probe)
+        .unwrap();
+    // Version 1 with PublisherId, group and payload header; UInt16 2, WriterGroupId 5; a chunk of DataSetWriterId 10.
+    let chunk = [
+        0xF1, 0x81, 0x01, 2, 0, 0x01, 5, 0, 10, 0, 0, 0, 0, 0, 0, 0, 9, 0, 0, 0, 1,
+    ];
+    let all = [
+        &event,
+        &delta,
+        &data_value,
+        &raw,
+        &signed,
+        &probe,
+        &chunk[..].to_vec(),
+    ];
+    for (count, datagram) in (1..).zip(all) {
+        bench.hear(datagram);
+        assert_eq!(bench.dropped(Reason::Unsupported), count, "{datagram:02x?}");
+    }
+    assert_eq!(bench.deliveries().len(), 0);
+    bench.hear(&Frame::new(10, 3, 42).bytes());
+    assert_eq!(bench.deliveries().len(), 1, "what is carried goes on");
+}
+
+#[test]
+fn a_message_without_a_writer_group_is_counted() {
+    let mut bench = Bench::new(1, Local::Fields);
+    let header = NetworkHeader {
+        publisher_id: Some(PublisherId::UInt16(2)),
+        ..NetworkHeader::default()
+    };
+    let mut bytes = Vec::new();
+    let mut message = NetworkMessageEncoder::new(&mut bytes, &header, Some(&[10])).unwrap();
+    message.keep_alive(&DataSetHeader::default()).unwrap();
+    message.finish().unwrap();
+    bench.hear(&bytes);
+    assert_eq!(bench.dropped(Reason::NotInSpace), 1);
 }
 
 #[test]

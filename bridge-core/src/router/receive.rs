@@ -6,7 +6,7 @@ use std::time::Duration;
 use mappings::{PublisherIdRule, SpaceId, TopicId};
 use uadp::{
     DataSetHeader, DataSetMessage, DecodeError, Fields, MessageKind, NetworkHeader, NetworkMessage,
-    PublisherId, Timestamp,
+    NetworkMessageType, PublisherId, Timestamp,
 };
 
 use super::{About, MAX_TOPICS, Router};
@@ -30,16 +30,21 @@ impl Router {
             }
         };
         let header = message.header();
-        let (Some(space), Some(namespace)) = (
-            self.space_of(&header, from),
-            header.group.and_then(|group| group.writer_group_id),
-        ) else {
+        let Some(space) = self.space_of(&header, from) else {
             return;
         };
         if !may_cross(self.settings.own, Side::Ua, space) {
             self.drop_own(from);
             return;
         }
+        if message.message_type() != NetworkMessageType::DataSet {
+            self.drop_undecoded(None, from, &DISCOVERY);
+            return;
+        }
+        let Some(namespace) = header.group.and_then(|group| group.writer_group_id) else {
+            self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
+            return;
+        };
         let sent = header.timestamp.map(|time| Timestamp {
             time,
             picoseconds: header.picoseconds.unwrap_or_default(),
@@ -140,7 +145,7 @@ impl Router {
             MessageKind::KeyFrame => Some(reader.admit(place)),
             // It says that the writer lives, and that is all.
             MessageKind::KeepAlive => None,
-            // Told apart below, by what the codec says of them.
+            // Not carried, and told so below.
             MessageKind::DeltaFrame | MessageKind::Event => Some(Ok(0)),
         };
         if let Some(Ok(missing)) = admitted {
@@ -164,7 +169,7 @@ impl Router {
                 1,
                 String::new,
             ),
-            Some(Ok(_)) => match message.fields() {
+            Some(Ok(_)) => match fields_of(message) {
                 Ok(fields) => {
                     self.record_way(place.stamp, sent, now);
                     let sample = Sample {
@@ -296,6 +301,18 @@ fn place(header: &DataSetHeader, from: SocketAddr) -> Place {
         from,
     }
 }
+
+/// The fields of a key frame. An event has Variants too, but no place in the sequence of a value's states.
+fn fields_of<'a>(message: &DataSetMessage<'a>) -> Result<Fields<'a>, DecodeError> {
+    match message.kind {
+        MessageKind::Event => Err(DecodeError::Misread("an event")),
+        MessageKind::KeyFrame | MessageKind::DeltaFrame | MessageKind::KeepAlive => {
+            message.fields()
+        }
+    }
+}
+
+const DISCOVERY: DecodeError = DecodeError::Misread("a discovery message");
 
 const fn reason_of(error: &DecodeError) -> Reason {
     if matches!(error, DecodeError::Unsupported(_) | DecodeError::Misread(_)) {
