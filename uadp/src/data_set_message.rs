@@ -1,7 +1,7 @@
 //! DataSetMessage: one writer's header, and its fields read one by one.
 
 use crate::reader::Reader;
-use crate::{DataValue, DateTime, DecodeError, Variant};
+use crate::{DataValue, DateTime, DecodeError, DeltaNull, Variant};
 
 /// One DataSetMessage whose header was read (OPC 10000-14, 7.2.4.5.4).
 ///
@@ -291,7 +291,8 @@ impl FieldValue<'_> {
     /// number of fields of the DataSet, so it is better not taken for a change of field 0.
     #[must_use]
     pub fn is_filler(&self) -> bool {
-        self.index == 0 && self.value == DataValue::from(Variant::Null)
+        let is_null = self.value == DataValue::from(Variant::Null);
+        !DeltaNull::Filler.applies(self.index, is_null)
     }
 }
 
