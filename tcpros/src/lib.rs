@@ -34,6 +34,7 @@ mod registrar;
 mod rpc;
 mod slave;
 mod subscription;
+mod time;
 mod topic_server;
 mod xmlrpc;
 
@@ -47,4 +48,5 @@ pub use crate::options::NodeOptions;
 pub use crate::publisher::{Published, Publisher, PublisherOptions, TopicType};
 pub use crate::rpc::RpcError;
 pub use crate::subscription::{SubscriberOptions, Subscription, Wanted};
+pub use crate::time::RosTime;
 pub use crate::xmlrpc::{Fault, XmlError};

@@ -12,6 +12,7 @@ use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
+use crate::clock;
 use crate::events;
 use crate::inbox::Inbox;
 use crate::link::LinkContext;
@@ -21,6 +22,7 @@ use crate::options::NodeOptions;
 use crate::outbox::{Limit, lock};
 use crate::publisher::{Hub, Publisher, PublisherOptions, TopicType};
 use crate::subscription::{Feed, SubscriberOptions, Subscription, Wanted};
+use crate::time::RosTime;
 use crate::{registrar, rpc, slave, topic_server};
 
 /// A ROS 1 node. Dropping it ends its connections; only [`Node::shutdown`] also tells the master.
@@ -93,6 +95,11 @@ impl Node {
     /// A topic's name as this node resolves it: namespace, `~` and remappings applied.
     pub fn resolve(&self, topic: &str) -> Result<String, NameError> {
         self.inner.names.resolve(topic)
+    }
+
+    /// The time for the stamps of messages.
+    pub fn now(&self) -> RosTime {
+        RosTime::from_system(clock::utc())
     }
 
     /// Whether the master has been found, now and as it changes.
