@@ -28,6 +28,7 @@ const APT: &[&str] = &[
     "python3-sensor-msgs",
     "python3-std-srvs",
     "python3-tf2-msgs",
+    "python3-trajectory-msgs",
     "topic-tools",
     "tshark",
     "iproute2",
