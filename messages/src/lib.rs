@@ -70,6 +70,6 @@ pub use error::{
 pub use fields::{Sink, Source};
 pub use message::{Leaf, MessageType, Rank, standard_type};
 pub use name::{Dialect, TypeName};
-pub use plan::{Plan, Selection, Wire};
+pub use plan::{Literal, Plan, Selection, Wire};
 pub use registry::Registry;
 pub use service::{ActionType, ServiceType};

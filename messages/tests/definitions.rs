@@ -335,10 +335,7 @@ fn constants_are_told_with_their_values() {
     registry.add(&name("t/T"), text).unwrap();
     let found = registry.get(&name("t/T")).unwrap();
     let add = found.constant("ADD").unwrap();
-    assert_eq!(
-        (add.builtin, add.value.as_str()),
-        (BuiltinType::Byte, "1")
-    );
+    assert_eq!((add.builtin, add.value.as_str()), (BuiltinType::Byte, "1"));
     assert_eq!(found.constant("WORD").unwrap().value, "it's # all");
     assert_eq!(found.constants().len(), 2);
     assert!(found.constant("cmd").is_none());
