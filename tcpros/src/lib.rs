@@ -16,6 +16,7 @@
 //!
 //! To read the code: `node` has the state, `registrar` the master's side of it, `publisher` and `topic_server` what
 //! goes out, `subscription` and `link` what comes in, `inbox` where it is taken, `service` what is called.
+//! [`actionlib`] stands on topics alone.
 
 pub mod actionlib;
 mod clock;

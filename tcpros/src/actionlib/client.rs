@@ -32,7 +32,8 @@ use crate::time::RosTime;
 pub struct ActionClientOptions {
     /// From sending a goal until a server must have listed it.
     pub acknowledge_timeout: Duration,
-    /// Without a status of the server before its goals are lost. Servers send five a second.
+    /// Without a status of the server before its goals are lost. Servers send five a second, those of roscpp and rospy
+    /// by ROS time: where a simulation may pause, give it the longest pause.
     pub silence_timeout: Duration,
     /// From the end of the connection to the server until its goals are lost; they are not if it comes back sooner.
     pub reconnect_timeout: Duration,

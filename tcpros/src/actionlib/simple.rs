@@ -36,8 +36,8 @@ impl SimpleActionServer {
         }
     }
 
-    /// Waits until work on `current` should stop, for a request to cancel it or for a newer goal. Ends at once when
-    /// the goal has ended. Call [`ServerGoal::cancelled`] then, and [`Self::next`]. Cancel-safe.
+    /// Waits until work on `current` should stop: a client asked to cancel it, or a newer goal waits. For a goal that
+    /// has ended it returns at once. Then call [`ServerGoal::cancelled`] and [`Self::next`]. Cancel-safe.
     pub async fn preempted(&mut self, current: &ServerGoal) {
         loop {
             if self.waiting.is_some()
