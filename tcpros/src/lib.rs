@@ -16,7 +16,9 @@
 //!
 //! To read the code: `node` has the state, `registrar` the master's side of it, `publisher` and `topic_server` what
 //! goes out, `subscription` and `link` what comes in, `inbox` where it is taken, `service` what is called.
+//! [`actionlib`] stands on topics alone.
 
+pub mod actionlib;
 mod clock;
 mod core;
 mod events;
@@ -44,7 +46,7 @@ pub use crate::header::{ConnectionHeader, HeaderError};
 pub use crate::inbox::{Inbox, InboxEvent, Message, Peer};
 pub use crate::master::{Graph, MasterError};
 pub use crate::names::NameError;
-pub use crate::node::{GraphReader, MasterState, Node, NodeError};
+pub use crate::node::{GraphReader, MasterState, Node, NodeError, RosClock};
 pub use crate::options::NodeOptions;
 pub use crate::publisher::{Published, Publisher, PublisherOptions, TopicType};
 pub use crate::rpc::RpcError;

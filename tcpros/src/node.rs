@@ -105,7 +105,14 @@ impl Node {
 
     /// The time for the stamps of messages.
     pub fn now(&self) -> RosTime {
-        RosTime::from_system(clock::utc())
+        self.inner.now()
+    }
+
+    /// Reads the same time in another task, which may outlive the node.
+    pub fn clock(&self) -> RosClock {
+        RosClock {
+            node: Arc::clone(&self.inner),
+        }
     }
 
     /// Whether the master has been found, now and as it changes.
@@ -304,6 +311,19 @@ impl GraphReader {
     }
 }
 
+/// The time of a node, for the stamps of messages.
+#[derive(Clone, Debug)]
+pub struct RosClock {
+    node: Arc<Inner>,
+}
+
+impl RosClock {
+    /// The same as [`Node::now`].
+    pub fn now(&self) -> RosTime {
+        self.node.now()
+    }
+}
+
 /// Where the node stands with its master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MasterState {
@@ -429,6 +449,10 @@ pub(crate) enum ResourceKind {
 impl Inner {
     pub(crate) fn name(&self) -> &str {
         self.names.node()
+    }
+
+    fn now(&self) -> RosTime {
+        RosTime::from_system(clock::utc())
     }
 
     pub(crate) fn next_connection_id(&self) -> i32 {
