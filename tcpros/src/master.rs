@@ -128,7 +128,7 @@ impl Master {
     }
 
     /// Calls with the caller id in front and unwraps `[code, message, result]`.
-    async fn call(
+    pub(crate) async fn call(
         &self,
         method: &'static str,
         mut params: Vec<Value>,
