@@ -26,6 +26,7 @@ pub(crate) struct LinkContext {
     pub(crate) caller_id: String,
     pub(crate) max_message: usize,
     pub(crate) master: Master,
+    pub(crate) ipv6_first: bool,
 }
 
 /// Keeps a subscription connected to one publisher until the master no longer names it. A task of its own.
@@ -78,7 +79,7 @@ async fn connect(
     uri: &str,
 ) -> Result<(TcpStream, Arc<Peer>), LinkError> {
     let (host, port) = request_topic(feed, context, uri).await?;
-    let connecting = timeout(CONNECT_LIMIT, rpc::connect(&host, port));
+    let connecting = timeout(CONNECT_LIMIT, rpc::connect(&host, port, context.ipv6_first));
     let mut stream = connecting
         .await
         .map_err(|_| LinkError::NoConnection(CONNECT_LIMIT))??;
@@ -101,7 +102,9 @@ async fn request_topic(
     context: &LinkContext,
     uri: &str,
 ) -> Result<(String, u16), LinkError> {
-    let endpoint = Endpoint::parse(uri).ok_or(RpcError::Uri)?;
+    let endpoint = Endpoint::parse(uri)
+        .ok_or(RpcError::Uri)?
+        .ipv6_first(context.ipv6_first);
     let protocols = vec![Value::Array(vec!["TCPROS".into()])];
     let params = vec![
         context.caller_id.as_str().into(),

@@ -21,8 +21,7 @@ pub(crate) fn answer(node: &Inner, call: Call) -> Response {
         "getBusInfo" => Ok(done(bus_info(node))),
         "publisherUpdate" => Ok(publisher_update(node, params)),
         "requestTopic" => Ok(request_topic(node, params)),
-        // No parameter is cached here, so none can be stale.
-        "paramUpdate" => Ok(done(0)),
+        "paramUpdate" => Ok(param_update(node, params)),
         "shutdown" => Ok(shutdown(node, params)),
         other => Err(Fault {
             code: -1,
@@ -39,6 +38,16 @@ fn publisher_update(node: &Inner, params: &[Value]) -> Value {
         return refused("publishers must be a list of strings");
     };
     node.publishers_changed(topic, &publishers);
+    done(0)
+}
+
+fn param_update(node: &Inner, params: &[Value]) -> Value {
+    let [_, Value::String(key), _] = params else {
+        return refused("paramUpdate takes (caller_id, key, value)");
+    };
+    // The key of a namespace ends in a slash, and that of the root is nothing else.
+    let name = key.trim_end_matches('/');
+    node.parameter_changed(if name.is_empty() { "/" } else { name });
     done(0)
 }
 
