@@ -60,6 +60,13 @@ document! {
         /// A writer silent for this long counts as gone; default 3s, and longer than `keep_alive_period`.
         #[schemars(regex(pattern = DURATION))]
         receive_timeout: String,
+        /// Bytes of the largest datagram sent, 512 to 65507 (the default); larger NetworkMessages go in chunks of it. 1472 fits
+        /// an Ethernet frame.
+        #[schemars(range(min = 512, max = 65507))]
+        max_datagram: u16,
+        /// MiB of the largest message sent or put together from chunks, 1 to 1024; default 64.
+        #[schemars(range(min = 1, max = 1024))]
+        max_message: u16,
     }
 
     /// The OPC UA server of the cell.

@@ -141,9 +141,19 @@ pub struct PubSub {
     pub keep_alive_period: Duration,
     /// A writer that is silent for this long counts as gone; longer than `keep_alive_period`.
     pub receive_timeout: Duration,
+    /// Bytes of the largest NetworkMessage that is sent as one datagram; a larger one goes in chunks of as much
+    /// (OPC 10000-14, 7.2.4.4.4).
+    pub max_datagram: u16,
+    /// Bytes of the largest DataSetMessage that is sent, or put together from chunks.
+    pub max_message: u32,
 }
 
 impl PubSub {
+    /// The largest UDP payload over IPv4.
+    pub const LARGEST_DATAGRAM: u16 = 65_507;
+    /// Room for the headers of a chunk and some of the message.
+    pub const SMALLEST_DATAGRAM: u16 = 512;
+
     /// 239.192.0.40:4840. The group is of the IPv4 organization-local scope (RFC 2365, 6.2), so no router
     /// leaks it to the world; the port is the one registered for OPC UA over UDP (OPC 10000-14, 7.3.2).
     pub const ADDRESS: SocketAddr =
@@ -178,6 +188,8 @@ impl Default for PubSub {
             key_frame_period: Duration::from_secs(1),
             keep_alive_period: Duration::from_secs(1),
             receive_timeout: Duration::from_secs(3),
+            max_datagram: Self::LARGEST_DATAGRAM,
+            max_message: 64 << 20,
         }
     }
 }
