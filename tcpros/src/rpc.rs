@@ -264,7 +264,7 @@ pub enum RpcError {
 
 const XML: &str = "text/xml";
 const MAX_BODY: usize = 4 * 1024 * 1024;
-const MAX_CONNECTIONS: usize = 256;
+const MAX_CONNECTIONS: usize = 1024;
 const READ_LIMIT: Duration = Duration::from_secs(30);
 
 #[cfg(test)]
