@@ -4,6 +4,7 @@ mod bindings;
 mod cell;
 mod names;
 mod network;
+mod services;
 mod types;
 mod variables;
 

@@ -17,8 +17,8 @@ pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use document::schema;
 pub use mapping::{
-    Binding, Endpoint, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, Server, Space,
-    Variable,
+    Binding, Endpoint, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, Server,
+    ServiceBinding, ServiceRole, Space, Trigger, Variable,
 };
 pub use node_id::{Identifier, NodeIdError, NodeIdText};
 pub use topic::{Part, SpaceId, TopicError, TopicId};

@@ -6,7 +6,7 @@ use std::num::NonZeroU16;
 use std::time::Duration;
 
 use messages::{Leaf, Selection, TypeName};
-use uadp::BuiltinType;
+use uadp::{BuiltinType, Scalar};
 
 use crate::node_id::NodeIdText;
 use crate::topic::{SpaceId, TopicId};
@@ -121,6 +121,115 @@ impl Mapping {
         self.variables
             .iter()
             .filter_map(move |v| Some((v, v.binding(space)?)))
+    }
+
+    /// Every binding to a service of one space.
+    pub fn services(&self, space: SpaceId) -> impl Iterator<Item = (&Variable, &ServiceBinding)> {
+        self.variables.iter().filter_map(move |v| {
+            let service = v.service.as_ref()?;
+            (service.space == space).then_some((v, service))
+        })
+    }
+}
+
+/// A ROS service tied to a variable.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ServiceBinding {
+    /// Whose ROS graph the service is in; so far [`SpaceId::ROS1`].
+    pub space: SpaceId,
+    /// What is done with it.
+    pub role: ServiceRole,
+}
+
+/// How a service and a variable are tied.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ServiceRole {
+    /// Values that arrive from other spaces call the service. `space` is not the variable's origin.
+    Call {
+        /// Name of the service, with its leading `/`.
+        service: String,
+        /// The type of the service.
+        service_type: TypeName,
+        /// The request, always [`Selection::Template`]; without a field in it no value crosses.
+        request: Selection,
+        /// Which values call; [`Trigger::Any`] where the request has the value in it.
+        when: Trigger,
+        /// How long the service may take.
+        timeout: Duration,
+    },
+    /// The value is what the service answers to the calls of another variable. `space` is this variable's origin.
+    Answer {
+        /// The variable with the [`ServiceRole::Call`].
+        of: TopicId,
+        /// What of the response is the value.
+        selection: Selection,
+    },
+    /// The value is what the service answers when it is asked regularly. `space` is this variable's origin.
+    Poll {
+        /// Name of the service, with its leading `/`.
+        service: String,
+        /// The type of the service.
+        service_type: TypeName,
+        /// The request, always [`Selection::Template`] without a field.
+        request: Selection,
+        /// What of the response is the value.
+        selection: Selection,
+        /// From call to call.
+        every: Duration,
+        /// How long the service may take.
+        timeout: Duration,
+    },
+}
+
+/// Which values call a service.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Trigger {
+    /// Each one.
+    Any,
+    /// Those equal to the literal.
+    Equals(String),
+}
+
+impl Trigger {
+    /// Whether a value calls.
+    #[must_use]
+    pub fn fires(&self, value: &Scalar<'_>) -> bool {
+        match self {
+            Self::Any => true,
+            Self::Equals(text) => equals(text, value) == Some(true),
+        }
+    }
+}
+
+/// `None` when the text is no value of that type.
+pub(crate) fn equals(text: &str, value: &Scalar<'_>) -> Option<bool> {
+    let whole = |value: i128| text.parse::<i128>().ok().map(|number| number == value);
+    match value {
+        Scalar::Boolean(value) => text.parse::<bool>().ok().map(|said| said == *value),
+        Scalar::SByte(value) => whole(i128::from(*value)),
+        Scalar::Byte(value) => whole(i128::from(*value)),
+        Scalar::Int16(value) => whole(i128::from(*value)),
+        Scalar::UInt16(value) => whole(i128::from(*value)),
+        Scalar::Int32(value) => whole(i128::from(*value)),
+        Scalar::UInt32(value) => whole(i128::from(*value)),
+        Scalar::Int64(value) => whole(i128::from(*value)),
+        Scalar::UInt64(value) => whole(i128::from(*value)),
+        Scalar::Float(value) => text.parse::<f32>().ok().map(|number| number == *value),
+        Scalar::Double(value) => text.parse::<f64>().ok().map(|number| number == *value),
+        Scalar::String(value) => Some(value.unwrap_or_default() == text),
+        Scalar::DateTime(_)
+        | Scalar::Guid(_)
+        | Scalar::ByteString(_)
+        | Scalar::XmlElement(_)
+        | Scalar::NodeId(_)
+        | Scalar::ExpandedNodeId(_)
+        | Scalar::StatusCode(_)
+        | Scalar::QualifiedName(_)
+        | Scalar::LocalizedText(_)
+        | Scalar::ExtensionObject(_)
+        | Scalar::DataValue(_)
+        | Scalar::Variant(_)
+        | Scalar::DiagnosticInfo(_) => None,
     }
 }
 
@@ -302,6 +411,8 @@ pub struct Variable {
     pub fields: Vec<Leaf>,
     /// At most one per space.
     pub bindings: Vec<Binding>,
+    /// The service tied to it, in a space where no topic is.
+    pub service: Option<ServiceBinding>,
     /// What its queue does when full.
     pub overflow: Overflow,
 }

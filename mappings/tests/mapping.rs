@@ -1,16 +1,23 @@
 //! What a document without faults comes to, and that no text is too strange.
-#![expect(clippy::unwrap_used, reason = "test code")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
 
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::num::NonZeroU16;
 use std::time::Duration;
 
 use mappings::{
-    Checked, Code, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, SpaceId, TopicId,
+    Checked, Code, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, ServiceRole,
+    SpaceId, TopicId, Trigger,
 };
-use messages::{Leaf, Rank, Selection};
+use messages::{Leaf, Literal, Rank, Selection};
 use proptest::prelude::*;
-use uadp::BuiltinType;
+use uadp::{BuiltinType, Scalar};
 
 const HEAD: &str = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:my-plant:line}\nvariables:\n";
 
@@ -274,6 +281,103 @@ fn a_message_may_cross_as_bytes_whether_its_type_is_known_or_not() {
         checked.mapping.unwrap().variables()[0].fields,
         [Leaf::bytes()]
     );
+}
+
+#[test]
+fn a_value_calls_a_service_and_its_answer_is_a_value() {
+    let text = format!(
+        "{HEAD}  - node: ns=2;i=20\n    name: Run\n    origin: 0\n    ros: {{space: 1, call: /pump, type: std_srvs/srv/SetBool, \
+         field: data, timeout: 2s}}\n  \
+         - {{node: ns=2;i=21, name: Message, origin: 1, ros: {{answer: ns=2;i=20, field: message}}}}\n  \
+         - {{node: ns=2;i=22, name: Answer, origin: 1, ros: {{answer: ns=2;i=20}}}}\n"
+    );
+    let mapping = sound(&text);
+    let services: Vec<_> = mapping.services(SpaceId::ROS1).collect();
+    let (run, binding) = services[0];
+    assert_eq!(run.value_type, Some((BuiltinType::Boolean, false)));
+    assert!(run.bindings.is_empty());
+    let call = ServiceRole::Call {
+        service: "/pump".to_owned(),
+        service_type: "std_srvs/SetBool".parse().unwrap(),
+        request: Selection::Template {
+            field: Some("data".to_owned()),
+            rest: BTreeMap::new(),
+        },
+        when: Trigger::Any,
+        timeout: Duration::from_secs(2),
+    };
+    assert_eq!(binding.role, call);
+    let (message, binding) = services[1];
+    assert_eq!(message.value_type, Some((BuiltinType::String, false)));
+    let answer = ServiceRole::Answer {
+        of: run.topic,
+        selection: Selection::Field("message".to_owned()),
+    };
+    assert_eq!(binding.role, answer);
+    assert_eq!(services[2].0.fields.len(), 2, "success and message");
+    let two = SpaceId::new(2).unwrap();
+    assert_eq!((services.len(), mapping.services(two).count()), (3, 0));
+}
+
+#[test]
+fn a_request_without_the_value_is_sent_when_the_value_is_the_one_said() {
+    let when = |variable: &str, binding: &str| {
+        let mapping = sound(&format!(
+            "{HEAD}  - {{node: ns=2;i=20, name: Go, origin: 0, {variable} ros: {{space: 1, call: /go, \
+             type: std_srvs/Trigger{binding}}}}}\n"
+        ));
+        match mapping.variables()[0].service.clone().unwrap().role {
+            ServiceRole::Call { when, .. } => when,
+            other => panic!("{other:?}"),
+        }
+    };
+    let boolean = when("type: Boolean,", "");
+    assert!(boolean.fires(&Scalar::Boolean(true)) && !boolean.fires(&Scalar::Boolean(false)));
+    assert_eq!(when("type: Int32,", ""), Trigger::Any);
+    assert_eq!(when("", ""), Trigger::Any);
+    let seven = when("type: Int32,", ", when: 7");
+    assert!(seven.fires(&Scalar::Int32(7)) && !seven.fires(&Scalar::Int32(8)));
+    assert!(!seven.fires(&Scalar::ByteString(None)));
+}
+
+#[test]
+fn a_topic_of_the_space_is_fed_by_polling_a_service() {
+    let text = format!(
+        "{HEAD}  - node: ns=2;i=22\n    name: Plan\n    origin: 1\n    ros:\n      poll: /plan\n      type: nav_msgs/GetPlan\n      \
+         request: {{start: {{pose: {{position: {{x: 1.5}}}}}}, goal.header.frame_id: map}}\n      \
+         every: 2s\n      field: plan.header.frame_id\n"
+    );
+    let mapping = sound(&text);
+    let variable = &mapping.variables()[0];
+    assert_eq!(variable.value_type, Some((BuiltinType::String, false)));
+    let one = |path: &str, text: &str| (path.to_owned(), Literal::One(text.to_owned()));
+    let poll = ServiceRole::Poll {
+        service: "/plan".to_owned(),
+        service_type: "nav_msgs/GetPlan".parse().unwrap(),
+        request: Selection::Template {
+            field: None,
+            rest: BTreeMap::from([
+                one("goal.header.frame_id", "map"),
+                one("start.pose.position.x", "1.5"),
+            ]),
+        },
+        selection: Selection::Field("plan.header.frame_id".to_owned()),
+        every: Duration::from_secs(2),
+        timeout: Duration::from_secs(5),
+    };
+    assert_eq!(variable.service.as_ref().unwrap().role, poll);
+}
+
+#[test]
+fn a_service_type_that_is_not_built_in_is_a_warning_and_runs() {
+    let text = format!(
+        "{HEAD}  - {{node: ns=2;i=20, name: Run, type: Boolean, origin: 0, ros: {{space: 1, call: /c, \
+         type: conveyor_interface/ControlConveyor, request: {{id: 12, speed: 50}}, field: control_on}}}}\n"
+    );
+    let checked = Mapping::from_yaml(&text, "cell.yaml");
+    assert_eq!(codes(&checked), [Code::UnknownServiceType]);
+    let variable = checked.mapping.unwrap().variables()[0].clone();
+    assert_eq!(variable.value_type, Some((BuiltinType::Boolean, false)));
 }
 
 #[test]

@@ -176,7 +176,7 @@ fn interface(text: &str, place: Place, findings: &mut Findings) -> Option<String
 const SHORTEST: Duration = Duration::from_millis(10);
 const LONGEST: Duration = Duration::from_secs(3600);
 
-fn duration(field: &Field<String>, findings: &mut Findings) -> Option<Duration> {
+pub(super) fn duration(field: &Field<String>, findings: &mut Findings) -> Option<Duration> {
     let (text, place) = given(field)?;
     let duration = parse_duration(text);
     if duration.is_none() {
