@@ -77,6 +77,8 @@ codes! {
     RequestConstant = "M076", "A constant of a request is a value of its field: the field exists, is given once, does not take the value too, and the value is of its type and range.";
     Answer = "M077", "`answer` names the node of a variable that has a `call`; its value is what that service answers.";
     When = "M078", "`when` is a value of the variable's type, and goes with a `call` that has no `field`: with one, each value is sent.";
+    TopicPattern = "M079", "A pattern of topics is a topic name in which `*` stands for one or more characters of a part, and at most one part `**` for any number of parts.";
+    PatternCapture = "M080", "`{1}` in the `node`, `alias` or `name` of a pattern stands for what its first wildcard does, and so on. Node and alias have one, or all topics would be one node.";
 }
 
 impl fmt::Display for Code {
@@ -99,7 +101,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M078")]
+#[error("no finding has that code; codes are M001 to M080")]
 pub struct UnknownCode;
 
 #[cfg(test)]

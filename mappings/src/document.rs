@@ -24,6 +24,9 @@ document! {
         namespaces: Namespaces,
         /// The values of the cell, at most 20 000.
         variables: Vec<At<VariableEntry>>,
+        /// Topics that become values as they appear, at most 1000; the first that fits counts, and an entry of `variables`
+        /// with the same topic before all.
+        patterns: Vec<At<PatternEntry>>,
     }
 
     /// One ROS side.
@@ -105,6 +108,34 @@ document! {
         /// values that call a service, `keep_latest` tries the newest until it is taken or replaced, `drop_oldest` each
         /// once within its `timeout`.
         queue: Queue,
+    }
+
+    /// ROS topics that become values as they appear.
+    struct PatternEntry {
+        /// The topics, as /robot*/joint_states: `*` stands for one or more characters of a part between slashes, a part `**`
+        /// for any number of parts.
+        #[schemars(required, regex(pattern = r"^/.*\*"))]
+        topics: String,
+        /// Topics left out, patterns too, as [/robot9/**].
+        exclude: Vec<At<String>>,
+        /// The ROS space of the topics.
+        #[schemars(required, range(min = 1, max = 232))]
+        origin: u16,
+        /// The OPC UA node of each, as ns=2;i=10{1}: {1} is what the first wildcard stands for, {2} the second. A topic whose
+        /// number would not be one from 1 to 65535 is left out, with a word in the log.
+        #[schemars(required, regex(pattern = r"^ns=[0-9]+;[isgb]="))]
+        node: String,
+        /// Name of the node, as Robot{1}Joints.
+        #[schemars(required, length(min = 1))]
+        name: String,
+        /// Stands for the identifier in topic names when the node id is no number, as 10{1}.
+        alias: String,
+        /// Message type, as sensor_msgs/JointState: topics of another type are left out. Left out: any.
+        r#type: String,
+        /// The field that holds the value. Left out: the whole message, a field per leaf.
+        field: String,
+        /// How the messages cross: `fields` (the default) as OPC UA values, `bytes` as they are, one ByteString each.
+        r#as: AsEntry,
     }
 
     /// A ROS topic or service tied to a value: exactly one of `topic`, `call`, `answer` and `poll`.
@@ -370,6 +401,7 @@ pub(crate) fn read(root: &Node, reader: &mut Reader<'_>) -> Option<(Document, Pl
             server: None,
             namespaces: None,
             variables: None,
+            patterns: None,
         };
         return Some((document, root.place));
     }

@@ -8,6 +8,7 @@ mod findings;
 mod mapping;
 mod nearest;
 mod node_id;
+mod pattern;
 mod read;
 mod topic;
 mod tree;
@@ -21,4 +22,5 @@ pub use mapping::{
     ServiceBinding, ServiceRole, Space, Trigger, Variable,
 };
 pub use node_id::{Identifier, NodeIdError, NodeIdText};
+pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use topic::{Part, SpaceId, TopicError, TopicId};

@@ -9,6 +9,7 @@ use messages::{Leaf, Selection, TypeName};
 use uadp::{BuiltinType, Scalar};
 
 use crate::node_id::NodeIdText;
+use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 use crate::topic::{SpaceId, TopicId};
 
 /// The checked mapping of one cell. Immutable: a changed file makes a new one.
@@ -23,6 +24,7 @@ pub struct Mapping {
     server: Server,
     variables: Vec<Variable>,
     by_topic: HashMap<TopicId, usize>,
+    patterns: Vec<Pattern>,
 }
 
 impl Mapping {
@@ -45,7 +47,53 @@ impl Mapping {
             server,
             variables,
             by_topic,
+            patterns: Vec::new(),
         }
+    }
+
+    pub(crate) fn with_patterns(mut self, patterns: Vec<Pattern>) -> Self {
+        self.patterns = patterns;
+        self
+    }
+
+    /// The rules for topics that are not named, in the order of the document.
+    #[must_use]
+    pub fn patterns(&self) -> &[Pattern] {
+        &self.patterns
+    }
+
+    /// The variable a ROS topic of a space becomes by the first pattern about it. `None` for a topic without a pattern, one
+    /// that a variable is bound to, and the names of the space (`/ua_1_2_10`).
+    ///
+    /// # Errors
+    /// The pattern makes no node of it, or one that a variable of the mapping has. Two topics that become one node are
+    /// the caller's to tell.
+    #[must_use]
+    pub fn matching(
+        &self,
+        space: SpaceId,
+        ros_topic: &str,
+    ) -> Option<Result<PatternVariable, PatternFault>> {
+        let name = ros_topic.strip_prefix('/').unwrap_or(ros_topic);
+        if name.parse::<TopicId>().is_ok()
+            || self.bindings(space).any(|(_, b)| b.ros_topic == ros_topic)
+        {
+            return None;
+        }
+        let patterns = self.patterns.iter().filter(|p| p.origin() == space);
+        let (pattern, made) = patterns
+            .filter_map(|pattern| Some((pattern, pattern.matches(ros_topic)?)))
+            .next()?;
+        Some(made.and_then(|made| {
+            let taken = |v: &&Variable| v.topic == made.topic || v.node == made.node;
+            match self.variables.iter().find(taken) {
+                Some(other) => {
+                    let why = PatternReason::Taken(made.topic, other.name.clone());
+                    Err(pattern.fault(ros_topic, why))
+                }
+                None => Ok(made),
+            }
+        }))
     }
 
     /// How NetworkMessages travel.

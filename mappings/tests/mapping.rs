@@ -1,7 +1,6 @@
 //! What a document without faults comes to, and that no text is too strange.
 #![expect(
     clippy::unwrap_used,
-    clippy::panic,
     clippy::wildcard_enum_match_arm,
     reason = "test code"
 )]
@@ -378,6 +377,70 @@ fn a_service_type_that_is_not_built_in_is_a_warning_and_runs() {
     assert_eq!(codes(&checked), [Code::UnknownServiceType]);
     let variable = checked.mapping.unwrap().variables()[0].clone();
     assert_eq!(variable.value_type, Some((BuiltinType::Boolean, false)));
+}
+
+#[test]
+fn topics_become_variables_by_the_first_pattern_about_them() {
+    let text = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:my-plant:line}\nvariables:\n  \
+         - {node: ns=2;i=101, name: First, origin: 1, ros: {topic: /robot1/joint_states, type: sensor_msgs/JointState}}\n\
+         patterns:\n  \
+         - topics: /robot*/joint_states\n    exclude: [/robot9/**]\n    origin: 1\n    node: \"ns=2;i=10{1}\"\n    \
+         name: Robot{1}Joints\n    type: sensor_msgs/JointState\n    field: position\n  \
+         - {topics: /robot*/**, origin: 1, node: \"ns=2;s={1}/{2}\", alias: \"2{1}\", name: \"{2} of {1}\", as: bytes}\n";
+    let mapping = sound(text);
+    assert_eq!(mapping.patterns().len(), 2);
+    let matching = |topic: &str| mapping.matching(SpaceId::ROS1, topic);
+    let made = matching("/robot2/joint_states").unwrap().unwrap();
+    assert_eq!(made.topic, topic("ua_1_2_102"));
+    assert_eq!(
+        (made.node.to_string(), made.name.as_str()),
+        ("ns=2;i=102".to_owned(), "Robot2Joints")
+    );
+    assert_eq!(
+        made.message_type,
+        Some("sensor_msgs/JointState".parse().unwrap())
+    );
+    assert_eq!(made.selection, Selection::Field("position".to_owned()));
+    let made = matching("/robot9/joint_states").unwrap().unwrap();
+    assert_eq!(
+        (made.topic, made.selection),
+        (topic("ua_1_2_29"), Selection::Bytes)
+    );
+    assert_eq!(made.name, "joint_states of 9");
+    assert_eq!(matching("/robot1/joint_states"), None, "a variable has it");
+    assert_eq!(matching("/rosout"), None);
+    assert_eq!(matching("/ua_1_2_102"), None);
+    assert_eq!(
+        mapping.matching(SpaceId::new(2).unwrap(), "/robot2/joint_states"),
+        None
+    );
+    let told = |topic: &str| matching(topic).unwrap().unwrap_err().to_string();
+    assert_eq!(
+        told("/robotX/joint_states"),
+        "`/robotX/joint_states` matches the pattern `/robot*/joint_states`, but `ns=2;i=10X` is no node id"
+    );
+    assert!(
+        told("/robot99999/joint_states").ends_with("`ns=2;i=1099999` is no number from 1 to 65535")
+    );
+}
+
+#[test]
+fn a_pattern_does_not_take_the_node_of_a_variable() {
+    let text = "spaces: [{id: 1}]\nnamespaces: {2: urn:my-plant:line}\nvariables:\n  \
+         - {node: ns=2;i=101, name: First, type: Boolean, origin: 1}\n\
+         patterns:\n  - {topics: /robot*, origin: 1, node: \"ns=2;i=10{1}\", name: R}\n";
+    let mapping = sound(text);
+    let fault = mapping
+        .matching(SpaceId::ROS1, "/robot1")
+        .unwrap()
+        .unwrap_err();
+    assert!(
+        fault
+            .to_string()
+            .ends_with("`ua_1_2_101` is the variable `First` already"),
+        "{fault}"
+    );
+    assert!(mapping.matching(SpaceId::ROS1, "/robot2").unwrap().is_ok());
 }
 
 #[test]
