@@ -134,6 +134,7 @@ fn line(event: &PortEvent) -> String {
             let field = match selection {
                 Selection::Whole => "whole",
                 Selection::Field(field) => field,
+                Selection::Bytes => "bytes",
             };
             format!("{topic} is {} {field}", message_type.name())
         }

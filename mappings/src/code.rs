@@ -70,6 +70,7 @@ codes! {
     ReadAndWritten = "M069", "One ROS topic is read for one variable and written for another: what is written would come back under the other name.";
     TopicTypesDiffer = "M070", "One ROS topic is bound with two message types.";
     OpcUaBinding = "M071", "Space 0 is the OPC UA side and has no ROS topics.";
+    FieldOfBytes = "M072", "A message bound `as: bytes` crosses as it is, so no field of it can be named.";
 }
 
 impl fmt::Display for Code {
@@ -92,7 +93,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M071")]
+#[error("no finding has that code; codes are M001 to M072")]
 pub struct UnknownCode;
 
 #[cfg(test)]

@@ -109,6 +109,10 @@ document! {
         r#type: String,
         /// The field that holds the value, as data or pose.position.x. Left out: the whole message, a field per leaf.
         field: String,
+        /// How the message crosses: `fields` (the default) as OPC UA values, `bytes` as it is, one ByteString that only a
+        /// reader who knows the message type can read. For messages too big or too deep to be of use as values, as
+        /// images; not together with `field`.
+        r#as: AsEntry,
     }
 }
 
@@ -118,6 +122,13 @@ choice! {
         Exact = "exact",
         /// The number in any unsigned integer type.
         AnyWidth = "any_width",
+    }
+
+    enum AsEntry {
+        /// A value per field.
+        Fields = "fields",
+        /// The message as it is, one ByteString.
+        Bytes = "bytes",
     }
 
     enum SecurityEntry {

@@ -311,7 +311,7 @@ pub struct Binding {
     pub ros_topic: String,
     /// The type of the topic.
     pub message_type: TypeName,
-    /// One field of the message or all of it.
+    /// One field of the message, all of them, or the message as it is.
     pub selection: Selection,
 }
 

@@ -8,7 +8,7 @@ use std::time::Duration;
 use mappings::{
     Checked, Code, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, SpaceId, TopicId,
 };
-use messages::{Rank, Selection};
+use messages::{Leaf, Rank, Selection};
 use proptest::prelude::*;
 use uadp::BuiltinType;
 
@@ -252,6 +252,27 @@ fn an_unknown_type_read_from_ros_1_is_a_warning_and_runs() {
     assert_eq!(
         variable.bindings[0].selection,
         Selection::Field("x".to_owned())
+    );
+}
+
+#[test]
+fn a_message_may_cross_as_bytes_whether_its_type_is_known_or_not() {
+    let text = format!(
+        "{HEAD}  - node: ns=2;i=10\n    name: Image\n    type: ByteString\n    origin: 1\n    ros:\n      \
+         - {{topic: /camera, type: sensor_msgs/Image, as: bytes}}\n      \
+         - {{space: 2, topic: /image, type: std_msgs/UInt8MultiArray, field: data, as: fields}}\n"
+    );
+    let mapping = sound(&text);
+    let variable = &mapping.variables()[0];
+    assert_eq!(variable.value_type, Some((BuiltinType::ByteString, false)));
+    assert_eq!(variable.fields, [Leaf::bytes()]);
+    assert_eq!(variable.bindings[0].selection, Selection::Bytes);
+    let text = text.replace("sensor_msgs", "their_msgs");
+    let checked = Mapping::from_yaml(&text, "cell.yaml");
+    assert_eq!(codes(&checked), [Code::UnknownMessageType]);
+    assert_eq!(
+        checked.mapping.unwrap().variables()[0].fields,
+        [Leaf::bytes()]
     );
 }
 

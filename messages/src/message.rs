@@ -27,6 +27,18 @@ pub struct Leaf {
     pub rank: Rank,
 }
 
+impl Leaf {
+    /// The one field of a message that crosses as it is ([`Selection::Bytes`](crate::Selection::Bytes)): a ByteString
+    /// without a name.
+    pub const fn bytes() -> Self {
+        Self {
+            path: String::new(),
+            builtin: BuiltinType::ByteString,
+            rank: Rank::Scalar,
+        }
+    }
+}
+
 /// Whether a field is an array.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rank {

@@ -6,8 +6,8 @@ mod support;
 use std::sync::Arc;
 
 use messages::{
-    Dialect, Fault, MessageType, Plan, PlanError, ReadError, Registry, Selection, SourceError,
-    TypeName, Wire, WriteError, WriteFault,
+    Dialect, Fault, Leaf, MessageType, Plan, PlanError, ReadError, Registry, Selection,
+    SourceError, TypeName, Wire, WriteError, WriteFault,
 };
 use support::{Event, Player, Recorder, Value};
 use uadp::{BuiltinType, DateTime, Scalar};
@@ -341,4 +341,24 @@ fn a_ros_2_time_as_a_topic_is_one_date_time() {
         ["scalar DateTime 116444735990000000"]
     );
     assert_eq!(plan.leaves().first().unwrap().path, "data");
+}
+
+#[test]
+fn a_message_may_cross_as_it_is() {
+    for (dialect, wire) in [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)] {
+        let message = message(dialect, "bool b\nstring s");
+        let plan = Plan::compile(&message, &Selection::Bytes, wire).unwrap();
+        assert_eq!(plan.leaves(), [Leaf::bytes()]);
+        // No message of the type: nobody looks.
+        let payload = [9, 8, 7];
+        assert_eq!(read(&plan, &payload).unwrap(), ["scalar ByteString 090807"]);
+        let events = [scalar(Scalar::ByteString(Some(&payload)))];
+        assert_eq!(write(&plan, &events).unwrap(), payload);
+        let two = [events[0].clone(), events[0].clone()];
+        assert_eq!(
+            write(&plan, &two).unwrap_err().to_string(),
+            "1 fields too many"
+        );
+        assert!(write(&plan, &[scalar(Scalar::Byte(1))]).is_err());
+    }
 }

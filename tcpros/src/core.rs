@@ -178,8 +178,13 @@ impl Registry {
                 self.services.insert((*service).to_owned(), entry);
                 done(1)
             }
-            ("unregisterService", [caller, service, _]) => {
-                let removed = self.services.remove(*service).is_some();
+            ("unregisterService", [caller, service, service_api]) => {
+                // A service that another node has taken over is that node's.
+                let own = |(node, api): &(String, String)| node == caller && api == service_api;
+                let removed = self.services.get(*service).is_some_and(own);
+                if removed {
+                    self.services.remove(*service);
+                }
                 self.forget_unused(caller);
                 done(i32::from(removed))
             }

@@ -90,6 +90,10 @@ pub(crate) fn message_too_long(topic: &str, bytes: usize) {
     );
 }
 
+pub(crate) fn service_failed(service: &str, client: &str, why: &str) {
+    warn!(service, client, why, "a request was given up");
+}
+
 pub(crate) fn publisher_joined(topic: &str, publisher: &str) {
     debug!(topic, publisher, "connected to a publisher");
 }

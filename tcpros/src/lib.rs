@@ -1,7 +1,7 @@
 //! A ROS 1 node on tokio.
 //!
-//! A [`Node`] registers with a ROS master, publishes and subscribes topics of any type as bytes, and answers the
-//! slave API. It knows no message type: types are given with their checksum and text, or learned from the peer's
+//! A [`Node`] registers with a ROS master, publishes and subscribes topics and offers and calls services of any type
+//! as bytes, and answers the slave API. It knows no message type: types are given with their checksum and text, or learned from the peer's
 //! [`ConnectionHeader`].
 //!
 //! - It needs no master to start: it registers when one comes, and again after a restart. Connections between nodes
@@ -12,10 +12,9 @@
 //! - It runs on a `current_thread` runtime as well as on several threads. A consumer on a `current_thread` runtime
 //!   is served fastest when it is a spawned task: waking the future given to `block_on` costs a system call.
 //!
-//! Services are not part of it.
-//!
 //! To read the code: `node` has the state, `registrar` the master's side of it, `publisher` and `topic_server` what
-//! goes out, `subscription` and `link` what comes in, `inbox` where it is taken, `parameters` what the master keeps.
+//! goes out, `subscription` and `link` what comes in, `inbox` where it is taken, `service` what is called, and
+//! `parameters` what the master keeps.
 
 mod clock;
 mod core;
@@ -33,6 +32,7 @@ mod parameters;
 mod publisher;
 mod registrar;
 mod rpc;
+mod service;
 mod slave;
 mod subscription;
 mod time;
@@ -49,6 +49,10 @@ pub use crate::options::{ArgumentError, NodeOptions};
 pub use crate::parameters::{ParamError, ParamSubscription, ParamValue, Parameters};
 pub use crate::publisher::{Published, Publisher, PublisherOptions, TopicType};
 pub use crate::rpc::RpcError;
+pub use crate::service::{
+    CallPhase, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions, ServiceRequest,
+    ServiceServer, ServiceType,
+};
 pub use crate::subscription::{SubscriberOptions, Subscription, Wanted};
 pub use crate::time::{RosClock, RosTime};
 pub use crate::xmlrpc::{Fault, XmlError};

@@ -1,4 +1,4 @@
-//! The node: what it publishes and subscribes, and the tasks that serve it.
+//! The node: what it publishes, subscribes and offers, and the tasks that serve it.
 
 use std::collections::HashMap;
 use std::net::IpAddr;
@@ -6,6 +6,7 @@ use std::sync::atomic::{AtomicI32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use bytes::Bytes;
 use thiserror::Error;
 use tokio::net::TcpListener;
 use tokio::sync::{Notify, watch};
@@ -21,14 +22,18 @@ use crate::options::NodeOptions;
 use crate::outbox::{Limit, lock};
 use crate::parameters::{ParamValue, Parameters, Params};
 use crate::publisher::{Hub, Publisher, PublisherOptions, TopicType};
+use crate::service::{
+    Served, ServiceClient, ServiceClientOptions, ServiceOptions, ServiceRequest, ServiceServer,
+    ServiceType,
+};
 use crate::subscription::{Feed, SubscriberOptions, Subscription, Wanted};
 use crate::time::{CLOCK_MD5, CLOCK_TYPE, RosClock, RosTime};
 use crate::{registrar, rpc, slave, topic_server};
 
 /// A ROS 1 node. Dropping it ends its connections; only [`Node::shutdown`] also tells the master.
 ///
-/// Three tasks belong to it: the slave API, the listener for subscribers, and the one that keeps the master
-/// informed. Each connection to a subscriber or publisher is a task besides. All end with the node.
+/// Three tasks belong to it: the slave API, the listener for subscribers and clients, and the one that keeps the master
+/// informed. Each connection to a subscriber, publisher or client is a task besides. All end with the node.
 #[derive(Debug)]
 pub struct Node {
     inner: Arc<Inner>,
@@ -58,11 +63,11 @@ impl Node {
             caller_id,
             max_message: options.max_message,
             master: master.clone(),
-            ipv6_first: options.ipv6,
         };
         let inner = Arc::new(Inner {
             names,
             uri,
+            service_uri: format!("rosrpc://{}:{topics_port}", bracketed(&options.hostname)),
             hostname: options.hostname,
             topics_port,
             master,
@@ -97,7 +102,7 @@ impl Node {
         &self.inner.uri
     }
 
-    /// A topic's name as this node resolves it: namespace, `~` and remappings applied.
+    /// A topic's or service's name as this node resolves it: namespace, `~` and remappings applied.
     pub fn resolve(&self, topic: &str) -> Result<String, NameError> {
         self.inner.names.resolve(topic)
     }
@@ -196,7 +201,59 @@ impl Node {
         Ok(Subscription::new(feed, Arc::clone(&self.inner)))
     }
 
-    /// Asks the master who publishes and subscribes what.
+    /// Offers a service. The handler is called once per request, for several clients at a time; what it fails with
+    /// reaches the client as text. Where several nodes offer one service, the master sends clients to the last.
+    ///
+    /// Fails when the name is no ROS name, when this node already offers it, or when the type is not complete.
+    pub fn advertise_service<H, F>(
+        &self,
+        service: &str,
+        service_type: ServiceType,
+        options: ServiceOptions,
+        handler: H,
+    ) -> Result<ServiceServer, NodeError>
+    where
+        H: Fn(ServiceRequest) -> F + Send + Sync + 'static,
+        F: Future<Output = Result<Bytes, String>> + Send + 'static,
+    {
+        let service = self.inner.names.resolve(service)?;
+        if !service_type.name.contains('/') || service_type.md5sum.len() != 32 {
+            return Err(NodeError::ServiceType {
+                service,
+                type_name: service_type.name,
+            });
+        }
+        let mut registry = lock(&self.inner.registry);
+        if registry.services.contains_key(&service) {
+            return Err(NodeError::AlreadyOffered(service));
+        }
+        let served = Arc::new(Served::new(
+            service.clone(),
+            service_type,
+            options,
+            registry.next_generation(),
+            self.inner.draining.clone(),
+            handler,
+        ));
+        registry.services.insert(service, Arc::clone(&served));
+        drop(registry);
+        self.inner.changed.notify_one();
+        Ok(ServiceServer::new(served, Arc::clone(&self.inner)))
+    }
+
+    /// A client of a service, which need not be there yet: nobody is asked before the first call. Fails when the name
+    /// is no ROS name.
+    pub fn service_client(
+        &self,
+        service: &str,
+        options: ServiceClientOptions,
+    ) -> Result<ServiceClient, NodeError> {
+        let service = self.inner.names.resolve(service)?;
+        let master = self.inner.master.clone();
+        Ok(ServiceClient::new(service, options, self.name(), master))
+    }
+
+    /// Asks the master who publishes, subscribes and offers what.
     pub async fn graph(&self) -> Result<Graph, MasterError> {
         self.inner.master.graph().await
     }
@@ -208,7 +265,8 @@ impl Node {
         }
     }
 
-    /// Withdraws everything from the master and ends: connections to subscribers after their queues are written,
+    /// Withdraws everything from the master and ends: connections to subscribers after their queues are written, those to
+    /// clients after their requests are answered,
     /// all within two seconds. What could not be withdrawn is logged.
     pub async fn shutdown(mut self) {
         let mut settled = self.inner.settled.subscribe();
@@ -233,7 +291,7 @@ impl Drop for Node {
     }
 }
 
-/// Asks the master of a node who publishes and subscribes what.
+/// Asks the master of a node who publishes, subscribes and offers what.
 #[derive(Clone, Debug)]
 pub struct GraphReader {
     master: Master,
@@ -255,7 +313,7 @@ pub enum MasterState {
     Registered,
 }
 
-/// Why a node could not start or a topic could not be taken.
+/// Why a node could not start or a topic or service could not be taken.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum NodeError {
@@ -288,6 +346,17 @@ pub enum NodeError {
         /// The name given.
         type_name: String,
     },
+    /// This node offers the service already.
+    #[error("{0} is already offered by this node")]
+    AlreadyOffered(String),
+    /// The service's type has no package or no checksum.
+    #[error("{service} cannot be offered with the incomplete type `{type_name}`")]
+    ServiceType {
+        /// The resolved service.
+        service: String,
+        /// The name given.
+        type_name: String,
+    },
 }
 
 /// What the node's handles and tasks share.
@@ -295,6 +364,8 @@ pub enum NodeError {
 pub(crate) struct Inner {
     names: Names,
     pub(crate) uri: String,
+    /// Where the node's services are called, as the master is told it.
+    pub(crate) service_uri: String,
     pub(crate) hostname: String,
     pub(crate) topics_port: u16,
     pub(crate) master: Master,
@@ -311,7 +382,7 @@ pub(crate) struct Inner {
     shutdown: watch::Sender<Option<String>>,
     /// True once everything is closed and the master was told so.
     pub(crate) settled: watch::Sender<bool>,
-    /// Connections to subscribers, those of withdrawn topics included.
+    /// Connections to subscribers and clients, those of withdrawn topics and services included.
     draining: watch::Sender<usize>,
     next_id: AtomicI32,
 }
@@ -320,6 +391,7 @@ pub(crate) struct Inner {
 struct Registry {
     publications: HashMap<String, Arc<Hub>>,
     subscriptions: HashMap<String, Subscribed>,
+    services: HashMap<String, Arc<Served>>,
     generation: u64,
     closed: bool,
 }
@@ -341,19 +413,21 @@ struct Subscribed {
     feeds: Vec<Arc<Feed>>,
 }
 
-/// What the master should know of one topic, and which version of it.
+/// What the master should know of one topic or service, and which version of it.
 #[derive(Clone, Debug)]
 pub(crate) struct Registration {
-    pub(crate) topic: String,
-    pub(crate) kind: TopicKind,
+    pub(crate) name: String,
+    pub(crate) kind: ResourceKind,
     pub(crate) generation: u64,
+    /// Of a topic; the master is not told the type of a service.
     pub(crate) type_name: String,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub(crate) enum TopicKind {
+pub(crate) enum ResourceKind {
     Published,
     Subscribed,
+    Service,
 }
 
 impl Inner {
@@ -461,6 +535,24 @@ impl Inner {
         self.changed.notify_one();
     }
 
+    pub(crate) fn service(&self, name: &str) -> Option<Arc<Served>> {
+        lock(&self.registry).services.get(name).cloned()
+    }
+
+    pub(crate) fn services(&self) -> Vec<Arc<Served>> {
+        lock(&self.registry).services.values().cloned().collect()
+    }
+
+    pub(crate) fn withdraw_service(&self, served: &Arc<Served>) {
+        let mut registry = lock(&self.registry);
+        let known = registry.services.get(&served.service);
+        if known.is_some_and(|known| Arc::ptr_eq(known, served)) {
+            registry.services.remove(&served.service);
+        }
+        drop(registry);
+        self.changed.notify_one();
+    }
+
     pub(crate) fn withdraw_subscription(&self, feed: &Arc<Feed>) {
         let mut registry = lock(&self.registry);
         if let Some(entry) = registry.subscriptions.get_mut(&feed.topic) {
@@ -477,8 +569,8 @@ impl Inner {
     pub(crate) fn wanted_registrations(&self) -> Vec<Registration> {
         let registry = lock(&self.registry);
         let published = registry.publications.values().map(|hub| Registration {
-            topic: hub.topic.clone(),
-            kind: TopicKind::Published,
+            name: hub.topic.clone(),
+            kind: ResourceKind::Published,
             generation: hub.generation,
             type_name: hub.topic_type.name.clone(),
         });
@@ -486,8 +578,8 @@ impl Inner {
             .subscriptions
             .iter()
             .map(|(topic, entry)| Registration {
-                topic: topic.clone(),
-                kind: TopicKind::Subscribed,
+                name: topic.clone(),
+                kind: ResourceKind::Subscribed,
                 generation: entry.generation,
                 type_name: entry
                     .feeds
@@ -495,7 +587,13 @@ impl Inner {
                     .find_map(|feed| feed.wanted.type_name.clone())
                     .unwrap_or_else(|| "*".to_owned()),
             });
-        published.chain(subscribed).collect()
+        let offered = registry.services.values().map(|served| Registration {
+            name: served.service.clone(),
+            kind: ResourceKind::Service,
+            generation: served.generation,
+            type_name: String::new(),
+        });
+        published.chain(subscribed).chain(offered).collect()
     }
 
     /// How many lists of publishers have come for a topic.
@@ -558,7 +656,7 @@ impl Inner {
         lock(&self.registry).closed
     }
 
-    /// Ends all topics, for good.
+    /// Ends all topics and services, for good.
     fn close(&self) {
         let mut registry = lock(&self.registry);
         registry.closed = true;
@@ -568,6 +666,11 @@ impl Inner {
             .drain()
             .flat_map(|(_, entry)| entry.feeds)
             .collect();
+        let services: Vec<_> = registry
+            .services
+            .drain()
+            .map(|(_, served)| served)
+            .collect();
         drop(registry);
         self.params.close();
         for hub in &hubs {
@@ -575,6 +678,9 @@ impl Inner {
         }
         for feed in &feeds {
             feed.close();
+        }
+        for served in &services {
+            served.close();
         }
     }
 }

@@ -32,20 +32,10 @@ pub(crate) struct Endpoint {
 impl Endpoint {
     /// Reads `http://host:port[/path]`.
     pub(crate) fn parse(uri: &str) -> Option<Self> {
-        let rest = uri.trim().strip_prefix("http://")?;
-        let (authority, path) = rest.find('/').map_or((rest, "/"), |at| rest.split_at(at));
-        let (host, port) = authority.rsplit_once(':')?;
-        let host = host
-            .strip_prefix('[')
-            .and_then(|h| h.strip_suffix(']'))
-            .unwrap_or(host);
-        let plain = |text: &str| text.bytes().all(|b| b.is_ascii_graphic());
-        if host.is_empty() || !plain(host) || !plain(path) {
-            return None;
-        }
+        let (host, port, path) = parts(uri, "http://")?;
         Some(Self {
             host: host.to_owned(),
-            port: port.parse().ok()?,
+            port,
             path: path.to_owned(),
             ipv6_first: false,
         })
@@ -56,6 +46,26 @@ impl Endpoint {
         self.ipv6_first = ipv6_first;
         self
     }
+
+    pub(crate) const fn prefers_ipv6(&self) -> bool {
+        self.ipv6_first
+    }
+}
+
+/// Host, port and path of a URI of this scheme.
+pub(crate) fn parts<'a>(uri: &'a str, scheme: &str) -> Option<(&'a str, u16, &'a str)> {
+    let rest = uri.trim().strip_prefix(scheme)?;
+    let (authority, path) = rest.find('/').map_or((rest, "/"), |at| rest.split_at(at));
+    let (host, port) = authority.rsplit_once(':')?;
+    let host = host
+        .strip_prefix('[')
+        .and_then(|h| h.strip_suffix(']'))
+        .unwrap_or(host);
+    let plain = |text: &str| text.bytes().all(|b| b.is_ascii_graphic());
+    if host.is_empty() || !plain(host) || !plain(path) {
+        return None;
+    }
+    Some((host, port.parse().ok()?, path))
 }
 
 /// Calls a method and waits for its result at most `limit`.

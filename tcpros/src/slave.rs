@@ -130,7 +130,15 @@ fn bus_stats(node: &Inner) -> Value {
         let connections: Vec<Value> = feed.connections().into_iter().map(connection).collect();
         subscribed.push(vec![feed.topic.as_str().into(), connections.into()].into());
     }
-    let services = vec![0.into(), 0.into(), 0.into()];
+    // Requests, bytes received, bytes sent, over all services: the slave API knows no more of them.
+    let (mut calls, mut received, mut sent) = (0u64, 0u64, 0u64);
+    for served in node.services() {
+        let counters = &served.counters;
+        calls = calls.saturating_add(counters.calls.load(Ordering::Relaxed));
+        received = received.saturating_add(counters.received.load(Ordering::Relaxed));
+        sent = sent.saturating_add(counters.sent.load(Ordering::Relaxed));
+    }
+    let services = vec![count(calls), count(received), count(sent)];
     Value::Array(vec![
         Value::Array(published),
         Value::Array(subscribed),

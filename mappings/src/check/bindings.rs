@@ -10,11 +10,11 @@ use super::names::{mended, topic_fault};
 use super::types::{self, Types, ValueType, dialect};
 use super::{Declared, required, variables};
 use crate::code::Code;
-use crate::document::{self, BindingEntry};
+use crate::document::{self, AsEntry, BindingEntry};
 use crate::findings::Findings;
 use crate::mapping::{Binding, Space};
 use crate::nearest::nearest;
-use crate::read::{At, list, short};
+use crate::read::{At, given, list, short};
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::Place;
 
@@ -164,19 +164,20 @@ impl<'c> Bindings<'c> {
         let (name, place) = named?;
         let space = site.space?;
         let message_type = self.message_type(&name, place, site, findings);
-        let selection = match &entry.field {
-            None => Selection::Whole,
-            Some(at) => Selection::Field(at.value.clone()?),
+        let selection = selection(entry, findings)?;
+        let chosen = match (&entry.field, &entry.r#as) {
+            (Some(at), _) => at.place,
+            (None, Some(at)) => at.place,
+            (None, None) => place,
         };
-        let fields = match message_type {
-            Some(message_type) => {
-                let place = entry.field.as_ref().map_or(place, |at| at.place);
-                let fields = select(&message_type, &selection, place, findings)?;
-                compare(&fields, &name, site.subject, place, findings);
-                Some(fields)
-            }
-            None => None,
+        let fields = match (&selection, message_type) {
+            (Selection::Bytes, _) => Some(vec![Leaf::bytes()]),
+            (_, Some(message_type)) => Some(select(&message_type, &selection, chosen, findings)?),
+            (_, None) => None,
         };
+        if let Some(fields) = &fields {
+            compare(fields, &name, site.subject, chosen, findings);
+        }
         let (ros_topic, place) = topic?;
         let binding = Binding {
             space,
@@ -322,6 +323,25 @@ impl<'c> Bindings<'c> {
     }
 }
 
+/// `None` when it is faulty, which is noted.
+fn selection(entry: &BindingEntry, findings: &mut Findings) -> Option<Selection> {
+    let bytes = matches!(given(&entry.r#as), Some((AsEntry::Bytes, _)));
+    match &entry.field {
+        None if bytes => Some(Selection::Bytes),
+        None => Some(Selection::Whole),
+        Some(at) if bytes => {
+            let note = findings.error(
+                Code::FieldOfBytes,
+                at.place,
+                "a message that crosses as bytes has no fields",
+            );
+            note.help("leave `field` out, or `as: bytes`");
+            None
+        }
+        Some(at) => Some(Selection::Field(at.value.clone()?)),
+    }
+}
+
 fn conflict(first: &Use, other: &Use, topic: &str, findings: &mut Findings) {
     let label = format!("first at line {}", first.place.line);
     if first.reads != other.reads {
@@ -462,6 +482,12 @@ fn compare(
     let told_type = types::print(declared);
     match fields {
         [one] if types::value_type(one) == declared => {}
+        [one] if *one == Leaf::bytes() => {
+            let message = format!("the variable is {told_type}, but bytes are a ByteString");
+            findings
+                .error(Code::TypeDiffers, place, message)
+                .help("leave the variable's `type` out, or write `type: ByteString`");
+        }
         [one] => {
             let found = types::print(types::value_type(one));
             let message = format!(
@@ -486,6 +512,12 @@ fn compare(
     }
 }
 
+/// Whether the bytes that are a message of the one are none of the other.
+fn differ_as_bytes(a: &Binding, b: &Binding) -> bool {
+    let bytes = a.selection == Selection::Bytes && b.selection == Selection::Bytes;
+    bytes && (dialect(a.space) != dialect(b.space) || a.message_type != b.message_type)
+}
+
 /// Where the fields of two bindings could not stand for one another.
 fn differences(found: &[Found], findings: &mut Findings) {
     let mut known = found
@@ -497,6 +529,16 @@ fn differences(found: &[Found], findings: &mut Findings) {
     let shape =
         |fields: &[Leaf]| -> Vec<ValueType> { fields.iter().map(types::value_type).collect() };
     for (other, others) in known {
+        if differ_as_bytes(&first.binding, &other.binding) {
+            let (a, b) = (&first.binding, &other.binding);
+            let message = format!(
+                "the bytes of `{}` in space {} are no `{}` in space {}",
+                a.message_type, a.space, b.message_type, b.space
+            );
+            let note = findings.error(Code::BindingsDiffer, other.place, message);
+            note.label(format!("differs from line {}", first.place.line))
+                .help("bytes cross as they are: only topics of one type and of one ROS can both have them");
+        }
         if shape(fields) == shape(others) {
             continue;
         }

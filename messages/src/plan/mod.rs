@@ -5,6 +5,8 @@ mod write;
 
 use std::sync::Arc;
 
+use uadp::Scalar;
+
 use crate::definition::{Arity, Number, Primitive};
 use crate::resolve::{Shape, ShapeKind};
 use crate::{Dialect, Leaf, MessageType, PlanError, ReadError, Sink, Source, TypeName, WriteError};
@@ -26,6 +28,9 @@ pub enum Selection {
     Whole,
     /// The one of that path.
     Field(String),
+    /// The message as it is on the wire, as one ByteString: no field of it is looked at, so whoever writes it says what
+    /// is in it. Of CDR the encapsulation header is part of it.
+    Bytes,
 }
 
 /// Reads and writes the messages of one type on one wire.
@@ -34,10 +39,17 @@ pub enum Selection {
 #[derive(Clone, Debug)]
 pub struct Plan {
     wire: Wire,
-    ops: Vec<Op>,
+    body: Body,
     leaves: Vec<Leaf>,
     /// Paths of all fields, for errors; `Op::leaf` counts in it.
     paths: Vec<String>,
+}
+
+#[derive(Clone, Debug)]
+enum Body {
+    Steps(Vec<Op>),
+    /// The message crosses as it is.
+    Bytes,
 }
 
 /// One step. The steps of a message in an array follow its [`What::Messages`].
@@ -117,6 +129,7 @@ impl Plan {
                 };
                 (Some(at), vec![leaf.clone()])
             }
+            Selection::Bytes => return Ok(Self::bytes(wire)),
         };
         let mut compiler = Compiler {
             wire,
@@ -132,10 +145,19 @@ impl Plan {
         }
         Ok(Self {
             wire,
-            ops: compiler.ops,
+            body: Body::Steps(compiler.ops),
             leaves,
             paths,
         })
+    }
+
+    fn bytes(wire: Wire) -> Self {
+        Self {
+            wire,
+            body: Body::Bytes,
+            leaves: vec![Leaf::bytes()],
+            paths: Vec::new(),
+        }
     }
 
     /// The fields that cross, in the order they do.
@@ -148,7 +170,15 @@ impl Plan {
     /// A length is believed only after it was compared with the bytes that are left. When it errs the sink may have
     /// taken some fields already.
     pub fn read<S: Sink>(&self, payload: &[u8], sink: &mut S) -> Result<(), ReadError<S::Error>> {
-        read::read(self, payload, sink)
+        match &self.body {
+            Body::Steps(ops) => read::read(self, ops, payload, sink),
+            Body::Bytes => sink
+                .scalar(Scalar::ByteString(Some(payload)))
+                .map_err(|source| ReadError::Sink {
+                    field: String::new(),
+                    source,
+                }),
+        }
     }
 
     /// Takes the fields from `source` and appends the message to `out`; on error `out` is as it was.
@@ -157,7 +187,10 @@ impl Plan {
         source: &mut S,
         out: &mut Vec<u8>,
     ) -> Result<(), WriteError> {
-        write::write(self, source, out)
+        match &self.body {
+            Body::Steps(ops) => write::write(self, ops, source, out),
+            Body::Bytes => write::bytes(source, out),
+        }
     }
 
     fn path(&self, leaf: Option<usize>) -> String {

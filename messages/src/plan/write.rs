@@ -16,6 +16,7 @@ struct Writer<'o, 's, S> {
 
 pub(super) fn write<'a, S: Source<'a>>(
     plan: &Plan,
+    ops: &[Op],
     source: &mut S,
     out: &mut Vec<u8>,
 ) -> Result<(), WriteError> {
@@ -30,7 +31,7 @@ pub(super) fn write<'a, S: Source<'a>>(
         leaf: None,
         source,
     };
-    let done = writer.steps(&plan.ops, false).and_then(|()| {
+    let done = writer.steps(ops, false).and_then(|()| {
         writer.leaf = None;
         writer.source.finish().map_err(WriteFault::Source)
     });
@@ -43,6 +44,26 @@ pub(super) fn write<'a, S: Source<'a>>(
             fault,
         }
     })
+}
+
+/// A message that crosses as it is.
+pub(super) fn bytes<'a, S: Source<'a>>(
+    source: &mut S,
+    out: &mut Vec<u8>,
+) -> Result<(), WriteError> {
+    let whole = |fault: WriteFault| WriteError {
+        field: String::new(),
+        fault,
+    };
+    let value = source
+        .scalar(BuiltinType::ByteString)
+        .map_err(|error| whole(error.into()))?;
+    let Scalar::ByteString(bytes) = value else {
+        return Err(whole(mismatch(BuiltinType::ByteString, &value)));
+    };
+    source.finish().map_err(|error| whole(error.into()))?;
+    out.extend_from_slice(bytes.unwrap_or_default());
+    Ok(())
 }
 
 impl<'a, S: Source<'a>> Writer<'_, '_, S> {
