@@ -28,7 +28,6 @@ pub(crate) struct LinkContext {
     pub(crate) caller_id: String,
     pub(crate) max_message: usize,
     pub(crate) master: Master,
-    pub(crate) ipv6_first: bool,
 }
 
 /// Keeps a subscription connected to one publisher until the master no longer names it. A task of its own.
@@ -83,7 +82,10 @@ async fn connect(
     uri: &str,
 ) -> Result<(TcpStream, Arc<Peer>), LinkError> {
     let (host, port) = request_topic(feed, context, uri).await?;
-    let connecting = timeout(CONNECT_LIMIT, rpc::connect(&host, port, context.ipv6_first));
+    let connecting = timeout(
+        CONNECT_LIMIT,
+        rpc::connect(&host, port, context.master.prefers_ipv6()),
+    );
     let mut stream = connecting
         .await
         .map_err(|_| LinkError::NoConnection(CONNECT_LIMIT))??;
@@ -108,7 +110,7 @@ async fn request_topic(
 ) -> Result<(String, u16), LinkError> {
     let endpoint = Endpoint::parse(uri)
         .ok_or(RpcError::Uri)?
-        .ipv6_first(context.ipv6_first);
+        .ipv6_first(context.master.prefers_ipv6());
     let protocols = vec![Value::Array(vec!["TCPROS".into()])];
     let params = vec![
         context.caller_id.as_str().into(),

@@ -45,6 +45,11 @@ impl Master {
         }
     }
 
+    /// Whether other nodes are tried by IPv6 before IPv4, as this one is told to.
+    pub(crate) const fn prefers_ipv6(&self) -> bool {
+        self.endpoint.prefers_ipv6()
+    }
+
     pub(crate) fn uri(&self) -> &str {
         &self.uri
     }

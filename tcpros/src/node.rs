@@ -64,7 +64,6 @@ impl Node {
             caller_id,
             max_message: options.max_message,
             master: master.clone(),
-            ipv6_first: options.ipv6,
         };
         let inner = Arc::new(Inner {
             names,

@@ -50,6 +50,10 @@ impl Endpoint {
         self.ipv6_first = ipv6_first;
         self
     }
+
+    pub(crate) const fn prefers_ipv6(&self) -> bool {
+        self.ipv6_first
+    }
 }
 
 /// Host, port and path of a URI of this scheme.
