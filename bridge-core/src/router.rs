@@ -374,6 +374,13 @@ impl Router {
         });
     }
 
+    /// A value of the topic was not taken by the service it is for, or the service that should say it did not answer.
+    pub fn call_failed(&mut self, topic: TopicId, detail: &str) {
+        self.count(About::topic(topic), Reason::CallFailed, 1, || {
+            detail.to_owned()
+        });
+    }
+
     /// Samples that were lost before the Router saw them, in a queue of the port or the kernel.
     pub fn lost(&mut self, topic: Option<TopicId>, count: u64, why: &'static str) {
         self.count(About { topic, from: None }, Reason::Overflow, count, || {
