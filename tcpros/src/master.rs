@@ -49,6 +49,10 @@ impl Master {
         &self.uri
     }
 
+    pub(crate) const fn prefers_ipv6(&self) -> bool {
+        self.endpoint.prefers_ipv6()
+    }
+
     pub(crate) async fn pid(&self) -> Result<i32, MasterError> {
         self.call("getPid", vec![])
             .await?
@@ -169,7 +173,7 @@ impl Master {
     }
 
     /// Calls with the caller id in front and unwraps `[code, message, result]`.
-    async fn call(
+    pub(crate) async fn call(
         &self,
         method: &'static str,
         mut params: Vec<Value>,
