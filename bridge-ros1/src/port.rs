@@ -5,9 +5,10 @@
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::SystemTime;
 
 use bridge_node::{Delivery, Kept, Port, PortEvent, timestamp};
-use mappings::{Mapping, SpaceId, TopicId};
+use mappings::{Mapping, SpaceId, TopicId, Variable};
 use messages::{MessageType, Selection, TypeName};
 use tcpros::{
     Graph, Inbox, InboxEvent, Latched, Message, Node, NodeError, NodeOptions, Peer,
@@ -17,6 +18,7 @@ use tracing::{info, warn};
 use uadp::{BuiltinType, Timestamp};
 
 use crate::definitions::Definitions;
+use crate::services::Services;
 use crate::sink::{Open, Sink};
 use crate::source::{Met, Source};
 use crate::watcher::{Seen, Watcher};
@@ -49,6 +51,8 @@ pub struct Ros1Port {
     inbox: Inbox<usize>,
     /// Topics we write.
     sinks: HashMap<TopicId, Sink>,
+    /// Services that are called for values.
+    services: Services,
     /// What `recv` hands out next; filled by one message or by one pass over the topics.
     events: VecDeque<PortEvent>,
     /// What was already told, so that it is told once.
@@ -71,18 +75,21 @@ impl Ros1Port {
         let master = node.master_uri.clone();
         let node = Node::start(node)?;
         info!(node = node.name(), uri = node.uri(), master, space = %own, "started the ROS 1 node");
+        let mut definitions = Definitions::new(packages);
+        let (services, bound) = Services::start(&node, own, &mapping, &mut definitions);
         let mut port = Self {
             watcher: Watcher::of(&node),
             node,
             own,
             mapping: Arc::clone(&mapping),
-            definitions: Definitions::new(packages),
+            definitions,
+            services,
             graph: Graph::default(),
             sources: Vec::new(),
             source_of: BTreeMap::new(),
             inbox: Inbox::new(),
             sinks: HashMap::new(),
-            events: VecDeque::new(),
+            events: bound.into(),
             told: BTreeSet::new(),
         };
         port.take_bindings(&mapping)?;
@@ -322,41 +329,44 @@ impl Ros1Port {
         }
     }
 
-    /// Subscribes topics of our space that somebody publishes under their own name, and lets go of those nobody does.
+    /// Subscribes the topics that somebody publishes under a name of our space or of a pattern, and lets go of those
+    /// nobody does.
     fn find_sources(&mut self) {
         let mut found = Vec::new();
         for (ros_topic, publishers) in &self.graph.publishers {
-            let topic = ros_topic
+            if self.source_of.contains_key(ros_topic)
+                || publishers.iter().all(|name| name == self.node.name())
+            {
+                continue;
+            }
+            let named = ros_topic
                 .strip_prefix('/')
                 .and_then(|name| name.parse::<TopicId>().ok());
-            let Some(topic) = topic.filter(|topic| topic.space == self.own) else {
-                continue;
-            };
-            let bound = self
-                .mapping
-                .variable(topic)
-                .is_some_and(|v| v.binding(self.own).is_some());
-            if !bound && publishers.iter().any(|name| name != self.node.name()) {
-                found.push((ros_topic.clone(), topic));
+            match (named, self.mapping.matching(self.own, ros_topic)) {
+                (Some(topic), _) => {
+                    let variable = self.mapping.variable(topic);
+                    let bound = variable
+                        .is_some_and(|v| v.binding(self.own).is_some() || v.service.is_some());
+                    if topic.space == self.own && !bound {
+                        found.push((ros_topic.clone(), Ok((topic, None, Selection::Whole))));
+                    }
+                }
+                (None, Some(made)) => {
+                    let made = made.map(|made| (made.topic, made.message_type, made.selection));
+                    found.push((ros_topic.clone(), made.map_err(|fault| fault.to_string())));
+                }
+                (None, None) => {}
             }
         }
-        for (ros_topic, topic) in found {
-            let new = !self.source_of.contains_key(&ros_topic);
-            if new && self.sources.len() >= MAX_TOPICS {
-                self.tell_once("", "too many topics", || {
-                    format!("more than {MAX_TOPICS} topics of this space: the rest is left alone")
-                });
-                return;
+        for (ros_topic, made) in found {
+            match made {
+                Ok(value) => self.add_source(ros_topic, value),
+                Err(fault) => self.tell_once(&ros_topic, "pattern", || fault),
             }
-            let index = self.source(ros_topic, None);
-            if let Some(source) = self.sources.get_mut(index)
-                && new
-            {
-                source.values.push((topic, Selection::Whole));
-            }
-            if let Err(error) = self.subscribe(index) {
-                self.tell_once(&topic.to_string(), "not subscribed", || error.to_string());
-            }
+        }
+        // Those that are known already may have lost their subscription.
+        for index in 0..self.sources.len() {
+            self.resubscribe(index);
         }
         for source in &mut self.sources {
             let published = self.graph.publishers.contains_key(&source.ros_topic);
@@ -365,9 +375,53 @@ impl Ros1Port {
                 .as_ref()
                 .is_some_and(|s| s.publishers() > 0);
             // A master that has just restarted does not name all who publish.
-            if source.expected.is_none() && !published && !connected && !source.is_live() {
+            if source.found && !published && !connected && !source.is_live() {
                 source.subscription = None;
             }
+        }
+    }
+
+    /// Takes in a topic the mapping does not name, unless another one is that value already.
+    fn add_source(
+        &mut self,
+        ros_topic: String,
+        (topic, expected, selection): (TopicId, Option<TypeName>, Selection),
+    ) {
+        if self.sources.len() >= MAX_TOPICS {
+            self.tell_once("", "too many topics", || {
+                format!("more than {MAX_TOPICS} topics of this space: the rest is left alone")
+            });
+            return;
+        }
+        let same = |source: &&Source| source.values.iter().any(|(other, _)| *other == topic);
+        if let Some(other) = self.sources.iter().find(same) {
+            let other = other.ros_topic.clone();
+            self.tell_once(&ros_topic, "pattern", || {
+                format!("it would be {topic}, which {other} is already: it does not cross")
+            });
+            return;
+        }
+        let index = self.source(ros_topic, expected);
+        if let Some(source) = self.sources.get_mut(index) {
+            source.values.push((topic, selection));
+            source.found = true;
+        }
+        self.resubscribe(index);
+    }
+
+    /// Subscribes a topic that was found in the graph, if somebody publishes it and it is not subscribed.
+    fn resubscribe(&mut self, index: usize) {
+        let Some(source) = self.sources.get(index).filter(|s| s.subscription.is_none()) else {
+            return;
+        };
+        let publishers = self.graph.publishers.get(&source.ros_topic);
+        let others = |names: &Vec<String>| names.iter().any(|name| name != self.node.name());
+        if !publishers.is_some_and(others) {
+            return;
+        }
+        let ros_topic = source.ros_topic.clone();
+        if let Err(error) = self.subscribe(index) {
+            self.tell_once(&ros_topic, "not subscribed", || error.to_string());
         }
     }
 
@@ -466,7 +520,7 @@ impl Port for Ros1Port {
             if let Some(event) = self.events.pop_front() {
                 return event;
             }
-            // Both are cancel-safe. The graph first, so that a flood of samples does not keep new topics out.
+            // All are cancel-safe. The graph first, so that a flood of samples does not keep new topics out.
             tokio::select! {
                 biased;
                 seen = self.watcher.recv() => match seen {
@@ -476,6 +530,10 @@ impl Port for Ros1Port {
                         return PortEvent::Ended(format!("the ROS 1 node {name} was told to shut down: {reason}"));
                     }
                 },
+                outcome = self.services.recv() => {
+                    let events = self.services.ended(outcome, utc());
+                    self.events.extend(events);
+                }
                 (index, event) = self.inbox.recv() => self.taken(index, event),
             }
         }
@@ -484,6 +542,16 @@ impl Port for Ros1Port {
     fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
         if sample.status & STATUS_BAD != 0 {
             return Err("bad status");
+        }
+        if let Some(replaced) = self.services.hand_over(sample.topic, &sample.payload) {
+            if replaced > 0 {
+                self.events.push_back(PortEvent::Lost {
+                    topic: Some(sample.topic),
+                    why: "service too slow",
+                    count: replaced,
+                });
+            }
+            return Ok(());
         }
         let Some(Sink {
             open: Some(open), ..
@@ -506,7 +574,8 @@ impl Port for Ros1Port {
     }
 
     fn wanted(&mut self, topic: TopicId, shape: &[(BuiltinType, bool)]) {
-        if topic.space == self.own {
+        let for_service = |variable: &Variable| variable.service.is_some();
+        if topic.space == self.own || self.mapping.variable(topic).is_some_and(for_service) {
             return;
         }
         if !self.sinks.contains_key(&topic) {
@@ -553,12 +622,22 @@ impl Port for Ros1Port {
             sinks,
             sources,
             watcher,
+            services,
             ..
         } = self;
-        drop(watcher);
+        drop((watcher, services));
         node.shutdown().await;
         drop((sinks, sources));
     }
+}
+
+/// When an answer of a service came.
+#[expect(
+    clippy::disallowed_methods,
+    reason = "the stamp of an answer is taken where it is handed on"
+)]
+fn utc() -> SystemTime {
+    SystemTime::now()
 }
 
 /// Values that are latched side by side are known by when they were taken, and stand in this order.

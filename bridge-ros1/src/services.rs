@@ -230,11 +230,11 @@ impl Services {
     }
 
     /// Hands a value to the service of its topic; `None` when it has none. Else says how many older values gave way.
-    pub(crate) fn hand_over(&self, topic: TopicId, value: Bytes) -> Option<u64> {
+    pub(crate) fn hand_over(&self, topic: TopicId, value: &Bytes) -> Option<u64> {
         let callee = self.callers.get(&topic)?;
         let request = match &callee.constant {
-            None => value,
-            Some((_, Some(wanted))) if *wanted != value => return Some(0),
+            None => value.clone(),
+            Some((_, Some(wanted))) if wanted != value => return Some(0),
             Some((request, _)) => request.clone(),
         };
         Some(u64::from(callee.pending.push(request)))

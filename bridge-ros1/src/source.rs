@@ -15,7 +15,9 @@ pub(crate) struct Source {
     pub(crate) expected: Option<TypeName>,
     /// Which values are made of a message; one unless a mapping ties several variables to one topic.
     pub(crate) values: Vec<(TopicId, Selection)>,
-    /// `None` while nobody publishes a topic that is known by its name alone.
+    /// Whether it was found in the graph, by its name or a pattern, and not named by the mapping.
+    pub(crate) found: bool,
+    /// `None` while nobody publishes a topic that was found.
     pub(crate) subscription: Option<Subscription>,
     /// The type its values cross as.
     pub(crate) bound: Option<Arc<MessageType>>,
@@ -48,6 +50,7 @@ impl Source {
             ros_topic,
             expected,
             values,
+            found: false,
             subscription: None,
             bound: None,
             peers: Vec::new(),

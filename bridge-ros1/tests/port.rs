@@ -143,6 +143,8 @@ fn line(event: &PortEvent) -> String {
         }
         PortEvent::Sample { topic, payload, .. } => format!("{topic} = {payload:?}"),
         PortEvent::Live { topic, live } => format!("{topic} live {live}"),
+        PortEvent::Left { topic, .. } => format!("{topic} left"),
+        PortEvent::CallFailed { topic, detail } => format!("{topic} call failed: {detail}"),
         PortEvent::Lost { topic, why, count } => {
             format!(
                 "{} lost {count}: {why}",

@@ -185,20 +185,23 @@ const fn why(why: GiveUp) -> &'static str {
 }
 
 const fn reason_of(refusal: ChunkRefusal) -> Reason {
-    match refusal {
-        ChunkRefusal::TooBig { .. } | ChunkRefusal::TooManyPieces => Reason::TooBig,
-        ChunkRefusal::Duplicate => Reason::Duplicate,
-        // What else a later version refuses is about bytes, too.
-        _ => Reason::Malformed,
+    if matches!(
+        refusal,
+        ChunkRefusal::TooBig { .. } | ChunkRefusal::TooManyPieces
+    ) {
+        Reason::TooBig
+    } else if matches!(refusal, ChunkRefusal::Duplicate) {
+        Reason::Duplicate
+    } else {
+        Reason::Malformed
     }
 }
 
 fn told(refusal: ChunkRefusal, most: u32) -> String {
-    match refusal {
-        ChunkRefusal::TooBig { total_size } => {
-            format!("a message of {total_size} bytes; `pubsub.max_message` allows {most} MiB")
-        }
-        other => other.to_string(),
+    if let ChunkRefusal::TooBig { total_size } = refusal {
+        format!("a message of {total_size} bytes; `pubsub.max_message` allows {most} MiB")
+    } else {
+        refusal.to_string()
     }
 }
 
