@@ -31,10 +31,16 @@ pub enum Reason {
     Repeat,
     /// The topic's queue was full and its oldest sample gave way.
     Overflow,
-    /// Larger than one NetworkMessage carries.
+    /// Larger than is sent or put together from chunks.
     TooBig,
+    /// A large message of which chunks never came.
+    Incomplete,
+    /// A large message given up since others took up the room for unfinished ones.
+    NoRoom,
     /// More topics than are tracked.
     TooManyTopics,
+    /// More latched publishers of one topic than are kept for late joiners.
+    TooManyPublishers,
     /// The local side did not take it.
     NotPublished,
     /// The socket did not take it.
@@ -43,7 +49,7 @@ pub enum Reason {
 
 impl Reason {
     /// All of them, in the order of their counters.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 20] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -58,7 +64,10 @@ impl Reason {
         Self::Repeat,
         Self::Overflow,
         Self::TooBig,
+        Self::Incomplete,
+        Self::NoRoom,
         Self::TooManyTopics,
+        Self::TooManyPublishers,
         Self::NotPublished,
         Self::NotSent,
     ];
@@ -81,7 +90,10 @@ impl Reason {
             Self::Repeat => "repeat",
             Self::Overflow => "overflow",
             Self::TooBig => "too_big",
+            Self::Incomplete => "incomplete",
+            Self::NoRoom => "no_room",
             Self::TooManyTopics => "too_many_topics",
+            Self::TooManyPublishers => "too_many_publishers",
             Self::NotPublished => "not_published",
             Self::NotSent => "not_sent",
         }

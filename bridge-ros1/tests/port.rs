@@ -135,6 +135,7 @@ fn line(event: &PortEvent) -> String {
                 Selection::Whole => "whole",
                 Selection::Field(field) => field,
                 Selection::Bytes => "bytes",
+                Selection::Template { .. } => "template",
             };
             format!("{topic} is {} {field}", message_type.name())
         }

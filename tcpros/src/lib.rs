@@ -13,9 +13,10 @@
 //!   is served fastest when it is a spawned task: waking the future given to `block_on` costs a system call.
 //!
 //! To read the code: `node` has the state, `registrar` the master's side of it, `publisher` and `topic_server` what
-//! goes out, `subscription` and `link` what comes in, `inbox` where it is taken, `service` what is called, and
-//! `parameters` what the master keeps.
+//! goes out, `subscription` and `link` what comes in, `inbox` where it is taken, `service` what is called,
+//! `parameters` what the master keeps. [`actionlib`] stands on topics alone.
 
+pub mod actionlib;
 mod clock;
 mod core;
 mod events;

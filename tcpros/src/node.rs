@@ -1,12 +1,13 @@
 //! The node: what it publishes, subscribes and offers, and the tasks that serve it.
 
 use std::collections::HashMap;
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
+use socket2::{Domain, Socket, Type};
 use thiserror::Error;
 use tokio::net::TcpListener;
 use tokio::sync::{Notify, watch};
@@ -699,10 +700,14 @@ fn params(names: &Names, given: Vec<(String, ParamValue)>) -> Result<Params, Nod
 /// Listens on a port of the system's choosing.
 fn listen(address: IpAddr) -> Result<(TcpListener, u16), NodeError> {
     let open = || {
-        let listener = std::net::TcpListener::bind((address, 0))?;
-        listener.set_nonblocking(true)?;
+        let address = SocketAddr::from((address, 0));
+        let socket = Socket::new(Domain::for_address(address), Type::STREAM, None)?;
+        socket.bind(&address.into())?;
+        socket.listen(BACKLOG)?;
+        socket.set_nonblocking(true)?;
+        let listener = TcpListener::from_std(socket.into())?;
         let port = listener.local_addr()?.port();
-        Ok((TcpListener::from_std(listener)?, port))
+        Ok((listener, port))
     };
     open().map_err(|source| NodeError::Listen { address, source })
 }
@@ -717,3 +722,6 @@ fn bracketed(host: &str) -> String {
 }
 
 const SHUTDOWN_LIMIT: Duration = Duration::from_secs(2);
+/// Peers that may connect in one moment: a launch file starts a whole graph at once, and one that is not let in tries
+/// again after a second.
+const BACKLOG: i32 = 1024;

@@ -7,7 +7,7 @@ use bytes::Bytes;
 use tokio::sync::watch;
 
 use crate::events;
-use crate::header::ConnectionHeader;
+use crate::header::{ConnectionHeader, clipped};
 use crate::node::Inner;
 use crate::outbox::{Limit, Outbox, lock};
 
@@ -30,6 +30,8 @@ pub struct PublisherOptions {
     /// How many messages may wait for one subscriber; then its oldest are dropped.
     pub queue_messages: usize,
     /// How many bytes may wait for one subscriber; then its oldest are dropped. The newest message is always kept.
+    /// Subscribers that are slow at the same time wait for the same messages, which are held once: beyond this, each
+    /// costs what is being written to it, 64 KiB or one longer message.
     pub queue_bytes: usize,
 }
 
@@ -76,6 +78,12 @@ impl Publisher {
     /// How many subscribers are connected.
     pub fn subscribers(&self) -> usize {
         lock(&self.hub.state).subscribers.len()
+    }
+
+    /// Whether the node of this resolved name is connected.
+    pub fn is_subscribed_by(&self, node: &str) -> bool {
+        let state = lock(&self.hub.state);
+        state.subscribers.iter().any(|s| s.caller_id == node)
     }
 
     /// The topic's resolved name.
@@ -128,6 +136,8 @@ struct HubState {
 pub(crate) struct Subscriber {
     pub(crate) id: i32,
     pub(crate) caller_id: String,
+    /// What `rosnode info` shows of the connection.
+    pub(crate) transport: String,
     pub(crate) outbox: Outbox,
     pub(crate) bytes: AtomicU64,
     pub(crate) messages: AtomicU64,
@@ -179,7 +189,12 @@ impl Hub {
     }
 
     /// Adds a subscriber, its queue beginning with the latched message; `None` once the topic is withdrawn.
-    pub(crate) fn join(self: &Arc<Self>, id: i32, caller_id: &str) -> Option<Joined> {
+    pub(crate) fn join(
+        self: &Arc<Self>,
+        id: i32,
+        caller_id: &str,
+        transport: String,
+    ) -> Option<Joined> {
         let limit = Limit {
             messages: self.options.queue_messages,
             bytes: self.options.queue_bytes,
@@ -187,6 +202,7 @@ impl Hub {
         let subscriber = Arc::new(Subscriber {
             id,
             caller_id: caller_id.to_owned(),
+            transport,
             outbox: Outbox::new(limit),
             bytes: AtomicU64::new(0),
             messages: AtomicU64::new(0),
@@ -237,12 +253,13 @@ impl Hub {
         };
         // As roscpp and rospy do it: the checksum decides. Names alone differ where packages were renamed.
         if !fits(Some(md5sum), &ours.md5sum) {
-            lock(&self.state).refused_type = request.type_name().map(str::to_owned);
+            let wanted = clipped(request.type_name().unwrap_or("*"));
+            lock(&self.state).refused_type = request.type_name().map(|_| wanted.to_owned());
             return Err(format!(
-                "Client [{}] wants topic {} to have datatype/md5sum [{}/{md5sum}], but our version has [{}/{}]. Dropping connection.",
-                request.caller_id(),
+                "Client [{}] wants topic {} to have datatype/md5sum [{wanted}/{}], but our version has [{}/{}]. Dropping connection.",
+                clipped(request.caller_id()),
                 self.topic,
-                request.type_name().unwrap_or("*"),
+                clipped(md5sum),
                 ours.name,
                 ours.md5sum,
             ));
@@ -354,7 +371,7 @@ mod tests {
                     dropped_oldest: 0
                 }
             );
-            let late = hub.join(1, "/late").unwrap();
+            let late = hub.join(1, "/late", String::new()).unwrap();
             hub.close();
             let mut taken = Vec::new();
             assert_eq!(late.subscriber.outbox.take(&mut taken, 64).await, latch);
@@ -365,7 +382,7 @@ mod tests {
     #[test]
     fn a_subscriber_that_does_not_read_costs_only_itself() {
         let hub = hub(false);
-        let joined = hub.join(1, "/slow").unwrap();
+        let joined = hub.join(1, "/slow", String::new()).unwrap();
         let published: Vec<_> = (0..3u8)
             .map(|n| hub.publish(Bytes::from(vec![n])).dropped_oldest)
             .collect();

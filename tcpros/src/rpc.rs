@@ -42,6 +42,10 @@ impl Endpoint {
     }
 
     /// Tries the IPv6 addresses of the host before the others, or after them.
+    pub(crate) const fn prefers_ipv6(&self) -> bool {
+        self.ipv6_first
+    }
+
     pub(crate) const fn ipv6_first(mut self, ipv6_first: bool) -> Self {
         self.ipv6_first = ipv6_first;
         self
@@ -264,7 +268,7 @@ pub enum RpcError {
 
 const XML: &str = "text/xml";
 const MAX_BODY: usize = 4 * 1024 * 1024;
-const MAX_CONNECTIONS: usize = 256;
+const MAX_CONNECTIONS: usize = 1024;
 const READ_LIMIT: Duration = Duration::from_secs(30);
 
 #[cfg(test)]

@@ -7,6 +7,7 @@ use std::sync::atomic::Ordering;
 use crate::events;
 use crate::master::strings;
 use crate::node::Inner;
+use crate::outbox::lock;
 use crate::xmlrpc::{Call, Fault, Response, Value};
 
 /// Answers one call.
@@ -146,34 +147,35 @@ fn bus_stats(node: &Inner) -> Value {
     ])
 }
 
-/// `[connectionId, destinationId, direction, transport, topic, connected]` per connection.
+/// `[connectionId, destinationId, direction, transport, topic, connected, connectionInfo]` per connection, the
+/// destination being the name of a subscriber or the URI of a publisher, as rospy and roscpp have it.
 fn bus_info(node: &Inner) -> Value {
-    let entry = |id: i32, peer: &str, direction: &str, topic: &str| {
-        Value::Array(vec![
-            id.into(),
-            peer.into(),
-            direction.into(),
-            "TCPROS".into(),
-            topic.into(),
-            Value::Bool(true),
-        ])
-    };
     let mut entries = Vec::new();
     for hub in node.publications() {
-        let connected = hub.connected();
-        entries.extend(
-            connected
-                .iter()
-                .map(|s| entry(s.id, &s.caller_id, "o", &hub.topic)),
-        );
+        for subscriber in hub.connected() {
+            entries.push(Value::Array(vec![
+                subscriber.id.into(),
+                subscriber.caller_id.as_str().into(),
+                "o".into(),
+                "TCPROS".into(),
+                hub.topic.as_str().into(),
+                Value::Bool(true),
+                subscriber.transport.as_str().into(),
+            ]));
+        }
     }
     for feed in node.feeds() {
-        let connected = feed.connections();
-        entries.extend(
-            connected
-                .iter()
-                .map(|(uri, link)| entry(link.id, uri, "i", &feed.topic)),
-        );
+        for (uri, link) in feed.connections() {
+            entries.push(Value::Array(vec![
+                link.id.into(),
+                uri.into(),
+                "i".into(),
+                "TCPROS".into(),
+                feed.topic.as_str().into(),
+                Value::Bool(true),
+                lock(&link.transport).as_str().into(),
+            ]));
+        }
     }
     Value::Array(entries)
 }
