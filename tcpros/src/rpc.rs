@@ -42,10 +42,6 @@ impl Endpoint {
     }
 
     /// Tries the IPv6 addresses of the host before the others, or after them.
-    pub(crate) const fn prefers_ipv6(&self) -> bool {
-        self.ipv6_first
-    }
-
     pub(crate) const fn ipv6_first(mut self, ipv6_first: bool) -> Self {
         self.ipv6_first = ipv6_first;
         self
