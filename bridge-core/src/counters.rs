@@ -45,11 +45,13 @@ pub enum Reason {
     NotPublished,
     /// The socket did not take it.
     NotSent,
+    /// A service did not take the value, or did not answer.
+    CallFailed,
 }
 
 impl Reason {
     /// All of them, in the order of their counters.
-    pub const ALL: [Self; 20] = [
+    pub const ALL: [Self; 21] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -70,6 +72,7 @@ impl Reason {
         Self::TooManyPublishers,
         Self::NotPublished,
         Self::NotSent,
+        Self::CallFailed,
     ];
 
     /// The label of its counter.
@@ -96,6 +99,7 @@ impl Reason {
             Self::TooManyPublishers => "too_many_publishers",
             Self::NotPublished => "not_published",
             Self::NotSent => "not_sent",
+            Self::CallFailed => "call_failed",
         }
     }
 

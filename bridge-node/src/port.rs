@@ -108,6 +108,13 @@ pub enum PortEvent {
         /// How many.
         count: u64,
     },
+    /// A value could not be handed to the service it is for, or no service answered with it.
+    CallFailed {
+        /// Which value.
+        topic: TopicId,
+        /// What went wrong, for the log.
+        detail: String,
+    },
     /// The port cannot go on, such as a ROS 1 node that was told to shut down because another took its name. The
     /// program ends with this message.
     Ended(String),

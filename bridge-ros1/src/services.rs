@@ -1,122 +1,243 @@
-//! Services of the graph as values of the space.
+//! Services of the graph as values of the space: calls made for values that arrive, calls made by the clock, and what
+//! they bring.
 //!
-//! Three kinds of tasks: one per variable whose values call a service, one per service that is polled. Both report to
-//! the port what became of each call; nothing here waits in the port's own task.
+//! Each variable that calls and each service that is polled has a task of its own, so that no call holds up another or
+//! the port.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
+use bridge_node::{PortEvent, timestamp};
 use bytes::Bytes;
-use mappings::{Overflow, TopicId};
-use messages::Selection;
-use tcpros::{Node, NodeError, ServiceClient, ServiceClientOptions, ServiceError};
+use mappings::{Mapping, Overflow, ServiceRole, SpaceId, TopicId, Trigger, Variable};
+use messages::{Literal, Selection, ServiceType, TypeName};
+use tcpros::{Node, ServiceClient, ServiceClientOptions};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
-use tokio::time::{MissedTickBehavior, interval, sleep};
-use tracing::{info, warn};
+use tracing::warn;
 
+use crate::caller::{Caller, Outcome, Source};
+use crate::definitions::{Definitions, constant};
 use crate::pending::Pending;
-
-/// A service to call.
-#[derive(Debug, Clone)]
-pub(crate) struct Target {
-    /// Its name, as the mapping has it.
-    pub(crate) service: String,
-    /// The name and checksum of its type.
-    pub(crate) type_name: String,
-    pub(crate) md5sum: String,
-    pub(crate) timeout: Duration,
-}
-
-/// A value whose answer-taking variables wait for what its calls bring.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Taker {
-    pub(crate) topic: TopicId,
-    pub(crate) selection: Selection,
-}
-
-/// What became of a call.
-#[derive(Debug)]
-pub(crate) enum Outcome {
-    /// The answer, and whose it is.
-    Answered { of: Source, answer: Bytes },
-    /// No answer; `of` is what the call was made for.
-    Failed { of: Source },
-}
-
-/// What made a call.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(crate) enum Source {
-    /// A value of the space that arrived.
-    Value(TopicId),
-    /// The clock; the number of the poll.
-    Poll(usize),
-}
 
 /// The calls of one bridge.
 #[derive(Debug)]
 pub(crate) struct Services {
-    callers: HashMap<TopicId, Arc<Pending>>,
+    callers: HashMap<TopicId, Callee>,
+    /// Which values are made of the answers.
+    takers: HashMap<Source, Vec<TopicId>>,
+    /// Polls whose last call was answered.
+    answering: HashSet<Source>,
     outcomes: mpsc::Receiver<Outcome>,
     report: mpsc::Sender<Outcome>,
     tasks: JoinSet<()>,
 }
 
+/// What the values of one variable call.
+#[derive(Debug)]
+struct Callee {
+    pending: Arc<Pending>,
+    /// Where the request is the same each time: that request, and the value that calls, if not any does.
+    constant: Option<(Bytes, Option<Vec<u8>>)>,
+}
+
+/// A service as a binding has it.
+struct Target<'m> {
+    service: &'m str,
+    service_type: Arc<ServiceType>,
+    timeout: Duration,
+}
+
+/// What makes two polls the same.
+type Poll<'m> = (&'m str, &'m TypeName, &'m Selection, Duration, Duration);
+
 impl Services {
-    pub(crate) fn new() -> Self {
-        // What is not taken yet delays the next calls: no more than these wait.
+    /// Starts what the mapping ties to services. Reports the types of the values; a binding that cannot be served is
+    /// told of.
+    pub(crate) fn start(
+        node: &Node,
+        own: SpaceId,
+        mapping: &Mapping,
+        definitions: &mut Definitions,
+    ) -> (Self, Vec<PortEvent>) {
+        // What the port has not taken yet delays the next calls: no more than these wait.
         let (report, outcomes) = mpsc::channel(64);
-        Self {
+        let mut services = Self {
             callers: HashMap::new(),
+            takers: HashMap::new(),
+            answering: HashSet::new(),
             outcomes,
             report,
             tasks: JoinSet::new(),
+        };
+        let mut events = Vec::new();
+        let mut polls: Vec<Poll<'_>> = Vec::new();
+        for (variable, binding) in mapping.services(own) {
+            let bound = match &binding.role {
+                ServiceRole::Call { .. } => {
+                    services.open_call(node, variable, &binding.role, definitions)
+                }
+                ServiceRole::Answer { of, selection } => {
+                    services.take_answers(mapping, variable, (*of, selection), definitions)
+                }
+                ServiceRole::Poll { .. } => {
+                    services.open_poll(node, variable, (&binding.role, &mut polls), definitions)
+                }
+            };
+            match bound {
+                Ok(event) => events.push(event),
+                Err(error) => warn!(
+                    topic = %variable.topic,
+                    name = variable.name,
+                    "no service is called for this value: {error}"
+                ),
+            }
         }
+        (services, events)
     }
 
-    /// Calls the service with each request that [`request`](Self::request) is given for the topic.
-    pub(crate) fn call(
+    fn open_call(
         &mut self,
         node: &Node,
-        topic: TopicId,
-        target: &Target,
-        overflow: Overflow,
-    ) -> Result<(), NodeError> {
-        let caller = Caller {
-            client: client(node, target)?,
-            of: Source::Value(topic),
-            report: self.report.clone(),
-            trouble: Trouble::default(),
+        variable: &Variable,
+        role: &ServiceRole,
+        definitions: &mut Definitions,
+    ) -> Result<PortEvent, String> {
+        let ServiceRole::Call {
+            service,
+            service_type,
+            request,
+            when,
+            timeout,
+        } = role
+        else {
+            return Err("it has no call".to_owned());
         };
-        let pending = Arc::new(Pending::new(overflow));
-        self.callers.insert(topic, Arc::clone(&pending));
-        self.tasks
-            .spawn(caller.serve(pending, overflow == Overflow::KeepLatest));
-        Ok(())
+        let service_type = service_of(definitions, service_type)?;
+        let message_type = service_type.request();
+        let (bound, constant) = match request {
+            Selection::Template { field: None, .. } => {
+                let request = constant(message_type, request)?;
+                let carrier = carrier(variable, definitions)?;
+                let value = match when {
+                    Trigger::Any => None,
+                    Trigger::Equals(text) => Some(constant(&carrier, &only(text))?.to_vec()),
+                };
+                let event = PortEvent::Bound {
+                    topic: variable.topic,
+                    message_type: carrier,
+                    selection: Selection::Whole,
+                };
+                (event, Some((request, value)))
+            }
+            Selection::Whole
+            | Selection::Field(_)
+            | Selection::Template { .. }
+            | Selection::Bytes => {
+                let event = PortEvent::Bound {
+                    topic: variable.topic,
+                    message_type: Arc::clone(message_type),
+                    selection: request.clone(),
+                };
+                (event, None)
+            }
+        };
+        let target = Target {
+            service,
+            service_type: Arc::clone(&service_type),
+            timeout: *timeout,
+        };
+        let of = Source::Value(variable.topic);
+        let caller = self.caller(node, &target, of)?;
+        let pending = Arc::new(Pending::new(variable.overflow));
+        let insist = variable.overflow == Overflow::KeepLatest;
+        self.tasks.spawn(caller.serve(Arc::clone(&pending), insist));
+        self.callers
+            .insert(variable.topic, Callee { pending, constant });
+        Ok(bound)
     }
 
-    /// Calls the service with one and the same request every so often.
-    pub(crate) fn poll(
+    fn take_answers(
+        &mut self,
+        mapping: &Mapping,
+        variable: &Variable,
+        (of, selection): (TopicId, &Selection),
+        definitions: &mut Definitions,
+    ) -> Result<PortEvent, String> {
+        let role = mapping
+            .variable(of)
+            .and_then(|of| of.service.as_ref())
+            .map(|binding| &binding.role);
+        let Some(ServiceRole::Call { service_type, .. }) = role else {
+            return Err(format!("{of} calls no service"));
+        };
+        let service_type = service_of(definitions, service_type)?;
+        let takers = self.takers.entry(Source::Value(of)).or_default();
+        takers.push(variable.topic);
+        Ok(bound(variable.topic, &service_type, selection))
+    }
+
+    fn open_poll<'m>(
         &mut self,
         node: &Node,
-        number: usize,
-        target: &Target,
-        (request, every): (Bytes, Duration),
-    ) -> Result<(), NodeError> {
-        let caller = Caller {
-            client: client(node, target)?,
-            of: Source::Poll(number),
-            report: self.report.clone(),
-            trouble: Trouble::default(),
+        variable: &Variable,
+        (role, polls): (&'m ServiceRole, &mut Vec<Poll<'m>>),
+        definitions: &mut Definitions,
+    ) -> Result<PortEvent, String> {
+        let ServiceRole::Poll {
+            service,
+            service_type: name,
+            request,
+            selection,
+            every,
+            timeout,
+        } = role
+        else {
+            return Err("it has no poll".to_owned());
         };
-        self.tasks.spawn(caller.poll(request, every));
-        Ok(())
+        let service_type = service_of(definitions, name)?;
+        let poll = (service.as_str(), name, request, *every, *timeout);
+        let known = polls.iter().position(|known| *known == poll);
+        let of = Source::Poll(known.unwrap_or(polls.len()));
+        if known.is_none() {
+            let request = constant(service_type.request(), request)?;
+            let target = Target {
+                service,
+                service_type: Arc::clone(&service_type),
+                timeout: *timeout,
+            };
+            let caller = self.caller(node, &target, of)?;
+            self.tasks.spawn(caller.poll(request, *every));
+            polls.push(poll);
+        }
+        self.takers.entry(of).or_default().push(variable.topic);
+        Ok(bound(variable.topic, &service_type, selection))
     }
 
-    /// Queues a request for the service of a topic. `None`: it calls none; else whether an older request gave way.
-    pub(crate) fn request(&self, topic: TopicId, request: Bytes) -> Option<bool> {
-        Some(self.callers.get(&topic)?.push(request))
+    fn caller(&self, node: &Node, target: &Target<'_>, of: Source) -> Result<Caller, String> {
+        let options = ServiceClientOptions {
+            md5sum: Some(target.service_type.md5().to_owned()),
+            type_name: Some(target.service_type.name().to_string()),
+            persistent: true,
+            timeout: target.timeout,
+            ..ServiceClientOptions::default()
+        };
+        let client: ServiceClient = node
+            .service_client(target.service, options)
+            .map_err(|error| error.to_string())?;
+        Ok(Caller::new(client, of, self.report.clone()))
+    }
+
+    /// Hands a value to the service of its topic; `None` when it has none. Else says how many older values gave way.
+    pub(crate) fn hand_over(&self, topic: TopicId, value: Bytes) -> Option<u64> {
+        let callee = self.callers.get(&topic)?;
+        let request = match &callee.constant {
+            None => value,
+            Some((_, Some(wanted))) if *wanted != value => return Some(0),
+            Some((request, _)) => request.clone(),
+        };
+        Some(u64::from(callee.pending.push(request)))
     }
 
     /// The end of the next call. Cancel-safe.
@@ -127,110 +248,89 @@ impl Services {
             None => std::future::pending().await,
         }
     }
-}
 
-fn client(node: &Node, target: &Target) -> Result<ServiceClient, NodeError> {
-    let options = ServiceClientOptions {
-        md5sum: Some(target.md5sum.clone()),
-        type_name: Some(target.type_name.clone()),
-        persistent: true,
-        timeout: target.timeout,
-        ..ServiceClientOptions::default()
-    };
-    node.service_client(&target.service, options)
-}
-
-/// One task that calls one service.
-struct Caller {
-    client: ServiceClient,
-    of: Source,
-    report: mpsc::Sender<Outcome>,
-    trouble: Trouble,
-}
-
-impl Caller {
-    /// Calls with each request in turn. A state (`insist`) is tried until the service takes it or a newer one came,
-    /// an event once.
-    async fn serve(mut self, pending: Arc<Pending>, insist: bool) {
-        loop {
-            let mut request = pending.take().await;
-            let mut wait = FIRST_WAIT;
-            while self.call(request.clone(), insist).await == Next::Again {
-                tokio::select! {
-                    newer = pending.take() => (request, wait) = (newer, FIRST_WAIT),
-                    () = sleep(wait) => wait = (wait * 2).min(LAST_WAIT),
+    /// What the end of a call is for the values made of it.
+    pub(crate) fn ended(&mut self, outcome: Outcome, now: SystemTime) -> Vec<PortEvent> {
+        let Outcome { of, result } = outcome;
+        let takers = self.takers.get(&of).map_or(&[][..], Vec::as_slice);
+        let mut events = Vec::new();
+        let mut live = |live: bool| {
+            events.extend(takers.iter().map(|topic| PortEvent::Live {
+                topic: *topic,
+                live,
+            }));
+        };
+        match result {
+            Ok(answer) => {
+                if self.answering.insert(of) {
+                    live(true);
+                }
+                let received = timestamp(now);
+                events.extend(takers.iter().map(|topic| PortEvent::Sample {
+                    topic: *topic,
+                    payload: answer.clone(),
+                    received,
+                    latched_by: None,
+                }));
+            }
+            Err(detail) => {
+                let failed = |topic: &TopicId| PortEvent::CallFailed {
+                    topic: *topic,
+                    detail: detail.clone(),
+                };
+                match of {
+                    // What the service answered before is still its last answer.
+                    Source::Value(topic) => events.push(failed(&topic)),
+                    Source::Poll(_) => {
+                        if self.answering.remove(&of) {
+                            live(false);
+                        }
+                        events.extend(takers.iter().map(failed));
+                    }
                 }
             }
         }
-    }
-
-    async fn poll(mut self, request: Bytes, every: Duration) {
-        let mut ticks = interval(every);
-        // A slow service is asked when it has answered, not twice in a row.
-        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        loop {
-            ticks.tick().await;
-            self.call(request.clone(), false).await;
-        }
-    }
-
-    async fn call(&mut self, request: Bytes, insist: bool) -> Next {
-        let service = self.client.service();
-        let (outcome, next) = match self.client.call(request).await {
-            Ok(answer) => {
-                self.trouble.over(service);
-                (Outcome::Answered { of: self.of, answer }, Next::Done)
-            }
-            Err(error) => {
-                let again = insist && is_passing(&error);
-                self.trouble.tell(service, self.of, &error, again);
-                let next = if again { Next::Again } else { Next::Done };
-                (Outcome::Failed { of: self.of }, next)
-            }
-        };
-        if next == Next::Done {
-            // Nobody is left to be told when the port is gone.
-            drop(self.report.send(outcome).await);
-        }
-        next
+        events
     }
 }
 
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Next {
-    Done,
-    Again,
+fn service_of(definitions: &mut Definitions, name: &TypeName) -> Result<Arc<ServiceType>, String> {
+    definitions.service(name).map_err(|error| {
+        format!(
+            "{error}; the connection to a service does not bring its definition, so a folder below ROS_PACKAGE_PATH \
+             must have {}/srv/{}.srv",
+            name.package(),
+            name.name()
+        )
+    })
 }
 
-/// Tells of a fault once, and when it is over.
-#[derive(Debug, Default)]
-struct Trouble {
-    told: Option<String>,
-}
-
-impl Trouble {
-    fn tell(&mut self, service: &str, of: Source, error: &ServiceError, again: bool) {
-        let text = error.to_string();
-        if self.told.as_ref() == Some(&text) {
-            return;
-        }
-        let then = if again { "trying again" } else { "given up" };
-        match of {
-            Source::Value(topic) => {
-                warn!(service, %topic, error = text, then, "a value could not be handed to its service");
-            }
-            Source::Poll(_) => warn!(service, error = text, "a polled service did not answer"),
-        }
-        self.told = Some(text);
-    }
-
-    fn over(&mut self, service: &str) {
-        if self.told.take().is_some() {
-            info!(service, "the service answers again");
-        }
+fn bound(topic: TopicId, service_type: &ServiceType, selection: &Selection) -> PortEvent {
+    PortEvent::Bound {
+        topic,
+        message_type: Arc::clone(service_type.response()),
+        selection: selection.clone(),
     }
 }
 
-/// The first wait before a state is handed to its service again, doubling to the last.
-const FIRST_WAIT: Duration = Duration::from_millis(250);
-const LAST_WAIT: Duration = Duration::from_secs(5);
+/// The type a value comes as that is only compared.
+fn carrier(
+    variable: &Variable,
+    definitions: &mut Definitions,
+) -> Result<Arc<messages::MessageType>, String> {
+    let (builtin, array) = variable
+        .value_type
+        .ok_or("a variable whose value does not go into the request needs a `type`")?;
+    let name = definitions
+        .standard_type(builtin, array)
+        .ok_or_else(|| format!("a value of type {builtin:?} cannot be compared with `when`"))?;
+    definitions.get(&name).map_err(|error| error.to_string())
+}
+
+/// A std_msgs type with that text as its `data`.
+fn only(text: &str) -> Selection {
+    Selection::Template {
+        field: None,
+        rest: BTreeMap::from([("data".to_owned(), Literal::One(text.to_owned()))]),
+    }
+}
