@@ -96,7 +96,7 @@ fn clock_publisher(node: &Node) -> Publisher {
 
 fn tick(clock: &Publisher, secs: u32) {
     let time = [secs.to_le_bytes(), 5_u32.to_le_bytes()].concat();
-    let _published = clock.publish(Bytes::from(time));
+    assert_eq!(clock.publish(Bytes::from(time)).dropped_oldest, 0);
 }
 
 fn string() -> TopicType {
@@ -531,7 +531,7 @@ async fn nodes_that_are_known_by_an_ipv6_address_talk_over_it() {
         .subscribe("/t", Wanted::default(), options, (), &inbox)
         .unwrap();
     eventually("the link", || publisher.subscribers() == 1).await;
-    let _published = publisher.publish(Bytes::from_static(b"six"));
+    assert_eq!(publisher.publish(Bytes::from_static(b"six")).sent_to, 1);
     let bytes = within("the message", async {
         loop {
             if let ((), InboxEvent::Message(message)) = inbox.recv().await {
