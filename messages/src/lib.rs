@@ -67,7 +67,7 @@ pub use definition::Constant;
 pub use error::{
     DefinitionError, Fault, NameError, PlanError, ReadError, SourceError, WriteError, WriteFault,
 };
-pub use fields::{Sink, Source};
+pub use fields::{NoFields, Sink, Source};
 pub use message::{Leaf, MessageType, Rank, standard_type};
 pub use name::{Dialect, TypeName};
 pub use plan::{Literal, Plan, Selection, Wire};

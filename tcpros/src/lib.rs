@@ -12,11 +12,9 @@
 //! - It runs on a `current_thread` runtime as well as on several threads. A consumer on a `current_thread` runtime
 //!   is served fastest when it is a spawned task: waking the future given to `block_on` costs a system call.
 //!
-//! Parameters and simulated time are not part of it.
-//!
 //! To read the code: `node` has the state, `registrar` the master's side of it, `publisher` and `topic_server` what
-//! goes out, `subscription` and `link` what comes in, `inbox` where it is taken, `service` what is called.
-//! [`actionlib`] stands on topics alone.
+//! goes out, `subscription` and `link` what comes in, `inbox` where it is taken, `service` what is called,
+//! `parameters` what the master keeps. [`actionlib`] stands on topics alone.
 
 pub mod actionlib;
 mod clock;
@@ -31,6 +29,7 @@ mod names;
 mod node;
 mod options;
 mod outbox;
+mod parameters;
 mod publisher;
 mod registrar;
 mod rpc;
@@ -46,14 +45,17 @@ pub use crate::header::{ConnectionHeader, HeaderError};
 pub use crate::inbox::{Inbox, InboxEvent, Message, Peer};
 pub use crate::master::{Graph, MasterError};
 pub use crate::names::NameError;
-pub use crate::node::{GraphReader, MasterState, Node, NodeError, RosClock};
-pub use crate::options::NodeOptions;
-pub use crate::publisher::{Published, Publisher, PublisherOptions, TopicType};
+pub use crate::node::{GraphReader, MasterState, Node, NodeError};
+pub use crate::options::{ArgumentError, NodeOptions};
+pub use crate::parameters::{ParamError, ParamSubscription, ParamValue, Parameters};
+pub use crate::publisher::{
+    Latched, MAX_LATCHED, Published, Publisher, PublisherOptions, TopicType,
+};
 pub use crate::rpc::RpcError;
 pub use crate::service::{
     CallPhase, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions, ServiceRequest,
     ServiceServer, ServiceType,
 };
 pub use crate::subscription::{SubscriberOptions, Subscription, Wanted};
-pub use crate::time::RosTime;
+pub use crate::time::{RosClock, RosTime};
 pub use crate::xmlrpc::{Fault, XmlError};

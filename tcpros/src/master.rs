@@ -45,6 +45,11 @@ impl Master {
         }
     }
 
+    /// Whether other nodes are tried by IPv6 before IPv4, as this one is told to.
+    pub(crate) const fn prefers_ipv6(&self) -> bool {
+        self.endpoint.prefers_ipv6()
+    }
+
     pub(crate) fn uri(&self) -> &str {
         &self.uri
     }
@@ -169,7 +174,7 @@ impl Master {
     }
 
     /// Calls with the caller id in front and unwraps `[code, message, result]`.
-    async fn call(
+    pub(crate) async fn call(
         &self,
         method: &'static str,
         mut params: Vec<Value>,

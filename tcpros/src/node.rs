@@ -1,19 +1,19 @@
 //! The node: what it publishes, subscribes and offers, and the tasks that serve it.
 
 use std::collections::HashMap;
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
+use socket2::{Domain, Socket, Type};
 use thiserror::Error;
 use tokio::net::TcpListener;
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use crate::clock;
 use crate::events;
 use crate::inbox::Inbox;
 use crate::link::LinkContext;
@@ -21,13 +21,14 @@ use crate::master::{Graph, Master, MasterError};
 use crate::names::{NameError, Names};
 use crate::options::NodeOptions;
 use crate::outbox::{Limit, lock};
+use crate::parameters::{ParamValue, Parameters, Params};
 use crate::publisher::{Hub, Publisher, PublisherOptions, TopicType};
 use crate::service::{
     Served, ServiceClient, ServiceClientOptions, ServiceOptions, ServiceRequest, ServiceServer,
     ServiceType,
 };
 use crate::subscription::{Feed, SubscriberOptions, Subscription, Wanted};
-use crate::time::RosTime;
+use crate::time::{CLOCK_MD5, CLOCK_TYPE, RosClock, RosTime};
 use crate::{registrar, rpc, slave, topic_server};
 
 /// A ROS 1 node. Dropping it ends its connections; only [`Node::shutdown`] also tells the master.
@@ -50,6 +51,7 @@ impl Node {
             return Err(NodeError::NoRuntime);
         }
         let names = options.names()?;
+        let params = params(&names, options.parameters.clone())?;
         let endpoint = options
             .master()
             .ok_or_else(|| NodeError::MasterUri(options.master_uri.clone()))?;
@@ -71,6 +73,9 @@ impl Node {
             topics_port,
             master,
             links: Arc::new(context),
+            params,
+            clock: RosClock::default(),
+            clock_feed: Mutex::default(),
             registry: Mutex::default(),
             changed: Notify::new(),
             master_state: watch::Sender::new(MasterState::Awaited),
@@ -103,16 +108,20 @@ impl Node {
         self.inner.names.resolve(topic)
     }
 
-    /// The time for the stamps of messages.
+    /// The time for the stamps of messages: that of [`Node::clock`].
     pub fn now(&self) -> RosTime {
-        self.inner.now()
+        self.inner.clock.now()
     }
 
-    /// Reads the same time in another task, which may outlive the node.
+    /// The clock that follows `/use_sim_time` and `/clock`. From [`MasterState::Registered`] on it is the one the
+    /// master wants; before that it is the wall clock.
     pub fn clock(&self) -> RosClock {
-        RosClock {
-            node: Arc::clone(&self.inner),
-        }
+        self.inner.clock.clone()
+    }
+
+    /// The parameters of the node's master.
+    pub fn parameters(&self) -> Parameters {
+        Parameters::new(Arc::clone(&self.inner))
     }
 
     /// Whether the master has been found, now and as it changes.
@@ -188,23 +197,8 @@ impl Node {
             bytes: options.queue_bytes,
         };
         let entrance = Box::new(inbox.open(key, limit));
-        let feed = Arc::new(Feed::new(topic.clone(), wanted, entrance));
-        let mut registry = lock(&self.inner.registry);
-        let generation = registry.next_generation();
-        let entry = registry
-            .subscriptions
-            .entry(topic)
-            .or_insert_with(|| Subscribed {
-                generation,
-                updates: 0,
-                publishers: Vec::new(),
-                feeds: Vec::new(),
-            });
-        entry.feeds.push(Arc::clone(&feed));
-        let publishers = entry.publishers.clone();
-        drop(registry);
-        self.inner.connect(&feed, &publishers);
-        self.inner.changed.notify_one();
+        let feed = Arc::new(Feed::new(topic, wanted, entrance));
+        self.inner.follow(&feed);
         Ok(Subscription::new(feed, Arc::clone(&self.inner)))
     }
 
@@ -311,19 +305,6 @@ impl GraphReader {
     }
 }
 
-/// The time of a node, for the stamps of messages.
-#[derive(Clone, Debug)]
-pub struct RosClock {
-    node: Arc<Inner>,
-}
-
-impl RosClock {
-    /// The same as [`Node::now`].
-    pub fn now(&self) -> RosTime {
-        self.node.now()
-    }
-}
-
 /// Where the node stands with its master.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum MasterState {
@@ -390,6 +371,10 @@ pub(crate) struct Inner {
     pub(crate) topics_port: u16,
     pub(crate) master: Master,
     links: Arc<LinkContext>,
+    pub(crate) params: Params,
+    clock: RosClock,
+    /// The subscription of `/clock` while time is simulated.
+    clock_feed: Mutex<Option<Arc<Feed>>>,
     registry: Mutex<Registry>,
     /// Rings when the registry no longer is what the master was told.
     pub(crate) changed: Notify,
@@ -451,10 +436,6 @@ impl Inner {
         self.names.node()
     }
 
-    fn now(&self) -> RosTime {
-        RosTime::from_system(clock::utc())
-    }
-
     pub(crate) fn next_connection_id(&self) -> i32 {
         self.next_id.fetch_add(1, Ordering::Relaxed)
     }
@@ -478,6 +459,68 @@ impl Inner {
             .values()
             .flat_map(|entry| entry.feeds.iter().cloned())
             .collect()
+    }
+
+    /// The full name of a parameter; `/` is the root of all.
+    pub(crate) fn parameter_name(&self, name: &str) -> Result<String, NameError> {
+        if name == "/" {
+            Ok(name.to_owned())
+        } else {
+            self.names.resolve(name)
+        }
+    }
+
+    /// A parameter's name for the master to search upwards from this node. A remapped name is no longer relative.
+    pub(crate) fn searched_name(&self, name: &str) -> Result<String, NameError> {
+        self.names.searched(name)
+    }
+
+    /// What is followed of a parameter or namespace has to be read anew.
+    pub(crate) fn parameter_changed(&self, name: &str) {
+        self.params.touch(name);
+        self.changed.notify_one();
+    }
+
+    /// Goes over to simulated time, or back.
+    pub(crate) fn simulate(&self, simulated: bool) {
+        if !self.clock.simulate(simulated) {
+            return;
+        }
+        events::time_source_changed(simulated);
+        let mut current = lock(&self.clock_feed);
+        if let Some(feed) = current.take() {
+            feed.close();
+            self.withdraw_subscription(&feed);
+        }
+        if simulated && let Ok(topic) = self.names.resolve("/clock") {
+            let wanted = Wanted {
+                type_name: Some(CLOCK_TYPE.to_owned()),
+                md5sum: Some(CLOCK_MD5.to_owned()),
+            };
+            let feed = Arc::new(Feed::new(topic, wanted, Box::new(self.clock.clone())));
+            self.follow(&feed);
+            *current = Some(feed);
+        }
+    }
+
+    /// Registers a subscription and links it to the publishers known.
+    fn follow(&self, feed: &Arc<Feed>) {
+        let mut registry = lock(&self.registry);
+        let generation = registry.next_generation();
+        let entry = registry
+            .subscriptions
+            .entry(feed.topic.clone())
+            .or_insert_with(|| Subscribed {
+                generation,
+                updates: 0,
+                publishers: Vec::new(),
+                feeds: Vec::new(),
+            });
+        entry.feeds.push(Arc::clone(feed));
+        let publishers = entry.publishers.clone();
+        drop(registry);
+        self.connect(feed, &publishers);
+        self.changed.notify_one();
     }
 
     pub(crate) fn withdraw_publication(&self, hub: &Arc<Hub>) {
@@ -606,6 +649,10 @@ impl Inner {
         });
     }
 
+    pub(crate) fn is_asked_to_shut_down(&self) -> bool {
+        self.shutdown.borrow().is_some()
+    }
+
     pub(crate) fn is_closed(&self) -> bool {
         lock(&self.registry).closed
     }
@@ -626,6 +673,7 @@ impl Inner {
             .map(|(_, served)| served)
             .collect();
         drop(registry);
+        self.params.close();
         for hub in &hubs {
             hub.close();
         }
@@ -638,13 +686,28 @@ impl Inner {
     }
 }
 
+/// The parameters to begin with, by their full names.
+fn params(names: &Names, given: Vec<(String, ParamValue)>) -> Result<Params, NodeError> {
+    let full =
+        |(name, value): (String, ParamValue)| Ok((names.resolve(&format!("~{name}"))?, value));
+    let given = given
+        .into_iter()
+        .map(full)
+        .collect::<Result<_, NameError>>()?;
+    Ok(Params::new(given, names.resolve("/use_sim_time")?))
+}
+
 /// Listens on a port of the system's choosing.
 fn listen(address: IpAddr) -> Result<(TcpListener, u16), NodeError> {
     let open = || {
-        let listener = std::net::TcpListener::bind((address, 0))?;
-        listener.set_nonblocking(true)?;
+        let address = SocketAddr::from((address, 0));
+        let socket = Socket::new(Domain::for_address(address), Type::STREAM, None)?;
+        socket.bind(&address.into())?;
+        socket.listen(BACKLOG)?;
+        socket.set_nonblocking(true)?;
+        let listener = TcpListener::from_std(socket.into())?;
         let port = listener.local_addr()?.port();
-        Ok((TcpListener::from_std(listener)?, port))
+        Ok((listener, port))
     };
     open().map_err(|source| NodeError::Listen { address, source })
 }
@@ -659,3 +722,6 @@ fn bracketed(host: &str) -> String {
 }
 
 const SHUTDOWN_LIMIT: Duration = Duration::from_secs(2);
+/// Peers that may connect in one moment: a launch file starts a whole graph at once, and one that is not let in tries
+/// again after a second.
+const BACKLOG: i32 = 1024;

@@ -14,6 +14,7 @@ use crate::clock::{self, Throttle};
 use crate::events;
 use crate::master::MasterError;
 use crate::node::{Inner, MasterState, Registration, ResourceKind};
+use crate::parameters;
 
 /// Works until the node is closed and the master has been told.
 pub(crate) async fn run(node: Arc<Inner>) {
@@ -48,7 +49,7 @@ pub(crate) async fn run(node: Arc<Inner>) {
                 };
             }
         }
-        if closed && registrar.told.is_empty() {
+        if closed && registrar.told.is_empty() && node.params.is_empty() {
             node.settled.send_replace(true);
             return;
         }
@@ -96,6 +97,15 @@ impl Registrar {
             self.check().await?;
             self.checked = Some(clock::now());
         }
+        // First of all: a program may read its own parameters as soon as the node is registered.
+        if let Err(error) = parameters::settle(&self.node, &mut self.refusals).await {
+            if closed {
+                events::unregistration_failed(self.node.name(), &error);
+                self.told.clear();
+                self.node.params.abandon();
+            }
+            return Err(error);
+        }
         let mut jobs = self.jobs();
         let mut running: JoinSet<Outcome> = JoinSet::new();
         let mut failure = None;
@@ -128,7 +138,9 @@ impl Registrar {
         let pid = master.pid().await?;
         let other = self.pid.replace(pid).is_some_and(|before| before != pid);
         let mut forgotten = other;
-        if !other && self.told.values().any(|told| told.confirmed) {
+        let known =
+            self.node.params.any_subscribed() || self.told.values().any(|told| told.confirmed);
+        if !other && known {
             match master.lookup_node(self.node.name()).await? {
                 None => forgotten = true,
                 Some(uri) if uri != self.node.uri => {
@@ -148,12 +160,23 @@ impl Registrar {
             self.told
                 .values_mut()
                 .for_each(|told| told.confirmed = false);
+            self.node.params.forget();
         }
         Ok(())
     }
 
     fn jobs(&mut self) -> Vec<Job> {
-        let wanted = self.node.wanted_registrations();
+        let mut wanted = self.node.wanted_registrations();
+        if self.node.is_asked_to_shut_down() {
+            // The name belongs to another node now, which a registration would push out in turn.
+            wanted.retain(|registration| {
+                let key = (registration.name.clone(), registration.kind);
+                let told = self.told.get(&key);
+                told.is_some_and(|told| {
+                    told.confirmed && told.generation == registration.generation
+                })
+            });
+        }
         let mut gone = self.told.clone();
         let mut jobs = Vec::new();
         for registration in wanted {

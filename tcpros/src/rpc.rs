@@ -26,6 +26,7 @@ pub(crate) struct Endpoint {
     host: String,
     port: u16,
     path: String,
+    ipv6_first: bool,
 }
 
 impl Endpoint {
@@ -36,7 +37,19 @@ impl Endpoint {
             host: host.to_owned(),
             port,
             path: path.to_owned(),
+            ipv6_first: false,
         })
+    }
+
+    /// Whether it tries the IPv6 addresses of a host before the others.
+    pub(crate) const fn prefers_ipv6(&self) -> bool {
+        self.ipv6_first
+    }
+
+    /// Tries the IPv6 addresses of the host before the others, or after them.
+    pub(crate) const fn ipv6_first(mut self, ipv6_first: bool) -> Self {
+        self.ipv6_first = ipv6_first;
+        self
     }
 }
 
@@ -76,7 +89,7 @@ pub(crate) async fn call(
 }
 
 async fn exchange(endpoint: &Endpoint, body: String) -> Result<Bytes, RpcError> {
-    let stream = connect(&endpoint.host, endpoint.port)
+    let stream = connect(&endpoint.host, endpoint.port, endpoint.ipv6_first)
         .await
         .map_err(RpcError::Connect)?;
     let (mut sender, connection) = hyper::client::conn::http1::Builder::new()
@@ -113,10 +126,11 @@ async fn exchange(endpoint: &Endpoint, body: String) -> Result<Bytes, RpcError> 
     }
 }
 
-/// Connects with Nagle's algorithm off, to the IPv4 addresses of a name first, as ROS 1 peers listen there.
-pub(crate) async fn connect(host: &str, port: u16) -> std::io::Result<TcpStream> {
+/// Connects with Nagle's algorithm off, to the IPv4 addresses of a name first, as ROS 1 peers listen there unless
+/// they are told to use IPv6.
+pub(crate) async fn connect(host: &str, port: u16, ipv6_first: bool) -> std::io::Result<TcpStream> {
     let mut addresses: Vec<SocketAddr> = tokio::net::lookup_host((host, port)).await?.collect();
-    addresses.sort_by_key(SocketAddr::is_ipv6);
+    addresses.sort_by_key(|address| address.is_ipv6() != ipv6_first);
     let stream = TcpStream::connect(addresses.as_slice()).await?;
     stream.set_nodelay(true)?;
     Ok(stream)
@@ -251,7 +265,7 @@ pub enum RpcError {
 
 const XML: &str = "text/xml";
 const MAX_BODY: usize = 4 * 1024 * 1024;
-const MAX_CONNECTIONS: usize = 256;
+const MAX_CONNECTIONS: usize = 1024;
 const READ_LIMIT: Duration = Duration::from_secs(30);
 
 #[cfg(test)]

@@ -11,16 +11,16 @@ use std::time::Duration;
 
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 use thiserror::Error;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::tcp::{ReadHalf, WriteHalf};
+use tokio::io::{AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::net::tcp::ReadHalf;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
 use crate::events::{self, Refusals};
-use crate::header::{ConnectionHeader, HeaderError};
-use crate::link::prepare;
+use crate::header::{ConnectionHeader, HeaderError, clipped};
+use crate::link::{prepare, transport_info};
 use crate::node::Inner;
 use crate::publisher::{Joined, Subscriber};
 use crate::service::{self, ClientFault};
@@ -90,7 +90,7 @@ enum Admitted {
 async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Admitted, Refused> {
     prepare(stream)?;
     let request = ConnectionHeader::read(stream).await?;
-    match admit(request, node) {
+    match admit(request, node, transport_info(stream)) {
         Ok((reply, admitted)) => {
             stream.write_all(&reply.encode()?).await?;
             Ok(admitted)
@@ -105,11 +105,15 @@ async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Admitted, R
 }
 
 /// Joins before the reply is written, so that what is published from then on arrives.
-fn admit(request: ConnectionHeader, node: &Inner) -> Result<(ConnectionHeader, Admitted), String> {
+fn admit(
+    request: ConnectionHeader,
+    node: &Inner,
+    transport: String,
+) -> Result<(ConnectionHeader, Admitted), String> {
     if let Some(name) = request.get("service") {
         let served = node
             .service(name)
-            .ok_or_else(|| service::nonexistent(name))?;
+            .ok_or_else(|| service::nonexistent(clipped(name)))?;
         let (reply, admitted) = served.admit(request, node.name())?;
         return Ok((reply, Admitted::Service(admitted)));
     }
@@ -118,13 +122,15 @@ fn admit(request: ConnectionHeader, node: &Inner) -> Result<(ConnectionHeader, A
             "Header from subscriber did not have the required elements: md5sum, topic".to_owned(),
         );
     };
-    let caller = request.caller_id();
-    let gone =
-        || format!("received a connection for a nonexistent topic [{topic}] from [{caller}]");
+    let caller = clipped(request.caller_id());
+    let gone = || {
+        let topic = clipped(topic);
+        format!("received a connection for a nonexistent topic [{topic}] from [{caller}]")
+    };
     let hub = node.publication(topic).ok_or_else(gone)?;
     let reply = hub.reply_to(&request, node.name())?;
     let joined = hub
-        .join(node.next_connection_id(), caller)
+        .join(node.next_connection_id(), caller, transport)
         .ok_or_else(gone)?;
     let nodelay = request.get("tcp_nodelay") == Some("1");
     events::subscriber_joined(&joined.hub.topic, caller, nodelay);
@@ -153,23 +159,8 @@ async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ende
         }
         let bytes: usize = waiting.iter().map(|message| message.len() + 4).sum();
         let messages = waiting.len();
-        for message in waiting.drain(..) {
-            batch.put_slice(&length(&message));
-            if message.len() <= COPIED {
-                batch.put_slice(&message);
-            } else if let Err(ended) = write(
-                &mut writer,
-                batch.split().freeze(),
-                message,
-                overdue.as_mut(),
-            )
-            .await
-            {
-                return ended;
-            }
-        }
-        let rest = batch.split().freeze();
-        if let Err(ended) = write(&mut writer, rest, Bytes::new(), overdue.as_mut()).await {
+        if let Err(ended) = write_all(&mut writer, &mut waiting, &mut batch, overdue.as_mut()).await
+        {
             return ended;
         }
         subscriber
@@ -182,10 +173,28 @@ async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ende
     }
 }
 
+/// Writes messages: small ones together in one piece, a large one without copying it.
+async fn write_all(
+    writer: &mut (impl AsyncWrite + Unpin),
+    messages: &mut Vec<Bytes>,
+    batch: &mut BytesMut,
+    mut overdue: Pin<&mut impl Future<Output = ()>>,
+) -> Result<(), Ended> {
+    for message in messages.drain(..) {
+        batch.put_slice(&length(&message));
+        if message.len() <= COPIED {
+            batch.put_slice(&message);
+        } else {
+            write(writer, batch.split().freeze(), message, overdue.as_mut()).await?;
+        }
+    }
+    write(writer, batch.split().freeze(), Bytes::new(), overdue).await
+}
+
 /// Writes two pieces as one, the second without copying it, as long as the peer takes at least something in time and
 /// `overdue` does not end.
 pub(crate) async fn write(
-    writer: &mut WriteHalf<'_>,
+    writer: &mut (impl AsyncWrite + Unpin),
     head: Bytes,
     body: Bytes,
     mut overdue: Pin<&mut impl Future<Output = ()>>,
@@ -262,3 +271,102 @@ pub(crate) const DRAIN_LIMIT: Duration = Duration::from_secs(1);
 const BATCH: usize = 64 * 1024;
 /// Up to here copying a message into the batch is cheaper than a write of its own.
 const COPIED: usize = 16 * 1024;
+
+#[cfg(test)]
+mod tests {
+    use std::io::IoSlice;
+    use std::pin::Pin;
+    use std::task::{Context, Poll};
+
+    use super::*;
+    use crate::outbox::{Limit, Outbox};
+
+    /// Takes everything and notes the pieces of each write: where they are and how long.
+    #[derive(Default)]
+    struct Recorder {
+        writes: Vec<Vec<(*const u8, usize)>>,
+        bytes: Vec<u8>,
+    }
+
+    impl AsyncWrite for Recorder {
+        fn poll_write(
+            self: Pin<&mut Self>,
+            cx: &mut Context<'_>,
+            piece: &[u8],
+        ) -> Poll<std::io::Result<usize>> {
+            self.poll_write_vectored(cx, &[IoSlice::new(piece)])
+        }
+
+        fn poll_write_vectored(
+            mut self: Pin<&mut Self>,
+            _: &mut Context<'_>,
+            pieces: &[IoSlice<'_>],
+        ) -> Poll<std::io::Result<usize>> {
+            let noted = pieces.iter().map(|p| (p.as_ptr(), p.len())).collect();
+            self.writes.push(noted);
+            for piece in pieces {
+                self.bytes.extend_from_slice(piece);
+            }
+            Poll::Ready(Ok(pieces.iter().map(|p| p.len()).sum()))
+        }
+
+        fn is_write_vectored(&self) -> bool {
+            true
+        }
+
+        fn poll_flush(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<std::io::Result<()>> {
+            Poll::Ready(Ok(()))
+        }
+
+        fn poll_shutdown(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<std::io::Result<()>> {
+            Poll::Ready(Ok(()))
+        }
+    }
+
+    fn outbox() -> Outbox {
+        Outbox::new(Limit {
+            messages: 1000,
+            bytes: 1 << 20,
+        })
+    }
+
+    async fn written(messages: &[Bytes]) -> Recorder {
+        let outbox = outbox();
+        for message in messages {
+            assert_eq!(outbox.push(message.clone()), 0);
+        }
+        outbox.close();
+        let mut recorder = Recorder::default();
+        let (mut waiting, mut batch) = (Vec::new(), BytesMut::new());
+        while outbox.take(&mut waiting, BATCH).await {
+            let never = std::pin::pin!(std::future::pending());
+            let whole = write_all(&mut recorder, &mut waiting, &mut batch, never).await;
+            assert!(whole.is_ok());
+        }
+        recorder
+    }
+
+    /// Requirement: small messages that wait leave in one write.
+    #[tokio::test]
+    async fn small_messages_that_wait_leave_in_one_write() {
+        let messages: Vec<Bytes> = (0..100u8).map(|n| Bytes::from(vec![n; 16])).collect();
+        let recorder = written(&messages).await;
+        assert_eq!(recorder.writes.len(), 1);
+        assert_eq!(recorder.bytes.len(), 100 * 20);
+        assert_eq!(recorder.bytes[..6], [16, 0, 0, 0, 0, 0]);
+        assert_eq!(recorder.bytes[20..26], [16, 0, 0, 0, 1, 1]);
+    }
+
+    /// Requirement: a large message is not copied on its way out, and its length leaves with it.
+    #[tokio::test]
+    async fn a_large_message_leaves_from_where_it_is_together_with_its_length() {
+        let small = Bytes::from_static(b"small");
+        let large = Bytes::from(vec![7; 100_000]);
+        let recorder = written(&[small, large.clone()]).await;
+        // The one that fits a batch goes ahead; the other is one write of two pieces.
+        assert_eq!(recorder.writes[1][0].1, 4);
+        assert_eq!(recorder.writes[1][1], (large.as_ptr(), large.len()));
+        assert_eq!(recorder.writes.len(), 2);
+        assert_eq!(recorder.bytes[9..13], 100_000u32.to_le_bytes());
+    }
+}

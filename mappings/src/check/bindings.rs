@@ -7,6 +7,7 @@ use std::sync::Arc;
 use messages::{DefinitionError, Dialect, Leaf, MessageType, Selection, TypeName};
 
 use super::names::{mended, topic_fault};
+use super::services::{self, Calls, Kind, Known, Service};
 use super::types::{self, Types, ValueType, dialect};
 use super::{Declared, required, variables};
 use crate::code::Code;
@@ -34,6 +35,7 @@ pub(super) struct Bound {
     pub(super) bindings: Vec<Binding>,
     /// `None` when no type of a binding is known.
     pub(super) fields: Option<Vec<Leaf>>,
+    pub(super) service: Option<Service>,
 }
 
 /// One binding, as far as it goes.
@@ -44,10 +46,10 @@ struct Found {
 }
 
 /// Where a binding stands.
-struct Site<'s> {
-    place: Place,
-    space: Option<SpaceId>,
-    subject: &'s Subject,
+pub(super) struct Site<'s> {
+    pub(super) place: Place,
+    pub(super) space: Option<SpaceId>,
+    pub(super) subject: &'s Subject,
 }
 
 /// What is done to one ROS topic of one space.
@@ -60,15 +62,17 @@ struct Use {
 pub(super) struct Bindings<'c> {
     spaces: &'c Declared<Vec<Space>>,
     types: Types,
+    calls: Calls,
     uses: HashMap<(SpaceId, String), Vec<Use>>,
     /// The topics in the order they came, so that findings do.
     order: Vec<(SpaceId, String)>,
 }
 
 impl<'c> Bindings<'c> {
-    pub(super) fn new(spaces: &'c Declared<Vec<Space>>) -> Self {
+    pub(super) fn new(spaces: &'c Declared<Vec<Space>>, calls: Calls) -> Self {
         Self {
             spaces,
+            calls,
             types: Types::new(),
             uses: HashMap::new(),
             order: Vec::new(),
@@ -82,6 +86,7 @@ impl<'c> Bindings<'c> {
         findings: &mut Findings,
     ) -> Bound {
         let mut found: Vec<Found> = Vec::new();
+        let mut service: Option<Service> = None;
         let mut spaces: HashMap<SpaceId, usize> = HashMap::new();
         let entries = entries
             .and_then(|at| at.value.as_ref())
@@ -104,7 +109,18 @@ impl<'c> Bindings<'c> {
                 space,
                 subject,
             };
-            found.extend(self.binding(entry, &site, findings));
+            match services::kind(entry, at.place, findings) {
+                Some(Kind::Topic) => found.extend(self.binding(entry, &site, findings)),
+                Some(kind) => {
+                    let mut known = Known {
+                        types: &mut self.types,
+                        calls: &self.calls,
+                    };
+                    let checked = services::check(kind, entry, &site, &mut known, findings);
+                    service = checked.or(service);
+                }
+                None => {}
+            }
         }
         differences(&found, findings);
         for one in &found {
@@ -114,10 +130,19 @@ impl<'c> Bindings<'c> {
         let own = found
             .iter()
             .filter(|one| Some(one.binding.space) == subject.origin);
-        let fields = own.chain(&found).find_map(|one| one.fields.clone());
+        let topics = own.chain(&found).find_map(|one| one.fields.clone());
+        let services = service.as_ref().and_then(|service| service.fields.clone());
+        if let (Some(topics), Some(services), Some(service)) = (&topics, &services, &service) {
+            service.compare(topics, services, findings);
+        }
+        let fields = match &service {
+            Some(service) if Some(service.binding.space) == subject.origin => services.or(topics),
+            Some(_) | None => topics.or(services),
+        };
         Bound {
             bindings: found.into_iter().map(|one| one.binding).collect(),
             fields,
+            service,
         }
     }
 
@@ -372,19 +397,7 @@ fn topic_name(
     findings: &mut Findings,
 ) -> Option<(String, Place)> {
     let dialect = site.space.map_or(Dialect::Ros1, dialect);
-    if let Some(fault) = topic_fault(text, dialect) {
-        let note = findings
-            .error(
-                Code::RosTopic,
-                place,
-                format!("`{}` is no ROS topic name", short(text)),
-            )
-            .label(fault);
-        if let Some(mended) = mended(text, dialect) {
-            note.help(format!("did you mean `{mended}`?"));
-        }
-        return None;
-    }
+    ros_name(text, place, (dialect, "topic"), findings)?;
     if let Some(other) = text
         .strip_prefix('/')
         .and_then(|name| name.parse::<TopicId>().ok())
@@ -403,6 +416,29 @@ fn topic_name(
     Some((text.to_owned(), place))
 }
 
+/// `None` when it is no name of a topic or service, which is noted.
+pub(super) fn ros_name(
+    text: &str,
+    place: Place,
+    (dialect, what): (Dialect, &str),
+    findings: &mut Findings,
+) -> Option<()> {
+    if let Some(fault) = topic_fault(text, dialect) {
+        let note = findings
+            .error(
+                Code::RosTopic,
+                place,
+                format!("`{}` is no ROS {what} name", short(text)),
+            )
+            .label(fault);
+        if let Some(mended) = mended(text, dialect) {
+            note.help(format!("did you mean `{mended}`?"));
+        }
+        return None;
+    }
+    Some(())
+}
+
 const fn ros(dialect: Dialect) -> &'static str {
     match dialect {
         Dialect::Ros1 => "ROS 1",
@@ -410,7 +446,7 @@ const fn ros(dialect: Dialect) -> &'static str {
     }
 }
 
-fn select(
+pub(super) fn select(
     message_type: &MessageType,
     selection: &Selection,
     place: Place,
@@ -459,7 +495,7 @@ fn select(
     None
 }
 
-fn told(paths: &[&str]) -> String {
+pub(super) fn told(paths: &[&str]) -> String {
     match paths.split_at_checked(TOLD) {
         Some((first, rest)) if !rest.is_empty() => {
             format!("{} and {} more", list(first), rest.len())
@@ -469,7 +505,7 @@ fn told(paths: &[&str]) -> String {
     }
 }
 
-fn compare(
+pub(super) fn compare(
     fields: &[Leaf],
     name: &TypeName,
     subject: &Subject,

@@ -21,10 +21,11 @@ use super::types::{
 use super::wire;
 use crate::clock;
 use crate::inbox::{Inbox, InboxEvent, Message};
-use crate::node::{Node, NodeError, RosClock};
+use crate::node::{Node, NodeError};
 use crate::outbox::lock;
 use crate::publisher::{Publisher, PublisherOptions};
 use crate::subscription::{SubscriberOptions, Subscription};
+use crate::time::RosClock;
 use crate::time::RosTime;
 
 /// How long a client waits, in steady time, and how much it holds.

@@ -19,10 +19,11 @@ use super::types::{
 use super::wire;
 use crate::clock;
 use crate::inbox::{Inbox, InboxEvent, Message};
-use crate::node::{Node, NodeError, RosClock};
+use crate::node::{Node, NodeError};
 use crate::outbox::lock;
 use crate::publisher::{Publisher, PublisherOptions};
 use crate::subscription::{SubscriberOptions, Subscription};
+use crate::time::RosClock;
 
 /// How a server reports its goals, in steady time, and how many it takes.
 #[derive(Clone, Debug, PartialEq, Eq)]

@@ -187,7 +187,7 @@ impl Shared {
             self.malformed(CallPhase::Lookup, what)
         })?;
         let opening = async {
-            let stream = rpc::connect(host, port).await?;
+            let stream = rpc::connect(host, port, self.master.prefers_ipv6()).await?;
             prepare(&stream)?;
             Ok(stream)
         };
