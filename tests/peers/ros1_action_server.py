@@ -1,5 +1,5 @@
 """An actionlib server. What it does depends on the goal's number:
--2 is rejected, -1 aborted, 100 and more last until they are cancelled, and n succeeds as 2 n after feedback n + 1."""
+-2 is rejected, -1 aborted, 100 and more report one more and last until they are cancelled, others succeed doubled."""
 
 import argparse
 
@@ -28,8 +28,8 @@ class Many:
             handle.set_aborted(TestResult(result=3), "failed")
         elif number >= 100:
             self.held[handle.get_goal_id().id] = handle
-        else:
             handle.publish_feedback(TestFeedback(feedback=number + 1))
+        else:
             handle.set_succeeded(TestResult(result=2 * number), "done")
 
     def cancel(self, handle):
@@ -51,7 +51,6 @@ class Simple:
         if goal.goal >= 100:
             self.server.set_preempted(TestResult(result=7), "stopped")
         else:
-            self.server.publish_feedback(TestFeedback(feedback=goal.goal + 1))
             self.server.set_succeeded(TestResult(result=2 * goal.goal), "done")
 
 

@@ -149,6 +149,8 @@ pub struct ClientCounters {
     pub invalid_transitions: u64,
     /// Results of goals that had ended already.
     pub late_results: u64,
+    /// Reports of progress of goals that had ended already.
+    pub late_feedback: u64,
     /// Reports of progress that gave way to newer ones, over all goals.
     pub feedback_dropped: u64,
     /// Messages of all topics that were lost because this process did not keep up.
@@ -298,8 +300,10 @@ impl ClientGoals {
     }
 
     pub(super) fn feedback(&mut self, id: &str, feedback: Feedback) {
-        if let Some(goal) = self.goals.get_mut(id).filter(|goal| !goal.state.is_end()) {
-            self.counters.feedback_dropped += goal.feedback(feedback, &self.limits);
+        match self.goals.get_mut(id) {
+            Some(goal) if goal.state.is_end() => self.counters.late_feedback += 1,
+            Some(goal) => self.counters.feedback_dropped += goal.feedback(feedback, &self.limits),
+            None => {}
         }
     }
 
@@ -697,13 +701,16 @@ mod tests {
     }
 
     #[test]
-    fn a_second_result_changes_nothing_and_is_counted() {
+    fn what_comes_after_the_end_changes_nothing_and_is_counted() {
         let (mut goals, now) = sent();
         for end in [Status::Aborted, Status::Succeeded] {
+            let body = Bytes::new();
+            goals.feedback("g", Feedback { body, peer: peer() });
             goals.result(&entry("g", end), Bytes::new(), peer(), now);
         }
         assert_eq!(goals.goal("g").unwrap().status, Status::Aborted);
-        assert_eq!(goals.counters.late_results, 1);
+        let counted = (goals.counters.late_results, goals.counters.late_feedback);
+        assert_eq!(counted, (1, 1));
     }
 
     #[test]

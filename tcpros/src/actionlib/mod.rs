@@ -11,6 +11,7 @@
 //! - A goal always ends: with its result, or as lost with the [`LostReason`]. A client whose server went away goes on
 //!   when one comes back, without being asked to.
 //! - Feedback waits in a bounded queue whose oldest give way and are counted. Results are never dropped there.
+//! - Each topic is a connection of its own: a result may overtake the last feedback, which then is dropped and counted.
 //! - What peers send is checked; messages that do not read are counted and logged.
 //!
 //! The behaviour is that of the ROS package actionlib 1.14 (<https://wiki.ros.org/actionlib/DetailedDescription>),
