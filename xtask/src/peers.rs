@@ -21,6 +21,7 @@ const APT: &[&str] = &[
     "python3-rosnode",
     "python3-rosservice",
     "python3-rosparam",
+    "python3-rosbag",
     "python3-std-msgs",
     "python3-geometry-msgs",
     "python3-sensor-msgs",
