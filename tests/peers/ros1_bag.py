@@ -16,8 +16,8 @@ def main():
                 type=connection.datatype,
                 md5sum=connection.md5sum,
                 definition=connection.msg_def,
-                callerid=connection.header.get("callerid"),
-                latching=connection.header.get("latching"),
+                callerid=connection.header["callerid"].decode(),
+                latching=connection.header["latching"].decode(),
             )
         for topic, message, _ in bag.read_messages():
             lifetime.say(message=topic, value=ros1_messages.plain(message))

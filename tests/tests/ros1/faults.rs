@@ -384,6 +384,8 @@ fn twenty_restarts_of_the_master_cost_no_message() {
     let args = [
         "/in",
         "std_msgs/String",
+        "--wait-subscribers",
+        "1",
         "--numbered",
         "100000",
         "--rate",
