@@ -15,6 +15,7 @@ use crate::support::{Ours, SOON, string, string_type, twist, twist_type};
 const PERIOD: Duration = Duration::from_millis(20);
 /// Messages per topic in a bag.
 const RECORDED: u8 = 10;
+const TRIPS: u32 = 50;
 
 /// Publishes a `Twist` fifty times a second, its forward speed counting up.
 fn driving(ours: &Ours, publisher: &Arc<Publisher>) -> JoinHandle<()> {
@@ -226,11 +227,13 @@ fn roscpp_relays_and_throttles_stand_on_either_side() {
     // There and back through roscpp, one at a time: what Nagle's algorithm would hold back shows as 40 ms each.
     while relayed.try_next().is_some() {}
     let started = Instant::now();
-    for number in 0..50 {
+    for number in 0..TRIPS {
         let _sent = cmd.publish(twist(-f64::from(number)));
         let _back = relayed.next("the message back");
     }
-    println!("50 round trips through roscpp: {:?}", started.elapsed());
+    let took = started.elapsed();
+    println!("{TRIPS} round trips through roscpp: {took:?}");
+    assert!(took < TRIPS * Duration::from_millis(30), "{took:?}");
 }
 
 /// Requirement: a node of a third make is heard and hears.
