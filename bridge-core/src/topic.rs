@@ -1,5 +1,6 @@
 //! Everything the Router keeps for one topic.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use mappings::Overflow;
@@ -9,7 +10,7 @@ use crate::counters::Counters;
 use crate::output::Delivery;
 use crate::queue::Queue;
 use crate::reader::Reader;
-use crate::writer::{Encoded, Writer};
+use crate::writer::{Encoded, Message, Writer};
 
 /// One topic of the space, seen from one bridge: of our own space, or of another.
 #[derive(Debug)]
@@ -19,6 +20,8 @@ pub(crate) struct Topic {
     /// that speaks in fields.
     pub(crate) plan: Option<Plan>,
     pub(crate) queue: Queue<Item>,
+    /// A large message of which chunks are still to be sent, before anything of the queue.
+    pub(crate) sending: Option<Sending>,
     pub(crate) overflow: Overflow,
     pub(crate) counters: Counters,
     /// Whether it stands in the Router's list of topics with something to poll.
@@ -38,8 +41,16 @@ pub(crate) enum Role {
 /// A sample on its way out.
 #[derive(Debug)]
 pub(crate) enum Item {
-    Datagram(Encoded),
+    Message(Message),
     Delivery(Delivery),
+}
+
+/// A large message on its way.
+#[derive(Debug)]
+pub(crate) struct Sending {
+    pub(crate) message: Arc<Encoded>,
+    /// Where in its DataSetMessage the next chunk begins.
+    pub(crate) offset: usize,
 }
 
 impl Topic {
@@ -48,10 +59,18 @@ impl Topic {
             role,
             plan: None,
             queue: Queue::new(overflow),
+            sending: None,
             overflow,
             counters: Counters::default(),
             ready: false,
             timer: None,
         }
+    }
+
+    /// Whether there is something to poll.
+    pub(crate) fn has_more(&self) -> bool {
+        !self.queue.is_empty()
+            || self.sending.is_some()
+            || matches!(&self.role, Role::Ours(writer) if writer.repeats())
     }
 }

@@ -16,7 +16,7 @@ mod status;
 
 pub use arguments::Arguments;
 pub use clock::{now, timestamp};
-pub use definitions::Definitions;
+pub use definitions::{Definitions, Wanted};
 pub use exit::{Failure, FailureKind};
 pub use logging::LogFormat;
 pub use port::{Delivery, Port, PortEvent};

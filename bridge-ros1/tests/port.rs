@@ -134,6 +134,8 @@ fn line(event: &PortEvent) -> String {
             let field = match selection {
                 Selection::Whole => "whole",
                 Selection::Field(field) => field,
+                Selection::Bytes => "bytes",
+                Selection::Template { .. } => "template",
             };
             format!("{topic} is {} {field}", message_type.name())
         }

@@ -15,7 +15,7 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
         .init();
     let mut options = NodeOptions::from_env("relay");
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let topics = options.apply_arguments(&arguments);
+    let topics = options.apply_arguments(&arguments)?;
     let [input, output] = topics.as_slice() else {
         return Err("relay IN OUT".into());
     };

@@ -42,6 +42,11 @@ impl Frames {
         Ok(Some(frame.slice(4..)))
     }
 
+    /// Whether no part of another message is here.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.buffer.is_empty()
+    }
+
     /// The buffer with room for the next read. What a peer announces is believed only as far as it delivers: the
     /// buffer at most doubles past `TRUSTED`.
     pub(crate) fn room(&mut self) -> &mut BytesMut {
@@ -69,10 +74,10 @@ impl Frames {
 
 /// The peer announced a message longer than this side takes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
-#[error("the publisher announced a message of {announced} bytes, more than the limit of {limit}")]
+#[error("the peer announced a message of {announced} bytes, more than the limit of {limit}")]
 pub(crate) struct FrameTooLong {
-    announced: u32,
-    limit: usize,
+    pub(crate) announced: u32,
+    pub(crate) limit: usize,
 }
 
 const MIN_WINDOW: usize = 4 * 1024;

@@ -82,7 +82,10 @@ async fn connect(
     uri: &str,
 ) -> Result<(TcpStream, Arc<Peer>), LinkError> {
     let (host, port) = request_topic(feed, context, uri).await?;
-    let connecting = timeout(CONNECT_LIMIT, rpc::connect(&host, port));
+    let connecting = timeout(
+        CONNECT_LIMIT,
+        rpc::connect(&host, port, context.master.prefers_ipv6()),
+    );
     let mut stream = connecting
         .await
         .map_err(|_| LinkError::NoConnection(CONNECT_LIMIT))??;
@@ -105,7 +108,9 @@ async fn request_topic(
     context: &LinkContext,
     uri: &str,
 ) -> Result<(String, u16), LinkError> {
-    let endpoint = Endpoint::parse(uri).ok_or(RpcError::Uri)?;
+    let endpoint = Endpoint::parse(uri)
+        .ok_or(RpcError::Uri)?
+        .ipv6_first(context.master.prefers_ipv6());
     let protocols = vec![Value::Array(vec!["TCPROS".into()])];
     let params = vec![
         context.caller_id.as_str().into(),

@@ -80,6 +80,12 @@ impl Publisher {
         lock(&self.hub.state).subscribers.len()
     }
 
+    /// Whether the node of this resolved name is connected.
+    pub fn is_subscribed_by(&self, node: &str) -> bool {
+        let state = lock(&self.hub.state);
+        state.subscribers.iter().any(|s| s.caller_id == node)
+    }
+
     /// The topic's resolved name.
     pub fn topic(&self) -> &str {
         &self.hub.topic

@@ -22,8 +22,7 @@ pub(crate) fn answer(node: &Inner, call: Call) -> Response {
         "getBusInfo" => Ok(done(bus_info(node))),
         "publisherUpdate" => Ok(publisher_update(node, params)),
         "requestTopic" => Ok(request_topic(node, params)),
-        // No parameter is cached here, so none can be stale.
-        "paramUpdate" => Ok(done(0)),
+        "paramUpdate" => Ok(param_update(node, params)),
         "shutdown" => Ok(shutdown(node, params)),
         other => Err(Fault {
             code: -1,
@@ -40,6 +39,16 @@ fn publisher_update(node: &Inner, params: &[Value]) -> Value {
         return refused("publishers must be a list of strings");
     };
     node.publishers_changed(topic, &publishers);
+    done(0)
+}
+
+fn param_update(node: &Inner, params: &[Value]) -> Value {
+    let [_, Value::String(key), _] = params else {
+        return refused("paramUpdate takes (caller_id, key, value)");
+    };
+    // The key of a namespace ends in a slash, and that of the root is nothing else.
+    let name = key.trim_end_matches('/');
+    node.parameter_changed(if name.is_empty() { "/" } else { name });
     done(0)
 }
 
@@ -122,7 +131,15 @@ fn bus_stats(node: &Inner) -> Value {
         let connections: Vec<Value> = feed.connections().into_iter().map(connection).collect();
         subscribed.push(vec![feed.topic.as_str().into(), connections.into()].into());
     }
-    let services = vec![0.into(), 0.into(), 0.into()];
+    // Requests, bytes received, bytes sent, over all services: the slave API knows no more of them.
+    let (mut calls, mut received, mut sent) = (0u64, 0u64, 0u64);
+    for served in node.services() {
+        let counters = &served.counters;
+        calls = calls.saturating_add(counters.calls.load(Ordering::Relaxed));
+        received = received.saturating_add(counters.received.load(Ordering::Relaxed));
+        sent = sent.saturating_add(counters.sent.load(Ordering::Relaxed));
+    }
+    let services = vec![count(calls), count(received), count(sent)];
     Value::Array(vec![
         Value::Array(published),
         Value::Array(subscribed),

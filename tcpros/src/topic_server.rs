@@ -1,9 +1,10 @@
-//! Where subscribers connect: accepting, the handshake, and writing to each on its own.
+//! Where subscribers and the clients of services connect: accepting, the handshake, and writing to each on its own.
 //!
 //! The accept loop only accepts. Each connection is one task, which ends with the connection, with its publisher, or
 //! with the node, whose accept task owns them all.
 
 use std::net::SocketAddr;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -21,10 +22,10 @@ use crate::events::{self, Refusals};
 use crate::header::{ConnectionHeader, HeaderError, clipped};
 use crate::link::{prepare, transport_info};
 use crate::node::Inner;
-use crate::outbox::Outbox;
 use crate::publisher::{Joined, Subscriber};
+use crate::service::{self, ClientFault};
 
-/// Serves the subscribers of all topics of a node until it is dropped.
+/// Serves the subscribers and clients of a node until it is dropped.
 pub(crate) async fn serve(listener: TcpListener, node: Arc<Inner>) {
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     let mut connections: JoinSet<Result<(), (SocketAddr, Refused)>> = JoinSet::new();
@@ -63,9 +64,16 @@ pub(crate) async fn serve(listener: TcpListener, node: Arc<Inner>) {
 
 async fn serve_one(mut stream: TcpStream, node: &Inner) -> Result<(), Refused> {
     let handshake = timeout(HANDSHAKE_LIMIT, shake_hands(&mut stream, node));
-    let joined = handshake
+    let admitted = handshake
         .await
         .map_err(|_| Refused::Silent(HANDSHAKE_LIMIT))??;
+    let joined = match admitted {
+        Admitted::Subscriber(joined) => joined,
+        Admitted::Service(service::Admitted::Client(session)) => {
+            return Ok(session.serve(&mut stream).await?);
+        }
+        Admitted::Service(service::Admitted::Probe) => return Ok(()),
+    };
     let subscriber = &joined.subscriber;
     let ended = write_messages(&mut stream, subscriber).await;
     let dropped = subscriber.outbox.dropped();
@@ -73,15 +81,19 @@ async fn serve_one(mut stream: TcpStream, node: &Inner) -> Result<(), Refused> {
     Ok(())
 }
 
-async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Joined, Refused> {
+/// What a peer has come for and may have.
+enum Admitted {
+    Subscriber(Joined),
+    Service(service::Admitted),
+}
+
+async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Admitted, Refused> {
     prepare(stream)?;
     let request = ConnectionHeader::read(stream).await?;
-    match admit(&request, node, transport_info(stream)) {
-        Ok((reply, joined)) => {
+    match admit(request, node, transport_info(stream)) {
+        Ok((reply, admitted)) => {
             stream.write_all(&reply.encode()?).await?;
-            let nodelay = request.get("tcp_nodelay") == Some("1");
-            events::subscriber_joined(&joined.hub.topic, &joined.subscriber.caller_id, nodelay);
-            Ok(joined)
+            Ok(admitted)
         }
         Err(error) => {
             let reply = ConnectionHeader::default().with("error", &*error);
@@ -94,15 +106,16 @@ async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Joined, Ref
 
 /// Joins before the reply is written, so that what is published from then on arrives.
 fn admit(
-    request: &ConnectionHeader,
+    request: ConnectionHeader,
     node: &Inner,
     transport: String,
-) -> Result<(ConnectionHeader, Joined), String> {
-    if let Some(service) = request.get("service") {
-        return Err(format!(
-            "service [{}] is not provided by this node",
-            clipped(service)
-        ));
+) -> Result<(ConnectionHeader, Admitted), String> {
+    if let Some(name) = request.get("service") {
+        let served = node
+            .service(name)
+            .ok_or_else(|| service::nonexistent(clipped(name)))?;
+        let (reply, admitted) = served.admit(request, node.name())?;
+        return Ok((reply, Admitted::Service(admitted)));
     }
     let Some(topic) = request.get("topic") else {
         return Err(
@@ -115,11 +128,13 @@ fn admit(
         format!("received a connection for a nonexistent topic [{topic}] from [{caller}]")
     };
     let hub = node.publication(topic).ok_or_else(gone)?;
-    let reply = hub.reply_to(request, node.name())?;
+    let reply = hub.reply_to(&request, node.name())?;
     let joined = hub
         .join(node.next_connection_id(), caller, transport)
         .ok_or_else(gone)?;
-    Ok((reply, joined))
+    let nodelay = request.get("tcp_nodelay") == Some("1");
+    events::subscriber_joined(&joined.hub.topic, caller, nodelay);
+    Ok((reply, Admitted::Subscriber(joined)))
 }
 
 async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ended {
@@ -127,6 +142,10 @@ async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ende
     let (mut reader, mut writer) = stream.split();
     let mut waiting = Vec::new();
     let mut batch = BytesMut::new();
+    let mut overdue = std::pin::pin!(async {
+        outbox.closed().await;
+        sleep(DRAIN_LIMIT).await;
+    });
     loop {
         waiting.clear();
         // Both branches are cancel-safe: `take` takes nothing before it returns, and what is read is of no use.
@@ -140,7 +159,8 @@ async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ende
         }
         let bytes: usize = waiting.iter().map(|message| message.len() + 4).sum();
         let messages = waiting.len();
-        if let Err(ended) = write_all(&mut writer, &mut waiting, &mut batch, outbox).await {
+        if let Err(ended) = write_all(&mut writer, &mut waiting, &mut batch, overdue.as_mut()).await
+        {
             return ended;
         }
         subscriber
@@ -158,32 +178,29 @@ async fn write_all(
     writer: &mut (impl AsyncWrite + Unpin),
     messages: &mut Vec<Bytes>,
     batch: &mut BytesMut,
-    outbox: &Outbox,
+    mut overdue: Pin<&mut impl Future<Output = ()>>,
 ) -> Result<(), Ended> {
     for message in messages.drain(..) {
         batch.put_slice(&length(&message));
         if message.len() <= COPIED {
             batch.put_slice(&message);
         } else {
-            write(writer, batch.split().freeze(), message, outbox).await?;
+            write(writer, batch.split().freeze(), message, overdue.as_mut()).await?;
         }
     }
-    write(writer, batch.split().freeze(), Bytes::new(), outbox).await
+    write(writer, batch.split().freeze(), Bytes::new(), overdue).await
 }
 
-/// Writes two pieces as one, the second without copying it, as long as the peer takes at least something in time.
-async fn write(
+/// Writes two pieces as one, the second without copying it, as long as the peer takes at least something in time and
+/// `overdue` does not end.
+pub(crate) async fn write(
     writer: &mut (impl AsyncWrite + Unpin),
     head: Bytes,
     body: Bytes,
-    outbox: &Outbox,
+    mut overdue: Pin<&mut impl Future<Output = ()>>,
 ) -> Result<(), Ended> {
     let mut data = head.chain(body);
     while data.has_remaining() {
-        let overdue = async {
-            outbox.closed().await;
-            sleep(DRAIN_LIMIT).await;
-        };
         tokio::select! {
             biased;
             written = writer.write_buf(&mut data) => match written {
@@ -192,14 +209,14 @@ async fn write(
                 Err(error) => return Err(Ended::Failed(error)),
             },
             () = sleep(STALL_LIMIT) => return Err(Ended::Stalled),
-            () = overdue => return Err(Ended::Withdrawn),
+            () = overdue.as_mut() => return Err(Ended::Withdrawn),
         }
     }
     Ok(())
 }
 
 /// A subscriber has nothing to say after its header: reading is how its leaving is noticed.
-async fn until_closed(reader: &mut ReadHalf<'_>) -> Ended {
+pub(crate) async fn until_closed(reader: &mut ReadHalf<'_>) -> Ended {
     let mut nothing = [0; 256];
     loop {
         match reader.read(&mut nothing).await {
@@ -227,15 +244,17 @@ enum Refused {
     #[error("{0}")]
     Mismatch(String),
     #[error(transparent)]
+    Client(#[from] ClientFault),
+    #[error(transparent)]
     Io(#[from] std::io::Error),
 }
 
-/// How a subscriber's connection came to its end.
+/// How a connection came to its end.
 #[derive(Debug, Error)]
-enum Ended {
+pub(crate) enum Ended {
     #[error("it closed the connection")]
     Closed,
-    #[error("the topic was withdrawn")]
+    #[error("what it asked for was withdrawn")]
     Withdrawn,
     #[error("it took nothing for {STALL_LIMIT:?}")]
     Stalled,
@@ -245,8 +264,9 @@ enum Ended {
 
 const MAX_CONNECTIONS: usize = 4096;
 const HANDSHAKE_LIMIT: Duration = Duration::from_secs(5);
-const STALL_LIMIT: Duration = Duration::from_secs(10);
-const DRAIN_LIMIT: Duration = Duration::from_secs(1);
+pub(crate) const STALL_LIMIT: Duration = Duration::from_secs(10);
+/// How long what has been withdrawn may take to send what it still has.
+pub(crate) const DRAIN_LIMIT: Duration = Duration::from_secs(1);
 /// Messages written in one go.
 const BATCH: usize = 64 * 1024;
 /// Up to here copying a message into the batch is cheaper than a write of its own.
@@ -259,7 +279,7 @@ mod tests {
     use std::task::{Context, Poll};
 
     use super::*;
-    use crate::outbox::Limit;
+    use crate::outbox::{Limit, Outbox};
 
     /// Takes everything and notes the pieces of each write: where they are and how long.
     #[derive(Default)]
@@ -319,7 +339,8 @@ mod tests {
         let mut recorder = Recorder::default();
         let (mut waiting, mut batch) = (Vec::new(), BytesMut::new());
         while outbox.take(&mut waiting, BATCH).await {
-            let whole = write_all(&mut recorder, &mut waiting, &mut batch, &outbox).await;
+            let never = std::pin::pin!(std::future::pending());
+            let whole = write_all(&mut recorder, &mut waiting, &mut batch, never).await;
             assert!(whole.is_ok());
         }
         recorder

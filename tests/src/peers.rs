@@ -53,6 +53,15 @@ impl Cell {
             .args(args)
     }
 
+    /// A program of ROS 1 under `/usr`, such as `bin/rostopic` or `lib/topic_tools/throttle`, not started yet.
+    #[must_use]
+    pub fn ros1_started(&self, program: &str, args: &[&str]) -> Started {
+        let name = program.rsplit('/').next().unwrap_or(program);
+        self.with_ros1(Started::new(name, &Path::new("/usr").join(program)))
+            .args(args)
+            .ends_on(Signal::SIGINT)
+    }
+
     /// roscpp's `topic_tools relay` from one topic to another. It says nothing when it is ready.
     #[must_use]
     pub fn topic_tools_relay(&self, from: &str, to: &str) -> Child {

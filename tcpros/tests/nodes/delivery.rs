@@ -174,7 +174,9 @@ async fn a_node_in_a_namespace_under_another_name_does_not_hear_itself_either() 
     let core = core();
     let mut renamed = options("both", core.uri());
     assert_eq!(
-        renamed.apply_arguments(&["__ns:=/cell", "__name:=twin", "in:=/line/t"]),
+        renamed
+            .apply_arguments(&["__ns:=/cell", "__name:=twin", "in:=/line/t"])
+            .unwrap(),
         [""; 0]
     );
     let (both, other) = (Node::start(renamed).unwrap(), node("twin", &core));
