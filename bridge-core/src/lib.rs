@@ -20,6 +20,7 @@ mod reader;
 mod router;
 mod settings;
 mod topic;
+mod transcoder;
 mod writer;
 
 pub use counters::{Counters, Reason, Verdict};

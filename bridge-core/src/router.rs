@@ -9,8 +9,8 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use mappings::{Mapping, Overflow, TopicId};
-use messages::{MessageType, Plan, PlanError, Selection, Wire};
+use mappings::{Mapping, Overflow, SpaceId, TopicId};
+use messages::{Dialect, MessageType, Plan, PlanError, Selection, Wire};
 use uadp::{Fields, Timestamp};
 
 use crate::counters::{Counters, Reason, Verdict, is_told};
@@ -23,6 +23,7 @@ use crate::pace::Pace;
 use crate::reader::{Held, Reader};
 use crate::settings::{Local, Now, Settings};
 use crate::topic::{Item, Role, Sending, Topic};
+use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Idle, MAX_KEPT, Message, Writer};
 use chunks::Chunks;
 use receive::Sample;
@@ -89,10 +90,23 @@ impl Router {
             Local::Fields => return Ok(()),
         };
         let plan = Plan::compile(message_type, selection, wire)?;
+        // A message as bytes is in the dialect of its origin; that of an OPC UA origin is taken as it is.
+        let origin = match topic.space {
+            SpaceId::UA => None,
+            space if space.is_ros2() => Some(Dialect::Ros2),
+            _ => Some(Dialect::Ros1),
+        };
+        let transcoder = origin
+            .filter(|origin| *selection == Selection::Bytes && *origin != message_type.dialect())
+            .map(|origin| {
+                let (_, namespace, _) = topic.triple();
+                Box::new(Transcoder::compile(origin, message_type, namespace))
+            });
         let Some(entry) = self.entry(topic, None, now) else {
             return Ok(());
         };
         entry.plan = Some(plan);
+        entry.transcoder = transcoder;
         let held = match &mut entry.role {
             Role::Theirs(reader) => {
                 reader.forget_all();

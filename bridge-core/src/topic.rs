@@ -10,6 +10,7 @@ use crate::counters::Counters;
 use crate::output::Delivery;
 use crate::queue::Queue;
 use crate::reader::Reader;
+use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Message, Writer};
 
 /// One topic of the space, seen from one bridge: of our own space, or of another.
@@ -19,6 +20,8 @@ pub(crate) struct Topic {
     /// How its bytes become fields or the other way. `None` until the local type is known, and for a local side
     /// that speaks in fields.
     pub(crate) plan: Option<Plan>,
+    /// For bytes of the other ROS, what makes them ours, or why nothing does.
+    pub(crate) transcoder: Option<Box<Result<Transcoder, String>>>,
     pub(crate) queue: Queue<Item>,
     /// A large message of which chunks are still to be sent, before anything of the queue.
     pub(crate) sending: Option<Sending>,
@@ -58,6 +61,7 @@ impl Topic {
         Self {
             role,
             plan: None,
+            transcoder: None,
             queue: Queue::new(overflow),
             sending: None,
             overflow,

@@ -15,6 +15,7 @@ mod run;
 mod status;
 
 pub use arguments::Arguments;
+pub use bridge_core::{Kept, PublisherKey};
 pub use clock::{now, timestamp};
 pub use definitions::{Definitions, Wanted};
 pub use exit::{Failure, FailureKind};

@@ -7,7 +7,8 @@ use std::sync::Arc;
 use bridge_node::Wanted;
 use bytes::Bytes;
 use messages::{
-    DefinitionError, Dialect, MessageType, NameError, NoFields, Plan, Selection, ServiceType, TypeName, Wire,
+    DefinitionError, Dialect, MessageType, NameError, NoFields, Plan, Selection, ServiceType,
+    TypeName, Wire,
 };
 use tcpros::ConnectionHeader;
 use uadp::BuiltinType;
@@ -77,10 +78,7 @@ impl Definitions {
     }
 
     /// The service of that name, looked for likewise.
-    pub(crate) fn service(
-        &mut self,
-        name: &TypeName,
-    ) -> Result<Arc<ServiceType>, DefinitionError> {
+    pub(crate) fn service(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
         let packages = &self.packages;
         self.known.find_service(name, |file| locate(packages, file))
     }
@@ -158,8 +156,12 @@ fn find_below(
 }
 
 /// The message of a template without a value in it.
-pub(crate) fn constant(message_type: &Arc<MessageType>, template: &Selection) -> Result<Bytes, String> {
-    let plan = Plan::compile(message_type, template, Wire::Ros1).map_err(|error| error.to_string())?;
+pub(crate) fn constant(
+    message_type: &Arc<MessageType>,
+    template: &Selection,
+) -> Result<Bytes, String> {
+    let plan =
+        Plan::compile(message_type, template, Wire::Ros1).map_err(|error| error.to_string())?;
     let mut bytes = Vec::new();
     plan.write(&mut NoFields, &mut bytes)
         .map_err(|error| error.to_string())?;

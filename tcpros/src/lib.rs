@@ -48,7 +48,9 @@ pub use crate::names::NameError;
 pub use crate::node::{GraphReader, MasterState, Node, NodeError};
 pub use crate::options::{ArgumentError, NodeOptions};
 pub use crate::parameters::{ParamError, ParamSubscription, ParamValue, Parameters};
-pub use crate::publisher::{Published, Publisher, PublisherOptions, TopicType};
+pub use crate::publisher::{
+    Latched, MAX_LATCHED, Published, Publisher, PublisherOptions, TopicType,
+};
 pub use crate::rpc::RpcError;
 pub use crate::service::{
     CallPhase, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions, ServiceRequest,

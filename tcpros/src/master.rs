@@ -54,10 +54,6 @@ impl Master {
         &self.uri
     }
 
-    pub(crate) const fn prefers_ipv6(&self) -> bool {
-        self.endpoint.prefers_ipv6()
-    }
-
     pub(crate) async fn pid(&self) -> Result<i32, MasterError> {
         self.call("getPid", vec![])
             .await?

@@ -41,18 +41,15 @@ impl Endpoint {
         })
     }
 
-    /// Tries the IPv6 addresses of the host before the others, or after them.
+    /// Whether it tries the IPv6 addresses of a host before the others.
     pub(crate) const fn prefers_ipv6(&self) -> bool {
         self.ipv6_first
     }
 
+    /// Tries the IPv6 addresses of the host before the others, or after them.
     pub(crate) const fn ipv6_first(mut self, ipv6_first: bool) -> Self {
         self.ipv6_first = ipv6_first;
         self
-    }
-
-    pub(crate) const fn prefers_ipv6(&self) -> bool {
-        self.ipv6_first
     }
 }
 

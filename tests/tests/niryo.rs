@@ -15,10 +15,7 @@ use uadp::{
 const SOON: Duration = Duration::from_secs(30);
 const MAPPING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../mappings/niryo-ned.yaml");
 /// The definitions of ned_ros are under the GPL: they lie beside the project, never in it.
-const DEFINITIONS: &str = concat!(
-    env!("CARGO_MANIFEST_DIR"),
-    "/../../shared/data/ros1-niryo"
-);
+const DEFINITIONS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data/ros1-niryo");
 
 /// The OPC UA side of the cell: hears all values and writes those of origin 0.
 struct Side {
@@ -81,8 +78,7 @@ impl Side {
             ..NetworkHeader::default()
         };
         let mut datagram = Vec::new();
-        let mut message =
-            NetworkMessageEncoder::new(&mut datagram, &header, Some(&[id])).unwrap();
+        let mut message = NetworkMessageEncoder::new(&mut datagram, &header, Some(&[id])).unwrap();
         let header = DataSetHeader {
             sequence_number: Some(self.sequence),
             ..DataSetHeader::default()
@@ -151,9 +147,9 @@ fn what_a_niryo_shows_reaches_the_space_as_typed_values() {
         _ => None,
     });
     side.hear(12, "the joints' names", |fields| match fields {
-        [Variant::Array(array)] => (array.iter().next()
-            == Some(Scalar::String(Some("joint_1"))))
-        .then_some(()),
+        [Variant::Array(array)] => {
+            (array.iter().next() == Some(Scalar::String(Some("joint_1")))).then_some(())
+        }
         _ => None,
     });
     side.hear(13, "position.x 0.25 and tcp_speed 0.125", |fields| {
@@ -163,7 +159,7 @@ fn what_a_niryo_shows_reaches_the_space_as_typed_values() {
                 Some(&Variant::Scalar(Scalar::Double(0.25))),
                 Some(&Variant::Scalar(Scalar::Double(0.125))),
             ))
-        .then_some(())
+            .then_some(())
     });
     side.hear_scalar(14, Scalar::SByte(6));
     side.hear_scalar(15, Scalar::String(Some("STANDBY")));
@@ -195,7 +191,11 @@ fn values_of_the_space_add_and_run_a_conveyor_and_its_answers_are_values() {
     line.side.hear(11, "joints", |_| Some(()));
 
     line.side.write(40, Scalar::Byte(1));
-    let request = called(&line.robot, "/niryo_robot/conveyor/ping_and_set_conveyor", 0);
+    let request = called(
+        &line.robot,
+        "/niryo_robot/conveyor/ping_and_set_conveyor",
+        0,
+    );
     assert_eq!(request, json!({"cmd": 1, "id": 0}));
     line.side.hear_scalar(41, Scalar::Int16(12));
     line.side.hear_scalar(42, Scalar::Int16(1));
@@ -208,11 +208,13 @@ fn values_of_the_space_add_and_run_a_conveyor_and_its_answers_are_values() {
         json!({"id": 12, "control_on": true, "speed": 50, "direction": 1})
     );
     line.side.hear_scalar(44, Scalar::Int16(1));
-    line.side.hear(20, "one conveyor in the feedback", |fields| match fields {
-        [Variant::Array(conveyors)] => (conveyors.len() == 1).then_some(()),
-        _ => None,
-    });
-    line.side.hear_scalar(49, Scalar::String(Some("NiryoSteppers")));
+    line.side
+        .hear(20, "one conveyor in the feedback", |fields| match fields {
+            [Variant::Array(conveyors)] => (conveyors.len() == 1).then_some(()),
+            _ => None,
+        });
+    line.side
+        .hear_scalar(49, Scalar::String(Some("NiryoSteppers")));
 
     line.side.write(43, Scalar::Boolean(false));
     assert_eq!(called(&line.robot, control, 1)["control_on"], false);
@@ -264,6 +266,10 @@ fn a_state_waits_for_its_service_and_an_event_does_not() {
     assert_eq!(request, json!({"name": "DO1", "value": true}));
     line.side.hear_scalar(46, Scalar::Int32(1));
     let events = calls(&line.robot, "/niryo_robot/conveyor/ping_and_set_conveyor");
-    assert_eq!(events, [] as [Value; 0], "an event of before is not made up for");
+    assert_eq!(
+        events,
+        [] as [Value; 0],
+        "an event of before is not made up for"
+    );
     assert!(line.bridge.runs());
 }

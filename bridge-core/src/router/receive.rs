@@ -232,6 +232,7 @@ impl Router {
         let Some(Topic {
             role: Role::Theirs(reader),
             plan,
+            transcoder,
             ..
         }) = self.topics.get_mut(&topic)
         else {
@@ -240,10 +241,19 @@ impl Router {
         let evicted = reader.delivered(sample.instance, sample.kept, now.monotonic);
         let retired = evicted.map(|instance| Output::Retired { topic, instance });
         self.told.extend(retired);
-        let written = match plan {
-            Some(plan) => fields::write(plan, sample.fields.clone(), &mut payload),
-            None => fields::copy(&sample.fields, &mut payload),
+        let mut scratch = None;
+        let written = match (plan, transcoder.as_deref()) {
+            (Some(_), Some(Ok(transcoder))) => {
+                let scratch = scratch.insert(self.spare.pop().unwrap_or_default());
+                transcoder.run(sample.fields.clone(), scratch, &mut payload)
+            }
+            (Some(_), Some(Err(why))) => Err((Reason::Mismatch, why.clone())),
+            (Some(plan), None) => fields::write(plan, sample.fields.clone(), &mut payload),
+            (None, _) => fields::copy(&sample.fields, &mut payload),
         };
+        if let Some(scratch) = scratch {
+            self.recycle(scratch);
+        }
         if let Err((reason, detail)) = written {
             self.recycle(payload);
             self.count(About::topic(topic), reason, 1, || detail);

@@ -1,14 +1,17 @@
-//! rosrust as an independent ROS 1 implementation: publishes or subscribes `std_msgs/String`.
+//! rosrust as an independent ROS 1 implementation: publishes or subscribes `std_msgs/String`, calls or serves
+//! `std_srvs/SetBool`.
 //!
 //! `rosrust-peer pub TOPIC VALUE..` sends the values ten times a second; `rosrust-peer sub TOPIC` prints one
-//! JSON line per message. Both end on SIGTERM, and by themselves after two minutes.
+//! JSON line per message; `rosrust-peer serve SERVICE` answers `done` to true and fails at false. All three end on
+//! SIGTERM, and by themselves after two minutes. `rosrust-peer call SERVICE` calls with true and with false, prints one
+//! JSON line each, and ends.
 
 use std::{
     io::Write,
     time::{Duration, Instant},
 };
 
-use rosrust::{RawMessage, RawMessageDescription};
+use rosrust::{Message, RawMessage, RawMessageDescription, RosMsg, ServicePair};
 use serde_json::{Value, json};
 
 const LIMIT: Duration = Duration::from_secs(120);
@@ -20,8 +23,12 @@ fn main() {
     match args.get(1..).unwrap_or_default() {
         [verb, topic, values @ ..] if verb == "pub" => publish(topic, values),
         [verb, topic] if verb == "sub" => subscribe(topic),
+        [verb, service] if verb == "serve" => serve(service),
+        [verb, service] if verb == "call" => call(service),
         _ => {
-            eprintln!("usage: rosrust-peer pub TOPIC VALUE.. | sub TOPIC");
+            eprintln!(
+                "usage: rosrust-peer pub TOPIC VALUE.. | sub TOPIC | serve SERVICE | call SERVICE"
+            );
             std::process::exit(64);
         }
     }
@@ -59,6 +66,64 @@ fn subscribe(topic: &str) {
     say(&json!({ "ready": topic }));
     stay(Instant::now());
     drop(subscriber);
+}
+
+fn serve(service: &str) {
+    rosrust::init("rosrust_server");
+    let handle = |on: bool| match on {
+        true => Ok(RawMessage([&[1][..], &to_bytes("done")].concat())),
+        false => Err("the valve is stuck".to_owned()),
+    };
+    let server = rosrust::service::<SetBool, _>(service, handle).unwrap();
+    say(&json!({ "ready": service }));
+    stay(Instant::now());
+    drop(server);
+}
+
+fn call(service: &str) {
+    rosrust::init("rosrust_client");
+    rosrust::wait_for_service(service, Some(LIMIT)).unwrap();
+    say(&json!({ "ready": service }));
+    let client = rosrust::client::<SetBool>(service).unwrap();
+    for on in [true, false] {
+        match client.req(&on).unwrap() {
+            Ok(answer) => say(&json!({ "value": to_text(&answer.0[1..]) })),
+            Err(error) => say(&json!({ "error": error })),
+        }
+    }
+}
+
+/// `std_srvs/SetBool` with its answer as bytes.
+#[derive(Clone, Debug, Default, PartialEq)]
+struct SetBool;
+
+impl RosMsg for SetBool {
+    fn encode<W: Write>(&self, _: W) -> std::io::Result<()> {
+        Ok(())
+    }
+
+    fn decode<R: std::io::Read>(_: R) -> std::io::Result<Self> {
+        Ok(Self)
+    }
+}
+
+impl Message for SetBool {
+    fn msg_definition() -> String {
+        String::new()
+    }
+
+    fn md5sum() -> String {
+        "09fb03525b03e7ea1fd3992bafd87e16".to_owned()
+    }
+
+    fn msg_type() -> String {
+        "std_srvs/SetBool".to_owned()
+    }
+}
+
+impl ServicePair for SetBool {
+    type Request = bool;
+    type Response = RawMessage;
 }
 
 fn stay(start: Instant) {
