@@ -88,15 +88,6 @@ impl Cell {
         .start()
     }
 
-    /// A program of ROS 1 under `/usr`, such as `bin/rostopic` or `lib/topic_tools/throttle`, not started yet.
-    #[must_use]
-    pub fn ros1_started(&self, program: &str, args: &[&str]) -> Started {
-        let name = program.rsplit('/').next().unwrap_or(program);
-        self.with_ros1(Started::new(name, &Path::new("/usr").join(program)))
-            .args(args)
-            .ends_on(Signal::SIGINT)
-    }
-
     /// rosrust publishing or subscribing `std_msgs/String`; it has said that it is ready.
     #[must_use]
     pub fn rosrust(&self, args: &[&str]) -> Child {
