@@ -24,6 +24,7 @@ def arguments():
     parser.add_argument("--queue", type=int, default=20000)
     parser.add_argument("--wait-subscribers", type=int, default=0)
     parser.add_argument("--limit", type=float, default=120.0)
+    parser.add_argument("--ports", type=int, nargs=2, default=(0, 0), help="of the slave API and of TCPROS; 0: any")
     return parser.parse_args()
 
 
@@ -54,7 +55,8 @@ def main():
         values = lifetime.values_of(args)
     messages = [ros1_messages.build(kind, value) for value in values]
 
-    rospy.init_node(args.node, disable_rosout=True)
+    xmlrpc, tcpros = args.ports
+    rospy.init_node(args.node, disable_rosout=True, xmlrpc_port=xmlrpc, tcpros_port=tcpros)
     publisher = rospy.Publisher(
         args.topic, kind, queue_size=args.queue, latch=args.latch, tcp_nodelay=True
     )

@@ -1,0 +1,25 @@
+//! The crate `tcpros` and the program `bridge-ros1` among real ROS 1 nodes, tools and faults.
+//!
+//! What is held, and by which test:
+//!
+//! - Small messages leave at once: `tools::roscpp_relays_and_throttles_stand_on_either_side`.
+//! - A slow peer costs only itself, and is given up after ten seconds without a byte:
+//!   `faults::a_stalled_subscriber_costs_nobody_else_a_message`.
+//! - What a peer announces is believed as far as it delivers: `faults::a_publisher_that_lies_or_breaks_off_is_asked_again`.
+//! - Handshakes stand on their own, and an `error=` names the reason: `faults::peers_that_break_the_handshake_cost_only_themselves`.
+//! - A publisher is tried until the master drops it, and is found again under an old address as well as under a new one:
+//!   `faults::a_publisher_is_found_again_after_every_kind_of_end`.
+//! - A node does not hear itself: `tools::a_bag_has_all_a_topic_says_and_plays_it_back`, which publishes and hears one
+//!   topic, and `loop_silence`.
+//! - All is registered again when the master has restarted, and nobody loses a message by that:
+//!   `faults::twenty_restarts_of_the_master_cost_no_message`.
+//! - The end of a program leaves nothing behind: `faults::a_bridge_ends_in_time_with_and_without_a_master` and the two
+//!   tests after it.
+//! - The slave API serves the tools: `tools::the_tools_of_ros_see_and_hear_a_node`.
+//! - Latching and definition are told: `tools::a_bag_has_all_a_topic_says_and_plays_it_back`.
+//! - Nothing is left of what has gone: `churn`.
+
+mod churn;
+mod faults;
+mod support;
+mod tools;
