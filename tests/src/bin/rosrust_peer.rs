@@ -1,7 +1,8 @@
-//! rosrust as an independent ROS 1 implementation: publishes or subscribes `std_msgs/String`.
+//! rosrust as an independent ROS 1 implementation: publishes, subscribes or repeats `std_msgs/String`.
 //!
 //! `rosrust-peer pub TOPIC VALUE..` sends the values ten times a second; `rosrust-peer sub TOPIC` prints one
-//! JSON line per message. Both end on SIGTERM, and by themselves after two minutes.
+//! JSON line per message; `rosrust-peer relay IN OUT` sends on the bytes of each message. All end on SIGTERM, and by
+//! themselves: after two minutes, the relay after thirty.
 
 use std::{
     io::Write,
@@ -12,6 +13,8 @@ use rosrust::{RawMessage, RawMessageDescription};
 use serde_json::{Value, json};
 
 const LIMIT: Duration = Duration::from_secs(120);
+const RELAY_LIMIT: Duration = Duration::from_secs(1800);
+const QUEUE: usize = 1000;
 const PERIOD: Duration = Duration::from_millis(100);
 const POLL: Duration = Duration::from_millis(20);
 
@@ -20,8 +23,9 @@ fn main() {
     match args.get(1..).unwrap_or_default() {
         [verb, topic, values @ ..] if verb == "pub" => publish(topic, values),
         [verb, topic] if verb == "sub" => subscribe(topic),
+        [verb, from, to] if verb == "relay" => relay(from, to),
         _ => {
-            eprintln!("usage: rosrust-peer pub TOPIC VALUE.. | sub TOPIC");
+            eprintln!("usage: rosrust-peer pub TOPIC VALUE.. | sub TOPIC | relay IN OUT");
             std::process::exit(64);
         }
     }
@@ -29,13 +33,8 @@ fn main() {
 
 fn publish(topic: &str, values: &[String]) {
     rosrust::init("rosrust_pub");
-    let description = RawMessageDescription {
-        msg_definition: "string data\n".into(),
-        md5sum: "992ce8a1687cec8c8bd883ec73ca41d1".into(),
-        msg_type: "std_msgs/String".into(),
-    };
     let publisher =
-        rosrust::publish_with_description::<RawMessage>(topic, 100, description).unwrap();
+        rosrust::publish_with_description::<RawMessage>(topic, 100, description()).unwrap();
     say(&json!({ "ready": topic }));
     let start = Instant::now();
     while rosrust::is_ok() && start.elapsed() < LIMIT {
@@ -50,20 +49,42 @@ fn subscribe(topic: &str) {
     rosrust::init("rosrust_sub");
     let name = topic.to_owned();
     let subscriber =
-        rosrust::subscribe_with_ids(topic, 1000, move |message: RawMessage, id: &str| {
+        rosrust::subscribe_with_ids(topic, QUEUE, move |message: RawMessage, id: &str| {
             say(
                 &json!({ "topic": name, "callerid": id, "value": { "data": to_text(&message.0) } }),
             );
         })
         .unwrap();
     say(&json!({ "ready": topic }));
-    stay(Instant::now());
+    stay(LIMIT);
     drop(subscriber);
 }
 
-fn stay(start: Instant) {
-    while rosrust::is_ok() && start.elapsed() < LIMIT {
+fn relay(from: &str, to: &str) {
+    rosrust::init("rosrust_relay");
+    let publisher =
+        rosrust::publish_with_description::<RawMessage>(to, QUEUE, description()).unwrap();
+    let subscriber = rosrust::subscribe(from, QUEUE, move |message: RawMessage| {
+        publisher.send(message).unwrap();
+    })
+    .unwrap();
+    say(&json!({ "ready": to }));
+    stay(RELAY_LIMIT);
+    drop(subscriber);
+}
+
+fn stay(limit: Duration) {
+    let start = Instant::now();
+    while rosrust::is_ok() && start.elapsed() < limit {
         std::thread::sleep(POLL);
+    }
+}
+
+fn description() -> RawMessageDescription {
+    RawMessageDescription {
+        msg_definition: "string data\n".into(),
+        md5sum: "992ce8a1687cec8c8bd883ec73ca41d1".into(),
+        msg_type: "std_msgs/String".into(),
     }
 }
 
