@@ -31,19 +31,27 @@ pub enum Reason {
     Repeat,
     /// The topic's queue was full and its oldest sample gave way.
     Overflow,
-    /// Larger than one NetworkMessage carries.
+    /// Larger than is sent or put together from chunks.
     TooBig,
+    /// A large message of which chunks never came.
+    Incomplete,
+    /// A large message given up since others took up the room for unfinished ones.
+    NoRoom,
     /// More topics than are tracked.
     TooManyTopics,
+    /// More latched publishers of one topic than are kept for late joiners.
+    TooManyPublishers,
     /// The local side did not take it.
     NotPublished,
     /// The socket did not take it.
     NotSent,
+    /// A service did not take the value, or did not answer.
+    CallFailed,
 }
 
 impl Reason {
     /// All of them, in the order of their counters.
-    pub const ALL: [Self; 17] = [
+    pub const ALL: [Self; 21] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -58,9 +66,13 @@ impl Reason {
         Self::Repeat,
         Self::Overflow,
         Self::TooBig,
+        Self::Incomplete,
+        Self::NoRoom,
         Self::TooManyTopics,
+        Self::TooManyPublishers,
         Self::NotPublished,
         Self::NotSent,
+        Self::CallFailed,
     ];
 
     /// The label of its counter.
@@ -81,9 +93,13 @@ impl Reason {
             Self::Repeat => "repeat",
             Self::Overflow => "overflow",
             Self::TooBig => "too_big",
+            Self::Incomplete => "incomplete",
+            Self::NoRoom => "no_room",
             Self::TooManyTopics => "too_many_topics",
+            Self::TooManyPublishers => "too_many_publishers",
             Self::NotPublished => "not_published",
             Self::NotSent => "not_sent",
+            Self::CallFailed => "call_failed",
         }
     }
 

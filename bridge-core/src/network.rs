@@ -3,7 +3,8 @@
 
 use mappings::TopicId;
 use uadp::{
-    DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Timestamp,
+    ChunkBudget, ChunkError, Chunks, DataSetHeader, Extras, GroupHeader, NetworkHeader,
+    NetworkMessage, NetworkMessageEncoder, NetworkMessageType, PublisherId, Timestamp, Whole,
 };
 
 use crate::counters::Reason;
@@ -31,14 +32,48 @@ pub(crate) fn encode(
     message.finish().map_err(too_big)?;
     encoded.timestamp_at = timestamp_at.unwrap_or(usize::MAX);
     encoded.sequence_at = sequence_at.unwrap_or(usize::MAX);
-    if encoded.bytes.len() > MAX_DATAGRAM {
-        let detail = format!(
-            "{} bytes are more than one UDP datagram carries ({MAX_DATAGRAM})",
-            encoded.bytes.len()
-        );
-        return Err((Reason::TooBig, detail));
-    }
     Ok(())
+}
+
+/// Finds the DataSetMessage in a NetworkMessage that is too big for a datagram, and holds it to `max_message` bytes.
+pub(crate) fn prepare_chunks(encoded: &mut Encoded, max_message: u32) -> Result<(), String> {
+    let message = NetworkMessage::decode(&encoded.bytes).map_err(|error| error.to_string())?;
+    let payload_at = message.payload_offset();
+    let size = message.payload().len();
+    if u32::try_from(size).is_ok_and(|size| size <= max_message) {
+        encoded.payload_at = payload_at;
+        return Ok(());
+    }
+    Err(format!(
+        "a message of {size} bytes; `pubsub.max_message` allows {} MiB",
+        max_message >> 20
+    ))
+}
+
+/// Writes the chunk of a sample that begins `offset` bytes into its DataSetMessage; where the next one begins.
+pub(crate) fn chunk(
+    bytes: &mut Vec<u8>,
+    topic: TopicId,
+    (sample, offset): (&Encoded, usize),
+    max_datagram: u16,
+    utc: Timestamp,
+) -> Result<usize, ChunkError> {
+    let (space, namespace, identifier) = topic.triple();
+    let whole = Whole {
+        message_type: NetworkMessageType::DataSet,
+        writer_id: Some(identifier),
+        message_sequence_number: sample.sequence(),
+        bytes: sample.data_set_message(),
+    };
+    let budget = ChunkBudget {
+        network_message: max_datagram.into(),
+        trailer: 0,
+    };
+    let header = network_header(space, namespace, utc);
+    let extras = Extras::default();
+    let mut chunks = Chunks::new(&header, &extras, whole, budget)?.resumed_at(offset);
+    chunks.append(bytes, &extras).transpose()?;
+    Ok(chunks.offset())
 }
 
 /// Writes a keep-alive; the stamp of sending is patched in when it is polled.
@@ -61,6 +96,7 @@ pub(crate) fn keep_alive(
     Some(Encoded {
         bytes,
         timestamp_at,
+        payload_at: 0,
         sequence_at: usize::MAX,
     })
 }
@@ -88,6 +124,3 @@ pub(crate) fn data_set_header(sequence: u16, taken: Timestamp) -> DataSetHeader 
         ..DataSetHeader::default()
     }
 }
-
-/// The largest UDP payload over IPv4.
-const MAX_DATAGRAM: usize = 65_507;

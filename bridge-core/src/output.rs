@@ -35,8 +35,46 @@ pub enum Output {
         /// Whether it is silent now.
         silent: bool,
     },
+    /// Of the values a topic of another space has side by side, one is no longer repeated: who comes late is not to
+    /// get it any more.
+    Retired {
+        /// Which topic.
+        topic: TopicId,
+        /// [`Delivery::instance`] of the value.
+        instance: Timestamp,
+    },
     /// Something to log.
     Notice(Notice),
+}
+
+/// A latched publisher of the local side, among those of its topic.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct PublisherKey(pub u32);
+
+/// A message heard on the local side.
+#[derive(Debug, Clone, Copy)]
+pub struct Heard<'a> {
+    /// Which value it is.
+    pub topic: TopicId,
+    /// It, in the local encoding.
+    pub payload: &'a [u8],
+    /// When it came.
+    pub received: Timestamp,
+    /// The publisher, if it latches: its last message then stays for late joiners beside those of others, until
+    /// [`Router::left`](crate::Router::left). Of all messages without, the last one stays.
+    pub latched_by: Option<PublisherKey>,
+}
+
+/// What a value is to the others of its topic.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kept {
+    /// It takes the place of all before it, as the values of a state do.
+    Alone,
+    /// It lives beside others, as the messages of several latched publishers do, until it is
+    /// [retired](Output::Retired).
+    Beside,
+    /// As `Beside`, and it was handed out before: for late joiners only.
+    Again,
 }
 
 /// One value of another space on its way to the local side.
@@ -52,6 +90,10 @@ pub struct Delivery {
     pub status: u16,
     /// When its datagram arrived here.
     pub arrived: Timestamp,
+    /// `source`, where it tells this value from all others of the topic.
+    pub instance: Option<Timestamp>,
+    /// What it is to the others.
+    pub kept: Kept,
 }
 
 /// A drop worth a line in the log. A repeated one is told at its 1st, 10th, 100th ... occurrence.

@@ -1,18 +1,21 @@
 //! What is remembered of one DataSetWriter of another space.
 
+use std::collections::VecDeque;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use uadp::Timestamp;
 
 use crate::counters::Reason;
+use crate::output::Kept;
+use crate::writer::MAX_KEPT;
 
 /// The state of a topic we receive.
 #[derive(Debug)]
 pub(crate) struct Reader {
     /// Sequence number of the newest DataSetMessage taken.
     sequence: Option<u16>,
-    /// Its Timestamp.
+    /// The Timestamp of the last one that was no repetition.
     stamp: Option<Timestamp>,
     /// Who sent it.
     from: SocketAddr,
@@ -20,12 +23,26 @@ pub(crate) struct Reader {
     heard: Instant,
     /// Whether the writer is held to be silent.
     silent: bool,
-    /// The stamp of the sample that was last handed on, if it was fine enough to tell samples apart.
-    delivered: Option<Timestamp>,
+    /// The samples that were handed on, in this order, as far as their stamps are fine enough to tell them apart; at
+    /// most [`MAX_KNOWN`].
+    known: VecDeque<Known>,
+    /// `Some` while the writer repeats several values side by side, as it does for several latched publishers: when it
+    /// last repeated another than the newest.
+    several: Option<Instant>,
     /// A sample that waits for its local type.
     pub(crate) held: Option<Held>,
     /// When the port was last asked for the local type.
     pub(crate) asked: Option<Instant>,
+}
+
+/// A sample that was handed on.
+#[derive(Debug)]
+struct Known {
+    stamp: Timestamp,
+    heard: Instant,
+    repeated: bool,
+    /// Whether it is one of the topic's values now.
+    live: bool,
 }
 
 /// A sample that came before its local type was known; the newest one is kept.
@@ -33,6 +50,7 @@ pub(crate) struct Reader {
 pub(crate) struct Held {
     pub(crate) fields: Vec<u8>,
     pub(crate) source: Option<Timestamp>,
+    pub(crate) instance: Option<Timestamp>,
     pub(crate) status: u16,
     pub(crate) arrived: Timestamp,
 }
@@ -47,15 +65,23 @@ pub(crate) struct Place {
     pub(crate) from: SocketAddr,
 }
 
+impl Place {
+    /// The stamp, where it tells one sample of the writer from all others.
+    pub(crate) fn instance(&self) -> Option<Timestamp> {
+        self.stamp.filter(|_| self.fine)
+    }
+}
+
 impl Reader {
-    pub(crate) fn new(from: SocketAddr, now: Instant) -> Self {
+    pub(crate) const fn new(from: SocketAddr, now: Instant) -> Self {
         Self {
             sequence: None,
             stamp: None,
             from,
             heard: now,
             silent: false,
-            delivered: None,
+            known: VecDeque::new(),
+            several: None,
             held: None,
             asked: None,
         }
@@ -79,12 +105,13 @@ impl Reader {
         (!self.silent).then(|| self.heard + timeout)
     }
 
-    /// Admits a key frame into the sequence and gives the number of messages missing before it.
+    /// Admits a key frame into the sequence, and gives the number of messages missing before it and what it is to the
+    /// topic's other values.
     ///
     /// The arithmetic is that of OPC 10000-14 7.2.3: ahead by less than a quarter of the range is newer, behind by
     /// less than a quarter is old. A writer that starts over looks old by its numbers; its stamps or its new address
     /// tell.
-    pub(crate) fn admit(&mut self, place: Place) -> Result<u16, Reason> {
+    pub(crate) fn admit(&mut self, place: Place, now: Instant) -> Result<(u16, Kept), Reason> {
         let restarted = place.from != self.from
             || matches!((place.stamp, self.stamp), (Some(new), Some(last)) if new > last);
         let missing = match (self.sequence, place.sequence) {
@@ -98,25 +125,134 @@ impl Reader {
             (_, _) => 0,
         };
         self.sequence = place.sequence;
-        self.stamp = place.stamp.or(self.stamp);
         self.from = place.from;
-        if place.fine && place.stamp.is_some() && place.stamp == self.delivered {
-            return Err(Reason::Repeat);
+        let kept = match place.instance() {
+            // Newer than all before, as nearly every sample is.
+            Some(stamp) if self.several.is_none() && self.stamp.is_none_or(|last| stamp > last) => {
+                Kept::Alone
+            }
+            Some(stamp) => self.recognise(stamp, now)?,
+            None => Kept::Alone,
+        };
+        if kept != Kept::Again {
+            self.stamp = place.stamp.or(self.stamp);
         }
-        Ok(missing)
+        Ok((missing, kept))
     }
 
-    /// Takes note that the sample of that place was handed on, so that its repetitions are known.
-    pub(crate) fn delivered(&mut self, place: Place) {
-        self.delivered = place.stamp.filter(|_| place.fine);
+    /// What a sample is that may be a repetition.
+    fn recognise(&mut self, stamp: Timestamp, now: Instant) -> Result<Kept, Reason> {
+        let newest = self.stamp == Some(stamp);
+        let older = self.stamp.is_some_and(|last| stamp < last);
+        let known = self.known.iter_mut().find(|known| known.stamp == stamp);
+        // An older value is repeated after a newer one: they live side by side.
+        if (known.is_some() && !newest) || (known.is_none() && older) {
+            self.several = Some(now);
+        }
+        let Some(known) = known else {
+            return Ok(if self.several.is_some() {
+                Kept::Beside
+            } else {
+                Kept::Alone
+            });
+        };
+        known.heard = now;
+        known.repeated = true;
+        if known.live {
+            Err(Reason::Repeat)
+        } else {
+            Ok(Kept::Again)
+        }
+    }
+
+    /// Takes note that a sample is handed on, so that its repetitions are known. Gives the one that had to be
+    /// forgotten for it, if that was still one of the topic's values.
+    pub(crate) fn delivered(
+        &mut self,
+        instance: Option<Timestamp>,
+        kept: Kept,
+        now: Instant,
+    ) -> Option<Timestamp> {
+        let Some(stamp) = instance else {
+            self.known.clear();
+            return None;
+        };
+        let mut repeated = false;
+        match kept {
+            Kept::Again => {
+                if let Some(known) = self.known.iter_mut().find(|known| known.stamp == stamp) {
+                    known.live = true;
+                }
+                return None;
+            }
+            Kept::Alone => {
+                // Of one value at a time only the last one can be live.
+                if let Some(last) = self.known.back_mut() {
+                    last.live = false;
+                }
+            }
+            // Where a newer one came before, it is a repetition that we know the first of only now.
+            Kept::Beside => repeated = self.known.iter().any(|known| known.stamp > stamp),
+        }
+        let evicted = (self.known.len() >= MAX_KNOWN).then(|| self.evict());
+        self.known.push_back(Known {
+            stamp,
+            heard: now,
+            repeated,
+            live: true,
+        });
+        evicted
+            .flatten()
+            .filter(|known| known.live)
+            .map(|known| known.stamp)
+    }
+
+    /// Removes the oldest one; among several values rather one that was never repeated.
+    fn evict(&mut self) -> Option<Known> {
+        let seldom = match self.several {
+            Some(_) => self.known.iter().position(|known| !known.repeated),
+            None => None,
+        };
+        self.known.remove(seldom.unwrap_or(0))
+    }
+
+    /// Among several values, the next one that the writer has not repeated for `after` while it did others. To be
+    /// asked after each key frame until there is none.
+    pub(crate) fn retire(&mut self, now: Instant, after: Duration) -> Option<Timestamp> {
+        let several = self.several?;
+        let ended = now.saturating_duration_since(several) >= after;
+        let newest = self.stamp;
+        let mut live = self.known.iter_mut().filter(|known| known.live);
+        let gone = live.find(|known| {
+            now.saturating_duration_since(known.heard) >= after
+                || (ended && Some(known.stamp) != newest)
+        });
+        if let Some(gone) = gone {
+            gone.live = false;
+            return Some(gone.stamp);
+        }
+        let mut live = self.known.iter().filter(|known| known.live);
+        if let (last, None) = (live.next(), live.next()) {
+            self.several = None;
+            self.stamp = last.map(|known| known.stamp).or(self.stamp);
+        }
+        None
+    }
+
+    /// Forgets that a sample was handed on: it was not after all, and its repetition is welcome.
+    pub(crate) fn forget(&mut self, instance: Option<Timestamp>) {
+        self.known.retain(|known| Some(known.stamp) != instance);
     }
 
     /// Forgets what was handed on: the local type changed, and the next repetition is wanted.
-    pub(crate) fn forget_delivered(&mut self) {
-        self.delivered = None;
+    pub(crate) fn forget_all(&mut self) {
+        self.known.clear();
+        self.several = None;
     }
 }
 
+/// Samples whose repetitions are known: as many as a writer keeps.
+const MAX_KNOWN: usize = MAX_KEPT;
 /// A quarter of the sequence numbers' range.
 const QUARTER: u16 = 0x4000;
 /// From here on a number counts as behind the last one.
@@ -150,21 +286,25 @@ mod tests {
 
     #[test]
     fn numbers_wrap_and_gaps_are_counted() {
-        let (mut reader, _) = reader();
-        assert_eq!(reader.admit(place(65_534, 1000)), Ok(0));
-        assert_eq!(reader.admit(place(65_535, 2000)), Ok(0));
-        assert_eq!(reader.admit(place(2, 3000)), Ok(2), "0 and 1 are missing");
+        let (mut reader, now) = reader();
+        assert_eq!(reader.admit(place(65_534, 1000), now), Ok((0, Kept::Alone)));
+        assert_eq!(reader.admit(place(65_535, 2000), now), Ok((0, Kept::Alone)));
+        assert_eq!(
+            reader.admit(place(2, 3000), now),
+            Ok((2, Kept::Alone)),
+            "0 and 1 are missing"
+        );
     }
 
     #[test]
     fn old_and_equal_numbers_are_dropped_unless_the_writer_started_over() {
-        let (mut reader, _) = reader();
-        assert_eq!(reader.admit(place(500, 9000)), Ok(0));
-        assert_eq!(reader.admit(place(500, 9000)), Err(Reason::Duplicate));
-        assert_eq!(reader.admit(place(499, 8000)), Err(Reason::Stale));
+        let (mut reader, now) = reader();
+        assert_eq!(reader.admit(place(500, 9000), now), Ok((0, Kept::Alone)));
+        assert_eq!(reader.admit(place(500, 9000), now), Err(Reason::Duplicate));
+        assert_eq!(reader.admit(place(499, 8000), now), Err(Reason::Stale));
         assert_eq!(
-            reader.admit(place(0, 10_000)),
-            Ok(0),
+            reader.admit(place(0, 10_000), now),
+            Ok((0, Kept::Alone)),
             "a newer stamp tells of a restart"
         );
         let moved = Place {
@@ -172,36 +312,156 @@ mod tests {
             ..place(0, 10_000)
         };
         assert_eq!(
-            reader.admit(moved),
-            Ok(0),
+            reader.admit(moved, now),
+            Ok((0, Kept::Alone)),
             "another address tells of a restart"
         );
     }
 
     #[test]
     fn a_repeated_key_frame_is_known_by_its_stamp() {
-        let (mut reader, _) = reader();
+        let (mut reader, now) = reader();
         let first = place(1, 1000);
-        assert_eq!(reader.admit(first), Ok(0));
-        reader.delivered(first);
-        assert_eq!(reader.admit(place(2, 1000)), Err(Reason::Repeat));
-        assert_eq!(reader.admit(place(3, 2000)), Ok(0), "another sample");
-        let (mut coarse, _) = self::reader();
+        assert_eq!(reader.admit(first, now), Ok((0, Kept::Alone)));
+        reader.delivered(first.instance(), Kept::Alone, now);
+        assert_eq!(reader.admit(place(2, 1000), now), Err(Reason::Repeat));
+        assert_eq!(
+            reader.admit(place(3, 2000), now),
+            Ok((0, Kept::Alone)),
+            "another sample"
+        );
+        let (mut coarse, now) = self::reader();
         let stamp_without_picoseconds = Place {
             fine: false,
             ..place(1, 1000)
         };
-        assert_eq!(coarse.admit(stamp_without_picoseconds), Ok(0));
-        coarse.delivered(stamp_without_picoseconds);
+        assert_eq!(
+            coarse.admit(stamp_without_picoseconds, now),
+            Ok((0, Kept::Alone))
+        );
+        coarse.delivered(stamp_without_picoseconds.instance(), Kept::Alone, now);
         let next = Place {
             sequence: Some(2),
             ..stamp_without_picoseconds
         };
         assert_eq!(
-            coarse.admit(next),
-            Ok(0),
+            coarse.admit(next, now),
+            Ok((0, Kept::Alone)),
             "a coarse stamp may be shared by two samples"
         );
+    }
+
+    const PERIOD: Duration = Duration::from_secs(1);
+
+    /// Plays a key frame through, as the Router does.
+    fn hear(reader: &mut Reader, sequence: u16, stamp: i128, now: Instant) -> Result<Kept, Reason> {
+        let place = place(sequence, stamp);
+        let (_, kept) = reader.admit(place, now)?;
+        reader.delivered(place.instance(), kept, now);
+        Ok(kept)
+    }
+
+    #[test]
+    fn of_several_values_repeated_side_by_side_each_is_handed_on_once() {
+        let (mut reader, start) = reader();
+        let first: Vec<_> = [1000, 2000, 3000]
+            .into_iter()
+            .zip(1..)
+            .map(|(stamp, sequence)| hear(&mut reader, sequence, stamp, start))
+            .collect();
+        assert_eq!(first, [Ok(Kept::Alone); 3]);
+        let mut round = |turn: u16| -> Vec<_> {
+            let now = start + PERIOD * u32::from(turn);
+            [1000, 2000, 3000]
+                .into_iter()
+                .zip(turn * 3 + 1..)
+                .map(|(stamp, sequence)| hear(&mut reader, sequence, stamp, now))
+                .collect()
+        };
+        let kept_again = [Ok(Kept::Again), Ok(Kept::Again), Err(Reason::Repeat)];
+        assert_eq!(
+            round(1),
+            kept_again,
+            "the older ones were not given up after all"
+        );
+        for turn in 2..20 {
+            assert_eq!(round(turn), [Err(Reason::Repeat); 3]);
+        }
+    }
+
+    #[test]
+    fn who_comes_late_gets_all_values_wherever_in_the_round_it_begins() {
+        let (mut reader, now) = reader();
+        let heard: Vec<_> = [2000, 3000, 1000, 2000, 3000, 1000]
+            .into_iter()
+            .zip(7..)
+            .map(|(stamp, sequence)| hear(&mut reader, sequence, stamp, now))
+            .collect();
+        let repeat = Err(Reason::Repeat);
+        let expected = [
+            Ok(Kept::Alone),
+            Ok(Kept::Alone),
+            Ok(Kept::Beside),
+            Ok(Kept::Again),
+            repeat,
+            repeat,
+        ];
+        assert_eq!(heard, expected);
+    }
+
+    #[test]
+    fn a_value_that_is_no_longer_repeated_is_retired_and_one_value_is_a_state_again() {
+        let (mut reader, start) = reader();
+        let mut sequence = 0;
+        let mut retired = Vec::new();
+        for turn in 0..12_u32 {
+            let now = start + PERIOD * turn;
+            // From turn 4 on an update of the first takes its place, from turn 8 on the second has gone.
+            let first = if turn < 4 { 1000 } else { 3000 };
+            for stamp in [first, 2000].into_iter().filter(|s| turn < 8 || *s != 2000) {
+                sequence += 1;
+                let _what = hear(&mut reader, sequence, stamp, now);
+                while let Some(gone) = reader.retire(now, PERIOD * 3) {
+                    retired.push((turn, gone.unix_nanos()));
+                }
+            }
+        }
+        assert_eq!(retired, [(6, 1000), (10, 2000)]);
+        let next = hear(&mut reader, sequence + 1, 4000, start + PERIOD * 12);
+        assert_eq!(next, Ok(Kept::Alone));
+    }
+
+    #[test]
+    fn nothing_is_retired_while_the_writer_says_nothing_at_all() {
+        let (mut reader, start) = reader();
+        for (sequence, stamp) in (0..).zip([1000, 2000, 1000, 2000]) {
+            let _what = hear(&mut reader, sequence, stamp, start);
+        }
+        let later = start + PERIOD * 60;
+        assert_eq!(hear(&mut reader, 4, 1000, later), Err(Reason::Repeat));
+        let gone = reader.retire(later, PERIOD * 3);
+        assert_eq!(gone.map(Timestamp::unix_nanos), Some(2000));
+        assert_eq!(reader.retire(later, PERIOD * 3), None);
+    }
+
+    #[test]
+    fn a_fast_topic_beside_a_latched_value_does_not_push_that_out() {
+        let (mut reader, now) = reader();
+        let mut sequence = 0_u16;
+        let mut stamp = 1000;
+        let mut heard_anew = 0;
+        for turn in 0..2000 {
+            sequence += 1;
+            if turn % 100 == 0 {
+                let of_latched = hear(&mut reader, sequence, 1000, now);
+                heard_anew += usize::from(of_latched != Err(Reason::Repeat));
+            } else {
+                stamp += 1;
+                assert!(hear(&mut reader, sequence, stamp, now).is_ok());
+            }
+        }
+        // Handed on first, and once more when it turns out that it stays beside the others.
+        assert!(heard_anew <= 2, "{heard_anew}");
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! The Router: verdicts on samples, queues per topic, repetitions and silences.
 
+mod chunks;
 mod receive;
 
 use std::cmp::Reverse;
@@ -8,20 +9,23 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use mappings::{Mapping, Overflow, TopicId};
-use messages::{MessageType, Plan, PlanError, Selection, Wire};
+use mappings::{Mapping, Overflow, SpaceId, TopicId};
+use messages::{Dialect, MessageType, Plan, PlanError, Selection, Wire};
 use uadp::{Fields, Timestamp};
 
 use crate::counters::{Counters, Reason, Verdict, is_told};
 use crate::fields;
 use crate::hops::{Hop, Hops};
 use crate::loop_rule::{Side, may_cross};
-use crate::network::{data_set_header, encode, keep_alive};
-use crate::output::{Delivery, Notice, Output};
+use crate::network::{chunk, data_set_header, encode, keep_alive, prepare_chunks};
+use crate::output::{Delivery, Heard, Kept, Notice, Output, PublisherKey};
+use crate::pace::Pace;
 use crate::reader::{Held, Reader};
 use crate::settings::{Local, Now, Settings};
-use crate::topic::{Item, Role, Topic};
-use crate::writer::{Encoded, Idle, Writer};
+use crate::topic::{Item, Role, Sending, Topic};
+use crate::transcoder::Transcoder;
+use crate::writer::{Encoded, Idle, MAX_KEPT, Message, Writer};
+use chunks::Chunks;
 use receive::Sample;
 
 /// Decides what crosses between one space and UADP. See the crate's page for how it is driven.
@@ -32,6 +36,11 @@ pub struct Router {
     topics: HashMap<TopicId, Topic>,
     /// Topics with something in their queue, served in turn: a camera cannot starve a button.
     ready: VecDeque<TopicId>,
+    /// Topics in the midst of a large message, which wait for `pace`.
+    paced: VecDeque<TopicId>,
+    pace: Pace,
+    /// Chunks of large messages of other spaces; `None` before the first one.
+    chunks: Option<Box<Chunks>>,
     /// What is told besides samples. Bounded by the topics and by [`is_told`].
     told: VecDeque<Output>,
     timers: BinaryHeap<Reverse<(Instant, TopicId)>>,
@@ -51,6 +60,9 @@ impl Router {
             mapping,
             topics: HashMap::new(),
             ready: VecDeque::new(),
+            paced: VecDeque::new(),
+            pace: Pace::default(),
+            chunks: None,
             told: VecDeque::new(),
             timers: BinaryHeap::new(),
             spare: Vec::new(),
@@ -78,13 +90,26 @@ impl Router {
             Local::Fields => return Ok(()),
         };
         let plan = Plan::compile(message_type, selection, wire)?;
+        // A message as bytes is in the dialect of its origin; that of an OPC UA origin is taken as it is.
+        let origin = match topic.space {
+            SpaceId::UA => None,
+            space if space.is_ros2() => Some(Dialect::Ros2),
+            _ => Some(Dialect::Ros1),
+        };
+        let transcoder = origin
+            .filter(|origin| *selection == Selection::Bytes && *origin != message_type.dialect())
+            .map(|origin| {
+                let (_, namespace, _) = topic.triple();
+                Box::new(Transcoder::compile(origin, message_type, namespace))
+            });
         let Some(entry) = self.entry(topic, None, now) else {
             return Ok(());
         };
         entry.plan = Some(plan);
+        entry.transcoder = transcoder;
         let held = match &mut entry.role {
             Role::Theirs(reader) => {
-                reader.forget_delivered();
+                reader.forget_all();
                 reader.held.take()
             }
             Role::Ours(_) => None,
@@ -94,6 +119,7 @@ impl Router {
         {
             let Held {
                 source,
+                instance,
                 status,
                 arrived,
                 ..
@@ -101,22 +127,24 @@ impl Router {
             let sample = Sample {
                 fields,
                 source,
+                instance,
+                kept: Kept::Alone,
                 status,
                 arrived,
             };
-            self.deliver(topic, &sample);
+            self.deliver(topic, &sample, now);
         }
         Ok(())
     }
 
-    /// A sample was heard on the local side. `received` is when it came.
-    pub fn handle_local(
-        &mut self,
-        topic: TopicId,
-        payload: &[u8],
-        received: Timestamp,
-        now: Now,
-    ) -> Verdict {
+    /// A sample was heard on the local side.
+    pub fn handle_local(&mut self, heard: Heard<'_>, now: Now) -> Verdict {
+        let Heard {
+            topic,
+            payload,
+            received,
+            latched_by,
+        } = heard;
         if !may_cross(self.settings.own, Side::Local, topic.space) {
             return self.refuse(topic, Reason::Looped, String::new());
         }
@@ -125,6 +153,7 @@ impl Router {
             ..Encoded::default()
         };
         let local = self.settings.local;
+        let (max_datagram, max_message) = self.sizes();
         let Some(Topic {
             role: Role::Ours(writer),
             plan,
@@ -145,23 +174,51 @@ impl Router {
         };
         let stamp = writer.stamp(received);
         let header = data_set_header(writer.expected_sequence(), stamp);
-        match encode(&mut encoded, topic, &header, now.utc, &sample) {
-            Ok(()) => {}
-            Err((reason, detail)) => {
-                self.recycle(encoded.bytes);
-                return self.refuse(topic, reason, detail);
-            }
+        let mut written = encode(&mut encoded, topic, &header, now.utc, &sample);
+        let large = encoded.bytes.len() > usize::from(max_datagram);
+        if written.is_ok() && large {
+            written = prepare_chunks(&mut encoded, max_message)
+                .map_err(|detail| (Reason::TooBig, detail));
+        }
+        if let Err((reason, detail)) = written {
+            self.recycle(encoded.bytes);
+            return self.refuse(topic, reason, detail);
         }
         // The number is used up only by a message that goes out.
         writer.next_sequence();
-        let keep = *overflow == Overflow::KeepLatest;
-        writer.sent(&encoded, keep, now.monotonic);
+        let message = if large {
+            Message::Large(Arc::new(encoded))
+        } else {
+            Message::Datagram(encoded)
+        };
+        writer.sent(now.monotonic);
+        let gave_way = *overflow == Overflow::KeepLatest && writer.keep(latched_by, &message);
+        if gave_way {
+            self.count(About::topic(topic), Reason::TooManyPublishers, 1, || {
+                format!(
+                    "it has more than {MAX_KEPT} latched publishers: late joiners get the last message of those that \
+                     spoke last"
+                )
+            });
+        }
         self.hops.record(Hop::Out, received, now.utc);
         self.schedule(topic);
-        if self.push(topic, Item::Datagram(encoded)) {
+        if self.push(topic, Item::Message(message)) {
             Verdict::ForwardAfterDroppingOldest
         } else {
             Verdict::Forward
+        }
+    }
+
+    /// A latched publisher of a topic of our own space has gone for good: its last message is no longer repeated.
+    pub fn left(&mut self, topic: TopicId, publisher: PublisherKey) {
+        if let Some(Topic {
+            role: Role::Ours(writer),
+            ..
+        }) = self.topics.get_mut(&topic)
+        {
+            writer.forget(publisher);
+            self.schedule(topic);
         }
     }
 
@@ -196,12 +253,19 @@ impl Router {
             self.handle_due(topic, now);
             self.schedule(topic);
         }
+        self.expire_chunks(now);
     }
 
     /// When [`handle_timeout`](Self::handle_timeout) is wanted next.
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
-        self.timers.peek().map(|Reverse((at, _))| *at)
+        let timer = self.timers.peek().map(|Reverse((at, _))| *at);
+        let pace = match self.paced.is_empty() {
+            true => None,
+            false => self.pace.opens(),
+        };
+        let chunks = self.chunks.as_ref().and_then(|chunks| chunks.due());
+        [timer, pace, chunks].into_iter().flatten().min()
     }
 
     /// The next thing to do, topic by topic in turn. `None`: nothing until the next `handle_*`.
@@ -209,32 +273,97 @@ impl Router {
         if let Some(told) = self.told.pop_front() {
             return Some(told);
         }
+        // One for one: among those that are ready it waits its turn again.
+        if !self.paced.is_empty() && self.pace.is_open(now.monotonic) {
+            self.ready.extend(self.paced.pop_front());
+        }
         while let Some(topic) = self.ready.pop_front() {
-            let Some(entry) = self.topics.get_mut(&topic) else {
-                continue;
-            };
-            let item = entry.queue.pop();
-            entry.ready = !entry.queue.is_empty();
-            if entry.ready {
-                self.ready.push_back(topic);
-            }
-            match item {
-                Some(Item::Datagram(mut datagram)) => {
-                    entry.counters.sent += 1;
-                    datagram.stamp(now.utc);
-                    return Some(Output::Datagram {
-                        topic,
-                        bytes: datagram.bytes,
-                    });
-                }
-                Some(Item::Delivery(delivery)) => {
-                    entry.counters.delivered += 1;
-                    return Some(Output::Delivery(delivery));
-                }
-                None => {}
+            if let Some(output) = self.take_turn(topic, now) {
+                return Some(output);
             }
         }
         None
+    }
+
+    /// Takes one thing of a topic, and puts it back in line if it has more.
+    fn take_turn(&mut self, topic: TopicId, now: Now) -> Option<Output> {
+        let entry = self.topics.get_mut(&topic)?;
+        let item = if entry.sending.is_some() {
+            None
+        } else {
+            entry.queue.pop().or_else(|| {
+                let Role::Ours(writer) = &mut entry.role else {
+                    return None;
+                };
+                let again = writer.repeat(|| self.spare.pop().unwrap_or_default())?;
+                entry.counters.repeated += 1;
+                Some(Item::Message(again))
+            })
+        };
+        let output = match item {
+            Some(Item::Message(Message::Datagram(mut datagram))) => {
+                entry.counters.sent += 1;
+                datagram.stamp(now.utc);
+                Some(Output::Datagram {
+                    topic,
+                    bytes: datagram.bytes,
+                })
+            }
+            Some(Item::Delivery(delivery)) => {
+                entry.counters.delivered += 1;
+                Some(Output::Delivery(delivery))
+            }
+            Some(Item::Message(Message::Large(message))) => {
+                entry.sending = Some(Sending { message, offset: 0 });
+                None
+            }
+            None => None,
+        };
+        if entry.sending.is_some() && output.is_none() {
+            return self.send_chunk(topic, now);
+        }
+        entry.ready = entry.has_more();
+        if entry.ready {
+            self.ready.push_back(topic);
+        }
+        output
+    }
+
+    /// The next chunk of the topic's large message, if the pace lets it go.
+    fn send_chunk(&mut self, topic: TopicId, now: Now) -> Option<Output> {
+        if !self.pace.is_open(now.monotonic) {
+            self.paced.push_back(topic);
+            return None;
+        }
+        let (max_datagram, _) = self.sizes();
+        let mut bytes = self.buffer();
+        let entry = self.topics.get_mut(&topic)?;
+        let Sending { message, offset } = entry.sending.take()?;
+        let written = chunk(&mut bytes, topic, (&message, offset), max_datagram, now.utc);
+        if let Ok(offset) = written {
+            if offset < message.data_set_message().len() {
+                entry.sending = Some(Sending { message, offset });
+            } else {
+                entry.counters.sent += 1;
+            }
+        }
+        if let Role::Ours(writer) = &mut entry.role {
+            writer.spoke(now.monotonic);
+        }
+        entry.ready = entry.has_more();
+        if entry.ready {
+            self.ready.push_back(topic);
+        }
+        match written {
+            Ok(_) => {
+                self.pace.spend(bytes.len(), now.monotonic);
+                Some(Output::Datagram { topic, bytes })
+            }
+            Err(error) => {
+                self.count(About::topic(topic), Reason::TooBig, 1, || error.to_string());
+                None
+            }
+        }
     }
 
     /// The local side took a delivery: its time in this program ends at `now`.
@@ -242,17 +371,28 @@ impl Router {
         self.hops.record(Hop::In, arrived, now.utc);
     }
 
-    /// An output could not be carried out: counts it under `reason`, with what was said.
-    pub fn failed(&mut self, topic: TopicId, reason: Reason, detail: &str) {
-        if let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get_mut(&topic)
-        {
-            // It was not delivered after all, so its repetition is welcome.
-            reader.forget_delivered();
+    /// A datagram could not be sent: counts it under `reason`, with what was said. What is left of a large message is
+    /// not sent either.
+    pub fn not_sent(&mut self, topic: TopicId, reason: Reason, detail: &str) {
+        if let Some(entry) = self.topics.get_mut(&topic) {
+            entry.sending = None;
         }
         self.count(About::topic(topic), reason, 1, || detail.to_owned());
+    }
+
+    /// The local side did not take a delivery, given by its topic and instance: its repetition is welcome.
+    pub fn not_published(&mut self, topic: TopicId, instance: Option<Timestamp>, detail: &str) {
+        self.forget(topic, instance);
+        self.count(About::topic(topic), Reason::NotPublished, 1, || {
+            detail.to_owned()
+        });
+    }
+
+    /// A value of the topic was not taken by the service it is for, or the service that should say it did not answer.
+    pub fn call_failed(&mut self, topic: TopicId, detail: &str) {
+        self.count(About::topic(topic), Reason::CallFailed, 1, || {
+            detail.to_owned()
+        });
     }
 
     /// Samples that were lost before the Router saw them, in a queue of the port or the kernel.
@@ -311,20 +451,23 @@ impl Router {
                 if at > now.monotonic {
                     return;
                 }
-                let datagram = match idle {
-                    Idle::Repeat => {
-                        entry.counters.repeated += 1;
-                        writer.repeat(now.monotonic, buffer)
-                    }
+                match idle {
+                    Idle::Repeat => writer.begin_round(now.monotonic),
                     Idle::KeepAlive => {
-                        entry.counters.keep_alives += 1;
-                        writer.sent_keep_alive(now.monotonic);
-                        keep_alive(buffer, topic, writer.expected_sequence(), now.utc)
+                        writer.spoke(now.monotonic);
+                        let expected = writer.expected_sequence();
+                        // What waits says more.
+                        if !entry.has_more()
+                            && let Some(datagram) = keep_alive(buffer, topic, expected, now.utc)
+                        {
+                            entry.counters.keep_alives += 1;
+                            entry.queue.push(Item::Message(Message::Datagram(datagram)));
+                        }
                     }
-                };
-                // A fresh sample that waits in the queue says more than a repetition of the one before.
-                if let (Some(datagram), true) = (datagram, entry.queue.is_empty()) {
-                    self.push(topic, Item::Datagram(datagram));
+                }
+                if !entry.ready && entry.has_more() {
+                    entry.ready = true;
+                    self.ready.push_back(topic);
                 }
             }
         }
@@ -392,16 +535,38 @@ impl Router {
             entry.ready = true;
             self.ready.push_back(topic);
         }
-        let (Some(Item::Datagram(Encoded { bytes, .. }))
-        | Some(Item::Delivery(Delivery { payload: bytes, .. }))) = dropped
-        else {
-            return false;
-        };
-        self.recycle(bytes);
+        match dropped {
+            None => return false,
+            Some(Item::Message(Message::Datagram(Encoded { bytes, .. }))) => self.recycle(bytes),
+            // It is kept for repeating, or its last owner frees it.
+            Some(Item::Message(Message::Large(_))) => {}
+            Some(Item::Delivery(Delivery {
+                payload, instance, ..
+            })) => {
+                self.recycle(payload);
+                self.forget(topic, instance);
+            }
+        }
         self.count(About::topic(topic), Reason::Overflow, 1, || {
             "the queue was full, its oldest sample was dropped".to_owned()
         });
         true
+    }
+
+    /// Takes note that a delivery did not get through.
+    fn forget(&mut self, topic: TopicId, instance: Option<Timestamp>) {
+        if let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+        {
+            reader.forget(instance);
+        }
+    }
+
+    fn sizes(&self) -> (u16, u32) {
+        let pubsub = self.mapping.pubsub();
+        (pubsub.max_datagram, pubsub.max_message)
     }
 
     /// Counts a sample of the local side that does not cross.

@@ -1,5 +1,6 @@
 //! Everything the Router keeps for one topic.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use mappings::Overflow;
@@ -9,7 +10,8 @@ use crate::counters::Counters;
 use crate::output::Delivery;
 use crate::queue::Queue;
 use crate::reader::Reader;
-use crate::writer::{Encoded, Writer};
+use crate::transcoder::Transcoder;
+use crate::writer::{Encoded, Message, Writer};
 
 /// One topic of the space, seen from one bridge: of our own space, or of another.
 #[derive(Debug)]
@@ -18,7 +20,11 @@ pub(crate) struct Topic {
     /// How its bytes become fields or the other way. `None` until the local type is known, and for a local side
     /// that speaks in fields.
     pub(crate) plan: Option<Plan>,
+    /// For bytes of the other ROS, what makes them ours, or why nothing does.
+    pub(crate) transcoder: Option<Box<Result<Transcoder, String>>>,
     pub(crate) queue: Queue<Item>,
+    /// A large message of which chunks are still to be sent, before anything of the queue.
+    pub(crate) sending: Option<Sending>,
     pub(crate) overflow: Overflow,
     pub(crate) counters: Counters,
     /// Whether it stands in the Router's list of topics with something to poll.
@@ -38,8 +44,16 @@ pub(crate) enum Role {
 /// A sample on its way out.
 #[derive(Debug)]
 pub(crate) enum Item {
-    Datagram(Encoded),
+    Message(Message),
     Delivery(Delivery),
+}
+
+/// A large message on its way.
+#[derive(Debug)]
+pub(crate) struct Sending {
+    pub(crate) message: Arc<Encoded>,
+    /// Where in its DataSetMessage the next chunk begins.
+    pub(crate) offset: usize,
 }
 
 impl Topic {
@@ -47,11 +61,20 @@ impl Topic {
         Self {
             role,
             plan: None,
+            transcoder: None,
             queue: Queue::new(overflow),
+            sending: None,
             overflow,
             counters: Counters::default(),
             ready: false,
             timer: None,
         }
+    }
+
+    /// Whether there is something to poll.
+    pub(crate) fn has_more(&self) -> bool {
+        !self.queue.is_empty()
+            || self.sending.is_some()
+            || matches!(&self.role, Role::Ours(writer) if writer.repeats())
     }
 }

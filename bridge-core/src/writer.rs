@@ -1,8 +1,12 @@
 //! What is remembered of one DataSetWriter of our own space.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use uadp::Timestamp;
+
+use crate::output::PublisherKey;
+use crate::pace::Pace;
 
 /// The state of a topic we send.
 #[derive(Debug)]
@@ -13,14 +17,33 @@ pub(crate) struct Writer {
     taken: Option<Timestamp>,
     /// When anything was last sent for it.
     sent: Instant,
-    /// When its value was last sent.
+    /// When its value was last sent; with several, when they were last repeated.
     value_sent: Instant,
     /// Whether the topic has a producer. Without one nothing is repeated, so that readers see it fall silent.
     live: bool,
-    /// The last sample as it went out, for repeating. `None` for topics of events, and before the first sample.
-    last: Option<Encoded>,
+    /// What is repeated, in the order it was taken: the last sample, or that of each latched publisher. Empty for
+    /// topics of events, and before the first sample.
+    kept: Vec<Kept>,
+    /// Which of those is to be repeated next in this round; past the end, none.
+    next: usize,
     /// Whether anything was sent at all.
     started: bool,
+}
+
+/// The last sample of one latched publisher, or of all that do not latch.
+#[derive(Debug)]
+struct Kept {
+    publisher: Option<PublisherKey>,
+    message: Message,
+}
+
+/// What carries one sample.
+#[derive(Debug)]
+pub(crate) enum Message {
+    /// One NetworkMessage.
+    Datagram(Encoded),
+    /// More than a datagram holds; it goes in chunks, cut from this one buffer.
+    Large(Arc<Encoded>),
 }
 
 /// A NetworkMessage with one DataSetMessage, and where its numbers stand.
@@ -29,6 +52,8 @@ pub(crate) struct Encoded {
     pub(crate) bytes: Vec<u8>,
     /// Position of the NetworkMessage Timestamp, which PicoSeconds follow.
     pub(crate) timestamp_at: usize,
+    /// Position of the DataSetMessage.
+    pub(crate) payload_at: usize,
     /// Position of the DataSetMessage's sequence number.
     pub(crate) sequence_at: usize,
 }
@@ -40,6 +65,26 @@ pub(crate) enum Idle {
     KeepAlive,
 }
 
+impl Message {
+    /// For keeping: of a large one the same buffer.
+    fn share(&self) -> Self {
+        match self {
+            Self::Datagram(encoded) => Self::Datagram(encoded.clone()),
+            Self::Large(encoded) => Self::Large(Arc::clone(encoded)),
+        }
+    }
+
+    /// How long sending it takes, if that is worth a thought.
+    fn time(&self) -> Duration {
+        match self {
+            Self::Datagram(_) => Duration::ZERO,
+            Self::Large(encoded) => {
+                Pace::time_of(u64::try_from(encoded.bytes.len()).unwrap_or(u64::MAX))
+            }
+        }
+    }
+}
+
 impl Encoded {
     /// Sets the NetworkMessage Timestamp and PicoSeconds.
     pub(crate) fn stamp(&mut self, at: Timestamp) {
@@ -49,6 +94,19 @@ impl Encoded {
             self.timestamp_at + 8,
             &at.picoseconds.to_le_bytes(),
         );
+    }
+
+    /// The DataSetMessage alone.
+    pub(crate) fn data_set_message(&self) -> &[u8] {
+        self.bytes.get(self.payload_at..).unwrap_or_default()
+    }
+
+    /// The DataSetMessage's sequence number.
+    pub(crate) fn sequence(&self) -> u16 {
+        let number = self.bytes.get(self.sequence_at..).unwrap_or_default();
+        number
+            .first_chunk()
+            .map_or(0, |number| u16::from_le_bytes(*number))
     }
 
     fn number(&mut self, sequence: u16) {
@@ -64,7 +122,8 @@ impl Writer {
             sent: now,
             value_sent: now,
             live: true,
-            last: None,
+            kept: Vec::new(),
+            next: usize::MAX,
             started: false,
         }
     }
@@ -95,45 +154,127 @@ impl Writer {
         self.sequence
     }
 
-    /// Takes note of a sample sent; `keep` for topics whose last value is repeated.
-    pub(crate) fn sent(&mut self, sample: &Encoded, keep: bool, now: Instant) {
+    /// Takes note of a sample sent.
+    pub(crate) fn sent(&mut self, now: Instant) {
         self.sent = now;
-        self.value_sent = now;
         self.live = true;
         self.started = true;
-        if keep {
-            let last = self.last.get_or_insert_default();
-            last.bytes.clone_from(&sample.bytes);
-            last.timestamp_at = sample.timestamp_at;
-            last.sequence_at = sample.sequence_at;
+        if self.kept.len() <= 1 {
+            self.value_sent = now;
         }
     }
 
-    pub(crate) const fn sent_keep_alive(&mut self, now: Instant) {
+    /// Keeps a sample for repeating, in the place of the one before of that publisher. Says whether the oldest one
+    /// gave way, since there are [`MAX_KEPT`].
+    pub(crate) fn keep(&mut self, publisher: Option<PublisherKey>, message: &Message) -> bool {
+        let found = self
+            .kept
+            .iter()
+            .position(|kept| kept.publisher == publisher);
+        let mut gave_way = false;
+        match found.and_then(|at| Some((at, self.kept.get_mut(at)?))) {
+            Some((at, kept)) => {
+                match (&mut kept.message, message) {
+                    (Message::Datagram(last), Message::Datagram(new)) => {
+                        last.bytes.clone_from(&new.bytes);
+                        last.timestamp_at = new.timestamp_at;
+                        last.payload_at = new.payload_at;
+                        last.sequence_at = new.sequence_at;
+                    }
+                    (last, new) => *last = new.share(),
+                }
+                self.leave_round(at);
+                if let Some(later) = self.kept.get_mut(at..) {
+                    later.rotate_left(1);
+                }
+            }
+            None => {
+                gave_way = self.kept.len() >= MAX_KEPT;
+                if gave_way {
+                    self.kept.remove(0);
+                    self.leave_round(0);
+                }
+                self.kept.push(Kept {
+                    publisher,
+                    message: message.share(),
+                });
+            }
+        }
+        if self.kept.len() == 1 {
+            // It is just being sent.
+            self.next = usize::MAX;
+        }
+        gave_way
+    }
+
+    /// No longer repeats the sample of a publisher that has gone.
+    pub(crate) fn forget(&mut self, publisher: PublisherKey) {
+        let found = self
+            .kept
+            .iter()
+            .position(|kept| kept.publisher == Some(publisher));
+        if let Some(at) = found {
+            self.kept.remove(at);
+            self.leave_round(at);
+        }
+    }
+
+    /// Takes note that something was sent that is no value: a keep-alive, or a piece of one.
+    pub(crate) const fn spoke(&mut self, now: Instant) {
         self.sent = now;
     }
 
-    /// The last sample with a fresh sequence number, to be sent again.
-    pub(crate) fn repeat(&mut self, now: Instant, mut buffer: Vec<u8>) -> Option<Encoded> {
-        let sequence = self.sequence;
-        let last = self.last.as_ref()?;
-        buffer.clone_from(&last.bytes);
-        let mut again = Encoded {
-            bytes: buffer,
-            ..*last
-        };
-        again.number(sequence);
-        self.sequence = sequence.wrapping_add(1);
+    /// Begins to repeat what is kept.
+    pub(crate) const fn begin_round(&mut self, now: Instant) {
+        self.next = 0;
         self.sent = now;
         self.value_sent = now;
-        Some(again)
+    }
+
+    /// Whether the round is not over.
+    pub(crate) const fn repeats(&self) -> bool {
+        self.next < self.kept.len()
+    }
+
+    /// The next sample of the round with a fresh sequence number. `buffer` gives one to write a datagram into.
+    pub(crate) fn repeat(&mut self, buffer: impl FnOnce() -> Vec<u8>) -> Option<Message> {
+        let sequence = self.sequence;
+        let kept = loop {
+            let kept = self.kept.get_mut(self.next)?;
+            self.next += 1;
+            // One that is still on its way needs no repetition.
+            match &mut kept.message {
+                Message::Large(last) => {
+                    if let Some(last) = Arc::get_mut(last) {
+                        last.number(sequence);
+                        break kept;
+                    }
+                }
+                Message::Datagram(_) => break kept,
+            }
+        };
+        self.sequence = sequence.wrapping_add(1);
+        Some(match &kept.message {
+            Message::Datagram(last) => {
+                let mut bytes = buffer();
+                bytes.clone_from(&last.bytes);
+                let mut again = Encoded { bytes, ..*last };
+                again.number(sequence);
+                Message::Datagram(again)
+            }
+            large @ Message::Large(_) => large.share(),
+        })
     }
 
     pub(crate) const fn set_live(&mut self, live: bool) {
         self.live = live;
+        if !live {
+            self.next = usize::MAX;
+        }
     }
 
-    /// When the writer has to speak again, and how.
+    /// When the writer has to speak again, and how. Large values are repeated so seldom that this takes up no more
+    /// than a tenth of the pace of chunks.
     pub(crate) fn due(
         &self,
         key_frames: Duration,
@@ -142,14 +283,27 @@ impl Writer {
         if !self.live || !self.started {
             return None;
         }
+        let sending: Duration = self.kept.iter().map(|kept| kept.message.time()).sum();
         let keep_alive = (self.sent + keep_alives, Idle::KeepAlive);
-        let repeat = (self.value_sent + key_frames, Idle::Repeat);
+        let repeat = (
+            self.value_sent + key_frames.max(sending.saturating_mul(10)),
+            Idle::Repeat,
+        );
         // A repeated key frame says all that a keep-alive says.
-        let repeats_first = self.last.is_some() && repeat.0 <= keep_alive.0;
+        let repeats_first = !self.kept.is_empty() && repeat.0 <= keep_alive.0;
         Some(if repeats_first { repeat } else { keep_alive })
+    }
+
+    /// What was kept at `at` is elsewhere or gone; the round goes on behind it.
+    const fn leave_round(&mut self, at: usize) {
+        if self.next != usize::MAX && at < self.next {
+            self.next -= 1;
+        }
     }
 }
 
+/// Samples kept per topic: more latched publishers of one topic are not known of any graph.
+pub(crate) const MAX_KEPT: usize = 32;
 /// Samples of one topic come from several publishers, whose stamps may cross by as much; in nanoseconds.
 const STEP_BACK: i128 = 1_000_000_000;
 
@@ -167,6 +321,7 @@ mod tests {
         Encoded {
             bytes: vec![0; 20],
             timestamp_at: 2,
+            payload_at: 14,
             sequence_at: 16,
         }
     }
@@ -180,15 +335,102 @@ mod tests {
         (Writer::new(now), now)
     }
 
+    fn keep(writer: &mut Writer, publisher: Option<PublisherKey>, now: Instant) -> bool {
+        let mut sample = sample();
+        if let (Some(PublisherKey(key)), Some(byte)) = (publisher, sample.bytes.last_mut()) {
+            *byte = u8::try_from(key).unwrap();
+        }
+        let gave_way = writer.keep(publisher, &Message::Datagram(sample));
+        writer.sent(now);
+        gave_way
+    }
+
+    /// The sequence number and the last byte of each repetition.
+    fn round(writer: &mut Writer) -> Vec<(u16, u8)> {
+        std::iter::from_fn(|| writer.repeat(Vec::new))
+            .map(|message| match message {
+                Message::Datagram(again) => (again.sequence(), *again.bytes.last().unwrap()),
+                Message::Large(_) => unreachable!("none was kept"),
+            })
+            .collect()
+    }
+
+    #[test]
+    fn the_last_sample_of_each_latched_publisher_is_repeated_until_it_leaves() {
+        let (mut writer, now) = writer();
+        for publisher in [1, 2, 3, 1] {
+            keep(&mut writer, Some(PublisherKey(publisher)), now);
+        }
+        writer.begin_round(now);
+        assert_eq!(round(&mut writer), [(0, 2), (1, 3), (2, 1)]);
+        writer.forget(PublisherKey(3));
+        writer.begin_round(now);
+        assert_eq!(round(&mut writer), [(3, 2), (4, 1)]);
+        assert!(!writer.repeats());
+    }
+
+    #[test]
+    fn publishers_come_and_go_within_a_round_and_none_is_left_out() {
+        let (mut writer, now) = writer();
+        for publisher in 1..=4 {
+            keep(&mut writer, Some(PublisherKey(publisher)), now);
+        }
+        writer.begin_round(now);
+        assert!(writer.repeat(Vec::new).is_some());
+        assert!(writer.repeat(Vec::new).is_some());
+        writer.forget(PublisherKey(1));
+        keep(&mut writer, Some(PublisherKey(2)), now);
+        let rest: Vec<u8> = round(&mut writer)
+            .into_iter()
+            .map(|(_, byte)| byte)
+            .collect();
+        assert_eq!(rest, [3, 4, 2]);
+    }
+
+    #[test]
+    fn of_too_many_latched_publishers_the_one_that_spoke_first_gives_way() {
+        let (mut writer, now) = writer();
+        let all = u32::try_from(MAX_KEPT).unwrap();
+        assert!(!(0..all).any(|publisher| keep(&mut writer, Some(PublisherKey(publisher)), now)));
+        assert!(keep(&mut writer, Some(PublisherKey(all)), now));
+        writer.begin_round(now);
+        assert_eq!(round(&mut writer).first(), Some(&(0, 1)));
+    }
+
+    #[test]
+    fn a_large_value_is_repeated_seldom_and_from_the_same_buffer() {
+        let (mut writer, now) = writer();
+        let large = Arc::new(Encoded {
+            bytes: vec![0; 20_000_000],
+            ..sample()
+        });
+        writer.keep(None, &Message::Large(Arc::clone(&large)));
+        writer.sent(now);
+        let minute = SECOND * 60;
+        assert_eq!(
+            writer.due(SECOND, minute),
+            Some((now + SECOND * 2, Idle::Repeat))
+        );
+        writer.begin_round(now);
+        assert!(writer.repeat(Vec::new).is_none(), "it is still being sent");
+        let place = large.bytes.as_ptr();
+        drop(large);
+        writer.begin_round(now);
+        let Some(Message::Large(again)) = writer.repeat(Vec::new) else {
+            unreachable!("a large one was kept")
+        };
+        assert_eq!(again.bytes.as_ptr(), place);
+    }
+
     const SECOND: Duration = Duration::from_secs(1);
 
     #[test]
     fn a_repetition_has_a_number_of_its_own_and_the_same_value() {
         let (mut writer, now) = writer();
         assert_eq!(writer.next_sequence(), 0);
-        writer.sent(&sample(), true, now);
-        let again = writer.repeat(now + SECOND, Vec::new()).unwrap();
-        assert_eq!(again.bytes[16..18], [1, 0]);
+        keep(&mut writer, None, now);
+        writer.begin_round(now + SECOND);
+        assert_eq!(round(&mut writer), [(1, 0)]);
         assert_eq!(writer.expected_sequence(), 2);
     }
 
@@ -200,7 +442,7 @@ mod tests {
             None,
             "nothing to repeat before the first value"
         );
-        writer.sent(&sample(), true, now);
+        keep(&mut writer, None, now);
         assert_eq!(
             writer.due(SECOND, SECOND),
             Some((now + SECOND, Idle::Repeat))
@@ -209,7 +451,7 @@ mod tests {
             writer.due(SECOND * 2, SECOND),
             Some((now + SECOND, Idle::KeepAlive))
         );
-        writer.sent_keep_alive(now + SECOND);
+        writer.spoke(now + SECOND);
         assert_eq!(
             writer.due(SECOND * 2, SECOND),
             Some((now + SECOND * 2, Idle::Repeat))
@@ -219,14 +461,14 @@ mod tests {
     #[test]
     fn events_are_not_repeated_and_a_topic_without_producer_falls_silent() {
         let (mut writer, now) = writer();
-        writer.sent(&sample(), false, now);
+        writer.sent(now);
         assert_eq!(
             writer.due(SECOND, SECOND),
             Some((now + SECOND, Idle::KeepAlive))
         );
         writer.set_live(false);
         assert_eq!(writer.due(SECOND, SECOND), None);
-        writer.sent(&sample(), false, now);
+        writer.sent(now);
         assert!(
             writer.due(SECOND, SECOND).is_some(),
             "a sample shows that it has one again"

@@ -13,7 +13,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
-use bridge_core::{Local, Now, Output, Router, Settings};
+use bridge_core::{Heard, Local, Now, Output, Router, Settings};
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{Dialect, Registry, Selection};
 use proptest::prelude::*;
@@ -102,7 +102,15 @@ impl Cell {
                     let now = self.now();
                     let bridge = self.bridges.get_mut(&space).unwrap();
                     bind(bridge, topic, now);
-                    let _verdict = bridge.handle_local(topic, &payload, now.utc, now);
+                    let _verdict = bridge.handle_local(
+                        Heard {
+                            topic,
+                            payload: &payload,
+                            received: now.utc,
+                            latched_by: None,
+                        },
+                        now,
+                    );
                     self.drain(space);
                 }
                 Event::Datagram { from, bytes } => {

@@ -5,7 +5,7 @@ use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use messages::{DefinitionError, Dialect, MessageType, Registry, TypeName};
+use messages::{DefinitionError, Dialect, MessageType, Registry, ServiceType, TypeName};
 use tracing::{info, warn};
 
 /// Finds message types by name; a definition once read stays.
@@ -42,25 +42,65 @@ impl Definitions {
     pub fn find(
         &mut self,
         name: &TypeName,
-        locate: impl Fn(&TypeName) -> Option<PathBuf>,
+        locate: impl Fn(Wanted<'_>) -> Option<PathBuf>,
     ) -> Result<Arc<MessageType>, DefinitionError> {
+        self.search(|registry| registry.get(name), |_| "msg", locate)
+    }
+
+    /// The service of that name, found likewise.
+    ///
+    /// # Errors
+    /// As [`find`](Self::find).
+    pub fn find_service(
+        &mut self,
+        name: &TypeName,
+        locate: impl Fn(Wanted<'_>) -> Option<PathBuf>,
+    ) -> Result<Arc<ServiceType>, DefinitionError> {
+        // What nothing needs is the service itself.
+        let kind = |by: Option<&TypeName>| if by.is_none() { "srv" } else { "msg" };
+        self.search(|registry| registry.service(name), kind, locate)
+    }
+
+    fn search<T>(
+        &mut self,
+        ask: impl Fn(&Registry) -> Result<T, DefinitionError>,
+        kind_of: impl Fn(Option<&TypeName>) -> &'static str,
+        locate: impl Fn(Wanted<'_>) -> Option<PathBuf>,
+    ) -> Result<T, DefinitionError> {
         for _ in 0..MAX_FILES {
-            let unknown = match self.registry.get(name) {
+            let unknown = match ask(&self.registry) {
                 Err(unknown @ DefinitionError::Unknown { .. }) => unknown,
                 found => return found,
             };
-            let DefinitionError::Unknown { name: missing, .. } = &unknown else {
-                return Err(unknown);
-            };
-            let Some((text, file)) = locate(missing).and_then(|file| Some((read(&file)?, file)))
+            let DefinitionError::Unknown {
+                name, needed_by, ..
+            } = &unknown
             else {
                 return Err(unknown);
             };
-            self.registry.add(missing, &text)?;
-            info!(message_type = %missing, file = %file.display(), "definition read");
+            let kind = kind_of(needed_by.as_ref());
+            let file = locate(Wanted { name, kind });
+            let Some((text, file)) = file.and_then(|file| Some((read(&file)?, file))) else {
+                return Err(unknown);
+            };
+            if kind == "srv" {
+                self.registry.add_service(name, &text)?;
+            } else {
+                self.registry.add(name, &text)?;
+            }
+            info!(definition = %name, file = %file.display(), "definition read");
         }
-        self.registry.get(name)
+        ask(&self.registry)
     }
+}
+
+/// A definition that is not known yet.
+#[derive(Debug, Clone, Copy)]
+pub struct Wanted<'a> {
+    /// Package and name.
+    pub name: &'a TypeName,
+    /// `msg` or `srv`: the folder in its package, and the ending of the file's name.
+    pub kind: &'static str,
 }
 
 fn read(file: &Path) -> Option<String> {

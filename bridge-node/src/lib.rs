@@ -15,8 +15,9 @@ mod run;
 mod status;
 
 pub use arguments::Arguments;
+pub use bridge_core::{Kept, PublisherKey};
 pub use clock::{now, timestamp};
-pub use definitions::Definitions;
+pub use definitions::{Definitions, Wanted};
 pub use exit::{Failure, FailureKind};
 pub use logging::LogFormat;
 pub use port::{Delivery, Port, PortEvent};

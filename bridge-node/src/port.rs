@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use bridge_core::{Kept, PublisherKey};
 use bytes::Bytes;
 use mappings::TopicId;
 use messages::{MessageType, Selection};
@@ -33,6 +34,12 @@ pub trait Port: Send + 'static {
     /// The writer of a topic of another space fell silent past its receive timeout, or speaks again.
     fn silent(&mut self, topic: TopicId, silent: bool);
 
+    /// Of the values a topic has side by side, one is no longer there for who comes late: the one delivered with that
+    /// [`instance`](Delivery::instance). Nothing to do for a side that keeps the last value only.
+    fn retired(&mut self, topic: TopicId, instance: Timestamp) {
+        let _one_value = (topic, instance);
+    }
+
     /// Withdraws every registration and ends. Bounded by 2 s.
     fn shutdown(self) -> impl Future<Output = ()> + Send;
 }
@@ -48,6 +55,10 @@ pub struct Delivery {
     pub source: Option<Timestamp>,
     /// The DataSetMessage Status: the upper 16 bits of an OPC UA StatusCode, 0 for Good.
     pub status: u16,
+    /// `source`, where it tells this value from all others of the topic.
+    pub instance: Option<Timestamp>,
+    /// What the value is to the others of its topic.
+    pub kept: Kept,
 }
 
 /// What a port reports.
@@ -70,6 +81,16 @@ pub enum PortEvent {
         payload: Bytes,
         /// When it came.
         received: Timestamp,
+        /// Who published it, if that publisher latches: the same for as long as it is there, and for no other of the
+        /// topic.
+        latched_by: Option<PublisherKey>,
+    },
+    /// A latched publisher has gone for good: its last message is not for late joiners any more.
+    Left {
+        /// Which value.
+        topic: TopicId,
+        /// What its samples were reported under.
+        publisher: PublisherKey,
     },
     /// A topic of our own space has a producer now, or has none any more.
     Live {
@@ -86,6 +107,13 @@ pub enum PortEvent {
         why: &'static str,
         /// How many.
         count: u64,
+    },
+    /// A value could not be handed to the service it is for, or no service answered with it.
+    CallFailed {
+        /// Which value.
+        topic: TopicId,
+        /// What went wrong, for the log.
+        detail: String,
     },
     /// The port cannot go on, such as a ROS 1 node that was told to shut down because another took its name. The
     /// program ends with this message.

@@ -3,7 +3,7 @@
 use std::io;
 use std::time::Duration;
 
-use bridge_core::{Notice, Output, Reason, Router};
+use bridge_core::{Heard, Notice, Output, Reason, Router};
 use bytes::Bytes;
 use mappings::SpaceId;
 use tokio::time::{Instant as TokioInstant, Sleep};
@@ -95,9 +95,16 @@ impl<P: Port> Shell<P> {
                 topic,
                 payload,
                 received,
+                latched_by,
             } => {
+                let heard = Heard {
+                    topic,
+                    payload: &payload,
+                    received,
+                    latched_by,
+                };
                 // Counted by the router, whatever it is.
-                let _verdict = self.router.handle_local(topic, &payload, received, now());
+                let _verdict = self.router.handle_local(heard, now());
             }
             PortEvent::Bound {
                 topic,
@@ -107,8 +114,10 @@ impl<P: Port> Shell<P> {
                 Ok(()) => info!(%topic, message_type = %message_type.name(), "bound"),
                 Err(error) => warn!(%topic, %error, "the topic cannot cross"),
             },
+            PortEvent::Left { topic, publisher } => self.router.left(topic, publisher),
             PortEvent::Live { topic, live } => self.router.set_live(topic, live, now()),
             PortEvent::Lost { topic, why, count } => self.router.lost(topic, count, why),
+            PortEvent::CallFailed { topic, detail } => self.router.call_failed(topic, &detail),
             PortEvent::Ended(why) => return Err(Failure::new(FailureKind::Unavailable, why)),
         }
         Ok(())
@@ -125,13 +134,14 @@ impl<P: Port> Shell<P> {
                     };
                     if let Err(error) = sent {
                         self.router
-                            .failed(topic, not_sent(error), &error.to_string());
+                            .not_sent(topic, not_sent(error), &error.to_string());
                     }
                     self.router.recycle(bytes);
                 }
                 Output::Delivery(delivery) => self.deliver(delivery),
                 Output::Unbound { topic, shape } => self.port.wanted(topic, &shape),
                 Output::Silent { topic, silent } => self.port.silent(topic, silent),
+                Output::Retired { topic, instance } => self.port.retired(topic, instance),
                 Output::Notice(notice) => tell(&notice),
                 other => debug!(?other, "an output this program does not know"),
             }
@@ -145,6 +155,8 @@ impl<P: Port> Shell<P> {
             source,
             status,
             arrived,
+            instance,
+            kept,
         } = delivery;
         if self.dry_run {
             self.router.recycle(payload);
@@ -155,10 +167,12 @@ impl<P: Port> Shell<P> {
             payload: Bytes::from(payload),
             source,
             status,
+            instance,
+            kept,
         };
         match self.port.publish(sample) {
             Ok(()) => self.router.published(arrived, now()),
-            Err(why) => self.router.failed(topic, Reason::NotPublished, why),
+            Err(why) => self.router.not_published(topic, instance, why),
         }
     }
 }

@@ -4,7 +4,12 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use messages::{DefinitionError, Dialect, MessageType, NameError, TypeName};
+use bridge_node::Wanted;
+use bytes::Bytes;
+use messages::{
+    DefinitionError, Dialect, MessageType, NameError, NoFields, Plan, Selection, ServiceType,
+    TypeName, Wire,
+};
 use tcpros::ConnectionHeader;
 use uadp::BuiltinType;
 
@@ -69,12 +74,13 @@ impl Definitions {
     /// The type of that name with all it needs. One that is not known yet is looked for in the packages.
     pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
         let packages = &self.packages;
-        self.known.find(name, |missing| {
-            let mut budget = MAX_FOLDERS;
-            packages
-                .iter()
-                .find_map(|root| find_below(root, missing, MAX_DEPTH, &mut budget))
-        })
+        self.known.find(name, |file| locate(packages, file))
+    }
+
+    /// The service of that name, looked for likewise.
+    pub(crate) fn service(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
+        let packages = &self.packages;
+        self.known.find_service(name, |file| locate(packages, file))
     }
 
     /// The ROS type that carries one value of that type, and nothing else.
@@ -98,11 +104,25 @@ pub(crate) enum Unusable {
     },
 }
 
-/// `<package>/msg/<Name>.msg` at or below a folder. Packages lie flat in an installation and nested in a workspace.
-fn find_below(folder: &Path, name: &TypeName, depth: usize, budget: &mut usize) -> Option<PathBuf> {
+fn locate(packages: &[PathBuf], file: Wanted<'_>) -> Option<PathBuf> {
+    let mut budget = MAX_FOLDERS;
+    packages
+        .iter()
+        .find_map(|root| find_below(root, file, MAX_DEPTH, &mut budget))
+}
+
+/// `<package>/msg/<Name>.msg`, or `srv`, at or below a folder. Packages lie flat in an installation and nested in a
+/// workspace.
+fn find_below(
+    folder: &Path,
+    file: Wanted<'_>,
+    depth: usize,
+    budget: &mut usize,
+) -> Option<PathBuf> {
     *budget = budget.checked_sub(1)?;
+    let Wanted { name, kind } = file;
     // Neither part of a type name can hold a separator or a dot.
-    let message = Path::new("msg").join(format!("{}.msg", name.name()));
+    let message = Path::new(kind).join(format!("{}.{kind}", name.name()));
     let flat = folder.join(name.package()).join(&message);
     if flat.is_file() {
         return Some(flat);
@@ -132,7 +152,20 @@ fn find_below(folder: &Path, name: &TypeName, depth: usize, budget: &mut usize) 
     below.sort();
     below
         .into_iter()
-        .find_map(|folder| find_below(&folder, name, depth - 1, budget))
+        .find_map(|folder| find_below(&folder, file, depth - 1, budget))
+}
+
+/// The message of a template without a value in it.
+pub(crate) fn constant(
+    message_type: &Arc<MessageType>,
+    template: &Selection,
+) -> Result<Bytes, String> {
+    let plan =
+        Plan::compile(message_type, template, Wire::Ros1).map_err(|error| error.to_string())?;
+    let mut bytes = Vec::new();
+    plan.write(&mut NoFields, &mut bytes)
+        .map_err(|error| error.to_string())?;
+    Ok(bytes.into())
 }
 
 /// The checksum of a definition without fields, such as std_msgs/Empty.

@@ -8,7 +8,7 @@ use bridge_node::{Arguments, Context, Failure, FailureKind, Program};
 use bridge_ros1::{PortOptions, Ros1Port};
 use clap::{ArgMatches, Command, CommandFactory, FromArgMatches, Parser};
 use mappings::{Mapping, SpaceId};
-use tcpros::{NodeError, NodeOptions};
+use tcpros::{ArgumentError, NodeError, NodeOptions};
 use tracing::warn;
 
 fn main() -> ExitCode {
@@ -26,7 +26,7 @@ struct BridgeRos1 {
 /// Carries topics between a ROS 1 graph and the space of OPC UA PubSub.
 ///
 /// The ROS master is found by ROS_MASTER_URI, and this node by ROS_HOSTNAME or ROS_IP. Remappings such as `from:=to`
-/// and `__name:=bridge` are taken as every ROS node does.
+/// and `__name:=bridge` and private parameters such as `_rate:=5` are taken as every ROS node does.
 #[derive(Debug, Parser)]
 #[command(name = "bridge-ros1", version)]
 struct Flags {
@@ -51,17 +51,12 @@ impl BridgeRos1 {
         })
     }
 
-    fn node_options(&self) -> NodeOptions {
+    fn node_options(&self) -> Result<NodeOptions, ArgumentError> {
         let mut options = NodeOptions::from_env(NODE_NAME);
-        let unknown = options.apply_arguments(&self.words);
-        // `roslaunch` adds `__log:=`, which names a file for a log we write to stderr.
-        for word in unknown.iter().filter(|word| !word.starts_with("__log:=")) {
-            warn!(
-                word,
-                "not a word this program knows: it has no private parameters"
-            );
+        for word in options.apply_arguments(&self.words)? {
+            warn!(word, "not a word that ROS gives a meaning to: ignored");
         }
-        options
+        Ok(options)
     }
 }
 
@@ -104,7 +99,9 @@ impl Program for BridgeRos1 {
 
     async fn start(self, context: Context) -> Result<Ros1Port, Failure> {
         let options = PortOptions {
-            node: self.node_options(),
+            node: self
+                .node_options()
+                .map_err(|error| Failure::new(FailureKind::Usage, error.to_string()))?,
             own: context.own,
             mapping: context.mapping,
             packages: std::env::var_os("ROS_PACKAGE_PATH")
@@ -141,17 +138,30 @@ mod tests {
 
     #[test]
     fn words_of_roslaunch_may_stand_anywhere() {
-        let program = parsed(&["__name:=cell", "map.yaml", "/a:=/b", "__log:=/tmp/x.log"]);
+        let program = parsed(&[
+            "__name:=cell",
+            "map.yaml",
+            "/a:=/b",
+            "_rate:=5",
+            "__log:=/tmp/x.log",
+        ]);
         assert_eq!(program.arguments().mapping, Some(PathBuf::from("map.yaml")));
-        let options = program.node_options();
+        let options = program.node_options().unwrap();
         assert_eq!(options.name, "cell");
         assert_eq!(options.remappings, [("/a".to_owned(), "/b".to_owned())]);
+        assert_eq!(options.parameters, [("rate".to_owned(), 5.into())]);
+    }
+
+    #[test]
+    fn a_word_that_remaps_no_name_is_refused() {
+        let refused = parsed(&["/a:=1b"]).node_options().unwrap_err();
+        assert_eq!(refused.word(), "/a:=1b");
     }
 
     #[test]
     fn without_words_the_node_has_its_own_name() {
         let program = parsed(&[]);
-        assert_eq!(program.node_options().name, NODE_NAME);
+        assert_eq!(program.node_options().unwrap().name, NODE_NAME);
         assert_eq!(program.own(&Mapping::default()), Ok(SpaceId::ROS1));
     }
 }

@@ -6,15 +6,15 @@ use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use bridge_node::{Delivery, Port, PortEvent, timestamp};
+use bridge_node::{Delivery, Kept, Port, PortEvent, timestamp};
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{MessageType, Selection, TypeName};
 use tcpros::{
-    Graph, Inbox, InboxEvent, Message, Node, NodeError, NodeOptions, Peer, SubscriberOptions,
-    TopicType, Wanted,
+    Graph, Inbox, InboxEvent, Latched, Message, Node, NodeError, NodeOptions, Peer,
+    SubscriberOptions, TopicType, Wanted,
 };
 use tracing::{info, warn};
-use uadp::BuiltinType;
+use uadp::{BuiltinType, Timestamp};
 
 use crate::definitions::Definitions;
 use crate::sink::{Open, Sink};
@@ -181,16 +181,17 @@ impl Ros1Port {
             return;
         }
         let received = timestamp(received);
-        let values = self
-            .sources
-            .get(index)
-            .map_or(&[][..], |source| &source.values);
-        for (topic, _) in values {
+        let Some(source) = self.sources.get_mut(index) else {
+            return;
+        };
+        let latched_by = source.latched_by(&peer);
+        for (topic, _) in &source.values {
             let payload = bytes.clone();
             self.events.push_back(PortEvent::Sample {
                 topic: *topic,
                 payload,
                 received,
+                latched_by,
             });
         }
     }
@@ -304,6 +305,16 @@ impl Ros1Port {
         if let Some(graph) = graph {
             self.graph = graph;
             self.find_sources();
+        }
+        for source in &mut self.sources {
+            let named = self.graph.publishers.get(&source.ros_topic);
+            for publisher in source.gone_for_good(named.map_or(&[], Vec::as_slice)) {
+                let values = source.values.iter();
+                self.events.extend(values.map(|(topic, _)| PortEvent::Left {
+                    topic: *topic,
+                    publisher,
+                }));
+            }
         }
         let topics: Vec<TopicId> = self.sinks.keys().copied().collect();
         for topic in topics {
@@ -480,8 +491,17 @@ impl Port for Ros1Port {
         else {
             return Err("no publisher yet");
         };
+        let key = sample.instance.map_or(0, latch_key);
+        let latched = match sample.kept {
+            Kept::Alone => Latched::Alone(key),
+            Kept::Beside => Latched::Beside(key),
+            Kept::Again => {
+                open.publisher.latch(key, sample.payload);
+                return Ok(());
+            }
+        };
         // What slow subscribers lose by it is reported with the next look at the graph.
-        let _published = open.publisher.publish(sample.payload);
+        let _published = open.publisher.publish_latched(sample.payload, latched);
         Ok(())
     }
 
@@ -518,6 +538,15 @@ impl Port for Ros1Port {
         tracing::debug!(%topic, silent, "the writer in the space");
     }
 
+    fn retired(&mut self, topic: TopicId, instance: Timestamp) {
+        if let Some(Sink {
+            open: Some(open), ..
+        }) = self.sinks.get(&topic)
+        {
+            open.publisher.forget_latched(latch_key(instance));
+        }
+    }
+
     async fn shutdown(self) {
         let Self {
             node,
@@ -530,6 +559,11 @@ impl Port for Ros1Port {
         node.shutdown().await;
         drop((sinks, sources));
     }
+}
+
+/// Values that are latched side by side are known by when they were taken, and stand in this order.
+fn latch_key(instance: Timestamp) -> u64 {
+    u64::try_from(instance.unix_nanos()).unwrap_or_default()
 }
 
 /// The severity bit of a Bad StatusCode (OPC 10000-4, 7.39.1) in its upper 16 bits.

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use bridge_node::PublisherKey;
 use mappings::TopicId;
 use messages::{MessageType, Selection, TypeName};
 use tcpros::{Peer, Subscription};
@@ -22,6 +23,19 @@ pub(crate) struct Source {
     peers: Vec<Arc<Peer>>,
     /// Connected publishers of another, whose messages cannot be read.
     strangers: Vec<Arc<Peer>>,
+    /// Publishers that latch and have sent something, also while they are not connected.
+    latched: Vec<LatchedPeer>,
+    /// The key for the next of them.
+    next_key: u32,
+}
+
+/// A publisher that latches.
+#[derive(Debug)]
+struct LatchedPeer {
+    caller_id: String,
+    key: PublisherKey,
+    /// How often the graph was looked at since its connection ended.
+    looks: u32,
 }
 
 impl Source {
@@ -38,7 +52,45 @@ impl Source {
             bound: None,
             peers: Vec::new(),
             strangers: Vec::new(),
+            latched: Vec::new(),
+            next_key: 0,
         }
+    }
+
+    /// What a publisher is called to the Router, if it latches. It keeps that name over a lost connection.
+    pub(crate) fn latched_by(&mut self, peer: &Peer) -> Option<PublisherKey> {
+        if !peer.header.latching() {
+            return None;
+        }
+        let known = self.latched.iter().find(|l| l.caller_id == peer.caller_id);
+        if let Some(known) = known {
+            return Some(known.key);
+        }
+        let key = PublisherKey(self.next_key);
+        self.next_key = self.next_key.wrapping_add(1);
+        self.latched.push(LatchedPeer {
+            caller_id: peer.caller_id.clone(),
+            key,
+            looks: 0,
+        });
+        Some(key)
+    }
+
+    /// The latched publishers that are not connected and will not be again: the master no longer names them, or their
+    /// connection has been gone for [`MAX_LOOKS`] looks at the graph. To be asked with each.
+    pub(crate) fn gone_for_good(&mut self, named: &[String]) -> Vec<PublisherKey> {
+        let peers = &self.peers;
+        self.latched
+            .extract_if(.., |latched| {
+                if peers.iter().any(|peer| peer.caller_id == latched.caller_id) {
+                    latched.looks = 0;
+                    return false;
+                }
+                latched.looks += 1;
+                latched.looks > MAX_LOOKS || !named.contains(&latched.caller_id)
+            })
+            .map(|latched| latched.key)
+            .collect()
     }
 
     /// Whether messages of a publisher can be read; `None` when it has not been met.
@@ -92,6 +144,9 @@ impl Source {
         !self.peers.is_empty()
     }
 }
+
+/// About ten seconds: a publisher that died without a word to the master is not waited for any longer.
+const MAX_LOOKS: u32 = 20;
 
 /// What a publisher is to a source.
 #[derive(Debug)]
@@ -167,6 +222,36 @@ mod tests {
             source.meet(&second, of("std_msgs/String")),
             Met::Bound(_)
         ));
+    }
+
+    fn latching(name: &str) -> Arc<Peer> {
+        Arc::new(Peer {
+            caller_id: name.to_owned(),
+            header: ConnectionHeader::default().with("latching", "1"),
+        })
+    }
+
+    #[test]
+    fn a_latched_publisher_is_gone_when_neither_connected_nor_named() {
+        let mut source = source(None);
+        assert_eq!(source.latched_by(&peer()), None, "it does not latch");
+        let (a, b) = (latching("/a"), latching("/b"));
+        source.meet(&a, of("std_msgs/Bool"));
+        source.meet(&b, of("std_msgs/Bool"));
+        let keys = [&a, &b].map(|peer| source.latched_by(peer).unwrap());
+        assert_ne!(keys[0], keys[1]);
+        assert_eq!(source.gone_for_good(&[]), [], "both are connected");
+        source.part(&a, 1);
+        let named = ["/a".to_owned(), "/b".to_owned()];
+        assert_eq!(source.gone_for_good(&named), [], "it may come back");
+        let back = latching("/a");
+        source.meet(&back, of("std_msgs/Bool"));
+        assert_eq!(source.latched_by(&back), Some(keys[0]));
+        source.part(&back, 1);
+        assert_eq!(source.gone_for_good(&named[1..]), [keys[0]]);
+        source.part(&b, 0);
+        let looks = (0..100).position(|_| source.gone_for_good(&named) == [keys[1]]);
+        assert_eq!(looks, Some(20), "it died without a word to the master");
     }
 
     #[test]

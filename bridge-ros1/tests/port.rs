@@ -7,7 +7,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Delivery, Port, PortEvent};
+use bridge_node::{Delivery, Kept, Port, PortEvent};
 use bridge_ros1::{PortOptions, Ros1Port};
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
@@ -120,6 +120,8 @@ fn delivery(topic: &str, payload: &'static [u8]) -> Delivery {
         payload,
         source: None,
         status: 0,
+        instance: None,
+        kept: Kept::Alone,
     }
 }
 
@@ -134,6 +136,8 @@ fn line(event: &PortEvent) -> String {
             let field = match selection {
                 Selection::Whole => "whole",
                 Selection::Field(field) => field,
+                Selection::Bytes => "bytes",
+                Selection::Template { .. } => "template",
             };
             format!("{topic} is {} {field}", message_type.name())
         }
@@ -275,6 +279,8 @@ async fn a_value_of_another_space_appears_under_its_mapped_topic_and_is_latched(
     assert_eq!(got.peer.caller_id, "/bridge");
     let bad = Delivery {
         status: 0x8000,
+        instance: None,
+        kept: Kept::Alone,
         ..delivery("ua_2_2_3", b"\x00")
     };
     assert_eq!(port.publish(bad), Err("bad status"));

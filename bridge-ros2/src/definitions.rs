@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use bridge_node::Wanted;
 use messages::{DefinitionError, Dialect, MessageType, TypeName};
 use uadp::BuiltinType;
 
@@ -29,12 +30,12 @@ impl Definitions {
     /// [`DefinitionError`].
     pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
         let prefixes = &self.prefixes;
-        self.known.find(name, |missing| {
+        self.known.find(name, |Wanted { name, kind }| {
             // Neither part of a type name can hold a separator or a dot.
             let file = PathBuf::from("share")
-                .join(missing.package())
-                .join("msg")
-                .join(format!("{}.msg", missing.name()));
+                .join(name.package())
+                .join(kind)
+                .join(format!("{}.{kind}", name.name()));
             prefixes
                 .iter()
                 .map(|prefix| prefix.join(&file))

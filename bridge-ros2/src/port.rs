@@ -13,7 +13,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use bridge_node::{Delivery, Port, PortEvent, now};
+use bridge_node::{Delivery, Kept, Port, PortEvent, now};
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::TypeName;
@@ -176,7 +176,7 @@ impl Ros2Port {
                 writer,
                 missing,
             } => {
-                let Some(source) = self.sources.get(key) else {
+                let Some(source) = self.sources.get_mut(key) else {
                     return;
                 };
                 // Our own publication, which RustDDS hands to our own reader as well.
@@ -185,6 +185,11 @@ impl Ros2Port {
                 }
                 let received = now().utc;
                 let stranger = source.strangers.contains(&writer);
+                let latched_by = if stranger {
+                    None
+                } else {
+                    source.latched_by(writer)
+                };
                 let payload = payload.into_bytes();
                 for (topic, _) in &source.values {
                     let topic = *topic;
@@ -199,6 +204,7 @@ impl Ros2Port {
                             topic,
                             payload: payload.clone(),
                             received,
+                            latched_by,
                         }
                     });
                 }
@@ -266,7 +272,13 @@ impl Port for Ros2Port {
             payload,
             source,
             status,
+            kept,
+            ..
         } = sample;
+        if kept == Kept::Again {
+            // A writer of depth 1 has no place for more than the last value.
+            return Ok(());
+        }
         if status & STATUS_BAD != 0 {
             return Err("bad status");
         }

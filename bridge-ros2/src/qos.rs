@@ -19,6 +19,11 @@ pub struct Requested {
 }
 
 impl Requested {
+    /// Whether what was written before counts as well.
+    pub(crate) const fn is_transient_local(self) -> bool {
+        self.transient_local
+    }
+
     /// The most that every one of `writers` offers.
     #[must_use]
     pub fn from_writers(writers: &[Endpoint]) -> Self {

@@ -1,7 +1,8 @@
 //! A topic of the domain whose values are ours to send out.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
+use bridge_node::PublisherKey;
 use mappings::TopicId;
 use messages::{Selection, TypeName};
 use rustdds::{GUID, RTPSEntity};
@@ -22,6 +23,10 @@ pub(crate) struct Source {
     pub(crate) live: bool,
     /// Writers of this topic with another type. RustDDS matches by topic name alone, so their samples come too.
     pub(crate) strangers: BTreeSet<GUID>,
+    /// Transient-local writers that have sent something.
+    latched: BTreeMap<GUID, PublisherKey>,
+    /// The key for the next of them.
+    next_key: u32,
 }
 
 /// What there is of a reader.
@@ -42,7 +47,36 @@ impl Source {
             reading: Reading::Pending,
             live: false,
             strangers: BTreeSet::new(),
+            latched: BTreeMap::new(),
+            next_key: 0,
         }
+    }
+
+    /// What a writer is called to the Router, if all writers of the topic are transient-local.
+    pub(crate) fn latched_by(&mut self, writer: GUID) -> Option<PublisherKey> {
+        let Reading::Open { requested, .. } = self.reading else {
+            return None;
+        };
+        if !requested.is_transient_local() {
+            return None;
+        }
+        let next_key = &mut self.next_key;
+        let key = self.latched.entry(writer).or_insert_with(|| {
+            let key = PublisherKey(*next_key);
+            *next_key = next_key.wrapping_add(1);
+            key
+        });
+        Some(*key)
+    }
+
+    /// The transient-local writers that have gone; `writers` are there.
+    pub(crate) fn gone(&mut self, writers: &[Endpoint]) -> Vec<PublisherKey> {
+        self.latched
+            .extract_if(.., |guid, _| {
+                writers.iter().all(|writer| writer.guid != *guid)
+            })
+            .map(|(_, key)| key)
+            .collect()
     }
 
     /// Sorts the writers the topic has by now into ours and strangers; returns ours.

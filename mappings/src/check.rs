@@ -4,6 +4,8 @@ mod bindings;
 mod cell;
 mod names;
 mod network;
+mod patterns;
+mod services;
 mod types;
 mod variables;
 
@@ -91,13 +93,15 @@ fn compile(text: &str, findings: &mut Findings) -> Option<Mapping> {
         }
         None => Vec::new(),
     };
-    Some(Mapping::new(
-        pubsub,
-        spaces.known,
-        namespaces.known,
-        server,
-        variables,
-    ))
+    let patterns = match &document.patterns {
+        Some(entries) => {
+            let entries = entries.value.as_deref().unwrap_or_default();
+            patterns::check(entries, &spaces, &namespaces, findings)
+        }
+        None => Vec::new(),
+    };
+    let mapping = Mapping::new(pubsub, spaces.known, namespaces.known, server, variables);
+    Some(mapping.with_patterns(patterns))
 }
 
 /// What a document declares.

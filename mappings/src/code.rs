@@ -70,6 +70,15 @@ codes! {
     ReadAndWritten = "M069", "One ROS topic is read for one variable and written for another: what is written would come back under the other name.";
     TopicTypesDiffer = "M070", "One ROS topic is bound with two message types.";
     OpcUaBinding = "M071", "Space 0 is the OPC UA side and has no ROS topics.";
+    FieldOfBytes = "M072", "A message bound `as: bytes` crosses as it is, so no field of it can be named.";
+    BindingKind = "M073", "A ROS binding has exactly one of `topic`, `call`, `answer` and `poll`, and beside it only the keys that go with it.";
+    ServiceSpace = "M074", "Services of the ROS 1 space are bound, not of ROS 2 spaces. `call` takes values from other spaces; what `answer` and `poll` bring is produced in the space of the service, its origin.";
+    UnknownServiceType = "M075", "No definition of the service type is built in. The connection to a service does not carry it, so a package with the .srv file must be below one of the folders of ROS_PACKAGE_PATH when the bridge runs.";
+    RequestConstant = "M076", "A constant of a request is a value of its field: the field exists, is given once, does not take the value too, and the value is of its type and range.";
+    Answer = "M077", "`answer` names the node of a variable that has a `call`; its value is what that service answers.";
+    When = "M078", "`when` is a value of the variable's type, and goes with a `call` that has no `field`: with one, each value is sent.";
+    TopicPattern = "M079", "A pattern of topics is a topic name in which `*` stands for one or more characters of a part, and at most one part `**` for any number of parts.";
+    PatternCapture = "M080", "`{1}` in the `node`, `alias` or `name` of a pattern stands for what its first wildcard does, and so on. Node and alias have one, or all topics would be one node.";
 }
 
 impl fmt::Display for Code {
@@ -92,7 +101,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M071")]
+#[error("no finding has that code; codes are M001 to M080")]
 pub struct UnknownCode;
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use messages::Literal;
 use schemars::JsonSchema;
 
 use crate::code::Code;
@@ -23,6 +24,9 @@ document! {
         namespaces: Namespaces,
         /// The values of the cell, at most 20 000.
         variables: Vec<At<VariableEntry>>,
+        /// Topics that become values as they appear, at most 1000; the first that fits counts, and an entry of `variables`
+        /// with the same topic before all.
+        patterns: Vec<At<PatternEntry>>,
     }
 
     /// One ROS side.
@@ -60,6 +64,13 @@ document! {
         /// A writer silent for this long counts as gone; default 3s, and longer than `keep_alive_period`.
         #[schemars(regex(pattern = DURATION))]
         receive_timeout: String,
+        /// Bytes of the largest datagram sent, 512 to 65507 (the default); larger NetworkMessages go in chunks of it. 1472 fits
+        /// an Ethernet frame.
+        #[schemars(range(min = 512, max = 65507))]
+        max_datagram: u16,
+        /// MiB of the largest message sent or put together from chunks, 1 to 1024; default 64.
+        #[schemars(range(min = 1, max = 1024))]
+        max_message: u16,
     }
 
     /// The OPC UA server of the cell.
@@ -90,25 +101,84 @@ document! {
         /// 0. In the topic names of nodes of namespace 0 the namespace is 65535.
         #[schemars(range(min = 1, max = 65535))]
         alias: u16,
-        /// The ROS topics tied to the value, one or a list, at most one per space. In the space of its origin the topic is
-        /// read, elsewhere it is written. Without any, the topic is named after the space: /ua_1_2_10.
+        /// The ROS topics and services tied to the value, one or a list, at most one per space. In the space of its origin
+        /// the topic is read, elsewhere it is written. Without any, the topic is named after the space: /ua_1_2_10.
         ros: Bindings,
-        /// What its queue does when full: `keep_latest` (the default, for states) or `{drop_oldest: 100}` (for events).
+        /// What its queue does when full: `keep_latest` (the default, for states) or `{drop_oldest: 100}` (for events). Of
+        /// values that call a service, `keep_latest` tries the newest until it is taken or replaced, `drop_oldest` each
+        /// once within its `timeout`.
         queue: Queue,
     }
 
-    /// A ROS topic tied to a value.
+    /// ROS topics that become values as they appear.
+    struct PatternEntry {
+        /// The topics, as /robot*/joint_states: `*` stands for one or more characters of a part between slashes, a part `**`
+        /// for any number of parts.
+        #[schemars(required, regex(pattern = r"^/.*\*"))]
+        topics: String,
+        /// Topics left out, patterns too, as [/robot9/**].
+        exclude: Vec<At<String>>,
+        /// The ROS space of the topics.
+        #[schemars(required, range(min = 1, max = 232))]
+        origin: u16,
+        /// The OPC UA node of each, as ns=2;i=10{1}: {1} is what the first wildcard stands for, {2} the second. A topic whose
+        /// number would not be one from 1 to 65535 is left out, with a word in the log.
+        #[schemars(required, regex(pattern = r"^ns=[0-9]+;[isgb]="))]
+        node: String,
+        /// Name of the node, as Robot{1}Joints.
+        #[schemars(required, length(min = 1))]
+        name: String,
+        /// Stands for the identifier in topic names when the node id is no number, as 10{1}.
+        alias: String,
+        /// Message type, as sensor_msgs/JointState: topics of another type are left out. Left out: any.
+        r#type: String,
+        /// The field that holds the value. Left out: the whole message, a field per leaf.
+        field: String,
+        /// How the messages cross: `fields` (the default) as OPC UA values, `bytes` as they are, one ByteString each.
+        r#as: AsEntry,
+    }
+
+    /// A ROS topic or service tied to a value: exactly one of `topic`, `call`, `answer` and `poll`.
     struct BindingEntry {
         /// Whose topic it is. Left out: the origin of the value.
         #[schemars(range(min = 1, max = 232))]
         space: u16,
         /// Absolute topic name, as /conveyor/running.
-        #[schemars(required, regex(pattern = "^/"))]
+        #[schemars(regex(pattern = "^/"))]
         topic: String,
-        /// Message type, as std_msgs/Bool. Left out: the std_msgs type of the variable's `type`.
+        /// Absolute name of a ROS 1 service that is called with each value that arrives from another space: the value
+        /// stands in `field` of the request. Without `field` the request is the same each time, and `when` says which
+        /// values call.
+        #[schemars(regex(pattern = "^/"))]
+        call: String,
+        /// Node of the variable with a `call`, as ns=2;i=20: the value is what that service answers to its calls, one field
+        /// of the response or all.
+        #[schemars(regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
+        answer: String,
+        /// Absolute name of a ROS 1 service that is called `every` so often with `request`: the value is what it answers,
+        /// one field of the response or all.
+        #[schemars(regex(pattern = "^/"))]
+        poll: String,
+        /// Message type, as std_msgs/Bool. Left out: the std_msgs type of the variable's `type`. With `call` and `poll` the
+        /// service type, as std_srvs/SetBool, which is never left out.
         r#type: String,
         /// The field that holds the value, as data or pose.position.x. Left out: the whole message, a field per leaf.
         field: String,
+        /// With `call` and `poll`: fields of the request that stay the same, as {id: 12, pose: {x: 1.5}} or
+        /// {pose.x: 1.5}; the name of a constant of the request stands for its value. All others are zero or empty.
+        request: Request,
+        /// With `call` and without `field`: the value that calls the service. Default: true for a Boolean, any value else.
+        when: String,
+        /// With `call` and `poll`: how long the service may take; default 5s.
+        #[schemars(regex(pattern = DURATION))]
+        timeout: String,
+        /// With `poll`: how often the service is called; default 1s.
+        #[schemars(regex(pattern = DURATION))]
+        every: String,
+        /// How the message crosses: `fields` (the default) as OPC UA values, `bytes` as it is, one ByteString that only a
+        /// reader who knows the message type can read. For messages too big or too deep to be of use as values, as
+        /// images; not together with `field`.
+        r#as: AsEntry,
     }
 }
 
@@ -118,6 +188,13 @@ choice! {
         Exact = "exact",
         /// The number in any unsigned integer type.
         AnyWidth = "any_width",
+    }
+
+    enum AsEntry {
+        /// A value per field.
+        Fields = "fields",
+        /// The message as it is, one ByteString.
+        Bytes = "bytes",
     }
 
     enum SecurityEntry {
@@ -158,6 +235,68 @@ impl Read for Namespaces {
             )
         });
         Some(read.collect())
+    }
+}
+
+/// Constants of a request: path of the field, where it is said, and the value.
+#[derive(Clone, Debug)]
+pub(crate) struct Request(pub(crate) Vec<(String, Place, Literal)>);
+
+impl Read for Request {
+    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+        let mut found = Vec::new();
+        constants(node, "", reader, &mut found)?;
+        Some(Self(found))
+    }
+}
+
+/// `None` after noting what is faulty. Maps nest no deeper than documents do.
+fn constants(
+    node: &Node,
+    prefix: &str,
+    reader: &mut Reader<'_>,
+    found: &mut Vec<(String, Place, Literal)>,
+) -> Option<()> {
+    let mut sound = Some(());
+    for pair in reader.pairs(node, "a map of field and value")? {
+        let path = format!("{prefix}{}", pair.key);
+        let literal = match &pair.value.kind {
+            Kind::Map(_) => {
+                let inner = constants(pair.value, &format!("{path}."), reader, found);
+                sound = sound.and(inner);
+                continue;
+            }
+            Kind::Scalar(text) => Some(Literal::One(text.clone())),
+            Kind::List(items) => {
+                let texts = items
+                    .iter()
+                    .map(|item| reader.text(item, "a single value").map(str::to_owned));
+                texts.collect::<Option<_>>().map(Literal::List)
+            }
+            Kind::Null => {
+                reader.wrong(pair.value, "a value, a list or a map");
+                None
+            }
+        };
+        match literal {
+            Some(literal) => found.push((path, pair.place, literal)),
+            None => sound = None,
+        }
+    }
+    sound
+}
+
+impl JsonSchema for Request {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "Request".into()
+    }
+
+    fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        schemars::json_schema!({ "type": "object" })
     }
 }
 
@@ -262,6 +401,7 @@ pub(crate) fn read(root: &Node, reader: &mut Reader<'_>) -> Option<(Document, Pl
             server: None,
             namespaces: None,
             variables: None,
+            patterns: None,
         };
         return Some((document, root.place));
     }

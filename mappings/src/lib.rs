@@ -8,6 +8,7 @@ mod findings;
 mod mapping;
 mod nearest;
 mod node_id;
+mod pattern;
 mod read;
 mod topic;
 mod tree;
@@ -17,8 +18,9 @@ pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use document::schema;
 pub use mapping::{
-    Binding, Endpoint, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, Server, Space,
-    Variable,
+    Binding, Endpoint, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, Server,
+    ServiceBinding, ServiceRole, Space, Trigger, Variable,
 };
 pub use node_id::{Identifier, NodeIdError, NodeIdText};
+pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use topic::{Part, SpaceId, TopicError, TopicId};

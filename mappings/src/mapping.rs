@@ -6,9 +6,10 @@ use std::num::NonZeroU16;
 use std::time::Duration;
 
 use messages::{Leaf, Selection, TypeName};
-use uadp::BuiltinType;
+use uadp::{BuiltinType, Scalar};
 
 use crate::node_id::NodeIdText;
+use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 use crate::topic::{SpaceId, TopicId};
 
 /// The checked mapping of one cell. Immutable: a changed file makes a new one.
@@ -23,6 +24,7 @@ pub struct Mapping {
     server: Server,
     variables: Vec<Variable>,
     by_topic: HashMap<TopicId, usize>,
+    patterns: Vec<Pattern>,
 }
 
 impl Mapping {
@@ -45,7 +47,53 @@ impl Mapping {
             server,
             variables,
             by_topic,
+            patterns: Vec::new(),
         }
+    }
+
+    pub(crate) fn with_patterns(mut self, patterns: Vec<Pattern>) -> Self {
+        self.patterns = patterns;
+        self
+    }
+
+    /// The rules for topics that are not named, in the order of the document.
+    #[must_use]
+    pub fn patterns(&self) -> &[Pattern] {
+        &self.patterns
+    }
+
+    /// The variable a ROS topic of a space becomes by the first pattern about it. `None` for a topic without a pattern, one
+    /// that a variable is bound to, and the names of the space (`/ua_1_2_10`).
+    ///
+    /// # Errors
+    /// The pattern makes no node of it, or one that a variable of the mapping has. Two topics that become one node are
+    /// the caller's to tell.
+    #[must_use]
+    pub fn matching(
+        &self,
+        space: SpaceId,
+        ros_topic: &str,
+    ) -> Option<Result<PatternVariable, PatternFault>> {
+        let name = ros_topic.strip_prefix('/').unwrap_or(ros_topic);
+        if name.parse::<TopicId>().is_ok()
+            || self.bindings(space).any(|(_, b)| b.ros_topic == ros_topic)
+        {
+            return None;
+        }
+        let patterns = self.patterns.iter().filter(|p| p.origin() == space);
+        let (pattern, made) = patterns
+            .filter_map(|pattern| Some((pattern, pattern.matches(ros_topic)?)))
+            .next()?;
+        Some(made.and_then(|made| {
+            let taken = |v: &&Variable| v.topic == made.topic || v.node == made.node;
+            match self.variables.iter().find(taken) {
+                Some(other) => {
+                    let why = PatternReason::Taken(made.topic, other.name.clone());
+                    Err(pattern.fault(ros_topic, why))
+                }
+                None => Ok(made),
+            }
+        }))
     }
 
     /// How NetworkMessages travel.
@@ -122,6 +170,115 @@ impl Mapping {
             .iter()
             .filter_map(move |v| Some((v, v.binding(space)?)))
     }
+
+    /// Every binding to a service of one space.
+    pub fn services(&self, space: SpaceId) -> impl Iterator<Item = (&Variable, &ServiceBinding)> {
+        self.variables.iter().filter_map(move |v| {
+            let service = v.service.as_ref()?;
+            (service.space == space).then_some((v, service))
+        })
+    }
+}
+
+/// A ROS service tied to a variable.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ServiceBinding {
+    /// Whose ROS graph the service is in; so far [`SpaceId::ROS1`].
+    pub space: SpaceId,
+    /// What is done with it.
+    pub role: ServiceRole,
+}
+
+/// How a service and a variable are tied.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum ServiceRole {
+    /// Values that arrive from other spaces call the service. `space` is not the variable's origin.
+    Call {
+        /// Name of the service, with its leading `/`.
+        service: String,
+        /// The type of the service.
+        service_type: TypeName,
+        /// The request, always [`Selection::Template`]; without a field in it no value crosses.
+        request: Selection,
+        /// Which values call; [`Trigger::Any`] where the request has the value in it.
+        when: Trigger,
+        /// How long the service may take.
+        timeout: Duration,
+    },
+    /// The value is what the service answers to the calls of another variable. `space` is this variable's origin.
+    Answer {
+        /// The variable with the [`ServiceRole::Call`].
+        of: TopicId,
+        /// What of the response is the value.
+        selection: Selection,
+    },
+    /// The value is what the service answers when it is asked regularly. `space` is this variable's origin.
+    Poll {
+        /// Name of the service, with its leading `/`.
+        service: String,
+        /// The type of the service.
+        service_type: TypeName,
+        /// The request, always [`Selection::Template`] without a field.
+        request: Selection,
+        /// What of the response is the value.
+        selection: Selection,
+        /// From call to call.
+        every: Duration,
+        /// How long the service may take.
+        timeout: Duration,
+    },
+}
+
+/// Which values call a service.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Trigger {
+    /// Each one.
+    Any,
+    /// Those equal to the literal.
+    Equals(String),
+}
+
+impl Trigger {
+    /// Whether a value calls.
+    #[must_use]
+    pub fn fires(&self, value: &Scalar<'_>) -> bool {
+        match self {
+            Self::Any => true,
+            Self::Equals(text) => equals(text, value) == Some(true),
+        }
+    }
+}
+
+/// `None` when the text is no value of that type.
+pub(crate) fn equals(text: &str, value: &Scalar<'_>) -> Option<bool> {
+    let whole = |value: i128| text.parse::<i128>().ok().map(|number| number == value);
+    match value {
+        Scalar::Boolean(value) => text.parse::<bool>().ok().map(|said| said == *value),
+        Scalar::SByte(value) => whole(i128::from(*value)),
+        Scalar::Byte(value) => whole(i128::from(*value)),
+        Scalar::Int16(value) => whole(i128::from(*value)),
+        Scalar::UInt16(value) => whole(i128::from(*value)),
+        Scalar::Int32(value) => whole(i128::from(*value)),
+        Scalar::UInt32(value) => whole(i128::from(*value)),
+        Scalar::Int64(value) => whole(i128::from(*value)),
+        Scalar::UInt64(value) => whole(i128::from(*value)),
+        Scalar::Float(value) => text.parse::<f32>().ok().map(|number| number == *value),
+        Scalar::Double(value) => text.parse::<f64>().ok().map(|number| number == *value),
+        Scalar::String(value) => Some(value.unwrap_or_default() == text),
+        Scalar::DateTime(_)
+        | Scalar::Guid(_)
+        | Scalar::ByteString(_)
+        | Scalar::XmlElement(_)
+        | Scalar::NodeId(_)
+        | Scalar::ExpandedNodeId(_)
+        | Scalar::StatusCode(_)
+        | Scalar::QualifiedName(_)
+        | Scalar::LocalizedText(_)
+        | Scalar::ExtensionObject(_)
+        | Scalar::DataValue(_)
+        | Scalar::Variant(_)
+        | Scalar::DiagnosticInfo(_) => None,
+    }
 }
 
 /// How NetworkMessages travel between the spaces.
@@ -141,9 +298,19 @@ pub struct PubSub {
     pub keep_alive_period: Duration,
     /// A writer that is silent for this long counts as gone; longer than `keep_alive_period`.
     pub receive_timeout: Duration,
+    /// Bytes of the largest NetworkMessage that is sent as one datagram; a larger one goes in chunks of as much
+    /// (OPC 10000-14, 7.2.4.4.4).
+    pub max_datagram: u16,
+    /// Bytes of the largest DataSetMessage that is sent, or put together from chunks.
+    pub max_message: u32,
 }
 
 impl PubSub {
+    /// The largest UDP payload over IPv4.
+    pub const LARGEST_DATAGRAM: u16 = 65_507;
+    /// Room for the headers of a chunk and some of the message.
+    pub const SMALLEST_DATAGRAM: u16 = 512;
+
     /// 239.192.0.40:4840. The group is of the IPv4 organization-local scope (RFC 2365, 6.2), so no router
     /// leaks it to the world; the port is the one registered for OPC UA over UDP (OPC 10000-14, 7.3.2).
     pub const ADDRESS: SocketAddr =
@@ -178,6 +345,8 @@ impl Default for PubSub {
             key_frame_period: Duration::from_secs(1),
             keep_alive_period: Duration::from_secs(1),
             receive_timeout: Duration::from_secs(3),
+            max_datagram: Self::LARGEST_DATAGRAM,
+            max_message: 64 << 20,
         }
     }
 }
@@ -290,6 +459,8 @@ pub struct Variable {
     pub fields: Vec<Leaf>,
     /// At most one per space.
     pub bindings: Vec<Binding>,
+    /// The service tied to it, in a space where no topic is.
+    pub service: Option<ServiceBinding>,
     /// What its queue does when full.
     pub overflow: Overflow,
 }
@@ -311,7 +482,7 @@ pub struct Binding {
     pub ros_topic: String,
     /// The type of the topic.
     pub message_type: TypeName,
-    /// One field of the message or all of it.
+    /// One field of the message, all of them, or the message as it is.
     pub selection: Selection,
 }
 

@@ -1,16 +1,22 @@
 //! What a document without faults comes to, and that no text is too strange.
-#![expect(clippy::unwrap_used, reason = "test code")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
 
+use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::num::NonZeroU16;
 use std::time::Duration;
 
 use mappings::{
-    Checked, Code, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, SpaceId, TopicId,
+    Checked, Code, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, ServiceRole,
+    SpaceId, TopicId, Trigger,
 };
-use messages::{Rank, Selection};
+use messages::{Leaf, Literal, Rank, Selection};
 use proptest::prelude::*;
-use uadp::BuiltinType;
+use uadp::{BuiltinType, Scalar};
 
 const HEAD: &str = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:my-plant:line}\nvariables:\n";
 
@@ -256,6 +262,188 @@ fn an_unknown_type_read_from_ros_1_is_a_warning_and_runs() {
 }
 
 #[test]
+fn a_message_may_cross_as_bytes_whether_its_type_is_known_or_not() {
+    let text = format!(
+        "{HEAD}  - node: ns=2;i=10\n    name: Image\n    type: ByteString\n    origin: 1\n    ros:\n      \
+         - {{topic: /camera, type: sensor_msgs/Image, as: bytes}}\n      \
+         - {{space: 2, topic: /image, type: std_msgs/UInt8MultiArray, field: data, as: fields}}\n"
+    );
+    let mapping = sound(&text);
+    let variable = &mapping.variables()[0];
+    assert_eq!(variable.value_type, Some((BuiltinType::ByteString, false)));
+    assert_eq!(variable.fields, [Leaf::bytes()]);
+    assert_eq!(variable.bindings[0].selection, Selection::Bytes);
+    let text = text.replace("sensor_msgs", "their_msgs");
+    let checked = Mapping::from_yaml(&text, "cell.yaml");
+    assert_eq!(codes(&checked), [Code::UnknownMessageType]);
+    assert_eq!(
+        checked.mapping.unwrap().variables()[0].fields,
+        [Leaf::bytes()]
+    );
+}
+
+#[test]
+fn a_value_calls_a_service_and_its_answer_is_a_value() {
+    let text = format!(
+        "{HEAD}  - node: ns=2;i=20\n    name: Run\n    origin: 0\n    ros: {{space: 1, call: /pump, type: std_srvs/srv/SetBool, \
+         field: data, timeout: 2s}}\n  \
+         - {{node: ns=2;i=21, name: Message, origin: 1, ros: {{answer: ns=2;i=20, field: message}}}}\n  \
+         - {{node: ns=2;i=22, name: Answer, origin: 1, ros: {{answer: ns=2;i=20}}}}\n"
+    );
+    let mapping = sound(&text);
+    let services: Vec<_> = mapping.services(SpaceId::ROS1).collect();
+    let (run, binding) = services[0];
+    assert_eq!(run.value_type, Some((BuiltinType::Boolean, false)));
+    assert!(run.bindings.is_empty());
+    let call = ServiceRole::Call {
+        service: "/pump".to_owned(),
+        service_type: "std_srvs/SetBool".parse().unwrap(),
+        request: Selection::Template {
+            field: Some("data".to_owned()),
+            rest: BTreeMap::new(),
+        },
+        when: Trigger::Any,
+        timeout: Duration::from_secs(2),
+    };
+    assert_eq!(binding.role, call);
+    let (message, binding) = services[1];
+    assert_eq!(message.value_type, Some((BuiltinType::String, false)));
+    let answer = ServiceRole::Answer {
+        of: run.topic,
+        selection: Selection::Field("message".to_owned()),
+    };
+    assert_eq!(binding.role, answer);
+    assert_eq!(services[2].0.fields.len(), 2, "success and message");
+    let two = SpaceId::new(2).unwrap();
+    assert_eq!((services.len(), mapping.services(two).count()), (3, 0));
+}
+
+#[test]
+fn a_request_without_the_value_is_sent_when_the_value_is_the_one_said() {
+    let when = |variable: &str, binding: &str| {
+        let mapping = sound(&format!(
+            "{HEAD}  - {{node: ns=2;i=20, name: Go, origin: 0, {variable} ros: {{space: 1, call: /go, \
+             type: std_srvs/Trigger{binding}}}}}\n"
+        ));
+        match mapping.variables()[0].service.clone().unwrap().role {
+            ServiceRole::Call { when, .. } => when,
+            other => panic!("{other:?}"),
+        }
+    };
+    let boolean = when("type: Boolean,", "");
+    assert!(boolean.fires(&Scalar::Boolean(true)) && !boolean.fires(&Scalar::Boolean(false)));
+    assert_eq!(when("type: Int32,", ""), Trigger::Any);
+    assert_eq!(when("", ""), Trigger::Any);
+    let seven = when("type: Int32,", ", when: 7");
+    assert!(seven.fires(&Scalar::Int32(7)) && !seven.fires(&Scalar::Int32(8)));
+    assert!(!seven.fires(&Scalar::ByteString(None)));
+}
+
+#[test]
+fn a_topic_of_the_space_is_fed_by_polling_a_service() {
+    let text = format!(
+        "{HEAD}  - node: ns=2;i=22\n    name: Plan\n    origin: 1\n    ros:\n      poll: /plan\n      type: nav_msgs/GetPlan\n      \
+         request: {{start: {{pose: {{position: {{x: 1.5}}}}}}, goal.header.frame_id: map}}\n      \
+         every: 2s\n      field: plan.header.frame_id\n"
+    );
+    let mapping = sound(&text);
+    let variable = &mapping.variables()[0];
+    assert_eq!(variable.value_type, Some((BuiltinType::String, false)));
+    let one = |path: &str, text: &str| (path.to_owned(), Literal::One(text.to_owned()));
+    let poll = ServiceRole::Poll {
+        service: "/plan".to_owned(),
+        service_type: "nav_msgs/GetPlan".parse().unwrap(),
+        request: Selection::Template {
+            field: None,
+            rest: BTreeMap::from([
+                one("goal.header.frame_id", "map"),
+                one("start.pose.position.x", "1.5"),
+            ]),
+        },
+        selection: Selection::Field("plan.header.frame_id".to_owned()),
+        every: Duration::from_secs(2),
+        timeout: Duration::from_secs(5),
+    };
+    assert_eq!(variable.service.as_ref().unwrap().role, poll);
+}
+
+#[test]
+fn a_service_type_that_is_not_built_in_is_a_warning_and_runs() {
+    let text = format!(
+        "{HEAD}  - {{node: ns=2;i=20, name: Run, type: Boolean, origin: 0, ros: {{space: 1, call: /c, \
+         type: conveyor_interface/ControlConveyor, request: {{id: 12, speed: 50}}, field: control_on}}}}\n"
+    );
+    let checked = Mapping::from_yaml(&text, "cell.yaml");
+    assert_eq!(codes(&checked), [Code::UnknownServiceType]);
+    let variable = checked.mapping.unwrap().variables()[0].clone();
+    assert_eq!(variable.value_type, Some((BuiltinType::Boolean, false)));
+}
+
+#[test]
+fn topics_become_variables_by_the_first_pattern_about_them() {
+    let text = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:my-plant:line}\nvariables:\n  \
+         - {node: ns=2;i=101, name: First, origin: 1, ros: {topic: /robot1/joint_states, type: sensor_msgs/JointState}}\n\
+         patterns:\n  \
+         - topics: /robot*/joint_states\n    exclude: [/robot9/**]\n    origin: 1\n    node: \"ns=2;i=10{1}\"\n    \
+         name: Robot{1}Joints\n    type: sensor_msgs/JointState\n    field: position\n  \
+         - {topics: /robot*/**, origin: 1, node: \"ns=2;s={1}/{2}\", alias: \"2{1}\", name: \"{2} of {1}\", as: bytes}\n";
+    let mapping = sound(text);
+    assert_eq!(mapping.patterns().len(), 2);
+    let matching = |topic: &str| mapping.matching(SpaceId::ROS1, topic);
+    let made = matching("/robot2/joint_states").unwrap().unwrap();
+    assert_eq!(made.topic, topic("ua_1_2_102"));
+    assert_eq!(
+        (made.node.to_string(), made.name.as_str()),
+        ("ns=2;i=102".to_owned(), "Robot2Joints")
+    );
+    assert_eq!(
+        made.message_type,
+        Some("sensor_msgs/JointState".parse().unwrap())
+    );
+    assert_eq!(made.selection, Selection::Field("position".to_owned()));
+    let made = matching("/robot9/joint_states").unwrap().unwrap();
+    assert_eq!(
+        (made.topic, made.selection),
+        (topic("ua_1_2_29"), Selection::Bytes)
+    );
+    assert_eq!(made.name, "joint_states of 9");
+    assert_eq!(matching("/robot1/joint_states"), None, "a variable has it");
+    assert_eq!(matching("/rosout"), None);
+    assert_eq!(matching("/ua_1_2_102"), None);
+    assert_eq!(
+        mapping.matching(SpaceId::new(2).unwrap(), "/robot2/joint_states"),
+        None
+    );
+    let told = |topic: &str| matching(topic).unwrap().unwrap_err().to_string();
+    assert_eq!(
+        told("/robotX/joint_states"),
+        "`/robotX/joint_states` matches the pattern `/robot*/joint_states`, but `ns=2;i=10X` is no node id"
+    );
+    assert!(
+        told("/robot99999/joint_states").ends_with("`ns=2;i=1099999` is no number from 1 to 65535")
+    );
+}
+
+#[test]
+fn a_pattern_does_not_take_the_node_of_a_variable() {
+    let text = "spaces: [{id: 1}]\nnamespaces: {2: urn:my-plant:line}\nvariables:\n  \
+         - {node: ns=2;i=101, name: First, type: Boolean, origin: 1}\n\
+         patterns:\n  - {topics: /robot*, origin: 1, node: \"ns=2;i=10{1}\", name: R}\n";
+    let mapping = sound(text);
+    let fault = mapping
+        .matching(SpaceId::ROS1, "/robot1")
+        .unwrap()
+        .unwrap_err();
+    assert!(
+        fault
+            .to_string()
+            .ends_with("`ua_1_2_101` is the variable `First` already"),
+        "{fault}"
+    );
+    assert!(mapping.matching(SpaceId::ROS1, "/robot2").unwrap().is_ok());
+}
+
+#[test]
 fn a_fault_behind_an_alias_of_yaml_is_told_once() {
     let text = "spaces: [{id: 1}]\nnamespaces: {2: urn:x:y}\nvariables:\n  \
                 - {node: ns=2;i=1, name: A, origin: 1, queue: &q newest}\n  - {node: ns=2;i=2, name: B, origin: 1, queue: *q}\n";
@@ -360,5 +548,27 @@ proptest! {
         for found in &checked.findings {
             prop_assert!(found.at.line >= 1 && found.at.column >= 1 && found.at.len >= 1);
         }
+    }
+}
+
+#[test]
+fn the_sizes_of_datagrams_and_messages_are_held_to_what_udp_and_chunks_carry() {
+    let checked = |text: &str| Mapping::from_yaml(text, "cell.yaml").mapping;
+    let sizes = |text: &str| {
+        let pubsub = checked(text).unwrap().pubsub().clone();
+        (pubsub.max_datagram, pubsub.max_message)
+    };
+    assert_eq!(sizes("pubsub: {}\n"), (65_507, 64 << 20));
+    assert_eq!(
+        sizes("pubsub: {max_datagram: 1472, max_message: 8}\n"),
+        (1472, 8 << 20)
+    );
+    for text in [
+        "pubsub: {max_datagram: 511}\n",
+        "pubsub: {max_datagram: 65508}\n",
+        "pubsub: {max_message: 0}\n",
+        "pubsub: {max_message: 1025}\n",
+    ] {
+        assert!(checked(text).is_none(), "{text}");
     }
 }

@@ -1,11 +1,11 @@
 //! The common interfaces, one file per package.
 //!
 //! A line `message Name` begins a definition of both dialects, `message Name 1` and `message Name 2` one of ROS 1 and of
-//! ROS 2, where they differ. Field names, types and constants only.
+//! ROS 2, where they differ; a line `service Name 1` begins a service. Field names, types and constants only.
 
 use crate::{Dialect, TypeName};
 
-const PACKAGES: [(&str, &str); 17] = [
+const PACKAGES: [(&str, &str); 19] = [
     ("action_msgs", include_str!("../bundle/action_msgs.txt")),
     (
         "actionlib_msgs",
@@ -29,10 +29,12 @@ const PACKAGES: [(&str, &str); 17] = [
         "rcl_interfaces",
         include_str!("../bundle/rcl_interfaces.txt"),
     ),
+    ("roscpp", include_str!("../bundle/roscpp.txt")),
     ("rosgraph_msgs", include_str!("../bundle/rosgraph_msgs.txt")),
     ("sensor_msgs", include_str!("../bundle/sensor_msgs.txt")),
     ("shape_msgs", include_str!("../bundle/shape_msgs.txt")),
     ("std_msgs", include_str!("../bundle/std_msgs.txt")),
+    ("std_srvs", include_str!("../bundle/std_srvs.txt")),
     ("stereo_msgs", include_str!("../bundle/stereo_msgs.txt")),
     ("tf2_msgs", include_str!("../bundle/tf2_msgs.txt")),
     (
@@ -49,23 +51,30 @@ const PACKAGES: [(&str, &str); 17] = [
     ),
 ];
 
-/// Name and text of each definition of the dialect.
-pub(crate) fn texts(dialect: Dialect) -> Vec<(TypeName, String)> {
+/// What a text of the bundle defines.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Kind {
+    Message,
+    Service,
+}
+
+/// Kind, name and text of each definition of the dialect.
+pub(crate) fn texts(dialect: Dialect) -> Vec<(Kind, TypeName, String)> {
     let other = match dialect {
         Dialect::Ros1 => "2",
         Dialect::Ros2 => "1",
     };
-    let mut found: Vec<(TypeName, String)> = Vec::new();
+    let mut found: Vec<(Kind, TypeName, String)> = Vec::new();
     for (package, text) in PACKAGES {
         let mut skip = true;
         for line in text.lines() {
-            if let Some(heading) = line.strip_prefix("message ") {
+            if let Some((kind, heading)) = heading(line) {
                 let (name, only) = heading.split_once(' ').unwrap_or((heading, ""));
                 skip = only == other;
                 if !skip && let Ok(name) = TypeName::new(package, name) {
-                    found.push((name, String::new()));
+                    found.push((kind, name, String::new()));
                 }
-            } else if !skip && let Some((_, text)) = found.last_mut() {
+            } else if !skip && let Some((_, _, text)) = found.last_mut() {
                 if !text.is_empty() {
                     text.push('\n');
                 }
@@ -74,4 +83,11 @@ pub(crate) fn texts(dialect: Dialect) -> Vec<(TypeName, String)> {
         }
     }
     found
+}
+
+fn heading(line: &str) -> Option<(Kind, &str)> {
+    let message = line
+        .strip_prefix("message ")
+        .map(|rest| (Kind::Message, rest));
+    message.or_else(|| Some((Kind::Service, line.strip_prefix("service ")?)))
 }

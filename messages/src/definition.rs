@@ -1,5 +1,7 @@
 //! The parser of `.msg` texts: genmsg's rules for ROS 1, rosidl's for ROS 2.
 
+use uadp::BuiltinType;
+
 use crate::name::is_identifier;
 use crate::resolve::MOST_FIELDS;
 use crate::{DefinitionError, Dialect, TypeName};
@@ -70,9 +72,16 @@ pub(crate) struct Field {
     pub(crate) arity: Arity,
 }
 
-/// A constant as the md5 has it: `uint8 RED=1`.
+/// A constant of a message type: `uint8 RED=1`.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Constant {
+pub struct Constant {
+    /// The name, as `RED`.
+    pub name: String,
+    /// The type of the value.
+    pub builtin: BuiltinType,
+    /// The value as the definition has it, of a ROS 2 text without its quotes.
+    pub value: String,
+    /// What the md5 is made of.
     pub(crate) line: String,
 }
 
@@ -149,7 +158,14 @@ impl Definition {
         if value.is_empty() && !matches!(primitive, Primitive::Text(_)) {
             return Err("a value expected");
         }
+        let quoted = ['"', '\'']
+            .into_iter()
+            .filter(|_| dialect == Dialect::Ros2 && matches!(primitive, Primitive::Text(_)))
+            .find_map(|quote| value.strip_prefix(quote)?.strip_suffix(quote));
         self.constants.push(Constant {
+            name: name.to_owned(),
+            builtin: primitive.builtin(),
+            value: quoted.unwrap_or(value).to_owned(),
             line: format!("{written} {name}={value}"),
         });
         Ok(())

@@ -79,6 +79,36 @@ pub enum PlanError {
         /// The paths there are, in message order.
         known: Vec<String>,
     },
+    /// A constant that is no value of its field.
+    #[error("field `{path}` of `{name}`: `{text}` is not {expected}")]
+    Constant {
+        /// The message type.
+        name: TypeName,
+        /// The path of the field.
+        path: String,
+        /// The text, cut at 64 characters.
+        text: String,
+        /// What may stand there, with its article.
+        expected: String,
+    },
+    /// A constant of a length its field cannot have, or with something in it that cannot be written.
+    #[error("field `{path}` of `{name}`: {fault}")]
+    ConstantFault {
+        /// The message type.
+        name: TypeName,
+        /// The path of the field.
+        path: String,
+        /// What is wrong with it.
+        fault: WriteFault,
+    },
+    /// A constant for the field that takes the value.
+    #[error("field `{path}` of `{name}` takes the value and cannot be a constant too")]
+    ConstantOfField {
+        /// The message type.
+        name: TypeName,
+        /// The path of the field.
+        path: String,
+    },
     /// ROS 1 bytes of a ROS 2 type, or CDR of a ROS 1 type.
     #[error("`{name}` is a type of the other ROS: its bytes do not travel on this wire")]
     Wire {

@@ -75,3 +75,41 @@ pub trait Source<'a> {
     /// Errs when a field is left over.
     fn finish(&mut self) -> Result<(), SourceError>;
 }
+
+/// A [`Source`] of no field, for messages of constants alone.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct NoFields;
+
+impl<'a> Source<'a> for NoFields {
+    fn scalar(&mut self, _expected: BuiltinType) -> Result<Scalar<'a>, SourceError> {
+        Err(SourceError::Missing)
+    }
+
+    fn packed_array(&mut self, _expected: BuiltinType) -> Result<(usize, &'a [u8]), SourceError> {
+        Err(SourceError::Missing)
+    }
+
+    fn array(&mut self, _expected: BuiltinType) -> Result<usize, SourceError> {
+        Err(SourceError::Missing)
+    }
+
+    fn element(&mut self, _expected: BuiltinType) -> Result<Scalar<'a>, SourceError> {
+        Err(SourceError::Missing)
+    }
+
+    fn structures(&mut self) -> Result<usize, SourceError> {
+        Err(SourceError::Missing)
+    }
+
+    fn begin_structure(&mut self) -> Result<(), SourceError> {
+        Err(SourceError::Missing)
+    }
+
+    fn end_structure(&mut self) -> Result<(), SourceError> {
+        Err(SourceError::Missing)
+    }
+
+    fn finish(&mut self) -> Result<(), SourceError> {
+        Ok(())
+    }
+}

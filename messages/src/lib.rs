@@ -22,6 +22,10 @@
 //! Both dialects are read by a parser of this crate: definition texts come from peers, and published parsers panic on
 //! hostile ones (an array length of twenty digits) or know one dialect only.
 //!
+//! # Services and actions
+//! A `.srv` text is two messages, `package/NameRequest` and `package/NameResponse`; an `.action` text is seven, as
+//! genaction makes them. They are messages like any other, but those of a service are found only through it.
+//!
 //! # Values
 //! | ROS | field |
 //! |---|---|
@@ -56,13 +60,16 @@ mod name;
 mod plan;
 mod registry;
 mod resolve;
+mod service;
 
 pub use convert::{date_time_to_time, duration_to_millis, millis_to_duration, time_to_date_time};
+pub use definition::Constant;
 pub use error::{
     DefinitionError, Fault, NameError, PlanError, ReadError, SourceError, WriteError, WriteFault,
 };
-pub use fields::{Sink, Source};
+pub use fields::{NoFields, Sink, Source};
 pub use message::{Leaf, MessageType, Rank, standard_type};
 pub use name::{Dialect, TypeName};
-pub use plan::{Plan, Selection, Wire};
+pub use plan::{Literal, Plan, Selection, Wire};
 pub use registry::Registry;
+pub use service::{ActionType, ServiceType};

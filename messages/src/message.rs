@@ -3,7 +3,7 @@ use std::sync::Arc;
 use uadp::BuiltinType;
 
 use crate::resolve::Shape;
-use crate::{Dialect, TypeName};
+use crate::{Constant, Dialect, TypeName};
 
 /// A message type with all it needs resolved.
 #[derive(Debug)]
@@ -25,6 +25,18 @@ pub struct Leaf {
     pub builtin: BuiltinType,
     /// Single value or array. An array of bytes is a ByteString and single.
     pub rank: Rank,
+}
+
+impl Leaf {
+    /// The one field of a message that crosses as it is ([`Selection::Bytes`](crate::Selection::Bytes)): a ByteString
+    /// without a name.
+    pub const fn bytes() -> Self {
+        Self {
+            path: String::new(),
+            builtin: BuiltinType::ByteString,
+            rank: Rank::Scalar,
+        }
+    }
 }
 
 /// Whether a field is an array.
@@ -64,6 +76,18 @@ impl MessageType {
     /// The fields in message order.
     pub fn leaves(&self) -> &[Leaf] {
         &self.leaves
+    }
+
+    /// The constants of the message itself, in the order of its text; those of messages in it are theirs.
+    pub fn constants(&self) -> &[Constant] {
+        &self.shape.constants
+    }
+
+    /// The constant of that name.
+    pub fn constant(&self, name: &str) -> Option<&Constant> {
+        self.constants()
+            .iter()
+            .find(|constant| constant.name == name)
     }
 
     /// The field of that path.

@@ -5,8 +5,9 @@ use uadp::BuiltinType;
 
 use crate::bundle;
 use crate::definition::Definition;
-use crate::resolve::Resolver;
-use crate::{DefinitionError, Dialect, MessageType, TypeName};
+use crate::resolve::{self, Resolver};
+use crate::service::{self, ServiceDefinition};
+use crate::{ActionType, DefinitionError, Dialect, MessageType, ServiceType, TypeName};
 
 /// Message definitions of one dialect by name.
 ///
@@ -15,6 +16,7 @@ use crate::{DefinitionError, Dialect, MessageType, TypeName};
 pub struct Registry {
     dialect: Dialect,
     definitions: BTreeMap<TypeName, Arc<Definition>>,
+    services: BTreeMap<TypeName, Arc<ServiceDefinition>>,
 }
 
 impl Registry {
@@ -23,19 +25,23 @@ impl Registry {
         Self {
             dialect,
             definitions: BTreeMap::new(),
+            services: BTreeMap::new(),
         }
     }
 
     /// With the common interfaces built in: std_msgs, geometry_msgs, sensor_msgs, nav_msgs, trajectory_msgs,
-    /// diagnostic_msgs, actionlib_msgs, tf2_msgs, rosgraph_msgs, shape_msgs, visualization_msgs, stereo_msgs, and for
-    /// ROS 2 builtin_interfaces, action_msgs, unique_identifier_msgs, lifecycle_msgs and rcl_interfaces.
+    /// diagnostic_msgs, actionlib_msgs, tf2_msgs, rosgraph_msgs, shape_msgs, visualization_msgs, stereo_msgs, for
+    /// ROS 1 also roscpp, their services and those of std_srvs, and for ROS 2 builtin_interfaces, action_msgs,
+    /// unique_identifier_msgs, lifecycle_msgs and rcl_interfaces.
     pub fn bundle(dialect: Dialect) -> Self {
         let mut registry = Self::empty(dialect);
-        for (name, text) in bundle::texts(dialect) {
-            // Every text of the bundle parses: a test asks for each of them.
-            if let Ok(definition) = Definition::parse(dialect, &name, &text) {
-                registry.definitions.insert(name, Arc::new(definition));
-            }
+        for (kind, name, text) in bundle::texts(dialect) {
+            let added = match kind {
+                bundle::Kind::Message => registry.add(&name, &text),
+                bundle::Kind::Service => registry.add_service(&name, &text),
+            };
+            // A test asks for each of them.
+            debug_assert!(added.is_ok(), "every text of the bundle parses");
         }
         registry
     }
@@ -88,6 +94,67 @@ impl Registry {
         Resolver::new(self.dialect, &[&self.definitions])
             .message_type(name, None)
             .map(Arc::new)
+    }
+
+    /// The names of the services there are, in order.
+    pub fn services(&self) -> impl Iterator<Item = &TypeName> {
+        self.services.keys()
+    }
+
+    /// Adds the text of a `.srv` file, request and response parted by a line `---`; it replaces a service of the same
+    /// name. A message may have that name too.
+    ///
+    /// # Errors
+    /// [`DefinitionError::Syntax`]. What the text needs may be added later, so only [`Registry::service`] finds it
+    /// missing.
+    pub fn add_service(&mut self, name: &TypeName, text: &str) -> Result<(), DefinitionError> {
+        let definition = ServiceDefinition::parse(self.dialect, name, text)?;
+        self.services.insert(name.clone(), Arc::new(definition));
+        Ok(())
+    }
+
+    /// The service of that name with all it needs.
+    ///
+    /// # Errors
+    /// As [`Registry::get`]. [`DefinitionError::Unknown`] is of the service itself where nothing needs it, and else of a
+    /// message.
+    pub fn service(&self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
+        let Some(definition) = self.services.get(name) else {
+            return Err(DefinitionError::Unknown {
+                name: name.clone(),
+                needed_by: None,
+                suggestion: self.suggest_service(name),
+            });
+        };
+        let own = definition.messages();
+        let sets = [&own, &self.definitions];
+        let mut resolver = Resolver::new(self.dialect, &sets);
+        definition.resolve(name, &mut resolver).map(Arc::new)
+    }
+
+    /// Adds the text of an `.action` file, goal, result and feedback parted by two lines `---`: the seven messages
+    /// genaction makes of it, in place of messages of the same names.
+    ///
+    /// # Errors
+    /// [`DefinitionError::Syntax`]; then nothing is added.
+    pub fn add_action(&mut self, name: &TypeName, text: &str) -> Result<(), DefinitionError> {
+        let definitions = service::action(self.dialect, name, text)?;
+        self.definitions.extend(definitions);
+        Ok(())
+    }
+
+    /// The action of that name. Its messages suffice, wherever they are from: a package that was built has a `.msg` file
+    /// of each beside the `.action` file.
+    ///
+    /// # Errors
+    /// As [`Registry::get`], of one of the messages.
+    pub fn action(&self, name: &TypeName) -> Result<Arc<ActionType>, DefinitionError> {
+        ActionType::of(name, |name| self.get(name)).map(Arc::new)
+    }
+
+    /// As [`Registry::suggest`], among the services.
+    pub fn suggest_service(&self, name: &TypeName) -> Option<TypeName> {
+        resolve::suggest(name, self.services.keys())
     }
 
     /// As [`standard_type`](crate::standard_type), but with the type this dialect has for a DateTime.

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use md5::{Digest, Md5};
 use uadp::BuiltinType;
 
-use crate::definition::{Arity, Clock, Definition, FieldType, Number, Primitive};
+use crate::definition::{Arity, Clock, Constant, Definition, FieldType, Number, Primitive};
 use crate::{DefinitionError, Dialect, Leaf, MessageType, Rank, TypeName};
 
 const DEEPEST: usize = 32;
@@ -19,6 +19,7 @@ const BIGGEST: usize = 64 << 20;
 pub(crate) struct Shape {
     pub(crate) name: TypeName,
     pub(crate) fields: Vec<ShapeField>,
+    pub(crate) constants: Vec<Constant>,
     /// Fields when flattened, those of array elements included.
     weight: usize,
     /// The least number of bytes it takes on any wire, counting 1 for an empty message.
@@ -134,6 +135,7 @@ impl<'r> Resolver<'r> {
                 Arc::new(Shape {
                     name: name.clone(),
                     fields: vec![data],
+                    constants: Vec::new(),
                     weight: 1,
                     size: 8,
                     height: 1,
@@ -214,6 +216,7 @@ impl<'r> Resolver<'r> {
         let mut shape = Shape {
             name: name.clone(),
             fields: Vec::new(),
+            constants: definition.constants.clone(),
             weight: 0,
             size: 0,
             height: 1,
@@ -249,6 +252,14 @@ impl<'r> Resolver<'r> {
         if let Some(known) = self.md5s.get(name) {
             return Ok(known.clone());
         }
+        let text = self.md5_text(name)?;
+        let sum = hex(&Md5::digest(text));
+        self.md5s.insert(name.clone(), sum.clone());
+        Ok(sum)
+    }
+
+    /// What the md5 of a type is made of, and with that of its response the md5 of a service.
+    pub(crate) fn md5_text(&mut self, name: &TypeName) -> Result<String, DefinitionError> {
         let definition = self.find(name, None)?;
         let mut text = String::new();
         for constant in &definition.constants {
@@ -265,13 +276,7 @@ impl<'r> Resolver<'r> {
             text.push_str(&field.name);
             text.push('\n');
         }
-        let mut sum = String::with_capacity(32);
-        for byte in Md5::digest(text.trim()) {
-            // Writing to a String cannot fail.
-            write!(sum, "{byte:02x}").unwrap_or_default();
-        }
-        self.md5s.insert(name.clone(), sum.clone());
-        Ok(sum)
+        Ok(text.trim().to_owned())
     }
 
     /// The text and the texts of all it needs, in the order of `gendeps --cat`.
@@ -308,24 +313,41 @@ impl<'r> Resolver<'r> {
     }
 
     pub(crate) fn suggest(&self, name: &TypeName) -> Option<TypeName> {
-        let wanted = name.to_string();
-        let furthest = name.name().len() / 3;
-        let known = self.sets.iter().flat_map(|set| set.keys());
-        let (distance, nearest) = known
-            .map(|known| {
-                let same = known.name().eq_ignore_ascii_case(name.name());
-                (
-                    if same {
-                        1
-                    } else {
-                        distance(&wanted, &known.to_string())
-                    },
-                    known,
-                )
-            })
-            .min_by_key(|(distance, _)| *distance)?;
-        (distance <= furthest).then(|| nearest.clone())
+        suggest(name, self.sets.iter().flat_map(|set| set.keys()))
     }
+}
+
+/// The known name that is most like `name`, if one is near.
+pub(crate) fn suggest<'k>(
+    name: &TypeName,
+    known: impl Iterator<Item = &'k TypeName>,
+) -> Option<TypeName> {
+    let wanted = name.to_string();
+    let furthest = name.name().len() / 3;
+    let (distance, nearest) = known
+        .map(|known| {
+            let same = known.name().eq_ignore_ascii_case(name.name());
+            (
+                if same {
+                    1
+                } else {
+                    distance(&wanted, &known.to_string())
+                },
+                known,
+            )
+        })
+        .min_by_key(|(distance, _)| *distance)?;
+    (distance <= furthest).then(|| nearest.clone())
+}
+
+/// Lower case digits.
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    let mut text = String::with_capacity(bytes.len() * 2);
+    for byte in bytes {
+        // Writing to a String cannot fail.
+        write!(text, "{byte:02x}").unwrap_or_default();
+    }
+    text
 }
 
 impl Shape {

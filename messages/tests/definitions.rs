@@ -327,3 +327,74 @@ fn every_standard_type_holds_its_builtin_type_alone() {
         Some(name("std_msgs/Time"))
     );
 }
+
+#[test]
+fn constants_are_told_with_their_values() {
+    let mut registry = Registry::empty(Dialect::Ros1);
+    let text = "uint8 ADD=1 # one\nstring WORD= it's # all\nuint8 cmd";
+    registry.add(&name("t/T"), text).unwrap();
+    let found = registry.get(&name("t/T")).unwrap();
+    let add = found.constant("ADD").unwrap();
+    assert_eq!((add.builtin, add.value.as_str()), (BuiltinType::Byte, "1"));
+    assert_eq!(found.constant("WORD").unwrap().value, "it's # all");
+    assert_eq!(found.constants().len(), 2);
+    assert!(found.constant("cmd").is_none());
+    let mut registry = Registry::empty(Dialect::Ros2);
+    let text = "string A='x'\nstring B=\"y\"\nstring C=z";
+    registry.add(&name("t/T"), text).unwrap();
+    let found = registry.get(&name("t/T")).unwrap();
+    let values: Vec<&str> = found
+        .constants()
+        .iter()
+        .map(|constant| constant.value.as_str())
+        .collect();
+    assert_eq!(values, ["x", "y", "z"]);
+}
+
+#[test]
+fn a_service_is_two_messages_found_only_through_it() {
+    let mut registry = Registry::bundle(Dialect::Ros1);
+    let text = "uint8 ADD = 1\nuint8 cmd\n--- # the answer\nItem[] items\n";
+    registry.add_service(&name("t/List"), text).unwrap();
+    let error = registry.service(&name("t/List")).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "no definition of `t/Item`, which `t/ListResponse` needs"
+    );
+    registry.add(&name("t/Item"), "string id").unwrap();
+    let found = registry.service(&name("t/List")).unwrap();
+    assert_eq!(found.request().leaves().len(), 1);
+    assert_eq!(found.request().constant("ADD").unwrap().value, "1");
+    assert_eq!(found.response().leaves()[0].path, "items");
+    assert!(registry.get(&name("t/ListRequest")).is_err());
+    let error = registry.service(&name("std_srvs/Triger")).unwrap_err();
+    assert!(
+        error
+            .to_string()
+            .ends_with("did you mean `std_srvs/Trigger`?"),
+        "{error}"
+    );
+}
+
+#[test]
+fn a_service_or_action_text_in_the_wrong_number_of_parts_is_refused() {
+    let mut registry = Registry::empty(Dialect::Ros1);
+    for text in ["", "bool a\n", "---\n---\n"] {
+        let error = registry.add_service(&name("t/S"), text).unwrap_err();
+        assert!(error.to_string().contains("one line `---`"), "{error}");
+    }
+    for text in ["", "---\n", "---\n---\n---\n"] {
+        let error = registry.add_action(&name("t/A"), text).unwrap_err();
+        assert!(error.to_string().contains("two lines `---`"), "{error}");
+    }
+    let error = registry
+        .add_service(&name("t/S"), "bool a\n---\nbool b\nbool 9\n")
+        .unwrap_err();
+    assert!(
+        error.to_string().starts_with("`t/SResponse` line 4"),
+        "{error}"
+    );
+    let long = format!("t/{}", "S".repeat(250));
+    assert!(registry.add_service(&name(&long), "---").is_err());
+    assert_eq!(registry.names().count() + registry.services().count(), 0);
+}

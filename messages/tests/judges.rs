@@ -4,14 +4,19 @@
 mod support;
 
 use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::sync::Arc;
 
 use md5::{Digest, Md5};
-use messages::{Dialect, MessageType, Plan, Registry, Selection, TypeName, Wire};
+use messages::{
+    ActionType, DefinitionError, Dialect, MessageType, Plan, Registry, Selection, TypeName, Wire,
+};
 use serde_json::Value as Json;
 use support::{Player, Recorder};
 
 const MD5S: &str = include_str!("data/ros1_md5.txt");
+const SERVICES: &str = include_str!("data/ros1_services.txt");
 const FIELDS: &str = include_str!("data/ros2_fields.txt");
 const ROSBAGS: &str = include_str!("data/rosbags.json");
 const CYCLONE: &str = include_str!("data/cyclone.json");
@@ -53,6 +58,13 @@ fn the_md5_of_every_ros_1_type_of_the_bundle_is_the_one_others_compute() {
         .map(|line| line.split_once(' ').unwrap())
         .map(|(name, md5)| (name.to_owned(), md5.to_owned()))
         .collect();
+    for line in SERVICES
+        .lines()
+        .filter(|line| line.starts_with("roscpp/Logger "))
+    {
+        let (name, md5) = line.split_once(' ').unwrap();
+        table.insert(name.to_owned(), md5.to_owned());
+    }
     for sample in samples(GENPY) {
         table.insert(
             text(&sample["type"]).to_owned(),
@@ -66,6 +78,160 @@ fn the_md5_of_every_ros_1_type_of_the_bundle_is_the_one_others_compute() {
         assert_eq!(registry.get(known).unwrap().md5(), wanted, "{known}");
     }
     assert!(table.is_empty(), "the bundle lacks {table:?}");
+}
+
+/// Type name and md5 per line.
+fn table(text: &str) -> HashMap<String, String> {
+    text.lines()
+        .filter_map(|line| line.split_once(' '))
+        .map(|(name, md5)| (name.to_owned(), md5.to_owned()))
+        .collect()
+}
+
+fn parts(action: &ActionType) -> [&Arc<MessageType>; 7] {
+    [
+        action.action(),
+        action.action_goal(),
+        action.action_result(),
+        action.action_feedback(),
+        action.goal(),
+        action.result(),
+        action.feedback(),
+    ]
+}
+
+#[test]
+fn the_md5_of_every_service_of_the_bundle_is_the_one_genpy_computed() {
+    let registry = Registry::bundle(Dialect::Ros1);
+    let table = table(SERVICES);
+    for known in registry.services() {
+        let service = registry.service(known).unwrap();
+        assert_eq!(service.md5(), table[&known.to_string()], "{known}");
+        assert_eq!(service.request().name(), &name(&format!("{known}Request")));
+    }
+    assert_eq!(registry.services().count(), 14);
+}
+
+#[test]
+fn an_action_is_the_seven_messages_genaction_makes() {
+    let table = table(SERVICES);
+    let texts = [
+        (
+            "move_base_msgs/MoveBase",
+            "geometry_msgs/PoseStamped target_pose\n---\n---\ngeometry_msgs/PoseStamped base_position\n",
+        ),
+        (
+            "tf2_msgs/LookupTransform",
+            "#Simple API\nstring target_frame\nstring source_frame\ntime source_time\nduration timeout\n\n#Advanced API\n\
+             time target_time\nstring fixed_frame\n\n#Whether or not to use the advanced API\nbool advanced\n\n---\n\
+             geometry_msgs/TransformStamped transform\ntf2_msgs/TF2Error error\n---\n",
+        ),
+    ];
+    let mut registry = Registry::bundle(Dialect::Ros1);
+    for (action, text) in texts {
+        registry.add_action(&name(action), text).unwrap();
+        let action = registry.action(&name(action)).unwrap();
+        for part in parts(&action) {
+            assert_eq!(
+                part.md5(),
+                table[&part.name().to_string()],
+                "{}",
+                part.name()
+            );
+        }
+    }
+}
+
+#[test]
+fn the_services_and_actions_of_a_real_robot_have_the_md5s_genmsg_computes() {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let robot = here.join("../../shared/data/ros1-niryo");
+    let genmsg = Command::new("/usr/bin/python3")
+        .arg(here.join("tests/data/genmsg_md5.py"))
+        .arg(&robot)
+        .output();
+    let Some(told) = genmsg
+        .ok()
+        .filter(|done| robot.is_dir() && done.status.success())
+    else {
+        eprintln!(
+            "skipped: {} or Debian's python3-genmsg is missing",
+            robot.display()
+        );
+        return;
+    };
+    let told = String::from_utf8(told.stdout).unwrap();
+    let table = table(&told);
+    let mut registry = Registry::bundle(Dialect::Ros1);
+    let (mut services, mut actions) = (Vec::new(), Vec::new());
+    for path in files_below(&robot) {
+        let folder = path.parent().unwrap();
+        let package = folder
+            .parent()
+            .unwrap()
+            .file_name()
+            .unwrap()
+            .to_str()
+            .unwrap();
+        let stem = path.file_stem().unwrap().to_str().unwrap();
+        let text = std::fs::read_to_string(&path);
+        match folder.file_name().unwrap().to_str().unwrap() {
+            "msg" => registry
+                .add(&name(&format!("{package}/{stem}")), &text.unwrap())
+                .unwrap(),
+            "srv" => {
+                let service = name(&format!("{package}/{stem}"));
+                registry.add_service(&service, &text.unwrap()).unwrap();
+                services.push(service);
+            }
+            "action" => {
+                let action = name(&format!("{package}/{stem}"));
+                registry.add_action(&action, &text.unwrap()).unwrap();
+                actions.push(action);
+            }
+            _ => {}
+        }
+    }
+    let mut judged = 0;
+    let mut compare = |name: &TypeName, md5: Result<String, DefinitionError>| {
+        let Some(wanted) = table.get(&name.to_string()) else {
+            return;
+        };
+        if told.contains(&format!("? {name}: ")) {
+            assert!(md5.is_err(), "{name}");
+            return;
+        }
+        assert_eq!(&md5.unwrap(), wanted, "{name}");
+        judged += 1;
+    };
+    for name in &services {
+        compare(
+            name,
+            registry.service(name).map(|found| found.md5().to_owned()),
+        );
+    }
+    for name in &actions {
+        for part in parts(&registry.action(name).unwrap()) {
+            compare(part.name(), Ok(part.md5().to_owned()));
+        }
+    }
+    assert!(judged > 90, "{judged}: {told}");
+}
+
+fn files_below(folder: &Path) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            found.extend(files_below(&path));
+        } else if path
+            .extension()
+            .is_some_and(|kind| ["msg", "srv", "action"].iter().any(|known| kind == *known))
+        {
+            found.push(path);
+        }
+    }
+    found
 }
 
 #[test]

@@ -3,11 +3,12 @@
 
 mod support;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use messages::{
-    Dialect, Fault, MessageType, Plan, PlanError, ReadError, Registry, Selection, SourceError,
-    TypeName, Wire, WriteError, WriteFault,
+    Dialect, Fault, Leaf, Literal, MessageType, Plan, PlanError, ReadError, Registry, Selection,
+    SourceError, TypeName, Wire, WriteError, WriteFault,
 };
 use support::{Event, Player, Recorder, Value};
 use uadp::{BuiltinType, DateTime, Scalar};
@@ -341,4 +342,165 @@ fn a_ros_2_time_as_a_topic_is_one_date_time() {
         ["scalar DateTime 116444735990000000"]
     );
     assert_eq!(plan.leaves().first().unwrap().path, "data");
+}
+
+#[test]
+fn a_message_may_cross_as_it_is() {
+    for (dialect, wire) in [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)] {
+        let message = message(dialect, "bool b\nstring s");
+        let plan = Plan::compile(&message, &Selection::Bytes, wire).unwrap();
+        assert_eq!(plan.leaves(), [Leaf::bytes()]);
+        // No message of the type: nobody looks.
+        let payload = [9, 8, 7];
+        assert_eq!(read(&plan, &payload).unwrap(), ["scalar ByteString 090807"]);
+        let events = [scalar(Scalar::ByteString(Some(&payload)))];
+        assert_eq!(write(&plan, &events).unwrap(), payload);
+        let two = [events[0].clone(), events[0].clone()];
+        assert_eq!(
+            write(&plan, &two).unwrap_err().to_string(),
+            "1 fields too many"
+        );
+        assert!(write(&plan, &[scalar(Scalar::Byte(1))]).is_err());
+    }
+}
+
+fn template(field: Option<&str>, rest: &[(&str, Literal)]) -> Selection {
+    let rest = rest.iter().cloned();
+    Selection::Template {
+        field: field.map(str::to_owned),
+        rest: rest
+            .map(|(path, literal)| (path.to_owned(), literal))
+            .collect::<BTreeMap<_, _>>(),
+    }
+}
+
+fn one(text: &str) -> Literal {
+    Literal::One(text.to_owned())
+}
+
+fn list(texts: &[&str]) -> Literal {
+    Literal::List(texts.iter().map(|&text| text.to_owned()).collect())
+}
+
+const REQUEST: &str = "int8 FORWARD=1\nint8 BACKWARD=-1\nuint8 id\nbool run\nint16 speed\nint8 direction\nstring note\n\
+                       std_msgs/ColorRGBA colour\nuint8[3] key\nfloat32[] levels\nstring[] words\nduration wait\nbool[] flags";
+
+#[test]
+fn a_template_is_its_constants_with_the_value_in_its_place() {
+    let message = message(Dialect::Ros1, REQUEST);
+    let rest = [
+        ("id", one("12")),
+        ("speed", one("-2")),
+        ("direction", one("BACKWARD")),
+        ("note", one("ä")),
+        ("colour.g", one("0.5")),
+        ("key", list(&["1", "FORWARD", "0x03"])),
+        ("levels", list(&["1", "2"])),
+        ("words", list(&["a", ""])),
+        ("wait", one("1.5s")),
+        ("flags", list(&["true", "false"])),
+    ];
+    let wanted = |run: u8| {
+        let mut bytes = vec![12, run, 0xFE, 0xFF, 0xFF, 2, 0, 0, 0, 0xC3, 0xA4];
+        for colour in [0.0f32, 0.5, 0.0, 0.0] {
+            bytes.extend(colour.to_le_bytes());
+        }
+        bytes.extend([1, 1, 3, 2, 0, 0, 0]);
+        bytes.extend(1f32.to_le_bytes());
+        bytes.extend(2f32.to_le_bytes());
+        bytes.extend([2, 0, 0, 0, 1, 0, 0, 0, b'a', 0, 0, 0, 0]);
+        bytes.extend([1, 0, 0, 0]);
+        bytes.extend(500_000_000u32.to_le_bytes());
+        bytes.extend([2, 0, 0, 0, 1, 0]);
+        bytes
+    };
+    let plan = Plan::compile(&message, &template(Some("run"), &rest), Wire::Ros1).unwrap();
+    assert_eq!(plan.leaves().len(), 1);
+    let written = write(&plan, &[scalar(Scalar::Boolean(true))]).unwrap();
+    assert_eq!(written, wanted(1));
+    assert_eq!(read(&plan, &written).unwrap(), ["scalar Boolean true"]);
+    let constant = Plan::compile(&message, &template(None, &rest), Wire::Ros1).unwrap();
+    assert_eq!(constant.leaves(), []);
+    assert_eq!(write(&constant, &[]).unwrap(), wanted(0));
+    assert!(write(&constant, &[scalar(Scalar::Boolean(true))]).is_err());
+    let empty = Plan::compile(&message, &template(None, &[]), Wire::Ros1).unwrap();
+    assert!(write(&empty, &[]).unwrap().iter().all(|byte| *byte == 0));
+}
+
+#[test]
+fn a_template_is_aligned_in_cdr() {
+    let message = message(Dialect::Ros2, "uint8 a\nstring s\nfloat64 x\nint32[] n");
+    let rest = [("s", one("b")), ("n", list(&["-1"]))];
+    let plan = Plan::compile(&message, &template(Some("x"), &rest), Wire::Cdr).unwrap();
+    let mut wanted = vec![
+        0, 1, 0, 0, 0, 0, 0, 0, 2, 0, 0, 0, b'b', 0, 0, 0, 0, 0, 0, 0,
+    ];
+    wanted.extend(1f64.to_le_bytes());
+    wanted.extend([1, 0, 0, 0, 0xFF, 0xFF, 0xFF, 0xFF]);
+    assert_eq!(
+        write(&plan, &[scalar(Scalar::Double(1.0))]).unwrap(),
+        wanted
+    );
+}
+
+#[test]
+fn a_constant_that_does_not_fit_its_field_is_told_with_what_would() {
+    let ros1 = registry(
+        Dialect::Ros1,
+        &[(
+            "t/T",
+            &format!("{REQUEST}\ntime when\nstd_msgs/Header[] many"),
+        )],
+    );
+    let message = ros1.get(&name("t/T")).unwrap();
+    for (path, literal, told) in [
+        (
+            "id",
+            one("256"),
+            "field `id` of `t/T`: `256` is not a number from 0 to 255 or one of FORWARD",
+        ),
+        (
+            "direction",
+            one("UP"),
+            "`UP` is not a number from -128 to 127 or one of FORWARD, BACKWARD",
+        ),
+        (
+            "run",
+            one("on"),
+            "`on` is not true or false or one of FORWARD",
+        ),
+        (
+            "speed",
+            list(&["1"]),
+            "`a list` is not a number from -32768 to 32767",
+        ),
+        ("words", one("a"), "`a` is not a list, as [1, 2]"),
+        (
+            "key",
+            list(&["1"]),
+            "field `key` of `t/T`: 1 elements, the type has 3",
+        ),
+        (
+            "levels",
+            list(&["1", "x"]),
+            "`x` is not a number within the range of a float32",
+        ),
+        ("wait", one("5"), "`5` is not a duration with its unit"),
+        ("when", one("5"), "a time cannot be a constant"),
+        ("many", list(&[]), "arrays of messages have no constants"),
+        (
+            "colour",
+            one("1"),
+            "`t/T` has no field `colour`; it has id, run",
+        ),
+        (
+            "note",
+            one("x"),
+            "field `note` of `t/T` takes the value and cannot be a constant too",
+        ),
+    ] {
+        let selection = template(Some("note"), &[(path, literal)]);
+        let error = Plan::compile(&message, &selection, Wire::Ros1).unwrap_err();
+        assert!(error.to_string().contains(told), "{error}");
+    }
 }

@@ -25,7 +25,7 @@ async fn main() -> Result<(), Box<dyn Error + Send + Sync>> {
 async fn relay() -> Result<(), Box<dyn Error + Send + Sync>> {
     let mut options = NodeOptions::from_env("relay");
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let topics = options.apply_arguments(&arguments);
+    let topics = options.apply_arguments(&arguments)?;
     let (pairs, []) = topics.as_chunks::<2>() else {
         return Err("relay IN OUT [IN OUT]..".into());
     };

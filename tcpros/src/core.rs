@@ -1,22 +1,28 @@
 //! A ROS master inside this process, for tests and for demonstrations without a ROS installation.
 
+mod parameters;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use tokio::net::TcpListener;
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
+use self::parameters::{Tree, Update};
+use crate::clock;
+use crate::names::{self, NameError};
 use crate::outbox::lock;
-use crate::rpc::{self, Endpoint};
+use crate::rpc::{self, Endpoint, RpcError};
 use crate::xmlrpc::{Call, Fault, Response, Value};
 
-/// A running master: registrations of topics and services, and parameters under flat names. It ends on drop.
+/// A running master: registrations of topics and services, and the tree of parameters. It ends on drop.
 ///
-/// It is no replacement for `rosmaster`: parameters are not kept as a tree (`getParam` of a namespace finds nothing),
-/// and a node that takes another's name is told nothing.
+/// It answers the Master and Parameter Server APIs of `wiki.ros.org/ROS`, tells nodes of changed topics and
+/// parameters, and tells a node to shut down whose name another takes. Unlike `roscore` it has no `/rosout`, and it
+/// keeps nothing in files.
 #[derive(Debug)]
 pub struct Core {
     address: SocketAddr,
@@ -34,7 +40,7 @@ impl Core {
         let listener = TcpListener::from_std(listener)?;
         let shared = Arc::new(Shared {
             uri: format!("http://{address}/"),
-            registry: Mutex::default(),
+            registry: Mutex::new(Registry::new()),
             changed: Notify::new(),
         });
         let mut tasks = JoinSet::new();
@@ -74,9 +80,13 @@ struct Registry {
     types: BTreeMap<String, String>,
     /// URIs of the slave APIs by node name.
     nodes: BTreeMap<String, String>,
-    parameters: BTreeMap<String, Value>,
+    parameters: Tree,
     /// Topics whose subscribers have not been told of the last change.
     dirty: BTreeSet<String>,
+    /// Changes of parameters that have not been told, by slave API; of one key only the last.
+    updates: BTreeMap<String, Vec<(String, Value)>>,
+    /// Slave APIs and names of nodes that have lost their name to another and have not been told.
+    displaced: BTreeSet<(String, String)>,
 }
 
 /// Nodes and their slave APIs by topic.
@@ -108,10 +118,9 @@ impl Shared {
                 | "lookupService",
                 _,
             ) => registry.registration(&call.method, &texts)?,
-            (method, [_, name, ..]) => registry.parameter(method, name, call.params.get(2))?,
-            (method, _) => registry.parameter(method, "", None)?,
+            (method, _) => registry.parameter(method, &texts, call.params.get(2))?,
         };
-        let changed = !registry.dirty.is_empty();
+        let changed = registry.has_news();
         drop(registry);
         if changed {
             self.changed.notify_one();
@@ -121,6 +130,17 @@ impl Shared {
 }
 
 impl Registry {
+    fn new() -> Self {
+        let mut registry = Self::default();
+        // Tools tell one run of a master from the next by it.
+        let since = clock::utc().duration_since(SystemTime::UNIX_EPOCH);
+        let started = since.unwrap_or_default().as_nanos();
+        let run_id = format!("{started:x}-{:x}", std::process::id());
+        let nobody = registry.parameters.set("/run_id", &run_id.into(), MASTER);
+        registry.tell(nobody.unwrap_or_default());
+        registry
+    }
+
     fn registration(&mut self, method: &str, texts: &[&str]) -> Response {
         Ok(match (method, texts) {
             ("registerPublisher", [caller, topic, type_name, api]) => {
@@ -158,8 +178,13 @@ impl Registry {
                 self.services.insert((*service).to_owned(), entry);
                 done(1)
             }
-            ("unregisterService", [caller, service, _]) => {
-                let removed = self.services.remove(*service).is_some();
+            ("unregisterService", [caller, service, service_api]) => {
+                // A service that another node has taken over is that node's.
+                let own = |(node, api): &(String, String)| node == caller && api == service_api;
+                let removed = self.services.get(*service).is_some_and(own);
+                if removed {
+                    self.services.remove(*service);
+                }
                 self.forget_unused(caller);
                 done(i32::from(removed))
             }
@@ -171,54 +196,124 @@ impl Registry {
         })
     }
 
-    fn parameter(&mut self, method: &str, name: &str, value: Option<&Value>) -> Response {
-        Ok(match (method, value) {
-            ("setParam", Some(value)) => {
-                self.parameters.insert(name.to_owned(), value.clone());
+    fn parameter(&mut self, method: &str, texts: &[&str], value: Option<&Value>) -> Response {
+        let tree = &mut self.parameters;
+        Ok(match (method, texts) {
+            ("setParam", [caller, name, _]) => {
+                let name = full_name(name, caller)?;
+                let told = value.and_then(|value| tree.set(&name, value, caller));
+                let Some(told) = told else {
+                    return Ok(triple(-1, "the root of all parameters is no value", 0));
+                };
+                self.tell(told);
                 done(0)
             }
-            ("getParam" | "subscribeParam", _) => match self.parameters.get(name) {
-                Some(value) => triple(1, "", value.clone()),
-                // `subscribeParam` says "not set yet" with an empty struct.
-                None if method == "subscribeParam" => done(Value::Struct(Vec::new())),
-                None => triple(-1, &format!("Parameter [{name}] is not set"), 0),
-            },
-            ("hasParam", _) => done(Value::Bool(self.parameters.contains_key(name))),
-            ("deleteParam", _) => found(self.parameters.remove(name).map(|_| ""), "parameter"),
-            ("searchParam", _) => {
-                let full = format!("/{}", name.trim_start_matches('/'));
-                let known = self.parameters.contains_key(&full);
-                found(known.then_some(full.as_str()), "parameter")
+            ("getParam", [caller, name]) => {
+                let name = full_name(name, caller)?;
+                let value = tree.get(&name);
+                value.map_or_else(|| not_set(&name), done)
             }
-            ("unsubscribeParam", _) => done(1),
-            ("getParamNames", _) => done(Value::Array(
-                self.parameters
-                    .keys()
-                    .map(|key| key.as_str().into())
-                    .collect(),
-            )),
+            ("hasParam", [caller, name]) => {
+                done(Value::Bool(tree.get(&full_name(name, caller)?).is_some()))
+            }
+            ("deleteParam", [caller, name]) => {
+                let name = full_name(name, caller)?;
+                match tree.delete(&name) {
+                    Some(told) => {
+                        self.tell(told);
+                        done(0)
+                    }
+                    None => not_set(&name),
+                }
+            }
+            ("searchParam", [caller, name]) => {
+                let full = tree.search(caller, name);
+                found(full.as_deref(), "parameter")
+            }
+            ("subscribeParam", [caller, api, name]) => {
+                let name = full_name(name, caller)?;
+                self.know(caller, api);
+                done(self.parameters.follow(&name, caller, api))
+            }
+            ("unsubscribeParam", [caller, api, name]) => {
+                tree.unfollow(&full_name(name, caller)?, caller, api);
+                self.forget_unused(caller);
+                done(1)
+            }
+            ("getParamNames", _) => {
+                let names = tree.names().into_iter().map(Value::from);
+                done(names.collect::<Vec<_>>())
+            }
+            (
+                "setParam" | "getParam" | "hasParam" | "deleteParam" | "searchParam"
+                | "subscribeParam" | "unsubscribeParam",
+                _,
+            ) => return Err(fault(format!("{method}: wrong number of arguments"))),
             _ => return Err(fault(format!("no such method: {method}"))),
         })
     }
 
+    /// Remembers what followers of parameters have to be told; what they were not told of the same key is outdated.
+    fn tell(&mut self, told: Vec<Update>) {
+        for (api, key, value) in told {
+            let waiting = self.updates.entry(api).or_default();
+            waiting.retain(|(other, _)| *other != key);
+            waiting.push((key, value));
+        }
+    }
+
+    fn has_news(&self) -> bool {
+        !self.dirty.is_empty() || !self.updates.is_empty() || !self.displaced.is_empty()
+    }
+
     fn know(&mut self, caller: &str, api: &str) {
         let before = self.nodes.insert(caller.to_owned(), api.to_owned());
-        if before.is_some_and(|before| before != api) {
+        if let Some(before) = before.filter(|before| before != api) {
             // The name has a new owner: what the old one had registered is void.
             for registrations in [&mut self.publishers, &mut self.subscribers] {
                 for (topic, nodes) in registrations.iter_mut() {
-                    nodes.retain(|(node, old)| node != caller || old == api);
+                    nodes.retain(|(node, _)| node != caller);
                     self.dirty.insert(topic.clone());
                 }
                 registrations.retain(|_, nodes| !nodes.is_empty());
             }
+            self.services.retain(|_, (node, _)| node != caller);
+            self.parameters.forget(caller);
+            self.displaced.insert((before, caller.to_owned()));
         }
+    }
+
+    /// The calls to make, by slave API and in their order.
+    fn news(&mut self) -> BTreeMap<String, Vec<(&'static str, Vec<Value>)>> {
+        let mut news: BTreeMap<String, Vec<_>> = BTreeMap::new();
+        for topic in std::mem::take(&mut self.dirty) {
+            let publishers = apis(&self.publishers, &topic);
+            for (_, api) in self.subscribers.get(&topic).into_iter().flatten() {
+                let params = vec![MASTER.into(), topic.as_str().into(), publishers.clone()];
+                let calls = news.entry(api.clone()).or_default();
+                calls.push(("publisherUpdate", params));
+            }
+        }
+        for (api, updates) in std::mem::take(&mut self.updates) {
+            let update = |(key, value): (String, Value)| {
+                ("paramUpdate", vec![MASTER.into(), key.into(), value])
+            };
+            let calls = news.entry(api).or_default();
+            calls.extend(updates.into_iter().map(update));
+        }
+        for (api, name) in std::mem::take(&mut self.displaced) {
+            let reason = format!("[{name}] Reason: new node registered with same name");
+            let calls = news.entry(api).or_default();
+            calls.push(("shutdown", vec![MASTER.into(), reason.into()]));
+        }
+        news
     }
 
     fn forget_unused(&mut self, caller: &str) {
         let mut topics = self.publishers.values().chain(self.subscribers.values());
         let used = topics.any(|nodes| nodes.iter().any(|(node, _)| node == caller))
-            || self.services.values().any(|(node, _)| node == caller);
+            || self.services.values().any(|(node, _)| node == caller)
+            || self.parameters.is_followed_by(caller);
         if !used {
             self.nodes.remove(caller);
         }
@@ -254,28 +349,24 @@ impl Registry {
     }
 }
 
-/// Tells subscribers of changed topics, in rounds, so that no node hears an older list after a newer one.
+/// Tells nodes what concerns them, in rounds, so that no node hears something older after something newer.
 async fn notify(shared: Arc<Shared>) {
     loop {
         shared.changed.notified().await;
         let mut calls = JoinSet::new();
-        {
-            let mut registry = lock(&shared.registry);
-            for topic in std::mem::take(&mut registry.dirty) {
-                let publishers = apis(&registry.publishers, &topic);
-                for (_, api) in registry.subscribers.get(&topic).into_iter().flatten() {
-                    let params = vec!["/master".into(), topic.as_str().into(), publishers.clone()];
-                    if let Some(endpoint) = Endpoint::parse(api) {
-                        calls.spawn(async move {
-                            rpc::call(&endpoint, "publisherUpdate", params, NOTIFY_LIMIT).await
-                        });
+        for (api, news) in lock(&shared.registry).news() {
+            if let Some(endpoint) = Endpoint::parse(&api) {
+                calls.spawn(async move {
+                    for (method, params) in news {
+                        rpc::call(&endpoint, method, params, NOTIFY_LIMIT).await?;
                     }
-                }
+                    Ok::<(), RpcError>(())
+                });
             }
         }
         while let Some(told) = calls.join_next().await {
             if let Ok(Err(error)) = told {
-                tracing::debug!(%error, "a subscriber was not told of a change");
+                tracing::debug!(%error, "a node was not told of a change");
             }
         }
     }
@@ -318,8 +409,19 @@ fn triple(code: i32, message: &str, result: impl Into<Value>) -> Value {
     Value::Array(vec![code.into(), message.into(), result.into()])
 }
 
+fn not_set(name: &str) -> Value {
+    triple(-1, &format!("Parameter [{name}] is not set"), 0)
+}
+
+/// A parameter's name as the caller means it, in canonical form.
+fn full_name(name: &str, caller: &str) -> Result<String, Fault> {
+    names::of_caller(name, caller).map_err(|error: NameError| fault(error.to_string()))
+}
+
 const fn fault(message: String) -> Fault {
     Fault { code: -1, message }
 }
 
+/// How a master calls itself.
+const MASTER: &str = "/master";
 const NOTIFY_LIMIT: Duration = Duration::from_secs(3);

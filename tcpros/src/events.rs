@@ -36,6 +36,18 @@ pub(crate) fn unregistration_failed(topic: &str, error: &dyn Display) {
     warn!(topic, %error, "a registration stays behind in the ROS master: `rosnode cleanup` removes it");
 }
 
+pub(crate) fn parameter_failed(parameter: &str, error: &dyn Display) {
+    warn!(parameter, %error, "a parameter could not be read from the ROS master or set there: trying again");
+}
+
+pub(crate) fn time_source_changed(simulated: bool) {
+    if simulated {
+        info!("/use_sim_time is true: the time is that of /clock");
+    } else {
+        info!("/use_sim_time is no longer true: the time is the wall clock's");
+    }
+}
+
 pub(crate) fn shutdown_incomplete(limit: Duration) {
     warn!(
         ?limit,
@@ -76,6 +88,10 @@ pub(crate) fn message_too_long(topic: &str, bytes: usize) {
         bytes,
         "a message longer than TCPROS can say was not published"
     );
+}
+
+pub(crate) fn service_failed(service: &str, client: &str, why: &str) {
+    warn!(service, client, why, "a request was given up");
 }
 
 pub(crate) fn publisher_joined(topic: &str, publisher: &str) {

@@ -46,6 +46,11 @@ impl Frames {
         Ok(Some(frame.slice(4..)))
     }
 
+    /// Whether no part of another message is here.
+    pub(crate) fn is_empty(&self) -> bool {
+        self.buffer.is_empty()
+    }
+
     /// The buffer with room for the next read: for what is missing of a message, or for one like the last, so that
     /// messages of one size are not read in two pieces and moved. What a peer announces is believed only as far as
     /// it delivers: the buffer at most doubles past `TRUSTED`.
@@ -75,10 +80,10 @@ impl Frames {
 
 /// The peer announced a message longer than this side takes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
-#[error("the publisher announced a message of {announced} bytes, more than the limit of {limit}")]
+#[error("the peer announced a message of {announced} bytes, more than the limit of {limit}")]
 pub(crate) struct FrameTooLong {
-    announced: u32,
-    limit: usize,
+    pub(crate) announced: u32,
+    pub(crate) limit: usize,
 }
 
 const MIN_WINDOW: usize = 4 * 1024;

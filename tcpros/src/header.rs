@@ -135,6 +135,12 @@ pub enum HeaderError {
     Io(#[from] std::io::Error),
 }
 
+/// What a peer says, short enough for an answer and a log line.
+pub(crate) fn clipped(text: &str) -> &str {
+    let rest = text.char_indices().nth(MAX_QUOTED);
+    rest.map_or(text, |(end, _)| text.split_at(end).0)
+}
+
 fn length(bytes: usize) -> Result<u32, HeaderError> {
     let len = u32::try_from(bytes).map_err(|_| HeaderError::TooLong(u32::MAX))?;
     if len > MAX_HEADER {
@@ -146,6 +152,7 @@ fn length(bytes: usize) -> Result<u32, HeaderError> {
 
 const MAX_HEADER: u32 = 1 << 20;
 const MAX_FIELDS: usize = 256;
+const MAX_QUOTED: usize = 256;
 
 #[cfg(test)]
 mod tests {
@@ -175,6 +182,12 @@ mod tests {
     fn a_value_may_hold_equals_signs() {
         let header = ConnectionHeader::parse(b"\x06\0\0\0a=b=c=").unwrap();
         assert_eq!(header.get("a"), Some("b=c="));
+    }
+
+    #[test]
+    fn what_a_peer_says_is_quoted_in_part_only() {
+        assert_eq!(clipped("/talker"), "/talker");
+        assert_eq!(clipped(&"\u{20ac}".repeat(1000)), "\u{20ac}".repeat(256));
     }
 
     #[tokio::test]

@@ -23,12 +23,12 @@ pub struct Message {
     pub received: SystemTime,
 }
 
-/// The publisher at the other end of a connection.
+/// The node at the other end of a connection: a publisher, or a client of a service.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Peer {
     /// Its resolved node name.
     pub caller_id: String,
-    /// What it said of itself and the topic.
+    /// What it said of itself and of the topic or service.
     pub header: ConnectionHeader,
 }
 

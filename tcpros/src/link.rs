@@ -1,5 +1,6 @@
 //! The way to one publisher of one topic: asking it for its address, connecting, reading, and all of it again.
 
+use std::os::fd::AsRawFd;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
@@ -13,9 +14,10 @@ use tokio::time::{sleep, timeout};
 use crate::clock::{self, Throttle};
 use crate::events;
 use crate::frame::{FrameTooLong, Frames};
-use crate::header::{ConnectionHeader, HeaderError};
+use crate::header::{ConnectionHeader, HeaderError, clipped};
 use crate::inbox::{Message, Peer};
 use crate::master::{Master, MasterError, unwrap_triple};
+use crate::outbox::lock;
 use crate::rpc::{self, Endpoint, RpcError};
 use crate::subscription::{Feed, LinkState};
 use crate::xmlrpc::Value;
@@ -67,8 +69,10 @@ pub(crate) async fn run(
         } else {
             events::link_retried(&feed.topic, &uri, &error, wait);
         }
-        sleep(wait).await;
-        wait = (wait * 2).min(LAST_WAIT);
+        tokio::select! {
+            () = sleep(wait) => wait = (wait * 2).min(LAST_WAIT),
+            () = state.named_again.notified() => wait = FIRST_WAIT,
+        }
     }
 }
 
@@ -78,7 +82,10 @@ async fn connect(
     uri: &str,
 ) -> Result<(TcpStream, Arc<Peer>), LinkError> {
     let (host, port) = request_topic(feed, context, uri).await?;
-    let connecting = timeout(CONNECT_LIMIT, rpc::connect(&host, port));
+    let connecting = timeout(
+        CONNECT_LIMIT,
+        rpc::connect(&host, port, context.master.prefers_ipv6()),
+    );
     let mut stream = connecting
         .await
         .map_err(|_| LinkError::NoConnection(CONNECT_LIMIT))??;
@@ -101,7 +108,9 @@ async fn request_topic(
     context: &LinkContext,
     uri: &str,
 ) -> Result<(String, u16), LinkError> {
-    let endpoint = Endpoint::parse(uri).ok_or(RpcError::Uri)?;
+    let endpoint = Endpoint::parse(uri)
+        .ok_or(RpcError::Uri)?
+        .ipv6_first(context.master.prefers_ipv6());
     let protocols = vec![Value::Array(vec!["TCPROS".into()])];
     let params = vec![
         context.caller_id.as_str().into(),
@@ -138,7 +147,7 @@ async fn shake_hands(
     stream.write_all(&request.encode()?).await?;
     let reply = ConnectionHeader::read(stream).await?;
     if let Some(error) = reply.get("error") {
-        return Err(LinkError::Refused(error.to_owned()));
+        return Err(LinkError::Refused(clipped(error).to_owned()));
     }
     if reply.caller_id() == context.caller_id {
         return Err(LinkError::Ourselves);
@@ -146,7 +155,11 @@ async fn shake_hands(
     match reply.md5sum() {
         Some(theirs) if md5sum != "*" && theirs != "*" && theirs != md5sum => {
             Err(LinkError::OtherType {
-                theirs: format!("{}/{theirs}", reply.type_name().unwrap_or("?")),
+                theirs: format!(
+                    "{}/{}",
+                    clipped(reply.type_name().unwrap_or("?")),
+                    clipped(theirs)
+                ),
                 ours: format!("{}/{md5sum}", wanted.type_name.as_deref().unwrap_or("*")),
             })
         }
@@ -163,6 +176,7 @@ async fn follow(
     state: &LinkState,
 ) -> LinkError {
     events::publisher_joined(&feed.topic, &peer.caller_id);
+    *lock(&state.transport) = transport_info(&stream);
     let _connected = feed.connected(Arc::clone(&peer), state);
     let mut frames = Frames::new(context.max_message);
     let mut ahead = 0;
@@ -215,6 +229,19 @@ pub(crate) fn prepare(stream: &TcpStream) -> std::io::Result<()> {
         .with_interval(Duration::from_secs(10))
         .with_retries(6);
     SockRef::from(stream).set_tcp_keepalive(&keepalive)
+}
+
+/// A connection as `rosnode info` reads it.
+pub(crate) fn transport_info(stream: &TcpStream) -> String {
+    match (stream.local_addr(), stream.peer_addr()) {
+        (Ok(local), Ok(peer)) => format!(
+            "TCPROS connection on port {} to [{peer} on socket {}]",
+            local.port(),
+            stream.as_raw_fd()
+        ),
+        // It broke off just now.
+        _ => String::new(),
+    }
 }
 
 /// Why there is no connection to a publisher at the moment.
@@ -276,3 +303,39 @@ const LAST_WAIT: Duration = Duration::from_secs(20);
 /// Failures in a row before the first warning: a publisher that just starts or ends is no news.
 const PATIENCE: u32 = 4;
 const LOG_PERIOD: Duration = Duration::from_secs(60);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Requirement: small messages are not held back, and a peer that is gone without a word is noticed.
+    #[tokio::test]
+    async fn a_connection_has_no_delay_and_is_kept_alive() {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let stream = TcpStream::connect(listener.local_addr().unwrap())
+            .await
+            .unwrap();
+        let (accepted, _) = listener.accept().await.unwrap();
+        for stream in [&stream, &accepted] {
+            prepare(stream).unwrap();
+            assert!(stream.nodelay().unwrap());
+            let socket = SockRef::from(stream);
+            assert!(socket.keepalive().unwrap());
+            assert_eq!(
+                socket.tcp_keepalive_time().unwrap(),
+                Duration::from_secs(60)
+            );
+        }
+    }
+
+    #[tokio::test]
+    async fn a_connection_is_described_as_rosnode_reads_it() {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let server = listener.local_addr().unwrap();
+        let stream = TcpStream::connect(server).await.unwrap();
+        let own = stream.local_addr().unwrap().port();
+        let text = transport_info(&stream);
+        let expected = format!("TCPROS connection on port {own} to [{server} on socket ");
+        assert!(text.starts_with(&expected), "{text}");
+    }
+}

@@ -8,13 +8,15 @@ use thiserror::Error;
 use crate::rpc::{self, Endpoint, RpcError};
 use crate::xmlrpc::Value;
 
-/// Who publishes and subscribes what, as the master knows it.
+/// Who publishes, subscribes and offers what, as the master knows it.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Graph {
     /// Names of the publishing nodes by topic.
     pub publishers: BTreeMap<String, Vec<String>>,
     /// Names of the subscribing nodes by topic.
     pub subscribers: BTreeMap<String, Vec<String>>,
+    /// Names of the nodes that offer services, by service. The master keeps one for each: the last that registered.
+    pub services: BTreeMap<String, Vec<String>>,
     /// Type names by topic. A topic that has only subscribers of any type says `*` or is missing.
     pub types: BTreeMap<String, String>,
 }
@@ -43,6 +45,11 @@ impl Master {
         }
     }
 
+    /// Whether other nodes are tried by IPv6 before IPv4, as this one is told to.
+    pub(crate) const fn prefers_ipv6(&self) -> bool {
+        self.endpoint.prefers_ipv6()
+    }
+
     pub(crate) fn uri(&self) -> &str {
         &self.uri
     }
@@ -56,7 +63,15 @@ impl Master {
 
     /// The URI registered for a node, `None` when the master knows no such node.
     pub(crate) async fn lookup_node(&self, name: &str) -> Result<Option<String>, MasterError> {
-        match self.call("lookupNode", vec![name.into()]).await {
+        self.lookup("lookupNode", name).await
+    }
+
+    async fn lookup(
+        &self,
+        method: &'static str,
+        name: &str,
+    ) -> Result<Option<String>, MasterError> {
+        match self.call(method, vec![name.into()]).await {
             Ok(uri) => Ok(uri.as_str().map(str::to_owned)),
             Err(MasterError::Refused { .. }) => Ok(None),
             Err(error) => Err(error),
@@ -101,10 +116,40 @@ impl Master {
         self.call("unregisterSubscriber", params).await.map(drop)
     }
 
+    pub(crate) async fn register_service(
+        &self,
+        service: &str,
+        service_uri: &str,
+    ) -> Result<(), MasterError> {
+        let params = vec![
+            service.into(),
+            service_uri.into(),
+            self.caller_uri.as_str().into(),
+        ];
+        self.call("registerService", params).await.map(drop)
+    }
+
+    pub(crate) async fn unregister_service(
+        &self,
+        service: &str,
+        service_uri: &str,
+    ) -> Result<(), MasterError> {
+        let params = vec![service.into(), service_uri.into()];
+        self.call("unregisterService", params).await.map(drop)
+    }
+
+    /// The URI registered for a service, `None` when the master knows no such service.
+    pub(crate) async fn lookup_service(
+        &self,
+        service: &str,
+    ) -> Result<Option<String>, MasterError> {
+        self.lookup("lookupService", service).await
+    }
+
     pub(crate) async fn graph(&self) -> Result<Graph, MasterError> {
         let state = self.call("getSystemState", vec![]).await?;
         let types = self.call("getTopicTypes", vec![]).await?;
-        let [publishers, subscribers, ..] = state.as_array().unwrap_or_default() else {
+        let [publishers, subscribers, services, ..] = state.as_array().unwrap_or_default() else {
             return Err(MasterError::Shape("getSystemState"));
         };
         let by_topic = |value| pairs(value, strings).ok_or(MasterError::Shape("getSystemState"));
@@ -112,6 +157,7 @@ impl Master {
         Ok(Graph {
             publishers: by_topic(publishers)?,
             subscribers: by_topic(subscribers)?,
+            services: by_topic(services)?,
             types: pairs(&types, text).ok_or(MasterError::Shape("getTopicTypes"))?,
         })
     }
@@ -128,7 +174,7 @@ impl Master {
     }
 
     /// Calls with the caller id in front and unwraps `[code, message, result]`.
-    async fn call(
+    pub(crate) async fn call(
         &self,
         method: &'static str,
         mut params: Vec<Value>,

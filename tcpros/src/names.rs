@@ -51,26 +51,54 @@ impl Names {
         Ok(remapped.map_or(name, |(_, to)| to.clone()))
     }
 
-    fn expand(&self, name: &str) -> Result<String, NameError> {
-        check(name)?;
-        let full = if name.starts_with('/') {
-            name.to_owned()
-        } else if let Some(private) = name.strip_prefix('~') {
-            join(&self.node, private)
+    /// A name for the master to search upwards: as it is, unless it is private or remapped and thus has its place.
+    pub(crate) fn searched(&self, name: &str) -> Result<String, NameError> {
+        let resolved = self.resolve(name)?;
+        if name.starts_with(['~', '/']) || resolved != self.expand(name)? {
+            Ok(resolved)
         } else {
-            join(&self.namespace, name)
-        };
-        let mut clean = String::with_capacity(full.len());
-        for part in full.split('/').filter(|part| !part.is_empty()) {
-            clean.push('/');
-            clean.push_str(part);
-        }
-        if clean.is_empty() {
-            Err(NameError::Invalid(name.to_owned()))
-        } else {
-            Ok(clean)
+            Ok(name.to_owned())
         }
     }
+
+    fn expand(&self, name: &str) -> Result<String, NameError> {
+        check(name)?;
+        canonical(&full(name, &self.node, &self.namespace))
+            .ok_or_else(|| NameError::Invalid(name.to_owned()))
+    }
+}
+
+/// A parameter's name as a node of this name means it, `/` included; for a master, which knows no remappings and takes
+/// more characters than graph names have.
+pub(crate) fn of_caller(name: &str, caller: &str) -> Result<String, NameError> {
+    if name.is_empty() {
+        return Err(NameError::Invalid(name.to_owned()));
+    }
+    let namespace = caller
+        .rsplit_once('/')
+        .map_or("", |(namespace, _)| namespace);
+    let clean = canonical(&full(name, caller, namespace));
+    Ok(clean.unwrap_or_else(|| "/".to_owned()))
+}
+
+fn full(name: &str, node: &str, namespace: &str) -> String {
+    if name.starts_with('/') {
+        name.to_owned()
+    } else if let Some(private) = name.strip_prefix('~') {
+        join(node, private)
+    } else {
+        join(namespace, name)
+    }
+}
+
+/// A full name without doubled slashes and one at the end; `None` for the root.
+fn canonical(full: &str) -> Option<String> {
+    let mut clean = String::with_capacity(full.len());
+    for part in full.split('/').filter(|part| !part.is_empty()) {
+        clean.push('/');
+        clean.push_str(part);
+    }
+    (!clean.is_empty()).then_some(clean)
 }
 
 /// A name that is no graph resource name.
@@ -95,7 +123,8 @@ fn join(namespace: &str, name: &str) -> String {
     )
 }
 
-fn check(name: &str) -> Result<(), NameError> {
+/// Whether a name is one of ROS (`wiki.ros.org/Names`).
+pub(crate) fn check(name: &str) -> Result<(), NameError> {
     let mut bytes = name.bytes();
     let head = bytes
         .next()
@@ -140,6 +169,24 @@ mod tests {
         assert_eq!(names.resolve("chatter").unwrap(), "/talk");
         assert_eq!(names.resolve("/line1/chatter").unwrap(), "/talk");
         assert_eq!(names.resolve("/chatter").unwrap(), "/chatter");
+    }
+
+    #[test]
+    fn a_private_name_can_be_remapped_and_be_the_target() {
+        let names = names(&[("~out", "/line2/in"), ("log", "~log")]);
+        assert_eq!(names.resolve("~out").unwrap(), "/line2/in");
+        assert_eq!(names.resolve("/line1/cell/out").unwrap(), "/line2/in");
+        assert_eq!(names.resolve("log").unwrap(), "/line1/cell/log");
+        assert_eq!(names.resolve("~/a/").unwrap(), "/line1/cell/a");
+    }
+
+    #[test]
+    fn only_a_relative_name_that_is_not_remapped_is_searched_upwards() {
+        let names = names(&[("gains", "/other/gains")]);
+        assert_eq!(names.searched("limits/low").unwrap(), "limits/low");
+        assert_eq!(names.searched("gains").unwrap(), "/other/gains");
+        assert_eq!(names.searched("~limits").unwrap(), "/line1/cell/limits");
+        assert_eq!(names.searched("/limits").unwrap(), "/limits");
     }
 
     #[test]

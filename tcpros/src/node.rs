@@ -1,18 +1,19 @@
-//! The node: what it publishes and subscribes, and the tasks that serve it.
+//! The node: what it publishes, subscribes and offers, and the tasks that serve it.
 
 use std::collections::HashMap;
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicI32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use bytes::Bytes;
+use socket2::{Domain, Socket, Type};
 use thiserror::Error;
 use tokio::net::TcpListener;
 use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
-use crate::clock;
 use crate::events;
 use crate::inbox::Inbox;
 use crate::link::LinkContext;
@@ -20,15 +21,20 @@ use crate::master::{Graph, Master, MasterError};
 use crate::names::{NameError, Names};
 use crate::options::NodeOptions;
 use crate::outbox::{Limit, lock};
+use crate::parameters::{ParamValue, Parameters, Params};
 use crate::publisher::{Hub, Publisher, PublisherOptions, TopicType};
+use crate::service::{
+    Served, ServiceClient, ServiceClientOptions, ServiceOptions, ServiceRequest, ServiceServer,
+    ServiceType,
+};
 use crate::subscription::{Feed, SubscriberOptions, Subscription, Wanted};
-use crate::time::RosTime;
+use crate::time::{CLOCK_MD5, CLOCK_TYPE, RosClock, RosTime};
 use crate::{registrar, rpc, slave, topic_server};
 
 /// A ROS 1 node. Dropping it ends its connections; only [`Node::shutdown`] also tells the master.
 ///
-/// Three tasks belong to it: the slave API, the listener for subscribers, and the one that keeps the master
-/// informed. Each connection to a subscriber or publisher is a task besides. All end with the node.
+/// Three tasks belong to it: the slave API, the listener for subscribers and clients, and the one that keeps the master
+/// informed. Each connection to a subscriber, publisher or client is a task besides. All end with the node.
 #[derive(Debug)]
 pub struct Node {
     inner: Arc<Inner>,
@@ -45,6 +51,7 @@ impl Node {
             return Err(NodeError::NoRuntime);
         }
         let names = options.names()?;
+        let params = params(&names, options.parameters.clone())?;
         let endpoint = options
             .master()
             .ok_or_else(|| NodeError::MasterUri(options.master_uri.clone()))?;
@@ -61,10 +68,14 @@ impl Node {
         let inner = Arc::new(Inner {
             names,
             uri,
+            service_uri: format!("rosrpc://{}:{topics_port}", bracketed(&options.hostname)),
             hostname: options.hostname,
             topics_port,
             master,
             links: Arc::new(context),
+            params,
+            clock: RosClock::default(),
+            clock_feed: Mutex::default(),
             registry: Mutex::default(),
             changed: Notify::new(),
             master_state: watch::Sender::new(MasterState::Awaited),
@@ -92,14 +103,25 @@ impl Node {
         &self.inner.uri
     }
 
-    /// A topic's name as this node resolves it: namespace, `~` and remappings applied.
+    /// A topic's or service's name as this node resolves it: namespace, `~` and remappings applied.
     pub fn resolve(&self, topic: &str) -> Result<String, NameError> {
         self.inner.names.resolve(topic)
     }
 
-    /// The time for the stamps of messages.
+    /// The time for the stamps of messages: that of [`Node::clock`].
     pub fn now(&self) -> RosTime {
-        RosTime::from_system(clock::utc())
+        self.inner.clock.now()
+    }
+
+    /// The clock that follows `/use_sim_time` and `/clock`. From [`MasterState::Registered`] on it is the one the
+    /// master wants; before that it is the wall clock.
+    pub fn clock(&self) -> RosClock {
+        self.inner.clock.clone()
+    }
+
+    /// The parameters of the node's master.
+    pub fn parameters(&self) -> Parameters {
+        Parameters::new(Arc::clone(&self.inner))
     }
 
     /// Whether the master has been found, now and as it changes.
@@ -175,27 +197,64 @@ impl Node {
             bytes: options.queue_bytes,
         };
         let entrance = Box::new(inbox.open(key, limit));
-        let feed = Arc::new(Feed::new(topic.clone(), wanted, entrance));
-        let mut registry = lock(&self.inner.registry);
-        let generation = registry.next_generation();
-        let entry = registry
-            .subscriptions
-            .entry(topic)
-            .or_insert_with(|| Subscribed {
-                generation,
-                updates: 0,
-                publishers: Vec::new(),
-                feeds: Vec::new(),
-            });
-        entry.feeds.push(Arc::clone(&feed));
-        let publishers = entry.publishers.clone();
-        drop(registry);
-        self.inner.connect(&feed, &publishers);
-        self.inner.changed.notify_one();
+        let feed = Arc::new(Feed::new(topic, wanted, entrance));
+        self.inner.follow(&feed);
         Ok(Subscription::new(feed, Arc::clone(&self.inner)))
     }
 
-    /// Asks the master who publishes and subscribes what.
+    /// Offers a service. The handler is called once per request, for several clients at a time; what it fails with
+    /// reaches the client as text. Where several nodes offer one service, the master sends clients to the last.
+    ///
+    /// Fails when the name is no ROS name, when this node already offers it, or when the type is not complete.
+    pub fn advertise_service<H, F>(
+        &self,
+        service: &str,
+        service_type: ServiceType,
+        options: ServiceOptions,
+        handler: H,
+    ) -> Result<ServiceServer, NodeError>
+    where
+        H: Fn(ServiceRequest) -> F + Send + Sync + 'static,
+        F: Future<Output = Result<Bytes, String>> + Send + 'static,
+    {
+        let service = self.inner.names.resolve(service)?;
+        if !service_type.name.contains('/') || service_type.md5sum.len() != 32 {
+            return Err(NodeError::ServiceType {
+                service,
+                type_name: service_type.name,
+            });
+        }
+        let mut registry = lock(&self.inner.registry);
+        if registry.services.contains_key(&service) {
+            return Err(NodeError::AlreadyOffered(service));
+        }
+        let served = Arc::new(Served::new(
+            service.clone(),
+            service_type,
+            options,
+            registry.next_generation(),
+            self.inner.draining.clone(),
+            handler,
+        ));
+        registry.services.insert(service, Arc::clone(&served));
+        drop(registry);
+        self.inner.changed.notify_one();
+        Ok(ServiceServer::new(served, Arc::clone(&self.inner)))
+    }
+
+    /// A client of a service, which need not be there yet: nobody is asked before the first call. Fails when the name
+    /// is no ROS name.
+    pub fn service_client(
+        &self,
+        service: &str,
+        options: ServiceClientOptions,
+    ) -> Result<ServiceClient, NodeError> {
+        let service = self.inner.names.resolve(service)?;
+        let master = self.inner.master.clone();
+        Ok(ServiceClient::new(service, options, self.name(), master))
+    }
+
+    /// Asks the master who publishes, subscribes and offers what.
     pub async fn graph(&self) -> Result<Graph, MasterError> {
         self.inner.master.graph().await
     }
@@ -207,7 +266,8 @@ impl Node {
         }
     }
 
-    /// Withdraws everything from the master and ends: connections to subscribers after their queues are written,
+    /// Withdraws everything from the master and ends: connections to subscribers after their queues are written, those to
+    /// clients after their requests are answered,
     /// all within two seconds. What could not be withdrawn is logged.
     pub async fn shutdown(mut self) {
         let mut settled = self.inner.settled.subscribe();
@@ -232,7 +292,7 @@ impl Drop for Node {
     }
 }
 
-/// Asks the master of a node who publishes and subscribes what.
+/// Asks the master of a node who publishes, subscribes and offers what.
 #[derive(Clone, Debug)]
 pub struct GraphReader {
     master: Master,
@@ -254,7 +314,7 @@ pub enum MasterState {
     Registered,
 }
 
-/// Why a node could not start or a topic could not be taken.
+/// Why a node could not start or a topic or service could not be taken.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum NodeError {
@@ -287,6 +347,17 @@ pub enum NodeError {
         /// The name given.
         type_name: String,
     },
+    /// This node offers the service already.
+    #[error("{0} is already offered by this node")]
+    AlreadyOffered(String),
+    /// The service's type has no package or no checksum.
+    #[error("{service} cannot be offered with the incomplete type `{type_name}`")]
+    ServiceType {
+        /// The resolved service.
+        service: String,
+        /// The name given.
+        type_name: String,
+    },
 }
 
 /// What the node's handles and tasks share.
@@ -294,10 +365,16 @@ pub enum NodeError {
 pub(crate) struct Inner {
     names: Names,
     pub(crate) uri: String,
+    /// Where the node's services are called, as the master is told it.
+    pub(crate) service_uri: String,
     pub(crate) hostname: String,
     pub(crate) topics_port: u16,
     pub(crate) master: Master,
     links: Arc<LinkContext>,
+    pub(crate) params: Params,
+    clock: RosClock,
+    /// The subscription of `/clock` while time is simulated.
+    clock_feed: Mutex<Option<Arc<Feed>>>,
     registry: Mutex<Registry>,
     /// Rings when the registry no longer is what the master was told.
     pub(crate) changed: Notify,
@@ -306,7 +383,7 @@ pub(crate) struct Inner {
     shutdown: watch::Sender<Option<String>>,
     /// True once everything is closed and the master was told so.
     pub(crate) settled: watch::Sender<bool>,
-    /// Connections to subscribers, those of withdrawn topics included.
+    /// Connections to subscribers and clients, those of withdrawn topics and services included.
     draining: watch::Sender<usize>,
     next_id: AtomicI32,
 }
@@ -315,6 +392,7 @@ pub(crate) struct Inner {
 struct Registry {
     publications: HashMap<String, Arc<Hub>>,
     subscriptions: HashMap<String, Subscribed>,
+    services: HashMap<String, Arc<Served>>,
     generation: u64,
     closed: bool,
 }
@@ -336,19 +414,21 @@ struct Subscribed {
     feeds: Vec<Arc<Feed>>,
 }
 
-/// What the master should know of one topic, and which version of it.
+/// What the master should know of one topic or service, and which version of it.
 #[derive(Clone, Debug)]
 pub(crate) struct Registration {
-    pub(crate) topic: String,
-    pub(crate) kind: TopicKind,
+    pub(crate) name: String,
+    pub(crate) kind: ResourceKind,
     pub(crate) generation: u64,
+    /// Of a topic; the master is not told the type of a service.
     pub(crate) type_name: String,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub(crate) enum TopicKind {
+pub(crate) enum ResourceKind {
     Published,
     Subscribed,
+    Service,
 }
 
 impl Inner {
@@ -381,6 +461,68 @@ impl Inner {
             .collect()
     }
 
+    /// The full name of a parameter; `/` is the root of all.
+    pub(crate) fn parameter_name(&self, name: &str) -> Result<String, NameError> {
+        if name == "/" {
+            Ok(name.to_owned())
+        } else {
+            self.names.resolve(name)
+        }
+    }
+
+    /// A parameter's name for the master to search upwards from this node. A remapped name is no longer relative.
+    pub(crate) fn searched_name(&self, name: &str) -> Result<String, NameError> {
+        self.names.searched(name)
+    }
+
+    /// What is followed of a parameter or namespace has to be read anew.
+    pub(crate) fn parameter_changed(&self, name: &str) {
+        self.params.touch(name);
+        self.changed.notify_one();
+    }
+
+    /// Goes over to simulated time, or back.
+    pub(crate) fn simulate(&self, simulated: bool) {
+        if !self.clock.simulate(simulated) {
+            return;
+        }
+        events::time_source_changed(simulated);
+        let mut current = lock(&self.clock_feed);
+        if let Some(feed) = current.take() {
+            feed.close();
+            self.withdraw_subscription(&feed);
+        }
+        if simulated && let Ok(topic) = self.names.resolve("/clock") {
+            let wanted = Wanted {
+                type_name: Some(CLOCK_TYPE.to_owned()),
+                md5sum: Some(CLOCK_MD5.to_owned()),
+            };
+            let feed = Arc::new(Feed::new(topic, wanted, Box::new(self.clock.clone())));
+            self.follow(&feed);
+            *current = Some(feed);
+        }
+    }
+
+    /// Registers a subscription and links it to the publishers known.
+    fn follow(&self, feed: &Arc<Feed>) {
+        let mut registry = lock(&self.registry);
+        let generation = registry.next_generation();
+        let entry = registry
+            .subscriptions
+            .entry(feed.topic.clone())
+            .or_insert_with(|| Subscribed {
+                generation,
+                updates: 0,
+                publishers: Vec::new(),
+                feeds: Vec::new(),
+            });
+        entry.feeds.push(Arc::clone(feed));
+        let publishers = entry.publishers.clone();
+        drop(registry);
+        self.connect(feed, &publishers);
+        self.changed.notify_one();
+    }
+
     pub(crate) fn withdraw_publication(&self, hub: &Arc<Hub>) {
         let mut registry = lock(&self.registry);
         if registry
@@ -389,6 +531,24 @@ impl Inner {
             .is_some_and(|known| Arc::ptr_eq(known, hub))
         {
             registry.publications.remove(&hub.topic);
+        }
+        drop(registry);
+        self.changed.notify_one();
+    }
+
+    pub(crate) fn service(&self, name: &str) -> Option<Arc<Served>> {
+        lock(&self.registry).services.get(name).cloned()
+    }
+
+    pub(crate) fn services(&self) -> Vec<Arc<Served>> {
+        lock(&self.registry).services.values().cloned().collect()
+    }
+
+    pub(crate) fn withdraw_service(&self, served: &Arc<Served>) {
+        let mut registry = lock(&self.registry);
+        let known = registry.services.get(&served.service);
+        if known.is_some_and(|known| Arc::ptr_eq(known, served)) {
+            registry.services.remove(&served.service);
         }
         drop(registry);
         self.changed.notify_one();
@@ -410,8 +570,8 @@ impl Inner {
     pub(crate) fn wanted_registrations(&self) -> Vec<Registration> {
         let registry = lock(&self.registry);
         let published = registry.publications.values().map(|hub| Registration {
-            topic: hub.topic.clone(),
-            kind: TopicKind::Published,
+            name: hub.topic.clone(),
+            kind: ResourceKind::Published,
             generation: hub.generation,
             type_name: hub.topic_type.name.clone(),
         });
@@ -419,8 +579,8 @@ impl Inner {
             .subscriptions
             .iter()
             .map(|(topic, entry)| Registration {
-                topic: topic.clone(),
-                kind: TopicKind::Subscribed,
+                name: topic.clone(),
+                kind: ResourceKind::Subscribed,
                 generation: entry.generation,
                 type_name: entry
                     .feeds
@@ -428,7 +588,13 @@ impl Inner {
                     .find_map(|feed| feed.wanted.type_name.clone())
                     .unwrap_or_else(|| "*".to_owned()),
             });
-        published.chain(subscribed).collect()
+        let offered = registry.services.values().map(|served| Registration {
+            name: served.service.clone(),
+            kind: ResourceKind::Service,
+            generation: served.generation,
+            type_name: String::new(),
+        });
+        published.chain(subscribed).chain(offered).collect()
     }
 
     /// How many lists of publishers have come for a topic.
@@ -483,11 +649,15 @@ impl Inner {
         });
     }
 
+    pub(crate) fn is_asked_to_shut_down(&self) -> bool {
+        self.shutdown.borrow().is_some()
+    }
+
     pub(crate) fn is_closed(&self) -> bool {
         lock(&self.registry).closed
     }
 
-    /// Ends all topics, for good.
+    /// Ends all topics and services, for good.
     fn close(&self) {
         let mut registry = lock(&self.registry);
         registry.closed = true;
@@ -497,23 +667,47 @@ impl Inner {
             .drain()
             .flat_map(|(_, entry)| entry.feeds)
             .collect();
+        let services: Vec<_> = registry
+            .services
+            .drain()
+            .map(|(_, served)| served)
+            .collect();
         drop(registry);
+        self.params.close();
         for hub in &hubs {
             hub.close();
         }
         for feed in &feeds {
             feed.close();
         }
+        for served in &services {
+            served.close();
+        }
     }
+}
+
+/// The parameters to begin with, by their full names.
+fn params(names: &Names, given: Vec<(String, ParamValue)>) -> Result<Params, NodeError> {
+    let full =
+        |(name, value): (String, ParamValue)| Ok((names.resolve(&format!("~{name}"))?, value));
+    let given = given
+        .into_iter()
+        .map(full)
+        .collect::<Result<_, NameError>>()?;
+    Ok(Params::new(given, names.resolve("/use_sim_time")?))
 }
 
 /// Listens on a port of the system's choosing.
 fn listen(address: IpAddr) -> Result<(TcpListener, u16), NodeError> {
     let open = || {
-        let listener = std::net::TcpListener::bind((address, 0))?;
-        listener.set_nonblocking(true)?;
+        let address = SocketAddr::from((address, 0));
+        let socket = Socket::new(Domain::for_address(address), Type::STREAM, None)?;
+        socket.bind(&address.into())?;
+        socket.listen(BACKLOG)?;
+        socket.set_nonblocking(true)?;
+        let listener = TcpListener::from_std(socket.into())?;
         let port = listener.local_addr()?.port();
-        Ok((TcpListener::from_std(listener)?, port))
+        Ok((listener, port))
     };
     open().map_err(|source| NodeError::Listen { address, source })
 }
@@ -528,3 +722,6 @@ fn bracketed(host: &str) -> String {
 }
 
 const SHUTDOWN_LIMIT: Duration = Duration::from_secs(2);
+/// Peers that may connect in one moment: a launch file starts a whole graph at once, and one that is not let in tries
+/// again after a second.
+const BACKLOG: i32 = 1024;

@@ -2,11 +2,14 @@
 
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr};
 
-use crate::names::{NameError, Names};
+use thiserror::Error;
+
+use crate::names::{self, NameError, Names};
+use crate::parameters::{self, ParamError, ParamValue};
 use crate::rpc::Endpoint;
 
 /// What a node needs to know before it starts.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct NodeOptions {
     /// Name without namespace, such as `bridge`.
     pub name: String,
@@ -20,13 +23,19 @@ pub struct NodeOptions {
     pub bind: IpAddr,
     /// Pairs of names: who uses the first gets the second.
     pub remappings: Vec<(String, String)>,
+    /// Private parameters by their names without `~`. They are set at the master before the node counts as
+    /// registered, and after a restart of the master those that are no longer set.
+    pub parameters: Vec<(String, ParamValue)>,
+    /// Whether the IPv6 addresses of a host are tried before its IPv4 addresses (`ROS_IPV6=on`).
+    pub ipv6: bool,
     /// Longest message taken from a publisher, in bytes. A longer one closes its connection.
     pub max_message: usize,
 }
 
 impl NodeOptions {
-    /// Reads `ROS_MASTER_URI`, `ROS_HOSTNAME`, `ROS_IP` and `ROS_NAMESPACE`, with the defaults of ROS for those that
-    /// are not set: port 11311 here, and the name of this machine.
+    /// Reads `ROS_MASTER_URI`, `ROS_HOSTNAME`, `ROS_IP`, `ROS_NAMESPACE` and `ROS_IPV6`, with the defaults of ROS for
+    /// those that are not set: port 11311 here, and the name of this machine
+    /// (`wiki.ros.org/ROS/EnvironmentVariables`).
     pub fn from_env(name: &str) -> Self {
         Self::from_lookup(name, |key| std::env::var(key).ok())
     }
@@ -36,22 +45,30 @@ impl NodeOptions {
         let hostname = set("ROS_HOSTNAME")
             .or_else(|| set("ROS_IP"))
             .unwrap_or_else(|| gethostname::gethostname().to_string_lossy().into_owned());
+        let ipv6 = set("ROS_IPV6").as_deref() == Some("on");
         Self {
             name: name.to_owned(),
             namespace: set("ROS_NAMESPACE").unwrap_or_else(|| "/".to_owned()),
             master_uri: set("ROS_MASTER_URI")
                 .unwrap_or_else(|| "http://localhost:11311".to_owned()),
-            bind: bind_for(&hostname),
+            bind: bind_for(&hostname, ipv6),
             hostname,
             remappings: Vec::new(),
+            parameters: Vec::new(),
+            ipv6,
             max_message: DEFAULT_MAX_MESSAGE,
         }
     }
 
-    /// Takes the arguments that ROS gives a meaning to: `__name:=`, `__ns:=`, `__ip:=`, `__hostname:=`, `__master:=`
-    /// and `from:=to`. Returns the others in their order; private parameters (`_name:=value`) and unknown `__`
-    /// words are among them.
-    pub fn apply_arguments<S: AsRef<str>>(&mut self, arguments: &[S]) -> Vec<String> {
+    /// Takes the arguments that ROS gives a meaning to: `__name:=`, `__ns:=`, `__ip:=`, `__hostname:=`, `__master:=`,
+    /// `__log:=` (without effect: this crate writes no log file), `from:=to` and `_parameter:=value`
+    /// (`wiki.ros.org/Remapping Arguments`). Returns the others in their order, unknown `__` words among them.
+    ///
+    /// Fails when a remapping or a parameter has no ROS name, or a parameter is an integer past 32 bits.
+    pub fn apply_arguments<S: AsRef<str>>(
+        &mut self,
+        arguments: &[S],
+    ) -> Result<Vec<String>, ArgumentError> {
         let mut others = Vec::new();
         // An address given by name wins over `__ip`, whatever their order.
         let mut named = false;
@@ -66,20 +83,37 @@ impl NodeOptions {
                     named = true;
                 }
                 Some(("__ip", value)) if !named => self.advertise_as(value),
-                Some(("__ip", _)) => {}
-                Some((from, to)) if !from.starts_with('_') => {
-                    self.remappings.push((from.to_owned(), to.to_owned()));
+                Some(("__ip" | "__log", _)) => {}
+                Some((from, to)) if !from.starts_with("__") => {
+                    self.assign(from, to)
+                        .map_err(|reason| ArgumentError::new(argument, reason))?;
                 }
                 _ => others.push(argument.to_owned()),
             }
         }
-        others
+        Ok(others)
+    }
+
+    fn assign(&mut self, from: &str, to: &str) -> Result<(), ParamError> {
+        if let Some(parameter) = from.strip_prefix('_') {
+            if parameter.is_empty() {
+                return Err(NameError::Invalid(from.to_owned()).into());
+            }
+            names::check(&format!("~{parameter}"))?;
+            let value = parameters::argument_value(to)?;
+            self.parameters.push((parameter.to_owned(), value));
+        } else {
+            names::check(from)?;
+            names::check(to)?;
+            self.remappings.push((from.to_owned(), to.to_owned()));
+        }
+        Ok(())
     }
 
     /// Sets the address that others are told, and with it the one to listen on: all, or loopback alone.
     pub fn advertise_as(&mut self, hostname: &str) {
         hostname.clone_into(&mut self.hostname);
-        self.bind = bind_for(hostname);
+        self.bind = bind_for(hostname, self.ipv6);
     }
 
     pub(crate) fn names(&self) -> Result<Names, NameError> {
@@ -87,16 +121,45 @@ impl NodeOptions {
     }
 
     pub(crate) fn master(&self) -> Option<Endpoint> {
-        Endpoint::parse(&self.master_uri)
+        Endpoint::parse(&self.master_uri).map(|endpoint| endpoint.ipv6_first(self.ipv6))
     }
 }
 
-fn bind_for(hostname: &str) -> IpAddr {
+/// Where to listen so that others reach this host name: everywhere, or on loopback alone. Listening on `::` takes
+/// IPv4 as well.
+fn bind_for(hostname: &str, ipv6: bool) -> IpAddr {
     match hostname.parse::<IpAddr>() {
         Ok(address) if address.is_loopback() => address,
-        Ok(IpAddr::V6(_)) => Ipv6Addr::UNSPECIFIED.into(),
+        Err(_) if hostname == "localhost" && ipv6 => Ipv6Addr::LOCALHOST.into(),
         Err(_) if hostname == "localhost" => Ipv4Addr::LOCALHOST.into(),
+        Ok(IpAddr::V6(_)) => Ipv6Addr::UNSPECIFIED.into(),
+        _ if ipv6 => Ipv6Addr::UNSPECIFIED.into(),
         _ => Ipv4Addr::UNSPECIFIED.into(),
+    }
+}
+
+/// A word of the command line that looks like one of ROS and is none.
+#[derive(Debug, Error)]
+#[error(
+    "`{word}` is neither a remapping (from:=to) nor a private parameter (_name:=value): {reason}"
+)]
+pub struct ArgumentError {
+    word: String,
+    #[source]
+    reason: ParamError,
+}
+
+impl ArgumentError {
+    fn new(word: &str, reason: ParamError) -> Self {
+        Self {
+            word: word.to_owned(),
+            reason,
+        }
+    }
+
+    /// The word.
+    pub fn word(&self) -> &str {
+        &self.word
     }
 }
 
@@ -150,8 +213,12 @@ mod tests {
             "__hostname:=localhost",
             "__ip:=10.0.0.9",
             "_rate:=5",
+            "__log:=/tmp/x.log",
+            "__what:=1",
+            "~out:=/y",
         ]);
-        assert_eq!(rest, ["map.yaml", "_rate:=5"]);
+        assert_eq!(rest.unwrap(), ["map.yaml", "__what:=1"]);
+        assert_eq!(options.parameters, [("rate".to_owned(), 5.into())]);
         assert_eq!(
             (options.hostname.as_str(), options.bind.is_loopback()),
             ("localhost", true)
@@ -159,5 +226,37 @@ mod tests {
         let names = options.names().unwrap();
         assert_eq!(names.node(), "/line/b");
         assert_eq!(names.resolve("a").unwrap(), "/x");
+        assert_eq!(names.resolve("~out").unwrap(), "/y");
+    }
+
+    #[test]
+    fn a_word_that_remaps_no_name_is_refused_and_named() {
+        for word in [
+            "1a:=b",
+            "a:=b c",
+            "a:=",
+            ":=b",
+            "_:=1",
+            "_a-b:=1",
+            "_n:=2147483648",
+        ] {
+            let error = from(&[]).apply_arguments(&[word]).unwrap_err();
+            assert_eq!(error.word(), word);
+            assert!(error.to_string().contains(word), "{error}");
+        }
+    }
+
+    #[test]
+    fn with_ipv6_a_node_listens_on_both_families_and_on_the_loopback_it_is_known_by() {
+        let v6 = |more: &[(&str, &str)]| from(&[&[("ROS_IPV6", "on")], more].concat());
+        assert_eq!(v6(&[]).bind, Ipv6Addr::UNSPECIFIED);
+        assert_eq!(v6(&[("ROS_IP", "10.0.0.7")]).bind, Ipv6Addr::UNSPECIFIED);
+        assert_eq!(
+            v6(&[("ROS_HOSTNAME", "localhost")]).bind,
+            Ipv6Addr::LOCALHOST
+        );
+        assert_eq!(v6(&[("ROS_IP", "127.0.0.1")]).bind, Ipv4Addr::LOCALHOST);
+        assert_eq!(from(&[("ROS_IP", "::1")]).bind, Ipv6Addr::LOCALHOST);
+        assert_eq!(from(&[("ROS_IPV6", "off")]).bind, Ipv4Addr::UNSPECIFIED);
     }
 }

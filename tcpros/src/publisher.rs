@@ -7,7 +7,7 @@ use bytes::Bytes;
 use tokio::sync::watch;
 
 use crate::events;
-use crate::header::ConnectionHeader;
+use crate::header::{ConnectionHeader, clipped};
 use crate::node::Inner;
 use crate::outbox::{Limit, Outbox, lock};
 
@@ -30,6 +30,8 @@ pub struct PublisherOptions {
     /// How many messages may wait for one subscriber; then its oldest are dropped.
     pub queue_messages: usize,
     /// How many bytes may wait for one subscriber; then its oldest are dropped. The newest message is always kept.
+    /// Subscribers that are slow at the same time wait for the same messages, which are held once: beyond this, each
+    /// costs what is being written to it, 64 KiB or one longer message.
     pub queue_bytes: usize,
 }
 
@@ -54,6 +56,16 @@ pub struct Published {
     pub dropped_oldest: u64,
 }
 
+/// Which of the messages for late subscribers a message is. They get them in the order of their keys.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Latched {
+    /// It takes the place of all others.
+    Alone(u64),
+    /// It is one of several, and takes the place of the one with its key. Of more than [`MAX_LATCHED`] the first gives
+    /// way.
+    Beside(u64),
+}
+
 /// Publishes on one topic. Dropping it withdraws the topic; what is queued is still sent, within a second.
 #[derive(Debug)]
 pub struct Publisher {
@@ -70,12 +82,38 @@ impl Publisher {
     /// its oldest messages and nobody else's. A message past 4 GiB has no length on the wire: it goes to nobody, with
     /// a line in the log.
     pub fn publish(&self, message: Bytes) -> Published {
-        self.hub.publish(message)
+        self.hub.publish(message, Latched::Alone(0))
+    }
+
+    /// As [`publish`](Self::publish), where late subscribers may get the last message of several sources: `latched` says
+    /// which of them stay. Without `latch` none does.
+    pub fn publish_latched(&self, message: Bytes, latched: Latched) -> Published {
+        self.hub.publish(message, latched)
+    }
+
+    /// Keeps a message for late subscribers under `key` beside others, and sends it to nobody.
+    pub fn latch(&self, key: u64, message: Bytes) {
+        if u32::try_from(message.len()).is_ok() {
+            self.hub.latch(message, Latched::Beside(key));
+        }
+    }
+
+    /// Late subscribers no longer get what is latched under `key`.
+    pub fn forget_latched(&self, key: u64) {
+        lock(&self.hub.state)
+            .latched
+            .retain(|(other, _)| *other != key);
     }
 
     /// How many subscribers are connected.
     pub fn subscribers(&self) -> usize {
         lock(&self.hub.state).subscribers.len()
+    }
+
+    /// Whether the node of this resolved name is connected.
+    pub fn is_subscribed_by(&self, node: &str) -> bool {
+        let state = lock(&self.hub.state);
+        state.subscribers.iter().any(|s| s.caller_id == node)
     }
 
     /// The topic's resolved name.
@@ -118,7 +156,8 @@ pub(crate) struct Hub {
 #[derive(Debug, Default)]
 struct HubState {
     subscribers: Vec<Arc<Subscriber>>,
-    latched: Option<Bytes>,
+    /// Ordered by key.
+    latched: Vec<(u64, Bytes)>,
     refused_type: Option<String>,
     closed: bool,
 }
@@ -128,6 +167,8 @@ struct HubState {
 pub(crate) struct Subscriber {
     pub(crate) id: i32,
     pub(crate) caller_id: String,
+    /// What `rosnode info` shows of the connection.
+    pub(crate) transport: String,
     pub(crate) outbox: Outbox,
     pub(crate) bytes: AtomicU64,
     pub(crate) messages: AtomicU64,
@@ -152,7 +193,7 @@ impl Hub {
         }
     }
 
-    fn publish(&self, message: Bytes) -> Published {
+    fn publish(&self, message: Bytes, latched: Latched) -> Published {
         if u32::try_from(message.len()).is_err() {
             events::message_too_long(&self.topic, message.len());
             return Published {
@@ -169,8 +210,8 @@ impl Hub {
             published.dropped_oldest += subscriber.outbox.push(message.clone());
             published.sent_to += 1;
         }
-        if self.options.latch && !state.closed {
-            state.latched = Some(message);
+        if self.options.latch {
+            state.latch(message, latched);
         }
         drop(state);
         self.dropped
@@ -178,8 +219,19 @@ impl Hub {
         published
     }
 
-    /// Adds a subscriber, its queue beginning with the latched message; `None` once the topic is withdrawn.
-    pub(crate) fn join(self: &Arc<Self>, id: i32, caller_id: &str) -> Option<Joined> {
+    fn latch(&self, message: Bytes, latched: Latched) {
+        if self.options.latch {
+            lock(&self.state).latch(message, latched);
+        }
+    }
+
+    /// Adds a subscriber, its queue beginning with the latched messages; `None` once the topic is withdrawn.
+    pub(crate) fn join(
+        self: &Arc<Self>,
+        id: i32,
+        caller_id: &str,
+        transport: String,
+    ) -> Option<Joined> {
         let limit = Limit {
             messages: self.options.queue_messages,
             bytes: self.options.queue_bytes,
@@ -187,6 +239,7 @@ impl Hub {
         let subscriber = Arc::new(Subscriber {
             id,
             caller_id: caller_id.to_owned(),
+            transport,
             outbox: Outbox::new(limit),
             bytes: AtomicU64::new(0),
             messages: AtomicU64::new(0),
@@ -195,7 +248,7 @@ impl Hub {
         if state.closed {
             return None;
         }
-        if let Some(latched) = &state.latched {
+        for (_, latched) in &state.latched {
             subscriber.outbox.push(latched.clone());
         }
         state.subscribers.push(Arc::clone(&subscriber));
@@ -211,7 +264,7 @@ impl Hub {
     pub(crate) fn close(&self) {
         let mut state = lock(&self.state);
         state.closed = true;
-        state.latched = None;
+        state.latched.clear();
         for subscriber in &state.subscribers {
             subscriber.outbox.close();
         }
@@ -237,12 +290,13 @@ impl Hub {
         };
         // As roscpp and rospy do it: the checksum decides. Names alone differ where packages were renamed.
         if !fits(Some(md5sum), &ours.md5sum) {
-            lock(&self.state).refused_type = request.type_name().map(str::to_owned);
+            let wanted = clipped(request.type_name().unwrap_or("*"));
+            lock(&self.state).refused_type = request.type_name().map(|_| wanted.to_owned());
             return Err(format!(
-                "Client [{}] wants topic {} to have datatype/md5sum [{}/{md5sum}], but our version has [{}/{}]. Dropping connection.",
-                request.caller_id(),
+                "Client [{}] wants topic {} to have datatype/md5sum [{wanted}/{}], but our version has [{}/{}]. Dropping connection.",
+                clipped(request.caller_id()),
                 self.topic,
-                request.type_name().unwrap_or("*"),
+                clipped(md5sum),
                 ours.name,
                 ours.md5sum,
             ));
@@ -255,6 +309,34 @@ impl Hub {
             .with("topic", &*self.topic)
             .with("latching", if self.options.latch { "1" } else { "0" });
         Ok(reply)
+    }
+}
+
+impl HubState {
+    fn latch(&mut self, message: Bytes, latched: Latched) {
+        if self.closed {
+            return;
+        }
+        let key = match latched {
+            Latched::Alone(key) => {
+                self.latched.clear();
+                key
+            }
+            Latched::Beside(key) => key,
+        };
+        match self.latched.binary_search_by_key(&key, |(key, _)| *key) {
+            Ok(at) => {
+                if let Some((_, before)) = self.latched.get_mut(at) {
+                    *before = message;
+                }
+            }
+            Err(at) => {
+                self.latched.insert(at, (key, message));
+                if self.latched.len() > MAX_LATCHED {
+                    self.latched.remove(0);
+                }
+            }
+        }
     }
 }
 
@@ -275,11 +357,18 @@ impl Drop for Joined {
     }
 }
 
+/// Messages latched side by side.
+pub const MAX_LATCHED: usize = 64;
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     fn hub(latch: bool) -> Arc<Hub> {
+        hub_of(latch, 2)
+    }
+
+    fn hub_of(latch: bool, queue_messages: usize) -> Arc<Hub> {
         let topic_type = TopicType {
             name: "std_msgs/String".to_owned(),
             md5sum: "992ce8a1687cec8c8bd883ec73ca41d1".to_owned(),
@@ -287,7 +376,7 @@ mod tests {
         };
         let options = PublisherOptions {
             latch,
-            queue_messages: 2,
+            queue_messages,
             ..PublisherOptions::default()
         };
         Arc::new(Hub::new(
@@ -346,7 +435,7 @@ mod tests {
     async fn a_late_subscriber_gets_the_last_message_of_a_latched_topic_only() {
         for latch in [true, false] {
             let hub = hub(latch);
-            let none = hub.publish(Bytes::from_static(b"1"));
+            let none = hub.publish(Bytes::from_static(b"1"), Latched::Alone(0));
             assert_eq!(
                 none,
                 Published {
@@ -354,7 +443,7 @@ mod tests {
                     dropped_oldest: 0
                 }
             );
-            let late = hub.join(1, "/late").unwrap();
+            let late = hub.join(1, "/late", String::new()).unwrap();
             hub.close();
             let mut taken = Vec::new();
             assert_eq!(late.subscriber.outbox.take(&mut taken, 64).await, latch);
@@ -362,16 +451,44 @@ mod tests {
         }
     }
 
+    #[tokio::test]
+    async fn a_late_subscriber_gets_what_several_sources_latched_in_the_order_of_their_keys() {
+        let hub = hub_of(true, 10);
+        let message = |text: &'static str| Bytes::from_static(text.as_bytes());
+        let _early = hub.publish(message("0"), Latched::Alone(10));
+        let _third = hub.publish(message("3"), Latched::Beside(30));
+        hub.latch(message("2"), Latched::Beside(20));
+        let _again = hub.publish(message("4"), Latched::Beside(30));
+        let late = async |id| {
+            let late = hub.join(id, "/late").unwrap();
+            let mut taken = Vec::new();
+            late.subscriber.outbox.take(&mut taken, 64).await;
+            taken
+        };
+        assert_eq!(late(1).await, ["0", "2", "4"]);
+        lock(&hub.state).latched.retain(|(key, _)| *key != 20);
+        assert_eq!(late(2).await, ["0", "4"]);
+        let _alone = hub.publish(message("5"), Latched::Alone(5));
+        assert_eq!(late(3).await, ["5"]);
+        for key in 0..100 {
+            let _one_more = hub.publish(message("6"), Latched::Beside(key));
+        }
+        assert_eq!(lock(&hub.state).latched.len(), MAX_LATCHED);
+    }
+
     #[test]
     fn a_subscriber_that_does_not_read_costs_only_itself() {
         let hub = hub(false);
-        let joined = hub.join(1, "/slow").unwrap();
+        let joined = hub.join(1, "/slow", String::new()).unwrap();
         let published: Vec<_> = (0..3u8)
-            .map(|n| hub.publish(Bytes::from(vec![n])).dropped_oldest)
+            .map(|n| {
+                hub.publish(Bytes::from(vec![n]), Latched::Alone(0))
+                    .dropped_oldest
+            })
             .collect();
         assert_eq!(published, [0, 0, 1]);
         assert_eq!(joined.subscriber.outbox.dropped(), 1);
         drop(joined);
-        assert_eq!(hub.publish(Bytes::new()).sent_to, 0);
+        assert_eq!(hub.publish(Bytes::new(), Latched::Alone(0)).sent_to, 0);
     }
 }

@@ -1,7 +1,7 @@
-//! Keeps the master's knowledge of this node equal to what the node publishes and subscribes.
+//! Keeps the master's knowledge of this node equal to what the node publishes, subscribes and offers.
 //!
 //! It compares what should be registered with what the master was told and settles the difference, so the order in
-//! which topics come and go, a master that starts late, and one that restarts are the same case.
+//! which topics and services come and go, a master that starts late, and one that restarts are the same case.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -13,7 +13,8 @@ use tokio::time::{Instant, sleep, timeout};
 use crate::clock::{self, Throttle};
 use crate::events;
 use crate::master::MasterError;
-use crate::node::{Inner, MasterState, Registration, TopicKind};
+use crate::node::{Inner, MasterState, Registration, ResourceKind};
+use crate::parameters;
 
 /// Works until the node is closed and the master has been told.
 pub(crate) async fn run(node: Arc<Inner>) {
@@ -48,7 +49,7 @@ pub(crate) async fn run(node: Arc<Inner>) {
                 };
             }
         }
-        if closed && registrar.told.is_empty() {
+        if closed && registrar.told.is_empty() && node.params.is_empty() {
             node.settled.send_replace(true);
             return;
         }
@@ -62,7 +63,7 @@ pub(crate) async fn run(node: Arc<Inner>) {
 struct Registrar {
     node: Arc<Inner>,
     /// What the master was told, whether or not it has answered yet.
-    told: HashMap<(String, TopicKind), Told>,
+    told: HashMap<(String, ResourceKind), Told>,
     pid: Option<i32>,
     /// `None` before the first try.
     found: Option<bool>,
@@ -82,12 +83,12 @@ enum Job {
         replaces: bool,
     },
     Unregister {
-        topic: String,
-        kind: TopicKind,
+        name: String,
+        kind: ResourceKind,
     },
 }
 
-type Outcome = ((String, TopicKind), Option<u64>, Result<(), MasterError>);
+type Outcome = ((String, ResourceKind), Option<u64>, Result<(), MasterError>);
 
 impl Registrar {
     async fn turn(&mut self, closed: bool) -> Result<(), MasterError> {
@@ -95,6 +96,15 @@ impl Registrar {
         if due && !closed {
             self.check().await?;
             self.checked = Some(clock::now());
+        }
+        // First of all: a program may read its own parameters as soon as the node is registered.
+        if let Err(error) = parameters::settle(&self.node, &mut self.refusals).await {
+            if closed {
+                events::unregistration_failed(self.node.name(), &error);
+                self.told.clear();
+                self.node.params.abandon();
+            }
+            return Err(error);
         }
         let mut jobs = self.jobs();
         let mut running: JoinSet<Outcome> = JoinSet::new();
@@ -128,7 +138,9 @@ impl Registrar {
         let pid = master.pid().await?;
         let other = self.pid.replace(pid).is_some_and(|before| before != pid);
         let mut forgotten = other;
-        if !other && self.told.values().any(|told| told.confirmed) {
+        let known =
+            self.node.params.any_subscribed() || self.told.values().any(|told| told.confirmed);
+        if !other && known {
             match master.lookup_node(self.node.name()).await? {
                 None => forgotten = true,
                 Some(uri) if uri != self.node.uri => {
@@ -148,16 +160,27 @@ impl Registrar {
             self.told
                 .values_mut()
                 .for_each(|told| told.confirmed = false);
+            self.node.params.forget();
         }
         Ok(())
     }
 
     fn jobs(&mut self) -> Vec<Job> {
-        let wanted = self.node.wanted_registrations();
+        let mut wanted = self.node.wanted_registrations();
+        if self.node.is_asked_to_shut_down() {
+            // The name belongs to another node now, which a registration would push out in turn.
+            wanted.retain(|registration| {
+                let key = (registration.name.clone(), registration.kind);
+                let told = self.told.get(&key);
+                told.is_some_and(|told| {
+                    told.confirmed && told.generation == registration.generation
+                })
+            });
+        }
         let mut gone = self.told.clone();
         let mut jobs = Vec::new();
         for registration in wanted {
-            let key = (registration.topic.clone(), registration.kind);
+            let key = (registration.name.clone(), registration.kind);
             let before = gone.remove(&key);
             let current = before.filter(|told| told.generation == registration.generation);
             if current.is_some_and(|told| told.confirmed) {
@@ -176,7 +199,7 @@ impl Registrar {
         }
         jobs.extend(
             gone.into_keys()
-                .map(|(topic, kind)| Job::Unregister { topic, kind }),
+                .map(|(name, kind)| Job::Unregister { name, kind }),
         );
         jobs
     }
@@ -236,39 +259,47 @@ async fn perform(node: Arc<Inner>, job: Job) -> Outcome {
             replaces,
         } => {
             let Registration {
-                topic,
+                name,
                 kind,
                 generation,
                 type_name,
             } = registration;
             let result = async {
                 if replaces {
-                    unregister(&node, &topic, kind).await?;
+                    unregister(&node, &name, kind).await?;
                 }
                 match kind {
-                    TopicKind::Published => master.register_publisher(&topic, &type_name).await,
-                    TopicKind::Subscribed => {
-                        let seen = node.updates(&topic);
-                        let publishers = master.register_subscriber(&topic, &type_name).await?;
-                        node.registered_publishers(&topic, &publishers, seen);
+                    ResourceKind::Published => master.register_publisher(&name, &type_name).await,
+                    ResourceKind::Subscribed => {
+                        let seen = node.updates(&name);
+                        let publishers = master.register_subscriber(&name, &type_name).await?;
+                        node.registered_publishers(&name, &publishers, seen);
                         Ok(())
+                    }
+                    ResourceKind::Service => {
+                        master.register_service(&name, &node.service_uri).await
                     }
                 }
             };
             let result = result.await;
-            ((topic, kind), Some(generation), result)
+            ((name, kind), Some(generation), result)
         }
-        Job::Unregister { topic, kind } => {
-            let result = unregister(&node, &topic, kind).await;
-            ((topic, kind), None, result)
+        Job::Unregister { name, kind } => {
+            let result = unregister(&node, &name, kind).await;
+            ((name, kind), None, result)
         }
     }
 }
 
-async fn unregister(node: &Inner, topic: &str, kind: TopicKind) -> Result<(), MasterError> {
+async fn unregister(node: &Inner, name: &str, kind: ResourceKind) -> Result<(), MasterError> {
     match kind {
-        TopicKind::Published => node.master.unregister_publisher(topic).await,
-        TopicKind::Subscribed => node.master.unregister_subscriber(topic).await,
+        ResourceKind::Published => node.master.unregister_publisher(name).await,
+        ResourceKind::Subscribed => node.master.unregister_subscriber(name).await,
+        ResourceKind::Service => {
+            node.master
+                .unregister_service(name, &node.service_uri)
+                .await
+        }
     }
 }
 

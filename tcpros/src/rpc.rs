@@ -26,28 +26,47 @@ pub(crate) struct Endpoint {
     host: String,
     port: u16,
     path: String,
+    ipv6_first: bool,
 }
 
 impl Endpoint {
     /// Reads `http://host:port[/path]`.
     pub(crate) fn parse(uri: &str) -> Option<Self> {
-        let rest = uri.trim().strip_prefix("http://")?;
-        let (authority, path) = rest.find('/').map_or((rest, "/"), |at| rest.split_at(at));
-        let (host, port) = authority.rsplit_once(':')?;
-        let host = host
-            .strip_prefix('[')
-            .and_then(|h| h.strip_suffix(']'))
-            .unwrap_or(host);
-        let plain = |text: &str| text.bytes().all(|b| b.is_ascii_graphic());
-        if host.is_empty() || !plain(host) || !plain(path) {
-            return None;
-        }
+        let (host, port, path) = parts(uri, "http://")?;
         Some(Self {
             host: host.to_owned(),
-            port: port.parse().ok()?,
+            port,
             path: path.to_owned(),
+            ipv6_first: false,
         })
     }
+
+    /// Whether it tries the IPv6 addresses of a host before the others.
+    pub(crate) const fn prefers_ipv6(&self) -> bool {
+        self.ipv6_first
+    }
+
+    /// Tries the IPv6 addresses of the host before the others, or after them.
+    pub(crate) const fn ipv6_first(mut self, ipv6_first: bool) -> Self {
+        self.ipv6_first = ipv6_first;
+        self
+    }
+}
+
+/// Host, port and path of a URI of this scheme.
+pub(crate) fn parts<'a>(uri: &'a str, scheme: &str) -> Option<(&'a str, u16, &'a str)> {
+    let rest = uri.trim().strip_prefix(scheme)?;
+    let (authority, path) = rest.find('/').map_or((rest, "/"), |at| rest.split_at(at));
+    let (host, port) = authority.rsplit_once(':')?;
+    let host = host
+        .strip_prefix('[')
+        .and_then(|h| h.strip_suffix(']'))
+        .unwrap_or(host);
+    let plain = |text: &str| text.bytes().all(|b| b.is_ascii_graphic());
+    if host.is_empty() || !plain(host) || !plain(path) {
+        return None;
+    }
+    Some((host, port.parse().ok()?, path))
 }
 
 /// Calls a method and waits for its result at most `limit`.
@@ -70,7 +89,7 @@ pub(crate) async fn call(
 }
 
 async fn exchange(endpoint: &Endpoint, body: String) -> Result<Bytes, RpcError> {
-    let stream = connect(&endpoint.host, endpoint.port)
+    let stream = connect(&endpoint.host, endpoint.port, endpoint.ipv6_first)
         .await
         .map_err(RpcError::Connect)?;
     let (mut sender, connection) = hyper::client::conn::http1::Builder::new()
@@ -107,10 +126,11 @@ async fn exchange(endpoint: &Endpoint, body: String) -> Result<Bytes, RpcError> 
     }
 }
 
-/// Connects with Nagle's algorithm off, to the IPv4 addresses of a name first, as ROS 1 peers listen there.
-pub(crate) async fn connect(host: &str, port: u16) -> std::io::Result<TcpStream> {
+/// Connects with Nagle's algorithm off, to the IPv4 addresses of a name first, as ROS 1 peers listen there unless
+/// they are told to use IPv6.
+pub(crate) async fn connect(host: &str, port: u16, ipv6_first: bool) -> std::io::Result<TcpStream> {
     let mut addresses: Vec<SocketAddr> = tokio::net::lookup_host((host, port)).await?.collect();
-    addresses.sort_by_key(SocketAddr::is_ipv6);
+    addresses.sort_by_key(|address| address.is_ipv6() != ipv6_first);
     let stream = TcpStream::connect(addresses.as_slice()).await?;
     stream.set_nodelay(true)?;
     Ok(stream)
@@ -245,7 +265,7 @@ pub enum RpcError {
 
 const XML: &str = "text/xml";
 const MAX_BODY: usize = 4 * 1024 * 1024;
-const MAX_CONNECTIONS: usize = 256;
+const MAX_CONNECTIONS: usize = 1024;
 const READ_LIMIT: Duration = Duration::from_secs(30);
 
 #[cfg(test)]

@@ -7,6 +7,7 @@ use std::sync::atomic::Ordering;
 use crate::events;
 use crate::master::strings;
 use crate::node::Inner;
+use crate::outbox::lock;
 use crate::xmlrpc::{Call, Fault, Response, Value};
 
 /// Answers one call.
@@ -21,8 +22,7 @@ pub(crate) fn answer(node: &Inner, call: Call) -> Response {
         "getBusInfo" => Ok(done(bus_info(node))),
         "publisherUpdate" => Ok(publisher_update(node, params)),
         "requestTopic" => Ok(request_topic(node, params)),
-        // No parameter is cached here, so none can be stale.
-        "paramUpdate" => Ok(done(0)),
+        "paramUpdate" => Ok(param_update(node, params)),
         "shutdown" => Ok(shutdown(node, params)),
         other => Err(Fault {
             code: -1,
@@ -39,6 +39,16 @@ fn publisher_update(node: &Inner, params: &[Value]) -> Value {
         return refused("publishers must be a list of strings");
     };
     node.publishers_changed(topic, &publishers);
+    done(0)
+}
+
+fn param_update(node: &Inner, params: &[Value]) -> Value {
+    let [_, Value::String(key), _] = params else {
+        return refused("paramUpdate takes (caller_id, key, value)");
+    };
+    // The key of a namespace ends in a slash, and that of the root is nothing else.
+    let name = key.trim_end_matches('/');
+    node.parameter_changed(if name.is_empty() { "/" } else { name });
     done(0)
 }
 
@@ -121,7 +131,15 @@ fn bus_stats(node: &Inner) -> Value {
         let connections: Vec<Value> = feed.connections().into_iter().map(connection).collect();
         subscribed.push(vec![feed.topic.as_str().into(), connections.into()].into());
     }
-    let services = vec![0.into(), 0.into(), 0.into()];
+    // Requests, bytes received, bytes sent, over all services: the slave API knows no more of them.
+    let (mut calls, mut received, mut sent) = (0u64, 0u64, 0u64);
+    for served in node.services() {
+        let counters = &served.counters;
+        calls = calls.saturating_add(counters.calls.load(Ordering::Relaxed));
+        received = received.saturating_add(counters.received.load(Ordering::Relaxed));
+        sent = sent.saturating_add(counters.sent.load(Ordering::Relaxed));
+    }
+    let services = vec![count(calls), count(received), count(sent)];
     Value::Array(vec![
         Value::Array(published),
         Value::Array(subscribed),
@@ -129,34 +147,35 @@ fn bus_stats(node: &Inner) -> Value {
     ])
 }
 
-/// `[connectionId, destinationId, direction, transport, topic, connected]` per connection.
+/// `[connectionId, destinationId, direction, transport, topic, connected, connectionInfo]` per connection, the
+/// destination being the name of a subscriber or the URI of a publisher, as rospy and roscpp have it.
 fn bus_info(node: &Inner) -> Value {
-    let entry = |id: i32, peer: &str, direction: &str, topic: &str| {
-        Value::Array(vec![
-            id.into(),
-            peer.into(),
-            direction.into(),
-            "TCPROS".into(),
-            topic.into(),
-            Value::Bool(true),
-        ])
-    };
     let mut entries = Vec::new();
     for hub in node.publications() {
-        let connected = hub.connected();
-        entries.extend(
-            connected
-                .iter()
-                .map(|s| entry(s.id, &s.caller_id, "o", &hub.topic)),
-        );
+        for subscriber in hub.connected() {
+            entries.push(Value::Array(vec![
+                subscriber.id.into(),
+                subscriber.caller_id.as_str().into(),
+                "o".into(),
+                "TCPROS".into(),
+                hub.topic.as_str().into(),
+                Value::Bool(true),
+                subscriber.transport.as_str().into(),
+            ]));
+        }
     }
     for feed in node.feeds() {
-        let connected = feed.connections();
-        entries.extend(
-            connected
-                .iter()
-                .map(|(uri, link)| entry(link.id, uri, "i", &feed.topic)),
-        );
+        for (uri, link) in feed.connections() {
+            entries.push(Value::Array(vec![
+                link.id.into(),
+                uri.into(),
+                "i".into(),
+                "TCPROS".into(),
+                feed.topic.as_str().into(),
+                Value::Bool(true),
+                lock(&link.transport).as_str().into(),
+            ]));
+        }
     }
     Value::Array(entries)
 }

@@ -5,6 +5,7 @@ use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 
+use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
 use crate::inbox::{Deliver, Message, Peer};
@@ -113,6 +114,23 @@ pub(crate) struct LinkState {
     pub(crate) bytes: AtomicU64,
     pub(crate) messages: AtomicU64,
     pub(crate) connected: AtomicBool,
+    /// What `rosnode info` shows of the connection.
+    pub(crate) transport: Mutex<String>,
+    /// Rings when the publisher is named again, which ends the wait for the next try.
+    pub(crate) named_again: Notify,
+}
+
+impl LinkState {
+    fn new(id: i32) -> Self {
+        Self {
+            id,
+            bytes: AtomicU64::new(0),
+            messages: AtomicU64::new(0),
+            connected: AtomicBool::new(false),
+            transport: Mutex::default(),
+            named_again: Notify::new(),
+        }
+    }
 }
 
 impl Feed {
@@ -128,7 +146,8 @@ impl Feed {
         }
     }
 
-    /// Takes the master's list of publishers: links to new ones start, those to others end unless connected.
+    /// Takes the master's list of publishers: links to new ones start, those to others end unless connected. One that
+    /// is named again may just have come back under its old address, so its link does not wait any longer.
     pub(crate) fn update(
         self: &Arc<Self>,
         uris: &[String],
@@ -145,6 +164,8 @@ impl Feed {
             let keep = link.named || link.state.connected.load(Ordering::Acquire);
             if !keep {
                 link.task.abort();
+            } else if link.named {
+                link.state.named_again.notify_one();
             }
             keep
         });
@@ -152,12 +173,7 @@ impl Feed {
             if links.by_uri.contains_key(uri) {
                 continue;
             }
-            let state = Arc::new(LinkState {
-                id: next_id(),
-                bytes: AtomicU64::new(0),
-                messages: AtomicU64::new(0),
-                connected: AtomicBool::new(false),
-            });
+            let state = Arc::new(LinkState::new(next_id()));
             let task = tokio::spawn(link::run(
                 Arc::clone(self),
                 Arc::clone(context),

@@ -1,6 +1,11 @@
-//! Time as ROS messages carry it.
+//! Time as ROS messages carry it, and the clock it is read from.
 
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use crate::clock;
+use crate::inbox::{Deliver, Message, Peer};
 
 /// A point in time, as the `time` of a message: since the Unix epoch, or since the start of a simulation.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -28,9 +33,115 @@ impl RosTime {
     }
 }
 
+/// The clock of a node: the wall clock, or the simulated one of `/clock` while the parameter `/use_sim_time` is true
+/// (`wiki.ros.org/Clock`).
+///
+/// It is for what messages say. Simulated time stands still and jumps back as its publisher likes, so time limits,
+/// the watch over the master and reconnecting never look at it. A `/clock` that this very node publishes is not
+/// heard, as no node hears itself.
+#[derive(Clone, Debug, Default)]
+pub struct RosClock {
+    simulation: Arc<Simulation>,
+}
+
+#[derive(Debug, Default)]
+struct Simulation {
+    runs: AtomicBool,
+    /// Seconds in the upper half, nanoseconds in the lower: both change at once.
+    time: AtomicU64,
+    malformed: AtomicU64,
+}
+
+impl RosClock {
+    /// The time now. Simulated time is the last that came, and zero before the first.
+    pub fn now(&self) -> RosTime {
+        if !self.is_simulated() {
+            return RosTime::from_system(clock::utc());
+        }
+        let [a, b, c, d, e, f, g, h] = self.simulation.time.load(Ordering::Acquire).to_be_bytes();
+        RosTime {
+            secs: u32::from_be_bytes([a, b, c, d]),
+            nsecs: u32::from_be_bytes([e, f, g, h]),
+        }
+    }
+
+    /// Whether the time is that of `/clock`.
+    pub fn is_simulated(&self) -> bool {
+        self.simulation.runs.load(Ordering::Acquire)
+    }
+
+    /// Messages of `/clock` that said no time, since the start.
+    pub fn malformed(&self) -> u64 {
+        self.simulation.malformed.load(Ordering::Relaxed)
+    }
+
+    /// Goes over to simulated time, which begins at zero, or back to the wall clock. Returns whether that was a change.
+    pub(crate) fn simulate(&self, simulated: bool) -> bool {
+        if self.is_simulated() == simulated {
+            return false;
+        }
+        self.simulation.time.store(0, Ordering::Release);
+        self.simulation.runs.store(simulated, Ordering::Release);
+        true
+    }
+
+    fn set(&self, clock: &[u8]) {
+        // `rosgraph_msgs/Clock` is one `time`: seconds, nanoseconds.
+        if let Ok([a, b, c, d, e, f, g, h]) = <[u8; 8]>::try_from(clock) {
+            let secs = u32::from_le_bytes([a, b, c, d]);
+            let nsecs = u32::from_le_bytes([e, f, g, h]);
+            if nsecs < 1_000_000_000 {
+                let time = u64::from(secs) << 32 | u64::from(nsecs);
+                self.simulation.time.store(time, Ordering::Release);
+                return;
+            }
+        }
+        self.simulation.malformed.fetch_add(1, Ordering::Relaxed);
+    }
+}
+
+/// The messages of `/clock` go straight into the clock: nothing waits, and the newest is what counts.
+impl Deliver for RosClock {
+    fn message(&self, message: Message) -> u64 {
+        self.set(&message.bytes);
+        0
+    }
+
+    fn peer(&self, _connected: bool, _publishers: usize, _peer: Arc<Peer>) {}
+
+    fn close(&self) {}
+}
+
+/// The type of `/clock`.
+pub(crate) const CLOCK_TYPE: &str = "rosgraph_msgs/Clock";
+pub(crate) const CLOCK_MD5: &str = "a9c97c1d230cfc112e270351a944ee47";
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_simulated_clock_begins_at_zero_and_goes_where_it_is_told() {
+        let clock = RosClock::default();
+        assert!(clock.now().secs > 1_700_000_000);
+        assert!(clock.simulate(true) && !clock.simulate(true));
+        assert_eq!(clock.now(), RosTime::default());
+        for (secs, nsecs) in [(7_u32, 999_999_999_u32), (3, 0)] {
+            clock.set(&[secs.to_le_bytes(), nsecs.to_le_bytes()].concat());
+            assert_eq!(clock.now(), RosTime { secs, nsecs });
+        }
+        assert!(clock.simulate(false));
+        assert!(clock.now().secs > 1_700_000_000);
+    }
+
+    #[test]
+    fn a_clock_message_that_says_no_time_is_counted_and_not_taken() {
+        let clock = RosClock::default();
+        assert!(clock.simulate(true));
+        clock.set(&[1, 0, 0, 0, 0, 0, 0]);
+        clock.set(&[[1, 0, 0, 0], 1_000_000_000_u32.to_le_bytes()].concat());
+        assert_eq!((clock.now(), clock.malformed()), (RosTime::default(), 2));
+    }
 
     #[test]
     fn the_wall_clock_reads_as_seconds_and_nanoseconds() {

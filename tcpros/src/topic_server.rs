@@ -1,30 +1,31 @@
-//! Where subscribers connect: accepting, the handshake, and writing to each on its own.
+//! Where subscribers and the clients of services connect: accepting, the handshake, and writing to each on its own.
 //!
 //! The accept loop only accepts. Each connection is one task, which ends with the connection, with its publisher, or
 //! with the node, whose accept task owns them all.
 
 use std::net::SocketAddr;
+use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 use thiserror::Error;
-use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::tcp::{ReadHalf, WriteHalf};
+use tokio::io::{AsyncReadExt, AsyncWrite, AsyncWriteExt};
+use tokio::net::tcp::ReadHalf;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
 use crate::events::{self, Refusals};
-use crate::header::{ConnectionHeader, HeaderError};
-use crate::link::prepare;
+use crate::header::{ConnectionHeader, HeaderError, clipped};
+use crate::link::{prepare, transport_info};
 use crate::node::Inner;
-use crate::outbox::Outbox;
 use crate::publisher::{Joined, Subscriber};
+use crate::service::{self, ClientFault};
 
-/// Serves the subscribers of all topics of a node until it is dropped.
+/// Serves the subscribers and clients of a node until it is dropped.
 pub(crate) async fn serve(listener: TcpListener, node: Arc<Inner>) {
     let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     let mut connections: JoinSet<Result<(), (SocketAddr, Refused)>> = JoinSet::new();
@@ -63,9 +64,16 @@ pub(crate) async fn serve(listener: TcpListener, node: Arc<Inner>) {
 
 async fn serve_one(mut stream: TcpStream, node: &Inner) -> Result<(), Refused> {
     let handshake = timeout(HANDSHAKE_LIMIT, shake_hands(&mut stream, node));
-    let joined = handshake
+    let admitted = handshake
         .await
         .map_err(|_| Refused::Silent(HANDSHAKE_LIMIT))??;
+    let joined = match admitted {
+        Admitted::Subscriber(joined) => joined,
+        Admitted::Service(service::Admitted::Client(session)) => {
+            return Ok(session.serve(&mut stream).await?);
+        }
+        Admitted::Service(service::Admitted::Probe) => return Ok(()),
+    };
     let subscriber = &joined.subscriber;
     let ended = write_messages(&mut stream, subscriber).await;
     let dropped = subscriber.outbox.dropped();
@@ -73,15 +81,19 @@ async fn serve_one(mut stream: TcpStream, node: &Inner) -> Result<(), Refused> {
     Ok(())
 }
 
-async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Joined, Refused> {
+/// What a peer has come for and may have.
+enum Admitted {
+    Subscriber(Joined),
+    Service(service::Admitted),
+}
+
+async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Admitted, Refused> {
     prepare(stream)?;
     let request = ConnectionHeader::read(stream).await?;
-    match admit(&request, node) {
-        Ok((reply, joined)) => {
+    match admit(request, node, transport_info(stream)) {
+        Ok((reply, admitted)) => {
             stream.write_all(&reply.encode()?).await?;
-            let nodelay = request.get("tcp_nodelay") == Some("1");
-            events::subscriber_joined(&joined.hub.topic, &joined.subscriber.caller_id, nodelay);
-            Ok(joined)
+            Ok(admitted)
         }
         Err(error) => {
             let reply = ConnectionHeader::default().with("error", &*error);
@@ -93,24 +105,36 @@ async fn shake_hands(stream: &mut TcpStream, node: &Inner) -> Result<Joined, Ref
 }
 
 /// Joins before the reply is written, so that what is published from then on arrives.
-fn admit(request: &ConnectionHeader, node: &Inner) -> Result<(ConnectionHeader, Joined), String> {
-    if let Some(service) = request.get("service") {
-        return Err(format!("service [{service}] is not provided by this node"));
+fn admit(
+    request: ConnectionHeader,
+    node: &Inner,
+    transport: String,
+) -> Result<(ConnectionHeader, Admitted), String> {
+    if let Some(name) = request.get("service") {
+        let served = node
+            .service(name)
+            .ok_or_else(|| service::nonexistent(clipped(name)))?;
+        let (reply, admitted) = served.admit(request, node.name())?;
+        return Ok((reply, Admitted::Service(admitted)));
     }
     let Some(topic) = request.get("topic") else {
         return Err(
             "Header from subscriber did not have the required elements: md5sum, topic".to_owned(),
         );
     };
-    let caller = request.caller_id();
-    let gone =
-        || format!("received a connection for a nonexistent topic [{topic}] from [{caller}]");
+    let caller = clipped(request.caller_id());
+    let gone = || {
+        let topic = clipped(topic);
+        format!("received a connection for a nonexistent topic [{topic}] from [{caller}]")
+    };
     let hub = node.publication(topic).ok_or_else(gone)?;
-    let reply = hub.reply_to(request, node.name())?;
+    let reply = hub.reply_to(&request, node.name())?;
     let joined = hub
-        .join(node.next_connection_id(), caller)
+        .join(node.next_connection_id(), caller, transport)
         .ok_or_else(gone)?;
-    Ok((reply, joined))
+    let nodelay = request.get("tcp_nodelay") == Some("1");
+    events::subscriber_joined(&joined.hub.topic, caller, nodelay);
+    Ok((reply, Admitted::Subscriber(joined)))
 }
 
 async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ended {
@@ -118,6 +142,10 @@ async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ende
     let (mut reader, mut writer) = stream.split();
     let mut waiting = Vec::new();
     let mut batch = BytesMut::new();
+    let mut overdue = std::pin::pin!(async {
+        outbox.closed().await;
+        sleep(DRAIN_LIMIT).await;
+    });
     loop {
         waiting.clear();
         // Both branches are cancel-safe: `take` takes nothing before it returns, and what is read is of no use.
@@ -131,17 +159,8 @@ async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ende
         }
         let bytes: usize = waiting.iter().map(|message| message.len() + 4).sum();
         let messages = waiting.len();
-        for message in waiting.drain(..) {
-            batch.put_slice(&length(&message));
-            if message.len() <= COPIED {
-                batch.put_slice(&message);
-            } else if let Err(ended) =
-                write(&mut writer, batch.split().freeze(), message, outbox).await
-            {
-                return ended;
-            }
-        }
-        if let Err(ended) = write(&mut writer, batch.split().freeze(), Bytes::new(), outbox).await {
+        if let Err(ended) = write_all(&mut writer, &mut waiting, &mut batch, overdue.as_mut()).await
+        {
             return ended;
         }
         subscriber
@@ -154,19 +173,34 @@ async fn write_messages(stream: &mut TcpStream, subscriber: &Subscriber) -> Ende
     }
 }
 
-/// Writes two pieces as one, the second without copying it, as long as the peer takes at least something in time.
-async fn write(
-    writer: &mut WriteHalf<'_>,
+/// Writes messages: small ones together in one piece, a large one without copying it.
+async fn write_all(
+    writer: &mut (impl AsyncWrite + Unpin),
+    messages: &mut Vec<Bytes>,
+    batch: &mut BytesMut,
+    mut overdue: Pin<&mut impl Future<Output = ()>>,
+) -> Result<(), Ended> {
+    for message in messages.drain(..) {
+        batch.put_slice(&length(&message));
+        if message.len() <= COPIED {
+            batch.put_slice(&message);
+        } else {
+            write(writer, batch.split().freeze(), message, overdue.as_mut()).await?;
+        }
+    }
+    write(writer, batch.split().freeze(), Bytes::new(), overdue).await
+}
+
+/// Writes two pieces as one, the second without copying it, as long as the peer takes at least something in time and
+/// `overdue` does not end.
+pub(crate) async fn write(
+    writer: &mut (impl AsyncWrite + Unpin),
     head: Bytes,
     body: Bytes,
-    outbox: &Outbox,
+    mut overdue: Pin<&mut impl Future<Output = ()>>,
 ) -> Result<(), Ended> {
     let mut data = head.chain(body);
     while data.has_remaining() {
-        let overdue = async {
-            outbox.closed().await;
-            sleep(DRAIN_LIMIT).await;
-        };
         tokio::select! {
             biased;
             written = writer.write_buf(&mut data) => match written {
@@ -175,14 +209,14 @@ async fn write(
                 Err(error) => return Err(Ended::Failed(error)),
             },
             () = sleep(STALL_LIMIT) => return Err(Ended::Stalled),
-            () = overdue => return Err(Ended::Withdrawn),
+            () = overdue.as_mut() => return Err(Ended::Withdrawn),
         }
     }
     Ok(())
 }
 
 /// A subscriber has nothing to say after its header: reading is how its leaving is noticed.
-async fn until_closed(reader: &mut ReadHalf<'_>) -> Ended {
+pub(crate) async fn until_closed(reader: &mut ReadHalf<'_>) -> Ended {
     let mut nothing = [0; 256];
     loop {
         match reader.read(&mut nothing).await {
@@ -210,15 +244,17 @@ enum Refused {
     #[error("{0}")]
     Mismatch(String),
     #[error(transparent)]
+    Client(#[from] ClientFault),
+    #[error(transparent)]
     Io(#[from] std::io::Error),
 }
 
-/// How a subscriber's connection came to its end.
+/// How a connection came to its end.
 #[derive(Debug, Error)]
-enum Ended {
+pub(crate) enum Ended {
     #[error("it closed the connection")]
     Closed,
-    #[error("the topic was withdrawn")]
+    #[error("what it asked for was withdrawn")]
     Withdrawn,
     #[error("it took nothing for {STALL_LIMIT:?}")]
     Stalled,
@@ -228,9 +264,109 @@ enum Ended {
 
 const MAX_CONNECTIONS: usize = 4096;
 const HANDSHAKE_LIMIT: Duration = Duration::from_secs(5);
-const STALL_LIMIT: Duration = Duration::from_secs(10);
-const DRAIN_LIMIT: Duration = Duration::from_secs(1);
+pub(crate) const STALL_LIMIT: Duration = Duration::from_secs(10);
+/// How long what has been withdrawn may take to send what it still has.
+pub(crate) const DRAIN_LIMIT: Duration = Duration::from_secs(1);
 /// Messages written in one go.
 const BATCH: usize = 64 * 1024;
 /// Up to here copying a message into the batch is cheaper than a write of its own.
 const COPIED: usize = 16 * 1024;
+
+#[cfg(test)]
+mod tests {
+    use std::io::IoSlice;
+    use std::pin::Pin;
+    use std::task::{Context, Poll};
+
+    use super::*;
+    use crate::outbox::{Limit, Outbox};
+
+    /// Takes everything and notes the pieces of each write: where they are and how long.
+    #[derive(Default)]
+    struct Recorder {
+        writes: Vec<Vec<(*const u8, usize)>>,
+        bytes: Vec<u8>,
+    }
+
+    impl AsyncWrite for Recorder {
+        fn poll_write(
+            self: Pin<&mut Self>,
+            cx: &mut Context<'_>,
+            piece: &[u8],
+        ) -> Poll<std::io::Result<usize>> {
+            self.poll_write_vectored(cx, &[IoSlice::new(piece)])
+        }
+
+        fn poll_write_vectored(
+            mut self: Pin<&mut Self>,
+            _: &mut Context<'_>,
+            pieces: &[IoSlice<'_>],
+        ) -> Poll<std::io::Result<usize>> {
+            let noted = pieces.iter().map(|p| (p.as_ptr(), p.len())).collect();
+            self.writes.push(noted);
+            for piece in pieces {
+                self.bytes.extend_from_slice(piece);
+            }
+            Poll::Ready(Ok(pieces.iter().map(|p| p.len()).sum()))
+        }
+
+        fn is_write_vectored(&self) -> bool {
+            true
+        }
+
+        fn poll_flush(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<std::io::Result<()>> {
+            Poll::Ready(Ok(()))
+        }
+
+        fn poll_shutdown(self: Pin<&mut Self>, _: &mut Context<'_>) -> Poll<std::io::Result<()>> {
+            Poll::Ready(Ok(()))
+        }
+    }
+
+    fn outbox() -> Outbox {
+        Outbox::new(Limit {
+            messages: 1000,
+            bytes: 1 << 20,
+        })
+    }
+
+    async fn written(messages: &[Bytes]) -> Recorder {
+        let outbox = outbox();
+        for message in messages {
+            assert_eq!(outbox.push(message.clone()), 0);
+        }
+        outbox.close();
+        let mut recorder = Recorder::default();
+        let (mut waiting, mut batch) = (Vec::new(), BytesMut::new());
+        while outbox.take(&mut waiting, BATCH).await {
+            let never = std::pin::pin!(std::future::pending());
+            let whole = write_all(&mut recorder, &mut waiting, &mut batch, never).await;
+            assert!(whole.is_ok());
+        }
+        recorder
+    }
+
+    /// Requirement: small messages that wait leave in one write.
+    #[tokio::test]
+    async fn small_messages_that_wait_leave_in_one_write() {
+        let messages: Vec<Bytes> = (0..100u8).map(|n| Bytes::from(vec![n; 16])).collect();
+        let recorder = written(&messages).await;
+        assert_eq!(recorder.writes.len(), 1);
+        assert_eq!(recorder.bytes.len(), 100 * 20);
+        assert_eq!(recorder.bytes[..6], [16, 0, 0, 0, 0, 0]);
+        assert_eq!(recorder.bytes[20..26], [16, 0, 0, 0, 1, 1]);
+    }
+
+    /// Requirement: a large message is not copied on its way out, and its length leaves with it.
+    #[tokio::test]
+    async fn a_large_message_leaves_from_where_it_is_together_with_its_length() {
+        let small = Bytes::from_static(b"small");
+        let large = Bytes::from(vec![7; 100_000]);
+        let recorder = written(&[small, large.clone()]).await;
+        // The one that fits a batch goes ahead; the other is one write of two pieces.
+        assert_eq!(recorder.writes[1][0].1, 4);
+        assert_eq!(recorder.writes[1][1], (large.as_ptr(), large.len()));
+        assert_eq!(recorder.writes.len(), 2);
+        assert_eq!(recorder.bytes[9..13], 100_000u32.to_le_bytes());
+    }
+}

@@ -139,6 +139,7 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
     let needed: &[&Path] = match peer {
         Peer::Ros1 => &[
             Path::new("/usr/bin/rosmaster"),
+            Path::new("/usr/bin/rosparam"),
             Path::new("/usr/lib/python3/dist-packages/rospy/__init__.py"),
             Path::new("/usr/lib/python3/dist-packages/sensor_msgs/__init__.py"),
             Path::new("/usr/lib/topic_tools/relay"),

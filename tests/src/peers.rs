@@ -53,6 +53,28 @@ impl Cell {
             .args(args)
     }
 
+    /// A program of ROS 1 under `/usr`, such as `bin/rostopic` or `lib/topic_tools/throttle`, not started yet.
+    #[must_use]
+    pub fn ros1_started(&self, program: &str, args: &[&str]) -> Started {
+        let name = program.rsplit('/').next().unwrap_or(program);
+        self.with_ros1(Started::new(name, &Path::new("/usr").join(program)))
+            .args(args)
+            .ends_on(Signal::SIGINT)
+    }
+
+    /// A command line tool of ROS 1 that ends by itself, such as `rosservice`; the lines it printed.
+    ///
+    /// # Panics
+    /// When it fails.
+    #[must_use]
+    pub fn ros1_tool(&self, name: &str, args: &[&str]) -> Vec<String> {
+        let path = Path::new("/usr/bin").join(name);
+        let mut tool = self.with_ros1(Started::new(name, &path)).args(args).start();
+        let status = tool.wait_for_end(START);
+        assert!(status.success(), "{name} ended with {status}: {tool}");
+        tool.lines()
+    }
+
     /// roscpp's `topic_tools relay` from one topic to another. It says nothing when it is ready.
     #[must_use]
     pub fn topic_tools_relay(&self, from: &str, to: &str) -> Child {

@@ -323,6 +323,10 @@ fn sender(options: &Options, interface: Option<&Interface>) -> Result<UdpSocket,
     socket
         .set_nonblocking(true)
         .map_err(at("set non-blocking mode"))?;
+    // The chunks of a large message come in bursts, and nothing waits for a full buffer. The system may grant less.
+    socket
+        .set_send_buffer_size(SEND_BUFFER)
+        .map_err(at("set the send buffer"))?;
     socket
         .set_multicast_ttl_v4(options.ttl)
         .map_err(at("set the TTL"))?;
@@ -340,6 +344,9 @@ fn sender(options: &Options, interface: Option<&Interface>) -> Result<UdpSocket,
         .map_err(at("bind the sender"))?;
     UdpSocket::from_std(socket.into()).map_err(at("register the socket"))
 }
+
+/// Bytes the kernel may hold on their way out.
+const SEND_BUFFER: usize = 1 << 20;
 
 #[cfg(test)]
 mod tests {

@@ -186,6 +186,20 @@ impl<'a> Chunks<'a> {
         })
     }
 
+    /// Goes on at byte `offset` of the whole, as [`offset`](Self::offset) said of chunks of the same whole, headers
+    /// and budget: what is sent over a time need not stay borrowed.
+    #[must_use]
+    pub const fn resumed_at(mut self, offset: usize) -> Self {
+        self.offset = offset;
+        self
+    }
+
+    /// How many bytes of the whole are written.
+    #[must_use]
+    pub const fn offset(&self) -> usize {
+        self.offset
+    }
+
     /// Appends the next chunk NetworkMessage to `buf`; `None` when all are written. `extras` are its own: with
     /// security a nonce that no other NetworkMessage has. After an error `buf` is as before.
     pub fn append(

@@ -121,7 +121,7 @@ pub use reader_state::{
 };
 pub use reader_table::{ReaderKey, ReaderTable};
 pub use reassembler::{
-    ChunkRefusal, Reassembled, Reassembler, ReassemblyCounters, ReassemblyLimits,
+    ChunkRefusal, GiveUp, GivenUp, Reassembled, Reassembler, ReassemblyCounters, ReassemblyLimits,
 };
 pub use scalar::{ExtensionBody, ExtensionObject, LocalizedText, QualifiedName, Scalar};
 pub use security::{

@@ -5,6 +5,7 @@ mod open;
 use std::collections::VecDeque;
 use std::time::Duration;
 
+use crate::publisher_id::OwnedPublisherId;
 use crate::{
     Chunk, DataSetMessage, DecodeError, NetworkHeader, NetworkMessage, NetworkMessageType,
 };
@@ -41,6 +42,8 @@ pub struct Reassembler {
     /// The whole that was completed last.
     whole: Vec<u8>,
     counters: ReassemblyCounters,
+    /// What [`poll_given_up`](Self::poll_given_up) hands out.
+    given_up: VecDeque<GivenUp>,
 }
 
 /// What a [`Reassembler`] may hold.
@@ -140,6 +143,40 @@ pub struct ReassemblyCounters {
     pub contradicted: u64,
 }
 
+/// A whole that did not become complete.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct GivenUp {
+    /// Who sent it.
+    pub publisher_id: Option<OwnedPublisherId>,
+    /// The WriterGroup.
+    pub writer_group_id: Option<u16>,
+    /// The DataSetWriter; `None` without payload header.
+    pub writer_id: Option<u16>,
+    /// The number of the whole among those of the DataSetWriter.
+    pub message_sequence_number: u16,
+    /// Bytes that had arrived.
+    pub received: u32,
+    /// Bytes it would have had.
+    pub total_size: u32,
+    /// Why it was not waited for any longer.
+    pub why: GiveUp,
+}
+
+/// Why a whole was given up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum GiveUp {
+    /// [`ReassemblyLimits::age`] had passed.
+    Expired,
+    /// [`ReassemblyLimits::total`] was reached, and it was begun first.
+    OutOfBytes,
+    /// [`ReassemblyLimits::open`] was reached, and it was begun first.
+    OutOfPlaces,
+    /// [`ReassemblyLimits::open_per_writer`] was reached, and it was the writer's oldest.
+    Superseded,
+    /// A chunk in the place of an earlier one had other bytes.
+    Contradicted,
+}
+
 /// What taking a chunk led to.
 enum Step {
     Incomplete,
@@ -179,6 +216,7 @@ impl Reassembler {
             done: VecDeque::new(),
             held: 0,
             whole: Vec::new(),
+            given_up: VecDeque::new(),
             counters: ReassemblyCounters {
                 completed: 0,
                 chunks: 0,
@@ -236,8 +274,7 @@ impl Reassembler {
         let age = self.limits.age;
         let is_old = |since: Duration| now.saturating_sub(since) >= age;
         while self.open.front().is_some_and(|open| is_old(open.since)) {
-            self.give_up(0);
-            self.counters.expired += 1;
+            self.give_up(0, GiveUp::Expired);
         }
         while self.done.front().is_some_and(|done| is_old(done.at)) {
             self.forget_oldest();
@@ -249,6 +286,12 @@ impl Reassembler {
     pub fn poll_timeout(&self) -> Option<Duration> {
         let oldest = self.open.front()?;
         Some(oldest.since.saturating_add(self.limits.age))
+    }
+
+    /// The next whole that was given up; to be asked after each [`receive`](Self::receive) and
+    /// [`expire`](Self::expire) until there is none. No more than [`ReassemblyLimits::open`] are kept for who does not.
+    pub fn poll_given_up(&mut self) -> Option<GivenUp> {
+        self.given_up.pop_front()
     }
 
     /// What became of the chunks and wholes so far.
@@ -332,8 +375,7 @@ impl Reassembler {
             Insertion::Overlap => Err(ChunkRefusal::Overlap),
             Insertion::TooMany => Err(ChunkRefusal::TooManyPieces),
             Insertion::Contradiction => {
-                self.give_up(at);
-                self.counters.contradicted += 1;
+                self.give_up(at, GiveUp::Contradicted);
                 self.begin(key, chunk, now)
             }
         }
@@ -354,12 +396,10 @@ impl Reassembler {
         if self.open.iter().filter(|open| of_writer(open)).count() >= self.limits.open_per_writer
             && let Some(oldest) = self.open.iter().position(of_writer)
         {
-            self.give_up(oldest);
-            self.counters.superseded += 1;
+            self.give_up(oldest, GiveUp::Superseded);
         }
         if self.open.len() >= self.limits.open && !self.open.is_empty() {
-            self.give_up(0);
-            self.counters.out_of_places += 1;
+            self.give_up(0, GiveUp::OutOfPlaces);
         }
         self.held += open.cost();
         self.open.push_back(open);
@@ -375,8 +415,7 @@ impl Reassembler {
             if self.open.is_empty() {
                 return;
             }
-            self.give_up(0);
-            self.counters.out_of_bytes += 1;
+            self.give_up(0, GiveUp::OutOfBytes);
         }
     }
 
@@ -420,10 +459,17 @@ impl Reassembler {
         true
     }
 
-    fn give_up(&mut self, at: usize) {
-        if let Some(open) = self.open.remove(at) {
-            self.held -= open.cost();
+    fn give_up(&mut self, at: usize, why: GiveUp) {
+        let Some(open) = self.open.remove(at) else {
+            return;
+        };
+        self.held -= open.cost();
+        self.counters.count_given_up(why);
+        // One call gives up no more than were open, so that nothing is lost to who asks after each.
+        if self.given_up.len() > self.limits.open {
+            self.given_up.pop_front();
         }
+        self.given_up.push_back(open.given_up(why));
     }
 }
 
@@ -445,6 +491,17 @@ impl<'r> Reassembled<'r> {
 }
 
 impl ReassemblyCounters {
+    const fn count_given_up(&mut self, why: GiveUp) {
+        let counter = match why {
+            GiveUp::Expired => &mut self.expired,
+            GiveUp::OutOfBytes => &mut self.out_of_bytes,
+            GiveUp::OutOfPlaces => &mut self.out_of_places,
+            GiveUp::Superseded => &mut self.superseded,
+            GiveUp::Contradicted => &mut self.contradicted,
+        };
+        *counter += 1;
+    }
+
     const fn count(&mut self, refusal: ChunkRefusal) {
         let counter = match refusal {
             ChunkRefusal::Malformed(_) => &mut self.malformed,

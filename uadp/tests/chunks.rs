@@ -15,7 +15,7 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use uadp::{
     ChunkBudget, ChunkError, ChunkRefusal, Chunks, DataSetHeader, DataSetMessage, DecodeError,
-    Extras, GroupHeader, MessageKind, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
+    Extras, GiveUp, GroupHeader, MessageKind, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
     NetworkMessageType, PublisherId, Reassembler, ReassemblyLimits, Scalar, SecurityHeader,
     Variant, Whole,
 };
@@ -193,6 +193,31 @@ fn all_chunks_but_the_last_are_equally_long_and_fit_the_budget() {
         let data: usize = datagrams.iter().map(|datagram| datagram.len() - 17).sum();
         assert_eq!(data, 1000, "budget {budget}");
     }
+}
+
+#[test]
+fn chunks_written_one_at_a_time_are_those_written_at_once() {
+    let bytes: Vec<u8> = (0..1000_u32).map(|i| i as u8).collect();
+    let budget = ChunkBudget {
+        network_message: 100,
+        trailer: 0,
+    };
+    let extras = Extras::default();
+    let mut datagrams = Vec::new();
+    let mut offset = 0;
+    loop {
+        let chunks = Chunks::new(&header(), &extras, whole(&bytes), budget).unwrap();
+        let mut chunks = chunks.resumed_at(offset);
+        let mut datagram = Vec::new();
+        let Some(written) = chunks.append(&mut datagram, &extras) else {
+            break;
+        };
+        written.unwrap();
+        offset = chunks.offset();
+        datagrams.push(datagram);
+    }
+    assert_eq!(offset, bytes.len());
+    assert_eq!(datagrams, split(&header(), whole(&bytes), 100).unwrap());
 }
 
 #[test]
@@ -596,6 +621,11 @@ fn a_writer_that_loses_chunks_does_not_push_out_the_wholes_of_others() {
         receive(&mut reassembler, &chunk(2, number, 0, 2, &[0]), START).unwrap();
     }
     assert_eq!(reassembler.counters().superseded, 196);
+    let told = std::iter::from_fn(|| reassembler.poll_given_up()).last();
+    let told = told.unwrap();
+    assert_eq!(told.why, GiveUp::Superseded);
+    assert_eq!(told.publisher_id, Some(PublisherId::UInt16(2).into()));
+    assert_eq!((told.writer_id, told.writer_group_id), (Some(10), None));
     assert_eq!(reassembler.counters().out_of_places, 0);
     let whole = receive(&mut reassembler, &chunk(1, 1, 1, 2, &[1]), START);
     assert_eq!(whole, Ok(Some(vec![0, 1])));

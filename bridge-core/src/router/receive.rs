@@ -14,7 +14,7 @@ use crate::counters::Reason;
 use crate::fields;
 use crate::hops::Hop;
 use crate::loop_rule::{Side, may_cross};
-use crate::output::{Delivery, Output};
+use crate::output::{Delivery, Kept, Output};
 use crate::reader::{Held, Place};
 use crate::settings::{Local, Now};
 use crate::topic::{Item, Role, Topic};
@@ -22,13 +22,18 @@ use crate::topic::{Item, Role, Topic};
 impl Router {
     /// A datagram came from the UA side. What its messages hold is queued; what is wrong with it is counted.
     pub fn handle_datagram(&mut self, datagram: &[u8], from: SocketAddr, now: Now) {
-        let message = match NetworkMessage::decode(datagram) {
-            Ok(message) => message,
-            Err(error) => {
-                self.drop_undecoded(None, from, &error);
-                return;
-            }
-        };
+        match NetworkMessage::decode(datagram) {
+            Ok(message) => self.handle_network_message(&message, from, now),
+            Err(error) => self.drop_undecoded(None, from, &error),
+        }
+    }
+
+    pub(super) fn handle_network_message(
+        &mut self,
+        message: &NetworkMessage<'_>,
+        from: SocketAddr,
+        now: Now,
+    ) {
         let header = message.header();
         let Some(space) = self.space_of(&header, from) else {
             return;
@@ -45,10 +50,11 @@ impl Router {
             self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return;
         };
-        let sent = header.timestamp.map(|time| Timestamp {
-            time,
-            picoseconds: header.picoseconds.unwrap_or_default(),
-        });
+        if message.is_chunk() && !message.is_sealed() {
+            self.handle_chunk(message, (space, namespace), from, now);
+            return;
+        }
+        let sent = sent(&header);
         for message in message.messages() {
             match message {
                 Ok(message) => {
@@ -66,13 +72,7 @@ impl Router {
 
     /// Gives the space a NetworkMessage comes from, or counts why it is none of ours to read.
     fn space_of(&mut self, header: &NetworkHeader<'_>, from: SocketAddr) -> Option<SpaceId> {
-        let (number, exact) = match header.publisher_id {
-            Some(PublisherId::UInt16(number)) => (u64::from(number), true),
-            Some(PublisherId::Byte(number)) => (u64::from(number), false),
-            Some(PublisherId::UInt32(number)) => (u64::from(number), false),
-            Some(PublisherId::UInt64(number)) => (number, false),
-            Some(PublisherId::String(_)) | None => (u64::MAX, false),
-        };
+        let (number, exact) = number_of(header.publisher_id);
         let Some(space) = u16::try_from(number).ok().and_then(SpaceId::new) else {
             self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return None;
@@ -109,7 +109,7 @@ impl Router {
     }
 
     /// One DataSetMessage of another space: into the sequence, and on if it brings something new.
-    fn handle_message(
+    pub(super) fn handle_message(
         &mut self,
         topic: TopicId,
         message: &DataSetMessage<'_>,
@@ -142,13 +142,13 @@ impl Router {
         };
         let was_silent = reader.heard(now.monotonic);
         let admitted = match message.kind {
-            MessageKind::KeyFrame => Some(reader.admit(place)),
+            MessageKind::KeyFrame => Some(reader.admit(place, now.monotonic)),
             // It says that the writer lives, and that is all.
             MessageKind::KeepAlive => None,
             // Not carried, and told so below.
-            MessageKind::DeltaFrame | MessageKind::Event => Some(Ok(0)),
+            MessageKind::DeltaFrame | MessageKind::Event => Some(Ok((0, Kept::Alone))),
         };
-        if let Some(Ok(missing)) = admitted {
+        if let Some(Ok((missing, _))) = admitted {
             counters.missing += u64::from(missing);
         }
         if was_silent {
@@ -158,6 +158,7 @@ impl Router {
             });
             self.schedule(topic);
         }
+        self.retire(topic, now);
         match admitted {
             None => {}
             Some(Err(reason)) => self.count(
@@ -169,16 +170,18 @@ impl Router {
                 1,
                 String::new,
             ),
-            Some(Ok(_)) => match fields_of(message) {
+            Some(Ok((_, kept))) => match fields_of(message) {
                 Ok(fields) => {
                     self.record_way(place.stamp, sent, now);
                     let sample = Sample {
                         fields,
                         source: place.stamp,
+                        instance: place.instance(),
+                        kept,
                         status: message.header().status.unwrap_or_default(),
                         arrived: now.utc,
                     };
-                    self.route(topic, &sample, place, now);
+                    self.route(topic, &sample, now);
                 }
                 Err(error) => self.drop_undecoded(Some(topic), from, &error),
             },
@@ -186,7 +189,7 @@ impl Router {
     }
 
     /// Hands a sample on, or keeps it until its local type is known.
-    fn route(&mut self, topic: TopicId, sample: &Sample<'_>, place: Place, now: Now) {
+    fn route(&mut self, topic: TopicId, sample: &Sample<'_>, now: Now) {
         let typed = self.settings.local == Local::Fields;
         let Some(Topic {
             role: Role::Theirs(reader),
@@ -197,8 +200,7 @@ impl Router {
             return;
         };
         if typed || plan.is_some() {
-            reader.delivered(place);
-            self.deliver(topic, sample);
+            self.deliver(topic, sample, now);
             return;
         }
         if reader
@@ -217,6 +219,7 @@ impl Router {
         reader.held = (fields.len() <= MAX_HELD).then(|| Held {
             fields: fields.to_vec(),
             source: sample.source,
+            instance: sample.instance,
             status: sample.status,
             arrived: sample.arrived,
         });
@@ -224,16 +227,33 @@ impl Router {
         self.count(About::topic(topic), Reason::Untyped, 1, String::new);
     }
 
-    pub(super) fn deliver(&mut self, topic: TopicId, sample: &Sample<'_>) {
+    pub(super) fn deliver(&mut self, topic: TopicId, sample: &Sample<'_>, now: Now) {
         let mut payload = self.buffer();
-        let written = match self
-            .topics
-            .get(&topic)
-            .and_then(|entry| entry.plan.as_ref())
-        {
-            Some(plan) => fields::write(plan, sample.fields.clone(), &mut payload),
-            None => fields::copy(&sample.fields, &mut payload),
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            plan,
+            transcoder,
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
         };
+        let evicted = reader.delivered(sample.instance, sample.kept, now.monotonic);
+        let retired = evicted.map(|instance| Output::Retired { topic, instance });
+        self.told.extend(retired);
+        let mut scratch = None;
+        let written = match (plan, transcoder.as_deref()) {
+            (Some(_), Some(Ok(transcoder))) => {
+                let scratch = scratch.insert(self.spare.pop().unwrap_or_default());
+                transcoder.run(sample.fields.clone(), scratch, &mut payload)
+            }
+            (Some(_), Some(Err(why))) => Err((Reason::Mismatch, why.clone())),
+            (Some(plan), None) => fields::write(plan, sample.fields.clone(), &mut payload),
+            (None, _) => fields::copy(&sample.fields, &mut payload),
+        };
+        if let Some(scratch) = scratch {
+            self.recycle(scratch);
+        }
         if let Err((reason, detail)) = written {
             self.recycle(payload);
             self.count(About::topic(topic), reason, 1, || detail);
@@ -241,6 +261,8 @@ impl Router {
         }
         let Sample {
             source,
+            instance,
+            kept,
             status,
             arrived,
             ..
@@ -253,8 +275,29 @@ impl Router {
                 source,
                 status,
                 arrived,
+                instance,
+                kept,
             }),
         );
+    }
+
+    /// Tells of values that are no longer repeated beside others.
+    fn retire(&mut self, topic: TopicId, now: Now) {
+        let after = self
+            .mapping
+            .pubsub()
+            .key_frame_period
+            .saturating_mul(MISSED_ROUNDS);
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        while let Some(instance) = reader.retire(now.monotonic, after) {
+            self.told.push_back(Output::Retired { topic, instance });
+        }
     }
 
     fn record_way(&mut self, taken: Option<Timestamp>, sent: Option<Timestamp>, now: Now) {
@@ -269,7 +312,12 @@ impl Router {
         }
     }
 
-    fn drop_undecoded(&mut self, topic: Option<TopicId>, from: SocketAddr, error: &DecodeError) {
+    pub(super) fn drop_undecoded(
+        &mut self,
+        topic: Option<TopicId>,
+        from: SocketAddr,
+        error: &DecodeError,
+    ) {
         self.count(
             About {
                 topic,
@@ -286,8 +334,29 @@ impl Router {
 pub(super) struct Sample<'a> {
     pub(super) fields: Fields<'a>,
     pub(super) source: Option<Timestamp>,
+    pub(super) instance: Option<Timestamp>,
+    pub(super) kept: Kept,
     pub(super) status: u16,
     pub(super) arrived: Timestamp,
+}
+
+/// The number of a PublisherId, and whether it is a UInt16.
+pub(super) fn number_of(publisher: Option<PublisherId<'_>>) -> (u64, bool) {
+    match publisher {
+        Some(PublisherId::UInt16(number)) => (u64::from(number), true),
+        Some(PublisherId::Byte(number)) => (u64::from(number), false),
+        Some(PublisherId::UInt32(number)) => (u64::from(number), false),
+        Some(PublisherId::UInt64(number)) => (number, false),
+        Some(PublisherId::String(_)) | None => (u64::MAX, false),
+    }
+}
+
+/// When a NetworkMessage was sent.
+pub(super) fn sent(header: &NetworkHeader<'_>) -> Option<Timestamp> {
+    header.timestamp.map(|time| Timestamp {
+        time,
+        picoseconds: header.picoseconds.unwrap_or_default(),
+    })
 }
 
 fn place(header: &DataSetHeader, from: SocketAddr) -> Place {
@@ -325,5 +394,8 @@ const fn reason_of(error: &DecodeError) -> Reason {
 /// A sample that waits for its type is kept up to this size: whoever sends to the group can invent topics, and all of
 /// them together must not hold more than some megabytes. A larger value comes with its next repetition.
 const MAX_HELD: usize = 4_096;
+/// A value that lives beside others is held to be gone when it was not repeated for so many key frame periods: two
+/// lost datagrams are ridden out.
+const MISSED_ROUNDS: u32 = 3;
 /// How long the port is left alone with a topic it found no type for.
 const ASK_AGAIN: Duration = Duration::from_secs(1);

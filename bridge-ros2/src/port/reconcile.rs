@@ -124,6 +124,13 @@ impl Ros2Port {
         };
         let writers = self.graph.writers(&source.dds_topic);
         let ours = source.meet(writers);
+        for publisher in source.gone(writers) {
+            let values = source.values.iter();
+            self.events.extend(values.map(|(topic, _)| PortEvent::Left {
+                topic: *topic,
+                publisher,
+            }));
+        }
         let strange = writers
             .iter()
             .find(|writer| !ours.contains(writer))

@@ -7,14 +7,15 @@ use std::sync::Arc;
 use messages::{DefinitionError, Dialect, Leaf, MessageType, Selection, TypeName};
 
 use super::names::{mended, topic_fault};
+use super::services::{self, Calls, Kind, Known, Service};
 use super::types::{self, Types, ValueType, dialect};
 use super::{Declared, required, variables};
 use crate::code::Code;
-use crate::document::{self, BindingEntry};
+use crate::document::{self, AsEntry, BindingEntry};
 use crate::findings::Findings;
 use crate::mapping::{Binding, Space};
 use crate::nearest::nearest;
-use crate::read::{At, list, short};
+use crate::read::{At, given, list, short};
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::Place;
 
@@ -34,6 +35,7 @@ pub(super) struct Bound {
     pub(super) bindings: Vec<Binding>,
     /// `None` when no type of a binding is known.
     pub(super) fields: Option<Vec<Leaf>>,
+    pub(super) service: Option<Service>,
 }
 
 /// One binding, as far as it goes.
@@ -44,10 +46,10 @@ struct Found {
 }
 
 /// Where a binding stands.
-struct Site<'s> {
-    place: Place,
-    space: Option<SpaceId>,
-    subject: &'s Subject,
+pub(super) struct Site<'s> {
+    pub(super) place: Place,
+    pub(super) space: Option<SpaceId>,
+    pub(super) subject: &'s Subject,
 }
 
 /// What is done to one ROS topic of one space.
@@ -60,15 +62,17 @@ struct Use {
 pub(super) struct Bindings<'c> {
     spaces: &'c Declared<Vec<Space>>,
     types: Types,
+    calls: Calls,
     uses: HashMap<(SpaceId, String), Vec<Use>>,
     /// The topics in the order they came, so that findings do.
     order: Vec<(SpaceId, String)>,
 }
 
 impl<'c> Bindings<'c> {
-    pub(super) fn new(spaces: &'c Declared<Vec<Space>>) -> Self {
+    pub(super) fn new(spaces: &'c Declared<Vec<Space>>, calls: Calls) -> Self {
         Self {
             spaces,
+            calls,
             types: Types::new(),
             uses: HashMap::new(),
             order: Vec::new(),
@@ -82,6 +86,7 @@ impl<'c> Bindings<'c> {
         findings: &mut Findings,
     ) -> Bound {
         let mut found: Vec<Found> = Vec::new();
+        let mut service: Option<Service> = None;
         let mut spaces: HashMap<SpaceId, usize> = HashMap::new();
         let entries = entries
             .and_then(|at| at.value.as_ref())
@@ -104,7 +109,18 @@ impl<'c> Bindings<'c> {
                 space,
                 subject,
             };
-            found.extend(self.binding(entry, &site, findings));
+            match services::kind(entry, at.place, findings) {
+                Some(Kind::Topic) => found.extend(self.binding(entry, &site, findings)),
+                Some(kind) => {
+                    let mut known = Known {
+                        types: &mut self.types,
+                        calls: &self.calls,
+                    };
+                    let checked = services::check(kind, entry, &site, &mut known, findings);
+                    service = checked.or(service);
+                }
+                None => {}
+            }
         }
         differences(&found, findings);
         for one in &found {
@@ -114,10 +130,19 @@ impl<'c> Bindings<'c> {
         let own = found
             .iter()
             .filter(|one| Some(one.binding.space) == subject.origin);
-        let fields = own.chain(&found).find_map(|one| one.fields.clone());
+        let topics = own.chain(&found).find_map(|one| one.fields.clone());
+        let services = service.as_ref().and_then(|service| service.fields.clone());
+        if let (Some(topics), Some(services), Some(service)) = (&topics, &services, &service) {
+            service.compare(topics, services, findings);
+        }
+        let fields = match &service {
+            Some(service) if Some(service.binding.space) == subject.origin => services.or(topics),
+            Some(_) | None => topics.or(services),
+        };
         Bound {
             bindings: found.into_iter().map(|one| one.binding).collect(),
             fields,
+            service,
         }
     }
 
@@ -164,19 +189,20 @@ impl<'c> Bindings<'c> {
         let (name, place) = named?;
         let space = site.space?;
         let message_type = self.message_type(&name, place, site, findings);
-        let selection = match &entry.field {
-            None => Selection::Whole,
-            Some(at) => Selection::Field(at.value.clone()?),
+        let selection = selection(entry, findings)?;
+        let chosen = match (&entry.field, &entry.r#as) {
+            (Some(at), _) => at.place,
+            (None, Some(at)) => at.place,
+            (None, None) => place,
         };
-        let fields = match message_type {
-            Some(message_type) => {
-                let place = entry.field.as_ref().map_or(place, |at| at.place);
-                let fields = select(&message_type, &selection, place, findings)?;
-                compare(&fields, &name, site.subject, place, findings);
-                Some(fields)
-            }
-            None => None,
+        let fields = match (&selection, message_type) {
+            (Selection::Bytes, _) => Some(vec![Leaf::bytes()]),
+            (_, Some(message_type)) => Some(select(&message_type, &selection, chosen, findings)?),
+            (_, None) => None,
         };
+        if let Some(fields) = &fields {
+            compare(fields, &name, site.subject, chosen, findings);
+        }
         let (ros_topic, place) = topic?;
         let binding = Binding {
             space,
@@ -322,6 +348,25 @@ impl<'c> Bindings<'c> {
     }
 }
 
+/// `None` when it is faulty, which is noted.
+fn selection(entry: &BindingEntry, findings: &mut Findings) -> Option<Selection> {
+    let bytes = matches!(given(&entry.r#as), Some((AsEntry::Bytes, _)));
+    match &entry.field {
+        None if bytes => Some(Selection::Bytes),
+        None => Some(Selection::Whole),
+        Some(at) if bytes => {
+            let note = findings.error(
+                Code::FieldOfBytes,
+                at.place,
+                "a message that crosses as bytes has no fields",
+            );
+            note.help("leave `field` out, or `as: bytes`");
+            None
+        }
+        Some(at) => Some(Selection::Field(at.value.clone()?)),
+    }
+}
+
 fn conflict(first: &Use, other: &Use, topic: &str, findings: &mut Findings) {
     let label = format!("first at line {}", first.place.line);
     if first.reads != other.reads {
@@ -352,19 +397,7 @@ fn topic_name(
     findings: &mut Findings,
 ) -> Option<(String, Place)> {
     let dialect = site.space.map_or(Dialect::Ros1, dialect);
-    if let Some(fault) = topic_fault(text, dialect) {
-        let note = findings
-            .error(
-                Code::RosTopic,
-                place,
-                format!("`{}` is no ROS topic name", short(text)),
-            )
-            .label(fault);
-        if let Some(mended) = mended(text, dialect) {
-            note.help(format!("did you mean `{mended}`?"));
-        }
-        return None;
-    }
+    ros_name(text, place, (dialect, "topic"), findings)?;
     if let Some(other) = text
         .strip_prefix('/')
         .and_then(|name| name.parse::<TopicId>().ok())
@@ -383,6 +416,29 @@ fn topic_name(
     Some((text.to_owned(), place))
 }
 
+/// `None` when it is no name of a topic or service, which is noted.
+pub(super) fn ros_name(
+    text: &str,
+    place: Place,
+    (dialect, what): (Dialect, &str),
+    findings: &mut Findings,
+) -> Option<()> {
+    if let Some(fault) = topic_fault(text, dialect) {
+        let note = findings
+            .error(
+                Code::RosTopic,
+                place,
+                format!("`{}` is no ROS {what} name", short(text)),
+            )
+            .label(fault);
+        if let Some(mended) = mended(text, dialect) {
+            note.help(format!("did you mean `{mended}`?"));
+        }
+        return None;
+    }
+    Some(())
+}
+
 const fn ros(dialect: Dialect) -> &'static str {
     match dialect {
         Dialect::Ros1 => "ROS 1",
@@ -390,7 +446,7 @@ const fn ros(dialect: Dialect) -> &'static str {
     }
 }
 
-fn select(
+pub(super) fn select(
     message_type: &MessageType,
     selection: &Selection,
     place: Place,
@@ -439,7 +495,7 @@ fn select(
     None
 }
 
-fn told(paths: &[&str]) -> String {
+pub(super) fn told(paths: &[&str]) -> String {
     match paths.split_at_checked(TOLD) {
         Some((first, rest)) if !rest.is_empty() => {
             format!("{} and {} more", list(first), rest.len())
@@ -449,7 +505,7 @@ fn told(paths: &[&str]) -> String {
     }
 }
 
-fn compare(
+pub(super) fn compare(
     fields: &[Leaf],
     name: &TypeName,
     subject: &Subject,
@@ -462,6 +518,12 @@ fn compare(
     let told_type = types::print(declared);
     match fields {
         [one] if types::value_type(one) == declared => {}
+        [one] if *one == Leaf::bytes() => {
+            let message = format!("the variable is {told_type}, but bytes are a ByteString");
+            findings
+                .error(Code::TypeDiffers, place, message)
+                .help("leave the variable's `type` out, or write `type: ByteString`");
+        }
         [one] => {
             let found = types::print(types::value_type(one));
             let message = format!(
@@ -486,6 +548,12 @@ fn compare(
     }
 }
 
+/// Whether the bytes that are a message of the one are none of the other.
+fn differ_as_bytes(a: &Binding, b: &Binding) -> bool {
+    let bytes = a.selection == Selection::Bytes && b.selection == Selection::Bytes;
+    bytes && (dialect(a.space) != dialect(b.space) || a.message_type != b.message_type)
+}
+
 /// Where the fields of two bindings could not stand for one another.
 fn differences(found: &[Found], findings: &mut Findings) {
     let mut known = found
@@ -497,6 +565,16 @@ fn differences(found: &[Found], findings: &mut Findings) {
     let shape =
         |fields: &[Leaf]| -> Vec<ValueType> { fields.iter().map(types::value_type).collect() };
     for (other, others) in known {
+        if differ_as_bytes(&first.binding, &other.binding) {
+            let (a, b) = (&first.binding, &other.binding);
+            let message = format!(
+                "the bytes of `{}` in space {} are no `{}` in space {}",
+                a.message_type, a.space, b.message_type, b.space
+            );
+            let note = findings.error(Code::BindingsDiffer, other.place, message);
+            note.label(format!("differs from line {}", first.place.line))
+                .help("bytes cross as they are: only topics of one type and of one ROS can both have them");
+        }
         if shape(fields) == shape(others) {
             continue;
         }

@@ -1,6 +1,7 @@
 //! Where datagrams go, when, and where the server listens.
 
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use super::cell::is_uri;
@@ -39,6 +40,9 @@ pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -
     let key_frame_period = duration(&entry.key_frame_period, findings);
     let keep_alive_period = duration(&entry.keep_alive_period, findings);
     let receive_timeout = duration(&entry.receive_timeout, findings);
+    let largest = PubSub::SMALLEST_DATAGRAM..=PubSub::LARGEST_DATAGRAM;
+    let max_datagram = within(&entry.max_datagram, largest, "bytes", findings);
+    let max_message = within(&entry.max_message, 1..=1024, "MiB", findings);
     let pubsub = PubSub {
         address: address.unwrap_or(default.address),
         interface,
@@ -47,9 +51,30 @@ pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -
         key_frame_period: key_frame_period.unwrap_or(default.key_frame_period),
         keep_alive_period: keep_alive_period.unwrap_or(default.keep_alive_period),
         receive_timeout: receive_timeout.unwrap_or(default.receive_timeout),
+        max_datagram: max_datagram.unwrap_or(default.max_datagram),
+        max_message: max_message
+            .map_or(default.max_message, |mebibytes| u32::from(mebibytes) << 20),
     };
     timing(entry, &pubsub, findings);
     pubsub
+}
+
+fn within(
+    field: &Field<u16>,
+    range: RangeInclusive<u16>,
+    unit: &str,
+    findings: &mut Findings,
+) -> Option<u16> {
+    let (number, place) = given(field)?;
+    if range.contains(number) {
+        return Some(*number);
+    }
+    let message = format!("{number} {unit} are out of range");
+    let (least, most) = range.into_inner();
+    findings
+        .error(Code::WrongValue, place, message)
+        .label(format!("{least} to {most}"));
+    None
 }
 
 fn timing(entry: &PubSubEntry, pubsub: &PubSub, findings: &mut Findings) {
@@ -151,7 +176,7 @@ fn interface(text: &str, place: Place, findings: &mut Findings) -> Option<String
 const SHORTEST: Duration = Duration::from_millis(10);
 const LONGEST: Duration = Duration::from_secs(3600);
 
-fn duration(field: &Field<String>, findings: &mut Findings) -> Option<Duration> {
+pub(super) fn duration(field: &Field<String>, findings: &mut Findings) -> Option<Duration> {
     let (text, place) = given(field)?;
     let duration = parse_duration(text);
     if duration.is_none() {

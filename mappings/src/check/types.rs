@@ -3,7 +3,9 @@
 use std::collections::HashMap;
 use std::sync::{Arc, LazyLock};
 
-use messages::{DefinitionError, Dialect, Leaf, MessageType, Rank, Registry, TypeName};
+use messages::{
+    DefinitionError, Dialect, Leaf, MessageType, Rank, Registry, ServiceType, TypeName,
+};
 use uadp::BuiltinType;
 
 use crate::nearest::nearest;
@@ -77,6 +79,7 @@ type Answer = Result<Arc<MessageType>, Box<DefinitionError>>;
 /// The message types that are built in.
 pub(super) struct Types {
     asked: HashMap<(Dialect, TypeName), Answer>,
+    services: HashMap<TypeName, Option<Arc<ServiceType>>>,
 }
 
 static ROS1: LazyLock<Registry> = LazyLock::new(|| Registry::bundle(Dialect::Ros1));
@@ -86,6 +89,7 @@ impl Types {
     pub(super) fn new() -> Self {
         Self {
             asked: HashMap::new(),
+            services: HashMap::new(),
         }
     }
 
@@ -94,6 +98,12 @@ impl Types {
             Dialect::Ros1 => &ROS1,
             Dialect::Ros2 => &ROS2,
         }
+    }
+
+    /// A ROS 1 service that is built in.
+    pub(super) fn service(&mut self, name: &TypeName) -> Option<Arc<ServiceType>> {
+        let known = self.services.entry(name.clone());
+        known.or_insert_with(|| ROS1.service(name).ok()).clone()
     }
 
     pub(super) fn get(&mut self, dialect: Dialect, name: &TypeName) -> &Answer {

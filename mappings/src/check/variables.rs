@@ -7,6 +7,7 @@ use std::ops::RangeInclusive;
 use messages::{Leaf, Rank};
 
 use super::bindings::{self, Bindings};
+use super::services::Calls;
 use super::types::{self, ValueType};
 use super::{Declared, required};
 use crate::code::Code;
@@ -81,7 +82,11 @@ pub(super) fn check(
         .collect();
     aliases(&drafts, findings);
     unique(&drafts, findings);
-    let mut bindings = Bindings::new(spaces);
+    let calls = Calls::of(drafts.iter().filter_map(|draft| {
+        let (node, _) = draft.node.as_ref()?;
+        Some((node, draft.topic(), draft.entry.ros.as_ref()?))
+    }));
+    let mut bindings = Bindings::new(spaces, calls);
     let variables = drafts
         .iter()
         .filter_map(|draft| variable(draft, &mut bindings, findings));
@@ -327,6 +332,9 @@ fn variable(
         Some((Queue::DropOldest(size), _)) => Overflow::DropOldest(NonZeroU16::new(*size)?),
         Some((Queue::KeepLatest, _)) | None => Overflow::KeepLatest,
     };
+    let service = bound
+        .service
+        .map(|service| service.settled(value_type, findings));
     let (node, _) = draft.node.clone()?;
     let topic = draft.topic()?;
     Some(Variable {
@@ -336,6 +344,7 @@ fn variable(
         value_type,
         fields,
         bindings: bound.bindings,
+        service,
         overflow,
     })
 }

@@ -1,9 +1,16 @@
 //! A message type compiled for one wire and selection.
 
+mod literal;
 mod read;
 mod write;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
+
+use uadp::Scalar;
+
+pub use literal::Literal;
+use literal::{Given, Typed};
 
 use crate::definition::{Arity, Number, Primitive};
 use crate::resolve::{Shape, ShapeKind};
@@ -26,6 +33,17 @@ pub enum Selection {
     Whole,
     /// The one of that path.
     Field(String),
+    /// A message of constants, to be written: `field` takes the value, or without it no value crosses; the fields of
+    /// `rest` have what stands there, all others are zero or empty. Read, it is as [`Selection::Field`].
+    Template {
+        /// The path of the field that holds the value; `None` where the message is the same each time.
+        field: Option<String>,
+        /// Path of a field -> its value.
+        rest: BTreeMap<String, Literal>,
+    },
+    /// The message as it is on the wire, as one ByteString: no field of it is looked at, so whoever writes it says what
+    /// is in it. Of CDR the encapsulation header is part of it.
+    Bytes,
 }
 
 /// Reads and writes the messages of one type on one wire.
@@ -34,10 +52,17 @@ pub enum Selection {
 #[derive(Clone, Debug)]
 pub struct Plan {
     wire: Wire,
-    ops: Vec<Op>,
+    body: Body,
     leaves: Vec<Leaf>,
     /// Paths of all fields, for errors; `Op::leaf` counts in it.
     paths: Vec<String>,
+}
+
+#[derive(Clone, Debug)]
+enum Body {
+    Steps(Vec<Op>),
+    /// The message crosses as it is.
+    Bytes,
 }
 
 /// One step. The steps of a message in an array follow its [`What::Messages`].
@@ -46,6 +71,8 @@ struct Op {
     what: What,
     /// Whether the value crosses; else it is skipped when read and zero when written.
     carry: bool,
+    /// What stands there when it is written and does not cross.
+    constant: Option<Box<Typed>>,
     /// Index of the field in the flattened message.
     leaf: usize,
 }
@@ -81,7 +108,7 @@ enum Len {
 
 impl Plan {
     /// # Errors
-    /// A path the type has not, or a wire of the other ROS.
+    /// A path the type has not, a constant that is no value of its field, or a wire of the other ROS.
     pub fn compile(
         message: &Arc<MessageType>,
         selection: &Selection,
@@ -100,42 +127,59 @@ impl Plan {
             .iter()
             .map(|leaf| leaf.path.clone())
             .collect();
-        let (selected, leaves) = match selection {
-            Selection::Whole => (None, message.leaves().to_vec()),
-            Selection::Field(path) => {
-                let found = message
-                    .leaves()
-                    .iter()
-                    .enumerate()
-                    .find(|(_, leaf)| leaf.path == *path);
-                let Some((at, leaf)) = found else {
-                    return Err(PlanError::UnknownField {
-                        name: message.name().clone(),
-                        path: path.clone(),
-                        known: paths,
-                    });
-                };
-                (Some(at), vec![leaf.clone()])
-            }
+        let none = BTreeMap::new();
+        let (field, rest) = match selection {
+            Selection::Whole => (None, &none),
+            Selection::Field(path) => (Some(path), &none),
+            Selection::Template { field, rest } => (field.as_ref(), rest),
+            Selection::Bytes => return Ok(Self::bytes(wire)),
+        };
+        let carried = match field {
+            Some(path) => Carried::One(index(message, path)?),
+            None if *selection == Selection::Whole => Carried::All,
+            None => Carried::None,
         };
         let mut compiler = Compiler {
             wire,
-            selected,
+            carried,
+            given: given(message, field, rest)?,
             leaf: 0,
             ops: Vec::new(),
             body: 0,
-            empty_elements: None,
+            fault: None,
         };
         compiler.message(&message.shape, false);
-        if let Some(what) = compiler.empty_elements {
-            return Err(PlanError::EmptyElements { name: what });
+        if let Some(fault) = compiler.fault {
+            return Err(fault);
         }
+        write::try_constants(wire, &compiler.ops).map_err(|(leaf, fault)| {
+            let path = paths.get(leaf).cloned().unwrap_or_default();
+            PlanError::ConstantFault {
+                name: message.name().clone(),
+                path,
+                fault,
+            }
+        })?;
+        let leaves = match carried {
+            Carried::All => message.leaves().to_vec(),
+            Carried::One(at) => message.leaves().get(at).cloned().into_iter().collect(),
+            Carried::None => Vec::new(),
+        };
         Ok(Self {
             wire,
-            ops: compiler.ops,
+            body: Body::Steps(compiler.ops),
             leaves,
             paths,
         })
+    }
+
+    fn bytes(wire: Wire) -> Self {
+        Self {
+            wire,
+            body: Body::Bytes,
+            leaves: vec![Leaf::bytes()],
+            paths: Vec::new(),
+        }
     }
 
     /// The fields that cross, in the order they do.
@@ -148,7 +192,15 @@ impl Plan {
     /// A length is believed only after it was compared with the bytes that are left. When it errs the sink may have
     /// taken some fields already.
     pub fn read<S: Sink>(&self, payload: &[u8], sink: &mut S) -> Result<(), ReadError<S::Error>> {
-        read::read(self, payload, sink)
+        match &self.body {
+            Body::Steps(ops) => read::read(self, ops, payload, sink),
+            Body::Bytes => sink
+                .scalar(Scalar::ByteString(Some(payload)))
+                .map_err(|source| ReadError::Sink {
+                    field: String::new(),
+                    source,
+                }),
+        }
     }
 
     /// Takes the fields from `source` and appends the message to `out`; on error `out` is as it was.
@@ -157,7 +209,10 @@ impl Plan {
         source: &mut S,
         out: &mut Vec<u8>,
     ) -> Result<(), WriteError> {
-        write::write(self, source, out)
+        match &self.body {
+            Body::Steps(ops) => write::write(self, ops, source, out),
+            Body::Bytes => write::bytes(source, out),
+        }
     }
 
     fn path(&self, leaf: Option<usize>) -> String {
@@ -167,17 +222,62 @@ impl Plan {
     }
 }
 
-struct Compiler {
+fn index(message: &MessageType, path: &str) -> Result<usize, PlanError> {
+    message
+        .leaves()
+        .iter()
+        .position(|leaf| leaf.path == path)
+        .ok_or_else(|| PlanError::UnknownField {
+            name: message.name().clone(),
+            path: path.to_owned(),
+            known: message
+                .leaves()
+                .iter()
+                .map(|leaf| leaf.path.clone())
+                .collect(),
+        })
+}
+
+/// The constants by the index of their field.
+fn given<'m>(
+    message: &'m MessageType,
+    field: Option<&String>,
+    rest: &'m BTreeMap<String, Literal>,
+) -> Result<BTreeMap<usize, Given<'m>>, PlanError> {
+    let each = rest.iter().map(|(path, literal)| {
+        let at = index(message, path)?;
+        if field == Some(path) {
+            return Err(PlanError::ConstantOfField {
+                name: message.name().clone(),
+                path: path.clone(),
+            });
+        }
+        Ok((at, Given::new(message, path, literal)))
+    });
+    each.collect()
+}
+
+/// Which fields cross.
+#[derive(Clone, Copy)]
+enum Carried {
+    All,
+    One(usize),
+    None,
+}
+
+struct Compiler<'m> {
     wire: Wire,
-    selected: Option<usize>,
+    carried: Carried,
+    given: BTreeMap<usize, Given<'m>>,
     leaf: usize,
     ops: Vec<Op>,
     /// Where the steps of the innermost message in an array begin.
     body: usize,
-    empty_elements: Option<TypeName>,
+    /// The first that was met.
+    fault: Option<PlanError>,
 }
 
-impl Compiler {
+impl Compiler<'_> {
     /// Returns the least number of bytes the message takes. `element`: it is one of an array.
     fn message(&mut self, shape: &Shape, element: bool) -> usize {
         if shape.fields.is_empty() && self.wire == Wire::Cdr {
@@ -230,8 +330,9 @@ impl Compiler {
             (*steps, *least) = (all, each);
         }
         if each == 0 {
-            self.empty_elements
-                .get_or_insert_with(|| inner.name.clone());
+            self.fault.get_or_insert_with(|| PlanError::EmptyElements {
+                name: inner.name.clone(),
+            });
         }
         match len {
             Len::Fixed(count) => each.saturating_mul(usize::try_from(count).unwrap_or(usize::MAX)),
@@ -267,10 +368,26 @@ impl Compiler {
     }
 
     fn push(&mut self, what: What) {
-        let carry = self.selected.is_none_or(|selected| selected == self.leaf);
+        let carry = match self.carried {
+            Carried::All => true,
+            Carried::One(selected) => selected == self.leaf,
+            Carried::None => false,
+        };
+        let skip = matches!(what, What::Skip { .. });
+        let constant = match self.given.get(&self.leaf).filter(|_| !skip) {
+            Some(given) => match given.typed(&what) {
+                Ok(typed) => Some(Box::new(typed)),
+                Err(error) => {
+                    self.fault.get_or_insert(error);
+                    None
+                }
+            },
+            None => None,
+        };
         self.ops.push(Op {
             what,
             carry,
+            constant,
             leaf: self.leaf,
         });
         if let Some(Op {
@@ -284,7 +401,10 @@ impl Compiler {
 
     /// On ROS 1, where nothing is aligned, joins the last step, of `bytes` bytes, with the skip before it.
     fn shorten(&mut self, bytes: usize) {
-        let skips = |op: &Op| !op.carry || matches!(op.what, What::Skip { .. });
+        let skips = |op: &Op| {
+            let passed = !op.carry && op.constant.is_none();
+            passed || matches!(op.what, What::Skip { .. })
+        };
         if self.wire != Wire::Ros1 || !self.ops.last().is_some_and(skips) {
             return;
         }

@@ -54,11 +54,12 @@ struct Reader<'p, 's, L, S> {
 
 pub(super) fn read<S: Sink>(
     plan: &Plan,
+    ops: &[Op],
     payload: &[u8],
     sink: &mut S,
 ) -> Result<(), ReadError<S::Error>> {
     if plan.wire == Wire::Ros1 {
-        return run::<Packed, S>(plan, payload, 0, sink);
+        return run::<Packed, S>(plan, ops, (payload, 0), sink);
     }
     let malformed = |at, fault| ReadError::Malformed {
         field: String::new(),
@@ -69,16 +70,17 @@ pub(super) fn read<S: Sink>(
         return Err(malformed(payload.len(), Fault::Truncated));
     };
     match u16::from_be_bytes([*high, *low]) {
-        0 => run::<BigCdr, S>(plan, data, 4, sink),
-        1 => run::<LittleCdr, S>(plan, data, 4, sink),
+        0 => run::<BigCdr, S>(plan, ops, (data, 4), sink),
+        1 => run::<LittleCdr, S>(plan, ops, (data, 4), sink),
         other => Err(malformed(0, Fault::Encapsulation(other))),
     }
 }
 
+/// `offset`: where in the payload `data` begins.
 fn run<L: Layout, S: Sink>(
     plan: &Plan,
-    data: &[u8],
-    offset: usize,
+    ops: &[Op],
+    (data, offset): (&[u8], usize),
     sink: &mut S,
 ) -> Result<(), ReadError<S::Error>> {
     let mut reader = Reader::<L, S> {
@@ -89,7 +91,7 @@ fn run<L: Layout, S: Sink>(
         scratch: Vec::new(),
         layout: PhantomData,
     };
-    let mut done = reader.steps(&plan.ops, false);
+    let mut done = reader.steps(ops, false);
     let left = data.len().saturating_sub(reader.at);
     if done.is_ok() && !L::ALIGNED && left > 0 {
         reader.leaf = None;

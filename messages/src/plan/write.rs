@@ -2,6 +2,7 @@
 
 use uadp::{BuiltinType, Scalar};
 
+use super::literal::Typed;
 use super::{Len, Op, Plan, What, Wire};
 use crate::definition::{Clock, Number, Primitive};
 use crate::{Source, SourceError, WriteError, WriteFault, date_time_to_time, millis_to_duration};
@@ -16,6 +17,7 @@ struct Writer<'o, 's, S> {
 
 pub(super) fn write<'a, S: Source<'a>>(
     plan: &Plan,
+    ops: &[Op],
     source: &mut S,
     out: &mut Vec<u8>,
 ) -> Result<(), WriteError> {
@@ -30,7 +32,7 @@ pub(super) fn write<'a, S: Source<'a>>(
         leaf: None,
         source,
     };
-    let done = writer.steps(&plan.ops, false).and_then(|()| {
+    let done = writer.steps(ops, false).and_then(|()| {
         writer.leaf = None;
         writer.source.finish().map_err(WriteFault::Source)
     });
@@ -45,17 +47,71 @@ pub(super) fn write<'a, S: Source<'a>>(
     })
 }
 
+/// Errs with the field whose constant cannot be written, for its length or what is in it.
+pub(super) fn try_constants(wire: Wire, ops: &[Op]) -> Result<(), (usize, WriteFault)> {
+    let mut out = Vec::new();
+    let origin = (wire == Wire::Cdr).then_some(0);
+    ops.iter()
+        .filter_map(|op| Some((op, op.constant.as_ref()?)))
+        .try_for_each(|(op, constant)| {
+            constant_of(op, constant, &mut out, origin).map_err(|fault| (op.leaf, fault))
+        })
+}
+
+fn constant_of(
+    op: &Op,
+    constant: &Typed,
+    out: &mut Vec<u8>,
+    origin: Option<usize>,
+) -> Result<(), WriteFault> {
+    let mut writer = Writer {
+        out,
+        origin,
+        leaf: None,
+        source: &mut constant.source(),
+    };
+    match &op.what {
+        What::One(primitive) => writer.single(*primitive),
+        What::Packed(number, len) => writer.packed(*number, *len, true),
+        What::Bytes(len) => writer.bytes(*len, true),
+        What::Many(primitive, len) => writer.many(*primitive, *len, true),
+        // Neither has a constant.
+        What::Messages { .. } | What::Skip { .. } => Ok(()),
+    }
+}
+
+/// A message that crosses as it is.
+pub(super) fn bytes<'a, S: Source<'a>>(
+    source: &mut S,
+    out: &mut Vec<u8>,
+) -> Result<(), WriteError> {
+    let whole = |fault: WriteFault| WriteError {
+        field: String::new(),
+        fault,
+    };
+    let value = source
+        .scalar(BuiltinType::ByteString)
+        .map_err(|error| whole(error.into()))?;
+    let Scalar::ByteString(bytes) = value else {
+        return Err(whole(mismatch(BuiltinType::ByteString, &value)));
+    };
+    source.finish().map_err(|error| whole(error.into()))?;
+    out.extend_from_slice(bytes.unwrap_or_default());
+    Ok(())
+}
+
 impl<'a, S: Source<'a>> Writer<'_, '_, S> {
     /// `inside`: the steps are those of an element.
     fn steps(&mut self, mut ops: &[Op], inside: bool) -> Result<(), WriteFault> {
         while let Some((op, after)) = ops.split_first() {
             ops = after;
             self.leaf = Some(op.leaf);
+            if let Some(constant) = &op.constant {
+                constant_of(op, constant, self.out, self.origin)?;
+                continue;
+            }
             match &op.what {
-                What::One(primitive) if op.carry => {
-                    let value = self.source.scalar(primitive.builtin())?;
-                    self.one(*primitive, value)?;
-                }
+                What::One(primitive) if op.carry => self.single(*primitive)?,
                 What::One(primitive) => self.zero(*primitive),
                 What::Skip { align, bytes } => self.zeros(*align, *bytes),
                 What::Packed(number, len) => self.packed(*number, *len, op.carry)?,
@@ -69,6 +125,12 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
             }
         }
         Ok(())
+    }
+
+    #[inline]
+    fn single(&mut self, primitive: Primitive) -> Result<(), WriteFault> {
+        let value = self.source.scalar(primitive.builtin())?;
+        self.one(primitive, value)
     }
 
     /// `carry`: whether within an element already, if the value crosses at all.

@@ -4,8 +4,12 @@
     python3 make.py cyclone   needs rosbags and cyclonedds (11.0.1) -> cyclone.json
     python3 make.py genpy     needs Debian's python3-std-msgs, -geometry-msgs, -sensor-msgs, -tf2-msgs,
                               -rosgraph-msgs, -actionlib-msgs -> genpy.json
+    python3 make.py services  needs Debian's python3-std-srvs, -nav-msgs, -sensor-msgs, -tf2-msgs, -diagnostic-msgs,
+                              -roscpp-msg, -move-base-msgs -> ros1_services.txt
 
 ros1_md5.txt    name and md5 of each ROS 1 type: rosbags' store ROS1_NOETIC
+ros1_services.txt name and md5 of each service of those packages, of roscpp/Logger, and of the messages genaction made
+                of two actions: the classes genpy made
 ros2_fields.txt name and fields of each ROS 2 type: rosbags' store ROS2_JAZZY
 *.json          messages with made-up values: their bytes as that implementation writes them, and the fields a bridge
                 is to make of them, one line each, by the rules of the crate's documentation (written here a second time)
@@ -298,4 +302,23 @@ def genpy():
     write("genpy.json", samples)
 
 
-{"rosbags": rosbags, "cyclone": cyclone, "genpy": genpy}[sys.argv[1]]()
+def services():
+    import importlib
+
+    table = []
+    for package in "std_srvs nav_msgs sensor_msgs tf2_msgs diagnostic_msgs roscpp".split():
+        module = importlib.import_module(package + ".srv")
+        classes = [cls for cls in vars(module).values() if hasattr(cls, "_request_class")]
+        table += [f"{cls._type} {cls._md5sum}" for cls in classes]
+    messages = [("roscpp", "Logger")]
+    for package, action in [("move_base_msgs", "MoveBase"), ("tf2_msgs", "LookupTransform")]:
+        for suffix in "Action ActionGoal ActionResult ActionFeedback Goal Result Feedback".split():
+            messages.append((package, action + suffix))
+    for package, name in messages:
+        cls = getattr(importlib.import_module(package + ".msg"), name)
+        table.append(f"{cls._type} {cls._md5sum}")
+    with open("ros1_services.txt", "w") as out:
+        out.write("\n".join(sorted(table)) + "\n")
+
+
+{"rosbags": rosbags, "cyclone": cyclone, "genpy": genpy, "services": services}[sys.argv[1]]()

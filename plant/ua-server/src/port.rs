@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Delivery, Failure, FailureKind, Port, PortEvent};
+use bridge_node::{Delivery, Failure, FailureKind, Kept, Port, PortEvent};
 use mappings::{Mapping, SpaceId, TopicId};
 use opcua::server::ServerHandle;
 use opcua::server::address_space::AddressSpace;
@@ -145,7 +145,7 @@ impl Port for ServerPort {
             tokio::select! {
                 Some(write) = self.writes.recv() => {
                     let ClientWrite { topic, block, source } = write;
-                    return PortEvent::Sample { topic, payload: block, received: source };
+                    return PortEvent::Sample { topic, payload: block, received: source, latched_by: None };
                 }
                 ended = ended(&mut self.serving) => return PortEvent::Ended(ended),
                 _ = self.look.tick() => self.pki.report_rejected(),
@@ -154,6 +154,10 @@ impl Port for ServerPort {
     }
 
     fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
+        if sample.kept == Kept::Again {
+            // A variable has one value, and shows the last one.
+            return Ok(());
+        }
         self.space.update(
             sample.topic,
             &sample.payload,

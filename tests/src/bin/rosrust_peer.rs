@@ -1,15 +1,17 @@
-//! rosrust as an independent ROS 1 implementation: publishes, subscribes or repeats `std_msgs/String`.
+//! rosrust as an independent ROS 1 implementation: publishes, subscribes or repeats `std_msgs/String`, calls or serves
+//! `std_srvs/SetBool`.
 //!
 //! `rosrust-peer pub TOPIC VALUE..` sends the values ten times a second; `rosrust-peer sub TOPIC` prints one
-//! JSON line per message; `rosrust-peer relay IN OUT` sends on the bytes of each message. All end on SIGTERM, and by
-//! themselves: after two minutes, the relay after thirty.
+//! JSON line per message; `rosrust-peer relay IN OUT` sends on the bytes of each message; `rosrust-peer serve SERVICE`
+//! answers `done` to true and fails at false. All four end on SIGTERM, and by themselves after two minutes, the relay
+//! after thirty. `rosrust-peer call SERVICE` calls with true and with false, prints one JSON line each, and ends.
 
 use std::{
     io::Write,
     time::{Duration, Instant},
 };
 
-use rosrust::{RawMessage, RawMessageDescription};
+use rosrust::{Message, RawMessage, RawMessageDescription, RosMsg, ServicePair};
 use serde_json::{Value, json};
 
 const LIMIT: Duration = Duration::from_secs(120);
@@ -24,8 +26,12 @@ fn main() {
         [verb, topic, values @ ..] if verb == "pub" => publish(topic, values),
         [verb, topic] if verb == "sub" => subscribe(topic),
         [verb, from, to] if verb == "relay" => relay(from, to),
+        [verb, service] if verb == "serve" => serve(service),
+        [verb, service] if verb == "call" => call(service),
         _ => {
-            eprintln!("usage: rosrust-peer pub TOPIC VALUE.. | sub TOPIC | relay IN OUT");
+            eprintln!(
+                "usage: rosrust-peer pub TOPIC VALUE.. | sub TOPIC | relay IN OUT | serve SERVICE | call SERVICE"
+            );
             std::process::exit(64);
         }
     }
@@ -71,6 +77,64 @@ fn relay(from: &str, to: &str) {
     say(&json!({ "ready": to }));
     stay(RELAY_LIMIT);
     drop(subscriber);
+}
+
+fn serve(service: &str) {
+    rosrust::init("rosrust_server");
+    let handle = |on: bool| match on {
+        true => Ok(RawMessage([&[1][..], &to_bytes("done")].concat())),
+        false => Err("the valve is stuck".to_owned()),
+    };
+    let server = rosrust::service::<SetBool, _>(service, handle).unwrap();
+    say(&json!({ "ready": service }));
+    stay(LIMIT);
+    drop(server);
+}
+
+fn call(service: &str) {
+    rosrust::init("rosrust_client");
+    rosrust::wait_for_service(service, Some(LIMIT)).unwrap();
+    say(&json!({ "ready": service }));
+    let client = rosrust::client::<SetBool>(service).unwrap();
+    for on in [true, false] {
+        match client.req(&on).unwrap() {
+            Ok(answer) => say(&json!({ "value": to_text(&answer.0[1..]) })),
+            Err(error) => say(&json!({ "error": error })),
+        }
+    }
+}
+
+/// `std_srvs/SetBool` with its answer as bytes.
+#[derive(Clone, Debug, Default, PartialEq)]
+struct SetBool;
+
+impl RosMsg for SetBool {
+    fn encode<W: Write>(&self, _: W) -> std::io::Result<()> {
+        Ok(())
+    }
+
+    fn decode<R: std::io::Read>(_: R) -> std::io::Result<Self> {
+        Ok(Self)
+    }
+}
+
+impl Message for SetBool {
+    fn msg_definition() -> String {
+        String::new()
+    }
+
+    fn md5sum() -> String {
+        "09fb03525b03e7ea1fd3992bafd87e16".to_owned()
+    }
+
+    fn msg_type() -> String {
+        "std_srvs/SetBool".to_owned()
+    }
+}
+
+impl ServicePair for SetBool {
+    type Request = bool;
+    type Response = RawMessage;
 }
 
 fn stay(limit: Duration) {

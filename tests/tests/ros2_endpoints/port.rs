@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_node::{Delivery, Port, PortEvent};
+use bridge_node::{Delivery, Kept, Port, PortEvent};
 use bridge_ros2::{PortOptions, Ros2Port};
 use mappings::{Mapping, SpaceId, TopicId};
 use nix::sys::signal::Signal;
@@ -87,6 +87,8 @@ fn delivery(topic: TopicId, text: &str) -> Delivery {
         payload: string(text).into(),
         source: None,
         status: 0,
+        instance: None,
+        kept: Kept::Alone,
     }
 }
 
@@ -234,6 +236,8 @@ async fn a_bad_value_is_not_published() {
     assert_eq!(bound(&mut port, topic).await, "std_msgs/String");
     let bad = Delivery {
         status: 0x8032,
+        instance: None,
+        kept: Kept::Alone,
         ..delivery(topic, "stale")
     };
     assert_eq!(port.publish(bad), Err("bad status"));

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hasher};
 use std::time::Duration;
 
+use super::{GiveUp, GivenUp};
 use crate::publisher_id::OwnedPublisherId;
 use crate::{Chunk, NetworkMessage, NetworkMessageType, PublisherId};
 
@@ -183,6 +184,19 @@ impl Open {
             at,
             total_size: self.total_size,
             pieces: pieces.map(|(at, piece)| (*at, digest(piece))).collect(),
+        }
+    }
+
+    /// What is told of it when it is not waited for any longer.
+    pub(super) fn given_up(self, why: GiveUp) -> GivenUp {
+        GivenUp {
+            publisher_id: self.key.publisher_id,
+            writer_group_id: self.key.writer.group_id,
+            writer_id: self.key.writer.writer_id,
+            message_sequence_number: self.key.message_sequence_number,
+            received: self.received,
+            total_size: self.total_size,
+            why,
         }
     }
 

@@ -1,0 +1,209 @@
+//! Large messages of other spaces, put together from their chunks.
+
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use mappings::{PubSub, SpaceId, TopicId};
+use uadp::{
+    ChunkRefusal, DecodeError, GiveUp, GivenUp, NetworkMessage, OwnedPublisherId, Reassembler,
+    ReassemblyLimits,
+};
+
+use super::receive::{number_of, sent};
+use super::{About, MAX_TOPICS, Router};
+use crate::counters::Reason;
+use crate::output::Output;
+use crate::settings::Now;
+use crate::topic::{Role, Topic};
+
+/// The chunks of all topics.
+#[derive(Debug)]
+pub(super) struct Chunks {
+    reassembler: Reassembler,
+    /// What its times count from.
+    start: Instant,
+}
+
+impl Chunks {
+    fn new(pubsub: &PubSub, start: Instant) -> Self {
+        let whole = pubsub.max_message;
+        let bytes = usize::try_from(whole).unwrap_or(usize::MAX);
+        let limits = ReassemblyLimits {
+            whole,
+            // Two of the largest at a time with their bookkeeping, or very many smaller ones.
+            total: bytes.saturating_mul(5) / 2,
+            open: MAX_OPEN,
+            // One in progress, and one of which a chunk was lost.
+            open_per_writer: 2,
+            pieces: bytes / LEAST_PIECE,
+            age: pubsub.receive_timeout,
+        };
+        Self {
+            reassembler: Reassembler::new(limits),
+            start,
+        }
+    }
+
+    /// When the oldest one has waited long enough.
+    pub(super) fn due(&self) -> Option<Instant> {
+        Some(self.start + self.reassembler.poll_timeout()?)
+    }
+
+    fn since_start(&self, now: Now) -> Duration {
+        now.monotonic.saturating_duration_since(self.start)
+    }
+}
+
+impl Router {
+    /// A chunk of another space: kept until its message is complete, which is then handled like any.
+    pub(super) fn handle_chunk(
+        &mut self,
+        message: &NetworkMessage<'_>,
+        (space, namespace): (SpaceId, u16),
+        from: SocketAddr,
+        now: Now,
+    ) {
+        let writer_id = message.writer_ids().and_then(|mut ids| ids.next());
+        let topic = writer_id.and_then(|id| TopicId::new(u16::from(space.get()), namespace, id));
+        if writer_id.is_some() && topic.is_none() {
+            self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
+            return;
+        }
+        if topic.is_some_and(|topic| !self.hear(topic, from, now)) {
+            return;
+        }
+        // Taken out while the message it gives is handled, so that this needs no copy.
+        let mut chunks = self
+            .chunks
+            .take()
+            .unwrap_or_else(|| Box::new(Chunks::new(self.mapping.pubsub(), now.monotonic)));
+        let since = chunks.since_start(now);
+        match chunks.reassembler.receive(message, since) {
+            Ok(None) => {}
+            Ok(Some(whole)) => match topic {
+                Some(topic) => match whole.data_set_message() {
+                    Ok(message) => {
+                        self.handle_message(topic, &message, (from, sent(&whole.header)), now);
+                    }
+                    Err(error) => self.drop_undecoded(Some(topic), from, &error),
+                },
+                // Without a payload header it is an encoded NetworkMessage that was cut up.
+                None => match NetworkMessage::decode(whole.bytes) {
+                    Ok(message) if message.is_chunk() => {
+                        self.drop_undecoded(None, from, &CHUNK_IN_CHUNKS);
+                    }
+                    Ok(message) => self.handle_network_message(&message, from, now),
+                    Err(error) => self.drop_undecoded(None, from, &error),
+                },
+            },
+            Err(refusal) => {
+                let about = About {
+                    topic,
+                    from: Some(from),
+                };
+                let most = self.mapping.pubsub().max_message >> 20;
+                self.count(about, reason_of(refusal), 1, || told(refusal, most));
+            }
+        }
+        self.count_given_up(&mut chunks.reassembler);
+        self.chunks = Some(chunks);
+    }
+
+    /// Gives up the messages whose chunks have not come in time.
+    pub(super) fn expire_chunks(&mut self, now: Now) {
+        if self.chunks.as_ref().and_then(|chunks| chunks.due()) > Some(now.monotonic) {
+            return;
+        }
+        if let Some(mut chunks) = self.chunks.take() {
+            let since = chunks.since_start(now);
+            chunks.reassembler.expire(since);
+            self.count_given_up(&mut chunks.reassembler);
+            self.chunks = Some(chunks);
+        }
+    }
+
+    /// Takes note that the writer of a topic lives; false when there is no room to follow it.
+    fn hear(&mut self, topic: TopicId, from: SocketAddr, now: Now) -> bool {
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.entry(topic, Some(from), now)
+        else {
+            self.count(About::sender(from), Reason::TooManyTopics, 1, || {
+                format!("more than {MAX_TOPICS} topics are in the space; {topic} is not followed")
+            });
+            return false;
+        };
+        if reader.heard(now.monotonic) {
+            self.told.push_back(Output::Silent {
+                topic,
+                silent: false,
+            });
+            self.schedule(topic);
+        }
+        true
+    }
+
+    fn count_given_up(&mut self, reassembler: &mut Reassembler) {
+        while let Some(given_up) = reassembler.poll_given_up() {
+            let reason = match given_up.why {
+                GiveUp::Expired | GiveUp::Superseded | GiveUp::Contradicted => Reason::Incomplete,
+                GiveUp::OutOfBytes | GiveUp::OutOfPlaces => Reason::NoRoom,
+            };
+            let about = About {
+                topic: topic_of(&given_up),
+                from: None,
+            };
+            self.count(about, reason, 1, || {
+                format!(
+                    "of a message of {} bytes only {} came ({}); a larger receive buffer may help, see \
+                     net.core.rmem_max",
+                    given_up.total_size,
+                    given_up.received,
+                    why(given_up.why)
+                )
+            });
+        }
+    }
+}
+
+fn topic_of(given_up: &GivenUp) -> Option<TopicId> {
+    let publisher = given_up.publisher_id.as_ref().map(OwnedPublisherId::as_id);
+    let (number, _) = number_of(publisher);
+    let space = u16::try_from(number).ok()?;
+    TopicId::new(space, given_up.writer_group_id?, given_up.writer_id?)
+}
+
+const fn why(why: GiveUp) -> &'static str {
+    match why {
+        GiveUp::Expired => "waited for until receive_timeout",
+        GiveUp::Superseded => "two newer ones of its writer were begun",
+        GiveUp::Contradicted => "its writer started over",
+        GiveUp::OutOfBytes => "unfinished messages took up all the bytes for them",
+        GiveUp::OutOfPlaces => "too many messages were unfinished",
+    }
+}
+
+const fn reason_of(refusal: ChunkRefusal) -> Reason {
+    match refusal {
+        ChunkRefusal::TooBig { .. } | ChunkRefusal::TooManyPieces => Reason::TooBig,
+        ChunkRefusal::Duplicate => Reason::Duplicate,
+        // What else a later version refuses is about bytes, too.
+        _ => Reason::Malformed,
+    }
+}
+
+fn told(refusal: ChunkRefusal, most: u32) -> String {
+    match refusal {
+        ChunkRefusal::TooBig { total_size } => {
+            format!("a message of {total_size} bytes; `pubsub.max_message` allows {most} MiB")
+        }
+        other => other.to_string(),
+    }
+}
+
+const CHUNK_IN_CHUNKS: DecodeError = DecodeError::Misread("a chunk in chunks");
+/// Messages unfinished at a time: datagrams of so many large topics may come in turn.
+const MAX_OPEN: usize = 512;
+/// The least bytes a chunk carries on average: the smallest datagram less its headers.
+const LEAST_PIECE: usize = 256;

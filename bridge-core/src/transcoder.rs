@@ -1,0 +1,102 @@
+//! Messages that cross as they are, between the two kinds of ROS.
+
+use std::sync::Arc;
+
+use messages::{Dialect, MessageType, Plan, Registry, Selection, Wire};
+use uadp::{
+    DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder, Scalar, Variant,
+};
+
+use crate::counters::Reason;
+use crate::fields::{self, Payload};
+
+/// Makes the bytes of a message of the other ROS those of the local type of the same name.
+#[derive(Debug)]
+pub(crate) struct Transcoder {
+    from: Plan,
+    to: Plan,
+    namespace: u16,
+}
+
+impl Transcoder {
+    /// For messages that are written in `origin` and read as `local`.
+    ///
+    /// # Errors
+    /// Both sides by name, when the other ROS has no such type among the common interfaces, or other fields in it.
+    pub(crate) fn compile(
+        origin: Dialect,
+        local: &Arc<MessageType>,
+        namespace: u16,
+    ) -> Result<Self, String> {
+        let name = local.name();
+        let (there, here) = (label(origin), label(local.dialect()));
+        let why = |error: String| {
+            format!("{there} messages come as bytes and {here} {name} is wanted: {error}")
+        };
+        let foreign = Registry::bundle(origin)
+            .get(name)
+            .map_err(|error| why(error.to_string()))?;
+        let differs = foreign.leaves().len() != local.leaves().len()
+            || foreign.leaves().iter().zip(local.leaves()).any(|(a, b)| {
+                a.builtin != b.builtin || a.rank != b.rank || !a.path.eq_ignore_ascii_case(&b.path)
+            });
+        if differs {
+            return Err(why(format!("{there} {name} has other fields")));
+        }
+        let plan = |message: &Arc<MessageType>, wire| {
+            Plan::compile(message, &Selection::Whole, wire).map_err(|error| why(error.to_string()))
+        };
+        Ok(Self {
+            from: plan(&foreign, wire(origin))?,
+            to: plan(local, wire(local.dialect()))?,
+            namespace,
+        })
+    }
+
+    /// Appends the local message to `out`; `scratch` holds the fields on the way.
+    pub(crate) fn run(
+        &self,
+        mut fields: Fields<'_>,
+        scratch: &mut Vec<u8>,
+        out: &mut Vec<u8>,
+    ) -> Result<(), (Reason, String)> {
+        let (Some(Ok(Variant::Scalar(Scalar::ByteString(bytes)))), None) =
+            (fields.next(), fields.next())
+        else {
+            let detail = "a message as bytes is one ByteString, and this is something else";
+            return Err((Reason::Mismatch, detail.to_owned()));
+        };
+        let too_big = |error: uadp::EncodeError| (Reason::TooBig, error.to_string());
+        let mut message = NetworkMessageEncoder::new(scratch, &NetworkHeader::default(), None)
+            .map_err(too_big)?;
+        let mut frame = message
+            .key_frame(&DataSetHeader::default())
+            .map_err(too_big)?;
+        let payload = Payload::Ros(&self.from, bytes.unwrap_or_default());
+        fields::read(&payload, self.namespace, &mut frame)?;
+        frame.finish().map_err(too_big)?;
+        message.finish().map_err(too_big)?;
+        let malformed = |error: uadp::DecodeError| (Reason::Malformed, error.to_string());
+        let message = NetworkMessage::decode(scratch).map_err(malformed)?;
+        let message = message.messages().next();
+        let fields = message
+            .transpose()
+            .and_then(|message| message.map(|message| message.fields()).transpose())
+            .map_err(malformed)?;
+        fields.map_or(Ok(()), |fields| fields::write(&self.to, fields, out))
+    }
+}
+
+const fn wire(dialect: Dialect) -> Wire {
+    match dialect {
+        Dialect::Ros1 => Wire::Ros1,
+        Dialect::Ros2 => Wire::Cdr,
+    }
+}
+
+const fn label(dialect: Dialect) -> &'static str {
+    match dialect {
+        Dialect::Ros1 => "ROS 1",
+        Dialect::Ros2 => "ROS 2",
+    }
+}

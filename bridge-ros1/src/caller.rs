@@ -1,0 +1,135 @@
+//! The task that calls one service.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use mappings::TopicId;
+use tcpros::{ServiceClient, ServiceError};
+use tokio::sync::mpsc;
+use tokio::time::{MissedTickBehavior, interval, sleep};
+use tracing::{info, warn};
+
+use crate::pending::Pending;
+
+/// What became of a call.
+#[derive(Debug)]
+pub(crate) struct Outcome {
+    /// What it was made for.
+    pub(crate) of: Source,
+    /// The answer, or why there is none.
+    pub(crate) result: Result<Bytes, String>,
+}
+
+/// What makes calls.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(crate) enum Source {
+    /// The values of a topic.
+    Value(TopicId),
+    /// The clock; the number of the poll.
+    Poll(usize),
+}
+
+/// Calls one service and reports what came of it.
+#[derive(Debug)]
+pub(crate) struct Caller {
+    client: ServiceClient,
+    of: Source,
+    report: mpsc::Sender<Outcome>,
+    /// The fault that was told last and is not over.
+    trouble: Option<String>,
+}
+
+impl Caller {
+    pub(crate) const fn new(
+        client: ServiceClient,
+        of: Source,
+        report: mpsc::Sender<Outcome>,
+    ) -> Self {
+        Self {
+            client,
+            of,
+            report,
+            trouble: None,
+        }
+    }
+
+    /// Calls with each request in turn. A state (`insist`) is tried until the service takes it or a newer one has come,
+    /// an event once.
+    pub(crate) async fn serve(mut self, pending: Arc<Pending>, insist: bool) {
+        loop {
+            let mut request = pending.take().await;
+            let mut wait = FIRST_WAIT;
+            while self.call(request.clone(), insist).await == Next::Again {
+                tokio::select! {
+                    newer = pending.take() => (request, wait) = (newer, FIRST_WAIT),
+                    () = sleep(wait) => wait = (wait * 2).min(LAST_WAIT),
+                }
+            }
+        }
+    }
+
+    /// Calls with one request every so often.
+    pub(crate) async fn poll(mut self, request: Bytes, every: Duration) {
+        let mut ticks = interval(every);
+        // A slow service is asked again in its turn, not twice in a row.
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            ticks.tick().await;
+            self.call(request.clone(), false).await;
+        }
+    }
+
+    async fn call(&mut self, request: Bytes, insist: bool) -> Next {
+        let result = match self.client.call(request).await {
+            Ok(answer) => {
+                if self.trouble.take().is_some() {
+                    info!(service = self.client.service(), "the service answers again");
+                }
+                Ok(answer)
+            }
+            Err(error) => {
+                let text = error.to_string();
+                let again = insist && may_pass(&error);
+                let new = self.trouble.as_ref() != Some(&text);
+                if new && again {
+                    warn!(service = self.client.service(), "trying again: {text}");
+                }
+                self.trouble = Some(text.clone());
+                if again {
+                    return Next::Again;
+                }
+                Err(text)
+            }
+        };
+        let outcome = Outcome {
+            of: self.of,
+            result,
+        };
+        // Nobody is left to be told when the port is gone.
+        drop(self.report.send(outcome).await);
+        Next::Done
+    }
+}
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Next {
+    Done,
+    Again,
+}
+
+/// Whether the same call may succeed later, with nobody changing anything but the service coming back.
+fn may_pass(error: &ServiceError) -> bool {
+    matches!(
+        error,
+        ServiceError::NotAdvertised { .. }
+            | ServiceError::Master { .. }
+            | ServiceError::NoConnection { .. }
+            | ServiceError::Timeout { .. }
+            | ServiceError::Lost { .. }
+    )
+}
+
+/// The first wait before a state is handed to its service again, doubling to the last.
+const FIRST_WAIT: Duration = Duration::from_millis(250);
+const LAST_WAIT: Duration = Duration::from_secs(5);

@@ -1,0 +1,81 @@
+//! Requests that wait for a service.
+
+use std::collections::VecDeque;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use bytes::Bytes;
+use mappings::Overflow;
+use tokio::sync::Notify;
+
+/// The bounded queue between the port and the task that calls one service. When it is full, the oldest gives way.
+#[derive(Debug)]
+pub(crate) struct Pending {
+    depth: usize,
+    waiting: Mutex<VecDeque<Bytes>>,
+    changed: Notify,
+}
+
+impl Pending {
+    pub(crate) fn new(overflow: Overflow) -> Self {
+        let depth = match overflow {
+            Overflow::KeepLatest => 1,
+            Overflow::DropOldest(depth) => usize::from(depth.get()),
+        };
+        Self {
+            depth,
+            waiting: Mutex::default(),
+            changed: Notify::new(),
+        }
+    }
+
+    /// Queues a request and says whether the oldest one had to go.
+    pub(crate) fn push(&self, request: Bytes) -> bool {
+        let mut waiting = self.lock();
+        let full = waiting.len() >= self.depth;
+        if full {
+            waiting.pop_front();
+        }
+        waiting.push_back(request);
+        drop(waiting);
+        self.changed.notify_one();
+        full
+    }
+
+    /// The oldest request, when there is one. Cancel-safe: it is taken only when it is returned.
+    pub(crate) async fn take(&self) -> Bytes {
+        loop {
+            let next = self.lock().pop_front();
+            if let Some(request) = next {
+                return request;
+            }
+            self.changed.notified().await;
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, VecDeque<Bytes>> {
+        // The queue is whole between statements.
+        self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn of_states_the_newest_waits_and_of_events_as_many_as_the_mapping_says() {
+        let requests: Vec<Bytes> = (0..4u8).map(|n| Bytes::from(vec![n])).collect();
+        for (overflow, dropped, first) in [
+            (Overflow::KeepLatest, 3, 3),
+            (Overflow::DropOldest(3.try_into().unwrap()), 1, 1),
+        ] {
+            let pending = Pending::new(overflow);
+            let gone = requests
+                .iter()
+                .filter(|request| pending.push((*request).clone()))
+                .count();
+            assert_eq!(gone, dropped);
+            assert_eq!(pending.take().await, requests[first]);
+        }
+    }
+}

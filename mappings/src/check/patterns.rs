@@ -1,0 +1,257 @@
+//! Patterns: topics that become variables as they appear.
+
+use std::collections::BTreeMap;
+
+use messages::{Selection, TypeName};
+
+use super::bindings::select;
+use super::types::{Types, dialect};
+use super::{Declared, required, variables};
+use crate::code::Code;
+use crate::document::{AsEntry, PatternEntry};
+use crate::findings::Findings;
+use crate::mapping::Space;
+use crate::node_id::NodeIdText;
+use crate::pattern::{Glob, Pattern, Template};
+use crate::read::{At, given, short};
+use crate::topic::SpaceId;
+use crate::tree::Place;
+
+/// Most patterns of one document: each is tried on every topic.
+const MAX_PATTERNS: usize = 1000;
+
+pub(super) fn check(
+    entries: &[At<PatternEntry>],
+    spaces: &Declared<Vec<Space>>,
+    namespaces: &Declared<BTreeMap<u16, String>>,
+    findings: &mut Findings,
+) -> Vec<Pattern> {
+    if let Some(first) = entries.get(MAX_PATTERNS) {
+        let message = format!(
+            "{} patterns; at most {MAX_PATTERNS} are read",
+            entries.len()
+        );
+        findings.error(Code::TooLarge, first.place, message);
+        return Vec::new();
+    }
+    let mut types = Types::new();
+    let mut patterns = Vec::new();
+    for at in entries {
+        let Some(entry) = &at.value else { continue };
+        let origin = required(&entry.origin, "origin", "the pattern", at.place, findings);
+        let origin = origin.and_then(|(number, place)| origin_of(*number, place, spaces, findings));
+        let texts = texts(entry, at.place, namespaces, findings);
+        let kind = kind(entry, origin, &mut types, findings);
+        let (Some(origin), Some(texts), Some((message_type, selection))) = (origin, texts, kind)
+        else {
+            continue;
+        };
+        patterns.push(Pattern {
+            topics: texts.topics,
+            exclude: texts.exclude,
+            origin,
+            node: texts.node,
+            alias: texts.alias,
+            name: texts.name,
+            message_type,
+            selection,
+        });
+    }
+    patterns
+}
+
+fn origin_of(
+    number: u16,
+    place: Place,
+    spaces: &Declared<Vec<Space>>,
+    findings: &mut Findings,
+) -> Option<SpaceId> {
+    let origin = variables::space(number, place, "origin", spaces, findings)?;
+    if origin == SpaceId::UA {
+        let message = "space 0 is the OPC UA side and has no ROS topics";
+        findings
+            .error(Code::OpcUaBinding, place, message)
+            .help("a pattern is about the topics of one ROS space");
+        return None;
+    }
+    Some(origin)
+}
+
+struct Texts {
+    topics: Glob,
+    exclude: Vec<Glob>,
+    node: Template,
+    alias: Option<Template>,
+    name: Template,
+}
+
+fn texts(
+    entry: &PatternEntry,
+    owner: Place,
+    namespaces: &Declared<BTreeMap<u16, String>>,
+    findings: &mut Findings,
+) -> Option<Texts> {
+    let topics = required(&entry.topics, "topics", "the pattern", owner, findings);
+    let node = required(&entry.node, "node", "the pattern", owner, findings);
+    let name = required(&entry.name, "name", "the pattern", owner, findings);
+    let topics = topics.and_then(|(text, place)| {
+        let topics = glob(text, place, findings)?;
+        if topics.wildcards() == 0 {
+            let message = format!("`{text}` has no wildcard and is one topic");
+            findings
+                .error(Code::TopicPattern, place, message)
+                .help("`*` stands for part of a name; one topic is an entry of `variables`");
+            return None;
+        }
+        Some(topics)
+    });
+    let excluded = entry.exclude.as_ref().and_then(|at| at.value.as_ref());
+    let excluded = excluded.into_iter().flatten();
+    let exclude: Vec<Glob> = excluded
+        .filter_map(|at| glob(at.value.as_ref()?, at.place, findings))
+        .collect();
+    let topics = topics?;
+    let captures = topics.wildcards();
+    let node = node.and_then(|(text, place)| {
+        let alias = entry.alias.is_some();
+        self::node(text, place, (captures, alias), namespaces, findings)
+    });
+    let alias = match given(&entry.alias) {
+        Some((text, place)) => Some(numbered(text, place, captures, findings)?),
+        None => None,
+    };
+    let name = name.and_then(|(text, place)| template(text, place, captures, findings));
+    Some(Texts {
+        topics,
+        exclude,
+        node: node?,
+        alias,
+        name: name?,
+    })
+}
+
+fn glob(text: &str, place: Place, findings: &mut Findings) -> Option<Glob> {
+    match Glob::parse(text) {
+        Ok(glob) => Some(glob),
+        Err(why) => {
+            let message = format!("`{}` is no pattern of topic names", short(text));
+            findings
+                .error(Code::TopicPattern, place, message)
+                .label(why);
+            None
+        }
+    }
+}
+
+fn template(
+    text: &str,
+    place: Place,
+    captures: usize,
+    findings: &mut Findings,
+) -> Option<Template> {
+    match Template::parse(text, captures) {
+        Ok(template) => Some(template),
+        Err(piece) => {
+            let message = format!("`{}` stands for no wildcard", short(&piece));
+            findings
+                .error(Code::PatternCapture, place, message)
+                .help(format!("the pattern has {captures}: {{1}} is the first"));
+            None
+        }
+    }
+}
+
+/// A text that is to tell topics apart.
+fn numbered(
+    text: &str,
+    place: Place,
+    captures: usize,
+    findings: &mut Findings,
+) -> Option<Template> {
+    let template = template(text, place, captures, findings)?;
+    if !template.varies() {
+        let message = format!("`{}` is the same for every topic", short(text));
+        findings
+            .error(Code::PatternCapture, place, message)
+            .help("a node per topic: put what a wildcard stands for into the number, as 10{1}");
+        return None;
+    }
+    Some(template)
+}
+
+fn node(
+    text: &str,
+    place: Place,
+    (captures, alias): (usize, bool),
+    namespaces: &Declared<BTreeMap<u16, String>>,
+    findings: &mut Findings,
+) -> Option<Template> {
+    let template = numbered(text, place, captures, findings)?;
+    let example = template.render(&vec!["1".to_owned(); captures]);
+    let fixed = text.split(';').next().is_some_and(|ns| !ns.contains('{'));
+    let Some(node) = example.parse::<NodeIdText>().ok().filter(|_| fixed) else {
+        let message = format!("`{}` makes no node id", short(text));
+        findings
+            .error(Code::NodeId, place, message)
+            .help("as ns=2;i=10{1}, with an index that is the same for all");
+        return None;
+    };
+    let index = node.namespace;
+    if !alias && node.writer_id().is_none() || index == 0 {
+        let message = format!("`{}` makes no number of a topic", short(text));
+        findings
+            .error(Code::AliasNeeded, place, message)
+            .help("a node as ns=2;i=10{1}, or beside it `alias: \"10{1}\"`");
+        return None;
+    }
+    if !namespaces.partial && !namespaces.known.contains_key(&index) {
+        let message = format!(
+            "namespace {index} of node `{}` is not declared",
+            short(text)
+        );
+        findings
+            .error(Code::UndeclaredNamespace, place, message)
+            .help(format!(
+                "add it with its URI: `namespaces: {{{index}: urn:my-plant:line}}`"
+            ));
+    }
+    Some(template)
+}
+
+/// Type and selection.
+fn kind(
+    entry: &PatternEntry,
+    origin: Option<SpaceId>,
+    types: &mut Types,
+    findings: &mut Findings,
+) -> Option<(Option<TypeName>, Selection)> {
+    let bytes = matches!(given(&entry.r#as), Some((AsEntry::Bytes, _)));
+    let selection = match &entry.field {
+        Some(at) if bytes => {
+            let message = "a message that crosses as bytes has no fields";
+            findings
+                .error(Code::FieldOfBytes, at.place, message)
+                .help("leave `field` out, or `as: bytes`");
+            return None;
+        }
+        Some(at) => Selection::Field(at.value.clone()?),
+        None if bytes => Selection::Bytes,
+        None => Selection::Whole,
+    };
+    let Some(at) = &entry.r#type else {
+        return Some((None, selection));
+    };
+    let text = at.value.as_ref()?;
+    let Ok(name) = text.parse::<TypeName>() else {
+        let message = format!("`{}` is no message type name", short(text));
+        findings
+            .error(Code::MessageTypeName, at.place, message)
+            .help("package and name, as std_msgs/Bool");
+        return None;
+    };
+    let known = origin.and_then(|origin| types.get(dialect(origin), &name).as_ref().ok());
+    if let (Selection::Field(_), Some(known), Some(field)) = (&selection, known, &entry.field) {
+        select(known, &selection, field.place, findings)?;
+    }
+    Some((Some(name), selection))
+}

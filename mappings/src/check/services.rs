@@ -1,0 +1,509 @@
+//! Service bindings: what is called, with which request, and what of the answer is a value.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+use std::time::Duration;
+
+use messages::{
+    Dialect, Leaf, MessageType, Plan, PlanError, Selection, ServiceType, TypeName, Wire,
+};
+use uadp::{BuiltinType, Scalar};
+
+use super::bindings::{Site, compare, ros_name, select, told};
+use super::network::duration;
+use super::types::{self, Types, ValueType};
+use crate::code::Code;
+use crate::document::{self, BindingEntry, Request};
+use crate::findings::Findings;
+use crate::mapping::{ServiceBinding, ServiceRole, Trigger, equals};
+use crate::nearest::nearest;
+use crate::node_id::NodeIdText;
+use crate::read::{At, Field, given, short};
+use crate::topic::{SpaceId, TopicId};
+use crate::tree::Place;
+
+const TIMEOUT: Duration = Duration::from_secs(5);
+const EVERY: Duration = Duration::from_secs(1);
+
+/// What a binding is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Kind {
+    Topic,
+    Call,
+    Answer,
+    Poll,
+}
+
+impl Kind {
+    const fn key(self) -> &'static str {
+        match self {
+            Self::Topic => "topic",
+            Self::Call => "call",
+            Self::Answer => "answer",
+            Self::Poll => "poll",
+        }
+    }
+}
+
+/// A service binding, as far as it goes.
+pub(super) struct Service {
+    pub(super) binding: ServiceBinding,
+    /// `None` when the type of the service is not known or no value crosses.
+    pub(super) fields: Option<Vec<Leaf>>,
+    place: Place,
+    /// The literal of `when`.
+    when: Option<(String, Place)>,
+}
+
+impl Service {
+    /// Notes when the values of the variable's topics are none of the service.
+    pub(super) fn compare(&self, topics: &[Leaf], own: &[Leaf], findings: &mut Findings) {
+        let shape =
+            |fields: &[Leaf]| -> Vec<ValueType> { fields.iter().map(types::value_type).collect() };
+        if shape(topics) == shape(own) {
+            return;
+        }
+        let told = |fields: &[Leaf]| match fields {
+            [one] => types::print(types::value_type(one)),
+            several => format!("{} fields", several.len()),
+        };
+        let message = format!(
+            "the value is {} in the topic it is bound to, but {} in the service",
+            told(topics),
+            told(own)
+        );
+        findings
+            .error(Code::BindingsDiffer, self.place, message)
+            .help("bind fields of one type on both sides");
+    }
+
+    /// With the trigger of a call settled, now that the type of the value is known.
+    pub(super) fn settled(
+        mut self,
+        value_type: Option<ValueType>,
+        findings: &mut Findings,
+    ) -> ServiceBinding {
+        if let ServiceRole::Call {
+            request: Selection::Template { field: None, .. },
+            when,
+            ..
+        } = &mut self.binding.role
+        {
+            *when = match (self.when, value_type) {
+                (Some((text, place)), value_type) => {
+                    if let Some(value_type) = value_type {
+                        check_when(&text, value_type, place, findings);
+                    }
+                    Trigger::Equals(text)
+                }
+                (None, Some((BuiltinType::Boolean, false))) => Trigger::Equals("true".to_owned()),
+                (None, _) => Trigger::Any,
+            };
+        }
+        self.binding
+    }
+}
+
+fn check_when(text: &str, value_type: ValueType, place: Place, findings: &mut Findings) {
+    let example = match value_type {
+        (BuiltinType::Boolean, false) => Scalar::Boolean(false),
+        (BuiltinType::Float | BuiltinType::Double, false) => Scalar::Double(0.0),
+        (BuiltinType::String, false) => Scalar::String(None),
+        (
+            BuiltinType::SByte
+            | BuiltinType::Byte
+            | BuiltinType::Int16
+            | BuiltinType::UInt16
+            | BuiltinType::Int32
+            | BuiltinType::UInt32
+            | BuiltinType::Int64
+            | BuiltinType::UInt64,
+            false,
+        ) => Scalar::Int64(0),
+        _ => Scalar::ByteString(None),
+    };
+    if equals(text, &example).is_none() {
+        let told = types::print(value_type);
+        let message = format!("`{}` is no value of type {told}", short(text));
+        findings
+            .error(Code::When, place, message)
+            .help("a Boolean, number or text of the variable's type");
+    }
+}
+
+/// The calls of a document by the node of their variable.
+pub(super) struct Calls(HashMap<NodeIdText, Call>);
+
+struct Call {
+    /// `None` when something of the variable is faulty.
+    topic: Option<TopicId>,
+    service_type: Option<TypeName>,
+}
+
+impl Calls {
+    pub(super) fn of<'d>(
+        variables: impl Iterator<Item = (&'d NodeIdText, Option<TopicId>, &'d At<document::Bindings>)>,
+    ) -> Self {
+        let calls = variables.filter_map(|(node, topic, bindings)| {
+            let bindings = bindings.value.as_ref().map_or(&[][..], |all| &all.0);
+            let mut entries = bindings.iter().filter_map(|at| at.value.as_ref());
+            let entry = entries.find(|entry| entry.call.is_some())?;
+            let named = given(&entry.r#type);
+            let service_type = named.and_then(|(text, _)| type_name(text));
+            Some((
+                node.clone(),
+                Call {
+                    topic,
+                    service_type,
+                },
+            ))
+        });
+        Self(calls.collect())
+    }
+}
+
+/// What bindings are checked against.
+pub(super) struct Known<'k> {
+    pub(super) types: &'k mut Types,
+    pub(super) calls: &'k Calls,
+}
+
+/// `package/srv/Name` is the same name.
+fn type_name(text: &str) -> Option<TypeName> {
+    text.replacen("/srv/", "/", 1).parse().ok()
+}
+
+/// `None` when the binding is not exactly one of the kinds, which is noted. Keys of other kinds are noted too.
+pub(super) fn kind(entry: &BindingEntry, owner: Place, findings: &mut Findings) -> Option<Kind> {
+    let keys = [
+        (Kind::Topic, &entry.topic),
+        (Kind::Call, &entry.call),
+        (Kind::Answer, &entry.answer),
+        (Kind::Poll, &entry.poll),
+    ];
+    let mut said = keys
+        .iter()
+        .filter_map(|(kind, key)| Some((*kind, key.as_ref()?.place)));
+    let Some((kind, _)) = said.next() else {
+        findings
+            .error(Code::MissingKey, owner, "the binding has no `topic`")
+            .help("a topic, or a service under `call`, `answer` or `poll`");
+        return None;
+    };
+    if let Some((other, place)) = said.next() {
+        let (kind, other) = (kind.key(), other.key());
+        let message = format!("a binding has `{kind}` or `{other}`, not both");
+        findings
+            .error(Code::BindingKind, place, message)
+            .help("one binding per space: a second one is a second variable");
+        return None;
+    }
+    let place = |at: &Field<String>| at.as_ref().map(|at| at.place);
+    let (call, poll) = (kind == Kind::Call, kind == Kind::Poll);
+    let topic = kind == Kind::Topic;
+    let request = entry.request.as_ref().map(|at| at.place);
+    let r#as = entry.r#as.as_ref().map(|at| at.place);
+    let strange = [
+        ("type", place(&entry.r#type), kind == Kind::Answer),
+        ("as", r#as, !topic),
+        ("request", request, !call && !poll),
+        ("when", place(&entry.when), !call),
+        ("timeout", place(&entry.timeout), !call && !poll),
+        ("every", place(&entry.every), !poll),
+    ];
+    let mut sound = Some(kind);
+    for (key, place, refused) in strange {
+        if let (Some(place), true) = (place, refused) {
+            let message = format!("`{key}` does not go with `{}`", kind.key());
+            findings.error(Code::BindingKind, place, message);
+            sound = None;
+        }
+    }
+    sound
+}
+
+/// `None` when something of it is faulty.
+pub(super) fn check(
+    kind: Kind,
+    entry: &BindingEntry,
+    site: &Site<'_>,
+    known: &mut Known<'_>,
+    findings: &mut Findings,
+) -> Option<Service> {
+    let space = space_of(kind, site, findings);
+    let checked = match kind {
+        Kind::Answer => answer(entry, site, known, findings),
+        Kind::Topic | Kind::Call | Kind::Poll => asked(kind, entry, site, known.types, findings),
+    };
+    let (role, fields, when) = checked?;
+    Some(Service {
+        binding: ServiceBinding {
+            space: space?,
+            role,
+        },
+        fields,
+        place: site.place,
+        when,
+    })
+}
+
+type Checked = (ServiceRole, Option<Vec<Leaf>>, Option<(String, Place)>);
+
+/// The space of the service, when one can be bound there.
+fn space_of(kind: Kind, site: &Site<'_>, findings: &mut Findings) -> Option<SpaceId> {
+    let (space, origin) = (site.space?, site.subject.origin);
+    let (message, help) = if space.is_ros2() {
+        (
+            format!("space {space} is a ROS 2 space, whose services are not bound"),
+            "bind a topic there, or a service of the ROS 1 space",
+        )
+    } else if kind == Kind::Call && origin == Some(space) {
+        (
+            format!("the value comes from space {space}, and cannot call a service of it"),
+            "`call` is for values of other spaces; a value that is asked for has a `poll`",
+        )
+    } else if kind != Kind::Call && origin.is_some_and(|origin| origin != space) {
+        (
+            format!("what a service of space {space} answers is a value of that space"),
+            "give the variable the `origin` of the service",
+        )
+    } else {
+        return Some(space);
+    };
+    findings
+        .error(Code::ServiceSpace, site.place, message)
+        .help(help);
+    None
+}
+
+fn answer(
+    entry: &BindingEntry,
+    site: &Site<'_>,
+    known: &mut Known<'_>,
+    findings: &mut Findings,
+) -> Option<Checked> {
+    let (text, place) = given(&entry.answer)?;
+    let Ok(node) = text.parse::<NodeIdText>() else {
+        let message = format!("`{}` is no node id", short(text));
+        findings
+            .error(Code::NodeId, place, message)
+            .help("the node of the variable with the `call`, as ns=2;i=20");
+        return None;
+    };
+    let Some(call) = known.calls.0.get(&node) else {
+        let message = format!("no variable with a `call` has the node `{}`", short(text));
+        findings
+            .error(Code::Answer, place, message)
+            .help("name the node of the variable whose values call the service");
+        return None;
+    };
+    let service = call
+        .service_type
+        .as_ref()
+        .and_then(|name| known.types.service(name));
+    let response = service.as_ref().map(|service| service.response());
+    let (selection, fields) = response_field(entry, response, place, site, findings)?;
+    let of = call.topic?;
+    Some((ServiceRole::Answer { of, selection }, fields, None))
+}
+
+/// A call or a poll.
+fn asked(
+    kind: Kind,
+    entry: &BindingEntry,
+    site: &Site<'_>,
+    types: &mut Types,
+    findings: &mut Findings,
+) -> Option<Checked> {
+    let name = if kind == Kind::Call {
+        &entry.call
+    } else {
+        &entry.poll
+    };
+    let service = given(name).and_then(|(text, place)| {
+        ros_name(text, place, (Dialect::Ros1, "service"), findings)?;
+        Some(text.clone())
+    });
+    let timeout = duration(&entry.timeout, findings).unwrap_or(TIMEOUT);
+    let every = duration(&entry.every, findings).unwrap_or(EVERY);
+    let (service_type, place) = service_type(entry, kind, site.place, findings)?;
+    let known = built_in(&service_type, place, types, findings);
+    let request_type = known.as_ref().map(|service| service.request());
+    if kind == Kind::Call {
+        let taken = given(&entry.field);
+        let fields = match (taken, request_type) {
+            (Some((path, place)), Some(request)) => {
+                let fields = select(request, &Selection::Field(path.clone()), place, findings)?;
+                compare(&fields, request.name(), site.subject, place, findings);
+                Some(fields)
+            }
+            (Some(_), None) | (None, _) => None,
+        };
+        if let (Some(_), Some(at)) = (taken, &entry.when) {
+            let message = "`when` does not go with `field`: each value is sent";
+            findings
+                .error(Code::When, at.place, message)
+                .help("leave `field` out to send the same request each time");
+        }
+        let when = given(&entry.when).map(|(text, place)| (text.clone(), place));
+        let request = template(entry, taken.map(|(path, _)| path), request_type, findings)?;
+        let role = ServiceRole::Call {
+            service: service?,
+            service_type,
+            request,
+            when: Trigger::Any,
+            timeout,
+        };
+        return Some((role, fields, when));
+    }
+    let request = template(entry, None, request_type, findings);
+    let response = known.as_ref().map(|service| service.response());
+    let (selection, fields) = response_field(entry, response, place, site, findings)?;
+    let role = ServiceRole::Poll {
+        service: service?,
+        service_type,
+        request: request?,
+        selection,
+        every,
+        timeout,
+    };
+    Some((role, fields, None))
+}
+
+fn service_type(
+    entry: &BindingEntry,
+    kind: Kind,
+    owner: Place,
+    findings: &mut Findings,
+) -> Option<(TypeName, Place)> {
+    let Some(at) = &entry.r#type else {
+        let message = format!("the binding has a `{}` and no `type`", kind.key());
+        findings
+            .error(Code::MissingKey, owner, message)
+            .help("the type of the service, as std_srvs/SetBool");
+        return None;
+    };
+    let text = at.value.as_ref()?;
+    let name = type_name(text);
+    if name.is_none() {
+        let message = format!("`{}` is no service type name", short(text));
+        findings
+            .error(Code::MessageTypeName, at.place, message)
+            .help("package and name, as std_srvs/SetBool");
+    }
+    Some((name?, at.place))
+}
+
+/// `None` when it is not built in, which is noted.
+fn built_in(
+    name: &TypeName,
+    place: Place,
+    types: &mut Types,
+    findings: &mut Findings,
+) -> Option<Arc<ServiceType>> {
+    let known = types.service(name);
+    if known.is_none() {
+        let message = format!("no definition of the service type `{name}` is built in");
+        let note = findings.warning(Code::UnknownServiceType, place, message);
+        note.help_with(|| {
+            let why = "a package with its .srv file must be below ROS_PACKAGE_PATH when the bridge \
+                       runs, and fields are checked then";
+            match Types::registry(Dialect::Ros1).suggest_service(name) {
+                Some(near) => format!("did you mean `{near}`? If not: {why}"),
+                None => why.to_owned(),
+            }
+        });
+    }
+    known
+}
+
+/// What of the response is the value, and its fields where the type is known.
+fn response_field(
+    entry: &BindingEntry,
+    response: Option<&Arc<MessageType>>,
+    place: Place,
+    site: &Site<'_>,
+    findings: &mut Findings,
+) -> Option<(Selection, Option<Vec<Leaf>>)> {
+    let (selection, place) = match &entry.field {
+        None => (Selection::Whole, place),
+        Some(at) => (Selection::Field(at.value.clone()?), at.place),
+    };
+    let Some(response) = response else {
+        return Some((selection, None));
+    };
+    if response.leaves().is_empty() {
+        let message = format!("`{}` has no field, so there is no value", response.name());
+        findings.error(Code::UnknownField, place, message);
+        return None;
+    }
+    let fields = select(response, &selection, place, findings)?;
+    compare(&fields, response.name(), site.subject, place, findings);
+    Some((selection, Some(fields)))
+}
+
+/// The request with its constants, each checked where its type is known.
+fn template(
+    entry: &BindingEntry,
+    field: Option<&String>,
+    request: Option<&Arc<MessageType>>,
+    findings: &mut Findings,
+) -> Option<Selection> {
+    let constants = match &entry.request {
+        None => &[][..],
+        Some(at) => at.value.as_ref().map(|Request(all)| all.as_slice())?,
+    };
+    let mut rest = BTreeMap::new();
+    let mut sound = true;
+    for (path, place, literal) in constants {
+        let fault = if rest.insert(path.clone(), literal.clone()).is_some() {
+            Some((format!("field `{}` is given twice", short(path)), None))
+        } else if field == Some(path) {
+            let message = format!("field `{}` takes the value already", short(path));
+            Some((message, Some("leave it out of `request`".to_owned())))
+        } else {
+            request.and_then(|request| {
+                let one = Selection::Template {
+                    field: None,
+                    rest: BTreeMap::from([(path.clone(), literal.clone())]),
+                };
+                let error = Plan::compile(request, &one, Wire::Ros1).err()?;
+                Some(told_fault(path, error))
+            })
+        };
+        if let Some((message, help)) = fault {
+            sound = false;
+            let note = findings.error(Code::RequestConstant, *place, message);
+            if let Some(help) = help {
+                note.help(help);
+            }
+        }
+    }
+    sound.then(|| Selection::Template {
+        field: field.cloned(),
+        rest,
+    })
+}
+
+/// Message and help.
+fn told_fault(path: &str, error: PlanError) -> (String, Option<String>) {
+    match error {
+        PlanError::UnknownField { name, known, .. } => {
+            let known: Vec<&str> = known.iter().map(String::as_str).collect();
+            let near = nearest(path, known.iter().copied());
+            let near = near.map(|near| format!("did you mean `{near}`? "));
+            let help = format!(
+                "{}its fields are {}",
+                near.unwrap_or_default(),
+                told(&known)
+            );
+            let message = format!("`{name}` has no field `{}`", short(path));
+            (message, Some(help))
+        }
+        PlanError::Wire { .. }
+        | PlanError::EmptyElements { .. }
+        | PlanError::Constant { .. }
+        | PlanError::ConstantFault { .. }
+        | PlanError::ConstantOfField { .. } => (error.to_string(), None),
+    }
+}

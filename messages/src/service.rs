@@ -1,0 +1,276 @@
+//! Services and actions: texts of several messages, parted by lines that begin with `---`.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use md5::{Digest, Md5};
+
+use crate::definition::Definition;
+use crate::resolve::{self, Resolver};
+use crate::{DefinitionError, Dialect, MessageType, TypeName};
+
+/// A service type with all it needs resolved.
+#[derive(Debug)]
+pub struct ServiceType {
+    name: TypeName,
+    md5: String,
+    request: Arc<MessageType>,
+    response: Arc<MessageType>,
+}
+
+impl ServiceType {
+    /// Package and name.
+    pub fn name(&self) -> &TypeName {
+        &self.name
+    }
+
+    /// The 32 hex digits ROS 1 peers compare, as gensrv makes them; empty for a ROS 2 type, which has none.
+    pub fn md5(&self) -> &str {
+        &self.md5
+    }
+
+    /// What a caller sends, `package/NameRequest`.
+    pub fn request(&self) -> &Arc<MessageType> {
+        &self.request
+    }
+
+    /// What the service answers, `package/NameResponse`.
+    pub fn response(&self) -> &Arc<MessageType> {
+        &self.response
+    }
+}
+
+/// The seven messages of an action type, `package/Name` (actionlib, "Detailed Description").
+#[derive(Debug)]
+pub struct ActionType {
+    name: TypeName,
+    action: Arc<MessageType>,
+    action_goal: Arc<MessageType>,
+    action_result: Arc<MessageType>,
+    action_feedback: Arc<MessageType>,
+    goal: Arc<MessageType>,
+    result: Arc<MessageType>,
+    feedback: Arc<MessageType>,
+}
+
+impl ActionType {
+    pub(crate) fn of(
+        name: &TypeName,
+        get: impl Fn(&TypeName) -> Result<Arc<MessageType>, DefinitionError>,
+    ) -> Result<Self, DefinitionError> {
+        let part = |suffix| get(&derived(name, suffix)?);
+        Ok(Self {
+            name: name.clone(),
+            action: part("Action")?,
+            action_goal: part("ActionGoal")?,
+            action_result: part("ActionResult")?,
+            action_feedback: part("ActionFeedback")?,
+            goal: part("Goal")?,
+            result: part("Result")?,
+            feedback: part("Feedback")?,
+        })
+    }
+
+    /// Package and name.
+    pub fn name(&self) -> &TypeName {
+        &self.name
+    }
+
+    /// `NameAction`: the three below in one. It never travels; its md5 is that of the action.
+    pub fn action(&self) -> &Arc<MessageType> {
+        &self.action
+    }
+
+    /// `NameActionGoal`, the type of the topic `goal`.
+    pub fn action_goal(&self) -> &Arc<MessageType> {
+        &self.action_goal
+    }
+
+    /// `NameActionResult`, the type of the topic `result`.
+    pub fn action_result(&self) -> &Arc<MessageType> {
+        &self.action_result
+    }
+
+    /// `NameActionFeedback`, the type of the topic `feedback`.
+    pub fn action_feedback(&self) -> &Arc<MessageType> {
+        &self.action_feedback
+    }
+
+    /// `NameGoal`, the first part of the text.
+    pub fn goal(&self) -> &Arc<MessageType> {
+        &self.goal
+    }
+
+    /// `NameResult`, the second part.
+    pub fn result(&self) -> &Arc<MessageType> {
+        &self.result
+    }
+
+    /// `NameFeedback`, the third part.
+    pub fn feedback(&self) -> &Arc<MessageType> {
+        &self.feedback
+    }
+}
+
+/// The two messages of a `.srv` text.
+#[derive(Clone, Debug)]
+pub(crate) struct ServiceDefinition {
+    request: Arc<Definition>,
+    response: Arc<Definition>,
+}
+
+impl ServiceDefinition {
+    pub(crate) fn parse(
+        dialect: Dialect,
+        name: &TypeName,
+        text: &str,
+    ) -> Result<Self, DefinitionError> {
+        let [request, response] = parts(
+            name,
+            text,
+            "one line `---` expected, between request and response",
+        )?;
+        Ok(Self {
+            request: request.parse(dialect, &derived(name, "Request")?)?,
+            response: response.parse(dialect, &derived(name, "Response")?)?,
+        })
+    }
+
+    pub(crate) fn messages(&self) -> BTreeMap<TypeName, Arc<Definition>> {
+        [&self.request, &self.response]
+            .into_iter()
+            .map(|definition| (definition.name.clone(), Arc::clone(definition)))
+            .collect()
+    }
+
+    pub(crate) fn resolve(
+        &self,
+        name: &TypeName,
+        resolver: &mut Resolver<'_>,
+    ) -> Result<ServiceType, DefinitionError> {
+        let request = resolver.message_type(&self.request.name, None)?;
+        let response = resolver.message_type(&self.response.name, None)?;
+        let md5 = match request.dialect() {
+            Dialect::Ros1 => {
+                let mut sum = Md5::new();
+                sum.update(resolver.md5_text(&self.request.name)?);
+                sum.update(resolver.md5_text(&self.response.name)?);
+                resolve::hex(&sum.finalize())
+            }
+            Dialect::Ros2 => String::new(),
+        };
+        Ok(ServiceType {
+            name: name.clone(),
+            md5,
+            request: Arc::new(request),
+            response: Arc::new(response),
+        })
+    }
+}
+
+/// The seven messages genaction makes of an `.action` text.
+pub(crate) fn action(
+    dialect: Dialect,
+    name: &TypeName,
+    text: &str,
+) -> Result<Vec<(TypeName, Arc<Definition>)>, DefinitionError> {
+    let [goal, result, feedback] = parts(
+        name,
+        text,
+        "two lines `---` expected, between goal, result and feedback",
+    )?;
+    let x = name.name();
+    let status =
+        |part| format!("std_msgs/Header header\nactionlib_msgs/GoalStatus status\n{x}{part}");
+    let made = [
+        (
+            "Action",
+            format!(
+                "{x}ActionGoal action_goal\n{x}ActionResult action_result\n{x}ActionFeedback action_feedback\n"
+            ),
+        ),
+        (
+            "ActionGoal",
+            format!("std_msgs/Header header\nactionlib_msgs/GoalID goal_id\n{x}Goal goal\n"),
+        ),
+        ("ActionResult", status("Result result\n")),
+        ("ActionFeedback", status("Feedback feedback\n")),
+    ];
+    let mut found = Vec::new();
+    for (suffix, part) in [("Goal", goal), ("Result", result), ("Feedback", feedback)] {
+        found.push(part.parse(dialect, &derived(name, suffix)?)?);
+    }
+    for (suffix, text) in made {
+        let part = Part { before: 0, text };
+        found.push(part.parse(dialect, &derived(name, suffix)?)?);
+    }
+    let named = found
+        .into_iter()
+        .map(|definition| (definition.name.clone(), definition));
+    Ok(named.collect())
+}
+
+/// A piece of a text, and how many lines of it come before.
+struct Part {
+    before: usize,
+    text: String,
+}
+
+impl Part {
+    /// A fault is told with its line in the whole text.
+    fn parse(&self, dialect: Dialect, name: &TypeName) -> Result<Arc<Definition>, DefinitionError> {
+        match Definition::parse(dialect, name, &self.text) {
+            Ok(definition) => Ok(Arc::new(definition)),
+            Err(DefinitionError::Syntax {
+                name,
+                line,
+                reason,
+                text,
+            }) => Err(DefinitionError::Syntax {
+                name,
+                line: self.before + line,
+                reason,
+                text,
+            }),
+            Err(other) => Err(other),
+        }
+    }
+}
+
+/// The `N` pieces of a text. As in genmsg and genaction whatever follows the three dashes belongs to the line.
+fn parts<const N: usize>(
+    name: &TypeName,
+    text: &str,
+    reason: &'static str,
+) -> Result<[Part; N], DefinitionError> {
+    let mut found = vec![Part {
+        before: 0,
+        text: String::new(),
+    }];
+    for (number, line) in text.lines().enumerate() {
+        if line.starts_with("---") {
+            found.push(Part {
+                before: number + 1,
+                text: String::new(),
+            });
+        } else if let Some(part) = found.last_mut() {
+            part.text.push_str(line);
+            part.text.push('\n');
+        }
+    }
+    found.try_into().map_err(|_| DefinitionError::Syntax {
+        name: name.clone(),
+        line: text.lines().count(),
+        reason,
+        text: String::new(),
+    })
+}
+
+fn derived(name: &TypeName, suffix: &str) -> Result<TypeName, DefinitionError> {
+    TypeName::new(name.package(), &format!("{}{suffix}", name.name())).map_err(|_| {
+        DefinitionError::TooBig {
+            name: name.clone(),
+            what: "names of more than 255 bytes",
+        }
+    })
+}

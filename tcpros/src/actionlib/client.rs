@@ -1,0 +1,466 @@
+//! The client: sends goals, and hands each what its server says of it.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use thiserror::Error;
+use tokio::sync::Notify;
+use tokio::task::AbortHandle;
+use tokio::time::{Instant, sleep_until, timeout};
+
+use super::client_goals::{
+    ClientCounters, ClientGoals, CommState, Feedback, GoalEvent, GoalResult, Limits, LostReason,
+    Source,
+};
+use super::events::Faults;
+use super::types::{
+    ActionError, ClientType, GoalId, GoalStatus, check_wrapper, goal_id_type,
+    goal_status_array_type, wanted,
+};
+use super::wire;
+use crate::clock;
+use crate::inbox::{Inbox, InboxEvent, Message};
+use crate::node::{Node, NodeError};
+use crate::outbox::lock;
+use crate::publisher::{Publisher, PublisherOptions};
+use crate::subscription::{SubscriberOptions, Subscription};
+use crate::time::RosClock;
+use crate::time::RosTime;
+
+/// How long a client waits, in steady time, and how much it holds.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ActionClientOptions {
+    /// From sending a goal until a server must have listed it.
+    pub acknowledge_timeout: Duration,
+    /// Without a status of the server before its goals are lost. Servers send five a second, those of roscpp and rospy
+    /// by ROS time: where a simulation may pause, give it the longest pause.
+    pub silence_timeout: Duration,
+    /// From the end of the connection to the server until its goals are lost; they are not if it comes back sooner.
+    pub reconnect_timeout: Duration,
+    /// From the status that a goal has ended until its result must have come.
+    pub result_timeout: Duration,
+    /// How many reports of progress may wait per goal; then the oldest are dropped.
+    pub feedback_messages: usize,
+    /// How many bytes of them may wait per goal; then the oldest are dropped. The newest is always kept.
+    pub feedback_bytes: usize,
+}
+
+impl Default for ActionClientOptions {
+    /// Five seconds, for the end of a connection one; 100 reports of progress and 16 MiB.
+    fn default() -> Self {
+        let five = Duration::from_secs(5);
+        Self {
+            acknowledge_timeout: five,
+            silence_timeout: five,
+            reconnect_timeout: Duration::from_secs(1),
+            result_timeout: five,
+            feedback_messages: 100,
+            feedback_bytes: 16 * 1024 * 1024,
+        }
+    }
+}
+
+/// Sends goals to the server of an action. Dropping it ends its goals as lost; it does not cancel them.
+#[derive(Debug)]
+pub struct ActionClient {
+    shared: Arc<Shared>,
+    task: AbortHandle,
+    _subscriptions: [Subscription; 3],
+}
+
+impl ActionClient {
+    /// Opens the action's topics; the server need not be there yet, and may come and go.
+    ///
+    /// `name` is the action's, such as `arm/move`, and is resolved as a topic's. Must be called inside the node's
+    /// runtime. Fails when the name is no ROS name, when this node has a client of the action already, or when the
+    /// goal's type is incomplete or not an `ActionGoal`.
+    pub fn new(
+        node: &Node,
+        name: &str,
+        action: impl Into<ClientType>,
+        options: ActionClientOptions,
+    ) -> Result<Self, ActionError> {
+        let action = action.into();
+        check_wrapper(&action.goal.name, "ActionGoal")?;
+        let name = node.resolve(name).map_err(NodeError::from)?;
+        let inbox = Inbox::new();
+        let queues = SubscriberOptions::default();
+        let subscribe = |topic, wanted, source| {
+            node.subscribe(&format!("{name}/{topic}"), wanted, queues, source, &inbox)
+        };
+        let status = wanted(goal_status_array_type());
+        let subscriptions = [
+            subscribe("status", status, Source::Status)?,
+            subscribe("feedback", action.feedback, Source::Feedback)?,
+            subscribe("result", action.result, Source::Result)?,
+        ];
+        let advertise = |topic, topic_type| {
+            let options = PublisherOptions::default();
+            node.advertise(&format!("{name}/{topic}"), topic_type, options)
+        };
+        let outputs = Outputs {
+            goal: advertise("goal", action.goal)?,
+            cancel: advertise("cancel", goal_id_type())?,
+            seq: 0,
+        };
+        let state = State {
+            goals: ClientGoals::new(limits(&options)),
+            outputs: Some(outputs),
+            faults: Faults::new(),
+        };
+        let shared = Arc::new(Shared {
+            name,
+            node: node.name().to_owned(),
+            clock: node.clock(),
+            state: Mutex::new(state),
+            deadline_moved: Notify::new(),
+        });
+        let task = tokio::spawn(run(Arc::clone(&shared), inbox)).abort_handle();
+        Ok(Self {
+            shared,
+            task,
+            _subscriptions: subscriptions,
+        })
+    }
+
+    /// Sends a goal, the serialized `XGoal`. Never waits, and does not fail: a goal that nobody can receive is lost at
+    /// once, see [`LostReason::NoServer`]. To send it to a server that is starting, wait for that first.
+    pub fn send_goal(&self, body: &[u8]) -> GoalHandle {
+        let goal_id = self.shared.new_id();
+        let wake = Arc::new(Notify::new());
+        let mut state = lock(&self.shared.state);
+        let id = goal_id.id.clone();
+        state
+            .goals
+            .sent(id.clone(), clock::now(), Arc::clone(&wake));
+        let sent_to = state.outputs.as_mut().map_or(0, |outputs| {
+            outputs.seq = outputs.seq.wrapping_add(1);
+            let message = wire::goal(outputs.seq, goal_id.stamp, &goal_id, body);
+            outputs.goal.publish(message).sent_to
+        });
+        if sent_to == 0 {
+            let topic = format!("{}/goal", self.shared.name);
+            state.goals.lose(&id, LostReason::NoServer { topic });
+        }
+        drop(state);
+        self.shared.deadline_moved.notify_one();
+        GoalHandle {
+            shared: Arc::clone(&self.shared),
+            goal_id,
+            wake,
+        }
+    }
+
+    /// Asks the server to cancel all goals of the action, those of other clients too. Returns how many nodes were
+    /// asked. The goals say what comes of it.
+    pub fn cancel_all(&self) -> usize {
+        self.shared.send_cancel(&GoalId::default())
+    }
+
+    /// Asks the server to cancel all goals requested at `time` or before, those of other clients too, by the clocks
+    /// of their clients. It will also recall goals of such a time that come later. Returns how many nodes were asked.
+    ///
+    /// The time zero stands for all, as with [`Self::cancel_all`].
+    pub fn cancel_before(&self, time: RosTime) -> usize {
+        self.shared.send_cancel(&GoalId {
+            stamp: time,
+            id: String::new(),
+        })
+    }
+
+    /// The node that serves the action: its status has come, it sends feedback and results, and it takes goals and
+    /// requests to cancel.
+    pub fn server(&self) -> Result<String, NoServer> {
+        let state = lock(&self.shared.state);
+        let missing = |reason| NoServer {
+            action: self.shared.name.clone(),
+            reason,
+        };
+        let server = state.goals.ready_server().map_err(missing)?;
+        let takes = |topic: fn(&Outputs) -> &Publisher| {
+            let outputs = state.outputs.as_ref();
+            outputs.is_some_and(|outputs| topic(outputs).is_subscribed_by(server))
+        };
+        if !takes(|outputs| &outputs.goal) {
+            Err(missing(
+                "the server has not connected for goals, or wants them of another type",
+            ))
+        } else if !takes(|outputs| &outputs.cancel) {
+            Err(missing(
+                "the server has not connected for requests to cancel",
+            ))
+        } else {
+            Ok(server.to_owned())
+        }
+    }
+
+    /// Waits until there is a [`Self::server`]. Fails when there is none within `limit`, and tells what was missing.
+    /// Cancel-safe.
+    pub async fn wait_for_server(&self, limit: Duration) -> Result<String, NoServer> {
+        let found = async {
+            loop {
+                if let Ok(server) = self.server() {
+                    return server;
+                }
+                // Publishers do not report who subscribes.
+                tokio::time::sleep(SERVER_POLL).await;
+            }
+        };
+        match timeout(limit, found).await {
+            Ok(server) => Ok(server),
+            Err(_) => self.server(),
+        }
+    }
+
+    /// The action's resolved name.
+    pub fn name(&self) -> &str {
+        &self.shared.name
+    }
+
+    /// What was received so far and could not be used.
+    pub fn counters(&self) -> ClientCounters {
+        lock(&self.shared.state).goals.counters
+    }
+}
+
+impl Drop for ActionClient {
+    fn drop(&mut self) {
+        self.task.abort();
+        let mut state = lock(&self.shared.state);
+        state.goals.lose_all(&LostReason::ClientClosed);
+        let outputs = state.outputs.take();
+        drop(state);
+        drop(outputs);
+    }
+}
+
+/// No server is ready to take goals.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+#[error("no server of the action {action}: {reason}")]
+pub struct NoServer {
+    action: String,
+    reason: &'static str,
+}
+
+/// A goal that was sent. Dropping it ends the interest in the goal; it does not cancel it.
+#[derive(Debug)]
+pub struct GoalHandle {
+    shared: Arc<Shared>,
+    goal_id: GoalId,
+    wake: Arc<Notify>,
+}
+
+impl GoalHandle {
+    /// The goal's id, `<node>-<count>-<seconds>.<nanoseconds>`, and the time it was sent.
+    pub fn goal_id(&self) -> &GoalId {
+        &self.goal_id
+    }
+
+    /// Where the goal is.
+    pub fn state(&self) -> CommState {
+        let state = lock(&self.shared.state);
+        let goal = state.goals.goal(&self.goal_id.id);
+        goal.map_or(CommState::Lost, |goal| goal.state)
+    }
+
+    /// What the server said of the goal last: pending while it has said nothing, lost when the goal is.
+    pub fn status(&self) -> GoalStatus {
+        let state = lock(&self.shared.state);
+        let goal = state.goals.goal(&self.goal_id.id);
+        GoalStatus {
+            goal_id: self.goal_id.clone(),
+            status: goal.map_or(super::Status::Lost, |goal| goal.status),
+            text: goal.map(|goal| goal.text.clone()).unwrap_or_default(),
+        }
+    }
+
+    /// The next event, in order; `None` after the one that ends the goal. It always ends within the client's time
+    /// limits once its server has fallen silent. Cancel-safe.
+    pub async fn recv(&mut self) -> Option<GoalEvent> {
+        loop {
+            let rung = self.wake.notified();
+            {
+                let mut state = lock(&self.shared.state);
+                let event = state.goals.next_event(&self.goal_id.id);
+                if event.is_some() {
+                    return event;
+                }
+                let goal = state.goals.goal(&self.goal_id.id);
+                if goal.is_none_or(|goal| goal.outcome.is_some()) {
+                    return None;
+                }
+            }
+            rung.await;
+        }
+    }
+
+    /// Waits for the end of the goal, passing over what else happens to it. May be asked again. Cancel-safe.
+    pub async fn outcome(&mut self) -> Result<GoalResult, LostReason> {
+        while self.recv().await.is_some() {}
+        let state = lock(&self.shared.state);
+        let goal = state.goals.goal(&self.goal_id.id);
+        goal.and_then(|goal| goal.outcome.clone())
+            .unwrap_or(Err(LostReason::ClientClosed))
+    }
+
+    /// Asks the server to cancel the goal. The goal goes on until the server says what came of it, which may be
+    /// success. False when the request was not sent: the goal has ended, its server already knows, or nobody is there.
+    pub fn cancel(&self) -> bool {
+        let wanted = lock(&self.shared.state).goals.cancel(&self.goal_id.id);
+        wanted
+            && self.shared.send_cancel(&GoalId {
+                stamp: RosTime::default(),
+                id: self.goal_id.id.clone(),
+            }) > 0
+    }
+}
+
+impl Drop for GoalHandle {
+    fn drop(&mut self) {
+        lock(&self.shared.state).goals.forget(&self.goal_id.id);
+    }
+}
+
+/// What the client, its task and its goals share.
+#[derive(Debug)]
+struct Shared {
+    name: String,
+    node: String,
+    clock: RosClock,
+    state: Mutex<State>,
+    deadline_moved: Notify,
+}
+
+#[derive(Debug)]
+struct State {
+    goals: ClientGoals,
+    /// `None` once the client is dropped.
+    outputs: Option<Outputs>,
+    faults: Faults,
+}
+
+#[derive(Debug)]
+struct Outputs {
+    goal: Publisher,
+    cancel: Publisher,
+    seq: u32,
+}
+
+impl Shared {
+    fn new_id(&self) -> GoalId {
+        // For all clients of the process: two of one node must not give the same id.
+        static COUNT: AtomicU64 = AtomicU64::new(1);
+        let stamp = self.clock.now();
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
+        let id = format!("{}-{count}-{}.{:09}", self.node, stamp.secs, stamp.nsecs);
+        GoalId { stamp, id }
+    }
+
+    fn send_cancel(&self, id: &GoalId) -> usize {
+        let state = lock(&self.state);
+        let outputs = state.outputs.as_ref();
+        outputs.map_or(0, |outputs| {
+            outputs.cancel.publish(wire::cancel(id)).sent_to
+        })
+    }
+
+    fn take(&self, source: Source, event: InboxEvent) {
+        let now = clock::now();
+        let mut guard = lock(&self.state);
+        let state = &mut *guard;
+        match event {
+            InboxEvent::Message(message) => {
+                if let Err(error) = state.message(source, &message, now) {
+                    state.goals.counters.malformed += 1;
+                    let topic = message.peer.header.get("topic").unwrap_or(&self.name);
+                    state
+                        .faults
+                        .malformed(topic, &message.peer.caller_id, &error);
+                }
+            }
+            InboxEvent::Peer {
+                connected, peer, ..
+            } => state
+                .goals
+                .connection(&peer.caller_id, source, connected, now),
+            InboxEvent::Dropped(lost) => {
+                state.goals.counters.overrun += lost;
+                state.faults.overrun(&self.name, lost);
+            }
+        }
+    }
+}
+
+impl State {
+    fn message(
+        &mut self,
+        source: Source,
+        message: &Message,
+        now: Instant,
+    ) -> Result<(), wire::Malformed> {
+        let peer = || Arc::clone(&message.peer);
+        match source {
+            Source::Status => {
+                let list = wire::read_status_array(&message.bytes)?;
+                self.goals.status(&message.peer.caller_id, &list, now);
+            }
+            Source::Feedback => {
+                let (status, body) = wire::read_reply(&message.bytes)?;
+                let feedback = Feedback { body, peer: peer() };
+                self.goals.feedback(&status.id, feedback);
+            }
+            Source::Result => {
+                let (status, body) = wire::read_reply(&message.bytes)?;
+                self.goals.result(&status, body, peer(), now);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Takes what the server sends and ends goals whose time is up, until aborted.
+async fn run(shared: Arc<Shared>, mut inbox: Inbox<Source>) {
+    loop {
+        let deadline = lock(&shared.state).goals.deadline();
+        let due = async {
+            match deadline {
+                Some(at) => sleep_until(at).await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            (source, event) = inbox.recv() => shared.take(source, event),
+            () = shared.deadline_moved.notified() => {}
+            () = due => {}
+        }
+        let mut taken = 0;
+        while let Some((source, event)) = inbox.try_recv() {
+            shared.take(source, event);
+            taken += 1;
+            if taken == BATCH {
+                break;
+            }
+        }
+        // Silence is judged only when nothing waits to be read.
+        if taken < BATCH {
+            lock(&shared.state).goals.expire(clock::now());
+        } else {
+            tokio::task::yield_now().await;
+        }
+    }
+}
+
+const fn limits(options: &ActionClientOptions) -> Limits {
+    Limits {
+        acknowledge: options.acknowledge_timeout,
+        silence: options.silence_timeout,
+        reconnect: options.reconnect_timeout,
+        result: options.result_timeout,
+        feedback_messages: options.feedback_messages,
+        feedback_bytes: options.feedback_bytes,
+    }
+}
+
+const SERVER_POLL: Duration = Duration::from_millis(20);
+const BATCH: usize = 256;

@@ -1,0 +1,51 @@
+//! What this module tells operators, one function per event.
+
+use std::fmt::Display;
+use std::time::Duration;
+
+use tracing::warn;
+
+use crate::clock::{self, Throttle};
+
+/// What was received and could not be used, with one line per ten seconds.
+#[derive(Debug)]
+pub(super) struct Faults {
+    malformed: Throttle,
+    overrun: Throttle,
+    full: Throttle,
+}
+
+impl Faults {
+    pub(super) const fn new() -> Self {
+        let every = Duration::from_secs(10);
+        Self {
+            malformed: Throttle::new(every),
+            overrun: Throttle::new(every),
+            full: Throttle::new(every),
+        }
+    }
+
+    pub(super) fn malformed(&mut self, topic: &str, node: &str, error: &dyn Display) {
+        if let Some(more) = self.malformed.admit(clock::now()) {
+            warn!(topic, node, %error, more, "a message of an action does not read and is dropped");
+        }
+    }
+
+    pub(super) fn overrun(&mut self, topic: &str, lost: u64) {
+        if let Some(more) = self.overrun.admit(clock::now()) {
+            warn!(
+                topic,
+                lost, more, "messages of an action were lost: this process does not keep up"
+            );
+        }
+    }
+
+    pub(super) fn full(&mut self, goal: &str) {
+        if let Some(more) = self.full.admit(clock::now()) {
+            warn!(
+                goal,
+                more, "a goal or a request to cancel was turned away: too many are open"
+            );
+        }
+    }
+}

@@ -1,0 +1,491 @@
+//! The server: takes goals and requests to cancel, and publishes what becomes of them.
+
+use std::collections::VecDeque;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use bytes::Bytes;
+use tokio::sync::{Notify, watch};
+use tokio::task::AbortHandle;
+use tokio::time::sleep_until;
+
+use super::events::Faults;
+use super::server_goals::{Arrival, Decision, GoalError, Key, ServerCounters, ServerGoals};
+use super::types::{
+    ActionError, ActionType, GoalId, GoalStatus, Status, check_wrapper, goal_id_type,
+    goal_status_array_type, wanted,
+};
+use super::wire;
+use crate::clock;
+use crate::inbox::{Inbox, InboxEvent, Message};
+use crate::node::{Node, NodeError};
+use crate::outbox::lock;
+use crate::publisher::{Publisher, PublisherOptions};
+use crate::subscription::{SubscriberOptions, Subscription};
+use crate::time::RosClock;
+
+/// How a server reports its goals, in steady time, and how many it takes.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ActionServerOptions {
+    /// The serialized `XResult` with nothing in it, for goals that end without a result of yours: recalled before they
+    /// arrive, rejected, or dropped. Clients of the type have to be able to read it.
+    pub empty_result: Bytes,
+    /// Between two statuses when nothing happens. Clients take five seconds without one for a lost server.
+    pub status_period: Duration,
+    /// How long a goal that has ended stays in the status.
+    pub status_list_timeout: Duration,
+    /// How many goals the status holds. When it is full, ended goals leave it early; when all are open, goals are
+    /// rejected.
+    pub max_goals: usize,
+}
+
+impl ActionServerOptions {
+    /// A status five times a second, ended goals in it for five seconds, 1000 goals.
+    pub const fn new(empty_result: Bytes) -> Self {
+        Self {
+            empty_result,
+            status_period: Duration::from_millis(200),
+            status_list_timeout: Duration::from_secs(5),
+            max_goals: 1000,
+        }
+    }
+}
+
+/// What clients want of a server.
+#[derive(Debug)]
+pub enum ServerEvent {
+    /// A new goal, to be accepted or rejected.
+    Goal(ServerGoal),
+    /// The open goal of this id should be cancelled. What becomes of it is the server's decision.
+    Cancel(GoalId),
+}
+
+/// Takes the goals of an action. Dropping it aborts the goals that have not ended.
+#[derive(Debug)]
+pub struct ActionServer {
+    shared: Arc<Shared>,
+    task: AbortHandle,
+    _subscriptions: [Subscription; 2],
+}
+
+impl ActionServer {
+    /// Opens the action's topics and begins to publish its status.
+    ///
+    /// `name` is the action's, such as `arm/move`, and is resolved as a topic's. Must be called inside the node's
+    /// runtime. Fails when the name is no ROS name, when this node serves the action already, or when a type is
+    /// incomplete or not that of the message with goal id or status.
+    pub fn new(
+        node: &Node,
+        name: &str,
+        action: ActionType,
+        options: ActionServerOptions,
+    ) -> Result<Self, ActionError> {
+        check_wrapper(&action.goal.name, "ActionGoal")?;
+        check_wrapper(&action.result.name, "ActionResult")?;
+        check_wrapper(&action.feedback.name, "ActionFeedback")?;
+        let name = node.resolve(name).map_err(NodeError::from)?;
+        let advertise = |topic, topic_type, latch| {
+            let options = PublisherOptions {
+                latch,
+                ..PublisherOptions::default()
+            };
+            node.advertise(&format!("{name}/{topic}"), topic_type, options)
+        };
+        let outputs = Outputs {
+            status: advertise("status", goal_status_array_type(), true)?,
+            feedback: advertise("feedback", action.feedback, false)?,
+            result: advertise("result", action.result, false)?,
+            empty_result: options.empty_result,
+            seq: 0,
+        };
+        let inbox = Inbox::new();
+        let subscribe = |topic, wanted, source| {
+            let queues = SubscriberOptions::default();
+            node.subscribe(&format!("{name}/{topic}"), wanted, queues, source, &inbox)
+        };
+        let subscriptions = [
+            subscribe("goal", wanted(action.goal), Source::Goal)?,
+            subscribe("cancel", wanted(goal_id_type()), Source::Cancel)?,
+        ];
+        let state = State {
+            goals: ServerGoals::new(options.max_goals, options.status_list_timeout),
+            outputs: Some(outputs),
+            arrived: VecDeque::new(),
+            faults: Faults::new(),
+        };
+        let shared = Arc::new(Shared {
+            name,
+            node: node.name().to_owned(),
+            clock: node.clock(),
+            state: Mutex::new(state),
+            arrival: Notify::new(),
+            changed: watch::Sender::new(()),
+        });
+        let period = options.status_period.max(SHORTEST_PERIOD);
+        let task = tokio::spawn(run(Arc::clone(&shared), inbox, period)).abort_handle();
+        Ok(Self {
+            shared,
+            task,
+            _subscriptions: subscriptions,
+        })
+    }
+
+    /// The next event. Cancel-safe. As many wait as there are open goals, twice over.
+    pub async fn recv(&mut self) -> ServerEvent {
+        loop {
+            if let Some(event) = self.try_recv() {
+                return event;
+            }
+            self.shared.arrival.notified().await;
+        }
+    }
+
+    /// The next event if there is one.
+    pub fn try_recv(&mut self) -> Option<ServerEvent> {
+        let mut state = lock(&self.shared.state);
+        loop {
+            match state.arrived.pop_front()? {
+                Arrived::Goal(key, goal_id, body) => {
+                    return Some(ServerEvent::Goal(ServerGoal {
+                        shared: Arc::clone(&self.shared),
+                        key,
+                        goal_id,
+                        body,
+                    }));
+                }
+                Arrived::Cancel(key) => {
+                    let status = state.goals.status(key);
+                    // It may have ended since.
+                    if let Some(status) = status.filter(|status| !status.status.is_terminal()) {
+                        return Some(ServerEvent::Cancel(status.goal_id.clone()));
+                    }
+                }
+            }
+        }
+    }
+
+    /// The action's resolved name.
+    pub fn name(&self) -> &str {
+        &self.shared.name
+    }
+
+    /// What was received so far and could not be used.
+    pub fn counters(&self) -> ServerCounters {
+        lock(&self.shared.state).goals.counters
+    }
+}
+
+impl Drop for ActionServer {
+    fn drop(&mut self) {
+        self.task.abort();
+        let mut guard = lock(&self.shared.state);
+        let state = &mut *guard;
+        for key in state.goals.open() {
+            if let Some(status) = state.goals.abandon(key, SERVER_CLOSED, clock::now()) {
+                self.shared.publish_result(state, &status, None);
+            }
+        }
+        let left = (state.outputs.take(), std::mem::take(&mut state.arrived));
+        drop(guard);
+        drop(left);
+        self.shared.changed.send_replace(());
+    }
+}
+
+/// A goal to decide about. Its decisions are published at once and never wait. One that is dropped before its end is
+/// aborted.
+#[derive(Debug)]
+pub struct ServerGoal {
+    shared: Arc<Shared>,
+    key: Key,
+    goal_id: GoalId,
+    body: Bytes,
+}
+
+impl ServerGoal {
+    /// The goal's id and when it was requested, by the clock of its client.
+    pub const fn goal_id(&self) -> &GoalId {
+        &self.goal_id
+    }
+
+    /// The serialized `XGoal`.
+    pub const fn body(&self) -> &Bytes {
+        &self.body
+    }
+
+    /// How far the goal is. `Lost` when it has ended and left the server's status.
+    pub fn status(&self) -> Status {
+        let state = lock(&self.shared.state);
+        let status = state.goals.status(self.key);
+        status.map_or(Status::Lost, |status| status.status)
+    }
+
+    /// Begins work: from pending to active, from recalling to preempting.
+    pub fn accept(&self, text: &str) -> Result<(), GoalError> {
+        let mut guard = lock(&self.shared.state);
+        let state = &mut *guard;
+        state.open()?;
+        state
+            .goals
+            .decide(self.key, Decision::Accept, text, clock::now())?;
+        self.shared.publish_status(state);
+        drop(guard);
+        self.shared.changed.send_replace(());
+        Ok(())
+    }
+
+    /// Ends a goal that was not accepted, with the empty result.
+    pub fn reject(&self, text: &str) -> Result<(), GoalError> {
+        self.end(Decision::Reject, None, text)
+    }
+
+    /// Ends an accepted goal that was reached, with the serialized `XResult`.
+    pub fn succeed(&self, result: &[u8], text: &str) -> Result<(), GoalError> {
+        self.end(Decision::Succeed, Some(result), text)
+    }
+
+    /// Ends an accepted goal that failed, with the serialized `XResult` or, for `None`, the empty one.
+    pub fn abort(&self, result: Option<&[u8]>, text: &str) -> Result<(), GoalError> {
+        self.end(Decision::Abort, result, text)
+    }
+
+    /// Ends a goal as cancelled, asked for or not, with the serialized `XResult` or, for `None`, the empty one: as
+    /// preempted when it was accepted, else as recalled.
+    pub fn cancelled(&self, result: Option<&[u8]>, text: &str) -> Result<(), GoalError> {
+        self.end(Decision::Cancelled, result, text)
+    }
+
+    /// Reports progress, the serialized `XFeedback`. Fails once the goal has ended.
+    pub fn feedback(&self, body: &[u8]) -> Result<(), GoalError> {
+        let mut guard = lock(&self.shared.state);
+        let state = &mut *guard;
+        let outputs = state.outputs.as_mut().ok_or(GoalError::Closed)?;
+        let status = state.goals.status(self.key).ok_or(GoalError::Forgotten)?;
+        if status.status.is_terminal() {
+            return Err(GoalError::NotFrom {
+                goal: self.goal_id.id.clone(),
+                from: status.status,
+                wanted: "given feedback",
+            });
+        }
+        let seq = outputs.next_seq();
+        let message = wire::reply(seq, self.shared.clock.now(), status, body);
+        send(&outputs.feedback, message);
+        Ok(())
+    }
+
+    /// Whether a client asked to cancel the goal and it has not ended.
+    pub fn is_cancel_requested(&self) -> bool {
+        matches!(self.status(), Status::Recalling | Status::Preempting)
+    }
+
+    /// Waits until a client asks to cancel the goal, or the goal has ended. Cancel-safe.
+    pub async fn cancel_requested(&self) {
+        let mut changed = self.shared.changed.subscribe();
+        while !self.is_cancel_requested() && !self.status().is_terminal() {
+            // The sender lives as long as this goal.
+            if changed.changed().await.is_err() {
+                return;
+            }
+        }
+    }
+
+    fn end(&self, decision: Decision, result: Option<&[u8]>, text: &str) -> Result<(), GoalError> {
+        let mut guard = lock(&self.shared.state);
+        let state = &mut *guard;
+        state.open()?;
+        let status = state.goals.decide(self.key, decision, text, clock::now())?;
+        self.shared.publish_result(state, &status, result);
+        drop(guard);
+        self.shared.changed.send_replace(());
+        Ok(())
+    }
+}
+
+impl Drop for ServerGoal {
+    fn drop(&mut self) {
+        let mut guard = lock(&self.shared.state);
+        let state = &mut *guard;
+        let ended = state.goals.abandon(self.key, DROPPED, clock::now());
+        if let Some(status) = ended {
+            self.shared.publish_result(state, &status, None);
+        }
+    }
+}
+
+/// A topic that clients publish.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Source {
+    Goal,
+    Cancel,
+}
+
+/// What the server, its task and its goals share.
+#[derive(Debug)]
+struct Shared {
+    name: String,
+    node: String,
+    clock: RosClock,
+    state: Mutex<State>,
+    /// Rings for [`ActionServer::recv`].
+    arrival: Notify,
+    /// Tells all goals that one has changed.
+    changed: watch::Sender<()>,
+}
+
+#[derive(Debug)]
+struct State {
+    goals: ServerGoals,
+    /// `None` once the server is dropped.
+    outputs: Option<Outputs>,
+    arrived: VecDeque<Arrived>,
+    faults: Faults,
+}
+
+#[derive(Debug)]
+enum Arrived {
+    Goal(Key, GoalId, Bytes),
+    Cancel(Key),
+}
+
+#[derive(Debug)]
+struct Outputs {
+    status: Publisher,
+    feedback: Publisher,
+    result: Publisher,
+    empty_result: Bytes,
+    seq: u32,
+}
+
+impl Outputs {
+    const fn next_seq(&mut self) -> u32 {
+        self.seq = self.seq.wrapping_add(1);
+        self.seq
+    }
+}
+
+impl State {
+    const fn open(&self) -> Result<(), GoalError> {
+        match self.outputs {
+            Some(_) => Ok(()),
+            None => Err(GoalError::Closed),
+        }
+    }
+}
+
+impl Shared {
+    /// An id and a stamp for a goal that came without.
+    fn new_id(&self) -> GoalId {
+        static COUNT: AtomicU64 = AtomicU64::new(1);
+        let stamp = self.clock.now();
+        let count = COUNT.fetch_add(1, Ordering::Relaxed);
+        let id = format!("{}-{count}-{}.{:09}", self.node, stamp.secs, stamp.nsecs);
+        GoalId { stamp, id }
+    }
+
+    fn take(&self, source: Source, event: InboxEvent) {
+        let mut guard = lock(&self.state);
+        let state = &mut *guard;
+        match event {
+            InboxEvent::Message(message) => {
+                let read = match source {
+                    Source::Goal => self.goal(state, &message),
+                    Source::Cancel => self.cancel(state, &message),
+                };
+                if let Err(error) = read {
+                    state.goals.counters.malformed += 1;
+                    let topic = message.peer.header.get("topic").unwrap_or(&self.name);
+                    state
+                        .faults
+                        .malformed(topic, &message.peer.caller_id, &error);
+                }
+            }
+            InboxEvent::Peer { .. } => {}
+            InboxEvent::Dropped(lost) => {
+                state.goals.counters.overrun += lost;
+                state.faults.overrun(&self.name, lost);
+            }
+        }
+    }
+
+    fn goal(&self, state: &mut State, message: &Message) -> Result<(), wire::Malformed> {
+        let (id, body) = wire::read_goal(&message.bytes)?;
+        let refused = state.goals.counters.refused;
+        match state.goals.goal(id, self.new_id(), clock::now()) {
+            Arrival::New(key, id) => {
+                state.arrived.push_back(Arrived::Goal(key, id, body));
+                self.arrival.notify_one();
+                self.publish_status(state);
+            }
+            Arrival::Ended(status) => {
+                if state.goals.counters.refused > refused {
+                    state.faults.full(&status.goal_id.id);
+                }
+                self.publish_result(state, &status, None);
+            }
+            Arrival::Known => {}
+        }
+        Ok(())
+    }
+
+    fn cancel(&self, state: &mut State, message: &Message) -> Result<(), wire::Malformed> {
+        let request = wire::read_cancel(&message.bytes)?;
+        let refused = state.goals.counters.refused;
+        let told = state.goals.cancel(&request, clock::now());
+        if state.goals.counters.refused > refused {
+            state.faults.full(&request.id);
+        }
+        if !told.is_empty() {
+            state.arrived.extend(told.into_iter().map(Arrived::Cancel));
+            self.arrival.notify_one();
+            self.changed.send_replace(());
+            self.publish_status(state);
+        }
+        Ok(())
+    }
+
+    /// The result first, so that whoever sees the end in the status can expect it.
+    fn publish_result(&self, state: &mut State, status: &GoalStatus, result: Option<&[u8]>) {
+        if let Some(outputs) = &mut state.outputs {
+            let seq = outputs.next_seq();
+            let result = result.unwrap_or(&outputs.empty_result);
+            let message = wire::reply(seq, self.clock.now(), status, result);
+            send(&outputs.result, message);
+            self.publish_status(state);
+        }
+    }
+
+    fn publish_status(&self, state: &mut State) {
+        if let Some(outputs) = &mut state.outputs {
+            let list = state.goals.list(clock::now());
+            let message = wire::status_array(outputs.next_seq(), self.clock.now(), list);
+            send(&outputs.status, message);
+        }
+    }
+}
+
+/// Takes goals and requests, and publishes the status, until aborted.
+async fn run(shared: Arc<Shared>, mut inbox: Inbox<Source>, period: Duration) {
+    let mut next = clock::now();
+    loop {
+        tokio::select! {
+            // First, so that a flood of goals does not keep the status from clients.
+            biased;
+            () = sleep_until(next) => {
+                shared.publish_status(&mut lock(&shared.state));
+                next = clock::now() + period;
+            }
+            (source, event) = inbox.recv() => shared.take(source, event),
+        }
+    }
+}
+
+/// Publishers count for themselves what slow subscribers lose.
+fn send(publisher: &Publisher, message: Bytes) {
+    let _published = publisher.publish(message);
+}
+
+const SHORTEST_PERIOD: Duration = Duration::from_millis(1);
+const DROPPED: &str = "the server gave the goal up without a result";
+const SERVER_CLOSED: &str = "the server was stopped";

@@ -1,0 +1,595 @@
+//! The server's side of goals: which it knows, what a request to cancel means for each, and what may follow on what.
+//!
+//! No clock and no network: messages, decisions and time come in, the statuses to publish come out.
+
+use std::time::Duration;
+
+use thiserror::Error;
+use tokio::time::Instant;
+
+use super::types::{GoalId, GoalStatus, Status};
+use crate::time::RosTime;
+
+/// What a server decides about a goal.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Decision {
+    Accept,
+    Reject,
+    Cancelled,
+    Abort,
+    Succeed,
+}
+
+/// Why a goal did not take a decision.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum GoalError {
+    /// It cannot follow on the goal's status.
+    #[error("the goal {goal} is {from:?}: it cannot be {wanted}")]
+    NotFrom {
+        /// The goal's id.
+        goal: String,
+        /// Its status, which stays.
+        from: Status,
+        /// What was asked for.
+        wanted: &'static str,
+    },
+    /// It has ended and left the server's status.
+    #[error("the goal has ended and is forgotten")]
+    Forgotten,
+    /// The server was dropped, which has ended its goals.
+    #[error("the action server was closed")]
+    Closed,
+}
+
+/// What a server has received and could not use.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ServerCounters {
+    /// Messages that do not read.
+    pub malformed: u64,
+    /// Goals rejected and requests to cancel passed over because too many goals are open.
+    pub refused: u64,
+    /// Ended goals that left the status early to make room.
+    pub forgotten: u64,
+    /// Goals and requests that were lost because this process did not keep up.
+    pub overrun: u64,
+}
+
+/// What becomes of a goal that arrives.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Arrival {
+    /// It is the user's to decide.
+    New(Key, GoalId),
+    /// It has ended before it began, with this result.
+    Ended(GoalStatus),
+    /// It has been here before.
+    Known,
+}
+
+/// Tells a goal from an earlier one of the same id that has left the status.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub(super) struct Key(u64);
+
+/// All goals of the status, in the order they came.
+#[derive(Debug)]
+pub(super) struct ServerGoals {
+    entries: Vec<Entry>,
+    /// The latest time of a request to cancel all goals up to a time.
+    last_cancel: RosTime,
+    most: usize,
+    linger: Duration,
+    next_key: u64,
+    pub(super) counters: ServerCounters,
+}
+
+/// A goal, or a request to cancel one that has not come yet: that one is recalling with an end.
+#[derive(Debug)]
+struct Entry {
+    key: Key,
+    status: GoalStatus,
+    /// Since when nobody decides about it any more.
+    ended: Option<Instant>,
+}
+
+impl ServerGoals {
+    /// Knows at most `most` goals, ended ones for as long as `linger`.
+    pub(super) fn new(most: usize, linger: Duration) -> Self {
+        Self {
+            entries: Vec::new(),
+            last_cancel: RosTime::default(),
+            most,
+            linger,
+            next_key: 0,
+            counters: ServerCounters::default(),
+        }
+    }
+
+    /// A goal arrives; `fallback` gives the id and the stamp it came without.
+    pub(super) fn goal(&mut self, mut id: GoalId, fallback: GoalId, now: Instant) -> Arrival {
+        let mut entries = self.entries.iter_mut();
+        let known = entries.find(|entry| entry.status.goal_id.id == id.id && !id.id.is_empty());
+        if let Some(known) = known {
+            return known.seen_again(now);
+        }
+        let recalled = id.stamp != RosTime::default() && id.stamp <= self.last_cancel;
+        if id.id.is_empty() {
+            id.id = fallback.id;
+        }
+        if id.stamp == RosTime::default() {
+            id.stamp = fallback.stamp;
+        }
+        let mut status = GoalStatus {
+            goal_id: id.clone(),
+            status: Status::Pending,
+            text: String::new(),
+        };
+        if !self.has_room() {
+            status.status = Status::Rejected;
+            TOO_MANY.clone_into(&mut status.text);
+            return Arrival::Ended(status);
+        }
+        if recalled {
+            status.status = Status::Recalled;
+            RECALLED.clone_into(&mut status.text);
+        }
+        let key = self.push(status.clone(), recalled.then_some(now));
+        if recalled {
+            Arrival::Ended(status)
+        } else {
+            Arrival::New(key, id)
+        }
+    }
+
+    /// A request to cancel arrives. Returns the goals that have to be told of it.
+    ///
+    /// No id and no time: all goals. A time: all requested then or before, those that come later included. An id: that
+    /// goal, which may come later too.
+    pub(super) fn cancel(&mut self, request: &GoalId, now: Instant) -> Vec<Key> {
+        let timed = request.stamp != RosTime::default();
+        let all = request.id.is_empty() && !timed;
+        let mut told = Vec::new();
+        let mut found = request.id.is_empty();
+        for entry in &mut self.entries {
+            let this = !request.id.is_empty() && entry.status.goal_id.id == request.id;
+            found |= this;
+            let before = timed && entry.status.goal_id.stamp <= request.stamp;
+            if (all || this || before) && entry.ask_to_cancel(now) {
+                told.push(entry.key);
+            }
+        }
+        if !found && self.has_room() {
+            let status = GoalStatus {
+                goal_id: request.clone(),
+                status: Status::Recalling,
+                text: String::new(),
+            };
+            self.push(status, Some(now));
+        }
+        self.last_cancel = self.last_cancel.max(request.stamp);
+        told
+    }
+
+    /// Applies a decision and returns the status that follows.
+    pub(super) fn decide(
+        &mut self,
+        key: Key,
+        decision: Decision,
+        text: &str,
+        now: Instant,
+    ) -> Result<GoalStatus, GoalError> {
+        let entry = self.entries.iter_mut().find(|entry| entry.key == key);
+        // One that has left the status had ended.
+        let entry = entry.ok_or(GoalError::Forgotten)?;
+        let from = entry.status.status;
+        let to = follows(from, decision).ok_or_else(|| GoalError::NotFrom {
+            goal: entry.status.goal_id.id.clone(),
+            from,
+            wanted: decision.name(),
+        })?;
+        Ok(entry.set(to, text, now))
+    }
+
+    /// Ends a goal that nobody will decide about. `None` when it has ended.
+    pub(super) fn abandon(&mut self, key: Key, text: &str, now: Instant) -> Option<GoalStatus> {
+        let mut entries = self.entries.iter_mut();
+        let entry = entries.find(|entry| entry.key == key && entry.ended.is_none())?;
+        Some(entry.set(Status::Aborted, text, now))
+    }
+
+    /// The goals that have not ended.
+    pub(super) fn open(&self) -> Vec<Key> {
+        let open = self.entries.iter().filter(|entry| entry.ended.is_none());
+        open.map(|entry| entry.key).collect()
+    }
+
+    /// A goal's status while it is known.
+    pub(super) fn status(&self, key: Key) -> Option<&GoalStatus> {
+        let entry = self.entries.iter().find(|entry| entry.key == key)?;
+        Some(&entry.status)
+    }
+
+    /// What to publish, without what has ended long enough ago.
+    pub(super) fn list(&mut self, now: Instant) -> impl Iterator<Item = &GoalStatus> {
+        let linger = self.linger;
+        self.entries
+            .retain(|entry| entry.ended.is_none_or(|at| at + linger >= now));
+        self.entries.iter().map(|entry| &entry.status)
+    }
+
+    fn push(&mut self, status: GoalStatus, ended: Option<Instant>) -> Key {
+        let key = Key(self.next_key);
+        self.next_key += 1;
+        self.entries.push(Entry { key, status, ended });
+        key
+    }
+
+    /// Makes room by forgetting what has ended first, which has been published. False when all are open.
+    fn has_room(&mut self) -> bool {
+        if self.entries.len() < self.most {
+            return true;
+        }
+        let ended = self.entries.iter().enumerate();
+        let oldest = ended
+            .filter_map(|(at, entry)| Some((entry.ended?, at)))
+            .min();
+        if let Some((_, at)) = oldest {
+            self.entries.remove(at);
+            self.counters.forgotten += 1;
+            true
+        } else {
+            self.counters.refused += 1;
+            false
+        }
+    }
+}
+
+impl Entry {
+    /// A goal with the id of this entry arrives.
+    fn seen_again(&mut self, now: Instant) -> Arrival {
+        if self.ended.is_none() {
+            return Arrival::Known;
+        }
+        self.ended = Some(now);
+        if self.status.status == Status::Recalling {
+            Arrival::Ended(self.set(Status::Recalled, RECALLED, now))
+        } else {
+            Arrival::Known
+        }
+    }
+
+    /// True when the goal has to be told.
+    fn ask_to_cancel(&mut self, now: Instant) -> bool {
+        if self.ended.is_some() {
+            self.ended = Some(now);
+            return false;
+        }
+        let asked = match self.status.status {
+            Status::Pending => Status::Recalling,
+            Status::Active => Status::Preempting,
+            Status::Preempted
+            | Status::Succeeded
+            | Status::Aborted
+            | Status::Rejected
+            | Status::Preempting
+            | Status::Recalling
+            | Status::Recalled
+            | Status::Lost => return false,
+        };
+        self.status.status = asked;
+        true
+    }
+
+    fn set(&mut self, status: Status, text: &str, now: Instant) -> GoalStatus {
+        self.status.status = status;
+        text.clone_into(&mut self.status.text);
+        self.ended = status.is_terminal().then_some(now);
+        self.status.clone()
+    }
+}
+
+impl Decision {
+    const fn name(self) -> &'static str {
+        match self {
+            Self::Accept => "accepted",
+            Self::Reject => "rejected",
+            Self::Cancelled => "cancelled",
+            Self::Abort => "aborted",
+            Self::Succeed => "succeeded",
+        }
+    }
+}
+
+/// The status that follows on a decision, `None` where it must not be made.
+const fn follows(from: Status, decision: Decision) -> Option<Status> {
+    let waiting = matches!(from, Status::Pending | Status::Recalling);
+    let at_work = matches!(from, Status::Active | Status::Preempting);
+    match decision {
+        Decision::Accept if matches!(from, Status::Pending) => Some(Status::Active),
+        Decision::Accept if waiting => Some(Status::Preempting),
+        Decision::Reject if waiting => Some(Status::Rejected),
+        Decision::Cancelled if waiting => Some(Status::Recalled),
+        Decision::Cancelled if at_work => Some(Status::Preempted),
+        Decision::Abort if at_work => Some(Status::Aborted),
+        Decision::Succeed if at_work => Some(Status::Succeeded),
+        Decision::Accept
+        | Decision::Reject
+        | Decision::Cancelled
+        | Decision::Abort
+        | Decision::Succeed => None,
+    }
+}
+
+const RECALLED: &str = "cancelled before it arrived";
+const TOO_MANY: &str = "the server has too many open goals";
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::clock;
+
+    const LINGER: Duration = Duration::from_secs(5);
+
+    fn id(secs: u32, id: &str) -> GoalId {
+        GoalId {
+            stamp: RosTime { secs, nsecs: 0 },
+            id: id.to_owned(),
+        }
+    }
+
+    fn fallback() -> GoalId {
+        id(99, "made")
+    }
+
+    /// Goals with these ids, requested at seconds 1, 2, ...
+    fn with(ids: &[&str], now: Instant) -> ServerGoals {
+        let mut goals = ServerGoals::new(10, LINGER);
+        for (secs, text) in (1..).zip(ids) {
+            let new = goals.goal(id(secs, text), fallback(), now);
+            assert!(matches!(new, Arrival::New(..)));
+        }
+        goals
+    }
+
+    fn key(goals: &ServerGoals, id: &str) -> Option<Key> {
+        let mut entries = goals.entries.iter();
+        let entry = entries.find(|entry| entry.status.goal_id.id == id)?;
+        Some(entry.key)
+    }
+
+    fn decide(
+        goals: &mut ServerGoals,
+        id: &str,
+        decision: Decision,
+        now: Instant,
+    ) -> Result<GoalStatus, GoalError> {
+        let key = key(goals, id).ok_or(GoalError::Forgotten)?;
+        goals.decide(key, decision, "", now)
+    }
+
+    fn cancel(goals: &mut ServerGoals, request: &GoalId, now: Instant) -> Vec<String> {
+        let told = goals.cancel(request, now).into_iter();
+        told.map(|key| goals.status(key).unwrap().goal_id.id.clone())
+            .collect()
+    }
+
+    fn of(goals: &ServerGoals, id: &str) -> Status {
+        goals.status(key(goals, id).unwrap()).unwrap().status
+    }
+
+    #[test]
+    fn each_decision_is_taken_from_the_statuses_of_actionlib_and_no_other() {
+        use Decision as D;
+        use Status as S;
+        let allowed = [
+            (D::Accept, S::Pending, S::Active),
+            (D::Accept, S::Recalling, S::Preempting),
+            (D::Reject, S::Pending, S::Rejected),
+            (D::Reject, S::Recalling, S::Rejected),
+            (D::Cancelled, S::Pending, S::Recalled),
+            (D::Cancelled, S::Recalling, S::Recalled),
+            (D::Cancelled, S::Active, S::Preempted),
+            (D::Cancelled, S::Preempting, S::Preempted),
+            (D::Abort, S::Active, S::Aborted),
+            (D::Abort, S::Preempting, S::Aborted),
+            (D::Succeed, S::Active, S::Succeeded),
+            (D::Succeed, S::Preempting, S::Succeeded),
+        ];
+        for decision in [D::Accept, D::Reject, D::Cancelled, D::Abort, D::Succeed] {
+            for from in (0..10).filter_map(Status::from_code) {
+                let to = allowed
+                    .iter()
+                    .find(|(d, f, _)| (*d, *f) == (decision, from))
+                    .map(|(_, _, to)| *to);
+                assert_eq!(follows(from, decision), to, "{decision:?} from {from:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_refused_decision_says_what_the_goal_is_and_leaves_it() {
+        let now = clock::now();
+        let mut goals = with(&["a"], now);
+        let refused = decide(&mut goals, "a", Decision::Succeed, now).unwrap_err();
+        assert_eq!(
+            refused.to_string(),
+            "the goal a is Pending: it cannot be succeeded"
+        );
+        assert_eq!(of(&goals, "a"), Status::Pending);
+    }
+
+    #[test]
+    fn no_id_and_no_time_cancels_all() {
+        let now = clock::now();
+        let mut goals = with(&["a", "b", "c"], now);
+        decide(&mut goals, "b", Decision::Accept, now).unwrap();
+        decide(&mut goals, "c", Decision::Reject, now).unwrap();
+        assert_eq!(cancel(&mut goals, &GoalId::default(), now), ["a", "b"]);
+        assert_eq!(of(&goals, "a"), Status::Recalling);
+        assert_eq!(of(&goals, "b"), Status::Preempting);
+        assert_eq!(of(&goals, "c"), Status::Rejected);
+        assert!(
+            cancel(&mut goals, &GoalId::default(), now).is_empty(),
+            "they know"
+        );
+    }
+
+    #[test]
+    fn a_time_cancels_what_was_requested_until_then_and_what_comes_later_of_that_time() {
+        let now = clock::now();
+        let mut goals = with(&["a", "b", "c"], now);
+        assert_eq!(cancel(&mut goals, &id(2, ""), now), ["a", "b"]);
+        let late = goals.goal(id(2, "late"), fallback(), now);
+        assert!(matches!(late, Arrival::Ended(status) if status.status == Status::Recalled));
+        let newer = goals.goal(id(3, "newer"), fallback(), now);
+        assert!(matches!(newer, Arrival::New(..)));
+    }
+
+    #[test]
+    fn an_id_cancels_that_goal_and_with_a_time_all_until_then_too() {
+        let now = clock::now();
+        let mut goals = with(&["a", "b", "c"], now);
+        assert_eq!(cancel(&mut goals, &id(0, "b"), now), ["b"]);
+        assert_eq!(cancel(&mut goals, &id(1, "c"), now), ["a", "c"]);
+    }
+
+    #[test]
+    fn a_goal_whose_cancel_came_first_is_recalled_on_arrival() {
+        let now = clock::now();
+        let mut goals = with(&[], now);
+        assert!(cancel(&mut goals, &id(0, "a"), now).is_empty());
+        assert_eq!(of(&goals, "a"), Status::Recalling);
+        let arrival = goals.goal(id(7, "a"), fallback(), now);
+        assert!(matches!(arrival, Arrival::Ended(status) if status.status == Status::Recalled));
+        assert_eq!(goals.goal(id(7, "a"), fallback(), now), Arrival::Known);
+    }
+
+    #[test]
+    fn a_goal_that_comes_twice_is_taken_once() {
+        let now = clock::now();
+        let mut goals = with(&["a"], now);
+        cancel(&mut goals, &id(0, "a"), now);
+        assert_eq!(goals.goal(id(1, "a"), fallback(), now), Arrival::Known);
+        assert_eq!(
+            of(&goals, "a"),
+            Status::Recalling,
+            "it is the server's to decide"
+        );
+    }
+
+    #[test]
+    fn a_goal_without_id_and_time_is_given_them() {
+        let now = clock::now();
+        let mut goals = with(&[], now);
+        let arrival = goals.goal(GoalId::default(), fallback(), now);
+        assert!(matches!(arrival, Arrival::New(_, given) if given == fallback()));
+    }
+
+    #[test]
+    fn an_ended_goal_stays_in_the_status_for_its_time() {
+        let now = clock::now();
+        let mut goals = with(&["a", "b"], now);
+        decide(&mut goals, "a", Decision::Reject, now).unwrap();
+        assert_eq!(goals.list(now + LINGER).count(), 2);
+        let left: Vec<_> = goals
+            .list(now + LINGER + Duration::from_millis(1))
+            .collect();
+        assert_eq!(left.len(), 1);
+        assert_eq!(left[0].goal_id.id, "b");
+    }
+
+    #[test]
+    fn a_full_status_forgets_ended_goals_first_and_then_rejects() {
+        let now = clock::now();
+        let mut goals = ServerGoals::new(2, LINGER);
+        for text in ["a", "b", "c"] {
+            let new = goals.goal(id(1, text), fallback(), now);
+            assert!(matches!(new, Arrival::New(..)), "{text}");
+            if text == "a" {
+                decide(&mut goals, "a", Decision::Reject, now).unwrap();
+            }
+        }
+        let full = goals.goal(id(1, "d"), fallback(), now);
+        assert!(matches!(full, Arrival::Ended(status) if status.status == Status::Rejected));
+        assert_eq!((goals.counters.forgotten, goals.counters.refused), (1, 1));
+        assert!(key(&goals, "a").is_none() && key(&goals, "d").is_none());
+    }
+
+    #[derive(Clone, Copy, Debug)]
+    enum Input {
+        Goal(u8, u32),
+        Cancel(u8, u32),
+        Decide(u8, Decision),
+        Abandon(u8),
+        Wait(u64),
+    }
+
+    fn input() -> impl Strategy<Value = Input> {
+        let decision = prop::sample::select(vec![
+            Decision::Accept,
+            Decision::Reject,
+            Decision::Cancelled,
+            Decision::Abort,
+            Decision::Succeed,
+        ]);
+        prop_oneof![
+            (0u8..6, 0u32..4).prop_map(|(id, at)| Input::Goal(id, at)),
+            (0u8..6, 0u32..4).prop_map(|(id, at)| Input::Cancel(id, at)),
+            (0u8..6, decision).prop_map(|(id, decision)| Input::Decide(id, decision)),
+            (0u8..6).prop_map(Input::Abandon),
+            (0u64..3000).prop_map(Input::Wait),
+        ]
+    }
+
+    proptest! {
+        #[test]
+        fn whatever_comes_a_goal_is_told_to_cancel_at_most_once_and_never_leaves_its_end(
+            inputs in prop::collection::vec(input(), 0..80)
+        ) {
+            let mut now = clock::now();
+            let mut goals = ServerGoals::new(4, LINGER);
+            let mut told = std::collections::HashMap::new();
+            let name = |n: u8| if n == 0 { String::new() } else { n.to_string() };
+            for (step, input) in inputs.into_iter().enumerate() {
+                let before: Vec<_> = goals.entries.iter().map(|e| (e.key, e.status.status)).collect();
+                match input {
+                    Input::Goal(n, at) => {
+                        let fallback = id(9, &format!("made {step}"));
+                        if let Arrival::New(key, _) = goals.goal(id(at, &name(n)), fallback, now) {
+                            told.insert(key, 0);
+                        }
+                    }
+                    Input::Cancel(n, at) => {
+                        for one in goals.cancel(&id(at, &name(n)), now) {
+                            *told.get_mut(&one).unwrap() += 1;
+                        }
+                    }
+                    Input::Decide(n, decision) => {
+                        // Only who was given a goal decides about it.
+                        let given = key(&goals, &name(n)).filter(|key| told.contains_key(key));
+                        if let Some(key) = given {
+                            drop(goals.decide(key, decision, "", now));
+                        }
+                    }
+                    Input::Abandon(n) => {
+                        if let Some(key) = key(&goals, &name(n)) {
+                            drop(goals.abandon(key, "", now));
+                        }
+                    }
+                    Input::Wait(millis) => {
+                        now += Duration::from_millis(millis);
+                        prop_assert!(goals.list(now).count() <= 4);
+                    }
+                }
+                prop_assert!(told.values().all(|times| *times <= 1));
+                prop_assert!(goals.entries.len() <= 4);
+                for (key, old) in before.iter().filter(|(_, old)| old.is_terminal()) {
+                    if let Some(now) = goals.status(*key) {
+                        prop_assert_eq!(now.status, *old);
+                    }
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,234 @@
+//! The types of an action's topics, and what its messages say of goals.
+
+use thiserror::Error;
+
+use crate::node::NodeError;
+use crate::publisher::TopicType;
+use crate::subscription::Wanted;
+use crate::time::RosTime;
+
+/// The types of an action's own topics, such as `pkg/XActionGoal`, `pkg/XActionResult` and `pkg/XActionFeedback`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ActionType {
+    /// Of the topic `goal`.
+    pub goal: TopicType,
+    /// Of the topic `result`.
+    pub result: TopicType,
+    /// Of the topic `feedback`.
+    pub feedback: TopicType,
+}
+
+/// The types a client has to know: that of the goals it sends. What it receives may be left open.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ClientType {
+    /// Of the topic `goal`.
+    pub goal: TopicType,
+    /// Of the topic `result`.
+    pub result: Wanted,
+    /// Of the topic `feedback`.
+    pub feedback: Wanted,
+}
+
+impl ClientType {
+    /// Takes results and feedback of any type; the server's connection header tells which it is.
+    pub fn of_goal(goal: TopicType) -> Self {
+        Self {
+            goal,
+            result: Wanted::default(),
+            feedback: Wanted::default(),
+        }
+    }
+}
+
+impl From<ActionType> for ClientType {
+    fn from(action: ActionType) -> Self {
+        Self {
+            goal: action.goal,
+            result: wanted(action.result),
+            feedback: wanted(action.feedback),
+        }
+    }
+}
+
+/// A subscriber's wish for exactly this type.
+pub(super) fn wanted(topic_type: TopicType) -> Wanted {
+    Wanted {
+        type_name: Some(topic_type.name),
+        md5sum: Some(topic_type.md5sum),
+    }
+}
+
+/// Refuses the type of a bare `XGoal` where that of the `XActionGoal` around it belongs.
+pub(super) fn check_wrapper(type_name: &str, ending: &'static str) -> Result<(), ActionError> {
+    if type_name.ends_with(ending) {
+        Ok(())
+    } else {
+        Err(ActionError::NotAWrapper {
+            type_name: type_name.to_owned(),
+            ending,
+        })
+    }
+}
+
+/// Why a client or a server could not begin.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ActionError {
+    /// A topic of the action could not be taken.
+    #[error(transparent)]
+    Node(#[from] NodeError),
+    /// The type of a topic is not that of the message with goal id or status.
+    #[error(
+        "the type `{type_name}` does not end in `{ending}`: give the wrapper's type, such as pkg/X{ending}"
+    )]
+    NotAWrapper {
+        /// The type given.
+        type_name: String,
+        /// What its name has to end in.
+        ending: &'static str,
+    },
+}
+
+/// Which goal: `actionlib_msgs/GoalID`.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
+pub struct GoalId {
+    /// When the goal was requested, by the clock of its client.
+    pub stamp: RosTime,
+    /// Unique among all goals of the action.
+    pub id: String,
+}
+
+/// How far a goal is: `actionlib_msgs/GoalStatus`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct GoalStatus {
+    /// The goal.
+    pub goal_id: GoalId,
+    /// How far it is.
+    pub status: Status,
+    /// What the server says of it, for people.
+    pub text: String,
+}
+
+/// The codes of `actionlib_msgs/GoalStatus`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Status {
+    /// 0: received and not looked at.
+    Pending,
+    /// 1: at work.
+    Active,
+    /// 2, an end: cancelled at work.
+    Preempted,
+    /// 3, an end: reached.
+    Succeeded,
+    /// 4, an end: failed at work.
+    Aborted,
+    /// 5, an end: not taken on.
+    Rejected,
+    /// 6: at work, with a request to cancel.
+    Preempting,
+    /// 7: not looked at, with a request to cancel.
+    Recalling,
+    /// 8, an end: cancelled before any work.
+    Recalled,
+    /// 9, an end: the client's own conclusion, never sent.
+    Lost,
+}
+
+impl Status {
+    /// The code on the wire.
+    pub const fn code(self) -> u8 {
+        match self {
+            Self::Pending => 0,
+            Self::Active => 1,
+            Self::Preempted => 2,
+            Self::Succeeded => 3,
+            Self::Aborted => 4,
+            Self::Rejected => 5,
+            Self::Preempting => 6,
+            Self::Recalling => 7,
+            Self::Recalled => 8,
+            Self::Lost => 9,
+        }
+    }
+
+    /// The status of a code, `None` from 10 on.
+    pub const fn from_code(code: u8) -> Option<Self> {
+        Some(match code {
+            0 => Self::Pending,
+            1 => Self::Active,
+            2 => Self::Preempted,
+            3 => Self::Succeeded,
+            4 => Self::Aborted,
+            5 => Self::Rejected,
+            6 => Self::Preempting,
+            7 => Self::Recalling,
+            8 => Self::Recalled,
+            9 => Self::Lost,
+            _ => return None,
+        })
+    }
+
+    /// Whether a goal stays in this status.
+    pub const fn is_terminal(self) -> bool {
+        match self {
+            Self::Preempted
+            | Self::Succeeded
+            | Self::Aborted
+            | Self::Rejected
+            | Self::Recalled
+            | Self::Lost => true,
+            Self::Pending | Self::Active | Self::Preempting | Self::Recalling => false,
+        }
+    }
+}
+
+/// The type of the topic `cancel`.
+pub fn goal_id_type() -> TopicType {
+    TopicType {
+        name: "actionlib_msgs/GoalID".to_owned(),
+        md5sum: "302881f31927c1df708a2dbab0e80ee8".to_owned(),
+        definition: GOAL_ID.to_owned(),
+    }
+}
+
+/// The type of the topic `status`.
+pub fn goal_status_array_type() -> TopicType {
+    let separator = "=".repeat(80);
+    let definition = format!(
+        "Header header\nGoalStatus[] status_list\n\
+         {separator}\nMSG: std_msgs/Header\n{HEADER}\
+         {separator}\nMSG: actionlib_msgs/GoalStatus\n{GOAL_STATUS}\
+         {separator}\nMSG: actionlib_msgs/GoalID\n{GOAL_ID}"
+    );
+    TopicType {
+        name: "actionlib_msgs/GoalStatusArray".to_owned(),
+        md5sum: "8b2b82f13216d0a8ea88bd3af735e619".to_owned(),
+        definition,
+    }
+}
+
+const HEADER: &str = "uint32 seq\ntime stamp\nstring frame_id\n";
+const GOAL_ID: &str = "time stamp\nstring id\n";
+const GOAL_STATUS: &str = "GoalID goal_id\nuint8 status\nuint8 PENDING=0\nuint8 ACTIVE=1\nuint8 PREEMPTED=2\n\
+    uint8 SUCCEEDED=3\nuint8 ABORTED=4\nuint8 REJECTED=5\nuint8 PREEMPTING=6\nuint8 RECALLING=7\n\
+    uint8 RECALLED=8\nuint8 LOST=9\nstring text\n";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_code_of_the_message_has_its_status_and_no_other_has() {
+        for code in 0..10 {
+            assert_eq!(Status::from_code(code).unwrap().code(), code);
+        }
+        assert_eq!(Status::from_code(10), None);
+    }
+
+    #[test]
+    fn the_bare_goal_is_no_type_of_the_goal_topic() {
+        assert!(check_wrapper("pkg/MoveActionGoal", "ActionGoal").is_ok());
+        let refused = check_wrapper("pkg/MoveGoal", "ActionGoal").unwrap_err();
+        assert!(refused.to_string().contains("pkg/XActionGoal"), "{refused}");
+    }
+}

@@ -1,0 +1,258 @@
+//! Values as the parameter server keeps them.
+
+use std::collections::BTreeMap;
+
+use crate::parameters::ParamError;
+use crate::xmlrpc::Value;
+
+/// The value of a parameter, or of a whole namespace of them (`wiki.ros.org/Parameter Server`, "Parameter Types").
+#[derive(Clone, Debug, PartialEq)]
+pub enum ParamValue {
+    /// A truth value.
+    Bool(bool),
+    /// An integer; XML-RPC has 32 bits for it.
+    Int(i32),
+    /// A number.
+    Double(f64),
+    /// Text.
+    String(String),
+    /// A date as ISO 8601, such as `20261121T23:59:59`, unparsed.
+    DateTime(String),
+    /// Bytes.
+    Binary(Vec<u8>),
+    /// Values in their order.
+    List(Vec<Self>),
+    /// A namespace: parameters by name.
+    Map(BTreeMap<String, Self>),
+}
+
+impl ParamValue {
+    /// The truth value, if it is one.
+    pub const fn as_bool(&self) -> Option<bool> {
+        if let Self::Bool(flag) = self {
+            Some(*flag)
+        } else {
+            None
+        }
+    }
+
+    /// The integer, if it is one.
+    pub const fn as_int(&self) -> Option<i32> {
+        if let Self::Int(number) = self {
+            Some(*number)
+        } else {
+            None
+        }
+    }
+
+    /// The number, if it is one; an integer counts, as people leave the `.0` away.
+    pub fn as_double(&self) -> Option<f64> {
+        if let Self::Double(number) = self {
+            Some(*number)
+        } else {
+            self.as_int().map(f64::from)
+        }
+    }
+
+    /// The text, if it is one.
+    pub fn as_str(&self) -> Option<&str> {
+        if let Self::String(text) = self {
+            Some(text)
+        } else {
+            None
+        }
+    }
+
+    /// The values of a list, if it is one.
+    pub fn as_list(&self) -> Option<&[Self]> {
+        if let Self::List(items) = self {
+            Some(items)
+        } else {
+            None
+        }
+    }
+
+    /// The parameters of a namespace, if it is one.
+    pub const fn as_map(&self) -> Option<&BTreeMap<String, Self>> {
+        if let Self::Map(members) = self {
+            Some(members)
+        } else {
+            None
+        }
+    }
+
+    /// `None` for a value that holds `<nil/>`, which no parameter is.
+    pub(crate) fn from_wire(value: Value) -> Option<Self> {
+        Some(match value {
+            Value::Bool(flag) => Self::Bool(flag),
+            Value::Int(number) => Self::Int(number),
+            Value::Double(number) => Self::Double(number),
+            Value::String(text) => Self::String(text),
+            Value::DateTime(text) => Self::DateTime(text),
+            Value::Binary(bytes) => Self::Binary(bytes),
+            Value::Array(items) => Self::List(
+                items
+                    .into_iter()
+                    .map(Self::from_wire)
+                    .collect::<Option<_>>()?,
+            ),
+            Value::Struct(members) => Self::Map(
+                members
+                    .into_iter()
+                    .map(|(name, member)| Some((name, Self::from_wire(member)?)))
+                    .collect::<Option<_>>()?,
+            ),
+            Value::Nil => return None,
+        })
+    }
+
+    pub(crate) fn into_wire(self) -> Value {
+        match self {
+            Self::Bool(flag) => Value::Bool(flag),
+            Self::Int(number) => Value::Int(number),
+            Self::Double(number) => Value::Double(number),
+            Self::String(text) => Value::String(text),
+            Self::DateTime(text) => Value::DateTime(text),
+            Self::Binary(bytes) => Value::Binary(bytes),
+            Self::List(items) => Value::Array(items.into_iter().map(Self::into_wire).collect()),
+            Self::Map(members) => Value::Struct(
+                members
+                    .into_iter()
+                    .map(|(name, member)| (name, member.into_wire()))
+                    .collect(),
+            ),
+        }
+    }
+}
+
+impl From<bool> for ParamValue {
+    fn from(flag: bool) -> Self {
+        Self::Bool(flag)
+    }
+}
+
+impl From<i32> for ParamValue {
+    fn from(number: i32) -> Self {
+        Self::Int(number)
+    }
+}
+
+impl From<f64> for ParamValue {
+    fn from(number: f64) -> Self {
+        Self::Double(number)
+    }
+}
+
+impl From<&str> for ParamValue {
+    fn from(text: &str) -> Self {
+        Self::String(text.to_owned())
+    }
+}
+
+impl From<String> for ParamValue {
+    fn from(text: String) -> Self {
+        Self::String(text)
+    }
+}
+
+impl<T: Into<Self>> From<Vec<T>> for ParamValue {
+    fn from(items: Vec<T>) -> Self {
+        items.into_iter().collect()
+    }
+}
+
+impl<T: Into<Self>> FromIterator<T> for ParamValue {
+    fn from_iter<I: IntoIterator<Item = T>>(items: I) -> Self {
+        Self::List(items.into_iter().map(Into::into).collect())
+    }
+}
+
+impl From<BTreeMap<String, Self>> for ParamValue {
+    fn from(members: BTreeMap<String, Self>) -> Self {
+        Self::Map(members)
+    }
+}
+
+impl<K: Into<String>, V: Into<Self>, const N: usize> From<[(K, V); N]> for ParamValue {
+    fn from(members: [(K, V); N]) -> Self {
+        let members = members.into_iter();
+        Self::Map(members.map(|(name, v)| (name.into(), v.into())).collect())
+    }
+}
+
+/// Fails with [`ParamError::IntRange`] past 32 bits.
+impl TryFrom<i64> for ParamValue {
+    type Error = ParamError;
+
+    fn try_from(number: i64) -> Result<Self, ParamError> {
+        let small = i32::try_from(number);
+        small
+            .map(Self::Int)
+            .map_err(|_| ParamError::IntRange(number.to_string()))
+    }
+}
+
+/// Fails with [`ParamError::IntRange`] past 31 bits.
+impl TryFrom<u64> for ParamValue {
+    type Error = ParamError;
+
+    fn try_from(number: u64) -> Result<Self, ParamError> {
+        let small = i32::try_from(number);
+        small
+            .map(Self::Int)
+            .map_err(|_| ParamError::IntRange(number.to_string()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn an_integer_past_32_bits_is_refused_and_not_cut() {
+        assert_eq!(ParamValue::try_from(-5_i64).unwrap(), ParamValue::Int(-5));
+        for refused in [
+            ParamValue::try_from(i64::from(i32::MAX) + 1),
+            ParamValue::try_from(u64::MAX),
+        ] {
+            assert!(matches!(refused, Err(ParamError::IntRange(_))));
+        }
+    }
+
+    #[test]
+    fn an_integer_serves_where_a_number_is_wanted_but_not_the_other_way() {
+        assert_eq!(ParamValue::from(2).as_double(), Some(2.0));
+        assert_eq!(ParamValue::from(2.0).as_int(), None);
+    }
+
+    #[test]
+    fn what_holds_a_nil_is_no_parameter() {
+        let list = Value::Array(vec![Value::Int(1), Value::Nil]);
+        assert_eq!(ParamValue::from_wire(list), None);
+    }
+
+    fn any_value() -> impl Strategy<Value = ParamValue> {
+        let leaf = prop_oneof![
+            any::<i32>().prop_map(ParamValue::Int),
+            any::<bool>().prop_map(ParamValue::Bool),
+            (-1e300..1e300).prop_map(ParamValue::Double),
+            ".*".prop_map(ParamValue::String),
+            prop::collection::vec(any::<u8>(), 0..9).prop_map(ParamValue::Binary),
+        ];
+        leaf.prop_recursive(4, 32, 4, |inner| {
+            prop_oneof![
+                prop::collection::vec(inner.clone(), 0..4).prop_map(ParamValue::List),
+                prop::collection::btree_map("[a-z]{1,4}", inner, 0..4).prop_map(ParamValue::Map),
+            ]
+        })
+    }
+
+    proptest! {
+        #[test]
+        fn a_value_goes_to_the_master_and_back_unchanged(value in any_value()) {
+            prop_assert_eq!(ParamValue::from_wire(value.clone().into_wire()), Some(value));
+        }
+    }
+}

@@ -1,0 +1,429 @@
+//! Offering a service: who may call, reading requests, running the handler, answering.
+
+use std::fmt;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use bytes::{BufMut, Bytes, BytesMut};
+use thiserror::Error;
+use tokio::io::AsyncReadExt;
+use tokio::net::TcpStream;
+use tokio::net::tcp::{ReadHalf, WriteHalf};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, watch};
+use tokio::task::JoinSet;
+use tokio::time::{sleep, timeout};
+
+use super::{DEFAULT_MAX_BODY, ServiceType};
+use crate::events;
+use crate::frame::{FrameTooLong, Frames};
+use crate::header::ConnectionHeader;
+use crate::inbox::Peer;
+use crate::node::Inner;
+use crate::topic_server::{DRAIN_LIMIT, Ended, STALL_LIMIT, until_closed, write};
+
+/// What a service does for its clients, at most.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ServiceOptions {
+    /// Longest request taken, in bytes. A longer one is answered with an error and closes its connection.
+    pub max_request: usize,
+    /// Clients connected at once, idle persistent ones included. One more is told so and turned away.
+    pub max_clients: usize,
+    /// How long the handler may take for one request. Past that it is dropped and the client told.
+    pub handler_timeout: Duration,
+}
+
+impl Default for ServiceOptions {
+    /// 64 MiB, 256 clients, one minute.
+    fn default() -> Self {
+        Self {
+            max_request: DEFAULT_MAX_BODY,
+            max_clients: 256,
+            handler_timeout: Duration::from_secs(60),
+        }
+    }
+}
+
+/// One request, as the handler of a service gets it.
+#[derive(Clone, Debug)]
+pub struct ServiceRequest {
+    /// The serialized request without its length. Its type is the service's, unless the client came with the
+    /// checksum `*`.
+    pub bytes: Bytes,
+    /// Who asks.
+    pub client: Arc<Peer>,
+}
+
+/// Offers one service. Dropping it withdraws the service: idle clients are disconnected at once, and one whose
+/// request is being handled gets its answer if that takes no more than a second.
+#[derive(Debug)]
+pub struct ServiceServer {
+    served: Arc<Served>,
+    node: Arc<Inner>,
+}
+
+impl ServiceServer {
+    pub(crate) const fn new(served: Arc<Served>, node: Arc<Inner>) -> Self {
+        Self { served, node }
+    }
+
+    /// The service's resolved name.
+    pub fn service(&self) -> &str {
+        &self.served.service
+    }
+
+    /// Requests taken so far, those that failed included.
+    pub fn calls(&self) -> u64 {
+        self.served.counters.calls.load(Ordering::Relaxed)
+    }
+
+    /// Requests that were answered with an error text.
+    pub fn failures(&self) -> u64 {
+        self.served.counters.failures.load(Ordering::Relaxed)
+    }
+
+    /// Bytes of the requests so far, without their lengths.
+    pub fn bytes_received(&self) -> u64 {
+        self.served.counters.received.load(Ordering::Relaxed)
+    }
+
+    /// Bytes of the answers so far, error texts included, without their lengths.
+    pub fn bytes_sent(&self) -> u64 {
+        self.served.counters.sent.load(Ordering::Relaxed)
+    }
+
+    /// Clients turned away so far: for their checksum, for being too many, or for breaking the protocol.
+    pub fn refused(&self) -> u64 {
+        self.served.counters.refused.load(Ordering::Relaxed)
+    }
+
+    /// Clients connected now.
+    pub fn clients(&self) -> usize {
+        let free = self.served.places.available_permits();
+        self.served.options.max_clients.saturating_sub(free)
+    }
+}
+
+impl Drop for ServiceServer {
+    fn drop(&mut self) {
+        self.served.close();
+        self.node.withdraw_service(&self.served);
+    }
+}
+
+type Answer = Pin<Box<dyn Future<Output = Result<Bytes, String>> + Send>>;
+
+/// An offered service, shared by its server and the tasks that serve its clients.
+pub(crate) struct Served {
+    pub(crate) service: String,
+    /// Tells this registration from an earlier one of the same service.
+    pub(crate) generation: u64,
+    pub(crate) counters: Counters,
+    service_type: ServiceType,
+    options: ServiceOptions,
+    handler: Box<dyn Fn(ServiceRequest) -> Answer + Send + Sync>,
+    places: Arc<Semaphore>,
+    closed: watch::Sender<bool>,
+    /// The node's count of connections to others.
+    draining: watch::Sender<usize>,
+}
+
+/// What a service has done.
+#[derive(Debug, Default)]
+pub(crate) struct Counters {
+    pub(crate) calls: AtomicU64,
+    pub(crate) failures: AtomicU64,
+    pub(crate) received: AtomicU64,
+    pub(crate) sent: AtomicU64,
+    pub(crate) refused: AtomicU64,
+}
+
+/// What a client that has introduced itself gets.
+#[derive(Debug)]
+pub(crate) enum Admitted {
+    /// It only wanted to see the header.
+    Probe,
+    /// Its requests are taken.
+    Client(Session),
+}
+
+impl Served {
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "all that a service is, named by the only caller"
+    )]
+    pub(crate) fn new<H, F>(
+        service: String,
+        service_type: ServiceType,
+        options: ServiceOptions,
+        generation: u64,
+        draining: watch::Sender<usize>,
+        handler: H,
+    ) -> Self
+    where
+        H: Fn(ServiceRequest) -> F + Send + Sync + 'static,
+        F: Future<Output = Result<Bytes, String>> + Send + 'static,
+    {
+        Self {
+            service,
+            generation,
+            counters: Counters::default(),
+            service_type,
+            options,
+            handler: Box::new(move |request| Box::pin(handler(request))),
+            places: Arc::new(Semaphore::new(
+                options.max_clients.min(Semaphore::MAX_PERMITS),
+            )),
+            closed: watch::Sender::new(false),
+            draining,
+        }
+    }
+
+    /// Ends the connections of idle clients, and of the others once they are answered.
+    pub(crate) fn close(&self) {
+        self.closed.send_replace(true);
+    }
+
+    /// What a client is told of this service and gets, or why it is turned away.
+    pub(crate) fn admit(
+        self: &Arc<Self>,
+        request: ConnectionHeader,
+        own_name: &str,
+    ) -> Result<(ConnectionHeader, Admitted), String> {
+        let admitted = self.check(&request).and_then(|()| self.take_in(request));
+        if admitted.is_err() {
+            self.counters.refused.fetch_add(1, Ordering::Relaxed);
+        }
+        let ours = &self.service_type;
+        let reply = ConnectionHeader::default()
+            .with("callerid", own_name)
+            .with("service", &*self.service)
+            .with("md5sum", &*ours.md5sum)
+            .with("type", &*ours.name)
+            .with("request_type", &*ours.request_type)
+            .with("response_type", &*ours.response_type);
+        Ok((reply, admitted?))
+    }
+
+    fn check(&self, request: &ConnectionHeader) -> Result<(), String> {
+        let Some(md5sum) = request.md5sum() else {
+            return Err(
+                "bogus tcpros header. did not have the required elements: md5sum".to_owned(),
+            );
+        };
+        let ours = &self.service_type.md5sum;
+        if md5sum == "*" || md5sum == ours {
+            return Ok(());
+        }
+        Err(format!(
+            "client wants service {} to have md5sum {md5sum}, but it has {ours}. Dropping connection.",
+            self.service
+        ))
+    }
+
+    fn take_in(self: &Arc<Self>, request: ConnectionHeader) -> Result<Admitted, String> {
+        if *self.closed.borrow() {
+            return Err(nonexistent(&self.service));
+        }
+        if request.get("probe") == Some("1") {
+            return Ok(Admitted::Probe);
+        }
+        let place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| {
+            format!(
+                "service [{}] has {} clients and takes no more",
+                self.service, self.options.max_clients
+            )
+        })?;
+        let persistent = request
+            .get("persistent")
+            .is_some_and(|asked| asked == "1" || asked.eq_ignore_ascii_case("true"));
+        self.draining.send_modify(|open| *open += 1);
+        Ok(Admitted::Client(Session {
+            served: Arc::clone(self),
+            client: Arc::new(Peer {
+                caller_id: request.caller_id().to_owned(),
+                header: request,
+            }),
+            persistent,
+            _place: place,
+        }))
+    }
+
+    async fn withdrawn(&self) {
+        // An error would be the end as well, and cannot be: the sender is `self`'s.
+        let _end = self
+            .closed
+            .subscribe()
+            .wait_for(|closed| *closed)
+            .await
+            .is_ok();
+    }
+}
+
+impl fmt::Debug for Served {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Served")
+            .field("service", &self.service)
+            .field("service_type", &self.service_type)
+            .field("counters", &self.counters)
+            .finish_non_exhaustive()
+    }
+}
+
+/// The words of roscpp for a service that is not here.
+pub(crate) fn nonexistent(service: &str) -> String {
+    format!("received a tcpros connection for a nonexistent service [{service}]")
+}
+
+/// One client's place at a service, given up on drop.
+#[derive(Debug)]
+pub(crate) struct Session {
+    served: Arc<Served>,
+    client: Arc<Peer>,
+    persistent: bool,
+    _place: OwnedSemaphorePermit,
+}
+
+impl Session {
+    /// Takes requests and answers them until the client, or the service, has had enough.
+    pub(crate) async fn serve(self, stream: &mut TcpStream) -> Result<(), ClientFault> {
+        let served = &self.served;
+        let (mut reader, mut writer) = stream.split();
+        let mut frames = Frames::new(served.options.max_request);
+        loop {
+            let request = match self.request(&mut reader, &mut frames).await {
+                Ok(Some(request)) => request,
+                Ok(None) => return Ok(()),
+                Err(fault) => {
+                    served.counters.refused.fetch_add(1, Ordering::Relaxed);
+                    if let ClientFault::TooLong(_) = fault {
+                        self.answer(&mut writer, Err(fault.to_string())).await?;
+                        // A client that is still writing would not read the answer of a connection that is reset.
+                        let gone = timeout(DRAIN_LIMIT, until_closed(&mut reader)).await;
+                        tracing::trace!(?gone, "a client with too long a request has been told");
+                    }
+                    return Err(fault);
+                }
+            };
+            let result = self.handle(request).await;
+            self.answer(&mut writer, result).await?;
+            if !self.persistent {
+                return Ok(());
+            }
+        }
+    }
+
+    /// The next request, `None` when there will be none.
+    async fn request(
+        &self,
+        reader: &mut ReadHalf<'_>,
+        frames: &mut Frames,
+    ) -> Result<Option<Bytes>, ClientFault> {
+        loop {
+            if let Some(request) = frames.next()? {
+                return Ok(Some(request));
+            }
+            let begun = !frames.is_empty();
+            tokio::select! {
+                read = reader.read_buf(frames.room()) => match read {
+                    Ok(0) if begun => return Err(ClientFault::Half),
+                    Ok(0) => return Ok(None),
+                    Ok(read) => frames.filled(read),
+                    Err(error) if begun => return Err(error.into()),
+                    // It leaves without having asked anything: no matter how.
+                    Err(_) => return Ok(None),
+                },
+                () = sleep(STALL_LIMIT), if begun || !self.persistent => {
+                    return Err(ClientFault::Silent(STALL_LIMIT));
+                }
+                () = self.served.withdrawn() => return Ok(None),
+            }
+        }
+    }
+
+    /// Runs the handler, in a task of its own: a panic ends that alone, and one that is given up ends with the set.
+    async fn handle(&self, bytes: Bytes) -> Result<Bytes, String> {
+        let served = Arc::clone(&self.served);
+        count(&served.counters.received, bytes.len());
+        let request = ServiceRequest {
+            bytes,
+            client: Arc::clone(&self.client),
+        };
+        let mut call = JoinSet::new();
+        call.spawn(async move { (served.handler)(request).await });
+        let limit = self.served.options.handler_timeout;
+        let given_up = tokio::select! {
+            biased;
+            Some(done) = call.join_next() => match done {
+                Ok(result) => return result,
+                Err(_) => "its handler panicked".to_owned(),
+            },
+            () = sleep(limit) => format!("its handler gave no answer within {limit:?}"),
+            () = self.overdue() => "it is being withdrawn".to_owned(),
+        };
+        events::service_failed(&self.served.service, &self.client.caller_id, &given_up);
+        Err(format!("service [{}]: {given_up}", self.served.service))
+    }
+
+    async fn answer(
+        &self,
+        writer: &mut WriteHalf<'_>,
+        result: Result<Bytes, String>,
+    ) -> Result<(), ClientFault> {
+        let too_long = |bytes: &Bytes| u32::try_from(bytes.len()).is_err();
+        let (ok, body) = match result {
+            Ok(body) if too_long(&body) => (
+                0,
+                Bytes::from_static(b"the answer is longer than TCPROS can say"),
+            ),
+            Ok(body) => (1, body),
+            Err(text) => (0, Bytes::from(text)),
+        };
+        let counters = &self.served.counters;
+        // Counted before the client can know, so that whoever has an answer finds it counted.
+        counters.calls.fetch_add(1, Ordering::Relaxed);
+        counters
+            .failures
+            .fetch_add(u64::from(ok == 0), Ordering::Relaxed);
+        count(&counters.sent, body.len());
+        let mut head = BytesMut::with_capacity(5);
+        head.put_u8(ok);
+        head.put_u32_le(u32::try_from(body.len()).unwrap_or(u32::MAX));
+        let overdue = std::pin::pin!(self.overdue());
+        write(writer, head.freeze(), body, overdue)
+            .await
+            .map_err(ClientFault::Answer)
+    }
+
+    /// Waits until the service has been withdrawn long enough for what was in progress then.
+    async fn overdue(&self) {
+        self.served.withdrawn().await;
+        sleep(DRAIN_LIMIT).await;
+    }
+}
+
+impl Drop for Session {
+    fn drop(&mut self) {
+        self.served.draining.send_modify(|open| *open -= 1);
+    }
+}
+
+fn count(counter: &AtomicU64, bytes: usize) {
+    counter.fetch_add(u64::try_from(bytes).unwrap_or(u64::MAX), Ordering::Relaxed);
+}
+
+/// What a client did wrong, or could not do.
+#[derive(Debug, Error)]
+pub(crate) enum ClientFault {
+    #[error(transparent)]
+    TooLong(#[from] FrameTooLong),
+    #[error("it closed the connection within a request")]
+    Half,
+    #[error("it sent nothing of its request for {0:?}")]
+    Silent(Duration),
+    #[error("its request was cut off: {0}")]
+    Io(#[from] std::io::Error),
+    #[error("it did not take the answer: {0}")]
+    Answer(Ended),
+}

@@ -1,0 +1,192 @@
+//! The node and its master: late, restarted, and told of everything that comes and goes.
+
+use std::time::Duration;
+
+use bytes::Bytes;
+use tcpros::{
+    Core, Inbox, InboxEvent, MasterState, Node, NodeError, Publisher, PublisherOptions, TopicType,
+};
+
+use crate::support::*;
+
+#[tokio::test]
+async fn a_node_that_starts_before_its_master_registers_when_it_comes() {
+    let placeholder = core();
+    let address = placeholder.address();
+    drop(placeholder);
+    let early = Node::start(options("early", &format!("http://{address}"))).unwrap();
+    let _publisher = advertise(&early, "/t", PublisherOptions::default());
+    assert_eq!(*early.master_state().borrow(), MasterState::Awaited);
+    let core = within("the port", async {
+        loop {
+            match Core::start(address) {
+                Ok(core) => return core,
+                Err(_) => tokio::task::yield_now().await,
+            }
+        }
+    })
+    .await;
+    registered(&early).await;
+    let graph = early.graph().await.unwrap();
+    assert_eq!(graph.publishers["/t"], ["/early"]);
+    assert_eq!(graph.types["/t"], "std_msgs/String");
+    drop(core);
+}
+
+#[tokio::test]
+async fn after_a_restart_of_the_master_all_is_registered_again_and_links_have_stayed() {
+    let core = core();
+    let address = core.address();
+    let (talker, listener) = (node("talker", &core), node("listener", &core));
+    let mut inbox = Inbox::new();
+    let subscription = subscribe(&listener, "/t", &inbox);
+    let publisher = advertise(&talker, "/t", PublisherOptions::default());
+    eventually("the link", || publisher.subscribers() == 1).await;
+    registered(&listener).await;
+    drop(core);
+    let mut state = talker.master_state();
+    within("the loss", state.wait_for(|s| *s == MasterState::Awaited))
+        .await
+        .unwrap();
+    assert_eq!(publisher.publish(Bytes::from_static(b"without")).sent_to, 1);
+    assert_eq!(message(&mut inbox).await.bytes, b"without".as_slice());
+
+    let _core = Core::start(address).unwrap();
+    within("the new registrations", async {
+        loop {
+            let graph = talker.graph().await.unwrap_or_default();
+            let known =
+                |of: &std::collections::BTreeMap<String, Vec<String>>| of.contains_key("/t");
+            if known(&graph.publishers) && known(&graph.subscribers) {
+                return;
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    })
+    .await;
+    assert_eq!((publisher.subscribers(), subscription.publishers()), (1, 1));
+    assert_eq!(publisher.publish(Bytes::from_static(b"again")).sent_to, 1);
+    assert_eq!(message(&mut inbox).await.bytes, b"again".as_slice());
+}
+
+#[tokio::test]
+async fn shutdown_leaves_nothing_in_the_master_and_delivers_what_was_queued() {
+    let core = core();
+    let (talker, listener) = (node("talker", &core), node("listener", &core));
+    let mut inbox = Inbox::new();
+    let mut held: Vec<Publisher> = (0..40)
+        .map(|n| advertise(&talker, &format!("/t{n}"), Default::default()))
+        .collect();
+    let own = subscribe(&talker, "/own", &inbox);
+    let _subscription = subscribe(&listener, "/t0", &inbox);
+    eventually("the link", || held[0].subscribers() == 1).await;
+    registered(&talker).await;
+    assert_eq!(held[0].publish(Bytes::from_static(b"farewell")).sent_to, 1);
+    drop(held.pop());
+    within("the shutdown", talker.shutdown()).await;
+    let graph = listener.graph().await.unwrap();
+    assert_eq!(graph.publishers.len(), 0);
+    assert_eq!(graph.subscribers.keys().collect::<Vec<_>>(), ["/t0"]);
+    assert_eq!(message(&mut inbox).await.bytes, b"farewell".as_slice());
+    assert_eq!(held[0].publish(Bytes::new()).sent_to, 0);
+    drop(own);
+}
+
+#[tokio::test]
+async fn a_dropped_publisher_leaves_the_graph_and_its_subscribers_learn_it() {
+    let core = core();
+    let (talker, listener) = (node("talker", &core), node("listener", &core));
+    let mut inbox = Inbox::new();
+    let subscription = subscribe(&listener, "/t", &inbox);
+    let publisher = advertise(&talker, "/t", PublisherOptions::default());
+    within("the link", async {
+        while !matches!(
+            inbox.recv().await.1,
+            InboxEvent::Peer {
+                connected: true,
+                publishers: 1,
+                ..
+            }
+        ) {}
+    })
+    .await;
+    drop(publisher);
+    within("the end", async {
+        while !matches!(
+            inbox.recv().await.1,
+            InboxEvent::Peer {
+                connected: false,
+                publishers: 0,
+                ..
+            }
+        ) {}
+    })
+    .await;
+    assert_eq!(subscription.publishers(), 0);
+    // The topic may be taken again at once, as another type.
+    let other = TopicType {
+        name: "std_msgs/Other".to_owned(),
+        ..string()
+    };
+    let again = talker
+        .advertise("/t", other, PublisherOptions::default())
+        .unwrap();
+    eventually("the link", || again.subscribers() == 1).await;
+    assert_eq!(talker.graph().await.unwrap().types["/t"], "std_msgs/Other");
+}
+
+#[tokio::test]
+async fn a_topic_is_published_once_and_with_a_whole_type() {
+    let core = core();
+    let talker = node("talker", &core);
+    let _publisher = advertise(&talker, "/t", PublisherOptions::default());
+    let twice = talker.advertise("t", string(), PublisherOptions::default());
+    assert!(matches!(twice, Err(NodeError::AlreadyPublished(topic)) if topic == "/t"));
+    let any = TopicType {
+        md5sum: "*".to_owned(),
+        ..string()
+    };
+    assert!(matches!(
+        talker.advertise("/u", any, Default::default()),
+        Err(NodeError::Type { .. })
+    ));
+    let named = talker.advertise("/a b", string(), Default::default());
+    assert!(matches!(named, Err(NodeError::Name(_))));
+}
+
+#[tokio::test]
+async fn two_hundred_topics_leave_no_file_descriptor_behind() {
+    let open = || std::fs::read_dir("/proc/self/fd").unwrap().count();
+    let core = core();
+    let (talker, listener) = (node("talker", &core), node("listener", &core));
+    registered(&talker).await;
+    registered(&listener).await;
+    let alive = || {
+        tokio::runtime::Handle::current()
+            .metrics()
+            .num_alive_tasks()
+    };
+    eventually("quiet", || alive() <= 9).await;
+    let (files, tasks) = (open(), alive());
+    let inbox = Inbox::new();
+    let topics: Vec<String> = (0..200).map(|n| format!("/t{n}")).collect();
+    let publishers: Vec<_> = topics
+        .iter()
+        .map(|t| advertise(&talker, t, PublisherOptions::default()))
+        .collect();
+    let subscriptions: Vec<_> = topics
+        .iter()
+        .map(|t| subscribe(&listener, t, &inbox))
+        .collect();
+    eventually("all links", || {
+        publishers.iter().all(|p| p.subscribers() == 1)
+    })
+    .await;
+    assert!(open() >= files + 400);
+    drop((publishers, subscriptions));
+    // Up to the few connections of the watchdogs, which come and go.
+    eventually("the end of all links", || {
+        open() <= files + 4 && alive() <= tasks + 4
+    })
+    .await;
+}

@@ -1,0 +1,99 @@
+"""An actionlib client. Lines of standard input tell it what to do: `send N` sends the goal N and calls it by the count
+of goals so far, `cancel COUNT` cancels that goal, `cancel_all` all. It prints what it hears of its goals."""
+
+import argparse
+import sys
+
+import actionlib
+import rospy
+
+import lifetime
+from ros1_actions import TestAction, TestGoal, start, status_name
+
+
+class Many:
+    """ActionClient: goals side by side."""
+
+    def __init__(self, name):
+        self.client = actionlib.ActionClient(name, TestAction)
+        self.sent = []
+
+    def send(self, number):
+        count = len(self.sent)
+
+        def transition(handle):
+            state = actionlib.CommState.to_string(handle.get_comm_state())
+            lifetime.say(count=count, state=state)
+            if state == "DONE":
+                result = handle.get_result()
+                lifetime.say(
+                    count=count,
+                    end=status_name(handle.get_terminal_state()),
+                    text=handle.get_goal_status_text(),
+                    result=result.result if result else None,
+                )
+
+        def feedback(_handle, feedback):
+            lifetime.say(count=count, feedback=feedback.feedback)
+
+        self.sent.append(self.client.send_goal(TestGoal(goal=number), transition, feedback))
+
+    def cancel(self, count):
+        self.sent[count].cancel()
+
+    def cancel_all(self):
+        self.client.cancel_all_goals()
+
+
+class Simple:
+    """SimpleActionClient: follows the last goal only."""
+
+    def __init__(self, name):
+        self.client = actionlib.SimpleActionClient(name, TestAction)
+        self.count = 0
+
+    def send(self, number):
+        count = self.count
+        self.count += 1
+
+        def done(status, result):
+            text = self.client.get_goal_status_text()
+            lifetime.say(count=count, end=status_name(status), text=text, result=result.result)
+
+        self.client.send_goal(
+            TestGoal(goal=number),
+            done,
+            lambda: lifetime.say(count=count, state="ACTIVE"),
+            lambda feedback: lifetime.say(count=count, feedback=feedback.feedback),
+        )
+
+    def cancel(self, _count):
+        self.client.cancel_goal()
+
+    def cancel_all(self):
+        self.client.cancel_all_goals()
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("name")
+    parser.add_argument("--node", default="rospy_action_client")
+    parser.add_argument("--simple", action="store_true")
+    parser.add_argument("--clock-offset", type=float, default=0.0)
+    parser.add_argument("--limit", type=float, default=120.0)
+    args = parser.parse_args()
+    lifetime.limit(args.limit)
+    start(args.node, args.clock_offset)
+    driving = (Simple if args.simple else Many)(args.name)
+    found = driving.client.wait_for_server(rospy.Duration(30.0))
+    if not found:
+        sys.exit("no server was found")
+    lifetime.say(ready=args.name)
+    for line in sys.stdin:
+        word, *numbers = line.split()
+        getattr(driving, word)(*map(int, numbers))
+        lifetime.say(told=line.strip())
+    rospy.spin()
+
+
+main()

@@ -1,0 +1,181 @@
+//! Images of ten megabytes between ROS 1 and the space, in chunks.
+
+use std::collections::BTreeSet;
+use std::time::{Duration, Instant};
+
+use system_tests::{Cell, METRICS_ROS1, Peer, UadpSocket, eventually, metrics};
+use uadp::{
+    ChunkBudget, Chunks, DataSetHeader, DataSetMessage, Extras, GroupHeader, NetworkHeader,
+    NetworkMessage, NetworkMessageEncoder, NetworkMessageType, PublisherId, Reassembler,
+    ReassemblyLimits, Scalar, Timestamp, Variant, Whole,
+};
+
+const SOON: Duration = Duration::from_secs(60);
+const SIZE: usize = 10_000_000;
+
+/// As `ros1_image.py` fills image `number`.
+fn pattern(number: u32) -> Vec<u8> {
+    (0..SIZE)
+        .map(|at| u8::try_from((number as usize + at) % 251).unwrap())
+        .collect()
+}
+
+/// The height of an image, which is its number, and its data.
+fn image<'a>(message: &DataSetMessage<'a>) -> (u32, &'a [u8]) {
+    let fields: Vec<_> = message.fields().unwrap().map(Result::unwrap).collect();
+    match fields[..] {
+        [
+            _,
+            _,
+            Variant::Scalar(Scalar::UInt32(height)),
+            _,
+            _,
+            _,
+            _,
+            Variant::Scalar(Scalar::ByteString(Some(data))),
+        ] => (height, data),
+        ref other => panic!("no image: {} fields", other.len()),
+    }
+}
+
+#[test]
+fn images_of_ten_megabytes_leave_ros_1_as_they_were_and_a_button_beside_them_loses_nothing() {
+    const IMAGES: u32 = 20;
+    const PRESSES: u32 = 200;
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let group = UadpSocket::join();
+    let _bridge = cell.bridge_ros1(&[]);
+    let count = IMAGES.to_string();
+    let _camera = cell.rospy("ros1_image.py", &["pub", "/ua_1_5_10", "--count", &count]);
+    let presses = PRESSES.to_string();
+    let button = ["/ua_1_5_11", "std_msgs/String", "--numbered", &presses];
+    let paced = ["--rate", "50", "--wait-subscribers", "1"];
+    let _button = cell.rospy("ros1_pub.py", &[&button[..], &paced].concat());
+
+    let mut reassembler = Reassembler::new(ReassemblyLimits {
+        pieces: 1000,
+        ..ReassemblyLimits::default()
+    });
+    let (mut images, mut pressed) = (BTreeSet::new(), BTreeSet::new());
+    let start = Instant::now();
+    while images.len() < IMAGES as usize || pressed.len() < PRESSES as usize {
+        assert!(
+            start.elapsed() < SOON,
+            "{} images and {} presses came; {:?}; {:?}",
+            images.len(),
+            pressed.len(),
+            reassembler.counters(),
+            metrics(METRICS_ROS1)
+        );
+        let Some(datagram) = group.receive(Duration::from_millis(100)) else {
+            continue;
+        };
+        let message = NetworkMessage::decode(&datagram).unwrap();
+        if message.is_chunk() {
+            let whole = reassembler.receive(&message, start.elapsed()).unwrap();
+            if let Some(whole) = whole {
+                let message = whole.data_set_message().unwrap();
+                let (number, data) = image(&message);
+                assert!(data == pattern(number), "image {number} has other bytes");
+                images.insert(number);
+            }
+            continue;
+        }
+        for message in message.messages().map(Result::unwrap) {
+            // Keep-alives have no fields.
+            let field = message.fields().ok().and_then(|mut fields| fields.next());
+            if let Some(Ok(Variant::Scalar(Scalar::String(Some(text))))) = field {
+                pressed.insert(text.parse::<u32>().unwrap());
+            }
+        }
+    }
+    assert!(images.into_iter().eq(0..IMAGES));
+    assert!(pressed.into_iter().eq(0..PRESSES));
+}
+
+/// Sends an image of space 2 as the chunks a writer makes of it.
+fn send_image(group: &UadpSocket, number: u32, sequence: u16) {
+    let now = std::time::SystemTime::now()
+        .duration_since(std::time::UNIX_EPOCH)
+        .unwrap();
+    let stamp = Timestamp::from_unix_nanos(i128::try_from(now.as_nanos()).unwrap());
+    let mut encoded = Vec::new();
+    let mut message =
+        NetworkMessageEncoder::new(&mut encoded, &NetworkHeader::default(), None).unwrap();
+    let header = DataSetHeader {
+        sequence_number: Some(sequence),
+        timestamp: Some(stamp.time),
+        picoseconds: Some(stamp.picoseconds),
+        ..DataSetHeader::default()
+    };
+    let data = pattern(number);
+    let mut fields = message.key_frame(&header).unwrap();
+    for field in [
+        Scalar::DateTime(stamp.time),
+        Scalar::String(Some("camera")),
+        Scalar::UInt32(number),
+        Scalar::UInt32(1),
+        Scalar::String(Some("mono8")),
+        Scalar::Byte(0),
+        Scalar::UInt32(1),
+        Scalar::ByteString(Some(&data)),
+    ] {
+        fields.scalar(field).unwrap();
+    }
+    fields.finish().unwrap();
+    message.finish().unwrap();
+    let whole = Whole {
+        message_type: NetworkMessageType::DataSet,
+        writer_id: Some(10),
+        message_sequence_number: sequence,
+        bytes: &encoded[1..],
+    };
+    let header = NetworkHeader {
+        publisher_id: Some(PublisherId::UInt16(2)),
+        group: Some(GroupHeader {
+            writer_group_id: Some(5),
+            ..GroupHeader::default()
+        }),
+        ..NetworkHeader::default()
+    };
+    let budget = ChunkBudget {
+        network_message: 65_507,
+        trailer: 0,
+    };
+    let extras = Extras::default();
+    let mut chunks = Chunks::new(&header, &extras, whole, budget).unwrap();
+    let mut datagram = Vec::new();
+    while let Some(written) = chunks.append(&mut datagram, &extras) {
+        written.unwrap();
+        group.send(&datagram);
+        datagram.clear();
+        // The pace of a sender: a socket buffer holds less than an image.
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+#[test]
+fn images_of_ten_megabytes_from_the_space_reach_a_rospy_subscriber_as_they_were() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let group = UadpSocket::join();
+    let _bridge = cell.bridge_ros1(&[]);
+    let mut subscriber = cell.rospy("ros1_image.py", &["sub", "/ua_2_5_10"]);
+    let mut sequence = 0;
+    eventually("five images came as they were", SOON, || {
+        send_image(&group, u32::from(sequence), sequence);
+        sequence += 1;
+        let heard = subscriber.json_lines();
+        let heard: Vec<_> = heard
+            .iter()
+            .filter(|line| line.get("number").is_some())
+            .collect();
+        assert!(heard.iter().all(|line| line["right"] == true), "{heard:?}");
+        (heard.len() >= 5).then_some(())
+    });
+}
