@@ -282,5 +282,5 @@ fn integers(xml: &str) -> impl Iterator<Item = u16> + '_ {
 pub const PATIENCE: Duration = Duration::from_secs(2);
 /// Python and a ROS graph on a busy machine need seconds to come up.
 const START: Duration = Duration::from_secs(30);
-/// A read takes what is there, up to here.
-const READ_AT_ONCE: usize = 64 * 1024;
+/// A read takes what is there, up to here; what a longer message still lacks is read in place, without a copy.
+const READ_AT_ONCE: usize = 4 * 1024;
