@@ -460,7 +460,7 @@ mod tests {
         hub.latch(message("2"), Latched::Beside(20));
         let _again = hub.publish(message("4"), Latched::Beside(30));
         let late = async |id| {
-            let late = hub.join(id, "/late").unwrap();
+            let late = hub.join(id, "/late", String::new()).unwrap();
             let mut taken = Vec::new();
             late.subscriber.outbox.take(&mut taken, 64).await;
             taken
