@@ -1,53 +1,60 @@
-//! Repeats a topic of any type under another name: `relay IN OUT`.
+//! Repeats topics of any type under other names: `relay IN OUT [IN OUT]..`.
 //!
-//! The type is not known beforehand: it comes from the connection header of the first publisher.
+//! The types are not known beforehand: they come from the connection headers of the first publishers.
+
+use std::collections::HashMap;
+use std::error::Error;
+use std::pin::pin;
+use std::sync::Arc;
 
 use tcpros::{
-    Inbox, InboxEvent, Node, NodeOptions, Peer, Publisher, PublisherOptions, SubscriberOptions,
-    TopicType, Wanted,
+    Inbox, InboxEvent, Node, NodeError, NodeOptions, Peer, Publisher, PublisherOptions,
+    SubscriberOptions, TopicType, Wanted,
 };
 use tokio::signal::unix::{SignalKind, signal};
 
 #[tokio::main(flavor = "current_thread")]
-async fn main() -> Result<(), Box<dyn std::error::Error>> {
+async fn main() -> Result<(), Box<dyn Error + Send + Sync>> {
     tracing_subscriber::fmt()
         .with_writer(std::io::stderr)
         .init();
+    // As a task of its own: waking the future of `main` costs a system call for each message.
+    tokio::spawn(relay()).await?
+}
+
+async fn relay() -> Result<(), Box<dyn Error + Send + Sync>> {
     let mut options = NodeOptions::from_env("relay");
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let topics = options.apply_arguments(&arguments)?;
-    let [input, output] = topics.as_slice() else {
-        return Err("relay IN OUT".into());
+    let (pairs, []) = topics.as_chunks::<2>() else {
+        return Err("relay IN OUT [IN OUT]..".into());
     };
     let node = Node::start(options)?;
     let mut inbox = Inbox::new();
-    let _subscription = node.subscribe(
-        input,
-        Wanted::default(),
-        SubscriberOptions::default(),
-        (),
-        &inbox,
-    )?;
-    let mut publisher: Option<Publisher> = None;
-    let mut terminate = signal(SignalKind::terminate())?;
-    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut subscriptions = Vec::new();
+    for [input, output] in pairs {
+        let (wanted, queue) = (Wanted::default(), SubscriberOptions::default());
+        let output: Arc<str> = output.as_str().into();
+        subscriptions.push(node.subscribe(input, wanted, queue, output, &inbox)?);
+    }
+    let mut publishers: HashMap<Arc<str>, Publisher> = HashMap::new();
+    let mut stop = pin!(stop(&node)?);
     loop {
-        let event = tokio::select! {
-            ((), event) = inbox.recv() => event,
-            _ = terminate.recv() => break,
-            _ = interrupt.recv() => break,
-            _ = node.shutdown_requested() => break,
+        let (output, event) = tokio::select! {
+            event = inbox.recv() => event,
+            () = &mut stop => break,
         };
         match event {
             InboxEvent::Peer {
                 connected: true,
                 peer,
                 ..
-            } if publisher.is_none() => {
-                publisher = Some(repeat(&node, output, &peer)?);
+            } if !publishers.contains_key(&output) => {
+                let publisher = advertise(&node, &output, &peer)?;
+                publishers.insert(output, publisher);
             }
             InboxEvent::Message(message) => {
-                if let Some(publisher) = &publisher {
+                if let Some(publisher) = publishers.get(&output) {
                     // Losses of slow subscribers are counted by the publisher.
                     let _published = publisher.publish(message.bytes);
                 }
@@ -55,12 +62,26 @@ async fn main() -> Result<(), Box<dyn std::error::Error>> {
             InboxEvent::Peer { .. } | InboxEvent::Dropped(_) => {}
         }
     }
-    drop(publisher);
+    drop(publishers);
     node.shutdown().await;
     Ok(())
 }
 
-fn repeat(node: &Node, topic: &str, peer: &Peer) -> Result<Publisher, tcpros::NodeError> {
+/// Ends when a signal asks for it, or the master.
+fn stop(node: &Node) -> std::io::Result<impl Future<Output = ()> + use<>> {
+    let mut terminate = signal(SignalKind::terminate())?;
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let asked = node.shutdown_requested();
+    Ok(async move {
+        tokio::select! {
+            _ = terminate.recv() => {}
+            _ = interrupt.recv() => {}
+            _ = asked => {}
+        }
+    })
+}
+
+fn advertise(node: &Node, topic: &str, peer: &Peer) -> Result<Publisher, NodeError> {
     let field = |text: Option<&str>| text.unwrap_or_default().to_owned();
     let topic_type = TopicType {
         name: field(peer.header.type_name()),

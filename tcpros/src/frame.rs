@@ -10,6 +10,8 @@ pub(crate) struct Frames {
     limit: usize,
     /// What one read may take; grows while reads fill it, so that idle links stay small.
     window: usize,
+    /// What the last message took, its length included: the next one is likely to need as much.
+    last: usize,
 }
 
 impl Frames {
@@ -18,6 +20,7 @@ impl Frames {
             buffer: BytesMut::with_capacity(MIN_WINDOW),
             limit,
             window: MIN_WINDOW,
+            last: 0,
         }
     }
 
@@ -38,7 +41,8 @@ impl Frames {
         if self.buffer.len() - 4 < len {
             return Ok(None);
         }
-        let frame = self.buffer.split_to(4 + len).freeze();
+        self.last = 4 + len;
+        let frame = self.buffer.split_to(self.last).freeze();
         Ok(Some(frame.slice(4..)))
     }
 
@@ -47,14 +51,16 @@ impl Frames {
         self.buffer.is_empty()
     }
 
-    /// The buffer with room for the next read. What a peer announces is believed only as far as it delivers: the
-    /// buffer at most doubles past `TRUSTED`.
+    /// The buffer with room for the next read: for what is missing of a message, or for one like the last, so that
+    /// messages of one size are not read in two pieces and moved. What a peer announces is believed only as far as
+    /// it delivers: the buffer at most doubles past `TRUSTED`.
     pub(crate) fn room(&mut self) -> &mut BytesMut {
         let missing = match self.buffer.split_first_chunk::<4>() {
             Some((len, rest)) => usize::try_from(u32::from_le_bytes(*len))
                 .unwrap_or(usize::MAX)
                 .saturating_sub(rest.len()),
-            None => 0,
+            // A byte more: a read that leaves room has emptied the socket, and needs no second one to find that out.
+            None => (self.last + 1).saturating_sub(self.buffer.len()),
         };
         let trusted = TRUSTED.max(self.buffer.len());
         let wanted = missing.min(trusted).max(1);
@@ -120,6 +126,19 @@ mod tests {
         frames.room().put_u32_le(u32::MAX);
         assert_eq!(frames.next(), Ok(None));
         assert!(frames.room().capacity() < 2 * TRUSTED);
+    }
+
+    #[test]
+    fn there_is_always_more_room_than_a_message_like_the_last_one_takes() {
+        let wire = wire(&[vec![7; 1000]]);
+        let mut frames = Frames::new(1000);
+        for _ in 0..20 {
+            let room = frames.room();
+            assert!(room.len() + wire.len() < room.capacity());
+            room.put_slice(&wire);
+            frames.filled(wire.len());
+            assert_eq!(frames.next().unwrap().unwrap().len(), 1000);
+        }
     }
 
     #[test]

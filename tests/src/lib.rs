@@ -9,6 +9,7 @@
 //! A peer that this machine does not have skips the test with the reason; with `CI=true` that is a failure.
 
 mod arrows;
+mod bare_node;
 mod capture;
 mod cell;
 mod child;
@@ -18,10 +19,11 @@ mod programs;
 mod wait;
 
 pub use arrows::{forbidden, tree};
+pub use bare_node::{BareNode, BareSubscription, PATIENCE, string_frame};
 pub use capture::{Capture, Dissected, hex, is_true};
 pub use cell::{Cell, Peer};
 pub use child::{Child, Started};
-pub use net::{GROUP, UadpSocket, http_get, metrics, xml_rpc};
+pub use net::{GROUP, UadpSocket, group_member, http_get, metrics, xml_rpc};
 pub use peers::MASTER;
 pub use programs::{
     METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, SERVER_ENDPOINT, drops, number, program,

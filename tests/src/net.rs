@@ -7,7 +7,7 @@ use std::{
 };
 
 use serde_json::Value;
-use socket2::{Domain, Protocol, Socket, Type};
+use socket2::{Domain, Protocol, SockRef, Socket, Type};
 
 /// The group and port programs use that are told nothing else.
 pub const GROUP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 40), 4840);
@@ -24,16 +24,11 @@ impl UadpSocket {
     /// When the socket cannot be made.
     #[must_use]
     pub fn join() -> Self {
-        let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP)).unwrap();
-        socket.set_reuse_address(true).unwrap();
-        socket.set_recv_buffer_size(4 << 20).unwrap();
-        socket.bind(&GROUP.into()).unwrap();
-        socket
-            .join_multicast_v4(GROUP.ip(), &Ipv4Addr::LOCALHOST)
-            .unwrap();
-        socket.set_multicast_if_v4(&Ipv4Addr::LOCALHOST).unwrap();
-        socket.set_multicast_loop_v4(true).unwrap();
-        Self(socket.into())
+        let socket = group_member(GROUP);
+        let options = SockRef::from(&socket);
+        options.set_multicast_if_v4(&Ipv4Addr::LOCALHOST).unwrap();
+        options.set_multicast_loop_v4(true).unwrap();
+        Self(socket)
     }
 
     /// Sends one datagram to the group.
@@ -80,6 +75,22 @@ impl UadpSocket {
     pub fn drain(&self) {
         while self.receive(Duration::from_millis(1)).is_some() {}
     }
+}
+
+/// A socket that hears a group on loopback, with room for bursts.
+///
+/// # Panics
+/// When the socket cannot be made.
+#[must_use]
+pub fn group_member(group: SocketAddrV4) -> UdpSocket {
+    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP)).unwrap();
+    socket.set_reuse_address(true).unwrap();
+    socket.set_recv_buffer_size(4 << 20).unwrap();
+    socket.bind(&group.into()).unwrap();
+    socket
+        .join_multicast_v4(group.ip(), &Ipv4Addr::LOCALHOST)
+        .unwrap();
+    socket.into()
 }
 
 /// What a program says about itself at `/status`, or `None` while it does not answer.

@@ -38,6 +38,15 @@ impl Cell {
             .args(["--interface", "lo", "--metrics", METRICS_ROS1])
     }
 
+    /// The example of tcpros that repeats the first topic of each pair as the second. It says nothing when it is ready.
+    #[must_use]
+    pub fn tcpros_relay(&self, node: &str, pairs: &[(String, String)]) -> Child {
+        self.with_ros1(Started::new("relay", &program("examples/relay")))
+            .args([format!("__name:={node}")])
+            .args(pairs.iter().flat_map(|(from, to)| [from, to]))
+            .start()
+    }
+
     /// bridge-ros2 in domain 2 as it answers, with `args` after those every cell needs.
     #[must_use]
     pub fn bridge_ros2(&self, args: &[&str]) -> Child {

@@ -11,6 +11,23 @@ use crate::{
 
 /// Measures one hop of each bridge beside the floor and roscpp's relay, all in one run.
 pub(crate) fn hop(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    let packages = ["bridge-ros1", "bridge-ros2", "system-tests"];
+    measured(workspace, "bench-hop", &packages, arguments)
+}
+
+/// Measures relays of ROS 1 messages beside a raw echo, and bridge-ros1 under many topics, all in one run.
+pub(crate) fn ros1(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    let packages = ["tcpros", "bridge-ros1", "system-tests"];
+    measured(workspace, "bench-ros1", &packages, arguments)
+}
+
+/// Builds the packages with all their programs, then runs the one that measures.
+fn measured(
+    workspace: &Workspace,
+    bench: &str,
+    packages: &[&str],
+    arguments: &[&str],
+) -> anyhow::Result<Ended> {
     let namespaces = Namespaces::try_out();
     ensure!(namespaces != Namespaces::Refused, "{REFUSED}");
     ensure!(
@@ -18,27 +35,20 @@ pub(crate) fn hop(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
         "the measurement needs all peers"
     );
     step("building the programs with optimisation (some minutes the first time)");
-    let packages = [
-        "-p",
-        "bridge-ros1",
-        "-p",
-        "bridge-ros2",
-        "-p",
-        "system-tests",
-    ];
-    must(
-        &mut workspace
-            .cargo(&[&["build", "--release", "--bins", "--locked"][..], &packages].concat()),
-    )?;
+    let mut build = workspace.cargo(&["build", "--release", "--bins", "--examples", "--locked"]);
+    for package in packages {
+        build.args(["--package", package]);
+    }
+    must(&mut build)?;
     let programs = workspace.target.join("release");
-    let bench = programs.join("bench-hop");
+    let program = programs.join(bench);
     ensure!(
-        bench.is_file(),
-        "package system-tests has built no bench-hop in {}",
+        program.is_file(),
+        "package system-tests has built no {bench} in {}",
         programs.display()
     );
     step("measuring");
-    let mut command = namespaces.command(bench);
+    let mut command = namespaces.command(program);
     command
         .current_dir(&workspace.root)
         .args(arguments)

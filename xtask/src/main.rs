@@ -27,6 +27,7 @@ cargo xtask <verb>
   peers                          only install the peers
   lint                           formatting, clippy, licences and sources of dependencies, documentation
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
+  bench ros1 [ARGS]              measure relays of ROS 1 messages beside a raw echo; bridge-ros1 with 50 topics (--help)
   bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
 ";
 
@@ -54,6 +55,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["lint"] => lint::run(&Workspace::find()?),
         ["bench", "uadp", rest @ ..] => instructions::run(&Workspace::find()?, rest),
         ["bench", "hop", rest @ ..] => bench::hop(&Workspace::find()?, rest),
+        ["bench", "ros1", rest @ ..] => bench::ros1(&Workspace::find()?, rest),
         _ => {
             eprint!("xtask: there is no `{}`\n\n{VERBS}", arguments.join(" "));
             Ok(Ended::USAGE)

@@ -1,10 +1,10 @@
-//! rosrust as an independent ROS 1 implementation: publishes or subscribes `std_msgs/String`, calls or serves
+//! rosrust as an independent ROS 1 implementation: publishes, subscribes or repeats `std_msgs/String`, calls or serves
 //! `std_srvs/SetBool`.
 //!
 //! `rosrust-peer pub TOPIC VALUE..` sends the values ten times a second; `rosrust-peer sub TOPIC` prints one
-//! JSON line per message; `rosrust-peer serve SERVICE` answers `done` to true and fails at false. All three end on
-//! SIGTERM, and by themselves after two minutes. `rosrust-peer call SERVICE` calls with true and with false, prints one
-//! JSON line each, and ends.
+//! JSON line per message; `rosrust-peer relay IN OUT` sends on the bytes of each message; `rosrust-peer serve SERVICE`
+//! answers `done` to true and fails at false. All four end on SIGTERM, and by themselves after two minutes, the relay
+//! after thirty. `rosrust-peer call SERVICE` calls with true and with false, prints one JSON line each, and ends.
 
 use std::{
     io::Write,
@@ -15,6 +15,8 @@ use rosrust::{Message, RawMessage, RawMessageDescription, RosMsg, ServicePair};
 use serde_json::{Value, json};
 
 const LIMIT: Duration = Duration::from_secs(120);
+const RELAY_LIMIT: Duration = Duration::from_secs(1800);
+const QUEUE: usize = 1000;
 const PERIOD: Duration = Duration::from_millis(100);
 const POLL: Duration = Duration::from_millis(20);
 
@@ -23,11 +25,12 @@ fn main() {
     match args.get(1..).unwrap_or_default() {
         [verb, topic, values @ ..] if verb == "pub" => publish(topic, values),
         [verb, topic] if verb == "sub" => subscribe(topic),
+        [verb, from, to] if verb == "relay" => relay(from, to),
         [verb, service] if verb == "serve" => serve(service),
         [verb, service] if verb == "call" => call(service),
         _ => {
             eprintln!(
-                "usage: rosrust-peer pub TOPIC VALUE.. | sub TOPIC | serve SERVICE | call SERVICE"
+                "usage: rosrust-peer pub TOPIC VALUE.. | sub TOPIC | relay IN OUT | serve SERVICE | call SERVICE"
             );
             std::process::exit(64);
         }
@@ -36,13 +39,8 @@ fn main() {
 
 fn publish(topic: &str, values: &[String]) {
     rosrust::init("rosrust_pub");
-    let description = RawMessageDescription {
-        msg_definition: "string data\n".into(),
-        md5sum: "992ce8a1687cec8c8bd883ec73ca41d1".into(),
-        msg_type: "std_msgs/String".into(),
-    };
     let publisher =
-        rosrust::publish_with_description::<RawMessage>(topic, 100, description).unwrap();
+        rosrust::publish_with_description::<RawMessage>(topic, 100, description()).unwrap();
     say(&json!({ "ready": topic }));
     let start = Instant::now();
     while rosrust::is_ok() && start.elapsed() < LIMIT {
@@ -57,14 +55,27 @@ fn subscribe(topic: &str) {
     rosrust::init("rosrust_sub");
     let name = topic.to_owned();
     let subscriber =
-        rosrust::subscribe_with_ids(topic, 1000, move |message: RawMessage, id: &str| {
+        rosrust::subscribe_with_ids(topic, QUEUE, move |message: RawMessage, id: &str| {
             say(
                 &json!({ "topic": name, "callerid": id, "value": { "data": to_text(&message.0) } }),
             );
         })
         .unwrap();
     say(&json!({ "ready": topic }));
-    stay(Instant::now());
+    stay(LIMIT);
+    drop(subscriber);
+}
+
+fn relay(from: &str, to: &str) {
+    rosrust::init("rosrust_relay");
+    let publisher =
+        rosrust::publish_with_description::<RawMessage>(to, QUEUE, description()).unwrap();
+    let subscriber = rosrust::subscribe(from, QUEUE, move |message: RawMessage| {
+        publisher.send(message).unwrap();
+    })
+    .unwrap();
+    say(&json!({ "ready": to }));
+    stay(RELAY_LIMIT);
     drop(subscriber);
 }
 
@@ -76,7 +87,7 @@ fn serve(service: &str) {
     };
     let server = rosrust::service::<SetBool, _>(service, handle).unwrap();
     say(&json!({ "ready": service }));
-    stay(Instant::now());
+    stay(LIMIT);
     drop(server);
 }
 
@@ -126,9 +137,18 @@ impl ServicePair for SetBool {
     type Response = RawMessage;
 }
 
-fn stay(start: Instant) {
-    while rosrust::is_ok() && start.elapsed() < LIMIT {
+fn stay(limit: Duration) {
+    let start = Instant::now();
+    while rosrust::is_ok() && start.elapsed() < limit {
         std::thread::sleep(POLL);
+    }
+}
+
+fn description() -> RawMessageDescription {
+    RawMessageDescription {
+        msg_definition: "string data\n".into(),
+        md5sum: "992ce8a1687cec8c8bd883ec73ca41d1".into(),
+        msg_type: "std_msgs/String".into(),
     }
 }
 

@@ -13,7 +13,7 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use socket2::{Domain, Protocol, Socket, Type};
-use system_tests::{Cell, Peer, Started};
+use system_tests::{BareNode, Cell, PATIENCE, Peer, Started, group_member, string_frame};
 use uadp::{DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar};
 
 fn main() -> ExitCode {
@@ -144,14 +144,14 @@ impl Path for Floor {
     }
 
     fn pass(&mut self, text: &str) {
-        ros1::write_string(&mut self.stream, text);
+        self.stream.write_all(&string_frame(text)).unwrap();
         until(&self.receiver, &mut self.buffer, text);
     }
 }
 
 /// ROS 1 in, UADP out.
 struct Bridge1 {
-    publisher: ros1::Publisher,
+    publisher: TcpStream,
     receiver: UdpSocket,
     buffer: Vec<u8>,
     _bridge: system_tests::Child,
@@ -161,7 +161,8 @@ impl Bridge1 {
     fn new(cell: &Cell) -> Self {
         let group = SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 42), 4842);
         let bridge = cell.bridge_ros1(&["--address", &format!("opc.udp://{group}")]);
-        let publisher = ros1::Publisher::new("/bench_bridge", "/ua_1_5_10");
+        let node = BareNode::start("/bench_bridge");
+        let publisher = node.publish(&["/ua_1_5_10".to_owned()]).remove(0);
         Self {
             publisher,
             receiver: receiver(group),
@@ -177,7 +178,7 @@ impl Path for Bridge1 {
     }
 
     fn pass(&mut self, text: &str) {
-        self.publisher.publish(text);
+        self.publisher.write_all(&string_frame(text)).unwrap();
         until(&self.receiver, &mut self.buffer, text);
     }
 }
@@ -274,15 +275,9 @@ fn until(receiver: &UdpSocket, buffer: &mut [u8], text: &str) {
 }
 
 fn receiver(group: SocketAddrV4) -> UdpSocket {
-    let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP)).unwrap();
-    socket.set_reuse_address(true).unwrap();
-    socket.set_recv_buffer_size(4 << 20).unwrap();
-    socket.bind(&group.into()).unwrap();
-    socket
-        .join_multicast_v4(group.ip(), &Ipv4Addr::LOCALHOST)
-        .unwrap();
+    let socket = group_member(group);
     socket.set_read_timeout(Some(PATIENCE)).unwrap();
-    socket.into()
+    socket
 }
 
 fn sender() -> UdpSocket {
@@ -293,24 +288,4 @@ fn sender() -> UdpSocket {
         .bind(&SocketAddrV4::new(Ipv4Addr::LOCALHOST, 0).into())
         .unwrap();
     socket.into()
-}
-
-/// A message that takes longer is lost.
-const PATIENCE: Duration = Duration::from_secs(2);
-
-/// The parts of `std::io` the ends of ROS 1 share.
-pub(crate) fn frame(stream: &mut TcpStream, body: &[u8]) {
-    let mut frame = u32::try_from(body.len()).unwrap().to_le_bytes().to_vec();
-    frame.extend_from_slice(body);
-    stream.write_all(&frame).unwrap();
-}
-
-/// Reads one length-prefixed frame into `buffer` and gives its length.
-pub(crate) fn read_frame(stream: &mut TcpStream, buffer: &mut Vec<u8>) -> usize {
-    let mut length = [0; 4];
-    stream.read_exact(&mut length).unwrap();
-    let length = u32::from_le_bytes(length) as usize;
-    buffer.resize(length.max(buffer.len()), 0);
-    stream.read_exact(&mut buffer[..length]).unwrap();
-    length
 }

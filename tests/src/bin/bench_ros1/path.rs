@@ -1,0 +1,88 @@
+//! What repeats messages: the echo, `tcpros`, roscpp, rospy, rosrust.
+
+use std::io::Write;
+use std::net::{TcpListener, TcpStream};
+use std::process::ExitCode;
+use std::time::Duration;
+
+use system_tests::{BareNode, BareSubscription, Cell, Child, Started};
+
+use crate::lane::Lane;
+use crate::usage::processor_time;
+
+/// One relay with both ends of its one lane.
+pub(crate) struct Path {
+    pub(crate) name: &'static str,
+    pub(crate) lane: Lane,
+    relay: Child,
+}
+
+impl Path {
+    /// All of them, the echo first.
+    pub(crate) fn all(cell: &Cell) -> Vec<Self> {
+        let node = BareNode::start("/bench");
+        vec![
+            Self::echo(),
+            Self::through(&node, "tcpros `relay`", |pair| {
+                cell.tcpros_relay("relay", std::slice::from_ref(pair))
+            }),
+            Self::through(&node, "roscpp `topic_tools relay`", |(input, output)| {
+                cell.topic_tools_relay(input, output)
+            }),
+            Self::through(&node, "rospy relay", |(input, output)| {
+                cell.rospy("ros1_relay.py", &[input, output])
+            }),
+            Self::through(&node, "rosrust relay", |(input, output)| {
+                cell.rosrust(&["relay", input, output])
+            }),
+        ]
+    }
+
+    fn through(
+        node: &BareNode,
+        name: &'static str,
+        start: impl FnOnce(&(String, String)) -> Child,
+    ) -> Self {
+        let word = name.split(' ').next().unwrap_or(name);
+        let pair = (format!("/{word}_in"), format!("/{word}_out"));
+        let relay = start(&pair);
+        let lane = Lane::through(node, &[pair]).remove(0);
+        Self { name, lane, relay }
+    }
+
+    fn echo() -> Self {
+        let me = std::env::current_exe().unwrap();
+        let mut relay = Started::new("echo", &me).args(["echo"]).start();
+        let address = relay.wait_for_line("127.0.0.1:", Duration::from_secs(10));
+        let input = TcpStream::connect(&address).unwrap();
+        input.set_nodelay(true).unwrap();
+        let output = BareSubscription::of(TcpStream::connect(&address).unwrap());
+        Self {
+            name: "raw TCP echo",
+            lane: Lane::of(input, output),
+            relay,
+        }
+    }
+
+    pub(crate) fn processor_time(&self) -> Duration {
+        processor_time(self.relay.id())
+    }
+}
+
+/// The echo: frames in from the first connection, out to the second, with as few calls as can be.
+pub(crate) fn echo() -> ExitCode {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    println!("{}", listener.local_addr().unwrap());
+    let (input, _) = listener.accept().unwrap();
+    let (mut output, _) = listener.accept().unwrap();
+    output.set_nodelay(true).unwrap();
+    // Waits as long as the other end stays.
+    let mut frames = BareSubscription::of(input);
+    frames.wait_without_end();
+    while let Ok(frame) = frames.receive_frame() {
+        if output.write_all(frame).is_err() {
+            break;
+        }
+    }
+    ExitCode::SUCCESS
+}

@@ -1,0 +1,82 @@
+//! What a message costs a relay that carries few topics or many, at the same rate over all of them.
+
+use std::time::Duration;
+
+use system_tests::{BareNode, Cell, Child, string_frame};
+
+use crate::lane::{DIGITS, Lane};
+use crate::usage::{Times, per_message, processor_time};
+
+/// A `tcpros` relay of so many topics, with both ends of each.
+struct Crowd {
+    relay: Child,
+    lanes: Vec<Lane>,
+    times: Times,
+    used: Duration,
+}
+
+impl Crowd {
+    fn of(cell: &Cell, count: usize) -> Self {
+        let pairs: Vec<(String, String)> = (0..count)
+            .map(|topic| {
+                (
+                    format!("/of_{count}/in_{topic}"),
+                    format!("/of_{count}/out_{topic}"),
+                )
+            })
+            .collect();
+        let relay = cell.tcpros_relay(&format!("relay_{count}"), &pairs);
+        let node = BareNode::start(&format!("/bench_{count}"));
+        Self {
+            lanes: Lane::through(&node, &pairs),
+            relay,
+            times: Times::default(),
+            used: Duration::ZERO,
+        }
+    }
+
+    /// One message at a time, each through the next topic, so that none is read or written together with another.
+    fn turn(&mut self, first: u64) {
+        let before = processor_time(self.relay.id());
+        let lanes = self.lanes.len() as u64;
+        for number in first..first + BLOCK {
+            let frame = string_frame(&format!("{number:0DIGITS$}"));
+            let lane = usize::try_from(number % lanes).unwrap();
+            self.times.add(self.lanes[lane].pass(&frame));
+        }
+        self.used += processor_time(self.relay.id()) - before;
+    }
+}
+
+pub(crate) fn measure(cell: &Cell, blocks: usize) {
+    println!(
+        "\n16 B, one message at a time, each through the next topic of a tcpros `relay`, {} messages for each count; \
+         microseconds:\n",
+        blocks as u64 * BLOCK
+    );
+    let mut crowds: Vec<Crowd> = [1, 10, 100, 1000]
+        .into_iter()
+        .map(|count| Crowd::of(cell, count))
+        .collect();
+    for block in 0..blocks as u64 {
+        for crowd in &mut crowds {
+            crowd.turn(block * BLOCK);
+        }
+    }
+    println!("| topics | p50 | p99 | CPU per message | CPU / that of one topic |");
+    println!("|---|---|---|---|---|");
+    let mut one = None;
+    for crowd in &mut crowds {
+        let cost = per_message(crowd.used, crowd.times.count());
+        let ratio = cost / *one.get_or_insert(cost);
+        println!(
+            "| {} | {:.1} | {:.1} | {cost:.1} | {ratio:.2} |",
+            crowd.lanes.len(),
+            crowd.times.at(0.5),
+            crowd.times.at(0.99)
+        );
+    }
+}
+
+/// Messages of one turn: every topic of the most gets its own.
+const BLOCK: u64 = 1000;
