@@ -21,7 +21,7 @@ mod wait;
 pub use arrows::{forbidden, tree};
 pub use bare_node::{BareNode, BareSubscription, PATIENCE, string_frame};
 pub use capture::{Capture, Dissected, hex, is_true};
-pub use cell::{Cell, Peer};
+pub use cell::{Cell, Peer, without_data};
 pub use child::{Child, Started};
 pub use net::{GROUP, UadpSocket, group_member, http_get, metrics, xml_rpc};
 pub use peers::MASTER;

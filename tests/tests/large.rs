@@ -165,7 +165,7 @@ fn images_of_ten_megabytes_from_the_space_reach_a_rospy_subscriber_as_they_were(
     let _master = cell.roscore();
     let group = UadpSocket::join();
     let _bridge = cell.bridge_ros1(&[]);
-    let mut subscriber = cell.rospy("ros1_image.py", &["sub", "/ua_2_5_10"]);
+    let subscriber = cell.rospy("ros1_image.py", &["sub", "/ua_2_5_10"]);
     let mut sequence = 0;
     eventually("five images came as they were", SOON, || {
         send_image(&group, u32::from(sequence), sequence);
