@@ -188,9 +188,9 @@ fn a_message_beyond_the_limit_is_refused_with_its_size_and_the_key() {
 #[test]
 fn a_button_goes_out_between_the_chunks_of_cameras_which_take_turns() {
     let mut pair = Pair::new(SMALL_DATAGRAMS);
-    let _ = pair.say(CAMERA, &text(4_000, 0));
-    let _ = pair.say(OTHER_CAMERA, &text(4_000, 1));
-    let _ = pair.say(BUTTON, &text(1, 2));
+    let _verdict = pair.say(CAMERA, &text(4_000, 0));
+    let _verdict = pair.say(OTHER_CAMERA, &text(4_000, 1));
+    let _verdict = pair.say(BUTTON, &text(1, 2));
     let order: Vec<_> = pair.burst().into_iter().map(|(topic, _)| topic).collect();
     assert_eq!(
         order[..5],
@@ -201,10 +201,10 @@ fn a_button_goes_out_between_the_chunks_of_cameras_which_take_turns() {
 #[test]
 fn a_button_is_not_paced_while_a_camera_is() {
     let mut pair = Pair::new("pubsub: {}\n");
-    let _ = pair.say(CAMERA, &text(2_000_000, 0));
+    let _verdict = pair.say(CAMERA, &text(2_000_000, 0));
     let first = pair.burst();
     assert!(first.len() < 10, "{} at once", first.len());
-    let _ = pair.say(BUTTON, &text(1, 2));
+    let _verdict = pair.say(BUTTON, &text(1, 2));
     let [(sent, _)] = &pair.burst()[..] else {
         unreachable!("one small datagram")
     };
@@ -215,7 +215,7 @@ fn a_button_is_not_paced_while_a_camera_is() {
 fn a_started_image_is_finished_and_of_those_that_wait_the_newest_goes() {
     let mut pair = Pair::new("pubsub: {}\n");
     let images = [0, 1, 2].map(|seed| text(1_000_000, seed));
-    let _ = pair.say(CAMERA, &images[0]);
+    let _verdict = pair.say(CAMERA, &images[0]);
     let mut datagrams = pair.burst();
     assert_eq!(pair.say(CAMERA, &images[1]), Verdict::Forward);
     assert_eq!(
@@ -238,7 +238,7 @@ fn a_started_image_is_finished_and_of_those_that_wait_the_newest_goes() {
 #[test]
 fn a_lost_chunk_costs_its_message_which_is_counted_and_named() {
     let mut pair = Pair::new(SMALL_DATAGRAMS);
-    let _ = pair.say(CAMERA, &text(4_000, 0));
+    let _verdict = pair.say(CAMERA, &text(4_000, 0));
     let (mut datagrams, _) = pair.all();
     datagrams.remove(3);
     for (_, bytes) in &datagrams {
@@ -263,7 +263,7 @@ fn a_lost_chunk_costs_its_message_which_is_counted_and_named() {
 fn a_value_whose_chunk_was_lost_comes_with_its_repetition() {
     let mut pair = Pair::new(SMALL_DATAGRAMS);
     let image = text(4_000, 0);
-    let _ = pair.say(CAMERA, &image);
+    let _verdict = pair.say(CAMERA, &image);
     let (mut datagrams, _) = pair.all();
     datagrams.remove(3);
     for (_, bytes) in &datagrams {
@@ -292,7 +292,7 @@ fn a_value_whose_chunk_was_lost_comes_with_its_repetition() {
 #[test]
 fn a_writer_that_starts_over_in_the_midst_of_a_message_mixes_nothing() {
     let mut pair = Pair::new(SMALL_DATAGRAMS);
-    let _ = pair.say(CAMERA, &text(4_000, 0));
+    let _verdict = pair.say(CAMERA, &text(4_000, 0));
     let (datagrams, _) = pair.all();
     for (_, bytes) in &datagrams[..4] {
         assert_eq!(pair.hear(bytes), []);
@@ -301,7 +301,7 @@ fn a_writer_that_starts_over_in_the_midst_of_a_message_mixes_nothing() {
     restarted.now = pair.now;
     restarted.wait(Duration::from_millis(10));
     let image = text(4_000, 9);
-    let _ = restarted.say(CAMERA, &image);
+    let _verdict = restarted.say(CAMERA, &image);
     let delivered: Vec<_> = restarted
         .all()
         .0
@@ -316,7 +316,7 @@ fn a_writer_that_starts_over_in_the_midst_of_a_message_mixes_nothing() {
 #[test]
 fn a_message_that_would_be_too_big_is_refused_at_its_first_chunk() {
     let mut large = Pair::new("pubsub: {}\n");
-    let _ = large.say(CAMERA, &text(2_000_000, 0));
+    let _verdict = large.say(CAMERA, &text(2_000_000, 0));
     let (_, chunk) = large.burst().remove(0);
     let mut pair = Pair::new(SMALL_DATAGRAMS);
     assert_eq!(pair.hear(&chunk), []);

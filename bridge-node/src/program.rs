@@ -9,7 +9,7 @@ use std::sync::Arc;
 use bridge_core::{Local, Router, Settings};
 use clap::Parser;
 use clap::error::ErrorKind;
-use mappings::{Mapping, PubSub, SpaceId};
+use mappings::{Code, Diagnostic, Mapping, PubSub, Severity, SpaceId};
 use tokio::signal::unix::{SignalKind, signal};
 use tracing::{error, info};
 use transport::{Options, Udp};
@@ -100,7 +100,10 @@ fn load(arguments: &Arguments) -> Result<Option<Mapping>, Failure> {
             format!("cannot read the mapping {}: {error}", file.display()),
         )
     })?;
-    let checked = Mapping::from_yaml(&text, &file.display().to_string());
+    let mut checked = Mapping::from_yaml(&text, &file.display().to_string());
+    if !arguments.check && checked.mapping.is_some() {
+        leave_to_the_run(&mut checked.findings, file);
+    }
     let findings = checked.render(&text);
     // A closed stderr is no reason not to run.
     let _printed = std::io::stderr().write_all(findings.as_bytes());
@@ -111,6 +114,26 @@ fn load(arguments: &Arguments) -> Result<Option<Mapping>, Failure> {
         }
         Some(mapping) => Ok(Some(mapping)),
         None => Err(refused(file)),
+    }
+}
+
+/// Types that are not built in are the rule with robots of a make, and what comes of them is told when they are met.
+fn leave_to_the_run(findings: &mut Vec<Diagnostic>, file: &Path) {
+    let before = findings.len();
+    findings.retain(|finding| {
+        finding.severity == Severity::Error
+            || !matches!(
+                finding.code,
+                Code::UnknownMessageType | Code::UnknownServiceType
+            )
+    });
+    let left = before - findings.len();
+    if left > 0 {
+        info!(
+            "{left} bindings of {} are of types that are not built in; they are looked at when the definitions are \
+             there (--check names them)",
+            file.display()
+        );
     }
 }
 

@@ -83,19 +83,13 @@ impl Caller {
     async fn call(&mut self, request: Bytes, insist: bool) -> Next {
         let result = match self.client.call(request).await {
             Ok(answer) => {
-                if self.trouble.take().is_some() {
-                    info!(service = self.client.service(), "the service answers again");
-                }
+                self.over();
                 Ok(answer)
             }
             Err(error) => {
-                let text = error.to_string();
                 let again = insist && may_pass(&error);
-                let new = self.trouble.as_ref() != Some(&text);
-                if new && again {
-                    warn!(service = self.client.service(), "trying again: {text}");
-                }
-                self.trouble = Some(text.clone());
+                let text = error.to_string();
+                self.trouble(&text, again);
                 if again {
                     return Next::Again;
                 }
@@ -109,6 +103,21 @@ impl Caller {
         // Nobody is left to be told when the port is gone.
         drop(self.report.send(outcome).await);
         Next::Done
+    }
+
+    /// Tells of a fault that is not reported, once.
+    fn trouble(&mut self, text: &str, again: bool) {
+        let new = self.trouble.as_deref() != Some(text);
+        if new && again {
+            warn!(service = self.client.service(), "trying again: {text}");
+        }
+        self.trouble = Some(text.to_owned());
+    }
+
+    fn over(&mut self) {
+        if self.trouble.take().is_some() {
+            info!(service = self.client.service(), "the service answers again");
+        }
     }
 }
 

@@ -491,6 +491,7 @@ impl Ros1Port {
                     message_type: Arc::clone(&message_type),
                     publisher,
                     reported: 0,
+                    stamps: sink.stamps(&message_type),
                 };
                 sink.open = Some(open);
                 let selection = sink.selection();
@@ -559,17 +560,18 @@ impl Port for Ros1Port {
         else {
             return Err("no publisher yet");
         };
+        let payload = open.stamped(sample.payload, self.node.now());
         let key = sample.instance.map_or(0, latch_key);
         let latched = match sample.kept {
             Kept::Alone => Latched::Alone(key),
             Kept::Beside => Latched::Beside(key),
             Kept::Again => {
-                open.publisher.latch(key, sample.payload);
+                open.publisher.latch(key, payload);
                 return Ok(());
             }
         };
         // What slow subscribers lose by it is reported with the next look at the graph.
-        let _published = open.publisher.publish_latched(sample.payload, latched);
+        let _published = open.publisher.publish_latched(payload, latched);
         Ok(())
     }
 

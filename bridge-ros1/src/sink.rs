@@ -2,9 +2,10 @@
 
 use std::sync::Arc;
 
+use bytes::{Bytes, BytesMut};
 use mappings::{Overflow, TopicId, Variable};
 use messages::{MessageType, Selection, TypeName};
-use tcpros::{Publisher, PublisherOptions};
+use tcpros::{Publisher, PublisherOptions, RosTime};
 
 /// Where the values of one topic of another space go.
 #[derive(Debug)]
@@ -26,6 +27,27 @@ pub(crate) struct Open {
     pub(crate) publisher: Publisher,
     /// Losses of slow subscribers that were reported.
     pub(crate) reported: u64,
+    /// Whether its header's stamp is ours to set: only one field of the message is the value, and not the stamp.
+    pub(crate) stamps: bool,
+}
+
+impl Open {
+    /// The message with the time in its header, if that is not part of the value.
+    pub(crate) fn stamped(&self, message: Bytes, now: RosTime) -> Bytes {
+        if !self.stamps {
+            return message;
+        }
+        let mut message = message
+            .try_into_mut()
+            .unwrap_or_else(|shared| BytesMut::from(shared.as_ref()));
+        // std_msgs/Header: seq, then stamp, then frame_id.
+        if let Some(stamp) = message.get_mut(4..12) {
+            let (secs, nsecs) = stamp.split_at_mut(4);
+            secs.copy_from_slice(&now.secs.to_le_bytes());
+            nsecs.copy_from_slice(&now.nsecs.to_le_bytes());
+        }
+        message.freeze()
+    }
 }
 
 impl Sink {
@@ -94,6 +116,14 @@ impl Sink {
             .map_or(Selection::Whole, |(_, selection)| selection.clone())
     }
 
+    /// Whether the stamp at the beginning of such messages is no part of the value.
+    pub(crate) fn stamps(&self, message_type: &MessageType) -> bool {
+        let header = message_type.leaves().first();
+        let selected = self.mapped.as_ref().map(|(_, selection)| selection);
+        header.is_some_and(|leaf| leaf.path == STAMP)
+            && matches!(selected, Some(Selection::Field(path)) if path != STAMP)
+    }
+
     /// The Router's queue says what waits; behind it, as much is held for a slow subscriber as for any.
     pub(crate) fn options(&self) -> PublisherOptions {
         PublisherOptions {
@@ -103,9 +133,32 @@ impl Sink {
     }
 }
 
+/// The first field of a message that begins with a header.
+const STAMP: &str = "header.stamp";
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_message_of_one_field_gets_a_stamp_and_a_whole_one_keeps_its_own() {
+        let imu: TypeName = "sensor_msgs/Imu".parse().unwrap();
+        let registry = messages::Registry::bundle(messages::Dialect::Ros1);
+        let message_type = registry.get(&imu).unwrap();
+        let stamps = |selection: Selection| {
+            Sink::mapped(
+                "/imu".to_owned(),
+                imu.clone(),
+                selection,
+                Overflow::KeepLatest,
+            )
+            .stamps(&message_type)
+        };
+        assert!(stamps(Selection::Field("angular_velocity.z".to_owned())));
+        assert!(!stamps(Selection::Field("header.stamp".to_owned())));
+        assert!(!stamps(Selection::Whole));
+        assert!(!stamps(Selection::Bytes));
+    }
 
     #[test]
     fn a_subscriber_decides_before_the_standard_type() {

@@ -71,12 +71,15 @@ impl Source {
 
     /// The transient-local writers that have gone; `writers` are there.
     pub(crate) fn gone(&mut self, writers: &[Endpoint]) -> Vec<PublisherKey> {
-        self.latched
-            .extract_if(.., |guid, _| {
-                writers.iter().all(|writer| writer.guid != *guid)
-            })
-            .map(|(_, key)| key)
-            .collect()
+        let mut gone = Vec::new();
+        self.latched.retain(|guid, key| {
+            let there = writers.iter().any(|writer| writer.guid == *guid);
+            if !there {
+                gone.push(*key);
+            }
+            there
+        });
+        gone
     }
 
     /// Sorts the writers the topic has by now into ours and strangers; returns ours.

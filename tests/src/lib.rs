@@ -16,6 +16,7 @@ mod child;
 mod net;
 mod peers;
 mod programs;
+mod ua_side;
 mod wait;
 
 pub use arrows::{forbidden, tree};
@@ -28,4 +29,5 @@ pub use peers::MASTER;
 pub use programs::{
     METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, SERVER_ENDPOINT, drops, number, program,
 };
+pub use ua_side::{Triple, UaSide};
 pub use wait::{eventually, holds_for};

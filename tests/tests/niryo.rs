@@ -1,95 +1,15 @@
 //! `mappings/niryo-ned.yaml` against a Niryo Ned as its ROS graph shows it: every topic, every service, by their real names.
 
-use std::{
-    path::Path,
-    time::{Duration, Instant},
-};
+use std::{path::Path, time::Duration};
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, METRICS_ROS1, Peer, UadpSocket, eventually, metrics, number};
-use uadp::{
-    DataSetHeader, GroupHeader, NetworkHeader, NetworkMessage, NetworkMessageEncoder, PublisherId,
-    Scalar, Variant,
-};
+use system_tests::{Cell, Child, METRICS_ROS1, Peer, UaSide, eventually, metrics, number};
+use uadp::{Scalar, Variant};
 
 const SOON: Duration = Duration::from_secs(30);
 const MAPPING: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../mappings/niryo-ned.yaml");
 /// The definitions of ned_ros are under the GPL: they lie beside the project, never in it.
 const DEFINITIONS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data/ros1-niryo");
-
-/// The OPC UA side of the cell: hears all values and writes those of origin 0.
-struct Side {
-    socket: UadpSocket,
-    sequence: u16,
-}
-
-impl Side {
-    fn join() -> Self {
-        Self {
-            socket: UadpSocket::join(),
-            sequence: 0,
-        }
-    }
-
-    /// What `pick` makes of the first value of `ua_1_2_<id>` it does not answer `None` to.
-    fn hear<T>(&self, id: u16, what: &str, pick: impl Fn(&[Variant<'_>]) -> Option<T>) -> T {
-        let start = Instant::now();
-        while start.elapsed() < SOON {
-            let Some(datagram) = self.socket.receive(SOON) else {
-                break;
-            };
-            let message = NetworkMessage::decode(&datagram).unwrap();
-            let header = message.header();
-            let group = header.group.and_then(|group| group.writer_group_id);
-            if (header.publisher_id, group) != (Some(PublisherId::UInt16(1)), Some(2)) {
-                continue;
-            }
-            for message in message.messages().map(Result::unwrap) {
-                if message.writer_id != Some(id) {
-                    continue;
-                }
-                let fields: Vec<_> = message
-                    .fields()
-                    .map(|fields| fields.map(Result::unwrap).collect())
-                    .unwrap_or_default();
-                if let Some(found) = pick(&fields) {
-                    return found;
-                }
-            }
-        }
-        panic!("ua_1_2_{id} was not heard: {what}");
-    }
-
-    fn hear_scalar(&self, id: u16, expected: Scalar<'_>) {
-        self.hear(id, &format!("{expected:?}"), |fields| {
-            matches!(fields, [Variant::Scalar(found)] if *found == expected).then_some(())
-        });
-    }
-
-    /// Writes one value of `ua_0_2_<id>`.
-    fn write(&mut self, id: u16, value: Scalar<'_>) {
-        self.sequence += 1;
-        let header = NetworkHeader {
-            publisher_id: Some(PublisherId::UInt16(0)),
-            group: Some(GroupHeader {
-                writer_group_id: Some(2),
-                ..GroupHeader::default()
-            }),
-            ..NetworkHeader::default()
-        };
-        let mut datagram = Vec::new();
-        let mut message = NetworkMessageEncoder::new(&mut datagram, &header, Some(&[id])).unwrap();
-        let header = DataSetHeader {
-            sequence_number: Some(self.sequence),
-            ..DataSetHeader::default()
-        };
-        let mut frame = message.key_frame(&header).unwrap();
-        frame.scalar(value).unwrap();
-        frame.finish().unwrap();
-        message.finish().unwrap();
-        self.socket.send(&datagram);
-    }
-}
 
 /// The request of the next call of that service the robot tells of, after those it told of before.
 fn called(robot: &Child, service: &str, before: usize) -> Value {
@@ -107,7 +27,7 @@ fn calls(robot: &Child, service: &str) -> Vec<Value> {
 }
 
 struct Line {
-    side: Side,
+    side: UaSide,
     robot: Child,
     bridge: Child,
     _master: Child,
@@ -115,7 +35,7 @@ struct Line {
 
 fn start(cell: &Cell) -> Line {
     let master = cell.roscore();
-    let side = Side::join();
+    let side = UaSide::join();
     let robot = cell.rospy("niryo.py", &[DEFINITIONS]);
     let bridge = cell
         .bridge_ros1_started(&[MAPPING])
@@ -142,45 +62,49 @@ fn what_a_niryo_shows_reaches_the_space_as_typed_values() {
     let Some(cell) = cell() else { return };
     let line = start(&cell);
     let side = &line.side;
-    side.hear(11, "six joint positions", |fields| match fields {
+    side.hear((1, 2, 11), "six joint positions", |fields| match fields {
         [Variant::Array(array)] => (array.len() == 6).then_some(()),
         _ => None,
     });
-    side.hear(12, "the joints' names", |fields| match fields {
+    side.hear((1, 2, 12), "the joints' names", |fields| match fields {
         [Variant::Array(array)] => {
             (array.iter().next() == Some(Scalar::String(Some("joint_1")))).then_some(())
         }
         _ => None,
     });
-    side.hear(13, "position.x 0.25 and tcp_speed 0.125", |fields| {
-        let ends = (fields.first(), fields.last());
-        (ends
-            == (
-                Some(&Variant::Scalar(Scalar::Double(0.25))),
-                Some(&Variant::Scalar(Scalar::Double(0.125))),
-            ))
-            .then_some(())
-    });
-    side.hear_scalar(14, Scalar::SByte(6));
-    side.hear_scalar(15, Scalar::String(Some("STANDBY")));
-    side.hear(16, "hardware version ned2", |fields| {
+    side.hear(
+        (1, 2, 13),
+        "position.x 0.25 and tcp_speed 0.125",
+        |fields| {
+            let ends = (fields.first(), fields.last());
+            (ends
+                == (
+                    Some(&Variant::Scalar(Scalar::Double(0.25))),
+                    Some(&Variant::Scalar(Scalar::Double(0.125))),
+                ))
+                .then_some(())
+        },
+    );
+    side.hear_scalar((1, 2, 14), Scalar::SByte(6));
+    side.hear_scalar((1, 2, 15), Scalar::String(Some("STANDBY")));
+    side.hear((1, 2, 16), "hardware version ned2", |fields| {
         fields
             .contains(&Variant::Scalar(Scalar::String(Some("ned2"))))
             .then_some(())
     });
-    side.hear_scalar(17, Scalar::Boolean(false));
-    side.hear_scalar(18, Scalar::Boolean(false));
-    side.hear(21, "two outputs", |fields| match fields {
+    side.hear_scalar((1, 2, 17), Scalar::Boolean(false));
+    side.hear_scalar((1, 2, 18), Scalar::Boolean(false));
+    side.hear((1, 2, 21), "two outputs", |fields| match fields {
         [Variant::Array(inputs), Variant::Array(outputs)] => {
             ((inputs.len(), outputs.len()) == (1, 2)).then_some(())
         }
         _ => None,
     });
-    side.hear(23, "tool 11", |fields| {
+    side.hear((1, 2, 23), "tool 11", |fields| {
         (fields.first() == Some(&Variant::Scalar(Scalar::SByte(11)))).then_some(())
     });
-    side.hear_scalar(24, Scalar::Int32(11));
-    side.hear_scalar(25, Scalar::Boolean(false));
+    side.hear_scalar((1, 2, 24), Scalar::Int32(11));
+    side.hear_scalar((1, 2, 25), Scalar::Boolean(false));
 }
 
 #[test]
@@ -188,58 +112,61 @@ fn values_of_the_space_add_and_run_a_conveyor_and_its_answers_are_values() {
     let Some(cell) = cell() else { return };
     let mut line = start(&cell);
     // Joints arrive, so the bridge and the robot have found one another.
-    line.side.hear(11, "joints", |_| Some(()));
+    line.side.hear((1, 2, 11), "joints", |_| Some(()));
 
-    line.side.write(40, Scalar::Byte(1));
+    line.side.write((0, 2, 40), Scalar::Byte(1));
     let request = called(
         &line.robot,
         "/niryo_robot/conveyor/ping_and_set_conveyor",
         0,
     );
     assert_eq!(request, json!({"cmd": 1, "id": 0}));
-    line.side.hear_scalar(41, Scalar::Int16(12));
-    line.side.hear_scalar(42, Scalar::Int16(1));
+    line.side.hear_scalar((1, 2, 41), Scalar::Int16(12));
+    line.side.hear_scalar((1, 2, 42), Scalar::Int16(1));
 
-    line.side.write(43, Scalar::Boolean(true));
+    line.side.write((0, 2, 43), Scalar::Boolean(true));
     let control = "/niryo_robot/conveyor/control_conveyor";
     let request = called(&line.robot, control, 0);
     assert_eq!(
         request,
         json!({"id": 12, "control_on": true, "speed": 50, "direction": 1})
     );
-    line.side.hear_scalar(44, Scalar::Int16(1));
-    line.side
-        .hear(20, "one conveyor in the feedback", |fields| match fields {
+    line.side.hear_scalar((1, 2, 44), Scalar::Int16(1));
+    line.side.hear(
+        (1, 2, 20),
+        "one conveyor in the feedback",
+        |fields| match fields {
             [Variant::Array(conveyors)] => (conveyors.len() == 1).then_some(()),
             _ => None,
-        });
+        },
+    );
     line.side
-        .hear_scalar(49, Scalar::String(Some("NiryoSteppers")));
+        .hear_scalar((1, 2, 49), Scalar::String(Some("NiryoSteppers")));
 
-    line.side.write(43, Scalar::Boolean(false));
+    line.side.write((0, 2, 43), Scalar::Boolean(false));
     assert_eq!(called(&line.robot, control, 1)["control_on"], false);
 
     // A conveyor that is not there: the fault is a value too.
-    line.side.write(40, Scalar::Byte(2));
-    line.side.hear_scalar(42, Scalar::Int16(-123));
+    line.side.write((0, 2, 40), Scalar::Byte(2));
+    line.side.hear_scalar((1, 2, 42), Scalar::Int16(-123));
 }
 
 #[test]
 fn digital_outputs_learning_mode_and_stop_are_called_with_what_the_mapping_says() {
     let Some(cell) = cell() else { return };
     let mut line = start(&cell);
-    line.side.hear(11, "joints", |_| Some(()));
-    line.side.write(45, Scalar::Boolean(true));
+    line.side.hear((1, 2, 11), "joints", |_| Some(()));
+    line.side.write((0, 2, 45), Scalar::Boolean(true));
     let request = called(&line.robot, "/niryo_robot_rpi/set_digital_io", 0);
     assert_eq!(request, json!({"name": "DO1", "value": true}));
-    line.side.hear_scalar(46, Scalar::Int32(1));
-    line.side.write(47, Scalar::Boolean(true));
+    line.side.hear_scalar((1, 2, 46), Scalar::Int32(1));
+    line.side.write((0, 2, 47), Scalar::Boolean(true));
     called(&line.robot, "/niryo_robot/learning_mode/activate", 0);
-    line.side.hear_scalar(25, Scalar::Boolean(true));
+    line.side.hear_scalar((1, 2, 25), Scalar::Boolean(true));
 
     let stop = "/niryo_robot_arm_commander/stop_command";
-    line.side.write(48, Scalar::Boolean(false));
-    line.side.write(48, Scalar::Boolean(true));
+    line.side.write((0, 2, 48), Scalar::Boolean(false));
+    line.side.write((0, 2, 48), Scalar::Boolean(true));
     called(&line.robot, stop, 0);
     assert_eq!(calls(&line.robot, stop).len(), 1, "false does not stop it");
 }
@@ -248,15 +175,15 @@ fn digital_outputs_learning_mode_and_stop_are_called_with_what_the_mapping_says(
 fn a_state_waits_for_its_service_and_an_event_does_not() {
     let Some(cell) = cell() else { return };
     let mut line = start(&cell);
-    line.side.hear(11, "joints", |_| Some(()));
+    line.side.hear((1, 2, 11), "joints", |_| Some(()));
     let killed = line.robot.id();
     line.robot.signal(nix::sys::signal::Signal::SIGKILL);
     eventually("the robot is gone", SOON, || {
         (!Path::new(&format!("/proc/{killed}/cmdline")).exists() || !line.robot.runs())
             .then_some(())
     });
-    line.side.write(45, Scalar::Boolean(true));
-    line.side.write(40, Scalar::Byte(1));
+    line.side.write((0, 2, 45), Scalar::Boolean(true));
+    line.side.write((0, 2, 40), Scalar::Byte(1));
     eventually("the event is counted as lost", SOON, || {
         let status = metrics(METRICS_ROS1)?;
         (number(&status, "call_failed") > 0).then_some(())
@@ -264,7 +191,7 @@ fn a_state_waits_for_its_service_and_an_event_does_not() {
     line.robot = cell.rospy("niryo.py", &[DEFINITIONS]);
     let request = called(&line.robot, "/niryo_robot_rpi/set_digital_io", 0);
     assert_eq!(request, json!({"name": "DO1", "value": true}));
-    line.side.hear_scalar(46, Scalar::Int32(1));
+    line.side.hear_scalar((1, 2, 46), Scalar::Int32(1));
     let events = calls(&line.robot, "/niryo_robot/conveyor/ping_and_set_conveyor");
     assert_eq!(
         events,

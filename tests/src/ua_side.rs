@@ -1,0 +1,134 @@
+//! The OPC UA side of a cell, by the codec alone.
+
+use std::time::{Duration, Instant};
+
+use uadp::{
+    DataSetHeader, GroupHeader, NetworkHeader, NetworkMessage, NetworkMessageEncoder, PublisherId,
+    Scalar, Variant,
+};
+
+use crate::UadpSocket;
+
+/// PublisherId, WriterGroupId and DataSetWriterId of a value.
+pub type Triple = (u16, u16, u16);
+
+/// Peers in Python on a busy machine need seconds.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Hears all values of a cell and writes those of other spaces.
+pub struct UaSide {
+    socket: UadpSocket,
+    sequence: u16,
+}
+
+impl UaSide {
+    /// Joins the group.
+    ///
+    /// # Panics
+    /// When the socket cannot be made.
+    #[must_use]
+    pub fn join() -> Self {
+        Self {
+            socket: UadpSocket::join(),
+            sequence: 0,
+        }
+    }
+
+    /// What `pick` makes of the first value of the triple it does not answer `None` to.
+    ///
+    /// # Panics
+    /// When none comes in time, with `what` in the message.
+    pub fn hear<T>(
+        &self,
+        triple: Triple,
+        what: &str,
+        pick: impl Fn(&[Variant<'_>]) -> Option<T>,
+    ) -> T {
+        let start = Instant::now();
+        while start.elapsed() < PATIENCE {
+            let Some(datagram) = self.socket.receive(PATIENCE) else {
+                break;
+            };
+            let message = NetworkMessage::decode(&datagram).unwrap();
+            for (found, fields) in values(&message) {
+                if found == triple
+                    && let Some(found) = pick(&fields)
+                {
+                    return found;
+                }
+            }
+        }
+        panic!("{triple:?} was not heard: {what}");
+    }
+
+    /// Waits for a value of one field.
+    ///
+    /// # Panics
+    /// When it does not come in time.
+    pub fn hear_scalar(&self, triple: Triple, expected: Scalar<'_>) {
+        self.hear(triple, &format!("{expected:?}"), |fields| {
+            matches!(fields, [Variant::Scalar(found)] if *found == expected).then_some(())
+        });
+    }
+
+    /// Writes one value of one field.
+    ///
+    /// # Panics
+    /// When it cannot be sent.
+    pub fn write(&mut self, (space, namespace, id): Triple, value: Scalar<'_>) {
+        self.sequence = self.sequence.wrapping_add(1);
+        let header = NetworkHeader {
+            publisher_id: Some(PublisherId::UInt16(space)),
+            group: Some(GroupHeader {
+                writer_group_id: Some(namespace),
+                ..GroupHeader::default()
+            }),
+            ..NetworkHeader::default()
+        };
+        let mut datagram = Vec::new();
+        let mut message = NetworkMessageEncoder::new(&mut datagram, &header, Some(&[id])).unwrap();
+        let header = DataSetHeader {
+            sequence_number: Some(self.sequence),
+            ..DataSetHeader::default()
+        };
+        let mut frame = message.key_frame(&header).unwrap();
+        frame.scalar(value).unwrap();
+        frame.finish().unwrap();
+        message.finish().unwrap();
+        self.socket.send(&datagram);
+    }
+
+    /// The triples of all values heard within `window`.
+    #[must_use]
+    pub fn triples_for(&self, window: Duration) -> Vec<Triple> {
+        let datagrams = self.socket.receive_for(window);
+        let messages = datagrams.iter().map(|d| NetworkMessage::decode(d).unwrap());
+        messages
+            .flat_map(|message| {
+                values(&message)
+                    .into_iter()
+                    .map(|(triple, _)| triple)
+                    .collect::<Vec<_>>()
+            })
+            .collect()
+    }
+}
+
+/// The values a NetworkMessage brings; without fields where it is a keep-alive.
+fn values<'a>(message: &NetworkMessage<'a>) -> Vec<(Triple, Vec<Variant<'a>>)> {
+    let header = message.header();
+    let group = header.group.and_then(|group| group.writer_group_id);
+    let (Some(PublisherId::UInt16(space)), Some(group)) = (header.publisher_id, group) else {
+        return Vec::new();
+    };
+    let all = message.messages().map(Result::unwrap);
+    all.filter_map(|message| {
+        let fields = message.fields();
+        let fields = fields.map(|fields| fields.map(Result::unwrap).collect());
+        Some((
+            (space, group, message.writer_id?),
+            fields.unwrap_or_default(),
+        ))
+    })
+    .collect()
+}
