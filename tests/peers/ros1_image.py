@@ -19,7 +19,7 @@ def pattern(number, size):
 
 
 def publish(args):
-    publisher = rospy.Publisher(args.topic, Image, queue_size=2, tcp_nodelay=True)
+    publisher = rospy.Publisher(args.topic, Image, queue_size=50, tcp_nodelay=True)
     lifetime.say(ready=args.topic)
     while publisher.get_num_connections() == 0 and not rospy.is_shutdown():
         time.sleep(0.005)

@@ -2,8 +2,11 @@
 
 use std::{path::Path, time::Duration};
 
+use messages::{Dialect, Literal, NoFields, Plan, Registry, Selection, Wire};
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, METRICS_ROS1, Peer, UaSide, eventually, metrics, number};
+use system_tests::{Cell, Child, MASTER, METRICS_ROS1, Peer, UaSide, eventually, metrics, number};
+use tcpros::actionlib::{self, ActionClient, ActionClientOptions, ClientType};
+use tcpros::{Node, NodeOptions, TopicType};
 use uadp::{Scalar, Variant};
 
 const SOON: Duration = Duration::from_secs(30);
@@ -199,4 +202,75 @@ fn a_state_waits_for_its_service_and_an_event_does_not() {
         "an event of before is not made up for"
     );
     assert!(line.bridge.runs());
+}
+
+#[test]
+fn a_niryos_actions_are_there_for_a_client_that_knows_their_definitions() {
+    let Some(cell) = cell() else { return };
+    let _master = cell.roscore();
+    let robot = cell.rospy("niryo.py", &[DEFINITIONS]);
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()
+        .unwrap();
+    let outcome = runtime.block_on(async {
+        let mut options = NodeOptions::from_env("skill");
+        options.master_uri = format!("http://{MASTER}");
+        options.advertise_as("127.0.0.1");
+        let node = Node::start(options).unwrap();
+        let (goal_type, goal) = move_goal("cmd.cmd_type", "LINEAR_POSE");
+        let client = ActionClient::new(
+            &node,
+            "/niryo_robot_arm_commander/robot_action",
+            ClientType::of_goal(goal_type),
+            ActionClientOptions::default(),
+        )
+        .unwrap();
+        client.wait_for_server(SOON).await.unwrap();
+        let mut goal = client.send_goal(&goal);
+        let outcome = tokio::time::timeout(SOON, goal.outcome()).await.unwrap();
+        node.shutdown().await;
+        outcome
+    });
+    let result = outcome.unwrap();
+    assert_eq!(result.status, actionlib::Status::Succeeded);
+    // int32 status, 1 of niryo_robot_msgs/CommandStatus, before its text.
+    assert_eq!(result.body[..4], 1i32.to_le_bytes());
+    let told = robot.json_lines();
+    let told = told.iter().find(|line| line.get("action").is_some());
+    assert_eq!(told.map(|line| line["cmd_type"].clone()), Some(json!(5)));
+}
+
+/// The type of RobotMove's goal topic, and a goal with one field set.
+fn move_goal(path: &str, value: &str) -> (TopicType, Vec<u8>) {
+    let mut registry = Registry::bundle(Dialect::Ros1);
+    for (folder, name, kind) in [
+        ("niryo_robot_arm_commander", "RobotMove", "action"),
+        ("niryo_robot_arm_commander", "ArmMoveCommand", "msg"),
+        ("niryo_robot_arm_commander", "ShiftPose", "msg"),
+        ("niryo_robot_msgs", "RobotState", "msg"),
+        ("niryo_robot_msgs", "RPY", "msg"),
+    ] {
+        let file = format!("{DEFINITIONS}/{folder}/{kind}/{name}.{kind}");
+        let text = std::fs::read_to_string(file).unwrap();
+        let name = format!("{folder}/{name}").parse().unwrap();
+        match kind {
+            "action" => registry.add_action(&name, &text).unwrap(),
+            _ => registry.add(&name, &text).unwrap(),
+        }
+    }
+    let name = "niryo_robot_arm_commander/RobotMove".parse().unwrap();
+    let action = registry.action(&name).unwrap();
+    let rest = [(path.to_owned(), Literal::One(value.to_owned()))].into();
+    let template = Selection::Template { field: None, rest };
+    let plan = Plan::compile(action.goal(), &template, Wire::Ros1).unwrap();
+    let mut goal = Vec::new();
+    plan.write(&mut NoFields, &mut goal).unwrap();
+    let goal_type = TopicType {
+        name: action.action_goal().name().to_string(),
+        md5sum: action.action_goal().md5().to_owned(),
+        definition: action.action_goal().definition().to_owned(),
+    };
+    (goal_type, goal)
 }
