@@ -15,8 +15,8 @@ pub(crate) struct Pace {
 impl Pace {
     /// Bytes per second: what a gigabit link carries with something to spare.
     pub(crate) const RATE: u64 = 100_000_000;
-    /// Bytes that may go at once: what accumulates while a timer rings some milliseconds late. Socket buffers of the
-    /// default size hold it.
+    /// Bytes that may go at once: what accumulates while a timer rings some milliseconds late. The socket buffers the
+    /// bridges ask for hold many times that; those a system grants by default hold about half of it.
     const BURST: u64 = 256 << 10;
 
     /// When the next chunk may go.

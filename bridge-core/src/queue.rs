@@ -4,11 +4,13 @@ use std::collections::VecDeque;
 
 use mappings::Overflow;
 
-/// Samples of one topic that wait to be polled. When full, the oldest gives way: nothing ever blocks a producer.
+/// Samples of one topic that wait to be polled, bounded in number and in bytes. When full, the oldest give way, never
+/// the newest: nothing ever blocks a producer.
 #[derive(Debug)]
 pub(crate) struct Queue<T> {
-    items: VecDeque<T>,
+    items: VecDeque<(T, usize)>,
     depth: usize,
+    bytes: usize,
 }
 
 impl<T> Queue<T> {
@@ -20,28 +22,36 @@ impl<T> Queue<T> {
         Self {
             items: VecDeque::new(),
             depth,
+            bytes: 0,
         }
     }
 
-    /// Appends a sample and gives back the oldest one if it had to go.
-    pub(crate) fn push(&mut self, item: T) -> Option<T> {
-        let dropped = if self.items.len() >= self.depth {
-            self.items.pop_front()
-        } else {
-            None
-        };
-        self.items.push_back(item);
+    /// Appends a sample of so many bytes and gives back the oldest ones that had to go.
+    pub(crate) fn push(&mut self, item: T, bytes: usize) -> Vec<T> {
+        let mut dropped = Vec::new();
+        while self.items.len() >= self.depth
+            || (!self.items.is_empty() && self.bytes.saturating_add(bytes) > MAX_BYTES)
+        {
+            dropped.extend(self.pop());
+        }
+        self.bytes += bytes;
+        self.items.push_back((item, bytes));
         dropped
     }
 
     pub(crate) fn pop(&mut self) -> Option<T> {
-        self.items.pop_front()
+        let (item, bytes) = self.items.pop_front()?;
+        self.bytes -= bytes;
+        Some(item)
     }
 
     pub(crate) fn is_empty(&self) -> bool {
         self.items.is_empty()
     }
 }
+
+/// Of one topic, beside a newest sample that is larger: twice the largest message that crosses unless told otherwise.
+const MAX_BYTES: usize = 128 << 20;
 
 #[cfg(test)]
 mod tests {
@@ -52,7 +62,7 @@ mod tests {
     #[test]
     fn the_latest_samples_stay_in_order() {
         let mut queue = Queue::new(Overflow::DropOldest(NonZeroU16::new(2).unwrap()));
-        let dropped: Vec<_> = (1..=4).filter_map(|sample| queue.push(sample)).collect();
+        let dropped: Vec<_> = (1..=4).flat_map(|sample| queue.push(sample, 1)).collect();
         assert_eq!(dropped, [1, 2]);
         assert_eq!(
             (queue.pop(), queue.pop(), queue.pop()),
@@ -63,7 +73,19 @@ mod tests {
     #[test]
     fn keep_latest_keeps_one() {
         let mut queue = Queue::new(Overflow::KeepLatest);
-        assert_eq!((queue.push(1), queue.push(2)), (None, Some(1)));
+        assert_eq!((queue.push(1, 1), queue.push(2, 1)), (vec![], vec![1]));
         assert_eq!((queue.pop(), queue.pop()), (Some(2), None));
+    }
+
+    #[test]
+    fn large_samples_give_way_before_their_number_is_reached() {
+        let mut queue = Queue::new(Overflow::DropOldest(NonZeroU16::new(100).unwrap()));
+        let half = MAX_BYTES / 2;
+        assert_eq!(queue.push(1, half), [0; 0]);
+        assert_eq!(queue.push(2, half), [0; 0]);
+        assert_eq!(queue.push(3, 10), [1]);
+        assert_eq!(queue.push(4, 2 * MAX_BYTES), [2, 3], "the newest stays");
+        assert_eq!(queue.push(5, 10), [4]);
+        assert_eq!((queue.pop(), queue.pop(), queue.bytes), (Some(5), None, 0));
     }
 }

@@ -431,7 +431,6 @@ impl Router {
 
     fn handle_due(&mut self, topic: TopicId, now: Now) {
         let (key_frames, keep_alives, silence) = self.periods();
-        let buffer = self.buffer();
         let Some(entry) = self.topics.get_mut(&topic) else {
             return;
         };
@@ -457,11 +456,15 @@ impl Router {
                         writer.spoke(now.monotonic);
                         let expected = writer.expected_sequence();
                         // What waits says more.
+                        let buffer = self.spare.pop().unwrap_or_default();
                         if !entry.has_more()
                             && let Some(datagram) = keep_alive(buffer, topic, expected, now.utc)
                         {
                             entry.counters.keep_alives += 1;
-                            entry.queue.push(Item::Message(Message::Datagram(datagram)));
+                            let item = Item::Message(Message::Datagram(datagram));
+                            let bytes = item.bytes();
+                            // Nothing waits that could give way.
+                            drop(entry.queue.push(item, bytes));
                         }
                     }
                 }
@@ -530,24 +533,30 @@ impl Router {
         let Some(entry) = self.topics.get_mut(&topic) else {
             return false;
         };
-        let dropped = entry.queue.push(item);
+        let bytes = item.bytes();
+        let dropped = entry.queue.push(item, bytes);
         if !entry.ready {
             entry.ready = true;
             self.ready.push_back(topic);
         }
-        match dropped {
-            None => return false,
-            Some(Item::Message(Message::Datagram(Encoded { bytes, .. }))) => self.recycle(bytes),
-            // It is kept for repeating, or its last owner frees it.
-            Some(Item::Message(Message::Large(_))) => {}
-            Some(Item::Delivery(Delivery {
-                payload, instance, ..
-            })) => {
-                self.recycle(payload);
-                self.forget(topic, instance);
+        if dropped.is_empty() {
+            return false;
+        }
+        let count = dropped.len().try_into().unwrap_or(u64::MAX);
+        for item in dropped {
+            match item {
+                Item::Message(Message::Datagram(Encoded { bytes, .. })) => self.recycle(bytes),
+                // It is kept for repeating, or its last owner frees it.
+                Item::Message(Message::Large(_)) => {}
+                Item::Delivery(Delivery {
+                    payload, instance, ..
+                }) => {
+                    self.recycle(payload);
+                    self.forget(topic, instance);
+                }
             }
         }
-        self.count(About::topic(topic), Reason::Overflow, 1, || {
+        self.count(About::topic(topic), Reason::Overflow, count, || {
             "the queue was full, its oldest sample was dropped".to_owned()
         });
         true

@@ -56,6 +56,17 @@ pub(crate) struct Sending {
     pub(crate) offset: usize,
 }
 
+impl Item {
+    /// How much of the queue's bytes it takes.
+    pub(crate) fn bytes(&self) -> usize {
+        match self {
+            Self::Message(Message::Datagram(encoded)) => encoded.bytes.len(),
+            Self::Message(Message::Large(encoded)) => encoded.bytes.len(),
+            Self::Delivery(delivery) => delivery.payload.len(),
+        }
+    }
+}
+
 impl Topic {
     pub(crate) fn new(role: Role, overflow: Overflow) -> Self {
         Self {

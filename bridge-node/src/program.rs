@@ -121,7 +121,12 @@ fn load(arguments: &Arguments) -> Result<Option<Mapping>, Failure> {
 fn leave_to_the_run(findings: &mut Vec<Diagnostic>, file: &Path) {
     let before = findings.len();
     findings.retain(|finding| {
+        let doubtful = finding
+            .help
+            .as_ref()
+            .is_some_and(|help| help.starts_with("did you mean"));
         finding.severity == Severity::Error
+            || doubtful
             || !matches!(
                 finding.code,
                 Code::UnknownMessageType | Code::UnknownServiceType

@@ -48,9 +48,12 @@ impl<P: Port> Shell<P> {
         let mut timer = std::pin::pin!(tokio::time::sleep(FAR));
         // Any UDP datagram fits.
         let mut buffer = vec![0; 65_536];
+        let mut more = false;
         loop {
             self.arm(timer.as_mut());
             tokio::select! {
+                // What is left of a long drain goes on after one more look at everything else.
+                () = tokio::task::yield_now(), if more => {}
                 () = &mut stop => return Ok(()),
                 heard = self.udp.recv(&mut buffer) => self.heard(heard, &buffer),
                 event = self.port.recv() => self.port_event(event)?,
@@ -58,7 +61,7 @@ impl<P: Port> Shell<P> {
                 // Who asked may have gone; there is nobody else to tell.
                 Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
             }
-            self.drain();
+            more = self.drain();
         }
     }
 
@@ -123,8 +126,12 @@ impl<P: Port> Shell<P> {
         Ok(())
     }
 
-    fn drain(&mut self) {
-        while let Some(output) = self.router.poll_output(now()) {
+    /// Carries out what the Router wants done, a bounded number of things; says whether more may wait.
+    fn drain(&mut self) -> bool {
+        for _ in 0..DRAINED_AT_ONCE {
+            let Some(output) = self.router.poll_output(now()) else {
+                return false;
+            };
             match output {
                 Output::Datagram { topic, bytes } => {
                     let sent = if self.dry_run {
@@ -146,6 +153,7 @@ impl<P: Port> Shell<P> {
                 other => debug!(?other, "an output this program does not know"),
             }
         }
+        true
     }
 
     fn deliver(&mut self, delivery: bridge_core::Delivery) {
@@ -198,5 +206,8 @@ fn tell(notice: &Notice) {
     warn!(topic, from, reason = %reason, total, "dropped: {detail}");
 }
 
+/// Outputs carried out before everybody else has a turn: where sending is slower than the Router's pace for large
+/// messages, there is always one more.
+const DRAINED_AT_ONCE: usize = 64;
 /// A deadline for when there is nothing to wait for.
 const FAR: Duration = Duration::from_secs(3600);

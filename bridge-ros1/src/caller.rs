@@ -8,7 +8,7 @@ use mappings::TopicId;
 use tcpros::{ServiceClient, ServiceError};
 use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval, sleep};
-use tracing::{info, warn};
+use tracing::info;
 
 use crate::pending::Pending;
 
@@ -36,8 +36,8 @@ pub(crate) struct Caller {
     client: ServiceClient,
     of: Source,
     report: mpsc::Sender<Outcome>,
-    /// The fault that was told last and is not over.
-    trouble: Option<String>,
+    /// Whether the last call came to nothing.
+    failing: bool,
 }
 
 impl Caller {
@@ -50,17 +50,19 @@ impl Caller {
             client,
             of,
             report,
-            trouble: None,
+            failing: false,
         }
     }
 
-    /// Calls with each request in turn. A state (`insist`) is tried until the service takes it or a newer one has come,
-    /// an event once.
+    /// Calls with each request in turn. A state (`insist`) is tried until the service takes it or a newer value has
+    /// come, an event once.
     pub(crate) async fn serve(mut self, pending: Arc<Pending>, insist: bool) {
         loop {
             let mut request = pending.take().await;
             let mut wait = FIRST_WAIT;
-            while self.call(request.clone(), insist).await == Next::Again {
+            while let Some(asked) = request.clone()
+                && self.call(asked, insist).await == Next::Again
+            {
                 tokio::select! {
                     newer = pending.take() => (request, wait) = (newer, FIRST_WAIT),
                     () = sleep(wait) => wait = (wait * 2).min(LAST_WAIT),
@@ -81,43 +83,26 @@ impl Caller {
     }
 
     async fn call(&mut self, request: Bytes, insist: bool) -> Next {
-        let result = match self.client.call(request).await {
-            Ok(answer) => {
-                self.over();
-                Ok(answer)
+        let answer = self.client.call(request).await;
+        let mut next = Next::Done;
+        let result = answer.map_err(|error| {
+            self.failing = true;
+            if insist && may_pass(&error) {
+                next = Next::Again;
+                return format!("{error}; trying again");
             }
-            Err(error) => {
-                let again = insist && may_pass(&error);
-                let text = error.to_string();
-                self.trouble(&text, again);
-                if again {
-                    return Next::Again;
-                }
-                Err(text)
-            }
-        };
+            error.to_string()
+        });
+        if result.is_ok() && std::mem::take(&mut self.failing) {
+            info!(service = self.client.service(), "the service answers again");
+        }
         let outcome = Outcome {
             of: self.of,
             result,
         };
         // Nobody is left to be told when the port is gone.
         drop(self.report.send(outcome).await);
-        Next::Done
-    }
-
-    /// Tells of a fault that is not reported, once.
-    fn trouble(&mut self, text: &str, again: bool) {
-        let new = self.trouble.as_deref() != Some(text);
-        if new && again {
-            warn!(service = self.client.service(), "trying again: {text}");
-        }
-        self.trouble = Some(text.to_owned());
-    }
-
-    fn over(&mut self) {
-        if self.trouble.take().is_some() {
-            info!(service = self.client.service(), "the service answers again");
-        }
+        next
     }
 }
 

@@ -8,10 +8,12 @@ use mappings::Overflow;
 use tokio::sync::Notify;
 
 /// The bounded queue between the port and the task that calls one service. When it is full, the oldest gives way.
+///
+/// `None` stands for a value that calls nothing: of a state it says that no earlier one is to be called for any more.
 #[derive(Debug)]
 pub(crate) struct Pending {
     depth: usize,
-    waiting: Mutex<VecDeque<Bytes>>,
+    waiting: Mutex<VecDeque<Option<Bytes>>>,
     changed: Notify,
 }
 
@@ -28,21 +30,22 @@ impl Pending {
         }
     }
 
-    /// Queues a request and says whether the oldest one had to go.
-    pub(crate) fn push(&self, request: Bytes) -> bool {
+    /// Queues a request and says how many requests had to go for it.
+    pub(crate) fn push(&self, request: Option<Bytes>) -> u64 {
         let mut waiting = self.lock();
-        let full = waiting.len() >= self.depth;
-        if full {
-            waiting.pop_front();
-        }
+        let oldest = if waiting.len() >= self.depth {
+            waiting.pop_front().flatten()
+        } else {
+            None
+        };
         waiting.push_back(request);
         drop(waiting);
         self.changed.notify_one();
-        full
+        u64::from(oldest.is_some())
     }
 
-    /// The oldest request, when there is one. Cancel-safe: it is taken only when it is returned.
-    pub(crate) async fn take(&self) -> Bytes {
+    /// The oldest, when there is one. Cancel-safe: it is taken only when it is returned.
+    pub(crate) async fn take(&self) -> Option<Bytes> {
         loop {
             let next = self.lock().pop_front();
             if let Some(request) = next {
@@ -52,7 +55,7 @@ impl Pending {
         }
     }
 
-    fn lock(&self) -> MutexGuard<'_, VecDeque<Bytes>> {
+    fn lock(&self) -> MutexGuard<'_, VecDeque<Option<Bytes>>> {
         // The queue is whole between statements.
         self.waiting.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -70,12 +73,12 @@ mod tests {
             (Overflow::DropOldest(3.try_into().unwrap()), 1, 1),
         ] {
             let pending = Pending::new(overflow);
-            let gone = requests
+            let gone: u64 = requests
                 .iter()
-                .filter(|request| pending.push((*request).clone()))
-                .count();
+                .map(|request| pending.push(Some(request.clone())))
+                .sum();
             assert_eq!(gone, dropped);
-            assert_eq!(pending.take().await, requests[first]);
+            assert_eq!(pending.take().await.as_ref(), Some(&requests[first]));
         }
     }
 }

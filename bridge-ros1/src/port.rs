@@ -342,7 +342,9 @@ impl Ros1Port {
             let named = ros_topic
                 .strip_prefix('/')
                 .and_then(|name| name.parse::<TopicId>().ok());
-            match (named, self.mapping.matching(self.own, ros_topic)) {
+            let typed = self.graph.types.get(ros_topic).and_then(|t| t.parse().ok());
+            let made = self.mapping.matching(self.own, ros_topic, typed.as_ref());
+            match (named, made) {
                 (Some(topic), _) => {
                     let variable = self.mapping.variable(topic);
                     let bound = variable
@@ -351,11 +353,11 @@ impl Ros1Port {
                         found.push((ros_topic.clone(), Ok((topic, None, Selection::Whole))));
                     }
                 }
-                (None, Some(made)) => {
+                (None, Some(made)) if !self.is_written(ros_topic) => {
                     let made = made.map(|made| (made.topic, made.message_type, made.selection));
                     found.push((ros_topic.clone(), made.map_err(|fault| fault.to_string())));
                 }
-                (None, None) => {}
+                (None, _) => {}
             }
         }
         for (ros_topic, made) in found {
@@ -379,6 +381,16 @@ impl Ros1Port {
                 source.subscription = None;
             }
         }
+    }
+
+    /// Whether values of other spaces are written there: others who publish it too are not a value of ours.
+    fn is_written(&self, ros_topic: &str) -> bool {
+        let mut sinks = self.sinks.values();
+        sinks.any(|sink| {
+            self.node
+                .resolve(&sink.ros_topic)
+                .is_ok_and(|name| name == ros_topic)
+        })
     }
 
     /// Takes in a topic the mapping does not name, unless another one is that value already.
@@ -543,6 +555,11 @@ impl Port for Ros1Port {
     fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
         if sample.status & STATUS_BAD != 0 {
             return Err("bad status");
+        }
+        // What was handed out before is for late joiners, and a service is none.
+        let again = sample.kept == Kept::Again;
+        if again && self.services.takes(sample.topic) {
+            return Ok(());
         }
         if let Some(replaced) = self.services.hand_over(sample.topic, &sample.payload) {
             if replaced > 0 {

@@ -229,15 +229,21 @@ impl Services {
         Ok(Caller::new(client, of, self.report.clone()))
     }
 
+    /// Whether the values of a topic are for a service.
+    pub(crate) fn takes(&self, topic: TopicId) -> bool {
+        self.callers.contains_key(&topic)
+    }
+
     /// Hands a value to the service of its topic; `None` when it has none. Else says how many older values gave way.
     pub(crate) fn hand_over(&self, topic: TopicId, value: &Bytes) -> Option<u64> {
         let callee = self.callers.get(&topic)?;
         let request = match &callee.constant {
-            None => value.clone(),
-            Some((_, Some(wanted))) if wanted != value => return Some(0),
-            Some((request, _)) => request.clone(),
+            None => Some(value.clone()),
+            // It calls nothing, and of a state it takes the place of one that still does.
+            Some((_, Some(wanted))) if wanted != value => None,
+            Some((request, _)) => Some(request.clone()),
         };
-        Some(u64::from(callee.pending.push(request)))
+        Some(callee.pending.push(request))
     }
 
     /// The end of the next call. Cancel-safe.

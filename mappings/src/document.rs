@@ -118,8 +118,8 @@ document! {
         topics: String,
         /// Topics left out, patterns too, as [/robot9/**].
         exclude: Vec<At<String>>,
-        /// The ROS space of the topics.
-        #[schemars(required, range(min = 1, max = 232))]
+        /// The ROS space of the topics: 1, since topics of ROS 2 are not taken in by patterns yet.
+        #[schemars(required, range(min = 1, max = 1))]
         origin: u16,
         /// The OPC UA node of each, as ns=2;i=10{1}: {1} is what the first wildcard stands for, {2} the second. A topic whose
         /// number would not be one from 1 to 65535 is left out, with a word in the log.

@@ -6,7 +6,7 @@ use std::num::NonZeroU16;
 use std::time::Duration;
 
 use messages::{Leaf, Selection, TypeName};
-use uadp::{BuiltinType, Scalar};
+use uadp::BuiltinType;
 
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
@@ -62,7 +62,7 @@ impl Mapping {
         &self.patterns
     }
 
-    /// The variable a ROS topic of a space becomes by the first pattern about it. `None` for a topic without a pattern, one
+    /// The variable a ROS topic of a space becomes by the first pattern about it and its type, where that is known. `None` for a topic without a pattern, one
     /// that a variable is bound to, and the names of the space (`/ua_1_2_10`).
     ///
     /// # Errors
@@ -73,6 +73,7 @@ impl Mapping {
         &self,
         space: SpaceId,
         ros_topic: &str,
+        message_type: Option<&TypeName>,
     ) -> Option<Result<PatternVariable, PatternFault>> {
         let name = ros_topic.strip_prefix('/').unwrap_or(ros_topic);
         if name.parse::<TopicId>().is_ok()
@@ -80,7 +81,11 @@ impl Mapping {
         {
             return None;
         }
-        let patterns = self.patterns.iter().filter(|p| p.origin() == space);
+        let patterns = self.patterns.iter().filter(|pattern| {
+            let wanted = pattern.message_type.as_ref();
+            pattern.origin() == space
+                && (message_type.is_none() || wanted.is_none() || wanted == message_type)
+        });
         let (pattern, made) = patterns
             .filter_map(|pattern| Some((pattern, pattern.matches(ros_topic)?)))
             .next()?;
@@ -236,49 +241,6 @@ pub enum Trigger {
     Any,
     /// Those equal to the literal.
     Equals(String),
-}
-
-impl Trigger {
-    /// Whether a value calls.
-    #[must_use]
-    pub fn fires(&self, value: &Scalar<'_>) -> bool {
-        match self {
-            Self::Any => true,
-            Self::Equals(text) => equals(text, value) == Some(true),
-        }
-    }
-}
-
-/// `None` when the text is no value of that type.
-pub(crate) fn equals(text: &str, value: &Scalar<'_>) -> Option<bool> {
-    let whole = |value: i128| text.parse::<i128>().ok().map(|number| number == value);
-    match value {
-        Scalar::Boolean(value) => text.parse::<bool>().ok().map(|said| said == *value),
-        Scalar::SByte(value) => whole(i128::from(*value)),
-        Scalar::Byte(value) => whole(i128::from(*value)),
-        Scalar::Int16(value) => whole(i128::from(*value)),
-        Scalar::UInt16(value) => whole(i128::from(*value)),
-        Scalar::Int32(value) => whole(i128::from(*value)),
-        Scalar::UInt32(value) => whole(i128::from(*value)),
-        Scalar::Int64(value) => whole(i128::from(*value)),
-        Scalar::UInt64(value) => whole(i128::from(*value)),
-        Scalar::Float(value) => text.parse::<f32>().ok().map(|number| number == *value),
-        Scalar::Double(value) => text.parse::<f64>().ok().map(|number| number == *value),
-        Scalar::String(value) => Some(value.unwrap_or_default() == text),
-        Scalar::DateTime(_)
-        | Scalar::Guid(_)
-        | Scalar::ByteString(_)
-        | Scalar::XmlElement(_)
-        | Scalar::NodeId(_)
-        | Scalar::ExpandedNodeId(_)
-        | Scalar::StatusCode(_)
-        | Scalar::QualifiedName(_)
-        | Scalar::LocalizedText(_)
-        | Scalar::ExtensionObject(_)
-        | Scalar::DataValue(_)
-        | Scalar::Variant(_)
-        | Scalar::DiagnosticInfo(_) => None,
-    }
 }
 
 /// How NetworkMessages travel between the spaces.

@@ -16,7 +16,7 @@ use mappings::{
 };
 use messages::{Leaf, Literal, Rank, Selection};
 use proptest::prelude::*;
-use uadp::{BuiltinType, Scalar};
+use uadp::BuiltinType;
 
 const HEAD: &str = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:my-plant:line}\nvariables:\n";
 
@@ -331,12 +331,11 @@ fn a_request_without_the_value_is_sent_when_the_value_is_the_one_said() {
         }
     };
     let boolean = when("type: Boolean,", "");
-    assert!(boolean.fires(&Scalar::Boolean(true)) && !boolean.fires(&Scalar::Boolean(false)));
+    assert_eq!(boolean, Trigger::Equals("true".to_owned()));
     assert_eq!(when("type: Int32,", ""), Trigger::Any);
     assert_eq!(when("", ""), Trigger::Any);
     let seven = when("type: Int32,", ", when: 7");
-    assert!(seven.fires(&Scalar::Int32(7)) && !seven.fires(&Scalar::Int32(8)));
-    assert!(!seven.fires(&Scalar::ByteString(None)));
+    assert_eq!(seven, Trigger::Equals("7".to_owned()));
 }
 
 #[test]
@@ -389,7 +388,7 @@ fn topics_become_variables_by_the_first_pattern_about_them() {
          - {topics: /robot*/**, origin: 1, node: \"ns=2;s={1}/{2}\", alias: \"2{1}\", name: \"{2} of {1}\", as: bytes}\n";
     let mapping = sound(text);
     assert_eq!(mapping.patterns().len(), 2);
-    let matching = |topic: &str| mapping.matching(SpaceId::ROS1, topic);
+    let matching = |topic: &str| mapping.matching(SpaceId::ROS1, topic, None);
     let made = matching("/robot2/joint_states").unwrap().unwrap();
     assert_eq!(made.topic, topic("ua_1_2_102"));
     assert_eq!(
@@ -408,10 +407,14 @@ fn topics_become_variables_by_the_first_pattern_about_them() {
     );
     assert_eq!(made.name, "joint_states of 9");
     assert_eq!(matching("/robot1/joint_states"), None, "a variable has it");
+    let string = "std_msgs/String".parse().unwrap();
+    let of_another_type = mapping.matching(SpaceId::ROS1, "/robot2/joint_states", Some(&string));
+    let name = of_another_type.unwrap().unwrap().name;
+    assert_eq!(name, "joint_states of 2", "the first pattern is not for it");
     assert_eq!(matching("/rosout"), None);
     assert_eq!(matching("/ua_1_2_102"), None);
     assert_eq!(
-        mapping.matching(SpaceId::new(2).unwrap(), "/robot2/joint_states"),
+        mapping.matching(SpaceId::new(2).unwrap(), "/robot2/joint_states", None),
         None
     );
     let told = |topic: &str| matching(topic).unwrap().unwrap_err().to_string();
@@ -431,7 +434,7 @@ fn a_pattern_does_not_take_the_node_of_a_variable() {
          patterns:\n  - {topics: /robot*, origin: 1, node: \"ns=2;i=10{1}\", name: R}\n";
     let mapping = sound(text);
     let fault = mapping
-        .matching(SpaceId::ROS1, "/robot1")
+        .matching(SpaceId::ROS1, "/robot1", None)
         .unwrap()
         .unwrap_err();
     assert!(
@@ -440,7 +443,12 @@ fn a_pattern_does_not_take_the_node_of_a_variable() {
             .ends_with("`ua_1_2_101` is the variable `First` already"),
         "{fault}"
     );
-    assert!(mapping.matching(SpaceId::ROS1, "/robot2").unwrap().is_ok());
+    assert!(
+        mapping
+            .matching(SpaceId::ROS1, "/robot2", None)
+            .unwrap()
+            .is_ok()
+    );
 }
 
 #[test]

@@ -57,14 +57,14 @@ fn images_of_ten_megabytes_leave_ros_1_as_they_were_and_a_button_beside_them_los
     let group = UadpSocket::join();
     let mapping = cell.file("camera.yaml", CAMERA);
     let _bridge = cell.bridge_ros1(&[mapping.to_str().unwrap()]);
-    let count = IMAGES.to_string();
-    let _camera = cell.rospy("ros1_image.py", &["pub", "/camera", "--count", &count]);
+    let patterns = patterns();
     let presses = PRESSES.to_string();
     let button = ["/button", "std_msgs/String", "--numbered", &presses];
     let paced = ["--rate", "50", "--wait-subscribers", "1"];
     let _button = cell.rospy("ros1_pub.py", &[&button[..], &paced].concat());
-
-    let patterns = patterns();
+    // Last, as it begins at once: what comes before somebody listens is more than a socket holds.
+    let count = IMAGES.to_string();
+    let _camera = cell.rospy("ros1_image.py", &["pub", "/camera", "--count", &count]);
     let mut reassembler = Reassembler::new(ReassemblyLimits {
         pieces: 1000,
         ..ReassemblyLimits::default()

@@ -130,13 +130,14 @@ fn a_type_that_cannot_be_read_is_named_once_with_the_reason() {
         md5sum: "0".repeat(32),
         definition: "missing_msgs/Thing thing\n".to_owned(),
     };
-    let _odd = node.latched("/ua_1_2_1", unreadable, &[0; 4]);
+    let odd = node.latched("/ua_1_2_1", unreadable.clone(), &[0; 4]);
     eventually("the reason is told", SOON, || {
         (lines(&bridge, "missing_msgs/Thing") > 0).then_some(())
     });
     // It comes and goes, and is not told of again.
+    drop(odd);
     for _ in 0..3 {
-        drop(node.latched("/ua_1_2_2", float32(), &[0; 4]));
+        let _odd = node.latched("/ua_1_2_1", unreadable.clone(), &[0; 4]);
         let _good = node.latched("/ua_1_2_2", float32(), &[0; 4]);
         side.hear_scalar((1, 2, 2), Scalar::Float(0.0));
     }

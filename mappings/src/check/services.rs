@@ -5,9 +5,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use messages::{
-    Dialect, Leaf, MessageType, Plan, PlanError, Selection, ServiceType, TypeName, Wire,
+    Dialect, Leaf, Literal, MessageType, Plan, PlanError, Selection, ServiceType, TypeName, Wire,
 };
-use uadp::{BuiltinType, Scalar};
+use uadp::BuiltinType;
 
 use super::bindings::{Site, compare, ros_name, select, told};
 use super::network::duration;
@@ -15,7 +15,7 @@ use super::types::{self, Types, ValueType};
 use crate::code::Code;
 use crate::document::{self, BindingEntry, Request};
 use crate::findings::Findings;
-use crate::mapping::{ServiceBinding, ServiceRole, Trigger, equals};
+use crate::mapping::{ServiceBinding, ServiceRole, Trigger};
 use crate::nearest::nearest;
 use crate::node_id::NodeIdText;
 use crate::read::{At, Field, given, short};
@@ -104,25 +104,18 @@ impl Service {
     }
 }
 
+/// The value that calls is compared as the std_msgs type of the variable's: the text has to be a value of it.
 fn check_when(text: &str, value_type: ValueType, place: Place, findings: &mut Findings) {
-    let example = match value_type {
-        (BuiltinType::Boolean, false) => Scalar::Boolean(false),
-        (BuiltinType::Float | BuiltinType::Double, false) => Scalar::Double(0.0),
-        (BuiltinType::String, false) => Scalar::String(None),
-        (
-            BuiltinType::SByte
-            | BuiltinType::Byte
-            | BuiltinType::Int16
-            | BuiltinType::UInt16
-            | BuiltinType::Int32
-            | BuiltinType::UInt32
-            | BuiltinType::Int64
-            | BuiltinType::UInt64,
-            false,
-        ) => Scalar::Int64(0),
-        _ => Scalar::ByteString(None),
+    let registry = Types::registry(Dialect::Ros1);
+    let carrier = registry.standard_type(value_type.0, value_type.1);
+    let carrier = carrier.and_then(|name| registry.get(&name).ok());
+    let data = ("data".to_owned(), Literal::One(text.to_owned()));
+    let template = Selection::Template {
+        field: None,
+        rest: BTreeMap::from([data]),
     };
-    if equals(text, &example).is_none() {
+    let fits = |carrier| Plan::compile(&carrier, &template, Wire::Ros1).is_ok();
+    if !carrier.is_some_and(fits) {
         let told = types::print(value_type);
         let message = format!("`{}` is no value of type {told}", short(text));
         findings

@@ -1,6 +1,6 @@
 //! The server as the local side of the bridge shell.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::{Interval, MissedTickBehavior};
 use tracing::{info, warn};
-use uadp::BuiltinType;
+use uadp::{BuiltinType, Timestamp};
 
 use crate::endpoint::{self, EndpointUrl};
 use crate::layout::Layout;
@@ -35,6 +35,8 @@ pub(crate) struct Setup {
 /// The OPC UA side of the space.
 pub(crate) struct ServerPort {
     space: Space,
+    /// When the values shown were taken; as many as there are nodes.
+    newest: HashMap<TopicId, Option<Timestamp>>,
     handle: ServerHandle,
     /// The server's own threads: signing for a client takes longer than a value should wait. Taken at the end.
     runtime: Option<Runtime>,
@@ -119,6 +121,7 @@ impl ServerPort {
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         Ok(Self {
             space: Space::new(&layout, manager, subscriptions),
+            newest: HashMap::new(),
             handle,
             runtime: Some(runtime),
             serving: Some(serving),
@@ -158,6 +161,12 @@ impl Port for ServerPort {
             // A variable has one value, and shows the last one.
             return Ok(());
         }
+        // Of several values side by side, who comes late hears an older one after the last.
+        let newest = self.newest.entry(sample.topic).or_default();
+        if sample.kept == Kept::Beside && sample.source < *newest {
+            return Ok(());
+        }
+        *newest = sample.source;
         self.space.update(
             sample.topic,
             &sample.payload,

@@ -421,6 +421,7 @@ fn twenty_restarts_of_the_master_cost_no_message() {
     println!("registered again within {longest:?} of the master's first answer");
     assert!(longest < Duration::from_secs(3) + AIR, "{longest:?}");
 
+    assert!(!sending.is_finished(), "a message found no subscriber");
     sending.abort();
     let mut heard = heard;
     let mut next = 0;
