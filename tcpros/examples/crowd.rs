@@ -14,7 +14,7 @@ use tcpros::{
     Inbox, InboxEvent, MasterState, Node, NodeOptions, Publisher, PublisherOptions,
     SubscriberOptions, Subscription, TopicType, Wanted,
 };
-use tokio::time::sleep;
+use tokio::time::{sleep, timeout};
 
 #[tokio::main(flavor = "multi_thread", worker_threads = 2)]
 async fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -38,24 +38,31 @@ async fn steady(topics: usize) -> Result<(), Box<dyn std::error::Error>> {
     let names = names("topic", topics);
     let subscriptions = subscribe(&listener, &names, &inbox)?;
     let publishers = advertise(&talker, &names)?;
-    while !publishers.iter().all(|p| p.subscribers() == 1) {
-        sleep(POLL).await;
-    }
+    within("connections", async {
+        while !publishers.iter().all(|p| p.subscribers() == 1) {
+            sleep(POLL).await;
+        }
+    })
+    .await?;
     for node in [&talker, &listener] {
         let mut state = node.master_state();
-        state.wait_for(|s| *s == MasterState::Registered).await?;
+        let registered = state.wait_for(|s| *s == MasterState::Registered);
+        drop(within("the master", registered).await??);
     }
     let ready = started.elapsed();
     for publisher in &publishers {
         // A subscriber that has gone again shows in the count of what arrives.
         let _published = publisher.publish(content());
     }
-    let mut heard = 0;
-    while heard < topics {
-        if let (_, InboxEvent::Message(_)) = inbox.recv().await {
-            heard += 1;
+    within("messages", async {
+        let mut heard = 0;
+        while heard < topics {
+            if let (_, InboxEvent::Message(_)) = inbox.recv().await {
+                heard += 1;
+            }
         }
-    }
+    })
+    .await?;
     say("steady", ready)?;
     drop((subscriptions, publishers));
     talker.shutdown().await;
@@ -72,22 +79,25 @@ async fn churn(topics: usize, rounds: usize) -> Result<(), Box<dyn std::error::E
         let mut inbox = Inbox::new();
         let subscriptions = subscribe(&node, &inputs, &inbox)?;
         let publishers = advertise(&node, &outputs)?;
-        let mut silent: std::collections::BTreeSet<usize> = (0..topics).collect();
-        while !silent.is_empty() {
-            if let (index, InboxEvent::Message(_)) = inbox.recv().await {
-                silent.remove(&index);
+        within("the other nodes", async {
+            let mut silent: std::collections::BTreeSet<usize> = (0..topics).collect();
+            while !silent.is_empty() {
+                if let (index, InboxEvent::Message(_)) = inbox.recv().await {
+                    silent.remove(&index);
+                }
             }
-        }
-        while !publishers.iter().all(|p| p.subscribers() > 0) {
-            sleep(POLL).await;
-        }
+            while !publishers.iter().all(|p| p.subscribers() > 0) {
+                sleep(POLL).await;
+            }
+        })
+        .await?;
         for publisher in &publishers {
             // Who takes it is of no interest here.
             let _published = publisher.publish(content());
         }
         drop((subscriptions, publishers));
         if round == warm || round == rounds {
-            settled().await?;
+            within("files to be closed", settled()).await??;
             say(
                 if round == warm { "warm" } else { "end" },
                 started.elapsed(),
@@ -133,6 +143,12 @@ const fn content() -> Bytes {
     Bytes::from_static(b"\x02\0\0\0hi")
 }
 
+/// One wait, with an end: a crowd that does not come together is a failure to be told.
+async fn within<T>(what: &str, wait: impl Future<Output = T>) -> Result<T, String> {
+    let done = timeout(LONGEST_WAIT, wait).await;
+    done.map_err(|_| format!("waited {LONGEST_WAIT:?} for {what}"))
+}
+
 /// Waits until no file is opened or closed any more.
 async fn settled() -> std::io::Result<()> {
     let mut before = files()?;
@@ -176,4 +192,5 @@ fn now() -> Instant {
     Instant::now()
 }
 
+const LONGEST_WAIT: Duration = Duration::from_secs(120);
 const POLL: Duration = Duration::from_millis(10);

@@ -26,7 +26,7 @@ async fn relay() -> Result<(), Box<dyn Error + Send + Sync>> {
     let mut options = NodeOptions::from_env("relay");
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let topics = options.apply_arguments(&arguments)?;
-    let (pairs, []) = topics.as_chunks::<2>() else {
+    let (pairs @ [_, ..], []) = topics.as_chunks::<2>() else {
         return Err("relay IN OUT [IN OUT]..".into());
     };
     let node = Node::start(options)?;
@@ -50,8 +50,15 @@ async fn relay() -> Result<(), Box<dyn Error + Send + Sync>> {
                 peer,
                 ..
             } if !publishers.contains_key(&output) => {
-                let publisher = advertise(&node, &output, &peer)?;
-                publishers.insert(output, publisher);
+                match advertise(&node, &output, &peer) {
+                    Ok(publisher) => {
+                        publishers.insert(output, publisher);
+                    }
+                    // The next publisher may tell a whole type.
+                    Err(error) => {
+                        tracing::warn!(publisher = peer.caller_id, %error, "a publisher is passed over");
+                    }
+                }
             }
             InboxEvent::Message(message) => {
                 if let Some(publisher) = publishers.get(&output) {

@@ -11,8 +11,9 @@ use tokio::net::TcpListener;
 use tokio::sync::Notify;
 use tokio::task::JoinSet;
 
-use self::parameters::{Tree, Update};
+use self::parameters::{Tree, Update, parts};
 use crate::clock;
+use crate::header::clipped;
 use crate::names::{self, NameError};
 use crate::outbox::lock;
 use crate::rpc::{self, Endpoint, RpcError};
@@ -104,7 +105,13 @@ impl Shared {
             ("getPid", _) => done(i32::try_from(std::process::id()).unwrap_or(0)),
             ("getUri", _) => done(self.uri.as_str()),
             ("getSystemState", _) => done(registry.system_state()),
-            ("getTopicTypes", _) | ("getPublishedTopics", _) => done(registry.topic_types()),
+            ("getTopicTypes", _) => done(registry.topic_types(|_| true)),
+            ("getPublishedTopics", [_, subgraph]) => done(registry.published_topics(subgraph)),
+            ("getPublishedTopics", _) => {
+                return Err(fault(
+                    "getPublishedTopics: wrong number of arguments".to_owned(),
+                ));
+            }
             ("lookupNode", [_, name, ..]) => {
                 found(registry.nodes.get(*name).map(String::as_str), "node")
             }
@@ -145,8 +152,11 @@ impl Registry {
         Ok(match (method, texts) {
             ("registerPublisher", [caller, topic, type_name, api]) => {
                 self.know(caller, api);
-                self.types
-                    .insert((*topic).to_owned(), (*type_name).to_owned());
+                // Whoever publishes any type takes nothing from what is known.
+                if *type_name != "*" || !self.types.contains_key(*topic) {
+                    self.types
+                        .insert((*topic).to_owned(), (*type_name).to_owned());
+                }
                 add(&mut self.publishers, topic, caller, api);
                 self.dirty.insert((*topic).to_owned());
                 done(apis(&self.subscribers, topic))
@@ -227,6 +237,8 @@ impl Registry {
                 }
             }
             ("searchParam", [caller, name]) => {
+                not_too_deep(caller)?;
+                not_too_deep(name)?;
                 let full = tree.search(caller, name);
                 found(full.as_deref(), "parameter")
             }
@@ -341,11 +353,23 @@ impl Registry {
         ])
     }
 
-    fn topic_types(&self) -> Value {
+    /// The types of the topics that have a publisher, of those below a namespace only; an empty one is all.
+    fn published_topics(&self, subgraph: &str) -> Value {
+        let namespace = match subgraph.trim_end_matches('/') {
+            "" => String::new(),
+            name => format!("{name}/"),
+        };
+        self.topic_types(|topic| {
+            self.publishers.contains_key(topic) && topic.starts_with(&namespace)
+        })
+    }
+
+    fn topic_types(&self, wanted: impl Fn(&str) -> bool) -> Value {
         let pair = |(topic, name): (&String, &String)| {
             Value::Array(vec![topic.as_str().into(), name.as_str().into()])
         };
-        Value::Array(self.types.iter().map(pair).collect())
+        let types = self.types.iter().filter(|(topic, _)| wanted(topic));
+        Value::Array(types.map(pair).collect())
     }
 }
 
@@ -413,15 +437,125 @@ fn not_set(name: &str) -> Value {
     triple(-1, &format!("Parameter [{name}] is not set"), 0)
 }
 
-/// A parameter's name as the caller means it, in canonical form.
+/// A parameter's name as the caller means it, in canonical form. Fails for one of more than [`MAX_PARTS`] parts.
 fn full_name(name: &str, caller: &str) -> Result<String, Fault> {
-    names::of_caller(name, caller).map_err(|error: NameError| fault(error.to_string()))
+    let full = names::of_caller(name, caller)
+        .map_err(|error: NameError| fault(clipped(&error.to_string()).to_owned()))?;
+    not_too_deep(&full)?;
+    Ok(full)
+}
+
+fn not_too_deep(name: &str) -> Result<(), Fault> {
+    if parts(name).nth(MAX_PARTS).is_some() {
+        let name = clipped(name);
+        return Err(fault(format!(
+            "`{name}` has more than {MAX_PARTS} parts, which this master does not take"
+        )));
+    }
+    Ok(())
 }
 
 const fn fault(message: String) -> Fault {
     Fault { code: -1, message }
 }
 
+/// Parts of a parameter's name: the tree is gone through by recursion, which must not go as deep as a peer likes.
+const MAX_PARTS: usize = 32;
 /// How a master calls itself.
 const MASTER: &str = "/master";
 const NOTIFY_LIMIT: Duration = Duration::from_secs(3);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shared() -> Shared {
+        Shared {
+            uri: "http://127.0.0.1:11311/".to_owned(),
+            registry: Mutex::new(Registry::new()),
+            changed: Notify::new(),
+        }
+    }
+
+    fn ask(shared: &Shared, method: &str, texts: &[&str]) -> Response {
+        shared.answer(&Call {
+            method: method.to_owned(),
+            params: texts.iter().map(|text| Value::from(*text)).collect(),
+        })
+    }
+
+    fn types(topics: &[(&str, &str)]) -> Value {
+        let pair =
+            |(topic, name): &(&str, &str)| Value::Array(vec![(*topic).into(), (*name).into()]);
+        done(topics.iter().map(pair).collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn a_parameter_of_a_hundred_thousand_parts_is_refused_and_one_of_32_taken() {
+        let shared = shared();
+        let deep = "/a".repeat(100_000);
+        for call in [
+            vec!["setParam", "/n", &deep, "1"],
+            vec!["getParam", "/n", &deep],
+            vec!["hasParam", "/n", &deep],
+            vec!["deleteParam", "/n", &deep],
+            vec!["searchParam", "/n", &deep],
+            vec!["searchParam", &deep, "a"],
+            vec!["subscribeParam", "/n", "http://127.0.0.1:1/", &deep],
+            vec!["unsubscribeParam", "/n", "http://127.0.0.1:1/", &deep],
+            // A name is relative to who asks.
+            vec!["setParam", &deep, "a", "1"],
+        ] {
+            let (method, texts) = call.split_first().unwrap();
+            let refused = ask(&shared, method, texts).unwrap_err();
+            assert!(
+                refused.message.contains("32 parts") && refused.message.len() < 400,
+                "{method}: {}",
+                refused.message
+            );
+        }
+        let most = "/a".repeat(32);
+        assert_eq!(
+            ask(&shared, "setParam", &["/n", &most, "1"]).unwrap(),
+            done(0)
+        );
+        assert_eq!(ask(&shared, "getParam", &["/n", &most]).unwrap(), done("1"));
+    }
+
+    #[test]
+    fn the_published_topics_are_those_with_publishers_below_the_namespace() {
+        let shared = shared();
+        let api = "http://127.0.0.1:1/";
+        for (method, topic, name) in [
+            ("registerPublisher", "/line/a", "std_msgs/String"),
+            ("registerPublisher", "/lines", "std_msgs/Bool"),
+            ("registerSubscriber", "/line/heard", "std_msgs/Int8"),
+        ] {
+            ask(&shared, method, &["/n", topic, name, api]).unwrap();
+        }
+        let published = |subgraph| ask(&shared, "getPublishedTopics", &["/n", subgraph]).unwrap();
+        let line = ("/line/a", "std_msgs/String");
+        let all = types(&[line, ("/lines", "std_msgs/Bool")]);
+        assert_eq!(published(""), all);
+        assert_eq!(published("/"), all);
+        assert_eq!(published("/line"), types(&[line]));
+        assert_eq!(published("/line/"), types(&[line]));
+        ask(&shared, "unregisterPublisher", &["/n", "/line/a", api]).unwrap();
+        assert_eq!(published("/line"), types(&[]));
+    }
+
+    #[test]
+    fn a_publisher_of_any_type_leaves_the_type_that_is_known() {
+        let shared = shared();
+        for (name, known) in [
+            ("*", "*"),
+            ("std_msgs/String", "std_msgs/String"),
+            ("*", "std_msgs/String"),
+        ] {
+            let texts = ["/n", "/a", name, "http://127.0.0.1:1/"];
+            ask(&shared, "registerPublisher", &texts).unwrap();
+            let now = ask(&shared, "getTopicTypes", &["/n"]).unwrap();
+            assert_eq!(now, types(&[("/a", known)]));
+        }
+    }
+}

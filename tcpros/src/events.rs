@@ -90,8 +90,9 @@ pub(crate) fn message_too_long(topic: &str, bytes: usize) {
     );
 }
 
-pub(crate) fn service_failed(service: &str, client: &str, why: &str) {
-    warn!(service, client, why, "a request was given up");
+/// `more`: how many of these lines were held back since the last.
+pub(crate) fn service_failed(service: &str, client: &str, why: &str, more: u64) {
+    warn!(service, client, why, more, "a request was given up");
 }
 
 pub(crate) fn publisher_joined(topic: &str, publisher: &str) {

@@ -1,8 +1,8 @@
 //! A ROS 1 node on tokio.
 //!
 //! A [`Node`] registers with a ROS master, publishes and subscribes topics and offers and calls services of any type
-//! as bytes, and answers the slave API. It knows no message type: types are given with their checksum and text, or learned from the peer's
-//! [`ConnectionHeader`].
+//! as bytes, and answers the slave API. It knows no message type: types are given with their checksum and text, or
+//! learned from the peer's [`ConnectionHeader`].
 //!
 //! - It needs no master to start: it registers when one comes, and again after a restart. Connections between nodes
 //!   do not depend on the master and stay.

@@ -57,7 +57,7 @@ impl Node {
             .ok_or_else(|| NodeError::MasterUri(options.master_uri.clone()))?;
         let (api, api_port) = listen(options.bind)?;
         let (topics, topics_port) = listen(options.bind)?;
-        let uri = format!("http://{}:{api_port}/", bracketed(&options.hostname));
+        let uri = format!("http://{}:{api_port}/", rpc::bracketed(&options.hostname));
         let caller_id = names.node().to_owned();
         let master = Master::new(endpoint, options.master_uri, caller_id.clone(), uri.clone());
         let context = LinkContext {
@@ -68,7 +68,10 @@ impl Node {
         let inner = Arc::new(Inner {
             names,
             uri,
-            service_uri: format!("rosrpc://{}:{topics_port}", bracketed(&options.hostname)),
+            service_uri: format!(
+                "rosrpc://{}:{topics_port}",
+                rpc::bracketed(&options.hostname)
+            ),
             hostname: options.hostname,
             topics_port,
             master,
@@ -198,7 +201,8 @@ impl Node {
         };
         let entrance = Box::new(inbox.open(key, limit));
         let feed = Arc::new(Feed::new(topic, wanted, entrance));
-        self.inner.follow(&feed);
+        // A node that can still be asked is open.
+        let _open = self.inner.follow(&feed);
         Ok(Subscription::new(feed, Arc::clone(&self.inner)))
     }
 
@@ -266,9 +270,9 @@ impl Node {
         }
     }
 
-    /// Withdraws everything from the master and ends: connections to subscribers after their queues are written, those to
-    /// clients after their requests are answered,
-    /// all within two seconds. What could not be withdrawn is logged.
+    /// Withdraws everything from the master and ends: connections to subscribers after their queues are written, those
+    /// to clients after their requests are answered, all within two seconds. What a master that cannot be reached keeps
+    /// is logged by its names; one that answers too slowly is logged as such.
     pub async fn shutdown(mut self) {
         let mut settled = self.inner.settled.subscribe();
         let mut draining = self.inner.draining.subscribe();
@@ -310,7 +314,8 @@ impl GraphReader {
 pub enum MasterState {
     /// Not found yet, or lost: the node looks for it.
     Awaited,
-    /// The master has all registrations of this node.
+    /// It answers, and was told of all that the node had then. What it refused is tried again, with a line in the log,
+    /// and what was added since may still be on its way.
     Registered,
 }
 
@@ -498,14 +503,21 @@ impl Inner {
                 md5sum: Some(CLOCK_MD5.to_owned()),
             };
             let feed = Arc::new(Feed::new(topic, wanted, Box::new(self.clock.clone())));
-            self.follow(&feed);
-            *current = Some(feed);
+            if self.follow(&feed) {
+                *current = Some(feed);
+            }
         }
     }
 
-    /// Registers a subscription and links it to the publishers known.
-    fn follow(&self, feed: &Arc<Feed>) {
+    /// Registers a subscription and links it to the publishers known. False once the node is closed, which closes the
+    /// feed as well.
+    fn follow(&self, feed: &Arc<Feed>) -> bool {
         let mut registry = lock(&self.registry);
+        if registry.closed {
+            drop(registry);
+            feed.close();
+            return false;
+        }
         let generation = registry.next_generation();
         let entry = registry
             .subscriptions
@@ -517,10 +529,10 @@ impl Inner {
                 feeds: Vec::new(),
             });
         entry.feeds.push(Arc::clone(feed));
-        let publishers = entry.publishers.clone();
+        self.connect(feed, &entry.publishers);
         drop(registry);
-        self.connect(feed, &publishers);
         self.changed.notify_one();
+        true
     }
 
     pub(crate) fn withdraw_publication(&self, hub: &Arc<Hub>) {
@@ -607,12 +619,16 @@ impl Inner {
 
     /// Takes the list that answers a registration, unless a newer one came meanwhile.
     pub(crate) fn registered_publishers(&self, topic: &str, publishers: &[String], seen: u64) {
-        if self.updates(topic) == seen {
-            self.publishers_changed(topic, publishers);
-        }
+        self.take_publishers(topic, publishers, |updates| updates == seen);
     }
 
+    /// Takes the list that the master sends unasked.
     pub(crate) fn publishers_changed(&self, topic: &str, publishers: &[String]) {
+        self.take_publishers(topic, publishers, |_| true);
+    }
+
+    /// Compares and links under one lock, so that no list is overtaken by an older one.
+    fn take_publishers(&self, topic: &str, publishers: &[String], due: impl Fn(u64) -> bool) {
         let mut registry = lock(&self.registry);
         if registry.closed {
             return;
@@ -620,16 +636,18 @@ impl Inner {
         let Some(entry) = registry.subscriptions.get_mut(topic) else {
             return;
         };
+        if !due(entry.updates) {
+            return;
+        }
         entry.updates += 1;
         entry.publishers = publishers.to_vec();
-        let feeds = entry.feeds.clone();
-        drop(registry);
-        for feed in feeds {
-            self.connect(&feed, publishers);
+        for feed in &entry.feeds {
+            self.connect(feed, publishers);
         }
     }
 
-    /// Links a feed to publishers other than this node itself.
+    /// Links a feed to publishers other than this node itself. Called with the registry locked, whose lock comes before
+    /// that of a feed's links.
     fn connect(&self, feed: &Arc<Feed>, publishers: &[String]) {
         let own = self.uri.trim_end_matches('/');
         let others: Vec<String> = publishers
@@ -686,15 +704,15 @@ impl Inner {
     }
 }
 
-/// The parameters to begin with, by their full names.
+/// The parameters to begin with, by their full names. Of several for one name the last counts.
 fn params(names: &Names, given: Vec<(String, ParamValue)>) -> Result<Params, NodeError> {
-    let full =
-        |(name, value): (String, ParamValue)| Ok((names.resolve(&format!("~{name}"))?, value));
-    let given = given
-        .into_iter()
-        .map(full)
-        .collect::<Result<_, NameError>>()?;
-    Ok(Params::new(given, names.resolve("/use_sim_time")?))
+    let mut last: Vec<(String, ParamValue)> = Vec::new();
+    for (name, value) in given {
+        let full = names.resolve(&format!("~{name}"))?;
+        last.retain(|(other, _)| *other != full);
+        last.push((full, value));
+    }
+    Ok(Params::new(last, names.resolve("/use_sim_time")?))
 }
 
 /// Listens on a port of the system's choosing.
@@ -712,16 +730,69 @@ fn listen(address: IpAddr) -> Result<(TcpListener, u16), NodeError> {
     open().map_err(|source| NodeError::Listen { address, source })
 }
 
-/// An IPv6 address as it stands in a URI.
-fn bracketed(host: &str) -> String {
-    if host.contains(':') {
-        format!("[{host}]")
-    } else {
-        host.to_owned()
-    }
-}
-
 const SHUTDOWN_LIMIT: Duration = Duration::from_secs(2);
 /// Peers that may connect in one moment: a launch file starts a whole graph at once, and one that is not let in tries
 /// again after a second.
 const BACKLOG: i32 = 1024;
+
+#[cfg(test)]
+mod tests {
+    use std::net::Ipv4Addr;
+
+    use super::*;
+
+    fn options() -> NodeOptions {
+        let mut options = NodeOptions::from_env("n");
+        // Nothing listens there.
+        "http://127.0.0.1:1".clone_into(&mut options.master_uri);
+        "/".clone_into(&mut options.namespace);
+        options.advertise_as("127.0.0.1");
+        options.bind = Ipv4Addr::LOCALHOST.into();
+        options
+    }
+
+    #[tokio::test]
+    async fn a_closed_node_does_not_begin_to_follow_the_simulated_clock() {
+        let node = Node::start(options()).unwrap();
+        node.inner.simulate(true);
+        assert_eq!(node.inner.wanted_registrations().len(), 1);
+        node.inner.simulate(false);
+        node.inner.close();
+        node.inner.simulate(true);
+        assert!(node.inner.wanted_registrations().is_empty());
+        assert!(lock(&node.inner.clock_feed).is_none());
+    }
+
+    #[tokio::test]
+    async fn the_answer_to_a_registration_does_not_replace_a_newer_list() {
+        let node = Node::start(options()).unwrap();
+        node.inner.simulate(true);
+        let list = |port: u16| vec![format!("http://127.0.0.1:{port}/")];
+        let known = || {
+            let registry = lock(&node.inner.registry);
+            registry.subscriptions["/clock"].publishers.clone()
+        };
+        let seen = node.inner.updates("/clock");
+        node.inner.publishers_changed("/clock", &list(2));
+        node.inner.registered_publishers("/clock", &list(3), seen);
+        assert_eq!(known(), list(2));
+        let seen = node.inner.updates("/clock");
+        node.inner.registered_publishers("/clock", &list(3), seen);
+        assert_eq!(known(), list(3));
+    }
+
+    #[test]
+    fn of_several_values_for_one_parameter_the_last_counts() {
+        let names = options().names().unwrap();
+        let given = [("rate", 5), ("gain", 1), ("rate", 6)];
+        let given = given.map(|(name, value)| (name.to_owned(), value.into()));
+        let params = params(&names, given.to_vec());
+        assert_eq!(
+            params.unwrap().given(),
+            [
+                ("/n/gain".to_owned(), 1.into()),
+                ("/n/rate".to_owned(), 6.into())
+            ]
+        );
+    }
+}

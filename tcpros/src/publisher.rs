@@ -61,8 +61,8 @@ pub struct Published {
 pub enum Latched {
     /// It takes the place of all others.
     Alone(u64),
-    /// It is one of several, and takes the place of the one with its key. Of more than [`MAX_LATCHED`] the first gives
-    /// way.
+    /// It is one of several, and takes the place of the one with its key. Of more than [`MAX_LATCHED`] the first
+    /// other one gives way.
     Beside(u64),
 }
 
@@ -126,7 +126,8 @@ impl Publisher {
         lock(&self.hub.state).refused_type.clone()
     }
 
-    /// Messages that slow subscribers have lost so far.
+    /// Messages lost so far: by slow subscribers, by late ones whose queue does not hold all that is latched, and latched
+    /// ones that gave way past [`MAX_LATCHED`].
     pub fn dropped(&self) -> u64 {
         self.hub.dropped.load(Ordering::Relaxed)
     }
@@ -210,18 +211,19 @@ impl Hub {
             published.dropped_oldest += subscriber.outbox.push(message.clone());
             published.sent_to += 1;
         }
+        let mut dropped = published.dropped_oldest;
         if self.options.latch {
-            state.latch(message, latched);
+            dropped += state.latch(message, latched);
         }
         drop(state);
-        self.dropped
-            .fetch_add(published.dropped_oldest, Ordering::Relaxed);
+        self.dropped.fetch_add(dropped, Ordering::Relaxed);
         published
     }
 
     fn latch(&self, message: Bytes, latched: Latched) {
         if self.options.latch {
-            lock(&self.state).latch(message, latched);
+            let dropped = lock(&self.state).latch(message, latched);
+            self.dropped.fetch_add(dropped, Ordering::Relaxed);
         }
     }
 
@@ -248,9 +250,11 @@ impl Hub {
         if state.closed {
             return None;
         }
+        let mut dropped = 0;
         for (_, latched) in &state.latched {
-            subscriber.outbox.push(latched.clone());
+            dropped += subscriber.outbox.push(latched.clone());
         }
+        self.dropped.fetch_add(dropped, Ordering::Relaxed);
         state.subscribers.push(Arc::clone(&subscriber));
         drop(state);
         self.draining.send_modify(|open| *open += 1);
@@ -313,9 +317,10 @@ impl Hub {
 }
 
 impl HubState {
-    fn latch(&mut self, message: Bytes, latched: Latched) {
+    /// Keeps a message for late subscribers, and returns how many others gave way for want of room.
+    fn latch(&mut self, message: Bytes, latched: Latched) -> u64 {
         if self.closed {
-            return;
+            return 0;
         }
         let key = match latched {
             Latched::Alone(key) => {
@@ -329,12 +334,16 @@ impl HubState {
                 if let Some((_, before)) = self.latched.get_mut(at) {
                     *before = message;
                 }
+                0
             }
             Err(at) => {
                 self.latched.insert(at, (key, message));
-                if self.latched.len() > MAX_LATCHED {
-                    self.latched.remove(0);
+                if self.latched.len() <= MAX_LATCHED {
+                    return 0;
                 }
+                // Never the one that has just come, which may be the first itself.
+                self.latched.remove(usize::from(at == 0));
+                1
             }
         }
     }
@@ -474,6 +483,38 @@ mod tests {
             let _one_more = hub.publish(message("6"), Latched::Beside(key));
         }
         assert_eq!(lock(&hub.state).latched.len(), MAX_LATCHED);
+    }
+
+    #[test]
+    fn past_the_most_that_is_latched_another_than_the_newest_gives_way_and_is_counted() {
+        let hub = hub(true);
+        for key in 1..=64 {
+            let _kept = hub.publish(Bytes::new(), Latched::Beside(key));
+        }
+        assert_eq!(hub.dropped.load(Ordering::Relaxed), 0);
+        hub.latch(Bytes::new(), Latched::Beside(0));
+        let keys = || -> Vec<u64> {
+            lock(&hub.state)
+                .latched
+                .iter()
+                .map(|(key, _)| *key)
+                .collect()
+        };
+        assert_eq!(keys()[..2], [0, 2]);
+        let _last = hub.publish(Bytes::new(), Latched::Beside(99));
+        assert_eq!((keys()[0], keys()[63]), (2, 99));
+        assert_eq!(hub.dropped.load(Ordering::Relaxed), 2);
+    }
+
+    #[test]
+    fn what_a_late_subscribers_queue_does_not_hold_is_counted() {
+        let hub = hub_of(true, 2);
+        for key in 0..5 {
+            hub.latch(Bytes::new(), Latched::Beside(key));
+        }
+        let late = hub.join(1, "/late", String::new()).unwrap();
+        assert_eq!(late.subscriber.outbox.dropped(), 3);
+        assert_eq!(hub.dropped.load(Ordering::Relaxed), 3);
     }
 
     #[test]

@@ -100,9 +100,10 @@ impl Registrar {
         // First of all: a program may read its own parameters as soon as the node is registered.
         if let Err(error) = parameters::settle(&self.node, &mut self.refusals).await {
             if closed {
-                events::unregistration_failed(self.node.name(), &error);
-                self.told.clear();
-                self.node.params.abandon();
+                self.abandon(&error);
+                for name in self.node.params.abandon() {
+                    events::unregistration_failed(&name, &error);
+                }
             }
             return Err(error);
         }
@@ -120,16 +121,22 @@ impl Registrar {
                 break;
             };
             if let Ok(outcome) = finished
-                && let Err(error) = self.note(outcome, closed)
+                && let Err(error) = self.note(outcome)
             {
                 failure = Some(error);
             }
         }
-        if closed && failure.is_some() {
-            // Nobody is there to be told: no use in trying what is left.
-            self.told.clear();
+        if closed && let Some(error) = &failure {
+            self.abandon(error);
         }
         failure.map_or(Ok(()), Err)
+    }
+
+    /// Gives up and names what the master may still have: nobody is there to be told.
+    fn abandon(&mut self, error: &MasterError) {
+        for (name, _) in self.told.drain().map(|(key, _)| key) {
+            events::unregistration_failed(&name, error);
+        }
     }
 
     /// Finds out whether the master is there, is the same as before, and still knows this node.
@@ -205,7 +212,7 @@ impl Registrar {
     }
 
     /// Takes the result of one job. Only a master that cannot be reached is a failure of the turn.
-    fn note(&mut self, outcome: Outcome, closed: bool) -> Result<(), MasterError> {
+    fn note(&mut self, outcome: Outcome) -> Result<(), MasterError> {
         let (key, registered, result) = outcome;
         match (registered, result) {
             (Some(generation), Ok(())) => {
@@ -226,10 +233,6 @@ impl Registrar {
             // A master that does not know the registration has nothing to forget.
             (None, Err(MasterError::Refused { .. } | MasterError::Shape(_))) => {
                 self.told.remove(&key);
-            }
-            (None, Err(error)) if closed => {
-                events::unregistration_failed(&key.0, &error);
-                return Err(error);
             }
             (_, Err(error)) => return Err(error),
         }

@@ -52,6 +52,15 @@ impl Endpoint {
     }
 }
 
+/// A host as it stands before a port: an IPv6 address in brackets.
+pub(crate) fn bracketed(host: &str) -> String {
+    if host.contains(':') {
+        format!("[{host}]")
+    } else {
+        host.to_owned()
+    }
+}
+
 /// Host, port and path of a URI of this scheme.
 pub(crate) fn parts<'a>(uri: &'a str, scheme: &str) -> Option<(&'a str, u16, &'a str)> {
     let rest = uri.trim().strip_prefix(scheme)?;
@@ -94,7 +103,7 @@ async fn exchange(endpoint: &Endpoint, body: String) -> Result<Bytes, RpcError> 
     let (mut sender, connection) = hyper::client::conn::http1::Builder::new()
         .handshake(TokioIo::new(stream))
         .await?;
-    let host = format!("{}:{}", endpoint.host, endpoint.port);
+    let host = format!("{}:{}", bracketed(&endpoint.host), endpoint.port);
     let request = Request::post(&endpoint.path)
         .header(HOST, host)
         .header(CONTENT_TYPE, XML)
@@ -373,6 +382,13 @@ mod tests {
         )
         .await;
         assert!(answer.starts_with("HTTP/1.1 405"), "{answer}");
+    }
+
+    #[test]
+    fn an_ipv6_address_stands_in_brackets_before_its_port() {
+        assert_eq!(bracketed("::1"), "[::1]");
+        assert_eq!(bracketed("127.0.0.1"), "127.0.0.1");
+        assert_eq!(bracketed("robot"), "robot");
     }
 
     #[tokio::test]

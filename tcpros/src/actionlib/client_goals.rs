@@ -14,6 +14,7 @@ use tokio::time::Instant;
 
 use super::types::Status;
 use super::wire::StatusEntry;
+use crate::clock;
 use crate::inbox::Peer;
 
 /// Where a goal is between its client and its server.
@@ -397,7 +398,7 @@ fn next_loss(
     }
     let Some(node) = &goal.server else {
         let reason = LostReason::NotAcknowledged(limits.acknowledge);
-        return Some((goal.sent + limits.acknowledge, reason));
+        return Some((clock::after(goal.sent, limits.acknowledge), reason));
     };
     let server = servers.get(node);
     let node = || node.clone();
@@ -408,19 +409,23 @@ fn next_loss(
     };
     let gone = server.and_then(|server| server.gone).map(|at| {
         let reason = LostReason::Disconnected { server: node() };
-        (at + limits.reconnect, reason)
+        (clock::after(at, limits.reconnect), reason)
     });
     let waiting = goal.ended.map(|at| {
         let reason = LostReason::NoResult {
             status: goal.status,
             waited: limits.result,
         };
-        (at + limits.result, reason)
+        (clock::after(at, limits.result), reason)
     });
-    [Some((heard + limits.silence, silent)), gone, waiting]
-        .into_iter()
-        .flatten()
-        .min_by_key(|(at, _)| *at)
+    [
+        Some((clock::after(heard, limits.silence), silent)),
+        gone,
+        waiting,
+    ]
+    .into_iter()
+    .flatten()
+    .min_by_key(|(at, _)| *at)
 }
 
 /// A goal, from the moment it is sent.

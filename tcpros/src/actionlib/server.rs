@@ -474,7 +474,7 @@ async fn run(shared: Arc<Shared>, mut inbox: Inbox<Source>, period: Duration) {
             biased;
             () = sleep_until(next) => {
                 shared.publish_status(&mut lock(&shared.state));
-                next = clock::now() + period;
+                next = clock::after(clock::now(), period);
             }
             (source, event) = inbox.recv() => shared.take(source, event),
         }

@@ -8,6 +8,7 @@ use thiserror::Error;
 use tokio::time::Instant;
 
 use super::types::{GoalId, GoalStatus, Status};
+use crate::clock;
 use crate::time::RosTime;
 
 /// What a server decides about a goal.
@@ -212,7 +213,7 @@ impl ServerGoals {
     pub(super) fn list(&mut self, now: Instant) -> impl Iterator<Item = &GoalStatus> {
         let linger = self.linger;
         self.entries
-            .retain(|entry| entry.ended.is_none_or(|at| at + linger >= now));
+            .retain(|entry| entry.ended.is_none_or(|at| clock::after(at, linger) >= now));
         self.entries.iter().map(|entry| &entry.status)
     }
 

@@ -152,10 +152,15 @@ impl<'a> Reader<'a> {
     }
 
     fn time(&mut self, field: &'static str) -> Result<RosTime, Malformed> {
-        Ok(RosTime {
+        let time = RosTime {
             secs: self.u32(field)?,
             nsecs: self.u32(field)?,
-        })
+        };
+        if time.nsecs < 1_000_000_000 {
+            Ok(time)
+        } else {
+            Err(Malformed(field))
+        }
     }
 
     fn string(&mut self, field: &'static str) -> Result<&'a [u8], Malformed> {
@@ -223,6 +228,22 @@ mod tests {
         let mut array = header(1, RosTime::default());
         array.extend_from_slice(b"\x01\0\0\0\0\0\0\0\0\0\0\0\x01\0\0\0\xff\x01\0\0\0\0");
         assert_eq!(read_status_array(&array).unwrap()[0].id, "\u{fffd}");
+    }
+
+    #[test]
+    fn a_stamp_of_a_second_or_more_of_nanoseconds_is_malformed() {
+        let cancel = |nsecs: u32| {
+            let mut wire = vec![0; 4];
+            wire.extend_from_slice(&nsecs.to_le_bytes());
+            wire.extend_from_slice(&[0; 4]);
+            wire
+        };
+        let last = read_cancel(&cancel(999_999_999)).unwrap();
+        assert_eq!(last.stamp.nsecs, 999_999_999);
+        assert_eq!(
+            read_cancel(&cancel(1_000_000_000)),
+            Err(Malformed("goal id"))
+        );
     }
 
     #[test]

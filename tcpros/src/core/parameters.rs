@@ -212,7 +212,8 @@ const fn unset() -> Value {
     Value::Struct(Vec::new())
 }
 
-fn parts(name: &str) -> impl Iterator<Item = &str> {
+/// What stands between the slashes of a name.
+pub(super) fn parts(name: &str) -> impl Iterator<Item = &str> {
     name.split('/').filter(|part| !part.is_empty())
 }
 

@@ -1,7 +1,8 @@
 //! The value of `_name:=value` on a command line.
 //!
-//! A plain word is a number or a truth value when roscpp and rospy agree that it is one, and text otherwise: `yes` and
-//! `on` stay text, which YAML 1.1 would turn into truth values. Quotes, `[...]` and `{...}` are read as YAML, as rospy
+//! Where roscpp and rospy read a plain word differently, roscpp's reading wins: `yes`, `on` and `1:30` are text, `010` is
+//! ten and `1e3` a number, all of which the YAML 1.1 of rospy reads otherwise. Only the numbers that are none follow
+//! rospy: `.inf` and `.nan` are such, `inf` and `nan` are text. Quotes, `[...]` and `{...}` are read as YAML, as rospy
 //! does. What is no YAML is text.
 
 use std::collections::BTreeMap;
@@ -127,12 +128,13 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_plain_word_is_what_roscpp_and_rospy_agree_on() {
+    fn a_plain_word_is_what_roscpp_reads() {
         for (text, meant) in [
             ("5", ParamValue::Int(5)),
             ("-7", ParamValue::Int(-7)),
             ("010", ParamValue::Int(10)),
             ("0.5", ParamValue::Double(0.5)),
+            ("1e3", ParamValue::Double(1000.0)),
             ("-1e3", ParamValue::Double(-1000.0)),
             (".5", ParamValue::Double(0.5)),
             ("-.inf", ParamValue::Double(f64::NEG_INFINITY)),

@@ -54,6 +54,8 @@ struct Given {
 #[derive(Debug)]
 struct Followed {
     holders: usize,
+    /// Whether a master was asked for it, answered or not: a call that timed out here may have been done there.
+    told: bool,
     subscribed: bool,
     /// Whether it changed since it was last read.
     stale: bool,
@@ -108,6 +110,7 @@ impl Params {
             .entry(name.to_owned())
             .or_insert_with(|| Followed {
                 holders: 0,
+                told: false,
                 subscribed: false,
                 stale: false,
                 heard: watch::Sender::new(Heard::Nothing),
@@ -161,9 +164,17 @@ impl Params {
         }
     }
 
-    /// Gives up what could not be withdrawn.
-    pub(crate) fn abandon(&self) {
-        lock(&self.table).followed.clear();
+    /// Gives up what could not be withdrawn, and names it.
+    pub(crate) fn abandon(&self) -> Vec<String> {
+        let followed = std::mem::take(&mut lock(&self.table).followed);
+        followed.into_keys().collect()
+    }
+
+    #[cfg(test)]
+    pub(crate) fn given(&self) -> Vec<(String, ParamValue)> {
+        let table = lock(&self.table);
+        let given = table.given.iter();
+        given.map(|g| (g.name.clone(), g.value.clone())).collect()
     }
 
     /// Whether everything is withdrawn.
@@ -181,7 +192,7 @@ impl Params {
                 unless_set: g.ever,
             }));
         }
-        table.followed.retain(|_, e| e.holders > 0 || e.subscribed);
+        table.followed.retain(|_, e| e.holders > 0 || e.told);
         for (name, entry) in &mut table.followed {
             if entry.holders == 0 {
                 work.push(Work::Unsubscribe(name.clone()));
@@ -203,6 +214,12 @@ impl Params {
         }
     }
 
+    fn asks_for(&self, name: &str) {
+        if let Some(entry) = lock(&self.table).followed.get_mut(name) {
+            entry.told = true;
+        }
+    }
+
     fn has_read(&self, name: &str, value: Option<ParamValue>) {
         if let Some(entry) = lock(&self.table).followed.get_mut(name) {
             entry.subscribed = true;
@@ -218,7 +235,7 @@ impl Params {
     fn has_unsubscribed(&self, name: &str) {
         let mut table = lock(&self.table);
         if let Some(entry) = table.followed.get_mut(name) {
-            entry.subscribed = false;
+            (entry.subscribed, entry.told) = (false, false);
             if entry.holders == 0 {
                 table.followed.remove(name);
             }
@@ -277,6 +294,7 @@ async fn perform(node: &Inner, work: &Work) -> Result<(), MasterError> {
             node.params.has_set(name);
         }
         Work::Subscribe(name) => {
+            node.params.asks_for(name);
             let params = vec![node.uri.as_str().into(), name.as_str().into()];
             let value = known(
                 "subscribeParam",
@@ -370,6 +388,27 @@ mod tests {
             let reads = |w: &Work| matches!(w, Work::Read(name) if name == "/a/b");
             assert_eq!(params.work().iter().any(reads), stale, "{changed}");
         }
+    }
+
+    #[test]
+    fn what_a_master_was_asked_for_is_withdrawn_though_it_did_not_answer() {
+        let params = Params::new(Vec::new(), "/use_sim_time".to_owned());
+        let withdraws = |name: &str| {
+            let mut work = params.work().into_iter();
+            work.any(|w| matches!(w, Work::Unsubscribe(of) if of == name))
+        };
+        for name in ["/asked", "/unasked"] {
+            drop(params.hold(name));
+        }
+        params.asks_for("/asked");
+        // The master was away meanwhile, and may be the same.
+        params.forget();
+        assert!(!withdraws("/asked"));
+        params.release("/asked");
+        params.release("/unasked");
+        assert!(withdraws("/asked") && !withdraws("/unasked"));
+        params.has_unsubscribed("/asked");
+        assert!(!withdraws("/asked"));
     }
 
     #[test]

@@ -17,7 +17,7 @@ use tokio::time::{Instant, timeout, timeout_at};
 use super::DEFAULT_MAX_BODY;
 use crate::clock;
 use crate::frame::{FrameTooLong, Frames};
-use crate::header::{ConnectionHeader, HeaderError};
+use crate::header::{ConnectionHeader, HeaderError, clipped};
 use crate::link::prepare;
 use crate::master::{Master, MasterError};
 use crate::rpc;
@@ -135,9 +135,7 @@ struct Wire {
 
 impl Shared {
     fn deadline(&self) -> Instant {
-        let now = clock::now();
-        now.checked_add(self.options.timeout)
-            .unwrap_or_else(|| now + FOREVER)
+        clock::after(clock::now(), self.options.timeout)
     }
 
     async fn call_once(&self, wire: &Wire, deadline: Instant) -> Result<Bytes, ServiceError> {
@@ -183,7 +181,10 @@ impl Shared {
                 service: self.service.clone(),
             })?;
         let (host, port, _) = rpc::parts(&uri, "rosrpc://").ok_or_else(|| {
-            let what = format!("its registered address `{uri}` is not rosrpc://host:port");
+            let what = format!(
+                "its registered address `{}` is not rosrpc://host:port",
+                clipped(&uri)
+            );
             self.malformed(CallPhase::Lookup, what)
         })?;
         let opening = async {
@@ -248,14 +249,18 @@ impl Shared {
         if let Some(message) = reply.get("error") {
             return Err(ServiceError::Refused {
                 service: self.service.clone(),
-                message: message.to_owned(),
+                message: clipped(message).to_owned(),
             });
         }
         match (asked, reply.md5sum()) {
             (Some(ours), Some(theirs)) if ours != "*" && theirs != "*" && ours != theirs => {
                 Err(ServiceError::OtherType {
                     service: self.service.clone(),
-                    theirs: format!("{}/{theirs}", reply.type_name().unwrap_or("?")),
+                    theirs: format!(
+                        "{}/{}",
+                        clipped(reply.type_name().unwrap_or("?")),
+                        clipped(theirs)
+                    ),
                     ours: format!(
                         "{}/{ours}",
                         self.options.type_name.as_deref().unwrap_or("?")
@@ -581,5 +586,3 @@ impl ServiceError {
 
 /// How quickly a server that closes after its answer is expected to have closed.
 const CLOSING_TIME: Duration = Duration::from_millis(50);
-/// Stands for a time limit past what the clock can say.
-const FOREVER: Duration = Duration::from_secs(30 * 365 * 24 * 3600);

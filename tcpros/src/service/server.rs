@@ -2,8 +2,8 @@
 
 use std::fmt;
 use std::pin::Pin;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::{BufMut, Bytes, BytesMut};
@@ -16,11 +16,13 @@ use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
 use super::{DEFAULT_MAX_BODY, ServiceType};
+use crate::clock::{self, Throttle};
 use crate::events;
 use crate::frame::{FrameTooLong, Frames};
-use crate::header::ConnectionHeader;
+use crate::header::{ConnectionHeader, clipped};
 use crate::inbox::Peer;
 use crate::node::Inner;
+use crate::outbox::lock;
 use crate::topic_server::{DRAIN_LIMIT, Ended, STALL_LIMIT, until_closed, write};
 
 /// What a service does for its clients, at most.
@@ -124,6 +126,8 @@ pub(crate) struct Served {
     options: ServiceOptions,
     handler: Box<dyn Fn(ServiceRequest) -> Answer + Send + Sync>,
     places: Arc<Semaphore>,
+    /// Of the log lines about requests given up.
+    faults: Mutex<Throttle>,
     closed: watch::Sender<bool>,
     /// The node's count of connections to others.
     draining: watch::Sender<usize>,
@@ -170,11 +174,16 @@ impl Served {
             generation,
             counters: Counters::default(),
             service_type,
-            options,
+            // The most that the places can count.
+            options: ServiceOptions {
+                max_clients: options.max_clients.min(Semaphore::MAX_PERMITS),
+                ..options
+            },
             handler: Box::new(move |request| Box::pin(handler(request))),
             places: Arc::new(Semaphore::new(
                 options.max_clients.min(Semaphore::MAX_PERMITS),
             )),
+            faults: Mutex::new(Throttle::new(Duration::from_secs(10))),
             closed: watch::Sender::new(false),
             draining,
         }
@@ -217,8 +226,9 @@ impl Served {
             return Ok(());
         }
         Err(format!(
-            "client wants service {} to have md5sum {md5sum}, but it has {ours}. Dropping connection.",
-            self.service
+            "client wants service {} to have md5sum {}, but it has {ours}. Dropping connection.",
+            self.service,
+            clipped(md5sum),
         ))
     }
 
@@ -292,6 +302,10 @@ impl Session {
         let (mut reader, mut writer) = stream.split();
         let mut frames = Frames::new(served.options.max_request);
         loop {
+            // What a client has sent ahead does not keep a withdrawn service up.
+            if *served.closed.borrow() {
+                return Ok(());
+            }
             let request = match self.request(&mut reader, &mut frames).await {
                 Ok(Some(request)) => request,
                 Ok(None) => return Ok(()),
@@ -362,7 +376,10 @@ impl Session {
             () = sleep(limit) => format!("its handler gave no answer within {limit:?}"),
             () = self.overdue() => "it is being withdrawn".to_owned(),
         };
-        events::service_failed(&self.served.service, &self.client.caller_id, &given_up);
+        if let Some(more) = lock(&self.served.faults).admit(clock::now()) {
+            let client = clipped(&self.client.caller_id);
+            events::service_failed(&self.served.service, client, &given_up, more);
+        }
         Err(format!("service [{}]: {given_up}", self.served.service))
     }
 
