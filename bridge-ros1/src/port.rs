@@ -445,7 +445,7 @@ impl Ros1Port {
             let count = open.publisher.dropped().saturating_sub(open.reported);
             if count > 0 {
                 open.reported += count;
-                let why = "subscriber too slow";
+                let why = "subscriber too slow or late";
                 self.events.push_back(PortEvent::Lost {
                     topic: Some(topic),
                     why,
