@@ -2,6 +2,8 @@
 
 #![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
 
+mod services;
+
 use std::future::Future;
 use std::net::SocketAddr;
 use std::sync::Arc;
