@@ -18,6 +18,18 @@
 //! - The slave API serves the tools: `tools::the_tools_of_ros_see_and_hear_a_node`.
 //! - Latching and definition are told: `tools::a_bag_has_all_a_topic_says_and_plays_it_back`.
 //! - Nothing is left of what has gone: `churn`.
+//! - Names, addresses and private parameters are those of every ROS node, IPv6 too:
+//!   `ros1_parameters::private_parameters_namespace_and_remappings_of_the_bridge_are_seen_in_the_graph` and
+//!   `topics_go_to_and_from_rospy_over_ipv6` there.
+//! - The last message of each latched publisher reaches late joiners, either way:
+//!   `latched::a_late_reader_of_the_space_gets_the_value_of_each_latched_publisher_that_is_there` and
+//!   `a_late_ros_1_subscriber_gets_each_value_the_space_repeats_and_an_update_replaces_one` there.
+//! - A type comes from the publisher's header, and one that cannot be read is named once with the reason: `ros1_graph`.
+//! - Services of any type, persistent connections, probes, error texts, time limits: `ros1_services`.
+//! - Goals end, whatever becomes of their server: `ros1_actionlib`.
+//! - Stamps have the time of the graph, watchdogs steady time:
+//!   `ros1_parameters::time_is_that_of_a_rospy_clock_while_use_sim_time_is_true`, `ros1_graph`, and in `tcpros`
+//!   `watching_the_master_and_reconnecting_go_on_while_simulated_time_stands_still_or_jumps_back`.
 
 mod churn;
 mod faults;
