@@ -1,5 +1,6 @@
 //! Publishing: one topic, its subscribers, and the message a late one gets.
 
+use std::collections::VecDeque;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
@@ -66,6 +67,14 @@ pub enum Latched {
     Beside(u64),
 }
 
+impl Latched {
+    const fn key(self) -> u64 {
+        match self {
+            Self::Alone(key) | Self::Beside(key) => key,
+        }
+    }
+}
+
 /// Publishes on one topic. Dropping it withdraws the topic; what is queued is still sent, within a second.
 #[derive(Debug)]
 pub struct Publisher {
@@ -91,7 +100,8 @@ impl Publisher {
         self.hub.publish(message, latched)
     }
 
-    /// Keeps a message for late subscribers under `key` beside others, and sends it to nobody.
+    /// Keeps a message for late subscribers under `key` beside others. It goes to those that came after it was published
+    /// and did not find it, and to nobody else.
     pub fn latch(&self, key: u64, message: Bytes) {
         if u32::try_from(message.len()).is_ok() {
             self.hub.latch(message, Latched::Beside(key));
@@ -159,6 +169,10 @@ struct HubState {
     subscribers: Vec<Arc<Subscriber>>,
     /// Ordered by key.
     latched: Vec<(u64, Bytes)>,
+    /// Messages published so far.
+    count: u64,
+    /// The keys of the last of them, each with the count before it; at most [`MAX_LATCHED`].
+    recent: VecDeque<(u64, u64)>,
     refused_type: Option<String>,
     closed: bool,
 }
@@ -170,6 +184,10 @@ pub(crate) struct Subscriber {
     pub(crate) caller_id: String,
     /// What `rosnode info` shows of the connection.
     pub(crate) transport: String,
+    /// The topic's count of messages when it came.
+    joined: u64,
+    /// The keys of the latched messages it found.
+    found: Vec<u64>,
     pub(crate) outbox: Outbox,
     pub(crate) bytes: AtomicU64,
     pub(crate) messages: AtomicU64,
@@ -213,6 +231,7 @@ impl Hub {
         }
         let mut dropped = published.dropped_oldest;
         if self.options.latch {
+            state.note(latched.key());
             dropped += state.latch(message, latched);
         }
         drop(state);
@@ -222,7 +241,10 @@ impl Hub {
 
     fn latch(&self, message: Bytes, latched: Latched) {
         if self.options.latch {
-            let dropped = lock(&self.state).latch(message, latched);
+            let mut state = lock(&self.state);
+            let mut dropped = state.make_up(latched.key(), &message);
+            dropped += state.latch(message, latched);
+            drop(state);
             self.dropped.fetch_add(dropped, Ordering::Relaxed);
         }
     }
@@ -238,18 +260,20 @@ impl Hub {
             messages: self.options.queue_messages,
             bytes: self.options.queue_bytes,
         };
-        let subscriber = Arc::new(Subscriber {
-            id,
-            caller_id: caller_id.to_owned(),
-            transport,
-            outbox: Outbox::new(limit),
-            bytes: AtomicU64::new(0),
-            messages: AtomicU64::new(0),
-        });
         let mut state = lock(&self.state);
         if state.closed {
             return None;
         }
+        let subscriber = Arc::new(Subscriber {
+            id,
+            caller_id: caller_id.to_owned(),
+            transport,
+            joined: state.count,
+            found: state.latched.iter().map(|(key, _)| *key).collect(),
+            outbox: Outbox::new(limit),
+            bytes: AtomicU64::new(0),
+            messages: AtomicU64::new(0),
+        });
         let mut dropped = 0;
         for (_, latched) in &state.latched {
             dropped += subscriber.outbox.push(latched.clone());
@@ -317,6 +341,31 @@ impl Hub {
 }
 
 impl HubState {
+    /// Takes note of a message that goes to all who are there.
+    fn note(&mut self, key: u64) {
+        // One source after another is the rule: its messages take one place.
+        if self.recent.back().is_some_and(|(last, _)| *last == key) {
+            self.recent.pop_back();
+        } else if self.recent.len() >= MAX_LATCHED {
+            self.recent.pop_front();
+        }
+        self.recent.push_back((key, self.count));
+        self.count += 1;
+    }
+
+    /// Gives a message that is latched anew to those who came between its publication and now, and returns how many
+    /// other messages gave way to it.
+    fn make_up(&self, key: u64, message: &Bytes) -> u64 {
+        let latched = self.latched.binary_search_by_key(&key, |(key, _)| *key);
+        let published = self.recent.iter().rev().find(|(other, _)| *other == key);
+        let (Err(_), Some((_, before))) = (latched, published) else {
+            return 0;
+        };
+        let late = |s: &&Arc<Subscriber>| s.joined > *before && !s.found.contains(&key);
+        let late = self.subscribers.iter().filter(late);
+        late.map(|s| s.outbox.push(message.clone())).sum()
+    }
+
     /// Keeps a message for late subscribers, and returns how many others gave way for want of room.
     fn latch(&mut self, message: Bytes, latched: Latched) -> u64 {
         if self.closed {
@@ -515,6 +564,26 @@ mod tests {
         let late = hub.join(1, "/late", String::new()).unwrap();
         assert_eq!(late.subscriber.outbox.dropped(), 3);
         assert_eq!(hub.dropped.load(Ordering::Relaxed), 3);
+    }
+
+    #[tokio::test]
+    async fn who_came_before_it_was_known_that_there_are_several_gets_the_others_once() {
+        let hub = hub(true);
+        let text = Bytes::from_static;
+        for (key, message) in [(1, "left"), (2, "right"), (3, "base")] {
+            let _published = hub.publish(text(message.as_bytes()), Latched::Alone(key));
+        }
+        let early = hub.join(1, "/early", String::new()).unwrap();
+        let mut heard = Vec::new();
+        assert!(early.subscriber.outbox.take(&mut heard, 64).await);
+        for _ in 0..2 {
+            hub.latch(text(b"left"), Latched::Beside(1));
+            hub.latch(text(b"base"), Latched::Beside(3));
+        }
+        hub.close();
+        let mut made_up = Vec::new();
+        assert!(early.subscriber.outbox.take(&mut made_up, 64).await);
+        assert_eq!((heard, made_up), (vec![text(b"base")], vec![text(b"left")]));
     }
 
     #[test]
