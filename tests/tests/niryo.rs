@@ -40,16 +40,18 @@ fn start(cell: &Cell) -> Line {
     let master = cell.roscore();
     let side = UaSide::join();
     let robot = cell.rospy("niryo.py", &[DEFINITIONS]);
-    let bridge = cell
-        .bridge_ros1_started(&[MAPPING])
-        .env("ROS_PACKAGE_PATH", DEFINITIONS)
-        .start();
     Line {
         side,
         robot,
-        bridge,
+        bridge: bridge(cell),
         _master: master,
     }
+}
+
+fn bridge(cell: &Cell) -> Child {
+    cell.bridge_ros1_started(&[MAPPING])
+        .env("ROS_PACKAGE_PATH", DEFINITIONS)
+        .start()
 }
 
 fn cell() -> Option<Cell> {
@@ -277,4 +279,21 @@ fn move_goal(path: &str, value: &str) -> (TopicType, Vec<u8>) {
         definition: action.action_goal().definition().to_owned(),
     };
     (goal_type, goal)
+}
+
+#[test]
+fn a_restarted_bridge_calls_for_the_value_the_space_repeats() {
+    let Some(cell) = cell() else { return };
+    let mut line = start(&cell);
+    line.side.hear((1, 2, 11), "joints", |_| Some(()));
+    let output = "/niryo_robot_rpi/set_digital_io";
+    line.side.write((0, 2, 45), Scalar::Boolean(true));
+    called(&line.robot, output, 0);
+    line.bridge.end();
+    line.bridge = bridge(&cell);
+    let again = eventually("the repeated value is called for", SOON, || {
+        line.side.write((0, 2, 45), Scalar::Boolean(true));
+        calls(&line.robot, output).get(1).cloned()
+    });
+    assert_eq!(again, json!({"name": "DO1", "value": true}));
 }
