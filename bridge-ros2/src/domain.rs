@@ -7,7 +7,7 @@ use ros2_client::{Context, Node, NodeName, NodeOptions};
 use rustdds::dds::CreateError;
 use rustdds::{
     DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener, GUID, Publisher,
-    QosPolicies, RTPSEntity, Subscriber, TopicKind,
+    QosPolicies, RTPSEntity, Subscriber, Topic, TopicKind,
 };
 use thiserror::Error;
 
@@ -197,7 +197,7 @@ impl Domain {
         self.participant.status_listener()
     }
 
-    /// Makes a reader. `topic` and `type_name` are DDS names.
+    /// Makes the reader of a ROS topic that asks for `requested`. `topic` and `type_name` are DDS names.
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
@@ -207,25 +207,10 @@ impl Domain {
         type_name: &str,
         requested: Requested,
     ) -> Result<Reader, DomainError> {
-        let qos = requested.policies();
-        self.participant
-            .create_topic(
-                topic.to_owned(),
-                type_name.to_owned(),
-                &qos,
-                TopicKind::NoKey,
-            )
-            .and_then(|topic| {
-                self.subscriber
-                    .create_simple_datareader_no_key::<Payload, Opaque>(&topic, Some(qos))
-            })
-            .map_err(|source| DomainError::Endpoint {
-                topic: topic.to_owned(),
-                source,
-            })
+        self.open_reader(topic, type_name, &requested.policies())
     }
 
-    /// Makes a writer. `topic` and `type_name` are DDS names.
+    /// Makes the writer of a ROS topic that offers `offered`. `topic` and `type_name` are DDS names.
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
@@ -235,22 +220,48 @@ impl Domain {
         type_name: &str,
         offered: Offered,
     ) -> Result<Writer, DomainError> {
-        let qos = offered.policies();
-        self.participant
-            .create_topic(
-                topic.to_owned(),
-                type_name.to_owned(),
-                &qos,
-                TopicKind::NoKey,
-            )
+        self.open_writer(topic, type_name, &offered.policies())
+    }
+
+    /// Makes a reader of any DDS topic. Samples arrive as bytes.
+    ///
+    /// # Errors
+    /// [`DomainError::Endpoint`].
+    pub fn open_reader(
+        &self,
+        topic: &str,
+        type_name: &str,
+        qos: &QosPolicies,
+    ) -> Result<Reader, DomainError> {
+        self.topic(topic, type_name, qos)
+            .and_then(|topic| {
+                self.subscriber
+                    .create_simple_datareader_no_key::<Payload, Opaque>(&topic, Some(qos.clone()))
+            })
+            .map_err(|source| endpoint_error(topic, source))
+    }
+
+    /// Makes a writer of any DDS topic. Samples are given as bytes.
+    ///
+    /// # Errors
+    /// [`DomainError::Endpoint`].
+    pub fn open_writer(
+        &self,
+        topic: &str,
+        type_name: &str,
+        qos: &QosPolicies,
+    ) -> Result<Writer, DomainError> {
+        self.topic(topic, type_name, qos)
             .and_then(|topic| {
                 self.publisher
-                    .create_datawriter_no_key::<Payload, Opaque>(&topic, Some(qos))
+                    .create_datawriter_no_key::<Payload, Opaque>(&topic, Some(qos.clone()))
             })
-            .map_err(|source| DomainError::Endpoint {
-                topic: topic.to_owned(),
-                source,
-            })
+            .map_err(|source| endpoint_error(topic, source))
+    }
+
+    fn topic(&self, name: &str, type_name: &str, qos: &QosPolicies) -> Result<Topic, CreateError> {
+        self.participant
+            .create_topic(name.to_owned(), type_name.to_owned(), qos, TopicKind::NoKey)
     }
 
     /// Leaves the domain, after `endpoints` (readers and writers) were disposed. Returns after [`LEAVE_WITHIN`] at the
@@ -282,6 +293,13 @@ impl std::fmt::Debug for Domain {
             .field("domain", &self.context.domain_id())
             .field("node", &self.node_name())
             .finish_non_exhaustive()
+    }
+}
+
+fn endpoint_error(topic: &str, source: CreateError) -> DomainError {
+    DomainError::Endpoint {
+        topic: topic.to_owned(),
+        source,
     }
 }
 
