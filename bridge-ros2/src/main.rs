@@ -22,13 +22,14 @@ fn main() -> ExitCode {
 struct BridgeRos2 {
     #[command(flatten)]
     arguments: Arguments,
-    /// The DDS domain to join; without it the domain of the space, or of the mapping's only ROS 2 space
-    #[arg(long, value_name = "N", env = "ROS_DOMAIN_ID", value_parser = clap::value_parser!(u16).range(0..=232))]
-    domain: Option<u16>,
-    /// The space of this domain's values, 2 to 232; without it the one the mapping gives the domain, or the one of the
-    /// domain's number
-    #[arg(long, value_name = "N", env = "UA_SPACE", value_parser = clap::value_parser!(u16).range(2..=232))]
-    space: Option<u16>,
+    /// The DDS domain to join, or several as 2,3; without it the domain of the space, or of the mapping's only ROS 2
+    /// space
+    #[arg(long, value_name = "N", env = "ROS_DOMAIN_ID", value_delimiter = ',', value_parser = clap::value_parser!(u16).range(0..=232))]
+    domain: Vec<u16>,
+    /// The space of this domain's values, 2 to 232, or one for each domain as 40,41; without it the one the mapping
+    /// gives the domain, or the one of the domain's number
+    #[arg(long, value_name = "N", env = "UA_SPACE", value_delimiter = ',', value_parser = clap::value_parser!(u16).range(2..=232))]
+    space: Vec<u16>,
     /// The network interface of the ROS 2 side, by name or address; without it what `ROS_AUTOMATIC_DISCOVERY_RANGE`
     /// and `ROS_LOCALHOST_ONLY` say, else all
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_ROS_INTERFACE")]
@@ -38,7 +39,10 @@ struct BridgeRos2 {
 impl BridgeRos2 {
     /// The domain to join for the space `own`.
     fn domain(&self, own: SpaceId, mapping: &Mapping) -> u16 {
-        self.domain
+        let spaces = choose_spaces(&self.space, &self.domain, mapping).unwrap_or_default();
+        let asked = spaces.iter().position(|space| *space == own);
+        asked
+            .and_then(|place| self.domain.get(place).copied())
             .or_else(|| mapping.domain_of(own))
             .unwrap_or_else(|| own.into())
     }
@@ -78,12 +82,12 @@ impl Program for BridgeRos2 {
         &self.arguments
     }
 
-    fn own(&self, mapping: &Mapping) -> Result<SpaceId, Failure> {
-        choose_space(self.space, self.domain, mapping)
+    fn spaces(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
+        choose_spaces(&self.space, &self.domain, mapping)
             .map_err(|message| Failure::new(FailureKind::Usage, message))
     }
 
-    async fn start(self, context: Context) -> Result<Ros2Port, Failure> {
+    async fn start(&self, context: Context) -> Result<Ros2Port, Failure> {
         let Context { mapping, own } = context;
         let options = PortOptions {
             domain: DomainOptions {
@@ -108,7 +112,49 @@ impl Program for BridgeRos2 {
     }
 }
 
-/// The space a bridge serves: what was asked for, else the space of the domain asked for, else the mapping's only one.
+/// The spaces a bridge serves, one for each domain asked for.
+fn choose_spaces(
+    spaces: &[u16],
+    domains: &[u16],
+    mapping: &Mapping,
+) -> Result<Vec<SpaceId>, String> {
+    if !spaces.is_empty() && !domains.is_empty() && spaces.len() != domains.len() {
+        return Err(format!(
+            "{} spaces for {} domains: --space and --domain (ROS_DOMAIN_ID) go together, one space for each domain",
+            spaces.len(),
+            domains.len()
+        ));
+    }
+    for (what, numbers) in [("domain", domains), ("space", spaces)] {
+        if let Some(twice) = repeated(numbers) {
+            return Err(format!("{what} {twice} is asked for twice"));
+        }
+    }
+    let count = spaces.len().max(domains.len()).max(1);
+    let chosen: Vec<SpaceId> = (0..count)
+        .map(|place| {
+            choose_space(
+                spaces.get(place).copied(),
+                domains.get(place).copied(),
+                mapping,
+            )
+        })
+        .collect::<Result<_, _>>()?;
+    match repeated(&chosen) {
+        Some(twice) => Err(format!("two of the domains are of space {twice}")),
+        None => Ok(chosen),
+    }
+}
+
+fn repeated<T: Copy + PartialEq>(all: &[T]) -> Option<T> {
+    let before = |place: usize| all.iter().take(place);
+    all.iter()
+        .enumerate()
+        .find(|(place, one)| before(*place).any(|other| other == *one))
+        .map(|(_, one)| *one)
+}
+
+/// The space of one domain: what was asked for, else the space of the domain asked for, else the mapping's only one.
 fn choose_space(
     space: Option<u16>,
     domain: Option<u16>,
@@ -142,7 +188,7 @@ fn choose_space(
     match (declared.next(), declared.next()) {
         (Some(only), None) => Ok(only),
         (Some(_), Some(_)) => Err(
-            "the mapping has several ROS 2 spaces: say which with --space N or --domain N"
+            "the mapping has several ROS 2 spaces: say which with --space N, or --space N,M for several in one program"
                 .to_owned(),
         ),
         (None, _) => Err(
@@ -169,6 +215,23 @@ mod tests {
     fn a_domain_is_the_space_of_its_number() {
         let space = choose_space(None, Some(7), &Mapping::default()).unwrap();
         assert_eq!(space.get(), 7);
+    }
+
+    #[test]
+    fn several_domains_are_several_spaces() {
+        let none = Mapping::default();
+        let numbers = |spaces: Vec<SpaceId>| spaces.iter().map(|id| id.get()).collect::<Vec<_>>();
+        assert_eq!(numbers(choose_spaces(&[], &[7, 8], &none).unwrap()), [7, 8]);
+        let both = choose_spaces(&[40, 41], &[0, 1], &none);
+        assert_eq!(numbers(both.unwrap()), [40, 41]);
+        for (spaces, domains, why) in [
+            (&[40][..], &[0, 1][..], "1 spaces for 2 domains"),
+            (&[], &[7, 7], "domain 7 is asked for twice"),
+            (&[40, 40], &[], "space 40 is asked for twice"),
+        ] {
+            let error = choose_spaces(spaces, domains, &none).unwrap_err();
+            assert!(error.contains(why), "{error}");
+        }
     }
 
     #[test]

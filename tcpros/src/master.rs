@@ -229,14 +229,11 @@ impl Master {
 
 /// One answer of several: its result in an array of its own, or a struct that says why there is none.
 fn unwrap_one((reply, method): (Value, &'static str)) -> Result<Value, MasterError> {
-    match reply {
-        Value::Array(result) => {
-            let [result] =
-                <[Value; 1]>::try_from(result).map_err(|_| MasterError::Shape(method))?;
-            unwrap_triple(result, method)
-        }
-        _ => Err(MasterError::Shape(method)),
-    }
+    let Value::Array(result) = reply else {
+        return Err(MasterError::Shape(method));
+    };
+    let [result] = <[Value; 1]>::try_from(result).map_err(|_| MasterError::Shape(method))?;
+    unwrap_triple(result, method)
 }
 
 /// The URIs of a topic's publishers, as `registerSubscriber` answers.
