@@ -3,10 +3,12 @@
 //! RustDDS reports discovery as events too, but on a channel that drops when it is full, and its graph events name
 //! built-in entities. A snapshot of its database is the whole truth at that moment.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use rustdds::policy::{Durability, Reliability};
 use rustdds::{DomainParticipant, GUID, RTPSEntity};
+
+use crate::node::ParticipantPrefix;
 
 /// One writer or reader of another participant.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -34,6 +36,8 @@ impl Endpoint {
 pub struct Graph {
     writers: BTreeMap<String, Vec<Endpoint>>,
     readers: BTreeMap<String, Vec<Endpoint>>,
+    /// Participants with any endpoint.
+    participants: BTreeSet<ParticipantPrefix>,
 }
 
 impl Graph {
@@ -72,9 +76,18 @@ impl Graph {
         writers: impl IntoIterator<Item = (String, Endpoint)>,
         readers: impl IntoIterator<Item = (String, Endpoint)>,
     ) -> Self {
+        let mut participants = BTreeSet::new();
+        let mut note = |endpoint: &Endpoint| {
+            if let Ok(prefix) = ParticipantPrefix::try_from(endpoint.guid.prefix.as_ref()) {
+                participants.insert(prefix);
+            }
+        };
+        let writers = by_topic(writers.into_iter().inspect(|(_, writer)| note(writer)));
+        let readers = by_topic(readers.into_iter().inspect(|(_, reader)| note(reader)));
         Self {
-            writers: by_topic(writers),
-            readers: by_topic(readers),
+            writers,
+            readers,
+            participants,
         }
     }
 
@@ -88,6 +101,12 @@ impl Graph {
     #[must_use]
     pub fn readers(&self, topic: &str) -> &[Endpoint] {
         self.readers.get(topic).map_or(&[], Vec::as_slice)
+    }
+
+    /// What the GUIDs of the participants begin with that have any reader or writer, be it of ROS or not.
+    #[must_use]
+    pub fn participants(&self) -> &BTreeSet<ParticipantPrefix> {
+        &self.participants
     }
 
     /// The topics somebody writes.

@@ -76,7 +76,7 @@ impl Program for BridgeRos2 {
     const LOCAL: Local = Local::Cdr;
     // On leaving a domain RustDDS reports errors that mean nothing, and at all times much that only its authors need.
     const QUIET: &'static str = "rustdds=error,rustdds::dds::pubsub=off,rustdds::network=off,\
-                                 rustdds::rtps::dp_event_loop=off,ros2_client=warn";
+                                 rustdds::rtps::dp_event_loop=off";
 
     fn arguments(&self) -> &Arguments {
         &self.arguments
@@ -93,7 +93,7 @@ impl Program for BridgeRos2 {
             domain: DomainOptions {
                 domain: self.domain(own, &mapping),
                 networks: self.networks()?,
-                node: NODE_NAME.to_owned(),
+                node: NODE_NAME.into(),
             },
             own,
             mapping,

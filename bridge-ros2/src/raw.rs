@@ -7,6 +7,8 @@ use bytes::Bytes;
 use rustdds::no_key::{Decode, DefaultDecoder, DeserializerAdapter, SerializerAdapter};
 use rustdds::{RepresentationIdentifier, no_key};
 
+use crate::node::Listed;
+
 /// The serialized payload of one sample, encapsulation header first.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Payload(Bytes);
@@ -84,10 +86,14 @@ impl PayloadError {
 #[derive(Debug, Clone, Copy)]
 pub struct Opaque;
 
+/// A reader that hands out [`Payload`]s, on the list of its node.
+pub type Reader = Listed<RawReader>;
+/// A writer of [`Payload`]s, on the list of its node.
+pub type Writer = Listed<RawWriter>;
 /// A reader that hands out [`Payload`]s.
-pub type Reader = no_key::SimpleDataReader<Payload, Opaque>;
+pub(crate) type RawReader = no_key::SimpleDataReader<Payload, Opaque>;
 /// A writer of [`Payload`]s.
-pub type Writer = no_key::DataWriter<Payload, Opaque>;
+pub(crate) type RawWriter = no_key::DataWriter<Payload, Opaque>;
 
 impl DeserializerAdapter<Payload> for Opaque {
     type Error = std::convert::Infallible;

@@ -11,7 +11,7 @@ use tracing::{debug, info, warn};
 
 use super::{MAX_TOPICS, Ros2Port, lost};
 use crate::domain::{Domain, DomainError};
-use crate::graph::{Endpoint, Graph, ros_topic};
+use crate::graph::{Endpoint, ros_topic};
 use crate::outlet::Outlet;
 use crate::qos::Requested;
 use crate::sink::{Open, Sink};
@@ -28,7 +28,7 @@ impl Ros2Port {
         while self.retired.front().is_some_and(|(until, _)| *until <= now) {
             self.retired.pop_front();
         }
-        self.graph = Graph::snapshot(self.domain.participant());
+        self.graph = self.domain.graph();
         self.find_topics_of_the_space();
         for index in 0..self.sources.len() {
             self.reconcile_source(index, now);
