@@ -3,22 +3,13 @@
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
-use system_tests::{Cell, Child, METRICS_ROS2, Peer, Started, eventually, metrics, program};
+use system_tests::{Cell, Child, METRICS_ROS2, Peer, eventually, metrics};
 
 const SOON: Duration = Duration::from_secs(30);
 /// Long enough for a loop to show: one turn takes a few milliseconds.
 const WINDOW: Duration = Duration::from_secs(2);
 const STRING: &str = "std_msgs/String";
 const COUNT: usize = 100;
-
-fn bridge(args: &[&str]) -> Child {
-    let bridge = Started::new("bridge-ros2", &program("bridge-ros2"))
-        .args(args)
-        .args(["--interface", "lo", "--metrics", METRICS_ROS2])
-        .start();
-    eventually("the bridge answers", SOON, || metrics(METRICS_ROS2));
-    bridge
-}
 
 fn subscriber(cell: &Cell, topic: &str, domain: &str) -> Child {
     cell.cyclone("ros2_sub.py", &[topic, STRING, "--domain", domain])
@@ -71,7 +62,8 @@ fn values_cross_between_two_domains_of_one_bridge_once_and_do_not_come_home() {
          \x20 - {node: ns=5;i=11, name: Two, origin: 3, queue: {drop_oldest: 200}}\n",
     );
     let file = file.to_str().unwrap();
-    let mut bridge = bridge(&[file, "--space", "2,3"]);
+    let mut bridge = cell.bridge_ros2_alone(&[file, "--space", "2,3"]).start();
+    eventually("the bridge answers", SOON, || metrics(METRICS_ROS2));
     // Of each value: a subscriber at home, and one in the other domain.
     let mut subscribers = [
         ("/ua_2_5_10", "12"),
