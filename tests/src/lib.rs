@@ -19,6 +19,7 @@ mod numbered;
 mod peers;
 mod programs;
 mod ua_side;
+mod usage;
 mod wait;
 
 pub use arrows::{forbidden, tree};
@@ -34,4 +35,5 @@ pub use programs::{
     METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, SERVER_ENDPOINT, drops, number, program,
 };
 pub use ua_side::{Triple, UaSide};
+pub use usage::{cpu_share, resident, threads};
 pub use wait::{eventually, holds_for};
