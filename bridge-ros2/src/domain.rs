@@ -1,6 +1,6 @@
 //! Being in a DDS domain: the participant, the ROS node it stands for, and the making of endpoints.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
@@ -216,6 +216,13 @@ impl Domain {
         self.node
             .retain(|prefix| graph.participants().contains(prefix));
         graph
+    }
+
+    /// The readers and writers made here that were not announced to the domain: RustDDS' discovery drops what does not
+    /// fit into its queue. They are to be made anew.
+    #[must_use]
+    pub fn unannounced(&self, graph: &Graph) -> BTreeSet<GUID> {
+        self.node.unannounced(graph.own())
     }
 
     /// The nodes of others, as they told.

@@ -4,6 +4,7 @@
 //! RustDDS as bytes, because their types are known at run time only.
 
 pub mod clock;
+pub mod compatibility;
 mod definitions;
 pub mod discovery_info;
 pub mod domain;
@@ -14,8 +15,10 @@ pub mod outlet;
 mod port;
 pub mod qos;
 pub mod raw;
+mod ros_args;
 mod rosout;
 mod sink;
 mod source;
 
 pub use port::{PortOptions, Ros2Port};
+pub use ros_args::RosArgs;

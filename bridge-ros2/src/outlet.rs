@@ -10,7 +10,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use rustdds::dds::WriteError;
-use rustdds::{DataWriterStatus, GUID, RTPSEntity, StatusEvented, Timestamp};
+use rustdds::{DataWriterStatus, GUID, StatusEvented, Timestamp};
 use tokio::time::Instant;
 
 use crate::graph::Endpoint;

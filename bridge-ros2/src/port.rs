@@ -17,11 +17,12 @@ use bridge_node::{Delivery, Kept, Port, PortEvent, now};
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::TypeName;
-use rustdds::{DomainParticipantStatusEvent, DomainParticipantStatusListener, StatusEvented};
+use rustdds::{DomainParticipantStatusEvent, DomainParticipantStatusListener, GUID, StatusEvented};
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 use uadp::BuiltinType;
 
+use crate::clock::RosClock;
 use crate::definitions::Definitions;
 use crate::domain::{Domain, DomainError, DomainOptions};
 use crate::graph::{Graph, dds_topic};
@@ -67,6 +68,9 @@ pub struct Ros2Port {
     events: VecDeque<PortEvent>,
     /// Endpoints that may still be made before the next [`reconcile`](Self::reconcile).
     budget: usize,
+    clock: RosClock,
+    /// Endpoints of others that were told and counted as incompatible with ours.
+    incompatible: BTreeSet<GUID>,
     /// What was already told, so that it is told once.
     told: BTreeSet<(String, &'static str)>,
     schedule: Schedule,
@@ -92,6 +96,7 @@ impl Ros2Port {
             networks = ?domain_options.networks,
             "joined the DDS domain"
         );
+        let clock = domain.clock();
         let mut port = Self {
             discovery: domain.status_listener(),
             domain,
@@ -106,6 +111,8 @@ impl Ros2Port {
             retired: VecDeque::new(),
             events: VecDeque::new(),
             budget: MAX_BATCH,
+            clock,
+            incompatible: BTreeSet::new(),
             told: BTreeSet::new(),
             schedule: Schedule::new(),
         };
@@ -282,7 +289,6 @@ impl Port for Ros2Port {
         if status & STATUS_BAD != 0 {
             return Err("bad status");
         }
-        let payload = Payload::to_write(payload).map_err(|error| error.label())?;
         let Some(Sink {
             open: Some(open),
             dds_topic,
@@ -291,6 +297,8 @@ impl Port for Ros2Port {
         else {
             return Err("no writer yet");
         };
+        let payload = open.stamped(payload, || self.clock.now());
+        let payload = Payload::to_write(payload).map_err(|error| error.label())?;
         let size = payload.len();
         let offered = open
             .outlet
