@@ -21,6 +21,8 @@ pub struct DomainOptions {
     pub domain: u16,
     /// Addresses of the interfaces to use; all when empty.
     pub networks: Vec<IpAddr>,
+    /// Hosts to announce ourselves to by unicast, beside multicast.
+    pub peers: Vec<IpAddr>,
     /// The ROS name of the node, without namespace.
     pub node: String,
 }
@@ -92,6 +94,11 @@ pub enum DomainError {
         "ROS_AUTOMATIC_DISCOVERY_RANGE is `{0}`: a bridge needs SUBNET (the default) or LOCALHOST"
     )]
     DiscoveryRange(String),
+    /// Peers were given to a RustDDS that knows only multicast.
+    #[error(
+        "a list of peers needs RustDDS with this project's patches, as `cargo xtask dist` builds it"
+    )]
+    Peers,
     /// RustDDS could not open its sockets or start its threads.
     #[error("cannot join DDS domain {domain}: {source}")]
     Join {
@@ -150,7 +157,9 @@ impl Domain {
         if !options.networks.is_empty() {
             builder = builder.with_only_networks(options.networks.iter().copied());
         }
-        let participant = builder.build().map_err(failed)?;
+        let participant = with_peers(builder, &options.peers)?
+            .build()
+            .map_err(failed)?;
         let none = QosPolicies::qos_none();
         let publisher = participant.create_publisher(&none).map_err(failed)?;
         let subscriber = participant.create_subscriber(&none).map_err(failed)?;
@@ -293,6 +302,28 @@ impl std::fmt::Debug for Domain {
             .field("domain", &self.context.domain_id())
             .field("node", &self.node_name())
             .finish_non_exhaustive()
+    }
+}
+
+// When this does not compile: the feature `patched-dds` is on, but RustDDS is as published. `cargo xtask` builds with
+// both, and `cargo xtask dds` prints the flags to do so by hand.
+#[cfg(feature = "patched-dds")]
+fn with_peers(
+    builder: DomainParticipantBuilder,
+    peers: &[IpAddr],
+) -> Result<DomainParticipantBuilder, DomainError> {
+    Ok(builder.initial_peers(peers.iter().copied()))
+}
+
+#[cfg(not(feature = "patched-dds"))]
+fn with_peers(
+    builder: DomainParticipantBuilder,
+    peers: &[IpAddr],
+) -> Result<DomainParticipantBuilder, DomainError> {
+    if peers.is_empty() {
+        Ok(builder)
+    } else {
+        Err(DomainError::Peers)
     }
 }
 

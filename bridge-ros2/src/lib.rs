@@ -7,6 +7,7 @@ mod definitions;
 pub mod domain;
 pub mod graph;
 pub mod inbox;
+pub mod limits;
 pub mod outlet;
 mod port;
 pub mod qos;
