@@ -10,6 +10,7 @@ pub mod discovery_info;
 pub mod domain;
 pub mod graph;
 pub mod inbox;
+pub mod limits;
 pub mod node;
 pub mod outlet;
 mod port;

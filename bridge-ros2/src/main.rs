@@ -1,6 +1,7 @@
 //! `bridge-ros2`: carries topics between a ROS 2 domain and the space.
 
-use std::net::IpAddr;
+use std::fmt::Display;
+use std::net::{IpAddr, SocketAddr, ToSocketAddrs as _};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -9,7 +10,7 @@ use bridge_node::{Arguments, Context, Failure, FailureKind, Program};
 use bridge_ros2::discovery_info::GidLength;
 use bridge_ros2::domain::{DiscoveryRange, DomainError, DomainOptions};
 use bridge_ros2::node::NodeOptions;
-use bridge_ros2::{PortOptions, Ros2Port, RosArgs};
+use bridge_ros2::{PortOptions, Ros2Port, RosArgs, limits};
 use clap::Parser;
 use mappings::{Mapping, SpaceId};
 use transport::{Interface, InterfaceError};
@@ -20,7 +21,7 @@ fn main() -> ExitCode {
 
 /// Carries topics between a ROS 2 domain and the space of OPC UA PubSub.
 #[derive(Debug, Parser)]
-#[command(name = "bridge-ros2", version)]
+#[command(name = "bridge-ros2", version = limits::VERSION)]
 struct BridgeRos2 {
     #[command(flatten)]
     arguments: Arguments,
@@ -35,6 +36,10 @@ struct BridgeRos2 {
     /// and `ROS_LOCALHOST_ONLY` say, else all
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_ROS_INTERFACE")]
     ros_interface: Option<String>,
+    /// A host to announce the bridge to by unicast, where multicast does not reach; may be repeated. Without it the
+    /// hosts in `ROS_STATIC_PEERS`, separated by `;`
+    #[arg(long, value_name = "ADDRESS")]
+    ros_peer: Vec<String>,
     /// The name of the bridge's node
     #[arg(long, value_name = "NAME", default_value = NODE_NAME)]
     node_name: String,
@@ -104,6 +109,37 @@ impl BridgeRos2 {
     }
 }
 
+/// The addresses of hosts given as the command line and the environment have them.
+fn peers(given: &[String], variable: Option<&str>) -> Result<Vec<IpAddr>, Failure> {
+    let listed = variable.unwrap_or_default().split(';');
+    let hosts: Vec<&str> = if given.is_empty() {
+        listed
+            .map(str::trim)
+            .filter(|host| !host.is_empty())
+            .collect()
+    } else {
+        given.iter().map(String::as_str).collect()
+    };
+    hosts.into_iter().map(address).collect()
+}
+
+/// The address of one host; RustDDS speaks IPv4.
+fn address(host: &str) -> Result<IpAddr, Failure> {
+    if let Ok(IpAddr::V6(_)) = host.parse() {
+        let message = format!("peer {host}: only IPv4 addresses can be reached");
+        return Err(Failure::new(FailureKind::Usage, message));
+    }
+    let unknown =
+        |why: &dyn Display| Failure::new(FailureKind::Unavailable, format!("peer {host}: {why}"));
+    let mut addresses = (host, 0)
+        .to_socket_addrs()
+        .map_err(|error| unknown(&error))?;
+    addresses
+        .find(SocketAddr::is_ipv4)
+        .map(|address| address.ip())
+        .ok_or_else(|| unknown(&"has no IPv4 address"))
+}
+
 impl Program for BridgeRos2 {
     type Port = Ros2Port;
 
@@ -128,6 +164,10 @@ impl Program for BridgeRos2 {
             domain: DomainOptions {
                 domain: self.domain(own, &mapping),
                 networks: self.networks()?,
+                peers: peers(
+                    &self.ros_peer,
+                    std::env::var("ROS_STATIC_PEERS").ok().as_deref(),
+                )?,
                 node: self.node()?,
             },
             own,
@@ -137,7 +177,10 @@ impl Program for BridgeRos2 {
                 .unwrap_or_default(),
         };
         Ros2Port::start(options).map_err(|error| {
-            let kind = if matches!(error, DomainError::Domain(_) | DomainError::NodeName { .. }) {
+            let kind = if matches!(
+                error,
+                DomainError::Domain(_) | DomainError::NodeName { .. } | DomainError::Peers
+            ) {
                 FailureKind::Usage
             } else {
                 FailureKind::Unavailable

@@ -27,6 +27,7 @@ use crate::definitions::Definitions;
 use crate::domain::{Domain, DomainError, DomainOptions};
 use crate::graph::{Graph, dds_topic};
 use crate::inbox::{Inbox, Taken};
+use crate::limits;
 use crate::outlet::Refusal;
 use crate::raw::{Payload, Reader};
 use crate::sink::Sink;
@@ -94,6 +95,8 @@ impl Ros2Port {
             space = %own,
             node = domain.node_name(),
             networks = ?domain_options.networks,
+            peers = ?domain_options.peers,
+            dds = limits::RUSTDDS,
             "joined the DDS domain"
         );
         let clock = domain.clock();
@@ -308,9 +311,9 @@ impl Port for Ros2Port {
             let dds_topic = dds_topic.clone();
             self.tell_once(&dds_topic, "too large", || {
                 format!(
-                    "a message of {size} bytes may not arrive: above {limit} bytes the DDS stack repairs a lost \
-                     fragment too slowly. Larger socket buffers at the subscriber (net.core.rmem_max, \
-                     net.core.rmem_default) help"
+                    "a message of {size} bytes is not sent: above {limit} bytes it might never be complete at a \
+                     subscriber of this topic ({})",
+                    limits::RUSTDDS
                 )
             });
         }

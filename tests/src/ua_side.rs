@@ -98,6 +98,11 @@ impl UaSide {
         self.socket.send(&datagram);
     }
 
+    /// Reads away what is waiting.
+    pub fn drain(&self) {
+        self.socket.drain();
+    }
+
     /// The triples of all values heard within `window`.
     #[must_use]
     pub fn triples_for(&self, window: Duration) -> Vec<Triple> {

@@ -19,6 +19,7 @@ fn join(node: NodeOptions) -> Domain {
     Domain::join(&DomainOptions {
         domain: DOMAIN,
         networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
+        peers: Vec::new(),
         node,
     })
     .unwrap()
