@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use bridge_node::Wanted;
-use messages::{DefinitionError, Dialect, MessageType, TypeName};
+use messages::{DefinitionError, Dialect, MessageType, TypeHash, TypeName};
 use uadp::BuiltinType;
 
 /// Finds message types by name; a type once found stays.
@@ -41,6 +41,11 @@ impl Definitions {
                 .map(|prefix| prefix.join(&file))
                 .find(|file| file.is_file())
         })
+    }
+
+    /// The type hash of a type that was found.
+    pub(crate) fn type_hash(&self, name: &TypeName) -> Option<TypeHash> {
+        self.known.registry().type_hash(name).ok()
     }
 
     /// The ROS type that carries one value of that type, and nothing else.

@@ -1,6 +1,6 @@
 //! Being in a DDS domain: the participant, the ROS node it stands for, and the making of endpoints.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, Ipv4Addr};
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
@@ -28,6 +28,8 @@ pub struct DomainOptions {
     pub domain: u16,
     /// Addresses of the interfaces to use; all when empty.
     pub networks: Vec<IpAddr>,
+    /// Hosts to announce ourselves to by unicast, beside multicast.
+    pub peers: Vec<IpAddr>,
     /// The ROS node it is there; a name alone is one in the root namespace.
     pub node: NodeOptions,
 }
@@ -99,6 +101,11 @@ pub enum DomainError {
         "ROS_AUTOMATIC_DISCOVERY_RANGE is `{0}`: a bridge needs SUBNET (the default) or LOCALHOST"
     )]
     DiscoveryRange(String),
+    /// Peers were given to a RustDDS that knows only multicast.
+    #[error(
+        "a list of peers needs RustDDS with this project's patches, as `cargo xtask dist` builds it"
+    )]
+    Peers,
     /// RustDDS could not open its sockets or start its threads.
     #[error("cannot join DDS domain {domain}: {source}")]
     Join {
@@ -154,7 +161,7 @@ impl Domain {
             domain: options.domain,
             source,
         };
-        let participant = participant(options).map_err(failed)?;
+        let participant = participant(options)?.build().map_err(failed)?;
         let none = QosPolicies::qos_none();
         let publisher = participant.create_publisher(&none).map_err(failed)?;
         let subscriber = participant.create_subscriber(&none).map_err(failed)?;
@@ -216,6 +223,13 @@ impl Domain {
         self.node
             .retain(|prefix| graph.participants().contains(prefix));
         graph
+    }
+
+    /// The readers and writers made here that were not announced to the domain: RustDDS' discovery drops what does not
+    /// fit into its queue. They are to be made anew.
+    #[must_use]
+    pub fn unannounced(&self, graph: &Graph) -> BTreeSet<GUID> {
+        self.node.unannounced(graph.own())
     }
 
     /// The nodes of others, as they told.
@@ -369,7 +383,7 @@ impl std::fmt::Debug for Domain {
     }
 }
 
-fn participant(options: &DomainOptions) -> Result<DomainParticipant, CreateError> {
+fn participant(options: &DomainOptions) -> Result<DomainParticipantBuilder, DomainError> {
     // Announcements to 127.0.0.1 find peers on this machine without multicast; they would contradict a choice of
     // other interfaces.
     let mut builder = DomainParticipantBuilder::new(options.domain)
@@ -380,7 +394,7 @@ fn participant(options: &DomainOptions) -> Result<DomainParticipant, CreateError
     // The security enclave, of which ROS tools show that it is the default one.
     #[cfg(feature = "patched-dds")]
     let builder = builder.user_data(b"enclave=/;".to_vec());
-    builder.build()
+    with_peers(builder, &options.peers)
 }
 
 /// The policies with a type hash in the endpoint's user data, as every rmw of DDS puts it there (REP-2016).
@@ -421,6 +435,28 @@ fn info_qos(depth: i32) -> QosPolicies {
 #[must_use]
 pub const fn can_announce_type_hashes() -> bool {
     cfg!(feature = "patched-dds")
+}
+
+// When this does not compile: the feature `patched-dds` is on, but RustDDS is as published. `cargo xtask` builds with
+// both, and `cargo xtask dds` prints the flags to do so by hand.
+#[cfg(feature = "patched-dds")]
+fn with_peers(
+    builder: DomainParticipantBuilder,
+    peers: &[IpAddr],
+) -> Result<DomainParticipantBuilder, DomainError> {
+    Ok(builder.initial_peers(peers.iter().copied()))
+}
+
+#[cfg(not(feature = "patched-dds"))]
+fn with_peers(
+    builder: DomainParticipantBuilder,
+    peers: &[IpAddr],
+) -> Result<DomainParticipantBuilder, DomainError> {
+    if peers.is_empty() {
+        Ok(builder)
+    } else {
+        Err(DomainError::Peers)
+    }
 }
 
 fn endpoint_error(topic: &str, source: CreateError) -> DomainError {

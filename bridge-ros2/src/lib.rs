@@ -4,18 +4,22 @@
 //! RustDDS as bytes, because their types are known at run time only.
 
 pub mod clock;
+pub mod compatibility;
 mod definitions;
 pub mod discovery_info;
 pub mod domain;
 pub mod graph;
 pub mod inbox;
+pub mod limits;
 pub mod node;
 pub mod outlet;
 mod port;
 pub mod qos;
 pub mod raw;
+mod ros_args;
 mod rosout;
 mod sink;
 mod source;
 
 pub use port::{PortOptions, Ros2Port};
+pub use ros_args::RosArgs;

@@ -1,13 +1,16 @@
 //! `bridge-ros2`: carries topics between a ROS 2 domain and the space.
 
-use std::net::IpAddr;
+use std::fmt::Display;
+use std::net::{IpAddr, SocketAddr, ToSocketAddrs as _};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use bridge_core::Local;
 use bridge_node::{Arguments, Context, Failure, FailureKind, Program};
+use bridge_ros2::discovery_info::GidLength;
 use bridge_ros2::domain::{DiscoveryRange, DomainError, DomainOptions};
-use bridge_ros2::{PortOptions, Ros2Port};
+use bridge_ros2::node::NodeOptions;
+use bridge_ros2::{PortOptions, Ros2Port, RosArgs, limits};
 use clap::Parser;
 use mappings::{Mapping, SpaceId};
 use transport::{Interface, InterfaceError};
@@ -18,7 +21,7 @@ fn main() -> ExitCode {
 
 /// Carries topics between a ROS 2 domain and the space of OPC UA PubSub.
 #[derive(Debug, Parser)]
-#[command(name = "bridge-ros2", version)]
+#[command(name = "bridge-ros2", version = limits::VERSION)]
 struct BridgeRos2 {
     #[command(flatten)]
     arguments: Arguments,
@@ -34,9 +37,50 @@ struct BridgeRos2 {
     /// and `ROS_LOCALHOST_ONLY` say, else all
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_ROS_INTERFACE")]
     ros_interface: Option<String>,
+    /// A host to announce the bridge to by unicast, where multicast does not reach; may be repeated. Without it the
+    /// hosts in `ROS_STATIC_PEERS`, separated by `;`
+    #[arg(long, value_name = "ADDRESS")]
+    ros_peer: Vec<String>,
+    /// The name of the bridge's node
+    #[arg(long, value_name = "NAME", default_value = NODE_NAME)]
+    node_name: String,
+    /// The namespace of the bridge's node
+    #[arg(long, value_name = "/NAMESPACE", default_value = "/")]
+    node_namespace: String,
+    /// Take the time for what is stamped from /clock
+    #[arg(long)]
+    use_sim_time: bool,
+    /// How many bytes a Gid has in the node's list of readers and writers: 24 up to ROS 2 Humble, 16 from Iron on
+    #[arg(long, value_name = "16|24|auto", default_value = "auto", value_parser = gid_length)]
+    gid: GidChoice,
+    /// Arguments as `ros2 run` has them: -r __node:=NAME, -r __ns:=/NAMESPACE, -p use_sim_time:=true; ends with `--`
+    #[arg(
+        long,
+        value_name = "ROS_ARGS",
+        num_args = 0..,
+        allow_hyphen_values = true,
+        value_terminator = "--"
+    )]
+    ros_args: Vec<String>,
 }
 
 impl BridgeRos2 {
+    /// The node to be; ROS arguments win.
+    fn node(&self) -> Result<NodeOptions, Failure> {
+        let RosArgs {
+            name,
+            namespace,
+            use_sim_time,
+        } = RosArgs::parse(&self.ros_args)
+            .map_err(|error| Failure::new(FailureKind::Usage, error))?;
+        Ok(NodeOptions {
+            namespace: namespace.unwrap_or_else(|| self.node_namespace.clone()),
+            name: name.unwrap_or_else(|| self.node_name.clone()),
+            gid: self.gid.0,
+            use_sim_time: use_sim_time.unwrap_or(self.use_sim_time),
+        })
+    }
+
     /// The domain to join for the space `own`.
     fn domain(&self, own: SpaceId, mapping: &Mapping) -> u16 {
         let spaces = choose_spaces(&self.space, &self.domain, mapping).unwrap_or_default();
@@ -69,6 +113,37 @@ impl BridgeRos2 {
     }
 }
 
+/// The addresses of hosts given as the command line and the environment have them.
+fn peers(given: &[String], variable: Option<&str>) -> Result<Vec<IpAddr>, Failure> {
+    let listed = variable.unwrap_or_default().split(';');
+    let hosts: Vec<&str> = if given.is_empty() {
+        listed
+            .map(str::trim)
+            .filter(|host| !host.is_empty())
+            .collect()
+    } else {
+        given.iter().map(String::as_str).collect()
+    };
+    hosts.into_iter().map(address).collect()
+}
+
+/// The address of one host; RustDDS speaks IPv4.
+fn address(host: &str) -> Result<IpAddr, Failure> {
+    if let Ok(IpAddr::V6(_)) = host.parse() {
+        let message = format!("peer {host}: only IPv4 addresses can be reached");
+        return Err(Failure::new(FailureKind::Usage, message));
+    }
+    let unknown =
+        |why: &dyn Display| Failure::new(FailureKind::Unavailable, format!("peer {host}: {why}"));
+    let mut addresses = (host, 0)
+        .to_socket_addrs()
+        .map_err(|error| unknown(&error))?;
+    addresses
+        .find(SocketAddr::is_ipv4)
+        .map(|address| address.ip())
+        .ok_or_else(|| unknown(&"has no IPv4 address"))
+}
+
 impl Program for BridgeRos2 {
     type Port = Ros2Port;
 
@@ -93,7 +168,11 @@ impl Program for BridgeRos2 {
             domain: DomainOptions {
                 domain: self.domain(own, &mapping),
                 networks: self.networks()?,
-                node: NODE_NAME.into(),
+                peers: peers(
+                    &self.ros_peer,
+                    std::env::var("ROS_STATIC_PEERS").ok().as_deref(),
+                )?,
+                node: self.node()?,
             },
             own,
             mapping,
@@ -102,7 +181,10 @@ impl Program for BridgeRos2 {
                 .unwrap_or_default(),
         };
         Ros2Port::start(options).map_err(|error| {
-            let kind = if matches!(error, DomainError::Domain(_)) {
+            let kind = if matches!(
+                error,
+                DomainError::Domain(_) | DomainError::NodeName { .. } | DomainError::Peers
+            ) {
                 FailureKind::Usage
             } else {
                 FailureKind::Unavailable
@@ -198,6 +280,19 @@ fn choose_space(
     }
 }
 
+/// A fixed length, or that which most others write.
+#[derive(Debug, Clone, Copy)]
+struct GidChoice(Option<GidLength>);
+
+fn gid_length(text: &str) -> Result<GidChoice, &'static str> {
+    match text {
+        "16" => Ok(GidChoice(Some(GidLength::Bytes16))),
+        "24" => Ok(GidChoice(Some(GidLength::Bytes24))),
+        "auto" => Ok(GidChoice(None)),
+        _ => Err("16, 24 or auto expected"),
+    }
+}
+
 /// How the bridge appears in `ros2 node list`.
 const NODE_NAME: &str = "ua_bridge_ros2";
 
@@ -209,6 +304,19 @@ mod tests {
     #[test]
     fn the_command_line_is_well_formed() {
         BridgeRos2::command().debug_assert();
+    }
+
+    #[test]
+    fn the_node_is_what_ros_arguments_say() {
+        let line =
+            "bridge-ros2 cell.yaml --ros-args -r __node:=left -p use_sim_time:=true -- --check";
+        let bridge = BridgeRos2::try_parse_from(line.split(' ')).unwrap();
+        let node = bridge.node().unwrap();
+        assert_eq!(
+            (node.full_name().as_str(), node.use_sim_time),
+            ("/left", true)
+        );
+        assert!(bridge.arguments.check && bridge.arguments.mapping.is_some());
     }
 
     #[test]

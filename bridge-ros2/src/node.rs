@@ -80,7 +80,14 @@ impl From<&str> for NodeOptions {
 /// A reader or writer that is on its node's list for as long as it is there.
 pub struct Listed<E> {
     endpoint: E,
-    _entry: Entry,
+    entry: Entry,
+}
+
+impl<E> Listed<E> {
+    /// Who it is to others.
+    pub fn guid(&self) -> GUID {
+        self.entry.guid
+    }
 }
 
 impl<E> Deref for Listed<E> {
@@ -94,7 +101,7 @@ impl<E> Deref for Listed<E> {
 /// A place on the node's list, given up when dropped.
 struct Entry {
     node: Arc<Shared>,
-    guid: GuidBytes,
+    guid: GUID,
     kind: Kind,
 }
 
@@ -106,7 +113,8 @@ enum Kind {
 
 impl Drop for Entry {
     fn drop(&mut self) {
-        self.node.change(|own| own.of(self.kind).remove(&self.guid));
+        self.node
+            .change(|own| own.of(self.kind).remove(&self.guid.to_bytes()));
     }
 }
 
@@ -145,6 +153,8 @@ struct Own {
     readers: BTreeSet<GuidBytes>,
     writers: BTreeSet<GuidBytes>,
     changed: bool,
+    /// Those that were not seen to be announced, and since when they are there.
+    unseen: BTreeMap<GUID, Instant>,
 }
 
 /// What others told.
@@ -208,20 +218,22 @@ impl Node {
     }
 
     pub(crate) fn list_reader(&self, endpoint: RawReader) -> Reader {
-        let guid = endpoint.guid().to_bytes();
+        let guid = endpoint.guid();
         self.list(endpoint, guid, Kind::Reader)
     }
 
     pub(crate) fn list_writer(&self, endpoint: RawWriter) -> Writer {
-        let guid = endpoint.guid().to_bytes();
+        let guid = endpoint.guid();
         self.list(endpoint, guid, Kind::Writer)
     }
 
-    fn list<E>(&self, endpoint: E, guid: GuidBytes, kind: Kind) -> Listed<E> {
-        self.shared.change(|own| own.of(kind).insert(guid));
+    fn list<E>(&self, endpoint: E, guid: GUID, kind: Kind) -> Listed<E> {
+        lock(&self.shared.own).unseen.insert(guid, Instant::now());
+        self.shared
+            .change(|own| own.of(kind).insert(guid.to_bytes()));
         Listed {
             endpoint,
-            _entry: Entry {
+            entry: Entry {
                 node: Arc::clone(&self.shared),
                 guid,
                 kind,
@@ -248,6 +260,23 @@ impl Node {
             .iter()
             .find(|node| node.readers.contains(&guid) || node.writers.contains(&guid))
             .map(NodeEntities::full_name)
+    }
+
+    /// Takes note of endpoints of ours that were announced, and returns those that should have been by now.
+    pub(crate) fn unannounced(&self, announced: &BTreeSet<GUID>) -> BTreeSet<GUID> {
+        let mut own = lock(&self.shared.own);
+        own.unseen.retain(|guid, _| !announced.contains(guid));
+        if announced.is_empty() {
+            // RustDDS does not hear itself here, so nothing follows.
+            return BTreeSet::new();
+        }
+        let now = Instant::now();
+        let late = |since: &Instant| now.duration_since(*since) >= ANNOUNCED_WITHIN;
+        own.unseen
+            .iter()
+            .filter(|(_, since)| late(since))
+            .map(|(guid, _)| *guid)
+            .collect()
     }
 
     /// Forgets the nodes of participants that are not there any more.
@@ -498,6 +527,8 @@ where
 const BATCH: Duration = Duration::from_millis(50);
 /// When to try again what RustDDS had no room for.
 const RETRY: Duration = Duration::from_millis(100);
+/// How long an announcement may take: a full queue of RustDDS' discovery is worked off in less.
+const ANNOUNCED_WITHIN: Duration = Duration::from_secs(3);
 /// How long leaving waits for others to hear of it.
 const WITHDRAW_WITHIN: Duration = Duration::from_millis(200);
 /// Participants whose nodes are known; of further ones they are not.

@@ -17,15 +17,17 @@ use bridge_node::{Delivery, Kept, Port, PortEvent, now};
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::TypeName;
-use rustdds::{DomainParticipantStatusEvent, DomainParticipantStatusListener, StatusEvented};
+use rustdds::{DomainParticipantStatusEvent, DomainParticipantStatusListener, GUID, StatusEvented};
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 use uadp::BuiltinType;
 
+use crate::clock::RosClock;
 use crate::definitions::Definitions;
 use crate::domain::{Domain, DomainError, DomainOptions};
 use crate::graph::{Graph, dds_topic};
 use crate::inbox::{Inbox, Taken};
+use crate::limits;
 use crate::outlet::Refusal;
 use crate::raw::{Payload, Reader};
 use crate::sink::Sink;
@@ -67,6 +69,9 @@ pub struct Ros2Port {
     events: VecDeque<PortEvent>,
     /// Endpoints that may still be made before the next [`reconcile`](Self::reconcile).
     budget: usize,
+    clock: RosClock,
+    /// Endpoints of others that were told and counted as incompatible with ours.
+    incompatible: BTreeSet<GUID>,
     /// What was already told, so that it is told once.
     told: BTreeSet<(String, &'static str)>,
     schedule: Schedule,
@@ -90,8 +95,11 @@ impl Ros2Port {
             space = %own,
             node = domain.node_name(),
             networks = ?domain_options.networks,
+            peers = ?domain_options.peers,
+            dds = limits::RUSTDDS,
             "joined the DDS domain"
         );
+        let clock = domain.clock();
         let mut port = Self {
             discovery: domain.status_listener(),
             domain,
@@ -106,6 +114,8 @@ impl Ros2Port {
             retired: VecDeque::new(),
             events: VecDeque::new(),
             budget: MAX_BATCH,
+            clock,
+            incompatible: BTreeSet::new(),
             told: BTreeSet::new(),
             schedule: Schedule::new(),
         };
@@ -282,7 +292,6 @@ impl Port for Ros2Port {
         if status & STATUS_BAD != 0 {
             return Err("bad status");
         }
-        let payload = Payload::to_write(payload).map_err(|error| error.label())?;
         let Some(Sink {
             open: Some(open),
             dds_topic,
@@ -291,6 +300,8 @@ impl Port for Ros2Port {
         else {
             return Err("no writer yet");
         };
+        let payload = open.stamped(payload, || self.clock.now());
+        let payload = Payload::to_write(payload).map_err(|error| error.label())?;
         let size = payload.len();
         let offered = open
             .outlet
@@ -300,9 +311,9 @@ impl Port for Ros2Port {
             let dds_topic = dds_topic.clone();
             self.tell_once(&dds_topic, "too large", || {
                 format!(
-                    "a message of {size} bytes may not arrive: above {limit} bytes the DDS stack repairs a lost \
-                     fragment too slowly. Larger socket buffers at the subscriber (net.core.rmem_max, \
-                     net.core.rmem_default) help"
+                    "a message of {size} bytes is not sent: above {limit} bytes it might never be complete at a \
+                     subscriber of this topic ({})",
+                    limits::RUSTDDS
                 )
             });
         }

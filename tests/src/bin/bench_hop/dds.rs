@@ -26,6 +26,7 @@ impl Reader {
         let options = DomainOptions {
             domain: 2,
             networks: vec![IpAddr::V4(Ipv4Addr::LOCALHOST)],
+            peers: Vec::new(),
             node: "bench".into(),
         };
         let domain = Domain::join(&options).unwrap();
