@@ -20,6 +20,9 @@ macro_rules! rustdds {
     };
 }
 
+/// Whether RustDDS is the patched one.
+pub const PATCHED: bool = cfg!(feature = "patched-dds");
+
 /// Which RustDDS this is and what its limits are, for people.
 pub const RUSTDDS: &str = rustdds!();
 
