@@ -329,6 +329,21 @@ impl Own {
 }
 
 impl Others {
+    /// Says whether there was room.
+    fn insert(
+        &mut self,
+        prefix: ParticipantPrefix,
+        length: GidLength,
+        nodes: Vec<NodeEntities>,
+    ) -> bool {
+        let full = self.participants.len() >= MAX_PARTICIPANTS;
+        if full && !self.participants.contains_key(&prefix) {
+            return false;
+        }
+        self.participants.insert(prefix, (length, nodes));
+        true
+    }
+
     /// The length most participants write; the newer one when as many write either.
     fn majority(&self) -> GidLength {
         let lengths = || self.participants.values().map(|(length, _)| *length);
@@ -405,21 +420,13 @@ impl Teller {
             debug!(total = others.malformed, "malformed list of nodes");
             return;
         };
-        if others.participants.len() >= MAX_PARTICIPANTS
-            && !others.participants.contains_key(&prefix)
-        {
-            return;
-        }
         let own = self.shared.options.full_name();
         let double = info.nodes.iter().any(|node| node.full_name() == own);
-        if double && others.doubles.insert(prefix) {
-            warn!(
-                node = own,
-                "another node of the domain has the same name; tools of ROS show them as one"
-            );
+        if others.insert(prefix, length, info.nodes) && double && others.doubles.insert(prefix) {
+            // Not while the lock is held: a warning goes to all who hear the log.
+            drop(others);
+            warn_of_double(&own);
         }
-        debug!(?prefix, ?length, nodes = info.nodes.len(), "heard of nodes");
-        others.participants.insert(prefix, (length, info.nodes));
     }
 
     /// Serves `/rosout` and `/clock`; says whether records wait for room.
@@ -494,6 +501,13 @@ impl Teller {
             writer.wait_for_acknowledgments(WITHDRAW_WITHIN).ok();
         }
     }
+}
+
+fn warn_of_double(name: &str) {
+    warn!(
+        node = name,
+        "another node of the domain has the same name; tools of ROS show them as one"
+    );
 }
 
 /// Whether RustDDS took it.
