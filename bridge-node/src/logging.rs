@@ -158,11 +158,11 @@ mod tests {
         let heard = Arc::new(Heard::default());
         hear_log(&heard);
         let subscriber = tracing_subscriber::registry().with(Warnings);
-        tracing::subscriber::with_default(subscriber, || {
-            tracing::warn!(topic = "rt/a", size = 7, "too large");
-            tracing::info!("ordinary");
-            tracing::error!(target: "rustdds::network", "of a library");
-        });
+        let ours = || tracing::warn!(topic = "rt/a", size = 7, "too large");
+        let ordinary = || tracing::info!("ordinary");
+        let foreign = || tracing::error!(target: "rustdds::network", "of a library");
+        let all: [&dyn Fn(); 3] = [&ours, &ordinary, &foreign];
+        tracing::subscriber::with_default(subscriber, || all.iter().for_each(|log| log()));
         assert_eq!(
             *heard.0.lock().unwrap(),
             ["WARN too large topic=rt/a size=7"]

@@ -66,7 +66,8 @@ fn described(id: &QosPolicyId, qos: &QosPolicies) -> String {
         }
         QosPolicyId::Deadline => qos.deadline().map(|deadline| deadline.0).map_or_else(
             || "none".to_owned(),
-            |deadline| format!("{} ms", deadline.to_std().as_millis()),
+            // RTPS counts fractions of a second in powers of two: to the nearest millisecond.
+            |deadline| format!("{} ms", (deadline.to_nanoseconds() + 500_000) / 1_000_000),
         ),
         QosPolicyId::Liveliness => show(qos.liveliness()),
         QosPolicyId::Ownership => show(qos.ownership()),

@@ -3,23 +3,24 @@
 //! One thread does it, so that the node is whole whoever polls what. It sleeps until there is something to do: an
 //! endpoint that came or went, a message of another node's list, of `/clock`, or a warning for `/rosout`.
 
+mod teller;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Deref;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::task::{Wake, Waker};
 use std::thread::{JoinHandle, Thread};
 use std::time::Duration;
 
-use bytes::Bytes;
 use rustdds::{GUID, RTPSEntity};
 use tokio::time::Instant;
-use tracing::{debug, warn};
 
 use crate::clock::RosClock;
-use crate::discovery_info::{GidLength, GuidBytes, NodeEntities, ParticipantEntitiesInfo};
-use crate::raw::{Payload, RawReader, RawWriter, Reader, Writer};
+use crate::discovery_info::{GidLength, GuidBytes, NodeEntities};
+use crate::raw::{RawReader, RawWriter, Reader, Writer};
 use crate::rosout::Rosout;
+
+use teller::Teller;
 
 /// A node's name, and how it is to behave.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -329,6 +330,21 @@ impl Own {
 }
 
 impl Others {
+    /// Says whether there was room.
+    fn insert(
+        &mut self,
+        prefix: ParticipantPrefix,
+        length: GidLength,
+        nodes: Vec<NodeEntities>,
+    ) -> bool {
+        let full = self.participants.len() >= MAX_PARTICIPANTS;
+        if full && !self.participants.contains_key(&prefix) {
+            return false;
+        }
+        self.participants.insert(prefix, (length, nodes));
+        true
+    }
+
     /// The length most participants write; the newer one when as many write either.
     fn majority(&self) -> GidLength {
         let lengths = || self.participants.values().map(|(length, _)| *length);
@@ -338,175 +354,6 @@ impl Others {
         } else {
             GidLength::Bytes16
         }
-    }
-}
-
-/// The thread's side.
-struct Teller {
-    shared: Arc<Shared>,
-    channels: Channels,
-    /// When the list is to be published.
-    due: Option<Instant>,
-    /// The length it was published in.
-    written: Option<GidLength>,
-}
-
-impl Teller {
-    fn new(shared: Arc<Shared>, channels: Channels) -> Self {
-        Self {
-            shared,
-            channels,
-            due: None,
-            written: None,
-        }
-    }
-
-    fn run(mut self) {
-        let waker = Waker::from(Arc::new(Unpark(std::thread::current())));
-        while !self.shared.stop.load(Ordering::Acquire) {
-            // Armed before each look: what arrives between the look and the sleep ends the sleep.
-            self.channels.info_reader.set_waker(Some(waker.clone()));
-            self.hear_others();
-            let waits = self.serve(&waker);
-            self.tell();
-            let now = Instant::now();
-            match (self.due, waits) {
-                (None, false) => std::thread::park(),
-                (None, true) => std::thread::park_timeout(RETRY),
-                (Some(due), false) => std::thread::park_timeout(due.duration_since(now)),
-                (Some(due), true) => std::thread::park_timeout(due.duration_since(now).min(RETRY)),
-            }
-        }
-        self.withdraw();
-    }
-
-    fn hear_others(&mut self) {
-        loop {
-            match self.channels.info_reader.try_take_one() {
-                Ok(Some(sample)) => {
-                    let writer = sample.writer_guid;
-                    if let Ok(prefix) = ParticipantPrefix::try_from(writer.prefix.as_ref()) {
-                        self.heard(prefix, &sample.into_value().into_bytes());
-                    }
-                }
-                Ok(None) => return,
-                Err(error) => debug!(%error, "unreadable list of nodes"),
-            }
-        }
-    }
-
-    fn heard(&self, prefix: ParticipantPrefix, payload: &[u8]) {
-        if self.channels.participant.starts_with(&prefix) {
-            return;
-        }
-        let mut others = lock(&self.shared.others);
-        let Ok((info, length)) = ParticipantEntitiesInfo::decode(payload) else {
-            others.malformed += 1;
-            debug!(total = others.malformed, "malformed list of nodes");
-            return;
-        };
-        if others.participants.len() >= MAX_PARTICIPANTS
-            && !others.participants.contains_key(&prefix)
-        {
-            return;
-        }
-        let own = self.shared.options.full_name();
-        let double = info.nodes.iter().any(|node| node.full_name() == own);
-        if double && others.doubles.insert(prefix) {
-            warn!(
-                node = own,
-                "another node of the domain has the same name; tools of ROS show them as one"
-            );
-        }
-        debug!(?prefix, ?length, nodes = info.nodes.len(), "heard of nodes");
-        others.participants.insert(prefix, (length, info.nodes));
-    }
-
-    /// Serves `/rosout` and `/clock`; says whether records wait for room.
-    fn serve(&self, waker: &Waker) -> bool {
-        let services = lock(&self.shared.services);
-        let Some((services, rosout)) = &*services else {
-            return false;
-        };
-        if let Some(reader) = &services.clock {
-            reader.set_waker(Some(waker.clone()));
-            while let Ok(Some(sample)) = reader.try_take_one() {
-                self.shared.clock.hear(&sample.into_value().into_bytes());
-            }
-        }
-        rosout.flush(&self.shared.options.logger(), |log| {
-            write(&services.rosout, log)
-        })
-    }
-
-    /// Publishes the list if it is due, and makes up the next time.
-    fn tell(&mut self) {
-        let length = self
-            .shared
-            .options
-            .gid
-            .unwrap_or_else(|| lock(&self.shared.others).majority());
-        let changed = lock(&self.shared.own).changed || self.written != Some(length);
-        if !changed {
-            self.due = None;
-            return;
-        }
-        let now = Instant::now();
-        let due = *self.due.get_or_insert(now + BATCH);
-        if now < due {
-            return;
-        }
-        self.due = None;
-        let info = self.info();
-        if write(&self.channels.info_writer, info.encode(length)) {
-            self.written = Some(length);
-        } else {
-            // The send window is full.
-            lock(&self.shared.own).changed = true;
-            self.due = Some(now + RETRY);
-        }
-    }
-
-    fn info(&self) -> ParticipantEntitiesInfo {
-        let mut own = lock(&self.shared.own);
-        own.changed = false;
-        ParticipantEntitiesInfo {
-            participant: self.channels.participant,
-            nodes: vec![NodeEntities {
-                namespace: self.shared.options.namespace.clone(),
-                name: self.shared.options.name.clone(),
-                readers: own.readers.iter().copied().collect(),
-                writers: own.writers.iter().copied().collect(),
-            }],
-        }
-    }
-
-    /// Tells the others that the node has gone before the participant does.
-    fn withdraw(self) {
-        drop(lock(&self.shared.services).take());
-        let info = ParticipantEntitiesInfo {
-            participant: self.channels.participant,
-            nodes: Vec::new(),
-        };
-        let writer = &self.channels.info_writer;
-        if write(writer, info.encode(self.written.unwrap_or_default())) {
-            // Whoever has not heard by then notices that the participant goes.
-            writer.wait_for_acknowledgments(WITHDRAW_WITHIN).ok();
-        }
-    }
-}
-
-/// Whether RustDDS took it.
-fn write(writer: &RawWriter, bytes: Bytes) -> bool {
-    // What is made here is little endian CDR.
-    Payload::to_write(bytes).is_ok_and(|payload| writer.write(payload, None).is_ok())
-}
-
-struct Unpark(Thread);
-
-impl Wake for Unpark {
-    fn wake(self: Arc<Self>) {
-        self.0.unpark();
     }
 }
 
@@ -523,14 +370,8 @@ where
     }
 }
 
-/// Changes of the list within this time are told at once.
-const BATCH: Duration = Duration::from_millis(50);
-/// When to try again what RustDDS had no room for.
-const RETRY: Duration = Duration::from_millis(100);
 /// How long an announcement may take: a full queue of RustDDS' discovery is worked off in less.
 const ANNOUNCED_WITHIN: Duration = Duration::from_secs(3);
-/// How long leaving waits for others to hear of it.
-const WITHDRAW_WITHIN: Duration = Duration::from_millis(200);
 /// Participants whose nodes are known; of further ones they are not.
 const MAX_PARTICIPANTS: usize = 4096;
 
