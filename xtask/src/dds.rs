@@ -63,9 +63,10 @@ impl Rustdds {
     pub(crate) fn cargo(&self, workspace: &Workspace, arguments: &[&str]) -> Command {
         let mut command = workspace.cargo(&[]);
         let (verb, rest) = arguments.split_at(1.min(arguments.len()));
+        // Behind the verb: cargo does not hand what is before it to an external verb such as clippy.
         command
-            .args(self.configuration())
             .args(verb)
+            .args(self.configuration())
             .args(FEATURES)
             .args(rest);
         command
@@ -86,7 +87,7 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
     let rustdds = Rustdds::prepare(workspace)?;
     let [config, paths] = rustdds.configuration();
     println!(
-        "cargo {} '{}' build {}",
+        "cargo build {} '{}' {}",
         config.display(),
         paths.display(),
         FEATURES.join(" ")
