@@ -213,14 +213,15 @@ const HEADER: usize = 20;
 fn submessages(datagram: &[u8]) -> Vec<usize> {
     let mut all = Vec::new();
     let mut at = HEADER;
-    while let Some(&[_, flags, low, high]) = datagram.get(at..at + 4) {
+    while let Some(&[kind, flags, low, high]) = datagram.get(at..at + 4) {
         all.push(at);
         let length = if flags & 1 == 1 {
             u16::from_le_bytes([low, high])
         } else {
             u16::from_be_bytes([low, high])
         };
-        if length == 0 {
+        // Zero is the rest of the message, but for PAD and INFO_TS (RTPS 2.5, 9.4.5.1.3).
+        if length == 0 && !matches!(kind, 0x01 | 0x09) {
             break;
         }
         at += 4 + usize::from(length);
