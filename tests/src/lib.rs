@@ -18,6 +18,7 @@ mod net;
 mod numbered;
 mod peers;
 mod programs;
+mod rtps;
 mod ua_side;
 mod usage;
 mod wait;
@@ -34,6 +35,7 @@ pub use peers::MASTER;
 pub use programs::{
     METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, SERVER_ENDPOINT, drops, number, program,
 };
+pub use rtps::{Mutator, announced, claims_too_much, queued};
 pub use ua_side::{Triple, UaSide};
 pub use usage::{cpu_share, resident, threads};
 pub use wait::{eventually, holds_for};
