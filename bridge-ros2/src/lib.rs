@@ -11,6 +11,7 @@ pub mod outlet;
 mod port;
 pub mod qos;
 pub mod raw;
+pub mod service;
 mod sink;
 mod source;
 
