@@ -20,6 +20,10 @@ pub enum Peer {
     Ros1,
     /// Cyclone DDS and asyncua, in the Python environment that `cargo xtask test` makes.
     Python,
+    /// Fast DDS from Debian or Ubuntu, in a program that `cargo xtask test` compiles.
+    FastDds,
+    /// Cyclone DDS from Debian or Ubuntu, in a program that `cargo xtask test` compiles.
+    CycloneC,
     /// Wireshark's tshark, from Debian or Ubuntu.
     Tshark,
 }
@@ -38,6 +42,8 @@ pub struct Cell {
 static ONLY: Mutex<()> = Mutex::new(());
 
 pub(crate) const TSHARK: &str = "/usr/bin/tshark";
+pub(crate) const FASTDDS: &str = "fastdds-peer";
+pub(crate) const CYCLONE: &str = "cyclone-peer";
 
 impl Cell {
     /// Puts this thread into a new network, or says why the test is skipped and gives `None`.
@@ -135,7 +141,18 @@ fn python() -> PathBuf {
     )
 }
 
+/// Where the peers are that `cargo xtask test` compiles.
+pub(crate) fn compiled(name: &str) -> PathBuf {
+    env::var_os("UA_PEERS")
+        .map_or_else(
+            || Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/peers"),
+            PathBuf::from,
+        )
+        .join(name)
+}
+
 fn find(peer: Peer, python: &Path) -> Result<(), String> {
+    let (fastdds, cyclone) = (compiled(FASTDDS), compiled(CYCLONE));
     let needed: &[&Path] = match peer {
         Peer::Ros1 => &[
             Path::new("/usr/bin/rosmaster"),
@@ -148,6 +165,8 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
             Path::new("/usr/lib/rosbag/record"),
         ],
         Peer::Python => &[python],
+        Peer::FastDds => &[&fastdds],
+        Peer::CycloneC => &[&cyclone],
         Peer::Tshark => &[Path::new(TSHARK)],
     };
     match needed.iter().find(|path| !path.exists()) {

@@ -1,4 +1,4 @@
-//! The peers: ROS 1 from Debian, Cyclone DDS and asyncua from PyPI, rosrust.
+//! The peers: ROS 1, Fast DDS and Cyclone DDS from Debian, Cyclone DDS and asyncua from PyPI, rosrust.
 
 use std::{
     path::{Path, PathBuf},
@@ -7,7 +7,11 @@ use std::{
 
 use nix::sys::signal::Signal;
 
-use crate::{Cell, Child, GROUP, Started, eventually, program, xml_rpc};
+use crate::{
+    Cell, Child, GROUP, Started,
+    cell::{CYCLONE, FASTDDS, compiled},
+    eventually, program, xml_rpc,
+};
 
 /// Where the ROS 1 master of a cell is.
 pub const MASTER: &str = "127.0.0.1:11311";
@@ -15,10 +19,15 @@ pub const MASTER: &str = "127.0.0.1:11311";
 /// Python and a ROS graph on a busy machine need seconds to come up.
 const START: Duration = Duration::from_secs(30);
 
-const CYCLONE: &str = r#"<CycloneDDS><Domain id="any">
-<General><Interfaces><NetworkInterface name="lo" multicast="true"/></Interfaces></General>
-<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>60</MaxAutoParticipantIndex></Discovery>
-</Domain></CycloneDDS>"#;
+/// Cyclone's configuration, which keeps to one interface.
+pub(crate) fn cyclone_uri(interface: &str) -> String {
+    format!(
+        "<CycloneDDS><Domain id=\"any\">\
+         <General><Interfaces><NetworkInterface name=\"{interface}\" multicast=\"true\"/></Interfaces></General>\
+         <Discovery><ParticipantIndex>auto</ParticipantIndex>\
+         <MaxAutoParticipantIndex>60</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>"
+    )
+}
 
 impl Cell {
     /// A running ROS 1 master: it has answered `getPid`.
@@ -106,7 +115,40 @@ impl Cell {
     /// A Cyclone DDS script of `peers/`, not started yet.
     #[must_use]
     pub fn cyclone_started(&self, script: &str, args: &[&str]) -> Started {
-        self.python(script, args).env("CYCLONEDDS_URI", CYCLONE)
+        self.python(script, args)
+            .env("CYCLONEDDS_URI", cyclone_uri("lo"))
+    }
+
+    /// The Fast DDS peer, whose commands `peers/dds/README.md` lists, in domain 2; it has said that it is ready.
+    #[must_use]
+    pub fn fastdds(&self, args: &[&str]) -> Child {
+        self.fastdds_started(args).start().ready(START)
+    }
+
+    /// The Fast DDS peer in domain 2, not started yet.
+    #[must_use]
+    pub fn fastdds_started(&self, args: &[&str]) -> Started {
+        Started::new("fastdds-peer", &compiled(FASTDDS))
+            .args(args)
+            .args(["--domain", "2"])
+            .told()
+    }
+
+    /// The Cyclone DDS peer in C, whose commands `peers/dds/README.md` lists, in domain 2; it has said that it is
+    /// ready.
+    #[must_use]
+    pub fn cyclone_c(&self, args: &[&str]) -> Child {
+        self.cyclone_c_started(args).start().ready(START)
+    }
+
+    /// The Cyclone DDS peer in C in domain 2, not started yet.
+    #[must_use]
+    pub fn cyclone_c_started(&self, args: &[&str]) -> Started {
+        Started::new("cyclone-peer", &compiled(CYCLONE))
+            .env("CYCLONEDDS_URI", cyclone_uri("lo"))
+            .args(args)
+            .args(["--domain", "2"])
+            .told()
     }
 
     /// An asyncua script of `peers/` that stays and has said it is ready.

@@ -53,6 +53,7 @@ fn measured(
         .current_dir(&workspace.root)
         .args(arguments)
         .env("UA_BIN_DIR", &programs)
-        .env("UA_PEERS_PYTHON", peers::python(workspace));
+        .env("UA_PEERS_PYTHON", peers::python(workspace))
+        .env("UA_PEERS", workspace.peers());
     Ok(status(&mut command)?.into())
 }

@@ -1,4 +1,7 @@
-//! The software of other makers that the system tests talk to: ROS 1 from Debian or Ubuntu, the rest from PyPI.
+//! The software of other makers that the system tests talk to: ROS 1 and the DDS libraries from Debian or Ubuntu, the
+//! rest from PyPI.
+
+mod native;
 
 use std::{
     fs,
@@ -34,14 +37,23 @@ const APT: &[&str] = &[
     "iproute2",
     "valgrind",
     "python3-venv",
+    "g++",
+    "libfastrtps-dev",
+    "libfastcdr-dev",
+    "cyclonedds-dev",
+    "cyclonedds-tools",
 ];
 
 /// Installs what is missing. What cannot be installed is told; its tests then skip themselves, or fail with `CI=true`.
 pub(crate) fn install(workspace: &Workspace) -> Ended {
     let mut ended = Ended::WELL;
-    for (place, result) in [("apt", apt()), ("PyPI", venv(workspace))] {
+    for (which, result) in [
+        ("from apt", apt()),
+        ("from PyPI", venv(workspace)),
+        ("of DDS", native::build(workspace)),
+    ] {
         if let Err(error) = result {
-            eprintln!("xtask: the peers from {place} are not complete: {error:#}");
+            eprintln!("xtask: the peers {which} are not complete: {error:#}");
             ended = Ended::BADLY;
         }
     }

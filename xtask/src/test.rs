@@ -66,6 +66,7 @@ fn command(workspace: &Workspace, filters: &[&str], skipped: &Path) -> Command {
         .args(filters)
         .env("UA_BIN_DIR", workspace.target.join("debug"))
         .env("UA_PEERS_PYTHON", peers::python(workspace))
+        .env("UA_PEERS", workspace.peers())
         .env("UA_SKIPPED", skipped);
     if namespaces == Namespaces::Refused {
         eprintln!("xtask: {REFUSED}");

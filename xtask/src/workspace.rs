@@ -40,8 +40,13 @@ impl Workspace {
     }
 
     /// What the peers of the tests are installed into.
+    pub(crate) fn peers(&self) -> PathBuf {
+        self.target.join("peers")
+    }
+
+    /// The Python environment among them.
     pub(crate) fn venv(&self) -> PathBuf {
-        self.target.join("peers/venv")
+        self.peers().join("venv")
     }
 
     /// A command of cargo, in the root.

@@ -1,0 +1,179 @@
+// Cyclone DDS by its C library. Its type is std_msgs/String; CYCLONEDDS_URI names the interface, as everywhere.
+#include <atomic>
+#include <cstdio>
+#include <map>
+
+#include <dds/dds.h>
+
+#include "domain.hpp"
+#include "lines.hpp"
+#include "std_msgs_string.h"
+
+namespace {
+
+dds_entity_t made(dds_entity_t entity, const char* what) {
+    if (entity < 0) {
+        std::fprintf(stderr, "peer: Cyclone DDS makes no %s: %s\n", what, dds_strretcode(-entity));
+        std::_Exit(1);
+    }
+    return entity;
+}
+
+// The policies rmw_cyclonedds sets.
+dds_qos_t* policies(const Quality& quality) {
+    dds_qos_t* qos = dds_create_qos();
+    dds_qset_reliability(
+        qos, quality.reliable ? DDS_RELIABILITY_RELIABLE : DDS_RELIABILITY_BEST_EFFORT, DDS_SECS(10));
+    dds_qset_history(qos, DDS_HISTORY_KEEP_LAST, quality.depth);
+    dds_qset_durability(qos, quality.transient_local ? DDS_DURABILITY_TRANSIENT_LOCAL : DDS_DURABILITY_VOLATILE);
+    if (quality.transient_local) {
+        dds_qset_durability_service(qos, 0, DDS_HISTORY_KEEP_LAST, quality.depth, DDS_LENGTH_UNLIMITED,
+            DDS_LENGTH_UNLIMITED, DDS_LENGTH_UNLIMITED);
+    }
+    return qos;
+}
+
+class CycloneWriter : public Writer {
+public:
+    CycloneWriter(dds_entity_t participant, dds_entity_t topic, const Quality& quality) {
+        dds_qos_t* qos = policies(quality);
+        dds_listener_t* listener = dds_create_listener(nullptr);
+        dds_lset_offered_incompatible_qos(
+            listener, [](dds_entity_t, const dds_offered_incompatible_qos_status_t status, void*) {
+                Line().field("incompatible", status.last_policy_id);
+            });
+        writer_ = made(dds_create_writer(participant, topic, qos, listener), "writer");
+        dds_delete_listener(listener);
+        dds_delete_qos(qos);
+    }
+
+    bool write(const Body& body) override {
+        if (!text_of(body)) {
+            Arguments::fail("this peer writes std_msgs/String only");
+        }
+        // Cyclone copies the text, which ends with its zero.
+        const std_msgs_msg_dds__String_ sample{const_cast<char*>(reinterpret_cast<const char*>(body.data())) + 4};
+        return dds_write(writer_, &sample) == DDS_RETCODE_OK;
+    }
+    int readers() override {
+        dds_publication_matched_status_t status;
+        return dds_get_publication_matched_status(writer_, &status) == DDS_RETCODE_OK
+            ? static_cast<int>(status.current_count)
+            : 0;
+    }
+    bool acknowledged(double seconds) override {
+        return dds_wait_for_acks(writer_, static_cast<dds_duration_t>(seconds * 1e9)) == DDS_RETCODE_OK;
+    }
+
+private:
+    dds_entity_t writer_;
+};
+
+class CycloneReader : public Reader {
+public:
+    CycloneReader(dds_entity_t participant, dds_entity_t topic, const Quality& quality,
+        std::function<void(const Sample&)> heard)
+        : heard_(std::move(heard)) {
+        dds_qos_t* qos = policies(quality);
+        dds_listener_t* listener = dds_create_listener(this);
+        dds_lset_data_available(
+            listener, [](dds_entity_t reader, void* own) { static_cast<CycloneReader*>(own)->take(reader); });
+        dds_lset_requested_incompatible_qos(
+            listener, [](dds_entity_t, const dds_requested_incompatible_qos_status_t status, void*) {
+                Line().field("incompatible", status.last_policy_id);
+            });
+        reader_ = made(dds_create_reader(participant, topic, qos, listener), "reader");
+        dds_delete_listener(listener);
+        dds_delete_qos(qos);
+    }
+    ~CycloneReader() override { dds_delete(reader_); }
+
+    int writers() override {
+        dds_subscription_matched_status_t status;
+        return dds_get_subscription_matched_status(reader_, &status) == DDS_RETCODE_OK
+            ? static_cast<int>(status.current_count)
+            : 0;
+    }
+
+private:
+    void take(dds_entity_t reader) {
+        constexpr int MANY = 64;
+        void* samples[MANY] = {};
+        dds_sample_info_t infos[MANY];
+        for (;;) {
+            const dds_return_t taken = dds_take(reader, samples, infos, MANY, MANY);
+            if (taken <= 0) {
+                return;
+            }
+            for (int at = 0; at < taken; ++at) {
+                if (infos[at].valid_data) {
+                    hear(static_cast<std_msgs_msg_dds__String_*>(samples[at])->data, infos[at].source_timestamp);
+                }
+            }
+            dds_return_loan(reader, samples, taken);
+        }
+    }
+
+    void hear(const char* text, int64_t source) {
+        const auto length = static_cast<uint32_t>(std::strlen(text) + 1);
+        body_.resize(4 + length);
+        for (int at = 0; at < 4; ++at) {
+            body_[at] = static_cast<uint8_t>(length >> (8 * at));
+        }
+        std::memcpy(body_.data() + 4, text, length);
+        heard_(Sample{body_, source});
+    }
+
+    std::function<void(const Sample&)> heard_;
+    Body body_;
+    dds_entity_t reader_;
+};
+
+class CycloneParticipant : public Participant {
+public:
+    explicit CycloneParticipant(const Arguments& arguments) {
+        dds_qos_t* qos = dds_create_qos();
+        const std::string enclave = "enclave=/;";
+        dds_qset_userdata(qos, enclave.data(), enclave.size());
+        participant_ = made(
+            dds_create_participant(static_cast<dds_domainid_t>(arguments.number("domain", 0)), qos, nullptr),
+            "participant");
+        dds_delete_qos(qos);
+    }
+    ~CycloneParticipant() override { dds_delete(participant_); }
+
+    std::unique_ptr<Writer> writer(const std::string& topic, const std::string& type, const Quality& quality) override {
+        return std::make_unique<CycloneWriter>(participant_, make_topic(topic, type), quality);
+    }
+    std::unique_ptr<Reader> reader(const std::string& topic, const std::string& type, const Quality& quality,
+        std::function<void(const Sample&)> heard) override {
+        return std::make_unique<CycloneReader>(participant_, make_topic(topic, type), quality, std::move(heard));
+    }
+
+private:
+    dds_entity_t make_topic(const std::string& name, const std::string& type) {
+        if (type != std_msgs_msg_dds__String__desc.m_typename) {
+            Arguments::fail("this peer knows std_msgs/String only, not " + type);
+        }
+        return made(
+            dds_create_topic(participant_, &std_msgs_msg_dds__String__desc, name.c_str(), nullptr, nullptr), "topic");
+    }
+
+    dds_entity_t participant_;
+};
+
+} // namespace
+
+std::unique_ptr<Participant> join(const Arguments& arguments) {
+    return std::make_unique<CycloneParticipant>(arguments);
+}
+
+int main(int count, char** words) {
+    const Arguments arguments(count, words);
+    Lifetime::bound(arguments.number("limit", 120));
+    const std::string command = arguments.position(0, "a command: pub, sub, relay, crowd");
+    if (!run_shared(command, arguments)) {
+        Arguments::fail("there is no command " + command);
+    }
+    return 0;
+}

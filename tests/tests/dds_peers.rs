@@ -1,0 +1,58 @@
+//! The peers themselves: what the tests of bridge-ros2 conclude from them holds only if they understand each other.
+
+use std::time::Duration;
+
+use system_tests::{Cell, Child, Peer};
+
+const SOON: Duration = Duration::from_secs(20);
+const STRING: &str = "std_msgs/String";
+
+type Start = fn(&Cell, &[&str]) -> Child;
+
+#[test]
+fn numbered_texts_arrive_whole_between_both_makers() {
+    let Some(cell) = Cell::with(&[Peer::FastDds, Peer::CycloneC]) else {
+        return;
+    };
+    let (fast, cyclone): (Start, Start) = (Cell::fastdds, Cell::cyclone_c);
+    for (writer, reader) in [(fast, cyclone), (cyclone, fast), (fast, fast)] {
+        let mut hears = reader(&cell, &["sub", "/chatter", STRING, "--counts"]);
+        let sends = [
+            "pub", "/chatter", STRING, "--size", "2003", "--count", "200",
+        ];
+        let timing = ["--rate", "1000", "--wait-readers", "1"];
+        let _sends = writer(&cell, &[&sends[..], &timing].concat());
+        hears.wait_for_json("all 200, whole and in order", SOON, |line| {
+            (line["distinct"] == 200
+                && line["bad"] == 0
+                && line["repeated"] == 0
+                && line["disordered"] == 0)
+                .then_some(())
+        });
+    }
+}
+
+#[test]
+fn a_call_is_answered_with_the_servers_bytes_and_by_its_own_reply() {
+    let Some(cell) = Cell::with(&[Peer::FastDds]) else {
+        return;
+    };
+    let service = ["/add", "example_interfaces/AddTwoInts"];
+    let _serves = cell.fastdds(&[&["serve"], &service[..]].concat());
+    let call = [
+        &["call"],
+        &service[..],
+        &["--hex", "0a000000", "--hex", "0b000000"],
+    ]
+    .concat();
+    let mut callers = [cell.fastdds(&call), cell.fastdds(&call)];
+    for caller in &mut callers {
+        caller.wait_for_json("it is done", SOON, |line| line.get("done").map(drop));
+        let replies: Vec<_> = caller
+            .json_lines()
+            .iter()
+            .filter_map(|line| line.get("reply").cloned())
+            .collect();
+        assert_eq!(replies, ["0a000000", "0b000000"]);
+    }
+}

@@ -1,0 +1,111 @@
+//! The peers that are compiled here: Fast DDS and Cyclone DDS by their own libraries, from `tests/peers/dds`.
+
+use std::{fs, path::Path, process::Command};
+
+use anyhow::Context as _;
+
+use crate::{
+    shell::{line, run as must, step},
+    workspace::Workspace,
+};
+
+/// One program and what it is made of.
+struct Program {
+    name: &'static str,
+    sources: &'static [&'static str],
+    /// The types it knows, which Cyclone's own compiler turns into C.
+    types: Option<&'static str>,
+    libraries: &'static [&'static str],
+}
+
+const PROGRAMS: &[Program] = &[
+    Program {
+        name: "fastdds-peer",
+        sources: &["fastdds.cpp", "commands.cpp"],
+        types: None,
+        libraries: &["-lfastrtps", "-lfastcdr", "-pthread"],
+    },
+    Program {
+        name: "cyclone-peer",
+        sources: &["cyclone.cpp", "commands.cpp"],
+        types: Some("std_msgs_string"),
+        libraries: &["-lddsc", "-pthread"],
+    },
+];
+
+const HEADERS: &[&str] = &["arguments.hpp", "body.hpp", "domain.hpp", "lines.hpp"];
+
+/// Compiles what is not there yet, or was made from other sources.
+///
+/// # Errors
+/// When a source cannot be read, or does not compile. The other programs are made all the same.
+pub(super) fn build(workspace: &Workspace) -> anyhow::Result<()> {
+    let mut first = Ok(());
+    for program in PROGRAMS {
+        let built = program.build(&workspace.root.join("tests/peers/dds"), &workspace.peers());
+        first = first.and(built.with_context(|| program.name));
+    }
+    first
+}
+
+impl Program {
+    fn build(&self, source: &Path, target: &Path) -> anyhow::Result<()> {
+        fs::create_dir_all(target)
+            .with_context(|| format!("{} cannot be made", target.display()))?;
+        let made = target.join(self.name);
+        let stamp = target.join(format!("{}.source", self.name));
+        let wanted = self.source(source)?;
+        if made.is_file() && fs::read_to_string(&stamp).is_ok_and(|there| there == wanted) {
+            return Ok(());
+        }
+        step(&format!("compiling {}", made.display()));
+        for mut command in self.commands(source, target) {
+            println!("    {}", line(&command));
+            must(&mut command)?;
+        }
+        fs::write(&stamp, wanted).with_context(|| format!("{} cannot be written", stamp.display()))
+    }
+
+    /// All that the program is made of, in one text.
+    fn source(&self, folder: &Path) -> anyhow::Result<String> {
+        let types = self.types.map(|types| format!("{types}.idl"));
+        let names = self.sources.iter().chain(HEADERS).copied();
+        names
+            .chain(types.as_deref())
+            .map(|name| {
+                let path = folder.join(name);
+                fs::read_to_string(&path)
+                    .with_context(|| format!("{} cannot be read", path.display()))
+            })
+            .collect()
+    }
+
+    fn commands(&self, source: &Path, target: &Path) -> Vec<Command> {
+        let mut commands = Vec::new();
+        let object = |types: &str| target.join(format!("{types}.o"));
+        if let Some(types) = self.types {
+            let mut idlc = Command::new("idlc");
+            idlc.args(["-l", "c", "-o"])
+                .arg(target)
+                .arg(source.join(format!("{types}.idl")));
+            let mut gcc = Command::new("gcc");
+            gcc.args(["-O2", "-c", "-o"])
+                .arg(object(types))
+                .arg(target.join(format!("{types}.c")));
+            commands.extend([idlc, gcc]);
+        }
+        let mut gxx = Command::new("g++");
+        gxx.args(["-std=c++17", "-O2", "-Wall", "-Wextra"])
+            .arg("-I")
+            .arg(target)
+            .arg("-I")
+            .arg(source)
+            .arg("-o")
+            .arg(target.join(self.name))
+            .args(self.sources.iter().map(|name| source.join(name)))
+            .args(self.types.map(object))
+            .args(self.libraries);
+        commands.push(gxx);
+        commands
+    }
+}
