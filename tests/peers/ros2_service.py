@@ -105,7 +105,7 @@ def serve(args, participant, kinds):
         for request in server.reader.take(N=1000):
             if not hasattr(request, "count"):
                 continue
-            lifetime.say(value=body(request))
+            lifetime.say(value=body(request), number=request.count)
             if not args.silent:
                 due.append((time.monotonic() + args.delay, request))
         while due and due[0][0] <= time.monotonic():

@@ -1,7 +1,6 @@
 //! Calling a service: finding its servers, asking each in its own way, and telling what went wrong.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
-use std::fmt;
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 use std::time::Duration;
@@ -9,13 +8,14 @@ use std::time::Duration;
 use bytes::Bytes;
 use rustdds::dds::WriteError;
 use rustdds::{GUID, RTPSEntity, WriteOptionsBuilder};
-use thiserror::Error;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep_until, timeout_at};
 use tracing::debug;
 
+use super::error::{CallPhase, ServiceError};
 use super::mapping::{ClientId, Outgoing, Received, RequestKey};
+use super::opening::Opening;
 use super::peers::{ServicePeers, Snapshot};
 use super::{BUSY, IDLE, SETTLE, Service, ServiceMapping, next, policies};
 use crate::domain::{Domain, DomainError};
@@ -94,12 +94,13 @@ impl ServiceClient {
             max_calls: options.max_calls,
             servers: BTreeMap::new(),
             other_type: None,
-            mixed: false,
             waiting: VecDeque::new(),
             asked: BTreeMap::new(),
             keys: HashMap::new(),
             count: 0,
             looked: None,
+            readers: Vec::new(),
+            opening: Opening::default(),
             ignored: Arc::clone(&ignored),
             ready: Arc::clone(&servers),
         };
@@ -228,8 +229,6 @@ struct Driver {
     servers: BTreeMap<GUID, Instant>,
     /// A type that a server has instead of ours.
     other_type: Option<String>,
-    /// Whether servers of both mappings read the requests.
-    mixed: bool,
     /// Calls that wait for a server or for the send window, oldest first.
     waiting: VecDeque<Call>,
     /// Calls that wait for a reply.
@@ -237,6 +236,9 @@ struct Driver {
     keys: HashMap<RequestKey, u64>,
     count: u64,
     looked: Option<Instant>,
+    /// All that read the requests.
+    readers: Vec<GUID>,
+    opening: Opening,
     ignored: Arc<AtomicU64>,
     ready: Arc<AtomicU64>,
 }
@@ -296,7 +298,7 @@ impl Driver {
         let snapshot = self.peers.look(now, self.pause());
         self.meet(&snapshot, now);
         self.give_up_lost();
-        let count = self.ready(now).count();
+        let count = self.ready(now);
         self.ready
             .store(u64::try_from(count).unwrap_or(u64::MAX), Ordering::Relaxed);
         self.ask_waiting(now);
@@ -309,26 +311,27 @@ impl Driver {
         }
     }
 
-    /// The servers that know us by now.
-    fn ready(&self, now: Instant) -> impl Iterator<Item = GUID> {
-        let settled = move |since: Instant| now.saturating_duration_since(since) >= SETTLE;
-        self.servers
-            .iter()
-            .filter(move |(_, since)| settled(**since))
-            .map(|(guid, _)| *guid)
+    /// How many servers know us by now.
+    fn ready(&self, now: Instant) -> usize {
+        let settled = |since: &&Instant| now.saturating_duration_since(**since) >= SETTLE;
+        self.servers.values().filter(settled).count()
     }
 
     fn ask_waiting(&mut self, now: Instant) {
-        let servers: Vec<GUID> = self.ready(now).collect();
-        if servers.is_empty() {
+        if self.ready(now) == 0 {
             return;
         }
-        while let Some(call) = self.waiting.pop_front() {
+        // Those too that are new: the others may be dead, with their leases still running.
+        let servers: Vec<GUID> = self.servers.keys().copied().collect();
+        while self.opening.is_over(&self.writer, now)
+            && let Some(call) = self.waiting.pop_front()
+        {
             call.enter(CallPhase::Request);
             if let Some(unsent) = self.ask(call, &servers) {
                 self.waiting.push_front(unsent);
                 return;
             }
+            self.opening.written(self.readers.iter().copied(), now);
         }
     }
 
@@ -356,27 +359,15 @@ impl Driver {
             .iter()
             .find(|reader| reader.type_name != self.service.types.request)
             .map(|reader| reader.type_name.clone());
-        let mut mappings = readers.iter().map(|reader| ServiceMapping::of(reader.guid));
-        let first = mappings.next();
-        self.mixed = mappings.any(|mapping| Some(mapping) != first);
+        self.readers = readers.iter().map(|reader| reader.guid).collect();
     }
 
     /// Writes a request to the servers; returns it when the send window is full.
     fn ask(&mut self, call: Call, servers: &[GUID]) -> Option<Call> {
         self.count += 1;
-        // A request in one vendor's mapping is garbage to the servers of another, and each gets its own then.
-        let targets: Vec<(GUID, Option<GUID>)> = if self.mixed {
-            servers.iter().map(|guid| (*guid, Some(*guid))).collect()
-        } else {
-            servers
-                .first()
-                .map(|guid| (*guid, None))
-                .into_iter()
-                .collect()
-        };
         let mut keys = Vec::new();
-        for (server, only) in targets {
-            match self.write(&call.request, ServiceMapping::of(server), only) {
+        for server in servers {
+            match self.write(&call.request, *server) {
                 Ok(key) => keys.push(key),
                 Err(Unsent::Full) => {}
                 Err(Unsent::Request(why)) => {
@@ -401,23 +392,22 @@ impl Driver {
         None
     }
 
-    fn write(
-        &self,
-        request: &Bytes,
-        mapping: ServiceMapping,
-        only: Option<GUID>,
-    ) -> Result<RequestKey, Unsent> {
+    fn write(&self, request: &Bytes, server: GUID) -> Result<RequestKey, Unsent> {
+        let mapping = ServiceMapping::of(server);
         let count = i64::try_from(self.count).unwrap_or(i64::MAX);
         let Outgoing { payload, related } = self
             .id
             .seal_request(mapping, count, request.clone())
             .map_err(|fault| Unsent::Request(fault.label()))?;
         let payload = Payload::to_write(payload).map_err(|error| Unsent::Request(error.label()))?;
-        let mut options = WriteOptionsBuilder::new().related_sample_identity_opt(related);
-        if let Some(reader) = only {
-            options = options.to_single_reader(reader);
-        }
-        match self.writer.write_with_options(payload, options.build()) {
+        // To each server alone: a request in one vendor's way is garbage to the servers of another. Besides, what goes to
+        // all readers RustDDS puts together into larger datagrams, and of 100 requests so sent at once some never
+        // reached Cyclone DDS.
+        let options = WriteOptionsBuilder::new()
+            .related_sample_identity_opt(related)
+            .to_single_reader(server)
+            .build();
+        match self.writer.write_with_options(payload, options) {
             Ok(identity) => Ok(match mapping {
                 ServiceMapping::Cyclone => RequestKey::Counted(count),
                 ServiceMapping::Enhanced => {
@@ -457,150 +447,34 @@ impl Driver {
 
     fn forget_given_up(&mut self) {
         self.waiting.retain(|call| !call.done.is_closed());
-        let given_up = self
-            .asked
-            .extract_if(.., |_, asked| asked.call.done.is_closed());
-        for (_, asked) in given_up.collect::<Vec<_>>() {
+        for asked in self.take_asked(|asked| asked.call.done.is_closed()) {
             self.forget_keys(&asked.keys);
         }
     }
 
     /// Ends the calls whose servers have all gone.
     fn give_up_lost(&mut self) {
-        let servers = &self.servers;
-        let lost = self.asked.extract_if(.., |_, asked| {
-            !asked.servers.iter().any(|guid| servers.contains_key(guid))
-        });
-        for (_, asked) in lost.collect::<Vec<_>>() {
+        let servers: BTreeSet<GUID> = self.servers.keys().copied().collect();
+        let lost = |asked: &Asked| !asked.servers.iter().any(|guid| servers.contains(guid));
+        for asked in self.take_asked(lost) {
             self.forget_keys(&asked.keys);
             asked.call.end(Err(Failure::Lost));
         }
+    }
+
+    fn take_asked(&mut self, which: impl Fn(&Asked) -> bool) -> Vec<Asked> {
+        let found = self.asked.iter().filter(|(_, asked)| which(asked));
+        let found: Vec<u64> = found.map(|(id, _)| *id).collect();
+        found
+            .iter()
+            .filter_map(|id| self.asked.remove(id))
+            .collect()
     }
 }
 
 enum Unsent {
     Full,
     Request(&'static str),
-}
-
-/// What a call was at when it ended.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum CallPhase {
-    /// Waiting to be taken by the client's task.
-    Queue,
-    /// Waiting for a server.
-    Discovery,
-    /// Sending the request.
-    Request,
-    /// The request is sent, the reply awaited.
-    Answer,
-}
-
-impl From<CallPhase> for u8 {
-    fn from(phase: CallPhase) -> Self {
-        match phase {
-            CallPhase::Queue => 0,
-            CallPhase::Discovery => 1,
-            CallPhase::Request => 2,
-            CallPhase::Answer => 3,
-        }
-    }
-}
-
-impl From<u8> for CallPhase {
-    fn from(number: u8) -> Self {
-        match number {
-            0 => Self::Queue,
-            1 => Self::Discovery,
-            2 => Self::Request,
-            _ => Self::Answer,
-        }
-    }
-}
-
-impl fmt::Display for CallPhase {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Queue => "waiting for earlier calls",
-            Self::Discovery => {
-                "waiting for a node that offers it (`ros2 service list` shows what there is)"
-            }
-            Self::Request => "sending the request",
-            Self::Answer => "waiting for the answer",
-        })
-    }
-}
-
-/// Why a call brought no answer.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[non_exhaustive]
-pub enum ServiceError {
-    /// The time for the call is over.
-    #[error("{service}: the call was given up after {limit:?} while {phase}")]
-    Timeout {
-        /// The service.
-        service: String,
-        /// What took too long.
-        phase: CallPhase,
-        /// The time given to the whole call.
-        limit: Duration,
-    },
-    /// Every server that was asked has left, in order or by the end of its lease.
-    #[error("the servers of {service} left before they answered")]
-    Lost {
-        /// The service.
-        service: String,
-    },
-    /// There is a server, of another type.
-    #[error("{service} has the type {theirs}, and {ours} is wanted")]
-    OtherType {
-        /// The service.
-        service: String,
-        /// DDS type of the server's requests.
-        theirs: String,
-        /// DDS type of ours.
-        ours: String,
-    },
-    /// The client has as many calls in progress as its options allow.
-    #[error("{limit} calls of {service} are in progress already")]
-    Busy {
-        /// The service.
-        service: String,
-        /// The limit.
-        limit: usize,
-    },
-    /// The request cannot be sent.
-    #[error("the request for {service} cannot be sent: {why}")]
-    Request {
-        /// The service.
-        service: String,
-        /// What is wrong with it.
-        why: &'static str,
-    },
-    /// The client was closed.
-    #[error("the client of {service} was closed while {phase}")]
-    Closed {
-        /// The service.
-        service: String,
-        /// What the call was at.
-        phase: CallPhase,
-    },
-}
-
-impl ServiceError {
-    /// Whether a server may have acted on the request though no answer tells so: it was sent, and no reply came. When
-    /// this is false, no server has had it.
-    #[must_use]
-    pub const fn may_have_run(&self) -> bool {
-        match self {
-            Self::Timeout { phase, .. } | Self::Closed { phase, .. } => {
-                matches!(phase, CallPhase::Answer)
-            }
-            Self::Lost { .. } => true,
-            Self::OtherType { .. } | Self::Busy { .. } | Self::Request { .. } => false,
-        }
-    }
 }
 
 /// Calls that may wait to be taken; more wait in [`ServiceClient::call`].

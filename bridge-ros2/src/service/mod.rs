@@ -5,7 +5,9 @@
 //! [`ServiceMapping`].
 
 mod client;
+mod error;
 mod mapping;
+mod opening;
 mod peers;
 mod server;
 
@@ -17,7 +19,8 @@ use messages::TypeName;
 use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{QosPolicies, QosPolicyBuilder};
 
-pub use self::client::{CallPhase, ServiceClient, ServiceClientOptions, ServiceError};
+pub use self::client::{ServiceClient, ServiceClientOptions};
+pub use self::error::{CallPhase, ServiceError};
 pub use self::mapping::ServiceMapping;
 pub use self::peers::ServicePeers;
 pub use self::server::{ServiceCounters, ServiceOptions, ServiceRequest, ServiceServer};
@@ -38,19 +41,16 @@ impl ServiceTypes {
     /// Of a `.srv` file.
     #[must_use]
     pub fn of(service: &TypeName) -> Self {
-        Self::made("srv", service.package(), service.name())
-    }
-
-    /// Of the service `SendGoal` or `GetResult` that rosidl makes of an `.action` file.
-    pub(crate) fn of_action(action: &TypeName, service: &str) -> Self {
-        let name = format!("{}_{service}", action.name());
-        Self::made("action", action.package(), &name)
-    }
-
-    fn made(kind: &str, package: &str, name: &str) -> Self {
+        let of = |half| {
+            format!(
+                "{}::srv::dds_::{}_{half}_",
+                service.package(),
+                service.name()
+            )
+        };
         Self {
-            request: format!("{package}::{kind}::dds_::{name}_Request_"),
-            response: format!("{package}::{kind}::dds_::{name}_Response_"),
+            request: of("Request"),
+            response: of("Response"),
         }
     }
 }
@@ -151,10 +151,5 @@ mod tests {
         let types = service.types;
         assert_eq!(types.request, "std_srvs::srv::dds_::SetBool_Request_");
         assert_eq!(types.response, "std_srvs::srv::dds_::SetBool_Response_");
-        let types = ServiceTypes::of_action(&"demo/Fibonacci".parse().unwrap(), "SendGoal");
-        assert_eq!(
-            types.request,
-            "demo::action::dds_::Fibonacci_SendGoal_Request_"
-        );
     }
 }

@@ -14,8 +14,9 @@ use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, warn};
 
 use super::mapping::{self, Outgoing, Received, ReplyTo};
+use super::opening::Opening;
 use super::peers::{Peer, ServicePeers};
-use super::{BUSY, IDLE, Service, ServiceMapping, next, policies};
+use super::{BUSY, IDLE, Service, next, policies};
 use crate::domain::{Domain, DomainError};
 use crate::raw::{Payload, Reader, Writer};
 
@@ -117,6 +118,7 @@ impl ServiceServer {
             handled: JoinSet::new(),
             replies: VecDeque::new(),
             readers: BTreeMap::new(),
+            opening: Opening::default(),
         };
         let task = tokio::spawn(driver.run(reader)).abort_handle();
         Ok(Self {
@@ -175,6 +177,7 @@ struct Driver {
     replies: VecDeque<Reply>,
     /// Readers of replies, and since when they are known.
     readers: BTreeMap<GUID, Instant>,
+    opening: Opening,
 }
 
 struct Reply {
@@ -289,8 +292,10 @@ impl Driver {
     fn send(&mut self, now: Instant) {
         for reply in std::mem::take(&mut self.replies) {
             let kept = match self.targets(&reply.to, now) {
-                Some(targets) => self.write(reply, &targets),
-                None => Some(reply),
+                Some(targets) if self.opening.is_over(&self.writer, now) => {
+                    self.write(reply, &targets, now)
+                }
+                Some(_) | None => Some(reply),
             };
             match kept {
                 Some(reply) if now < reply.until => self.replies.push_back(reply),
@@ -304,9 +309,9 @@ impl Driver {
         }
     }
 
-    /// Who is to have a reply: all (`[None]`) when all read its mapping, else the readers of the client. `None` while
-    /// the client has none that could hear us.
-    fn targets(&mut self, to: &ReplyTo, now: Instant) -> Option<Vec<Option<GUID>>> {
+    /// The readers of a client: the one its request names, else all of its participant, as Cyclone's requests do not say
+    /// which. `None` while the client has none that could hear us.
+    fn targets(&mut self, to: &ReplyTo, now: Instant) -> Option<Vec<GUID>> {
         let topic = self.service.reply_topic();
         let mut age = IDLE;
         loop {
@@ -322,15 +327,9 @@ impl Driver {
                 None => guid.prefix == to.client().prefix,
             };
             let guids = readers.iter().map(|reader| reader.guid);
-            let found: Vec<GUID> = guids.clone().filter(of_client).filter(known).collect();
+            let found: Vec<GUID> = guids.filter(of_client).filter(known).collect();
             if !found.is_empty() {
-                let own = ServiceMapping::of(to.client());
-                let mixed = guids.clone().any(|guid| ServiceMapping::of(guid) != own);
-                return Some(if mixed {
-                    found.into_iter().map(Some).collect()
-                } else {
-                    vec![None]
-                });
+                return Some(found);
             }
             if age == BUSY {
                 return None;
@@ -355,15 +354,16 @@ impl Driver {
     }
 
     /// Returns the reply when the send window is full.
-    fn write(&self, reply: Reply, targets: &[Option<GUID>]) -> Option<Reply> {
-        for only in targets {
-            let mut options = WriteOptionsBuilder::new().related_sample_identity_opt(reply.related);
-            if let Some(reader) = only {
-                options = options.to_single_reader(*reader);
-            }
+    fn write(&mut self, reply: Reply, targets: &[GUID], now: Instant) -> Option<Reply> {
+        for reader in targets {
+            // To them alone: a reply in one vendor's way is garbage to the clients of another.
+            let options = WriteOptionsBuilder::new()
+                .related_sample_identity_opt(reply.related)
+                .to_single_reader(*reader)
+                .build();
             match self
                 .writer
-                .write_with_options(reply.payload.clone(), options.build())
+                .write_with_options(reply.payload.clone(), options)
             {
                 Ok(_) => {}
                 Err(WriteError::WouldBlock { .. }) => return Some(reply),
@@ -375,6 +375,7 @@ impl Driver {
                 ) => count(&self.counters.undelivered),
             }
         }
+        self.opening.written(self.readers.keys().copied(), now);
         None
     }
 }

@@ -36,56 +36,102 @@ impl Ours {
 #[derive(Clone, Copy)]
 pub(crate) enum Vendor {
     Cyclone,
+    FastDds,
 }
 
 impl Vendor {
     pub(crate) fn needs(self) -> &'static [Peer] {
         match self {
             Self::Cyclone => &[Peer::Python],
+            Self::FastDds => &[Peer::FastDds],
         }
     }
 
-    /// A server of `std_srvs/SetBool` that answers success and `done`, and reports requests as values.
-    pub(crate) fn serves(self, cell: &Cell, service: &str, more: &[&str]) -> Child {
+    /// A server of `std_srvs/SetBool` that answers success and `done`.
+    pub(crate) fn serves(self, cell: &Cell, service: &str) -> Child {
         match self {
-            Self::Cyclone => {
-                let answer = r#"{"success":true,"message":"done"}"#;
-                let own = [
-                    "serve",
-                    service,
-                    "std_srvs/SetBool",
-                    "--domain",
-                    "2",
-                    "--answer",
-                    answer,
-                ];
-                cell.cyclone_started("ros2_service.py", &[&own, more].concat())
-                    .told()
-                    .start()
-                    .ready(SOON)
+            Self::Cyclone => cyclone_serves(cell, service, &[]),
+            Self::FastDds => {
+                let done = "0100000005000000646f6e6500";
+                cell.fastdds(&["serve", service, SET_BOOL, "--hex", done])
             }
         }
     }
 
-    /// A client of `std_srvs/SetBool` that reports replies as values.
-    pub(crate) fn calls(self, cell: &Cell, service: &str, more: &[&str]) -> Child {
+    /// The `data` of the requests a server has had.
+    pub(crate) fn asked(self, server: &Child) -> Vec<bool> {
+        let lines = server.json_lines();
+        match self {
+            Self::Cyclone => server
+                .values()
+                .iter()
+                .map(|value| value["data"] == true)
+                .collect(),
+            Self::FastDds => lines
+                .iter()
+                .filter_map(|line| Some(line.get("request")?.as_str()?.starts_with("01")))
+                .collect(),
+        }
+    }
+
+    /// A client that asks true that many times: of Cyclone all at once, of Fast DDS one after the other.
+    pub(crate) fn calls(self, cell: &Cell, service: &str, count: usize) -> Child {
+        let count = count.to_string();
         match self {
             Self::Cyclone => {
-                let own = ["call", service, "std_srvs/SetBool", "--domain", "2"];
-                cell.cyclone("ros2_service.py", &[&own, more].concat())
+                let value = ["--value", r#"{"data":true}"#, "--at-once", &count];
+                cyclone_calls(cell, service, &value)
+            }
+            Self::FastDds => {
+                let value = ["call", service, SET_BOOL, "--hex", "01", "--count", &count];
+                cell.fastdds(&value)
             }
         }
     }
 
-    /// How many replies a client has reported, when it has said that it is done.
-    pub(crate) fn answers(self, client: &Child) -> usize {
-        let done = client
-            .json_lines()
-            .iter()
-            .any(|line| line.get("unanswered").is_some());
-        if done { client.values().len() } else { 0 }
+    /// How many replies `done` a client has had, and how many samples that were none of its replies, when it has said
+    /// that it is done.
+    pub(crate) fn answers(self, client: &Child) -> Option<(usize, u64)> {
+        let lines = client.json_lines();
+        let end = if matches!(self, Self::Cyclone) {
+            "strange"
+        } else {
+            "of_others"
+        };
+        let strange = lines.iter().find_map(|line| line.get(end)?.as_u64())?;
+        let done = match self {
+            Self::Cyclone => client
+                .values()
+                .iter()
+                .filter(|value| value["message"] == "done")
+                .count(),
+            Self::FastDds => lines
+                .iter()
+                .filter_map(|line| line.get("reply")?.as_str())
+                .filter(|reply| reply.starts_with("0100000005000000646f6e65"))
+                .count(),
+        };
+        Some((done, strange))
     }
 }
+
+pub(crate) fn cyclone_serves(cell: &Cell, service: &str, more: &[&str]) -> Child {
+    let answer = r#"{"success":true,"message":"done"}"#;
+    let own = [
+        "serve", service, SET_BOOL, "--domain", "2", "--answer", answer,
+    ];
+    cell.cyclone_started("ros2_service.py", &[&own, more].concat())
+        .told()
+        .start()
+        .ready(SOON)
+}
+
+pub(crate) fn cyclone_calls(cell: &Cell, service: &str, more: &[&str]) -> Child {
+    let own = ["call", service, SET_BOOL, "--domain", "2"];
+    cell.cyclone("ros2_service.py", &[&own, more].concat())
+}
+
+pub(crate) const SET_BOOL: &str = "std_srvs/SetBool";
 
 /// Fails when the condition does not hold within [`SOON`]. Lets other tasks run.
 pub(crate) async fn until(what: &str, mut condition: impl FnMut() -> bool) {
