@@ -47,11 +47,14 @@ pub enum Reason {
     NotSent,
     /// A service did not take the value, or did not answer.
     CallFailed,
+    /// No sample, but a publisher or subscriber that the local side cannot be matched with, as their qualities of service
+    /// exclude each other.
+    IncompatibleQos,
 }
 
 impl Reason {
     /// All of them, in the order of their counters.
-    pub const ALL: [Self; 21] = [
+    pub const ALL: [Self; 22] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -73,6 +76,7 @@ impl Reason {
         Self::NotPublished,
         Self::NotSent,
         Self::CallFailed,
+        Self::IncompatibleQos,
     ];
 
     /// The label of its counter.
@@ -100,13 +104,17 @@ impl Reason {
             Self::NotPublished => "not_published",
             Self::NotSent => "not_sent",
             Self::CallFailed => "call_failed",
+            Self::IncompatibleQos => "incompatible_qos",
         }
     }
 
-    /// Whether it belongs to normal traffic, so that nobody needs to be told.
+    /// Whether it belongs to normal traffic, so that nobody needs to be told; or is told by who counts it.
     #[must_use]
     pub const fn is_routine(self) -> bool {
-        matches!(self, Self::Looped | Self::Repeat | Self::NotInSpace)
+        matches!(
+            self,
+            Self::Looped | Self::Repeat | Self::NotInSpace | Self::IncompatibleQos
+        )
     }
 }
 

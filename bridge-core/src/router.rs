@@ -395,6 +395,11 @@ impl Router {
         });
     }
 
+    /// A publisher or subscriber of the topic cannot be matched on the local side.
+    pub fn unmatched(&mut self, topic: TopicId) {
+        self.count(About::topic(topic), Reason::IncompatibleQos, 1, String::new);
+    }
+
     /// Samples that were lost before the Router saw them, in a queue of the port or the kernel.
     pub fn lost(&mut self, topic: Option<TopicId>, count: u64, why: &'static str) {
         self.count(About { topic, from: None }, Reason::Overflow, count, || {

@@ -20,7 +20,7 @@ pub use bridge_core::{Kept, PublisherKey};
 pub use clock::{now, timestamp};
 pub use definitions::{Definitions, Wanted};
 pub use exit::{Failure, FailureKind};
-pub use logging::LogFormat;
+pub use logging::{LogFormat, LogRecord, LogSink, hear_log};
 pub use port::{Delivery, Port, PortEvent};
 pub use program::{Context, Program, run};
 pub use services::{CallFault, Outcome, ServiceCall, ServiceGraph, Services};

@@ -1,8 +1,16 @@
-//! Log lines for people (text) or for machines (one JSON object a line), on stderr.
+//! Log lines for people (text) or for machines (one JSON object a line), on stderr; and what a program warns of, for
+//! whoever in it publishes that elsewhere.
 
+use std::fmt::Write as _;
 use std::io::IsTerminal;
+use std::sync::{Arc, PoisonError, RwLock, Weak};
 
-use tracing_subscriber::EnvFilter;
+use tracing::field::{Field, Visit};
+use tracing::{Event, Level, Subscriber};
+use tracing_subscriber::filter::LevelFilter;
+use tracing_subscriber::layer::{Context, SubscriberExt as _};
+use tracing_subscriber::util::SubscriberInitExt as _;
+use tracing_subscriber::{EnvFilter, Layer};
 
 /// How log lines look.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
@@ -18,16 +26,146 @@ pub enum LogFormat {
 pub(crate) fn start(format: LogFormat, quiet: &str) {
     let levels = std::env::var("UA_LOG").unwrap_or_else(|_| "info".to_owned());
     let filter = EnvFilter::builder().parse_lossy(format!("{levels},{quiet}"));
-    let builder = tracing_subscriber::fmt()
-        .with_env_filter(filter)
+    let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal());
-    // A second start, as tests make it, keeps the first one's.
-    let started = match format {
-        LogFormat::Text => builder.with_target(false).try_init(),
-        LogFormat::Json => builder.json().flatten_event(true).try_init(),
+    // Each line layer has its filter: what is hushed on stderr may still be of use elsewhere.
+    let lines = match format {
+        LogFormat::Text => lines.with_target(false).with_filter(filter).boxed(),
+        LogFormat::Json => lines.json().flatten_event(true).with_filter(filter).boxed(),
     };
+    // A second start, as tests make it, keeps the first one's.
+    let started = tracing_subscriber::registry()
+        .with(lines)
+        .with(Warnings.with_filter(LevelFilter::WARN))
+        .try_init();
     if let Err(error) = started {
         tracing::debug!(%error, "logging had been started before");
+    }
+}
+
+/// A warning or an error of the program.
+#[derive(Debug, Clone)]
+pub struct LogRecord {
+    /// How bad it is.
+    pub level: Level,
+    /// What is to be said, the fields behind it.
+    pub message: String,
+    /// The source file.
+    pub file: Option<&'static str>,
+    /// The module.
+    pub module: Option<&'static str>,
+    /// The line in the file.
+    pub line: Option<u32>,
+}
+
+/// Where a program's warnings and errors go beside stderr.
+pub trait LogSink: Send + Sync + 'static {
+    /// Takes one record. Called on whichever thread warns, so it neither waits nor logs.
+    fn hear(&self, record: LogRecord);
+}
+
+/// Has `sink` hear every warning and error of our own crates from now on, for as long as it is there. Those of
+/// libraries are left out: a sink that uses the library would hear of its own doing.
+pub fn hear_log(sink: &Arc<impl LogSink>) {
+    let sink: Arc<dyn LogSink> = Arc::clone(sink) as _;
+    let mut sinks = SINKS.write().unwrap_or_else(PoisonError::into_inner);
+    sinks.retain(|sink| sink.strong_count() > 0);
+    sinks.push(Arc::downgrade(&sink));
+}
+
+static SINKS: RwLock<Vec<Weak<dyn LogSink>>> = RwLock::new(Vec::new());
+
+/// The layer that hands warnings and errors to the sinks.
+#[derive(Debug)]
+struct Warnings;
+
+impl<S: Subscriber> Layer<S> for Warnings {
+    fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
+        let metadata = event.metadata();
+        let ours = OURS.iter().any(|ours| metadata.target().starts_with(ours));
+        if *metadata.level() > Level::WARN || !ours {
+            return;
+        }
+        let sinks: Vec<Arc<dyn LogSink>> = SINKS
+            .read()
+            .unwrap_or_else(PoisonError::into_inner)
+            .iter()
+            .filter_map(Weak::upgrade)
+            .collect();
+        if sinks.is_empty() {
+            return;
+        }
+        let mut text = Text::default();
+        event.record(&mut text);
+        for sink in sinks {
+            sink.hear(LogRecord {
+                level: *metadata.level(),
+                message: format!("{}{}", text.message, text.fields),
+                file: metadata.file(),
+                module: metadata.module_path(),
+                line: metadata.line(),
+            });
+        }
+    }
+}
+
+#[derive(Default)]
+struct Text {
+    message: String,
+    fields: String,
+}
+
+impl Visit for Text {
+    fn record_str(&mut self, field: &Field, value: &str) {
+        match field.name() {
+            "message" => self.message.push_str(value),
+            // Writing to a String cannot fail.
+            name => write!(self.fields, " {name}={value}").unwrap_or_default(),
+        }
+    }
+
+    fn record_debug(&mut self, field: &Field, value: &dyn std::fmt::Debug) {
+        match field.name() {
+            "message" => write!(self.message, "{value:?}").unwrap_or_default(),
+            name => write!(self.fields, " {name}={value:?}").unwrap_or_default(),
+        }
+    }
+}
+
+/// The crates whose warnings are the program's.
+const OURS: [&str; 4] = ["bridge_", "tcpros", "transport", "uadp"];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::Mutex;
+
+    #[derive(Default)]
+    struct Heard(Mutex<Vec<String>>);
+
+    impl LogSink for Heard {
+        fn hear(&self, record: LogRecord) {
+            self.0
+                .lock()
+                .unwrap()
+                .push(format!("{} {}", record.level, record.message));
+        }
+    }
+
+    #[test]
+    fn a_sink_hears_the_warnings_of_the_program_with_their_fields() {
+        let heard = Arc::new(Heard::default());
+        hear_log(&heard);
+        let subscriber = tracing_subscriber::registry().with(Warnings);
+        tracing::subscriber::with_default(subscriber, || {
+            tracing::warn!(topic = "rt/a", size = 7, "too large");
+            tracing::info!("ordinary");
+            tracing::error!(target: "rustdds::network", "of a library");
+        });
+        assert_eq!(
+            *heard.0.lock().unwrap(),
+            ["WARN too large topic=rt/a size=7"]
+        );
     }
 }

@@ -2,6 +2,7 @@
 
 use std::convert::Infallible;
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -17,12 +18,25 @@ use tracing::{debug, info};
 use crate::exit::{Failure, FailureKind};
 use crate::status::Status;
 
-/// The run loop's end: each request brings the place for its answer.
+/// The run loops that answer, in the order of their spaces.
+type Ask = Arc<[mpsc::Sender<oneshot::Sender<Status>>]>;
+/// A run loop's end: each request brings the place for its answer.
 pub(crate) type Requests = mpsc::Receiver<oneshot::Sender<Status>>;
 
-/// Listens at `address` and gives the requests for status to answer. Without an address there are never any.
-pub(crate) async fn serve(address: Option<SocketAddr>) -> Result<Requests, Failure> {
-    let (ask, requests) = mpsc::channel(4);
+/// The requests of nobody.
+pub(crate) fn never() -> Requests {
+    mpsc::channel(1).1
+}
+
+/// Listens at `address` and gives each of so many run loops its requests to answer. Without an address there are
+/// never any.
+pub(crate) async fn serve(
+    address: Option<SocketAddr>,
+    loops: usize,
+) -> Result<Vec<Requests>, Failure> {
+    let (ask, mut requests): (Vec<_>, Vec<_>) = (0..loops).map(|_| mpsc::channel(4)).unzip();
+    // The last is taken first; answers are to be in the order of the spaces.
+    requests.reverse();
     let Some(address) = address else {
         return Ok(requests);
     };
@@ -34,14 +48,14 @@ pub(crate) async fn serve(address: Option<SocketAddr>) -> Result<Requests, Failu
     })?;
     let at = listener.local_addr().unwrap_or(address);
     info!("metrics at http://{at}/metrics, status at http://{at}/status");
-    tokio::spawn(accept(listener, ask));
+    tokio::spawn(accept(listener, ask.into()));
     Ok(requests)
 }
 
-async fn accept(listener: TcpListener, ask: mpsc::Sender<oneshot::Sender<Status>>) {
-    let places = std::sync::Arc::new(Semaphore::new(MAX_CONNECTIONS));
+async fn accept(listener: TcpListener, ask: Ask) {
+    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
     loop {
-        let Ok(place) = std::sync::Arc::clone(&places).acquire_owned().await else {
+        let Ok(place) = Arc::clone(&places).acquire_owned().await else {
             return;
         };
         let stream = tokio::select! {
@@ -54,9 +68,9 @@ async fn accept(listener: TcpListener, ask: mpsc::Sender<oneshot::Sender<Status>
                     continue;
                 }
             },
-            () = ask.closed() => return,
+            () = all_closed(&ask) => return,
         };
-        let ask = ask.clone();
+        let ask = Arc::clone(&ask);
         tokio::spawn(async move {
             if tokio::time::timeout(CONNECTION_TIME, answer(stream, ask))
                 .await
@@ -69,9 +83,15 @@ async fn accept(listener: TcpListener, ask: mpsc::Sender<oneshot::Sender<Status>
     }
 }
 
-async fn answer(stream: TcpStream, ask: mpsc::Sender<oneshot::Sender<Status>>) {
+async fn all_closed(ask: &Ask) {
+    for ask in ask.iter() {
+        ask.closed().await;
+    }
+}
+
+async fn answer(stream: TcpStream, ask: Ask) {
     let service = service_fn(|request| {
-        let ask = ask.clone();
+        let ask = Arc::clone(&ask);
         async move { Ok::<_, Infallible>(page(&request, &ask).await) }
     });
     let served = hyper::server::conn::http1::Builder::new()
@@ -84,10 +104,7 @@ async fn answer(stream: TcpStream, ask: mpsc::Sender<oneshot::Sender<Status>>) {
     }
 }
 
-async fn page(
-    request: &Request<Incoming>,
-    ask: &mpsc::Sender<oneshot::Sender<Status>>,
-) -> Response<Full<Bytes>> {
+async fn page(request: &Request<Incoming>, ask: &Ask) -> Response<Full<Bytes>> {
     let json = match request.uri().path() {
         "/metrics" => false,
         "/status" => true,
@@ -98,18 +115,29 @@ async fn page(
             );
         }
     };
-    let (reply, status) = oneshot::channel();
-    let status = match ask.send(reply).await {
-        Ok(()) => status.await.ok(),
-        Err(_) => None,
-    };
-    match status {
-        Some(status) if json => text(StatusCode::OK, status.json()),
-        Some(status) => text(StatusCode::OK, status.prometheus()),
-        None => text(
+    let mut all = Vec::with_capacity(ask.len());
+    for ask in ask.iter() {
+        let (reply, status) = oneshot::channel();
+        if ask.send(reply).await.is_ok()
+            && let Ok(status) = status.await
+        {
+            all.push(status);
+        }
+    }
+    match all.as_slice() {
+        [] => text(
             StatusCode::SERVICE_UNAVAILABLE,
             "the program is ending\n".into(),
         ),
+        all if !json => text(
+            StatusCode::OK,
+            all.iter().map(Status::prometheus).collect::<String>(),
+        ),
+        [only] if ask.len() == 1 => text(StatusCode::OK, only.json()),
+        all => {
+            let each: Vec<String> = all.iter().map(Status::json).collect();
+            text(StatusCode::OK, format!("[{}]", each.join(",")))
+        }
     }
 }
 

@@ -108,6 +108,12 @@ pub enum PortEvent {
         /// How many.
         count: u64,
     },
+    /// A publisher or subscriber of the topic asks for or offers what excludes ours, so that nothing passes between them.
+    /// Counted; the port tells of it.
+    Unmatched {
+        /// Which value.
+        topic: TopicId,
+    },
     /// A value could not be handed to the service it is for, or no service answered with it.
     CallFailed {
         /// Which value.

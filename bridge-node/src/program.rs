@@ -11,13 +11,15 @@ use clap::Parser;
 use clap::error::ErrorKind;
 use mappings::{Code, Diagnostic, Mapping, PubSub, Severity, SpaceId};
 use tokio::signal::unix::{SignalKind, signal};
-use tracing::{error, info};
+use tokio::sync::watch;
+use tokio::task::{JoinError, JoinSet};
+use tracing::{Instrument, Span, error, info, info_span};
 use transport::{Options, Udp};
 
 use crate::arguments::Arguments;
 use crate::exit::{Failure, FailureKind};
 use crate::logging;
-use crate::metrics;
+use crate::metrics::{self, Requests};
 use crate::port::Port;
 use crate::run::Shell;
 
@@ -36,17 +38,17 @@ pub trait Program: Parser {
     /// The arguments all programs have.
     fn arguments(&self) -> &Arguments;
 
-    /// The space it serves.
+    /// The spaces it serves, none of them twice: each with a local side, a Router and a place in the group of its own.
     ///
     /// # Errors
     /// When neither the arguments nor the mapping say which, or they contradict each other.
-    fn own(&self, mapping: &Mapping) -> Result<SpaceId, Failure>;
+    fn spaces(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure>;
 
-    /// Starts the local side.
+    /// Starts the local side of one space.
     ///
     /// # Errors
     /// What keeps it from running at all. A peer that is not there yet is waited for instead.
-    fn start(self, context: Context) -> impl Future<Output = Result<Self::Port, Failure>>;
+    fn start(&self, context: Context) -> impl Future<Output = Result<Self::Port, Failure>>;
 }
 
 /// What a port is started with.
@@ -156,38 +158,93 @@ fn serve<P: Program>(program: P, mapping: Arc<Mapping>) -> Result<(), Failure> {
         .build()
         .map_err(|error| Failure::new(FailureKind::Io, format!("cannot start: {error}")))?;
     runtime.block_on(async move {
-        let arguments = program.arguments().clone();
-        let own = program.own(&mapping)?;
-        info!(
-            version = env!("CARGO_PKG_VERSION"),
-            space = %own,
-            mapping = arguments.mapping.as_ref().map(|file| tracing::field::display(file.display())),
-            "{} starts",
-            P::NAME
-        );
-        let stop = stopped()?;
-        let udp = open(&arguments, &mapping)?;
-        let requests = metrics::serve(arguments.metrics).await?;
-        let settings = Settings { own, local: P::LOCAL, source: Some(udp.source()) };
-        let router = Router::new(settings, Arc::clone(&mapping));
-        let port = program.start(Context { mapping, own }).await?;
-        let shell = Shell {
-            program: P::NAME,
-            own,
-            router,
-            port,
-            udp,
-            requests,
-            dry_run: arguments.dry_run,
-        };
-        // As a task of its own: waking the future given to `block_on` costs a system call each time.
-        tokio::spawn(shell.run(stop)).await.unwrap_or_else(|error| {
-            Err(Failure::new(FailureKind::Io, format!("the program broke off: {error}")))
-        })
+        let arguments = program.arguments();
+        let spaces = program.spaces(&mapping)?;
+        let signal = stopped()?;
+        let mut requests = metrics::serve(arguments.metrics, spaces.len()).await?;
+        let several = spaces.len() > 1;
+        let (stopping, stop) = watch::channel(false);
+        let mut shells = JoinSet::new();
+        for own in spaces.iter().copied() {
+            // Which space a line of the log is about is only a question where there are several.
+            let span = if several {
+                info_span!("bridge", space = %own)
+            } else {
+                Span::none()
+            };
+            let requests = requests.pop().unwrap_or_else(metrics::never);
+            let shell =
+                prepare(&program, &mapping, (own, several), requests).instrument(span.clone());
+            let ended = shell.await?.run(told(stop.clone()));
+            // As tasks of their own: waking the future given to `block_on` costs a system call each time.
+            shells.spawn(ended.instrument(span));
+        }
+        let mut ended = Ok(());
+        tokio::select! {
+            () = signal => {}
+            first = shells.join_next() => ended = how(first),
+        }
+        stopping.send_replace(true);
+        while let Some(next) = shells.join_next().await {
+            ended = ended.and(how(Some(next)));
+        }
+        ended
     })
 }
 
-fn open(arguments: &Arguments, mapping: &Mapping) -> Result<Udp, Failure> {
+/// What carries one space, ready to run.
+async fn prepare<P: Program>(
+    program: &P,
+    mapping: &Arc<Mapping>,
+    (own, several): (SpaceId, bool),
+    requests: Requests,
+) -> Result<Shell<P::Port>, Failure> {
+    let arguments = program.arguments();
+    info!(
+        version = env!("CARGO_PKG_VERSION"),
+        space = %own,
+        mapping = arguments.mapping.as_ref().map(|file| tracing::field::display(file.display())),
+        "{} starts",
+        P::NAME
+    );
+    let udp = open(arguments, mapping, several)?;
+    let settings = Settings {
+        own,
+        local: P::LOCAL,
+        source: Some(udp.source()),
+    };
+    let router = Router::new(settings, Arc::clone(mapping));
+    let context = Context {
+        mapping: Arc::clone(mapping),
+        own,
+    };
+    Ok(Shell {
+        program: P::NAME,
+        own,
+        router,
+        port: program.start(context).await?,
+        udp,
+        requests,
+        dry_run: arguments.dry_run,
+    })
+}
+
+/// Ready when all are told to stop, or nobody is left to tell them.
+async fn told(mut stop: watch::Receiver<bool>) {
+    let _told_or_alone = stop.wait_for(|stop| *stop).await;
+}
+
+/// How a space's run loop ended.
+fn how(ended: Option<Result<Result<(), Failure>, JoinError>>) -> Result<(), Failure> {
+    ended.unwrap_or(Ok(Ok(()))).unwrap_or_else(|error| {
+        Err(Failure::new(
+            FailureKind::Io,
+            format!("the program broke off: {error}"),
+        ))
+    })
+}
+
+fn open(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Udp, Failure> {
     let pubsub = mapping.pubsub();
     let address: SocketAddr = match &arguments.address {
         Some(url) => PubSub::parse_address(url).ok_or_else(|| {
@@ -204,6 +261,13 @@ fn open(arguments: &Arguments, mapping: &Mapping) -> Result<Udp, Failure> {
         ttl: u32::from(pubsub.ttl),
         ..Options::new(address)
     };
+    if several && !address.ip().is_multicast() {
+        let message = format!(
+            "several spaces in one program hear each other by multicast, and {address} is no multicast address: start \
+             a program for each"
+        );
+        return Err(Failure::new(FailureKind::Usage, message));
+    }
     Udp::open(&options).map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))
 }
 

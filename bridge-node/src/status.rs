@@ -80,6 +80,7 @@ impl Status {
             // Writing to a string does not fail.
             let _written = writeln!(text, "ua_{name}{{{labels}}} {value}");
         };
+        let own = format!("program=\"{}\",space=\"{}\"", self.program, self.space);
         let none = [("none".to_owned(), &self.others)];
         let all = self
             .topics
@@ -87,7 +88,7 @@ impl Status {
             .map(|(topic, status)| (topic.clone(), status))
             .chain(none);
         for (topic, status) in all {
-            let labels = format!("program=\"{}\",topic=\"{topic}\"", self.program);
+            let labels = format!("{own},topic=\"{topic}\"");
             line("samples_sent_total", &labels, &status.sent);
             line("samples_delivered_total", &labels, &status.delivered);
             line("key_frames_repeated_total", &labels, &status.repeated);
@@ -102,7 +103,7 @@ impl Status {
             }
         }
         for (hop, delays) in &self.hops {
-            let labels = format!("program=\"{}\",hop=\"{hop}\"", self.program);
+            let labels = format!("{own},hop=\"{hop}\"");
             line("hop_count", &labels, &delays.count);
             line("hop_negative_total", &labels, &delays.negative);
             line("hop_p50_microseconds", &labels, &delays.p50_us);

@@ -93,11 +93,11 @@ impl Program for BridgeRos1 {
         &self.flags.arguments
     }
 
-    fn own(&self, _mapping: &Mapping) -> Result<SpaceId, Failure> {
-        Ok(SpaceId::ROS1)
+    fn spaces(&self, _mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
+        Ok(vec![SpaceId::ROS1])
     }
 
-    async fn start(self, context: Context) -> Result<Ros1Port, Failure> {
+    async fn start(&self, context: Context) -> Result<Ros1Port, Failure> {
         let options = PortOptions {
             node: self
                 .node_options()
@@ -162,6 +162,6 @@ mod tests {
     fn without_words_the_node_has_its_own_name() {
         let program = parsed(&[]);
         assert_eq!(program.node_options().unwrap().name, NODE_NAME);
-        assert_eq!(program.own(&Mapping::default()), Ok(SpaceId::ROS1));
+        assert_eq!(program.spaces(&Mapping::default()), Ok(vec![SpaceId::ROS1]));
     }
 }

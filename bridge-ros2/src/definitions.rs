@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use bridge_node::Wanted;
-use messages::{DefinitionError, Dialect, MessageType, ServiceType, TypeName};
+use messages::{DefinitionError, Dialect, MessageType, ServiceType, TypeHash, TypeName};
 use uadp::BuiltinType;
 
 /// Finds message types by name; a type once found stays.
@@ -41,6 +41,11 @@ impl Definitions {
         let prefixes = &self.prefixes;
         self.known
             .find_service(name, |wanted| locate(prefixes, wanted))
+    }
+
+    /// The type hash of a type that was found.
+    pub(crate) fn type_hash(&self, name: &TypeName) -> Option<TypeHash> {
+        self.known.registry().type_hash(name).ok()
     }
 
     /// The ROS type that carries one value of that type, and nothing else.

@@ -1,18 +1,25 @@
 //! Being in a DDS domain: the participant, the ROS node it stands for, and the making of endpoints.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, Ipv4Addr};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
-use ros2_client::{Context, Node, NodeName, NodeOptions};
 use rustdds::dds::CreateError;
+use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{
     DomainParticipant, DomainParticipantBuilder, DomainParticipantStatusListener, GUID, Publisher,
-    QosPolicies, RTPSEntity, Subscriber, Topic, TopicKind,
+    QosPolicies, QosPolicyBuilder, RTPSEntity, Subscriber, Topic, TopicKind,
 };
 use thiserror::Error;
 
+use crate::clock::{self, RosClock};
+use crate::discovery_info::{self, NodeEntities};
+use crate::graph::Graph;
+use crate::node::{Channels, Node, NodeOptions, Services};
 use crate::qos::{Offered, Requested};
-use crate::raw::{Opaque, Payload, Reader, Writer};
+use crate::raw::{Opaque, Payload, RawReader, RawWriter, Reader, Writer};
+use crate::rosout;
 
 /// Which domain to join and how.
 #[derive(Debug, Clone)]
@@ -21,8 +28,10 @@ pub struct DomainOptions {
     pub domain: u16,
     /// Addresses of the interfaces to use; all when empty.
     pub networks: Vec<IpAddr>,
-    /// The ROS name of the node, without namespace.
-    pub node: String,
+    /// Hosts to announce ourselves to by unicast, beside multicast.
+    pub peers: Vec<IpAddr>,
+    /// The ROS node it is there; a name alone is one in the root namespace.
+    pub node: NodeOptions,
 }
 
 impl DomainOptions {
@@ -85,13 +94,18 @@ pub enum DomainError {
         /// The name.
         name: String,
         /// What is wrong with it.
-        why: String,
+        why: &'static str,
     },
     /// A discovery range in which nobody is found.
     #[error(
         "ROS_AUTOMATIC_DISCOVERY_RANGE is `{0}`: a bridge needs SUBNET (the default) or LOCALHOST"
     )]
     DiscoveryRange(String),
+    /// Peers were given to a RustDDS that knows only multicast.
+    #[error(
+        "a list of peers needs RustDDS with this project's patches, as `cargo xtask dist` builds it"
+    )]
+    Peers,
     /// RustDDS could not open its sockets or start its threads.
     #[error("cannot join DDS domain {domain}: {source}")]
     Join {
@@ -102,7 +116,7 @@ pub enum DomainError {
     },
     /// The ROS node could not be created.
     #[error("cannot create the ROS node: {0}")]
-    Node(String),
+    Node(#[from] std::io::Error),
     /// A reader or writer could not be created.
     #[error("cannot create an endpoint of `{topic}`: {source}")]
     Endpoint {
@@ -113,14 +127,16 @@ pub enum DomainError {
     },
 }
 
-/// A participant of a domain under the name of a ROS node.
+/// A participant of a domain that is a ROS node there.
 ///
-/// The node shows up in `ros2 node list`. Its parameter services are off: `ros2-client` speaks one vendor's dialect of
-/// services, and calls from another vendor's nodes would hang.
+/// The node shows up in `ros2 node list` with the readers and writers made here, publishes the program's warnings on
+/// `/rosout`, and with `use_sim_time` follows `/clock`.
 pub struct Domain {
     // Dropped in this order: first the node withdraws its name, while the participant can still say so.
     node: Node,
-    context: Context,
+    domain: u16,
+    /// The type hashes to announce, by DDS type name.
+    type_hashes: Mutex<BTreeMap<String, String>>,
     publisher: Publisher,
     subscriber: Subscriber,
     participant: DomainParticipant,
@@ -135,42 +151,103 @@ impl Domain {
         if options.domain > MAX_DOMAIN {
             return Err(DomainError::Domain(options.domain));
         }
-        let name = NodeName::new("/", &options.node).map_err(|why| DomainError::NodeName {
-            name: options.node.clone(),
-            why: format!("{why:?}"),
-        })?;
+        if let Some(why) = options.node.fault() {
+            return Err(DomainError::NodeName {
+                name: options.node.full_name(),
+                why,
+            });
+        }
         let failed = |source| DomainError::Join {
             domain: options.domain,
             source,
         };
-        // Announcements to 127.0.0.1 find peers on this machine without multicast; they would contradict a choice of
-        // other interfaces.
-        let mut builder = DomainParticipantBuilder::new(options.domain)
-            .same_host_loopback(options.networks.is_empty() || options.is_local());
-        if !options.networks.is_empty() {
-            builder = builder.with_only_networks(options.networks.iter().copied());
-        }
-        let participant = builder.build().map_err(failed)?;
+        let participant = participant(options)?.build().map_err(failed)?;
         let none = QosPolicies::qos_none();
         let publisher = participant.create_publisher(&none).map_err(failed)?;
         let subscriber = participant.create_subscriber(&none).map_err(failed)?;
-        let context = Context::from_domain_participant(participant.clone())
-            .map_err(|error| DomainError::Node(error.to_string()))?;
-        let node = context
-            .new_node(
-                name,
-                NodeOptions::new()
-                    .start_parameter_services(false)
-                    .enable_rosout(true),
-            )
-            .map_err(|error| DomainError::Node(error.to_string()))?;
-        Ok(Self {
-            node,
-            context,
+        let names = (discovery_info::TOPIC, discovery_info::TYPE);
+        let [heard, told] = [INFO_DEPTH, 1].map(|depth| with_hash(&info_qos(depth), INFO_HASH));
+        let topic = create_topic(&participant, names, &told).map_err(failed)?;
+        let channels = Channels {
+            participant: participant.guid().to_bytes(),
+            info_reader: subscriber
+                .create_simple_datareader_no_key(&topic, Some(heard))
+                .map_err(failed)?,
+            info_writer: publisher
+                .create_datawriter_no_key(&topic, Some(told))
+                .map_err(failed)?,
+        };
+        let domain = Self {
+            node: Node::start(options.node.clone(), channels)?,
+            domain: options.domain,
+            type_hashes: Mutex::default(),
             publisher,
             subscriber,
             participant,
-        })
+        };
+        domain.serve()?;
+        Ok(domain)
+    }
+
+    /// What every ROS node has beside its name.
+    fn serve(&self) -> Result<(), DomainError> {
+        for (dds_type, hash) in [(rosout::TYPE, LOG_HASH), (clock::TYPE, CLOCK_HASH)] {
+            self.learn_type_hash(dds_type, hash);
+        }
+        let clock = self.node.options().use_sim_time.then(|| {
+            let newest = QosPolicyBuilder::new()
+                .best_effort()
+                .history(History::KeepLast { depth: 1 })
+                .build();
+            self.open_reader(clock::TOPIC, clock::TYPE, &newest)
+        });
+        self.node.serve(Services {
+            rosout: self.open_writer(rosout::TOPIC, rosout::TYPE, &rosout::qos())?,
+            clock: clock.transpose()?,
+        });
+        Ok(())
+    }
+
+    /// Announces this type hash (`RIHS01_` and 64 hex digits) for endpoints of that DDS type that are made from now
+    /// on. RustDDS as published has no place for it; see [`can_announce_type_hashes`].
+    pub fn learn_type_hash(&self, dds_type: &str, hash: impl Into<String>) {
+        self.type_hashes
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .insert(dds_type.to_owned(), hash.into());
+    }
+
+    /// What others have in the domain by now. Nodes of participants that are gone are forgotten with it.
+    pub fn graph(&self) -> Graph {
+        let graph = Graph::snapshot(&self.participant);
+        self.node
+            .retain(|prefix| graph.participants().contains(prefix));
+        graph
+    }
+
+    /// The readers and writers made here that were not announced to the domain: RustDDS' discovery drops what does not
+    /// fit into its queue. They are to be made anew.
+    #[must_use]
+    pub fn unannounced(&self, graph: &Graph) -> BTreeSet<GUID> {
+        self.node.unannounced(graph.own())
+    }
+
+    /// The nodes of others, as they told.
+    #[must_use]
+    pub fn nodes(&self) -> Vec<NodeEntities> {
+        self.node.others()
+    }
+
+    /// The full name of the node an endpoint of others belongs to, if it told.
+    #[must_use]
+    pub fn owner(&self, endpoint: GUID) -> Option<String> {
+        self.node.owner(endpoint)
+    }
+
+    /// The node's clock.
+    #[must_use]
+    pub fn clock(&self) -> RosClock {
+        self.node.clock()
     }
 
     /// The participant, for its discovery snapshot.
@@ -188,7 +265,7 @@ impl Domain {
     /// The node's full ROS name.
     #[must_use]
     pub fn node_name(&self) -> String {
-        self.node.fully_qualified_name()
+        self.node.options().full_name()
     }
 
     /// Discovery events of the participant.
@@ -223,7 +300,7 @@ impl Domain {
         self.open_writer(topic, type_name, &offered.policies())
     }
 
-    /// Makes a reader of any DDS topic. Samples arrive as bytes.
+    /// Makes a reader of any DDS topic, which is the node's until dropped. Samples arrive as bytes.
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
@@ -233,15 +310,17 @@ impl Domain {
         type_name: &str,
         qos: &QosPolicies,
     ) -> Result<Reader, DomainError> {
-        self.topic(topic, type_name, qos)
-            .and_then(|topic| {
+        let qos = self.with_type_hash(type_name, qos);
+        create_topic(&self.participant, (topic, type_name), &qos)
+            .and_then(|topic| -> Result<RawReader, CreateError> {
                 self.subscriber
-                    .create_simple_datareader_no_key::<Payload, Opaque>(&topic, Some(qos.clone()))
+                    .create_simple_datareader_no_key::<Payload, Opaque>(&topic, Some(qos))
             })
+            .map(|reader| self.node.list_reader(reader))
             .map_err(|source| endpoint_error(topic, source))
     }
 
-    /// Makes a writer of any DDS topic. Samples are given as bytes.
+    /// Makes a writer of any DDS topic, which is the node's until dropped. Samples are given as bytes.
     ///
     /// # Errors
     /// [`DomainError::Endpoint`].
@@ -251,17 +330,25 @@ impl Domain {
         type_name: &str,
         qos: &QosPolicies,
     ) -> Result<Writer, DomainError> {
-        self.topic(topic, type_name, qos)
-            .and_then(|topic| {
+        let qos = self.with_type_hash(type_name, qos);
+        create_topic(&self.participant, (topic, type_name), &qos)
+            .and_then(|topic| -> Result<RawWriter, CreateError> {
                 self.publisher
-                    .create_datawriter_no_key::<Payload, Opaque>(&topic, Some(qos.clone()))
+                    .create_datawriter_no_key::<Payload, Opaque>(&topic, Some(qos))
             })
+            .map(|writer| self.node.list_writer(writer))
             .map_err(|source| endpoint_error(topic, source))
     }
 
-    fn topic(&self, name: &str, type_name: &str, qos: &QosPolicies) -> Result<Topic, CreateError> {
-        self.participant
-            .create_topic(name.to_owned(), type_name.to_owned(), qos, TopicKind::NoKey)
+    /// The policies with the type hash, if it is known.
+    fn with_type_hash(&self, type_name: &str, qos: &QosPolicies) -> QosPolicies {
+        let hashes = self
+            .type_hashes
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        hashes
+            .get(type_name)
+            .map_or_else(|| qos.clone(), |hash| with_hash(qos, hash))
     }
 
     /// Leaves the domain, after `endpoints` (readers and writers) were disposed. Returns after [`LEAVE_WITHIN`] at the
@@ -290,9 +377,85 @@ impl Domain {
 impl std::fmt::Debug for Domain {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Domain")
-            .field("domain", &self.context.domain_id())
+            .field("domain", &self.domain)
             .field("node", &self.node_name())
             .finish_non_exhaustive()
+    }
+}
+
+fn participant(options: &DomainOptions) -> Result<DomainParticipantBuilder, DomainError> {
+    // Announcements to 127.0.0.1 find peers on this machine without multicast; they would contradict a choice of
+    // other interfaces.
+    let mut builder = DomainParticipantBuilder::new(options.domain)
+        .same_host_loopback(options.networks.is_empty() || options.is_local());
+    if !options.networks.is_empty() {
+        builder = builder.with_only_networks(options.networks.iter().copied());
+    }
+    // The security enclave, of which ROS tools show that it is the default one.
+    #[cfg(feature = "patched-dds")]
+    let builder = builder.user_data(b"enclave=/;".to_vec());
+    with_peers(builder, &options.peers)
+}
+
+/// The policies with a type hash in the endpoint's user data, as every rmw of DDS puts it there (REP-2016).
+#[cfg(feature = "patched-dds")]
+fn with_hash(qos: &QosPolicies, hash: &str) -> QosPolicies {
+    let user_data = QosPolicyBuilder::new().user_data(format!("typehash={hash};").into_bytes());
+    qos.modify_by(&user_data.build())
+}
+
+#[cfg(not(feature = "patched-dds"))]
+fn with_hash(qos: &QosPolicies, _hash: &str) -> QosPolicies {
+    qos.clone()
+}
+
+fn create_topic(
+    participant: &DomainParticipant,
+    (name, type_name): (&str, &str),
+    qos: &QosPolicies,
+) -> Result<Topic, CreateError> {
+    participant.create_topic(name.to_owned(), type_name.to_owned(), qos, TopicKind::NoKey)
+}
+
+/// The policies of `ros_discovery_info`, as rmw_dds_common has them.
+fn info_qos(depth: i32) -> QosPolicies {
+    QosPolicyBuilder::new()
+        .reliable(rustdds::Duration::ZERO)
+        .durability(Durability::TransientLocal)
+        .history(History::KeepLast { depth })
+        .resource_limits(ResourceLimits {
+            max_samples: INFO_DEPTH,
+            max_instances: 1,
+            max_samples_per_instance: INFO_DEPTH,
+        })
+        .build()
+}
+
+/// Whether peers can be told of type hashes: RustDDS as published has no user data of its own.
+#[must_use]
+pub const fn can_announce_type_hashes() -> bool {
+    cfg!(feature = "patched-dds")
+}
+
+// When this does not compile: the feature `patched-dds` is on, but RustDDS is as published. `cargo xtask` builds with
+// both, and `cargo xtask dds` prints the flags to do so by hand.
+#[cfg(feature = "patched-dds")]
+fn with_peers(
+    builder: DomainParticipantBuilder,
+    peers: &[IpAddr],
+) -> Result<DomainParticipantBuilder, DomainError> {
+    Ok(builder.initial_peers(peers.iter().copied()))
+}
+
+#[cfg(not(feature = "patched-dds"))]
+fn with_peers(
+    builder: DomainParticipantBuilder,
+    peers: &[IpAddr],
+) -> Result<DomainParticipantBuilder, DomainError> {
+    if peers.is_empty() {
+        Ok(builder)
+    } else {
+        Err(DomainError::Peers)
     }
 }
 
@@ -303,6 +466,13 @@ fn endpoint_error(topic: &str, source: CreateError) -> DomainError {
     }
 }
 
+/// Lists of nodes a reader keeps until they are read, which is at once; and those RustDDS may keep unacknowledged.
+const INFO_DEPTH: i32 = 256;
+/// The type hashes of `rcl_interfaces/msg/Log`, `rosgraph_msgs/msg/Clock` and
+/// `rmw_dds_common/msg/ParticipantEntitiesInfo`.
+const LOG_HASH: &str = "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac";
+const CLOCK_HASH: &str = "RIHS01_692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564";
+const INFO_HASH: &str = "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e";
 /// The highest domain whose ports fit into 16 bits.
 pub const MAX_DOMAIN: u16 = 232;
 /// How long [`Domain::leave`] takes at most.

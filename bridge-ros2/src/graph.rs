@@ -3,10 +3,13 @@
 //! RustDDS reports discovery as events too, but on a channel that drops when it is full, and its graph events name
 //! built-in entities. A snapshot of its database is the whole truth at that moment.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 
 use rustdds::policy::{Durability, Reliability};
-use rustdds::{DomainParticipant, GUID, RTPSEntity};
+use rustdds::{DomainParticipant, GUID, QosPolicies, RTPSEntity};
+
+use crate::node::ParticipantPrefix;
 
 /// One writer or reader of another participant.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -19,6 +22,8 @@ pub struct Endpoint {
     pub reliable: bool,
     /// Offered or requested durability is transient-local or stronger.
     pub transient_local: bool,
+    /// All it offers or requests.
+    pub qos: Arc<QosPolicies>,
 }
 
 impl Endpoint {
@@ -34,21 +39,28 @@ impl Endpoint {
 pub struct Graph {
     writers: BTreeMap<String, Vec<Endpoint>>,
     readers: BTreeMap<String, Vec<Endpoint>>,
+    /// Participants with any endpoint.
+    participants: BTreeSet<ParticipantPrefix>,
+    /// Endpoints of our own that came back to us as announced: RustDDS hears itself.
+    own: BTreeSet<GUID>,
 }
 
 impl Graph {
     /// What `participant` has discovered by now; its own endpoints are left out.
     #[must_use]
     pub fn snapshot(participant: &DomainParticipant) -> Self {
-        let own = participant.guid().prefix;
+        let prefix = participant.guid().prefix;
+        let mut own = BTreeSet::new();
         let writers = participant.discovered_writers().into_iter().map(|writer| {
             let data = writer.publication_topic_data;
+            let qos = Arc::new(data.qos());
             let endpoint = Endpoint {
                 guid: writer.writer_proxy.remote_writer_guid,
                 type_name: data.type_name,
                 // The default of a writer is reliable, that of a reader is best effort (DDS 1.4, 2.2.3.14).
                 reliable: data.reliability != Some(Reliability::BestEffort),
                 transient_local: is_durable(data.durability),
+                qos,
             };
             (data.topic_name, endpoint)
         });
@@ -60,11 +72,23 @@ impl Graph {
                 type_name: data.type_name().clone(),
                 reliable: matches!(qos.reliability(), Some(Reliability::Reliable { .. })),
                 transient_local: is_durable(qos.durability()),
+                qos: Arc::new(qos),
             };
             (data.topic_name().clone(), endpoint)
         });
-        let foreign = |(_, endpoint): &(String, Endpoint)| endpoint.guid.prefix != own;
-        Self::from_endpoints(writers.filter(foreign), readers.filter(foreign))
+        let mut foreign = |(_, endpoint): &(String, Endpoint)| {
+            let foreign = endpoint.guid.prefix != prefix;
+            if !foreign {
+                own.insert(endpoint.guid);
+            }
+            foreign
+        };
+        let writers: Vec<_> = writers.filter(&mut foreign).collect();
+        let readers: Vec<_> = readers.filter(&mut foreign).collect();
+        Self {
+            own,
+            ..Self::from_endpoints(writers, readers)
+        }
     }
 
     /// Sorts endpoints by topic, leaving out what is not a ROS topic.
@@ -72,9 +96,19 @@ impl Graph {
         writers: impl IntoIterator<Item = (String, Endpoint)>,
         readers: impl IntoIterator<Item = (String, Endpoint)>,
     ) -> Self {
+        let mut participants = BTreeSet::new();
+        let mut note = |endpoint: &Endpoint| {
+            if let Ok(prefix) = ParticipantPrefix::try_from(endpoint.guid.prefix.as_ref()) {
+                participants.insert(prefix);
+            }
+        };
+        let writers = by_topic(writers.into_iter().inspect(|(_, writer)| note(writer)));
+        let readers = by_topic(readers.into_iter().inspect(|(_, reader)| note(reader)));
         Self {
-            writers: by_topic(writers),
-            readers: by_topic(readers),
+            writers,
+            readers,
+            participants,
+            own: BTreeSet::new(),
         }
     }
 
@@ -88,6 +122,28 @@ impl Graph {
     #[must_use]
     pub fn readers(&self, topic: &str) -> &[Endpoint] {
         self.readers.get(topic).map_or(&[], Vec::as_slice)
+    }
+
+    /// Endpoints of our own that were announced. Empty, too, where RustDDS cannot hear itself, as without multicast.
+    #[must_use]
+    pub fn own(&self) -> &BTreeSet<GUID> {
+        &self.own
+    }
+
+    /// Whether there is a reader or writer of a ROS topic with this GUID.
+    #[must_use]
+    pub fn holds(&self, guid: GUID) -> bool {
+        self.writers
+            .values()
+            .chain(self.readers.values())
+            .flatten()
+            .any(|endpoint| endpoint.guid == guid)
+    }
+
+    /// What the GUIDs of the participants begin with that have any reader or writer, be it of ROS or not.
+    #[must_use]
+    pub fn participants(&self) -> &BTreeSet<ParticipantPrefix> {
+        &self.participants
     }
 
     /// The topics somebody writes.

@@ -94,6 +94,12 @@ impl<K: Clone> Inbox<K> {
         Some(before)
     }
 
+    /// Who the reader in a slot is to others.
+    #[must_use]
+    pub fn guid(&self, id: SlotId) -> Option<GUID> {
+        self.slots.get(&id.0).map(|slot| slot.reader.guid())
+    }
+
     /// Takes a reader out.
     pub fn remove(&mut self, id: SlotId) -> Option<Reader> {
         self.slots.remove(&id.0).map(|slot| slot.reader)

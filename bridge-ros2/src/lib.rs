@@ -1,20 +1,28 @@
 //! The ROS 2 side of the bridge: topics of a DDS domain as bytes, and the port that ties them to the space.
 //!
-//! Discovery, reliability and fragments are RustDDS'; `ros2-client` gives the process its ROS node. The samples
-//! themselves go past both as bytes, because their types are known at run time only.
+//! Discovery, reliability and fragments are RustDDS'; what makes a participant a ROS node is here. The samples go past
+//! RustDDS as bytes, because their types are known at run time only.
 
 mod cdr;
+pub mod clock;
+pub mod compatibility;
 mod definitions;
+pub mod discovery_info;
 pub mod domain;
 pub mod graph;
 pub mod inbox;
+pub mod limits;
+pub mod node;
 pub mod outlet;
 pub mod parameters;
 mod port;
 pub mod qos;
 pub mod raw;
+mod ros_args;
+mod rosout;
 pub mod service;
 mod sink;
 mod source;
 
 pub use port::{PortOptions, Ros2Port};
+pub use ros_args::RosArgs;

@@ -1,13 +1,16 @@
 //! `bridge-ros2`: carries topics between a ROS 2 domain and the space.
 
-use std::net::IpAddr;
+use std::fmt::Display;
+use std::net::{IpAddr, SocketAddr, ToSocketAddrs as _};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use bridge_core::Local;
 use bridge_node::{Arguments, Context, Failure, FailureKind, Program};
+use bridge_ros2::discovery_info::GidLength;
 use bridge_ros2::domain::{DiscoveryRange, DomainError, DomainOptions};
-use bridge_ros2::{PortOptions, Ros2Port};
+use bridge_ros2::node::NodeOptions;
+use bridge_ros2::{PortOptions, Ros2Port, RosArgs, limits};
 use clap::Parser;
 use mappings::{Mapping, SpaceId};
 use transport::{Interface, InterfaceError};
@@ -18,27 +21,72 @@ fn main() -> ExitCode {
 
 /// Carries topics between a ROS 2 domain and the space of OPC UA PubSub.
 #[derive(Debug, Parser)]
-#[command(name = "bridge-ros2", version)]
+#[command(name = "bridge-ros2", version = limits::VERSION)]
 struct BridgeRos2 {
     #[command(flatten)]
     arguments: Arguments,
-    /// The DDS domain to join; without it the domain of the space, or of the mapping's only ROS 2 space
-    #[arg(long, value_name = "N", env = "ROS_DOMAIN_ID", value_parser = clap::value_parser!(u16).range(0..=232))]
-    domain: Option<u16>,
-    /// The space of this domain's values, 2 to 232; without it the one the mapping gives the domain, or the one of the
-    /// domain's number
-    #[arg(long, value_name = "N", env = "UA_SPACE", value_parser = clap::value_parser!(u16).range(2..=232))]
-    space: Option<u16>,
+    /// The DDS domain to join, or several as 2,3; without it the domain of the space, or of the mapping's only ROS 2
+    /// space
+    #[arg(long, value_name = "N", env = "ROS_DOMAIN_ID", value_delimiter = ',', value_parser = clap::value_parser!(u16).range(0..=232))]
+    domain: Vec<u16>,
+    /// The space of this domain's values, 2 to 232, or one for each domain as 40,41; without it the one the mapping
+    /// gives the domain, or the one of the domain's number
+    #[arg(long, value_name = "N", env = "UA_SPACE", value_delimiter = ',', value_parser = clap::value_parser!(u16).range(2..=232))]
+    space: Vec<u16>,
     /// The network interface of the ROS 2 side, by name or address; without it what `ROS_AUTOMATIC_DISCOVERY_RANGE`
     /// and `ROS_LOCALHOST_ONLY` say, else all
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_ROS_INTERFACE")]
     ros_interface: Option<String>,
+    /// A host to announce the bridge to by unicast, where multicast does not reach; may be repeated. Without it the
+    /// hosts in `ROS_STATIC_PEERS`, separated by `;`
+    #[arg(long, value_name = "ADDRESS")]
+    ros_peer: Vec<String>,
+    /// The name of the bridge's node
+    #[arg(long, value_name = "NAME", default_value = NODE_NAME)]
+    node_name: String,
+    /// The namespace of the bridge's node
+    #[arg(long, value_name = "/NAMESPACE", default_value = "/")]
+    node_namespace: String,
+    /// Take the time for what is stamped from /clock
+    #[arg(long)]
+    use_sim_time: bool,
+    /// How many bytes a Gid has in the node's list of readers and writers: 24 up to ROS 2 Humble, 16 from Iron on
+    #[arg(long, value_name = "16|24|auto", default_value = "auto", value_parser = gid_length)]
+    gid: GidChoice,
+    /// Arguments as `ros2 run` has them: -r __node:=NAME, -r __ns:=/NAMESPACE, -p use_sim_time:=true; ends with `--`
+    #[arg(
+        long,
+        value_name = "ROS_ARGS",
+        num_args = 0..,
+        allow_hyphen_values = true,
+        value_terminator = "--"
+    )]
+    ros_args: Vec<String>,
 }
 
 impl BridgeRos2 {
+    /// The node to be; ROS arguments win.
+    fn node(&self) -> Result<NodeOptions, Failure> {
+        let RosArgs {
+            name,
+            namespace,
+            use_sim_time,
+        } = RosArgs::parse(&self.ros_args)
+            .map_err(|error| Failure::new(FailureKind::Usage, error))?;
+        Ok(NodeOptions {
+            namespace: namespace.unwrap_or_else(|| self.node_namespace.clone()),
+            name: name.unwrap_or_else(|| self.node_name.clone()),
+            gid: self.gid.0,
+            use_sim_time: use_sim_time.unwrap_or(self.use_sim_time),
+        })
+    }
+
     /// The domain to join for the space `own`.
     fn domain(&self, own: SpaceId, mapping: &Mapping) -> u16 {
-        self.domain
+        let spaces = choose_spaces(&self.space, &self.domain, mapping).unwrap_or_default();
+        let asked = spaces.iter().position(|space| *space == own);
+        asked
+            .and_then(|place| self.domain.get(place).copied())
             .or_else(|| mapping.domain_of(own))
             .unwrap_or_else(|| own.into())
     }
@@ -65,6 +113,37 @@ impl BridgeRos2 {
     }
 }
 
+/// The addresses of hosts given as the command line and the environment have them.
+fn peers(given: &[String], variable: Option<&str>) -> Result<Vec<IpAddr>, Failure> {
+    let listed = variable.unwrap_or_default().split(';');
+    let hosts: Vec<&str> = if given.is_empty() {
+        listed
+            .map(str::trim)
+            .filter(|host| !host.is_empty())
+            .collect()
+    } else {
+        given.iter().map(String::as_str).collect()
+    };
+    hosts.into_iter().map(address).collect()
+}
+
+/// The address of one host; RustDDS speaks IPv4.
+fn address(host: &str) -> Result<IpAddr, Failure> {
+    if let Ok(IpAddr::V6(_)) = host.parse() {
+        let message = format!("peer {host}: only IPv4 addresses can be reached");
+        return Err(Failure::new(FailureKind::Usage, message));
+    }
+    let unknown =
+        |why: &dyn Display| Failure::new(FailureKind::Unavailable, format!("peer {host}: {why}"));
+    let mut addresses = (host, 0)
+        .to_socket_addrs()
+        .map_err(|error| unknown(&error))?;
+    addresses
+        .find(SocketAddr::is_ipv4)
+        .map(|address| address.ip())
+        .ok_or_else(|| unknown(&"has no IPv4 address"))
+}
+
 impl Program for BridgeRos2 {
     type Port = Ros2Port;
 
@@ -72,24 +151,28 @@ impl Program for BridgeRos2 {
     const LOCAL: Local = Local::Cdr;
     // On leaving a domain RustDDS reports errors that mean nothing, and at all times much that only its authors need.
     const QUIET: &'static str = "rustdds=error,rustdds::dds::pubsub=off,rustdds::network=off,\
-                                 rustdds::rtps::dp_event_loop=off,ros2_client=warn";
+                                 rustdds::rtps::dp_event_loop=off";
 
     fn arguments(&self) -> &Arguments {
         &self.arguments
     }
 
-    fn own(&self, mapping: &Mapping) -> Result<SpaceId, Failure> {
-        choose_space(self.space, self.domain, mapping)
+    fn spaces(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
+        choose_spaces(&self.space, &self.domain, mapping)
             .map_err(|message| Failure::new(FailureKind::Usage, message))
     }
 
-    async fn start(self, context: Context) -> Result<Ros2Port, Failure> {
+    async fn start(&self, context: Context) -> Result<Ros2Port, Failure> {
         let Context { mapping, own } = context;
         let options = PortOptions {
             domain: DomainOptions {
                 domain: self.domain(own, &mapping),
                 networks: self.networks()?,
-                node: NODE_NAME.to_owned(),
+                peers: peers(
+                    &self.ros_peer,
+                    std::env::var("ROS_STATIC_PEERS").ok().as_deref(),
+                )?,
+                node: self.node()?,
             },
             own,
             mapping,
@@ -98,7 +181,10 @@ impl Program for BridgeRos2 {
                 .unwrap_or_default(),
         };
         Ros2Port::start(options).map_err(|error| {
-            let kind = if matches!(error, DomainError::Domain(_)) {
+            let kind = if matches!(
+                error,
+                DomainError::Domain(_) | DomainError::NodeName { .. } | DomainError::Peers
+            ) {
                 FailureKind::Usage
             } else {
                 FailureKind::Unavailable
@@ -108,7 +194,49 @@ impl Program for BridgeRos2 {
     }
 }
 
-/// The space a bridge serves: what was asked for, else the space of the domain asked for, else the mapping's only one.
+/// The spaces a bridge serves, one for each domain asked for.
+fn choose_spaces(
+    spaces: &[u16],
+    domains: &[u16],
+    mapping: &Mapping,
+) -> Result<Vec<SpaceId>, String> {
+    if !spaces.is_empty() && !domains.is_empty() && spaces.len() != domains.len() {
+        return Err(format!(
+            "{} spaces for {} domains: --space and --domain (ROS_DOMAIN_ID) go together, one space for each domain",
+            spaces.len(),
+            domains.len()
+        ));
+    }
+    for (what, numbers) in [("domain", domains), ("space", spaces)] {
+        if let Some(twice) = repeated(numbers) {
+            return Err(format!("{what} {twice} is asked for twice"));
+        }
+    }
+    let count = spaces.len().max(domains.len()).max(1);
+    let chosen: Vec<SpaceId> = (0..count)
+        .map(|place| {
+            choose_space(
+                spaces.get(place).copied(),
+                domains.get(place).copied(),
+                mapping,
+            )
+        })
+        .collect::<Result<_, _>>()?;
+    match repeated(&chosen) {
+        Some(twice) => Err(format!("two of the domains are of space {twice}")),
+        None => Ok(chosen),
+    }
+}
+
+fn repeated<T: Copy + PartialEq>(all: &[T]) -> Option<T> {
+    let before = |place: usize| all.iter().take(place);
+    all.iter()
+        .enumerate()
+        .find(|(place, one)| before(*place).any(|other| other == *one))
+        .map(|(_, one)| *one)
+}
+
+/// The space of one domain: what was asked for, else the space of the domain asked for, else the mapping's only one.
 fn choose_space(
     space: Option<u16>,
     domain: Option<u16>,
@@ -142,13 +270,26 @@ fn choose_space(
     match (declared.next(), declared.next()) {
         (Some(only), None) => Ok(only),
         (Some(_), Some(_)) => Err(
-            "the mapping has several ROS 2 spaces: say which with --space N or --domain N"
+            "the mapping has several ROS 2 spaces: say which with --space N, or --space N,M for several in one program"
                 .to_owned(),
         ),
         (None, _) => Err(
             "which DDS domain? Say --domain N (or set ROS_DOMAIN_ID), or declare a ROS 2 space in the mapping"
                 .to_owned(),
         ),
+    }
+}
+
+/// A fixed length, or that which most others write.
+#[derive(Debug, Clone, Copy)]
+struct GidChoice(Option<GidLength>);
+
+fn gid_length(text: &str) -> Result<GidChoice, &'static str> {
+    match text {
+        "16" => Ok(GidChoice(Some(GidLength::Bytes16))),
+        "24" => Ok(GidChoice(Some(GidLength::Bytes24))),
+        "auto" => Ok(GidChoice(None)),
+        _ => Err("16, 24 or auto expected"),
     }
 }
 
@@ -166,9 +307,39 @@ mod tests {
     }
 
     #[test]
+    fn the_node_is_what_ros_arguments_say() {
+        let line =
+            "bridge-ros2 cell.yaml --ros-args -r __node:=left -p use_sim_time:=true -- --check";
+        let bridge = BridgeRos2::try_parse_from(line.split(' ')).unwrap();
+        let node = bridge.node().unwrap();
+        assert_eq!(
+            (node.full_name().as_str(), node.use_sim_time),
+            ("/left", true)
+        );
+        assert!(bridge.arguments.check && bridge.arguments.mapping.is_some());
+    }
+
+    #[test]
     fn a_domain_is_the_space_of_its_number() {
         let space = choose_space(None, Some(7), &Mapping::default()).unwrap();
         assert_eq!(space.get(), 7);
+    }
+
+    #[test]
+    fn several_domains_are_several_spaces() {
+        let none = Mapping::default();
+        let numbers = |spaces: Vec<SpaceId>| spaces.iter().map(|id| id.get()).collect::<Vec<_>>();
+        assert_eq!(numbers(choose_spaces(&[], &[7, 8], &none).unwrap()), [7, 8]);
+        let both = choose_spaces(&[40, 41], &[0, 1], &none);
+        assert_eq!(numbers(both.unwrap()), [40, 41]);
+        for (spaces, domains, why) in [
+            (&[40][..], &[0, 1][..], "1 spaces for 2 domains"),
+            (&[], &[7, 7], "domain 7 is asked for twice"),
+            (&[40, 40], &[], "space 40 is asked for twice"),
+        ] {
+            let error = choose_spaces(spaces, domains, &none).unwrap_err();
+            assert!(error.contains(why), "{error}");
+        }
     }
 
     #[test]

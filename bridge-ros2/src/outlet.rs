@@ -10,10 +10,11 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use rustdds::dds::WriteError;
-use rustdds::{DataWriterStatus, GUID, RTPSEntity, StatusEvented, Timestamp};
+use rustdds::{DataWriterStatus, GUID, StatusEvented, Timestamp};
 use tokio::time::Instant;
 
 use crate::graph::Endpoint;
+use crate::limits;
 use crate::qos::Offered;
 use crate::raw::{Payload, Writer};
 
@@ -42,21 +43,17 @@ enum Audience {
     /// Nobody. A state topic holds its last value back: written to a writer without readers it would stay in RustDDS'
     /// history, whose pruning spares what nobody acknowledged, and a late joiner would be given a trail of old values.
     Nobody { held: Option<Sample> },
-    /// Somebody, from this moment on, with the size above which a sample may fail to reach them.
-    Present {
-        since: Instant,
-        reliable_size: usize,
-    },
+    /// Somebody, from this moment on, whom a sample of at most that size reaches.
+    Present { since: Instant, sample_size: usize },
 }
 
-/// Why a sample was not, or perhaps not, delivered.
+/// Why a sample was not delivered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Refusal {
     /// The send window is full, and the waiting room too: the oldest waiting sample made room for this one.
     Overflow,
-    /// Handed to RustDDS, but larger than this: when a receiver's socket buffer overflows, RustDDS repairs too slowly
-    /// for the sample ever to be complete.
+    /// Larger than this many bytes, which is what readers of this topic receive for certain ([`limits`]). Not written.
     TooLarge(usize),
     /// RustDDS failed; it does so only when one of its threads has died.
     Failed,
@@ -123,7 +120,7 @@ impl Outlet {
     /// Writes a sample, or queues it. Never waits.
     ///
     /// # Errors
-    /// [`Refusal`]: one sample was lost, this or an older one, or this one may be.
+    /// [`Refusal`]: one sample was lost, this or an older one.
     pub fn offer(
         &mut self,
         payload: Payload,
@@ -134,25 +131,26 @@ impl Outlet {
         if matches!(self.audience, Audience::Nobody { .. }) {
             self.notice_matches(now);
         }
-        let reliable_size = match &mut self.audience {
+        match &mut self.audience {
             Audience::Nobody { held } if self.offered == Offered::KeepLatest => {
                 *held = Some(sample);
                 return Ok(());
             }
-            Audience::Nobody { .. } => usize::MAX,
+            Audience::Nobody { .. } => {}
+            Audience::Present { sample_size, .. } if sample.payload.len() > *sample_size => {
+                return Err(Refusal::TooLarge(*sample_size));
+            }
             Audience::Present { since, .. } if now < *since => {
                 return self.queue(sample, self.offered.waiting_room().max(SETTLING_ROOM));
             }
-            Audience::Present { reliable_size, .. } => *reliable_size,
-        };
-        let size = sample.payload.len();
+            Audience::Present { .. } => {}
+        }
         self.flush(now)?;
         if !self.waiting.is_empty() {
             return self.queue(sample, self.offered.waiting_room());
         }
         match self.write(sample, now)? {
             Some(unsent) => self.queue(unsent, self.offered.waiting_room()),
-            None if size > reliable_size => Err(Refusal::TooLarge(reliable_size)),
             None => Ok(()),
         }
     }
@@ -188,13 +186,7 @@ impl Outlet {
             }
             return Ok(());
         }
-        let fast_dds = readers.iter().any(Endpoint::is_fast_dds);
-        let size = if fast_dds {
-            FAST_DDS_SIZE
-        } else {
-            RELIABLE_SIZE
-        };
-        match self.greet(now, size) {
+        match self.greet(now, limits::sample_size(readers)) {
             Some(held) => self.offer(held.payload, held.source, now),
             None => Ok(()),
         }
@@ -207,26 +199,23 @@ impl Outlet {
                 && current.count() > 0
             {
                 // The value held back is older than the one about to be written, which replaces it.
-                drop(self.greet(now, FAST_DDS_SIZE));
+                drop(self.greet(now, limits::TO_ANY));
             }
         }
     }
 
     /// Takes note of readers; returns the value that was held back from nobody.
-    fn greet(&mut self, now: Instant, reliable_size: usize) -> Option<Sample> {
+    fn greet(&mut self, now: Instant, size: usize) -> Option<Sample> {
         match &mut self.audience {
-            Audience::Present {
-                reliable_size: size,
-                ..
-            } => {
-                *size = reliable_size;
+            Audience::Present { sample_size, .. } => {
+                *sample_size = size;
                 None
             }
             Audience::Nobody { held } => {
                 let held = held.take();
                 self.audience = Audience::Present {
                     since: now + SETTLE,
-                    reliable_size,
+                    sample_size: size,
                 };
                 held
             }
@@ -304,8 +293,3 @@ const SETTLING_ROOM: usize = 512;
 const STUCK_AFTER: Duration = Duration::from_millis(500);
 /// Memory a topic may take for readers that do not acknowledge; the send window counts samples, whatever their size.
 const MAX_IN_FLIGHT: usize = 64 * 1024 * 1024;
-/// Measured: one sample in ten of 1 MiB reached a Fast DDS reader with the system's default socket buffers, and all of
-/// 262 kB did.
-const FAST_DDS_SIZE: usize = 256 * 1024;
-/// Measured: Cyclone DDS readers received 2 MiB and lost 3 MiB.
-const RELIABLE_SIZE: usize = 2 * 1024 * 1024;

@@ -18,15 +18,17 @@ use bridge_node::{Delivery, Kept, Port, PortEvent, Services, now};
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::TypeName;
-use rustdds::{DomainParticipantStatusEvent, DomainParticipantStatusListener, StatusEvented};
+use rustdds::{DomainParticipantStatusEvent, DomainParticipantStatusListener, GUID, StatusEvented};
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 use uadp::BuiltinType;
 
+use crate::clock::RosClock;
 use crate::definitions::Definitions;
 use crate::domain::{Domain, DomainError, DomainOptions};
 use crate::graph::{Graph, dds_topic};
 use crate::inbox::{Inbox, Taken};
+use crate::limits;
 use crate::outlet::Refusal;
 use crate::parameters::ParameterServer;
 use crate::raw::{Payload, Reader};
@@ -74,6 +76,9 @@ pub struct Ros2Port {
     events: VecDeque<PortEvent>,
     /// Endpoints that may still be made before the next [`reconcile`](Self::reconcile).
     budget: usize,
+    clock: RosClock,
+    /// Endpoints of others that were told and counted as incompatible with ours.
+    incompatible: BTreeSet<GUID>,
     /// What was already told, so that it is told once.
     told: BTreeSet<(String, &'static str)>,
     schedule: Schedule,
@@ -97,6 +102,8 @@ impl Ros2Port {
             space = %own,
             node = domain.node_name(),
             networks = ?domain_options.networks,
+            peers = ?domain_options.peers,
+            dds = limits::RUSTDDS,
             "joined the DDS domain"
         );
         let mut definitions = Definitions::new(prefixes);
@@ -109,6 +116,7 @@ impl Ros2Port {
             definitions: &mut definitions,
         };
         let (services, bound) = Services::start(&mut graph, own, &mapping);
+        let clock = domain.clock();
         let mut port = Self {
             discovery: domain.status_listener(),
             domain,
@@ -125,6 +133,8 @@ impl Ros2Port {
             retired: VecDeque::new(),
             events: bound.into(),
             budget: MAX_BATCH,
+            clock,
+            incompatible: BTreeSet::new(),
             told: BTreeSet::new(),
             schedule: Schedule::new(),
         };
@@ -313,7 +323,6 @@ impl Port for Ros2Port {
             }
             return Ok(());
         }
-        let payload = Payload::to_write(payload).map_err(|error| error.label())?;
         let Some(Sink {
             open: Some(open),
             dds_topic,
@@ -322,6 +331,8 @@ impl Port for Ros2Port {
         else {
             return Err("no writer yet");
         };
+        let payload = open.stamped(payload, || self.clock.now());
+        let payload = Payload::to_write(payload).map_err(|error| error.label())?;
         let size = payload.len();
         let offered = open
             .outlet
@@ -331,9 +342,9 @@ impl Port for Ros2Port {
             let dds_topic = dds_topic.clone();
             self.tell_once(&dds_topic, "too large", || {
                 format!(
-                    "a message of {size} bytes may not arrive: above {limit} bytes the DDS stack repairs a lost \
-                     fragment too slowly. Larger socket buffers at the subscriber (net.core.rmem_max, \
-                     net.core.rmem_default) help"
+                    "a message of {size} bytes is not sent: above {limit} bytes it might never be complete at a \
+                     subscriber of this topic ({})",
+                    limits::RUSTDDS
                 )
             });
         }

@@ -2,7 +2,7 @@
 
 use std::num::NonZeroU16;
 
-use rustdds::policy::{Durability, History, ResourceLimits};
+use rustdds::policy::{Deadline, Durability, History, ResourceLimits};
 use rustdds::{Duration, QosPolicies, QosPolicyBuilder};
 
 use crate::graph::Endpoint;
@@ -89,6 +89,18 @@ impl Offered {
         }
     }
 
+    /// The same with a deadline, in case readers ask for one: a reader that does is not matched by a writer that offers
+    /// none.
+    #[must_use]
+    pub fn with_deadline(self, deadline: Option<Duration>) -> QosPolicies {
+        match deadline {
+            None => self.policies(),
+            Some(deadline) => self
+                .policies()
+                .modify_by(&QosPolicyBuilder::new().deadline(Deadline(deadline)).build()),
+        }
+    }
+
     /// How many samples may wait on our side of a full send window.
     #[must_use]
     pub fn waiting_room(self) -> usize {
@@ -130,6 +142,7 @@ mod tests {
             type_name: "std_msgs::msg::dds_::Bool_".into(),
             reliable,
             transient_local,
+            qos: Default::default(),
         }
     }
 

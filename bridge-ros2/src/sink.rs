@@ -2,9 +2,13 @@
 
 use std::sync::Arc;
 
+use bytes::{Bytes, BytesMut};
 use mappings::{Overflow, TopicId, Variable};
 use messages::{MessageType, Selection, TypeName};
+use rustdds::Duration;
 
+use crate::clock::RosTime;
+use crate::compatibility::finite_deadline;
 use crate::graph::{Endpoint, dds_topic};
 use crate::outlet::Outlet;
 use crate::qos::Offered;
@@ -27,6 +31,45 @@ pub(crate) struct Sink {
 pub(crate) struct Open {
     pub(crate) message_type: Arc<MessageType>,
     pub(crate) outlet: Outlet,
+    /// The shortest deadline readers asked for, which the writer offers.
+    pub(crate) deadline: Option<Duration>,
+    /// How often it was made shorter.
+    pub(crate) tightened: u32,
+    /// Whether its header's stamp is ours to set: only one field of the message is the value, and not the stamp.
+    pub(crate) stamps: bool,
+}
+
+impl Open {
+    /// The message with the time in its header, if that is not part of the value.
+    pub(crate) fn stamped(&self, message: Bytes, now: impl Fn() -> RosTime) -> Bytes {
+        if !self.stamps {
+            return message;
+        }
+        let mut message = message
+            .try_into_mut()
+            .unwrap_or_else(|shared| BytesMut::from(shared.as_ref()));
+        // Behind the encapsulation header, std_msgs/Header: stamp, then frame_id. What we write is little endian.
+        if let Some(stamp) = message.get_mut(4..12) {
+            let RosTime { sec, nanosec } = now();
+            let (secs, nanos) = stamp.split_at_mut(4);
+            secs.copy_from_slice(&sec.to_le_bytes());
+            nanos.copy_from_slice(&nanosec.to_le_bytes());
+        }
+        message.freeze()
+    }
+
+    /// A deadline that a reader asks for and the writer does not offer yet.
+    pub(crate) fn shorter_deadline(&self, readers: &[Endpoint]) -> Option<Duration> {
+        shortest_deadline(readers)
+            .filter(|wanted| self.deadline.is_none_or(|offered| *wanted < offered))
+            .filter(|_| self.tightened < MOST_TIGHTENED)
+    }
+}
+
+/// The shortest deadline among those readers ask for.
+pub(crate) fn shortest_deadline(readers: &[Endpoint]) -> Option<Duration> {
+    let deadlines = readers.iter().map(|reader| finite_deadline(&reader.qos));
+    deadlines.flatten().min()
 }
 
 impl Sink {
@@ -86,12 +129,25 @@ impl Sink {
         })
     }
 
+    /// Whether the stamp at the beginning of such messages is no part of the value.
+    pub(crate) fn stamps(&self, message_type: &MessageType) -> bool {
+        let header = message_type.leaves().first();
+        let selected = self.mapped.as_ref().map(|(_, selection)| selection);
+        header.is_some_and(|leaf| leaf.path == STAMP)
+            && matches!(selected, Some(Selection::Field(path)) if path != STAMP)
+    }
+
     pub(crate) fn selection(&self) -> Selection {
         self.mapped
             .as_ref()
             .map_or(Selection::Whole, |(_, selection)| selection.clone())
     }
 }
+
+/// The first field of a message that begins with a header.
+const STAMP: &str = "header.stamp";
+/// Each other deadline needs another writer, so readers get that many.
+const MOST_TIGHTENED: u32 = 8;
 
 fn offered(overflow: Overflow) -> Offered {
     match overflow {
@@ -111,6 +167,7 @@ mod tests {
             type_name: name.parse::<TypeName>().unwrap().dds(),
             reliable: true,
             transient_local: false,
+            qos: Default::default(),
         }
     }
 
@@ -127,6 +184,20 @@ mod tests {
             names(&sink.candidates(&[reader("std_msgs/Float32")])),
             ["std_msgs/Float32", "std_msgs/Float64"]
         );
+    }
+
+    #[test]
+    fn a_message_of_one_field_gets_a_stamp_and_a_whole_one_keeps_its_own() {
+        let imu: TypeName = "sensor_msgs/Imu".parse().unwrap();
+        let registry = messages::Registry::bundle(messages::Dialect::Ros2);
+        let message_type = registry.get(&imu).unwrap();
+        let stamps = |selection| {
+            Sink::mapped("/imu", imu.clone(), selection, Overflow::KeepLatest).stamps(&message_type)
+        };
+        assert!(stamps(Selection::Field("angular_velocity.z".to_owned())));
+        assert!(!stamps(Selection::Field("header.stamp".to_owned())));
+        assert!(!stamps(Selection::Whole));
+        assert!(!stamps(Selection::Bytes));
     }
 
     #[test]

@@ -61,6 +61,7 @@ mod plan;
 mod registry;
 mod resolve;
 mod service;
+mod type_hash;
 
 pub use convert::{date_time_to_time, duration_to_millis, millis_to_duration, time_to_date_time};
 pub use definition::Constant;
@@ -73,3 +74,4 @@ pub use name::{Dialect, TypeName};
 pub use plan::{Literal, Plan, Selection, Wire};
 pub use registry::Registry;
 pub use service::{ActionType, ServiceType};
+pub use type_hash::{ActionTypeHashes, ServiceTypeHashes, TypeHash};

@@ -37,6 +37,13 @@ impl Leaf {
             rank: Rank::Scalar,
         }
     }
+
+    /// Whether it is a field of the message at `path`.
+    pub fn is_inside(&self, path: &str) -> bool {
+        self.path
+            .strip_prefix(path)
+            .is_some_and(|rest| rest.starts_with('.'))
+    }
 }
 
 /// Whether a field is an array.

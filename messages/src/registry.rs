@@ -96,6 +96,15 @@ impl Registry {
             .map(Arc::new)
     }
 
+    pub(crate) fn definition(&self, name: &TypeName) -> Option<&Arc<Definition>> {
+        self.definitions.get(name)
+    }
+
+    /// Request and response of a service.
+    pub(crate) fn service_definitions(&self, name: &TypeName) -> Option<[&Arc<Definition>; 2]> {
+        self.services.get(name).map(|service| service.parts())
+    }
+
     /// The names of the services there are, in order.
     pub fn services(&self) -> impl Iterator<Item = &TypeName> {
         self.services.keys()

@@ -136,6 +136,11 @@ impl ServiceDefinition {
         })
     }
 
+    /// Request and response.
+    pub(crate) fn parts(&self) -> [&Arc<Definition>; 2] {
+        [&self.request, &self.response]
+    }
+
     pub(crate) fn messages(&self) -> BTreeMap<TypeName, Arc<Definition>> {
         [&self.request, &self.response]
             .into_iter()
@@ -168,17 +173,29 @@ impl ServiceDefinition {
     }
 }
 
+/// Goal, result and feedback of an `.action` text.
+pub(crate) fn action_parts(
+    dialect: Dialect,
+    name: &TypeName,
+    text: &str,
+) -> Result<[Arc<Definition>; 3], DefinitionError> {
+    let [goal, result, feedback] = parts(name, text, ACTION_PARTS)?;
+    Ok([
+        goal.parse(dialect, &derived(name, "Goal")?)?,
+        result.parse(dialect, &derived(name, "Result")?)?,
+        feedback.parse(dialect, &derived(name, "Feedback")?)?,
+    ])
+}
+
+const ACTION_PARTS: &str = "two lines `---` expected, between goal, result and feedback";
+
 /// The seven messages genaction makes of an `.action` text.
 pub(crate) fn action(
     dialect: Dialect,
     name: &TypeName,
     text: &str,
 ) -> Result<Vec<(TypeName, Arc<Definition>)>, DefinitionError> {
-    let [goal, result, feedback] = parts(
-        name,
-        text,
-        "two lines `---` expected, between goal, result and feedback",
-    )?;
+    let goal_result_feedback = action_parts(dialect, name, text)?;
     let x = name.name();
     let status =
         |part| format!("std_msgs/Header header\nactionlib_msgs/GoalStatus status\n{x}{part}");
@@ -196,10 +213,7 @@ pub(crate) fn action(
         ("ActionResult", status("Result result\n")),
         ("ActionFeedback", status("Feedback feedback\n")),
     ];
-    let mut found = Vec::new();
-    for (suffix, part) in [("Goal", goal), ("Result", result), ("Feedback", feedback)] {
-        found.push(part.parse(dialect, &derived(name, suffix)?)?);
-    }
+    let mut found = goal_result_feedback.to_vec();
     for (suffix, text) in made {
         let part = Part { before: 0, text };
         found.push(part.parse(dialect, &derived(name, suffix)?)?);

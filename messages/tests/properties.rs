@@ -13,7 +13,8 @@ mod support;
 use std::collections::HashMap;
 
 use messages::{
-    Dialect, Fault, Plan, ReadError, Registry, Selection, Source, SourceError, Wire, WriteFault,
+    Dialect, Fault, Leaf, Plan, ReadError, Registry, Selection, Source, SourceError, Wire,
+    WriteFault,
 };
 use proptest::prelude::*;
 use proptest::test_runner::{TestRng, TestRunner};
@@ -271,36 +272,41 @@ fn a_field_alone_is_what_it_is_in_the_whole_and_the_rest_is_zero() {
             let (_, bytes) = invent(&whole, &runner.new_rng());
             let mut all = Recorder::default();
             whole.read(&bytes, &mut all).unwrap();
-            let mut pieces = Vec::new();
-            for leaf in message.leaves() {
-                let what = format!("{name} {}", leaf.path);
-                let plan =
-                    Plan::compile(&message, &Selection::Field(leaf.path.clone()), wire).unwrap();
-                assert_eq!(plan.leaves(), std::slice::from_ref(leaf));
-                let mut one = Recorder::default();
-                plan.read(&bytes, &mut one)
-                    .unwrap_or_else(|error| panic!("{what}: {error}"));
-                let mut alone = Vec::new();
-                plan.write(&mut Player::new(&one.events), &mut alone)
-                    .unwrap();
-                let mut back = Recorder::default();
-                plan.read(&alone, &mut back)
-                    .unwrap_or_else(|error| panic!("{what}: {error}"));
-                assert_eq!(back.events, one.events, "{what}");
-                let mut rest = Recorder::default();
-                whole
-                    .read(&alone, &mut rest)
-                    .unwrap_or_else(|error| panic!("{what}: {error}"));
-                assert!(
-                    is_zero_but(&rest.events, &one.events),
-                    "{what}: {:?}",
-                    rest.events
-                );
-                pieces.extend(one.events);
+            let paths = |path: fn(&Leaf) -> &str| {
+                let mut paths: Vec<&str> = message.leaves().iter().map(path).collect();
+                paths.dedup();
+                paths
+            };
+            let each = paths(|leaf| &leaf.path);
+            // A name without a dot is a field of the message itself: a value, or a message of its own.
+            let outer = paths(|leaf| leaf.path.split('.').next().unwrap());
+            for paths in [each, outer] {
+                let pieces = paths.into_iter().flat_map(|path| {
+                    let selection = Selection::Field(path.to_owned());
+                    let plan = Plan::compile(&message, &selection, wire).unwrap();
+                    alone(&plan, &whole, &bytes, &format!("{name} {path}"))
+                });
+                assert_eq!(pieces.collect::<Vec<_>>(), all.events, "{name}");
             }
-            assert_eq!(pieces, all.events, "{name}");
         }
     }
+}
+
+/// What `plan` reads of a message, once it has been written and read again on its own, with zeros around it.
+fn alone(plan: &Plan, whole: &Plan, bytes: &[u8], what: &str) -> Vec<Event> {
+    let read = |plan: &Plan, bytes: &[u8]| {
+        let mut recorder = Recorder::default();
+        plan.read(bytes, &mut recorder)
+            .unwrap_or_else(|error| panic!("{what}: {error}"));
+        recorder.events
+    };
+    let one = read(plan, bytes);
+    let mut written = Vec::new();
+    plan.write(&mut Player::new(&one), &mut written).unwrap();
+    assert_eq!(read(plan, &written), one, "{what}");
+    let rest = read(whole, &written);
+    assert!(is_zero_but(&rest, &one), "{what}: {rest:?}");
+    one
 }
 
 /// Whether all of `events` outside of one run of `carried` are zeros.

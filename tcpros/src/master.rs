@@ -1,6 +1,8 @@
 //! The master API as its client sees it.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use thiserror::Error;
@@ -28,10 +30,15 @@ pub(crate) struct Master {
     uri: String,
     caller_id: String,
     caller_uri: String,
+    /// Whether it turned out not to take several calls in one request.
+    one_by_one: Arc<AtomicBool>,
 }
 
+/// One call: the method, and its parameters without the caller id.
+pub(crate) type Request = (&'static str, Vec<Value>);
+
 impl Master {
-    pub(crate) const fn new(
+    pub(crate) fn new(
         endpoint: Endpoint,
         uri: String,
         caller_id: String,
@@ -42,6 +49,7 @@ impl Master {
             uri,
             caller_id,
             caller_uri,
+            one_by_one: Arc::default(),
         }
     }
 
@@ -78,64 +86,46 @@ impl Master {
         }
     }
 
-    pub(crate) async fn register_publisher(
-        &self,
-        topic: &str,
-        type_name: &str,
-    ) -> Result<(), MasterError> {
-        let params = vec![
-            topic.into(),
-            type_name.into(),
-            self.caller_uri.as_str().into(),
-        ];
-        self.call("registerPublisher", params).await.map(drop)
+    pub(crate) fn register_publisher(&self, topic: &str, type_name: &str) -> Request {
+        let uri = self.caller_uri.as_str();
+        (
+            "registerPublisher",
+            vec![topic.into(), type_name.into(), uri.into()],
+        )
     }
 
-    /// Returns the URIs of the topic's publishers.
-    pub(crate) async fn register_subscriber(
-        &self,
-        topic: &str,
-        type_name: &str,
-    ) -> Result<Vec<String>, MasterError> {
-        let params = vec![
-            topic.into(),
-            type_name.into(),
-            self.caller_uri.as_str().into(),
-        ];
-        let publishers = self.call("registerSubscriber", params).await?;
-        strings(&publishers).ok_or(MasterError::Shape("registerSubscriber"))
+    /// Its result is read by [`publishers`].
+    pub(crate) fn register_subscriber(&self, topic: &str, type_name: &str) -> Request {
+        let uri = self.caller_uri.as_str();
+        (
+            "registerSubscriber",
+            vec![topic.into(), type_name.into(), uri.into()],
+        )
     }
 
-    pub(crate) async fn unregister_publisher(&self, topic: &str) -> Result<(), MasterError> {
-        let params = vec![topic.into(), self.caller_uri.as_str().into()];
-        self.call("unregisterPublisher", params).await.map(drop)
+    pub(crate) fn register_service(&self, service: &str, service_uri: &str) -> Request {
+        let uri = self.caller_uri.as_str();
+        (
+            "registerService",
+            vec![service.into(), service_uri.into(), uri.into()],
+        )
     }
 
-    pub(crate) async fn unregister_subscriber(&self, topic: &str) -> Result<(), MasterError> {
-        let params = vec![topic.into(), self.caller_uri.as_str().into()];
-        self.call("unregisterSubscriber", params).await.map(drop)
+    pub(crate) fn unregister_publisher(&self, topic: &str) -> Request {
+        let uri = self.caller_uri.as_str();
+        ("unregisterPublisher", vec![topic.into(), uri.into()])
     }
 
-    pub(crate) async fn register_service(
-        &self,
-        service: &str,
-        service_uri: &str,
-    ) -> Result<(), MasterError> {
-        let params = vec![
-            service.into(),
-            service_uri.into(),
-            self.caller_uri.as_str().into(),
-        ];
-        self.call("registerService", params).await.map(drop)
+    pub(crate) fn unregister_subscriber(&self, topic: &str) -> Request {
+        let uri = self.caller_uri.as_str();
+        ("unregisterSubscriber", vec![topic.into(), uri.into()])
     }
 
-    pub(crate) async fn unregister_service(
-        &self,
-        service: &str,
-        service_uri: &str,
-    ) -> Result<(), MasterError> {
-        let params = vec![service.into(), service_uri.into()];
-        self.call("unregisterService", params).await.map(drop)
+    pub(crate) fn unregister_service(service: &str, service_uri: &str) -> Request {
+        (
+            "unregisterService",
+            vec![service.into(), service_uri.into()],
+        )
     }
 
     /// The URI registered for a service, `None` when the master knows no such service.
@@ -173,6 +163,58 @@ impl Master {
         None
     }
 
+    /// Makes several calls, in their order, and returns a result for each: in one request (`system.multicall`, an
+    /// extension of XML-RPC that rosmaster has), because to rosmaster a connection costs more than a registration. A
+    /// master without it is called one by one.
+    ///
+    /// # Errors
+    /// When the master cannot be reached; some of the calls may have been made then.
+    pub(crate) async fn call_all(
+        &self,
+        requests: Vec<Request>,
+    ) -> Result<Vec<Result<Value, MasterError>>, MasterError> {
+        if requests.len() > 1 && !self.one_by_one.load(Ordering::Relaxed) {
+            match self.multicall(&requests).await {
+                Err(MasterError::Rpc(RpcError::Fault(_)) | MasterError::Shape(_)) => {
+                    self.one_by_one.store(true, Ordering::Relaxed);
+                }
+                result => return result,
+            }
+        }
+        let mut results = Vec::with_capacity(requests.len());
+        for (method, params) in requests {
+            match self.call(method, params).await {
+                Err(error @ MasterError::Rpc(_)) => return Err(error),
+                result => results.push(result),
+            }
+        }
+        Ok(results)
+    }
+
+    async fn multicall(
+        &self,
+        requests: &[Request],
+    ) -> Result<Vec<Result<Value, MasterError>>, MasterError> {
+        let calls = requests.iter().map(|(method, params)| {
+            let own = std::iter::once(self.caller_id.as_str().into());
+            let params = own.chain(params.iter().cloned()).collect();
+            Value::Struct(vec![
+                ("methodName".to_owned(), (*method).into()),
+                ("params".to_owned(), Value::Array(params)),
+            ])
+        });
+        let params = vec![Value::Array(calls.collect())];
+        let reply = rpc::call(&self.endpoint, MULTICALL, params, CALL_LIMIT).await?;
+        let Value::Array(replies) = reply else {
+            return Err(MasterError::Shape(MULTICALL));
+        };
+        if replies.len() != requests.len() {
+            return Err(MasterError::Shape(MULTICALL));
+        }
+        let methods = requests.iter().map(|(method, _)| *method);
+        Ok(replies.into_iter().zip(methods).map(unwrap_one).collect())
+    }
+
     /// Calls with the caller id in front and unwraps `[code, message, result]`.
     pub(crate) async fn call(
         &self,
@@ -183,6 +225,20 @@ impl Master {
         let reply = rpc::call(&self.endpoint, method, params, CALL_LIMIT).await?;
         unwrap_triple(reply, method)
     }
+}
+
+/// One answer of several: its result in an array of its own, or a struct that says why there is none.
+fn unwrap_one((reply, method): (Value, &'static str)) -> Result<Value, MasterError> {
+    let Value::Array(result) = reply else {
+        return Err(MasterError::Shape(method));
+    };
+    let [result] = <[Value; 1]>::try_from(result).map_err(|_| MasterError::Shape(method))?;
+    unwrap_triple(result, method)
+}
+
+/// The URIs of a topic's publishers, as `registerSubscriber` answers.
+pub(crate) fn publishers(result: &Value) -> Result<Vec<String>, MasterError> {
+    strings(result).ok_or(MasterError::Shape("registerSubscriber"))
 }
 
 /// Unwraps what every ROS API returns: status code, status message, result.
@@ -239,4 +295,100 @@ fn pairs<T>(value: &Value, second: impl Fn(&Value) -> Option<T>) -> Option<BTree
     value.as_array()?.iter().map(pair).collect()
 }
 
+const MULTICALL: &str = "system.multicall";
 const CALL_LIMIT: Duration = Duration::from_secs(3);
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+
+    use tokio::net::TcpListener;
+    use tokio::task::JoinSet;
+
+    use super::*;
+    use crate::xmlrpc::{Call, Fault, Response};
+
+    /// A master that answers as `answer` says, and the methods it was asked for.
+    async fn master(
+        answer: fn(&Call) -> Response,
+    ) -> (Master, Arc<Mutex<Vec<String>>>, JoinSet<()>) {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let uri = format!("http://{}/", listener.local_addr().unwrap());
+        let asked = Arc::new(Mutex::new(Vec::new()));
+        let noted = Arc::clone(&asked);
+        let mut tasks = JoinSet::new();
+        tasks.spawn(rpc::serve(listener, move |call| {
+            noted.lock().unwrap().push(call.method.clone());
+            answer(&call)
+        }));
+        let endpoint = Endpoint::parse(&uri).unwrap();
+        let node = ("/node".to_owned(), "http://node:1/".to_owned());
+        (Master::new(endpoint, uri, node.0, node.1), asked, tasks)
+    }
+
+    fn accepted() -> Value {
+        Value::Array(vec![Value::Int(1), "".into(), Value::Int(0)])
+    }
+
+    fn requests(master: &Master) -> Vec<Request> {
+        vec![
+            master.register_publisher("/a", "std_msgs/Bool"),
+            master.register_publisher("/b", "std_msgs/Bool"),
+        ]
+    }
+
+    #[tokio::test]
+    async fn several_calls_are_one_request_and_a_refused_one_leaves_the_others() {
+        let (master, asked, _tasks) = master(|call| {
+            let Some(Value::Array(calls)) = call.params.first() else {
+                return Ok(Value::Nil);
+            };
+            let own = Value::Struct(vec![
+                ("methodName".to_owned(), "registerPublisher".into()),
+                (
+                    "params".to_owned(),
+                    Value::Array(vec![
+                        "/node".into(),
+                        "/b".into(),
+                        "std_msgs/Bool".into(),
+                        "http://node:1/".into(),
+                    ]),
+                ),
+            ]);
+            assert_eq!(calls.get(1), Some(&own));
+            let refused = Value::Array(vec![Value::Int(-1), "no".into(), Value::Int(0)]);
+            let answers = [accepted(), refused].map(|answer| Value::Array(vec![answer]));
+            Ok(Value::Array(answers.to_vec()))
+        })
+        .await;
+        let results = master.call_all(requests(&master)).await.unwrap();
+        assert!(
+            matches!(results.as_slice(), [Ok(_), Err(MasterError::Refused { message, .. })] if message == "no"),
+            "{results:?}"
+        );
+        assert_eq!(*asked.lock().unwrap(), ["system.multicall"]);
+    }
+
+    #[tokio::test]
+    async fn a_master_that_takes_no_several_calls_is_called_one_by_one_from_then_on() {
+        let (master, asked, _tasks) = master(|call| {
+            if call.method == "system.multicall" {
+                return Err(Fault {
+                    code: 1,
+                    message: "no such method".to_owned(),
+                });
+            }
+            Ok(accepted())
+        })
+        .await;
+        for _ in 0..2 {
+            let results = master.call_all(requests(&master)).await.unwrap();
+            assert!(results.iter().all(Result::is_ok), "{results:?}");
+        }
+        let single = "registerPublisher";
+        assert_eq!(
+            *asked.lock().unwrap(),
+            ["system.multicall", single, single, single, single]
+        );
+    }
+}

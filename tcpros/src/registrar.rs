@@ -12,9 +12,10 @@ use tokio::time::{Instant, sleep, timeout};
 
 use crate::clock::{self, Throttle};
 use crate::events;
-use crate::master::MasterError;
+use crate::master::{self, Master, MasterError, Request};
 use crate::node::{Inner, MasterState, Registration, ResourceKind};
 use crate::parameters;
+use crate::xmlrpc::Value;
 
 /// Works until the node is closed and the master has been told.
 pub(crate) async fn run(node: Arc<Inner>) {
@@ -108,21 +109,25 @@ impl Registrar {
             return Err(error);
         }
         let mut jobs = self.jobs();
-        let mut running: JoinSet<Outcome> = JoinSet::new();
+        jobs.sort_by_key(Job::rank);
+        let mut jobs = jobs.into_iter().peekable();
+        let mut running: JoinSet<Result<Vec<Outcome>, MasterError>> = JoinSet::new();
         let mut failure = None;
         loop {
-            while failure.is_none()
-                && running.len() < PARALLEL
-                && let Some(job) = jobs.pop()
-            {
-                running.spawn(perform(Arc::clone(&self.node), job));
+            while failure.is_none() && running.len() < PARALLEL && jobs.peek().is_some() {
+                let batch = jobs.by_ref().take(BATCH).collect();
+                running.spawn(perform(Arc::clone(&self.node), batch));
             }
             let Some(finished) = running.join_next().await else {
                 break;
             };
-            if let Ok(outcome) = finished
-                && let Err(error) = self.note(outcome)
-            {
+            let noted = match finished {
+                Ok(Ok(outcomes)) => outcomes.into_iter().try_for_each(|one| self.note(one)),
+                Ok(Err(error)) => Err(error),
+                // It was aborted with the node's runtime.
+                Err(_) => Ok(()),
+            };
+            if let Err(error) = noted {
                 failure = Some(error);
             }
         }
@@ -254,55 +259,99 @@ impl Registrar {
     }
 }
 
-async fn perform(node: Arc<Inner>, job: Job) -> Outcome {
-    let master = &node.master;
-    match job {
-        Job::Register {
-            registration,
-            replaces,
-        } => {
-            let Registration {
-                name,
-                kind,
-                generation,
-                type_name,
-            } = registration;
-            let result = async {
-                if replaces {
-                    unregister(&node, &name, kind).await?;
-                }
-                match kind {
-                    ResourceKind::Published => master.register_publisher(&name, &type_name).await,
-                    ResourceKind::Subscribed => {
-                        let seen = node.updates(&name);
-                        let publishers = master.register_subscriber(&name, &type_name).await?;
-                        node.registered_publishers(&name, &publishers, seen);
-                        Ok(())
-                    }
-                    ResourceKind::Service => {
-                        master.register_service(&name, &node.service_uri).await
-                    }
-                }
-            };
-            let result = result.await;
-            ((name, kind), Some(generation), result)
+/// Tells the master several things in one request.
+async fn perform(node: Arc<Inner>, jobs: Vec<Job>) -> Result<Vec<Outcome>, MasterError> {
+    // Lists of publishers that come while the master answers are newer than its answer.
+    let seen: Vec<u64> = jobs.iter().map(|job| job.updates(&node)).collect();
+    let requests = jobs.iter().flat_map(|job| job.requests(&node)).collect();
+    let mut results = node.master.call_all(requests).await?.into_iter();
+    let settle = |(job, seen): (Job, u64)| {
+        let answer = || MasterError::Shape("system.multicall");
+        let mut next = || results.next().unwrap_or_else(|| Err(answer()));
+        match job {
+            Job::Register {
+                registration,
+                replaces,
+            } => {
+                // A master that does not know the one before has nothing to forget.
+                let forgotten = if replaces { next().map(drop) } else { Ok(()) };
+                drop(forgotten);
+                let result =
+                    next().and_then(|result| registered(&node, &registration, &result, seen));
+                let key = (registration.name, registration.kind);
+                (key, Some(registration.generation), result)
+            }
+            Job::Unregister { name, kind } => ((name, kind), None, next().map(drop)),
         }
-        Job::Unregister { name, kind } => {
-            let result = unregister(&node, &name, kind).await;
-            ((name, kind), None, result)
+    };
+    Ok(jobs.into_iter().zip(seen).map(settle).collect())
+}
+
+/// What follows from the master's answer to a registration.
+fn registered(
+    node: &Inner,
+    registration: &Registration,
+    result: &Value,
+    seen: u64,
+) -> Result<(), MasterError> {
+    if registration.kind == ResourceKind::Subscribed {
+        let publishers = master::publishers(result)?;
+        node.registered_publishers(&registration.name, &publishers, seen);
+    }
+    Ok(())
+}
+
+impl Job {
+    /// What the master has to be asked, in this order.
+    fn requests(&self, node: &Inner) -> Vec<Request> {
+        let master = &node.master;
+        match self {
+            Self::Register {
+                registration,
+                replaces,
+            } => {
+                let (name, type_name) = (&registration.name, &registration.type_name);
+                let before = replaces.then(|| unregister(node, name, registration.kind));
+                let register = match registration.kind {
+                    ResourceKind::Published => master.register_publisher(name, type_name),
+                    ResourceKind::Subscribed => master.register_subscriber(name, type_name),
+                    ResourceKind::Service => master.register_service(name, &node.service_uri),
+                };
+                before.into_iter().chain([register]).collect()
+            }
+            Self::Unregister { name, kind } => vec![unregister(node, name, *kind)],
+        }
+    }
+
+    fn updates(&self, node: &Inner) -> u64 {
+        match self {
+            Self::Register { registration, .. }
+                if registration.kind == ResourceKind::Subscribed =>
+            {
+                node.updates(&registration.name)
+            }
+            Self::Register { .. } | Self::Unregister { .. } => 0,
+        }
+    }
+
+    /// Publishers before subscribers: a registered subscriber is told of each publisher that comes after it.
+    fn rank(&self) -> u8 {
+        match self {
+            Self::Unregister { .. } => 0,
+            Self::Register { registration, .. } => match registration.kind {
+                ResourceKind::Published => 1,
+                ResourceKind::Service => 2,
+                ResourceKind::Subscribed => 3,
+            },
         }
     }
 }
 
-async fn unregister(node: &Inner, name: &str, kind: ResourceKind) -> Result<(), MasterError> {
+fn unregister(node: &Inner, name: &str, kind: ResourceKind) -> Request {
     match kind {
-        ResourceKind::Published => node.master.unregister_publisher(name).await,
-        ResourceKind::Subscribed => node.master.unregister_subscriber(name).await,
-        ResourceKind::Service => {
-            node.master
-                .unregister_service(name, &node.service_uri)
-                .await
-        }
+        ResourceKind::Published => node.master.unregister_publisher(name),
+        ResourceKind::Subscribed => node.master.unregister_subscriber(name),
+        ResourceKind::Service => Master::unregister_service(name, &node.service_uri),
     }
 }
 
@@ -318,4 +367,7 @@ async fn check_hostname(hostname: String) {
 
 const TICK: Duration = Duration::from_secs(1);
 const LONGEST_WAIT: Duration = Duration::from_secs(2);
-const PARALLEL: usize = 16;
+/// Registrations in one request.
+const BATCH: usize = 64;
+/// Requests at a time.
+const PARALLEL: usize = 4;

@@ -60,6 +60,24 @@ class JointState(IdlStruct, typename="sensor_msgs.msg.dds_.JointState_"):
 
 @dataclass
 @final
+class Clock(IdlStruct, typename="rosgraph_msgs.msg.dds_.Clock_"):
+    clock: Time = field(default_factory=Time)
+
+
+@dataclass
+@final
+class Log(IdlStruct, typename="rcl_interfaces.msg.dds_.Log_"):
+    stamp: Time = field(default_factory=Time)
+    level: uint8 = 0
+    name: str = ""
+    msg: str = ""
+    file: str = ""
+    function: str = ""
+    line: uint32 = 0
+
+
+@dataclass
+@final
 class Unheard(IdlStruct, typename="nobody_msgs.msg.dds_.Unheard_"):
     """A type no bridge has a definition of."""
 
@@ -72,6 +90,8 @@ TYPES = {
     "std_msgs/Float64": Float64,
     "std_msgs/String": String,
     "sensor_msgs/JointState": JointState,
+    "rosgraph_msgs/Clock": Clock,
+    "rcl_interfaces/Log": Log,
     "nobody_msgs/Unheard": Unheard,
 }
 
@@ -121,9 +141,11 @@ def qos(args):
         if args.durability == "transient_local"
         else Policy.Durability.Volatile
     )
+    deadline = [Policy.Deadline(duration(milliseconds=args.deadline))] if args.deadline else []
     return Qos(
         reliability,
         durability,
+        *deadline,
         Policy.History.KeepLast(args.depth),
         Policy.DataRepresentation(use_cdrv0_representation=True),
     )
@@ -136,4 +158,5 @@ def add_arguments(parser):
     parser.add_argument("--reliability", choices=["reliable", "best_effort"], default="reliable")
     parser.add_argument("--durability", choices=["volatile", "transient_local"], default="volatile")
     parser.add_argument("--depth", type=int, default=20000)
+    parser.add_argument("--deadline", type=int, help="milliseconds")
     parser.add_argument("--limit", type=float, default=120.0)

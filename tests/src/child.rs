@@ -16,6 +16,8 @@ use nix::{
 };
 use serde_json::Value;
 
+use crate::Host;
+
 /// How long a process has between the signal that asks it to end and the one that makes it.
 const GRACE: Duration = Duration::from_secs(5);
 /// Lines kept per process. What comes after them is read and counted, so that the process never blocks on its pipe.
@@ -64,6 +66,25 @@ impl Started {
     #[must_use]
     pub fn ends_on(mut self, signal: Signal) -> Self {
         self.ends_on = signal;
+        self
+    }
+
+    /// The process runs on that host instead of the cell's.
+    #[must_use]
+    pub fn on(mut self, host: &Host) -> Self {
+        // It becomes setpriv, which becomes the program: one process, with one id.
+        let mut command = Command::new("nsenter");
+        command
+            .arg(format!("--net={}", host.path().display()))
+            .arg("--")
+            .arg(self.command.get_program())
+            .args(self.command.get_args())
+            .envs(
+                self.command
+                    .get_envs()
+                    .filter_map(|(key, value)| Some((key, value?))),
+            );
+        self.command = command;
         self
     }
 

@@ -13,10 +13,13 @@ mod bare_node;
 mod capture;
 mod cell;
 mod child;
+mod host;
 mod net;
+mod numbered;
 mod peers;
 mod programs;
 mod ua_side;
+mod usage;
 mod wait;
 
 pub use arrows::{forbidden, tree};
@@ -24,10 +27,13 @@ pub use bare_node::{BareNode, BareSubscription, PATIENCE, string_frame};
 pub use capture::{Capture, Dissected, hex, is_true};
 pub use cell::{Cell, Peer, without_data};
 pub use child::{Child, Started};
+pub use host::{HERE, Host, THERE, WIRE, Wire};
 pub use net::{GROUP, UadpSocket, group_member, http_get, metrics, xml_rpc};
+pub use numbered::{Numbered, numbered};
 pub use peers::MASTER;
 pub use programs::{
     METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, SERVER_ENDPOINT, drops, number, program,
 };
 pub use ua_side::{Triple, UaSide};
+pub use usage::{cpu_share, resident, threads};
 pub use wait::{eventually, holds_for};

@@ -58,16 +58,15 @@ impl Cell {
     /// bridge-ros2 in domain 2, not started yet.
     #[must_use]
     pub fn bridge_ros2_started(&self, args: &[&str]) -> Started {
+        self.bridge_ros2_alone(args).args(["--domain", "2"])
+    }
+
+    /// bridge-ros2 in the domain that `args` or the mapping say, not started yet.
+    #[must_use]
+    pub fn bridge_ros2_alone(&self, args: &[&str]) -> Started {
         Started::new("bridge-ros2", &program("bridge-ros2"))
             .args(args)
-            .args([
-                "--domain",
-                "2",
-                "--interface",
-                "lo",
-                "--metrics",
-                METRICS_ROS2,
-            ])
+            .args(["--interface", "lo", "--metrics", METRICS_ROS2])
     }
 
     /// ua-server as it answers, with `args` after those every cell needs.

@@ -75,7 +75,15 @@ impl UaSide {
     ///
     /// # Panics
     /// When it cannot be sent.
-    pub fn write(&mut self, (space, namespace, id): Triple, value: Scalar<'_>) {
+    pub fn write(&mut self, triple: Triple, value: Scalar<'_>) {
+        self.write_fields(triple, &[value]);
+    }
+
+    /// Writes one value of several fields.
+    ///
+    /// # Panics
+    /// When it cannot be sent.
+    pub fn write_fields(&mut self, (space, namespace, id): Triple, values: &[Scalar<'_>]) {
         self.sequence = self.sequence.wrapping_add(1);
         let header = NetworkHeader {
             publisher_id: Some(PublisherId::UInt16(space)),
@@ -92,10 +100,17 @@ impl UaSide {
             ..DataSetHeader::default()
         };
         let mut frame = message.key_frame(&header).unwrap();
-        frame.scalar(value).unwrap();
+        for value in values {
+            frame.scalar(*value).unwrap();
+        }
         frame.finish().unwrap();
         message.finish().unwrap();
         self.socket.send(&datagram);
+    }
+
+    /// Reads away what is waiting.
+    pub fn drain(&self) {
+        self.socket.drain();
     }
 
     /// The triples of all values heard within `window`.

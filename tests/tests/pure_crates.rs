@@ -117,7 +117,10 @@ fn each_bridge_knows_its_own_ros_library_only() {
         "bridge-ros1",
         &["ros2-client", "rustdds", "bridge-ros2", "rosrust*"],
     );
-    does_not_reach("bridge-ros2", &["tcpros", "bridge-ros1", "rosrust*"]);
+    does_not_reach(
+        "bridge-ros2",
+        &["tcpros", "bridge-ros1", "ros2-client", "rosrust*"],
+    );
 }
 
 #[test]

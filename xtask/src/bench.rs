@@ -3,6 +3,7 @@
 use anyhow::ensure;
 
 use crate::{
+    dds::Rustdds,
     namespace::{Namespaces, REFUSED},
     peers,
     shell::{Ended, run as must, status, step},
@@ -35,7 +36,11 @@ fn measured(
         "the measurement needs all peers"
     );
     step("building the programs with optimisation (some minutes the first time)");
-    let mut build = workspace.cargo(&["build", "--release", "--bins", "--examples", "--locked"]);
+    let rustdds = Rustdds::prepare(workspace)?;
+    let mut build = rustdds.cargo(
+        workspace,
+        &["build", "--release", "--bins", "--examples", "--locked"],
+    );
     for package in packages {
         build.args(["--package", package]);
     }

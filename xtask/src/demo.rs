@@ -3,6 +3,7 @@
 use std::process::Command;
 
 use crate::{
+    dds::Rustdds,
     shell::{Ended, run as must, status, step},
     workspace::Workspace,
 };
@@ -19,7 +20,8 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
         "-p",
         "demo",
     ];
-    must(&mut workspace.cargo(&[&["build", "--locked"][..], &packages].concat()))?;
+    let rustdds = Rustdds::prepare(workspace)?;
+    must(&mut rustdds.cargo(workspace, &[&["build", "--locked"][..], &packages].concat()))?;
     step("running the demo");
     let mut demo = Command::new(workspace.target.join("debug/demo"));
     Ok(status(demo.current_dir(&workspace.root).args(arguments))?.into())

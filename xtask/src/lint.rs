@@ -9,6 +9,7 @@ use std::{
 use anyhow::Context as _;
 
 use crate::{
+    dds::Rustdds,
     shell::{Ended, line, run as must, status, step, succeeds},
     workspace::Workspace,
 };
@@ -19,6 +20,7 @@ const FETCH: Duration = Duration::from_secs(120);
 
 /// Runs all checks, so that one run shows everything there is to mend.
 pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
+    let rustdds = Rustdds::prepare(workspace)?;
     let mut failed = Vec::new();
     let mut check = |what: &str, command: &mut Command| -> anyhow::Result<()> {
         step(what);
@@ -33,20 +35,23 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
     )?;
     check(
         "clippy",
-        &mut workspace.cargo(&[
-            "clippy",
-            "--workspace",
-            "--all-targets",
-            "--locked",
-            "--",
-            "-D",
-            "warnings",
-        ]),
+        &mut rustdds.cargo(
+            workspace,
+            &[
+                "clippy",
+                "--workspace",
+                "--all-targets",
+                "--locked",
+                "--",
+                "-D",
+                "warnings",
+            ],
+        ),
     )?;
     check(
         "documentation",
-        workspace
-            .cargo(&["doc", "--workspace", "--no-deps", "--locked"])
+        rustdds
+            .cargo(workspace, &["doc", "--workspace", "--no-deps", "--locked"])
             .env("RUSTDOCFLAGS", "-D warnings"),
     )?;
     let deny = Deny::find(workspace)?;

@@ -6,7 +6,9 @@
 )]
 
 mod bench;
+mod dds;
 mod demo;
+mod dist;
 mod instructions;
 mod lint;
 mod namespace;
@@ -26,6 +28,8 @@ cargo xtask <verb>
   test [--no-install] [FILTER..] install the peers of the tests (apt, pip), then run all tests whose name contains a FILTER
   peers                          only install the peers
   lint                           formatting, clippy, licences and sources of dependencies, documentation
+  dist                           build the programs that are handed out, with optimisation, into target/dist
+  dds                            only patch RustDDS, which all verbs build with, and print the flags to do so by hand
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
   bench ros1 [ARGS]              measure relays of ROS 1 messages beside a raw echo; bridge-ros1 with 50 topics (--help)
   bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
@@ -52,6 +56,8 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["demo", rest @ ..] => demo::run(&Workspace::find()?, rest),
         ["test", rest @ ..] => test::run(&Workspace::find()?, rest),
         ["peers"] => Ok(peers::run(&Workspace::find()?)),
+        ["dist"] => dist::run(&Workspace::find()?),
+        ["dds"] => dds::run(&Workspace::find()?),
         ["lint"] => lint::run(&Workspace::find()?),
         ["bench", "uadp", rest @ ..] => instructions::run(&Workspace::find()?, rest),
         ["bench", "hop", rest @ ..] => bench::hop(&Workspace::find()?, rest),

@@ -10,6 +10,7 @@ use std::{
 use anyhow::Context as _;
 
 use crate::{
+    dds::Rustdds,
     namespace::{Namespaces, REFUSED},
     peers,
     shell::{Ended, is_ci, run as must, step},
@@ -34,11 +35,12 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     }
     step("building the programs and the tests (some minutes the first time)");
     let built = ["--bins", "--tests", "--examples"];
-    must(&mut workspace.cargo(&[&["build"][..], TARGETS, &built].concat()))?;
+    let rustdds = Rustdds::prepare(workspace)?;
+    must(&mut rustdds.cargo(workspace, &[&["build"][..], TARGETS, &built].concat()))?;
 
     let skipped = workspace.target.join("skipped-tests.txt");
     remove(&skipped)?;
-    let mut tests = command(workspace, &filters, &skipped);
+    let mut tests = command(workspace, &rustdds, &filters, &skipped);
     step("testing; tests with peers run one at a time, each in a network of its own");
     let outcome = Outcome::of(&mut tests)?;
     let reasons = match fs::read_to_string(&skipped) {
@@ -53,14 +55,13 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     Ok(outcome.ended)
 }
 
-fn command(workspace: &Workspace, filters: &[&str], skipped: &Path) -> Command {
+fn command(workspace: &Workspace, rustdds: &Rustdds, filters: &[&str], skipped: &Path) -> Command {
     let namespaces = Namespaces::try_out();
-    let cargo = workspace.cargo(&[]);
+    let cargo = rustdds.cargo(workspace, &[&["test"][..], TARGETS].concat());
     let mut command = namespaces.command(cargo.get_program());
     command
         .current_dir(&workspace.root)
-        .arg("test")
-        .args(TARGETS)
+        .args(cargo.get_args())
         .arg("--no-fail-fast")
         .arg("--")
         .args(filters)

@@ -146,6 +146,7 @@ fn line(event: &PortEvent) -> String {
         PortEvent::Sample { topic, payload, .. } => format!("{topic} = {payload:?}"),
         PortEvent::Live { topic, live } => format!("{topic} live {live}"),
         PortEvent::Left { topic, .. } => format!("{topic} left"),
+        PortEvent::Unmatched { topic } => format!("{topic} unmatched"),
         PortEvent::CallFailed { topic, detail } => format!("{topic} call failed: {detail}"),
         PortEvent::Lost { topic, why, count } => {
             format!(

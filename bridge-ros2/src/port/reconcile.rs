@@ -6,15 +6,17 @@ use std::time::Duration;
 use bridge_node::PortEvent;
 use mappings::TopicId;
 use messages::{MessageType, Selection, TypeName};
+use rustdds::GUID;
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 
 use super::{MAX_TOPICS, Ros2Port, lost};
+use crate::compatibility::Incompatibility;
 use crate::domain::{Domain, DomainError};
-use crate::graph::{Endpoint, Graph, ros_topic};
+use crate::graph::{Endpoint, ros_topic};
 use crate::outlet::Outlet;
 use crate::qos::Requested;
-use crate::sink::{Open, Sink};
+use crate::sink::{Open, Sink, shortest_deadline};
 use crate::source::Reading;
 
 impl Ros2Port {
@@ -28,7 +30,10 @@ impl Ros2Port {
         while self.retired.front().is_some_and(|(until, _)| *until <= now) {
             self.retired.pop_front();
         }
-        self.graph = Graph::snapshot(self.domain.participant());
+        self.graph = self.domain.graph();
+        let graph = &self.graph;
+        self.incompatible.retain(|guid| graph.holds(*guid));
+        self.announce_anew(now);
         self.find_topics_of_the_space();
         for index in 0..self.sources.len() {
             self.reconcile_source(index, now);
@@ -36,6 +41,46 @@ impl Ros2Port {
         let topics: Vec<TopicId> = self.sinks.keys().copied().collect();
         for topic in topics {
             self.reconcile_sink(topic, now);
+        }
+    }
+
+    /// Makes anew what RustDDS left out of its announcements.
+    fn announce_anew(&mut self, now: Instant) {
+        let lost = self.domain.unannounced(&self.graph);
+        if lost.is_empty() {
+            return;
+        }
+        let mut made = 0_usize;
+        for index in 0..self.sources.len() {
+            let Some(Reading::Open { slot, requested }) =
+                self.sources.get(index).map(|s| s.reading)
+            else {
+                continue;
+            };
+            if self
+                .inbox
+                .guid(slot)
+                .is_some_and(|guid| lost.contains(&guid))
+            {
+                self.reopen_source(index, requested, now);
+                made += 1;
+            }
+        }
+        let is_lost = |sink: &Sink| {
+            let open = sink.open.as_ref();
+            open.is_some_and(|open| lost.contains(&open.outlet.guid()))
+        };
+        let sinks = self.sinks.iter().filter(|(_, sink)| is_lost(sink));
+        let sinks: Vec<TopicId> = sinks.map(|(topic, _)| *topic).collect();
+        for topic in sinks {
+            made += usize::from(self.advertise_anew(topic, now).is_some());
+        }
+        // What is left are readers that were replaced and hear on for a while.
+        if made > 0 {
+            warn!(
+                endpoints = made,
+                "readers and writers of ours were not announced by the DDS stack; made anew"
+            );
         }
     }
 
@@ -147,7 +192,13 @@ impl Ros2Port {
                 .inbox
                 .retain_writers(slot, |writer| writers.iter().any(|w| w.guid == *writer)),
         }
+        let wanted = requested.policies();
+        let offers: Vec<_> = ours
+            .iter()
+            .map(|writer| (writer.guid, Incompatibility::between(&writer.qos, &wanted)))
+            .collect();
         self.set_live(index, !ours.is_empty());
+        self.note_incompatible(&Side::Source(index), offers);
         if let Some(stranger) = strange {
             self.tell_stranger(index, &stranger);
         }
@@ -167,6 +218,7 @@ impl Ros2Port {
                 return;
             }
         };
+        self.announce_type(&name.dds(), &name);
         let Some(reader) = self.make(|domain| domain.reader(&topic, &name.dds(), requested)) else {
             return;
         };
@@ -254,7 +306,25 @@ impl Ros2Port {
                 self.replace_writer(topic, now);
                 return;
             }
+            if let Some(deadline) = open.shorter_deadline(readers) {
+                open.deadline = Some(deadline);
+                open.tightened += 1;
+                self.offer_deadline(topic, now);
+                return;
+            }
+            let offered = sink.offered.with_deadline(open.deadline);
+            let dds_type = open.message_type.name().dds();
+            let asks: Vec<_> = readers
+                .iter()
+                .filter(|reader| reader.type_name == dds_type)
+                .map(|reader| (reader.guid, Incompatibility::between(&offered, &reader.qos)))
+                .collect();
+            self.note_incompatible(&Side::Sink(topic), asks);
         }
+        let Some(sink) = self.sinks.get(&topic) else {
+            return;
+        };
+        let readers = self.graph.readers(&sink.dds_topic);
         if !sink.serves(readers) {
             self.open_sink(topic);
         }
@@ -262,30 +332,79 @@ impl Ros2Port {
 
     /// A reader that acknowledges nothing must not keep a value from the others.
     fn replace_writer(&mut self, topic: TopicId, now: Instant) {
-        let Some(Sink {
-            open: Some(open),
-            dds_topic,
-            offered,
-            ..
-        }) = self.sinks.get(&topic)
-        else {
-            return;
-        };
-        let (dds_topic, offered) = (dds_topic.clone(), *offered);
+        if let Some(dds_topic) = self.advertise_anew(topic, now) {
+            warn!(
+                topic = dds_topic,
+                "a subscriber does not acknowledge; advertised anew for the others"
+            );
+        }
+    }
+
+    /// A reader that asks for a deadline is matched by a writer that offers it.
+    fn offer_deadline(&mut self, topic: TopicId, now: Instant) {
+        if let Some(dds_topic) = self.advertise_anew(topic, now) {
+            info!(
+                topic = dds_topic,
+                "a subscriber asks for a deadline; advertised anew with it"
+            );
+        }
+    }
+
+    /// Puts another writer in the place of a sink's; returns the topic.
+    fn advertise_anew(&mut self, topic: TopicId, now: Instant) -> Option<String> {
+        let sink = self.sinks.get(&topic)?;
+        let open = sink.open.as_ref()?;
+        let dds_topic = sink.dds_topic.clone();
+        let qos = sink.offered.with_deadline(open.deadline);
         let dds_type = open.message_type.name().dds();
-        let Some(writer) = self.make(|domain| domain.writer(&dds_topic, &dds_type, offered)) else {
-            return;
-        };
-        warn!(
-            topic = dds_topic,
-            "a subscriber does not acknowledge; advertised anew for the others"
-        );
+        let writer = self.make(|domain| domain.open_writer(&dds_topic, &dds_type, &qos))?;
         if let Some(open) = self
             .sinks
             .get_mut(&topic)
             .and_then(|sink| sink.open.as_mut())
         {
             open.outlet.replace_writer(writer, now);
+        }
+        Some(dds_topic)
+    }
+
+    /// Tells and counts, once each, the endpoints of others that DDS does not match with ours.
+    fn note_incompatible(&mut self, side: &Side, peers: Vec<(GUID, Option<Incompatibility>)>) {
+        for (guid, found) in peers {
+            let Some(found) = found else {
+                self.incompatible.remove(&guid);
+                continue;
+            };
+            if !self.incompatible.insert(guid) {
+                continue;
+            }
+            let (dds_topic, topics, peer) = match side {
+                Side::Source(index) => {
+                    let Some(source) = self.sources.get(*index) else {
+                        continue;
+                    };
+                    let topics = source.values.iter().map(|(topic, _)| *topic).collect();
+                    (source.dds_topic.clone(), topics, "publisher")
+                }
+                Side::Sink(topic) => {
+                    let Some(sink) = self.sinks.get(topic) else {
+                        continue;
+                    };
+                    (sink.dds_topic.clone(), vec![*topic], "subscriber")
+                }
+            };
+            let unmatched = |topic: TopicId| PortEvent::Unmatched { topic };
+            self.events.extend(topics.into_iter().map(unmatched));
+            let owner = self.domain.owner(guid);
+            self.tell_once(&dds_topic, found.policy, || {
+                format!(
+                    "a {peer} of {} is not matched: in {} {} is offered and {} requested",
+                    owner.as_deref().unwrap_or("an unnamed node"),
+                    found.policy,
+                    found.offered,
+                    found.requested
+                )
+            });
         }
     }
 
@@ -318,7 +437,11 @@ impl Ros2Port {
             });
             return;
         }
-        let Some(writer) = self.make(|domain| domain.writer(&dds_topic, &dds_type, offered)) else {
+        let deadline = shortest_deadline(self.graph.readers(&dds_topic));
+        let qos = offered.with_deadline(deadline);
+        self.announce_type(&dds_type, message_type.name());
+        let Some(writer) = self.make(|domain| domain.open_writer(&dds_topic, &dds_type, &qos))
+        else {
             return;
         };
         info!(topic = dds_topic, message_type = %message_type.name(), ?offered, "advertised");
@@ -330,6 +453,9 @@ impl Ros2Port {
             sink.open = Some(Open {
                 message_type: Arc::clone(&message_type),
                 outlet,
+                deadline,
+                tightened: 0,
+                stamps: sink.stamps(&message_type),
             });
         }
         self.events.push_back(PortEvent::Bound {
@@ -337,6 +463,13 @@ impl Ros2Port {
             message_type,
             selection,
         });
+    }
+
+    /// Has the domain announce the hash of a type.
+    fn announce_type(&self, dds_type: &str, name: &TypeName) {
+        if let Some(hash) = self.definitions.type_hash(name) {
+            self.domain.learn_type_hash(dds_type, hash.to_string());
+        }
     }
 
     fn is_open_as(&self, topic: TopicId, message_type: &MessageType) -> bool {
@@ -362,6 +495,14 @@ impl Ros2Port {
             }
         }
     }
+}
+
+/// Which of our endpoints others are not matched with.
+enum Side {
+    /// The reader of that source.
+    Source(usize),
+    /// The writer of that sink.
+    Sink(TopicId),
 }
 
 /// How long a replaced reader hears on.

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use rustdds::dds::WriteError;
-use rustdds::{GUID, RTPSEntity, WriteOptionsBuilder};
+use rustdds::{GUID, WriteOptionsBuilder};
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep_until, timeout_at};

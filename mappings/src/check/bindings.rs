@@ -464,40 +464,29 @@ pub(super) fn select(
     if let Some(leaf) = message_type.leaf(path) {
         return Some(vec![leaf.clone()]);
     }
+    let inside: Vec<Leaf> = message_type
+        .leaves()
+        .iter()
+        .filter(|leaf| leaf.is_inside(path))
+        .cloned()
+        .collect();
+    if !inside.is_empty() {
+        return Some(inside);
+    }
     let paths: Vec<&str> = message_type
         .leaves()
         .iter()
         .map(|leaf| leaf.path.as_str())
         .collect();
     let name = message_type.name();
-    let inner: Vec<&str> = paths
-        .iter()
-        .copied()
-        .filter(|known| {
-            known
-                .strip_prefix(path.as_str())
-                .is_some_and(|rest| rest.starts_with('.'))
-        })
-        .collect();
-    if inner.is_empty() {
-        let message = format!("`{name}` has no field `{}`", short(path));
-        let note = findings.error(Code::UnknownField, place, message);
-        let near =
-            nearest(path, paths.iter().copied()).map(|near| format!("did you mean `{near}`? "));
-        note.help(format!(
-            "{}its fields are {}",
-            near.unwrap_or_default(),
-            told(&paths)
-        ));
-    } else {
-        let message = format!(
-            "`{}` of `{name}` is a message of its own, not one value",
-            short(path)
-        );
-        findings
-            .error(Code::UnknownField, place, message)
-            .help(format!("its fields are {}", told(&inner)));
-    }
+    let message = format!("`{name}` has no field `{}`", short(path));
+    let note = findings.error(Code::UnknownField, place, message);
+    let near = nearest(path, paths.iter().copied()).map(|near| format!("did you mean `{near}`? "));
+    note.help(format!(
+        "{}its fields are {}",
+        near.unwrap_or_default(),
+        told(&paths)
+    ));
     None
 }
 

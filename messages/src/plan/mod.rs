@@ -5,6 +5,7 @@ mod read;
 mod write;
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 use std::sync::Arc;
 
 use uadp::Scalar;
@@ -31,7 +32,7 @@ pub enum Wire {
 pub enum Selection {
     /// All of them.
     Whole,
-    /// The one of that path.
+    /// The one of that path; where that is a message of its own, all fields of it.
     Field(String),
     /// A message of constants, to be written: `field` takes the value, or without it no value crosses; the fields of
     /// `rest` have what stands there, all others are zero or empty. Read, it is as [`Selection::Field`].
@@ -135,13 +136,13 @@ impl Plan {
             Selection::Bytes => return Ok(Self::bytes(wire)),
         };
         let carried = match field {
-            Some(path) => Carried::One(index(message, path)?),
-            None if *selection == Selection::Whole => Carried::All,
-            None => Carried::None,
+            Some(path) => range(message, path)?,
+            None if *selection == Selection::Whole => 0..message.leaves().len(),
+            None => 0..0,
         };
         let mut compiler = Compiler {
             wire,
-            carried,
+            carried: carried.clone(),
             given: given(message, field, rest)?,
             leaf: 0,
             ops: Vec::new(),
@@ -160,11 +161,7 @@ impl Plan {
                 fault,
             }
         })?;
-        let leaves = match carried {
-            Carried::All => message.leaves().to_vec(),
-            Carried::One(at) => message.leaves().get(at).cloned().into_iter().collect(),
-            Carried::None => Vec::new(),
-        };
+        let leaves = message.leaves().get(carried).unwrap_or_default().to_vec();
         Ok(Self {
             wire,
             body: Body::Steps(compiler.ops),
@@ -222,6 +219,19 @@ impl Plan {
     }
 }
 
+/// The fields of a path: one, or those of a message, which follow each other.
+fn range(message: &MessageType, path: &str) -> Result<Range<usize>, PlanError> {
+    let leaves = message.leaves();
+    let inside = |leaf: &Leaf| leaf.is_inside(path);
+    match leaves.iter().position(inside) {
+        Some(first) => {
+            let rest = leaves.iter().skip(first);
+            Ok(first..first + rest.take_while(|leaf| inside(leaf)).count())
+        }
+        None => index(message, path).map(|at| at..at + 1),
+    }
+}
+
 fn index(message: &MessageType, path: &str) -> Result<usize, PlanError> {
     message
         .leaves()
@@ -257,17 +267,10 @@ fn given<'m>(
     each.collect()
 }
 
-/// Which fields cross.
-#[derive(Clone, Copy)]
-enum Carried {
-    All,
-    One(usize),
-    None,
-}
-
 struct Compiler<'m> {
     wire: Wire,
-    carried: Carried,
+    /// Which fields cross.
+    carried: Range<usize>,
     given: BTreeMap<usize, Given<'m>>,
     leaf: usize,
     ops: Vec<Op>,
@@ -368,11 +371,7 @@ impl Compiler<'_> {
     }
 
     fn push(&mut self, what: What) {
-        let carry = match self.carried {
-            Carried::All => true,
-            Carried::One(selected) => selected == self.leaf,
-            Carried::None => false,
-        };
+        let carry = self.carried.contains(&self.leaf);
         let skip = matches!(what, What::Skip { .. });
         let constant = match self.given.get(&self.leaf).filter(|_| !skip) {
             Some(given) => match given.typed(&what) {

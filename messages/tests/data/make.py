@@ -6,11 +6,14 @@
                               -rosgraph-msgs, -actionlib-msgs -> genpy.json
     python3 make.py services  needs Debian's python3-std-srvs, -nav-msgs, -sensor-msgs, -tf2-msgs, -diagnostic-msgs,
                               -roscpp-msg, -move-base-msgs -> ros1_services.txt
+    python3 make.py hashes    needs rosbags -> ros2_type_hashes.txt
 
 ros1_md5.txt    name and md5 of each ROS 1 type: rosbags' store ROS1_NOETIC
 ros1_services.txt name and md5 of each service of those packages, of roscpp/Logger, and of the messages genaction made
                 of two actions: the classes genpy made
 ros2_fields.txt name and fields of each ROS 2 type: rosbags' store ROS2_JAZZY
+ros2_type_hashes.txt for each of rosbags' stores from Humble to Lyrical a line `# store`, then type hash, name and fields of
+                each type that the store before has not or has otherwise
 *.json          messages with made-up values: their bytes as that implementation writes them, and the fields a bridge
                 is to make of them, one line each, by the rules of the crate's documentation (written here a second time)
 """
@@ -321,4 +324,31 @@ def services():
         out.write("\n".join(sorted(table)) + "\n")
 
 
-{"rosbags": rosbags, "cyclone": cyclone, "genpy": genpy, "services": services}[sys.argv[1]]()
+def hashes():
+    from rosbags.interfaces import Nodetype
+    from rosbags.typesys import Stores, get_typestore
+
+    def written(desc):
+        node, what = desc
+        if node == Nodetype.BASE:
+            return what[0].replace("octet", "byte") + (f"<={what[1]}" if what[1] else "")
+        if node == Nodetype.NAME:
+            return short(what)
+        length = str(what[1]) if node == Nodetype.ARRAY else f"<={what[1]}" if what[1] else ""
+        return f"{written(what[0])}[{length}]"
+
+    before = {}
+    with open("ros2_type_hashes.txt", "w") as out:
+        for which in "HUMBLE IRON JAZZY KILTED LYRICAL".split():
+            store = get_typestore(getattr(Stores, "ROS2_" + which))
+            out.write(f"# {which.title()}\n")
+            for full in sorted(store.fielddefs):
+                fields = [f"{f}:{written(d)}" for f, d in store.fielddefs[full][1]
+                          if f != "structure_needs_at_least_one_member"]
+                line = " ".join([store.hash_rihs01(full), short(full), *fields])
+                if before.get(full) != line:
+                    out.write(line + "\n")
+                    before[full] = line
+
+
+{"hashes": hashes, "rosbags": rosbags, "cyclone": cyclone, "genpy": genpy, "services": services}[sys.argv[1]]()

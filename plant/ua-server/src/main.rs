@@ -58,13 +58,13 @@ impl Program for UaServer {
         &self.arguments
     }
 
-    fn own(&self, _mapping: &Mapping) -> Result<SpaceId, Failure> {
-        Ok(SpaceId::UA)
+    fn spaces(&self, _mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
+        Ok(vec![SpaceId::UA])
     }
 
-    async fn start(self, context: Context) -> Result<ServerPort, Failure> {
-        let url = match self.endpoint {
-            Some(url) => url,
+    async fn start(&self, context: Context) -> Result<ServerPort, Failure> {
+        let url = match &self.endpoint {
+            Some(url) => url.clone(),
             None => {
                 let endpoint = context.mapping.server().endpoint.to_string();
                 endpoint.parse().map_err(|error| {
@@ -77,6 +77,7 @@ impl Program for UaServer {
         };
         let root = self
             .pki
+            .clone()
             .unwrap_or_else(|| pki::default_root(|name| std::env::var(name).ok()));
         let pki =
             Pki::open(root).map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;

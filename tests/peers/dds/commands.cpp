@@ -179,21 +179,26 @@ void relay(const Arguments& arguments) {
     Line().field("refused", refused.load());
 }
 
-// Participants of one process: member k publishes its number as text on TOPIC followed by k, and all hear --hear.
+// Many at once: member k writes the text k to TOPIC followed by k, and hears --hear, or --hear-each followed by k.
 void crowd(const Arguments& arguments) {
     const std::string topic = arguments.position(1, "what the topics begin with");
-    const std::string hear = arguments.text("hear", "");
     const int members = static_cast<int>(arguments.number("members", 13));
     const std::string type = dds_type("msg", "std_msgs/String");
     const Quality quality = Quality::from(arguments);
+    const auto heard_by = [&](int member) {
+        const std::string each = arguments.text("hear-each", "");
+        return each.empty() ? arguments.text("hear", "") : each + std::to_string(member);
+    };
     std::vector<std::unique_ptr<Participant>> participants;
     std::vector<std::unique_ptr<Writer>> writers;
     std::vector<std::unique_ptr<Reader>> readers;
     for (int member = 1; member <= members; ++member) {
-        participants.push_back(join(arguments));
+        if (participants.empty() || !arguments.has("one-participant")) {
+            participants.push_back(join(arguments));
+        }
         auto& own = *participants.back();
         writers.push_back(own.writer(dds_topic("rt", topic + std::to_string(member)), type, quality));
-        if (!hear.empty()) {
+        if (const std::string hear = heard_by(member); !hear.empty()) {
             readers.push_back(own.reader(dds_topic("rt", hear), type, quality, [member](const Sample& sample) {
                 const auto text = text_of(sample.body).value_or("");
                 Line().field("member", member).field("heard", std::string(text));

@@ -15,6 +15,7 @@ pub(crate) fn options() -> DomainOptions {
     DomainOptions {
         domain: DOMAIN,
         networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
+        peers: Vec::new(),
         node: "endpoints".into(),
     }
 }

@@ -22,6 +22,7 @@ impl Ours {
         let domain = Domain::join(&DomainOptions {
             domain: 2,
             networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
+            peers: Vec::new(),
             node: "services".into(),
         })
         .unwrap();

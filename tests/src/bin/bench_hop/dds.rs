@@ -26,7 +26,8 @@ impl Reader {
         let options = DomainOptions {
             domain: 2,
             networks: vec![IpAddr::V4(Ipv4Addr::LOCALHOST)],
-            node: "bench".to_owned(),
+            peers: Vec::new(),
+            node: "bench".into(),
         };
         let domain = Domain::join(&options).unwrap();
         let reader = domain

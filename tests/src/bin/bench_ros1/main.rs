@@ -22,8 +22,13 @@ use crate::path::Path;
 
 fn main() -> ExitCode {
     let args: Vec<String> = std::env::args().skip(1).collect();
-    if args.first().is_some_and(|first| first == "echo") {
-        return path::echo();
+    match args.iter().map(String::as_str).collect::<Vec<_>>()[..] {
+        ["echo"] => return path::echo(),
+        ["echo", lanes] => {
+            allow_open_files();
+            return path::echo_many(lanes.parse().unwrap());
+        }
+        _ => {}
     }
     let Some(plan) = Plan::of(&args) else {
         print!("{HELP}");

@@ -1,10 +1,11 @@
 //! What repeats messages: the echo, `tcpros`, roscpp, rospy, rosrust.
 
-use std::io::Write;
+use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::process::ExitCode;
 use std::time::Duration;
 
+use rustix::event::epoll;
 use system_tests::{BareNode, BareSubscription, Cell, Child, Started};
 
 use crate::lane::Lane;
@@ -67,6 +68,41 @@ impl Path {
     pub(crate) fn processor_time(&self) -> Duration {
         processor_time(self.relay.id())
     }
+}
+
+/// An echo of many lanes: what comes in on one connection goes out on the next, as a readiness queue shows it. Connections
+/// are taken in pairs, input first.
+pub(crate) fn echo_many(lanes: usize) -> ExitCode {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    println!("{}", listener.local_addr().unwrap());
+    let ready = epoll::create(epoll::CreateFlags::CLOEXEC).unwrap();
+    let mut pairs = Vec::with_capacity(lanes);
+    for lane in 0..lanes {
+        let (input, _) = listener.accept().unwrap();
+        let (output, _) = listener.accept().unwrap();
+        output.set_nodelay(true).unwrap();
+        let data = epoll::EventData::new_u64(lane as u64);
+        epoll::add(&ready, &input, data, epoll::EventFlags::IN).unwrap();
+        pairs.push((input, output));
+    }
+    let mut events = Vec::with_capacity(64);
+    let mut buffer = vec![0; 65_536];
+    let mut open = lanes;
+    while open > 0 {
+        epoll::wait(&ready, rustix::buffer::spare_capacity(&mut events), None).unwrap();
+        for event in events.drain(..) {
+            let lane = usize::try_from(event.data.u64()).unwrap();
+            let (input, output) = &mut pairs[lane];
+            match input.read(&mut buffer) {
+                Ok(length @ 1..) if output.write_all(&buffer[..length]).is_ok() => {}
+                _ => {
+                    epoll::delete(&ready, &*input).unwrap();
+                    open -= 1;
+                }
+            }
+        }
+    }
+    ExitCode::SUCCESS
 }
 
 /// The echo: frames in from the first connection, out to the second, with as few calls as can be.

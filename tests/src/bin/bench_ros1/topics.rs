@@ -1,14 +1,17 @@
-//! What a message costs a relay that carries few topics or many, at the same rate over all of them.
+//! What a message costs a relay that carries few topics or many, at the same rate over all of them, and what it costs
+//! an echo of as many connections that does nothing else.
 
+use std::net::TcpStream;
 use std::time::Duration;
 
-use system_tests::{BareNode, Cell, Child, string_frame};
+use system_tests::{BareNode, BareSubscription, Cell, Child, Started, string_frame};
 
 use crate::lane::{DIGITS, Lane};
 use crate::usage::{Times, per_message, processor_time};
 
-/// A `tcpros` relay of so many topics, with both ends of each.
+/// A relay of so many topics, with both ends of each.
 struct Crowd {
+    name: &'static str,
     relay: Child,
     lanes: Vec<Lane>,
     times: Times,
@@ -16,6 +19,28 @@ struct Crowd {
 }
 
 impl Crowd {
+    fn echo(count: usize) -> Self {
+        let me = std::env::current_exe().unwrap();
+        let lanes = count.to_string();
+        let mut relay = Started::new(&format!("echo_{count}"), &me)
+            .args(["echo", &lanes])
+            .start();
+        let address = relay.wait_for_line("127.0.0.1:", Duration::from_secs(10));
+        let connect = || TcpStream::connect(&address).unwrap();
+        let lane = |_| {
+            let input = connect();
+            input.set_nodelay(true).unwrap();
+            Lane::of(input, BareSubscription::of(connect()))
+        };
+        Self {
+            name: "raw TCP echo",
+            lanes: (0..count).map(lane).collect(),
+            relay,
+            times: Times::default(),
+            used: Duration::ZERO,
+        }
+    }
+
     fn of(cell: &Cell, count: usize) -> Self {
         let pairs: Vec<(String, String)> = (0..count)
             .map(|topic| {
@@ -28,6 +53,7 @@ impl Crowd {
         let relay = cell.tcpros_relay(&format!("relay_{count}"), &pairs);
         let node = BareNode::start(&format!("/bench_{count}"));
         Self {
+            name: "tcpros `relay`",
             lanes: Lane::through(&node, &pairs),
             relay,
             times: Times::default(),
@@ -50,31 +76,34 @@ impl Crowd {
 
 pub(crate) fn measure(cell: &Cell, blocks: usize) {
     println!(
-        "\n16 B, one message at a time, each through the next topic of a tcpros `relay`, {} messages for each count; \
+        "\n16 B, one message at a time, each through the next topic or connection, {} messages for each count; \
          microseconds:\n",
         blocks as u64 * BLOCK
     );
-    let mut crowds: Vec<Crowd> = [1, 10, 100, 1000]
+    let counts = [1, 10, 100, 1000];
+    let mut crowds: Vec<Crowd> = counts
         .into_iter()
-        .map(|count| Crowd::of(cell, count))
+        .flat_map(|count| [Crowd::echo(count), Crowd::of(cell, count)])
         .collect();
     for block in 0..blocks as u64 {
         for crowd in &mut crowds {
             crowd.turn(block * BLOCK);
         }
     }
-    println!("| topics | p50 | p99 | CPU per message | CPU / that of one topic |");
-    println!("|---|---|---|---|---|");
-    let mut one = None;
-    for crowd in &mut crowds {
-        let cost = per_message(crowd.used, crowd.times.count());
-        let ratio = cost / *one.get_or_insert(cost);
-        println!(
-            "| {} | {:.1} | {:.1} | {cost:.1} | {ratio:.2} |",
-            crowd.lanes.len(),
-            crowd.times.at(0.5),
-            crowd.times.at(0.99)
-        );
+    println!("| path | topics | p50 | p99 | CPU per message | CPU / that of one topic |");
+    println!("|---|---|---|---|---|---|");
+    for name in ["raw TCP echo", "tcpros `relay`"] {
+        let mut one = None;
+        for crowd in crowds.iter_mut().filter(|crowd| crowd.name == name) {
+            let cost = per_message(crowd.used, crowd.times.count());
+            let ratio = cost / *one.get_or_insert(cost);
+            println!(
+                "| {name} | {} | {:.1} | {:.1} | {cost:.1} | {ratio:.2} |",
+                crowd.lanes.len(),
+                crowd.times.at(0.5),
+                crowd.times.at(0.99)
+            );
+        }
     }
 }
 

@@ -1,0 +1,135 @@
+//! The clock of the node: the wall clock, or the simulated one of `/clock`.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+/// The clock of a node: the wall clock, or with `use_sim_time` the time of `/clock`, which is zero until the first
+/// message (design.ros2.org, "Clock and Time").
+///
+/// It is for what messages say. Simulated time stands still and jumps as its publisher likes, so time limits never
+/// look at it.
+#[derive(Debug, Clone, Default)]
+pub struct RosClock(Arc<Simulation>);
+
+/// A time as `builtin_interfaces/Time` has it.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub struct RosTime {
+    /// Whole seconds since 1970, or since the start of the simulation.
+    pub sec: i32,
+    /// The rest in nanoseconds, below 1 000 000 000.
+    pub nanosec: u32,
+}
+
+#[derive(Debug, Default)]
+struct Simulation {
+    runs: AtomicBool,
+    /// Seconds in the upper half, nanoseconds in the lower: both change at once.
+    time: AtomicU64,
+    malformed: AtomicU64,
+}
+
+impl RosClock {
+    pub(crate) fn new(use_sim_time: bool) -> Self {
+        let clock = Self::default();
+        clock.0.runs.store(use_sim_time, Ordering::Release);
+        clock
+    }
+
+    /// The time now.
+    #[must_use]
+    pub fn now(&self) -> RosTime {
+        if !self.is_simulated() {
+            return RosTime::from_unix_nanos(bridge_node::now().utc.unix_nanos());
+        }
+        let [a, b, c, d, e, f, g, h] = self.0.time.load(Ordering::Acquire).to_be_bytes();
+        RosTime {
+            sec: i32::from_be_bytes([a, b, c, d]),
+            nanosec: u32::from_be_bytes([e, f, g, h]),
+        }
+    }
+
+    /// Whether the time is that of `/clock`.
+    #[must_use]
+    pub fn is_simulated(&self) -> bool {
+        self.0.runs.load(Ordering::Acquire)
+    }
+
+    /// Messages of `/clock` that said no time, since the start.
+    #[must_use]
+    pub fn malformed(&self) -> u64 {
+        self.0.malformed.load(Ordering::Relaxed)
+    }
+
+    /// Takes a `rosgraph_msgs/msg/Clock`, encapsulation header first: seconds and nanoseconds.
+    pub(crate) fn hear(&self, payload: &[u8]) {
+        let words = match payload {
+            [0, 1, _, _, a, b, c, d, e, f, g, h, ..] => Some(([*d, *c, *b, *a], [*h, *g, *f, *e])),
+            [0, 0, _, _, a, b, c, d, e, f, g, h, ..] => Some(([*a, *b, *c, *d], [*e, *f, *g, *h])),
+            _ => None,
+        };
+        match words {
+            Some((sec, nanosec)) if u32::from_be_bytes(nanosec) < NANOS_PER_SEC => {
+                let time = u64::from(u32::from_be_bytes(sec)) << 32
+                    | u64::from(u32::from_be_bytes(nanosec));
+                self.0.time.store(time, Ordering::Release);
+            }
+            _ => {
+                self.0.malformed.fetch_add(1, Ordering::Relaxed);
+            }
+        }
+    }
+}
+
+impl RosTime {
+    /// The nearest time there is to that many nanoseconds since 1970.
+    #[must_use]
+    pub fn from_unix_nanos(nanos: i128) -> Self {
+        let per_sec = i128::from(NANOS_PER_SEC);
+        i32::try_from(nanos.div_euclid(per_sec)).map_or(
+            Self {
+                sec: if nanos < 0 { i32::MIN } else { i32::MAX },
+                nanosec: 0,
+            },
+            |sec| Self {
+                sec,
+                nanosec: u32::try_from(nanos.rem_euclid(per_sec)).unwrap_or_default(),
+            },
+        )
+    }
+}
+
+/// The topic of the simulated time.
+pub(crate) const TOPIC: &str = "rt/clock";
+/// Its DDS type.
+pub(crate) const TYPE: &str = "rosgraph_msgs::msg::dds_::Clock_";
+const NANOS_PER_SEC: u32 = 1_000_000_000;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn simulated_time_is_zero_at_first_and_then_what_the_last_message_said() {
+        let clock = RosClock::new(true);
+        assert_eq!(clock.now(), RosTime::default());
+        clock.hear(&[0, 1, 0, 0, 7, 0, 0, 0, 9, 0, 0, 0]);
+        assert_eq!(clock.now(), RosTime { sec: 7, nanosec: 9 });
+        clock.hear(&[0, 0, 0, 0, 0, 0, 0, 3, 0, 0, 0, 1]);
+        assert_eq!(clock.now(), RosTime { sec: 3, nanosec: 1 });
+    }
+
+    #[test]
+    fn a_message_that_says_no_time_is_counted_and_not_taken() {
+        let clock = RosClock::new(true);
+        clock.hear(&[0, 1, 0, 0, 7, 0, 0, 0]);
+        clock.hear(&[0, 1, 0, 0, 7, 0, 0, 0, 0, 0, 0, 0xFF]);
+        assert_eq!((clock.now(), clock.malformed()), (RosTime::default(), 2));
+    }
+
+    #[test]
+    fn without_simulation_it_is_the_wall_clock() {
+        let clock = RosClock::new(false);
+        clock.hear(&[0, 1, 0, 0, 7, 0, 0, 0, 9, 0, 0, 0]);
+        assert!(clock.now().sec > 1_700_000_000);
+    }
+}

@@ -1,0 +1,110 @@
+//! Which RustDDS carries the samples, and the largest sample it delivers.
+//!
+//! RustDDS as published repairs lost fragments so slowly that a large sample, whose burst overflows the receiver's socket
+//! buffer, never becomes complete. The patches in `patches/` change that; `cargo xtask` builds with them.
+
+use crate::graph::Endpoint;
+
+/// A macro, because `concat!` takes literals.
+#[cfg(feature = "patched-dds")]
+macro_rules! rustdds {
+    () => {
+        "RustDDS 0.15.1 with 7 patches, samples up to 10 MB"
+    };
+}
+
+#[cfg(not(feature = "patched-dds"))]
+macro_rules! rustdds {
+    () => {
+        "RustDDS 0.15.1 as published, samples up to 256 kB to Fast DDS, 2 MB to others"
+    };
+}
+
+/// Whether RustDDS is the patched one.
+pub const PATCHED: bool = cfg!(feature = "patched-dds");
+
+/// Which RustDDS this is and what its limits are, for people.
+pub const RUSTDDS: &str = rustdds!();
+
+/// The version of this program, and of RustDDS in it.
+pub const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", rustdds!(), ")");
+
+/// The largest serialized sample, in bytes, that all readers with the system's default socket buffers receive. A larger
+/// one is not written, but refused ([`Refusal::TooLarge`](crate::outlet::Refusal::TooLarge)).
+#[must_use]
+pub fn sample_size(readers: &[Endpoint]) -> usize {
+    if readers.iter().any(Endpoint::is_fast_dds) {
+        TO_FAST_DDS
+    } else {
+        TO_OTHERS
+    }
+}
+
+/// The largest sample for readers of which nothing is known yet.
+pub const TO_ANY: usize = if TO_FAST_DDS < TO_OTHERS {
+    TO_FAST_DDS
+} else {
+    TO_OTHERS
+};
+
+#[cfg(feature = "patched-dds")]
+mod sizes {
+    /// Measured: 30 of 30 samples of this size, reliable.
+    pub(super) const TO_FAST_DDS: usize = 10 * 1024 * 1024;
+    /// The same.
+    pub(super) const TO_OTHERS: usize = 10 * 1024 * 1024;
+}
+
+#[cfg(not(feature = "patched-dds"))]
+mod sizes {
+    /// Measured: one sample in ten of 1 MiB reached a Fast DDS reader, and all of 262 kB did.
+    pub(super) const TO_FAST_DDS: usize = 256 * 1024;
+    /// Measured: Cyclone DDS readers received 2 MiB and lost 3 MiB.
+    pub(super) const TO_OTHERS: usize = 2 * 1024 * 1024;
+}
+
+use sizes::{TO_FAST_DDS, TO_OTHERS};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs;
+    use std::path::Path;
+
+    #[test]
+    fn the_text_names_the_version_that_is_locked() {
+        let lock = include_str!("../../Cargo.lock");
+        let (_, package) = lock.split_once("name = \"rustdds\"\nversion = \"").unwrap();
+        let (version, _) = package.split_once('"').unwrap();
+        assert!(
+            RUSTDDS.starts_with(&format!("RustDDS {version} ")),
+            "{version}"
+        );
+    }
+
+    #[cfg(feature = "patched-dds")]
+    #[test]
+    fn the_text_counts_the_patches() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../patches/rustdds-0.15.1");
+        let count = fs::read_dir(folder)
+            .unwrap()
+            .filter(|entry| {
+                entry
+                    .as_ref()
+                    .is_ok_and(|entry| entry.path().extension().is_some_and(|e| e == "patch"))
+            })
+            .count();
+        assert!(RUSTDDS.contains(&format!(" with {count} patches,")));
+    }
+
+    #[test]
+    fn the_text_names_the_limits() {
+        let size = |bytes: usize| match bytes / (1024 * 1024) {
+            0 => format!("{} kB", bytes / 1024),
+            mega => format!("{mega} MB"),
+        };
+        for limit in [TO_FAST_DDS, TO_OTHERS] {
+            assert!(RUSTDDS.contains(&size(limit)), "{limit}");
+        }
+    }
+}

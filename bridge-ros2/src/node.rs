@@ -1,0 +1,586 @@
+//! The ROS node a participant stands for: its name, what it tells the others of itself, and what they tell.
+//!
+//! One thread does it, so that the node is whole whoever polls what. It sleeps until there is something to do: an
+//! endpoint that came or went, a message of another node's list, of `/clock`, or a warning for `/rosout`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Deref;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::task::{Wake, Waker};
+use std::thread::{JoinHandle, Thread};
+use std::time::Duration;
+
+use bytes::Bytes;
+use rustdds::{GUID, RTPSEntity};
+use tokio::time::Instant;
+use tracing::{debug, warn};
+
+use crate::clock::RosClock;
+use crate::discovery_info::{GidLength, GuidBytes, NodeEntities, ParticipantEntitiesInfo};
+use crate::raw::{Payload, RawReader, RawWriter, Reader, Writer};
+use crate::rosout::Rosout;
+
+/// A node's name, and how it is to behave.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NodeOptions {
+    /// `/`, or `/cell/left`.
+    pub namespace: String,
+    /// The name without namespace.
+    pub name: String,
+    /// The length of the Gids it writes; without one that which most other participants write.
+    pub gid: Option<GidLength>,
+    /// Whether its clock is that of `/clock`.
+    pub use_sim_time: bool,
+}
+
+impl NodeOptions {
+    /// The name with its namespace.
+    #[must_use]
+    pub fn full_name(&self) -> String {
+        format!("{}/{}", self.namespace.trim_end_matches('/'), self.name)
+    }
+
+    /// What its messages on `/rosout` are headed by, as rcl has it: the full name with dots.
+    fn logger(&self) -> String {
+        self.full_name().trim_start_matches('/').replace('/', ".")
+    }
+
+    /// Why ROS would not take such a node (`rmw_validate_node_name`, `rmw_validate_namespace`).
+    pub(crate) fn fault(&self) -> Option<&'static str> {
+        let is_token = |text: &str| {
+            text.starts_with(|c: char| c.is_ascii_alphabetic() || c == '_')
+                && text.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_')
+        };
+        let parts = self.namespace.strip_prefix('/');
+        if !is_token(&self.name) {
+            Some("a name is letters, digits and `_`, no digit first")
+        } else if !parts.is_some_and(|parts| parts.is_empty() || parts.split('/').all(is_token)) {
+            Some("a namespace is `/`, or names each after a `/`")
+        } else if self.name.len() > 255 || self.namespace.len() > 245 {
+            Some("a name has up to 255 letters, a namespace up to 245")
+        } else {
+            None
+        }
+    }
+}
+
+/// A node in the root namespace.
+impl From<&str> for NodeOptions {
+    fn from(name: &str) -> Self {
+        Self {
+            namespace: "/".to_owned(),
+            name: name.to_owned(),
+            gid: None,
+            use_sim_time: false,
+        }
+    }
+}
+
+/// A reader or writer that is on its node's list for as long as it is there.
+pub struct Listed<E> {
+    endpoint: E,
+    entry: Entry,
+}
+
+impl<E> Listed<E> {
+    /// Who it is to others.
+    pub fn guid(&self) -> GUID {
+        self.entry.guid
+    }
+}
+
+impl<E> Deref for Listed<E> {
+    type Target = E;
+
+    fn deref(&self) -> &E {
+        &self.endpoint
+    }
+}
+
+/// A place on the node's list, given up when dropped.
+struct Entry {
+    node: Arc<Shared>,
+    guid: GUID,
+    kind: Kind,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Kind {
+    Reader,
+    Writer,
+}
+
+impl Drop for Entry {
+    fn drop(&mut self) {
+        self.node
+            .change(|own| own.of(self.kind).remove(&self.guid.to_bytes()));
+    }
+}
+
+/// The node, told of by a thread of its own until dropped; then its name is withdrawn.
+pub(crate) struct Node {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// The endpoints a node lives by, none of which is on its list.
+pub(crate) struct Channels {
+    pub(crate) participant: GuidBytes,
+    pub(crate) info_reader: RawReader,
+    pub(crate) info_writer: RawWriter,
+}
+
+/// Endpoints of the node that its thread serves.
+pub(crate) struct Services {
+    pub(crate) rosout: Writer,
+    pub(crate) clock: Option<Reader>,
+}
+
+struct Shared {
+    options: NodeOptions,
+    clock: RosClock,
+    own: Mutex<Own>,
+    others: Mutex<Others>,
+    services: Mutex<Option<(Services, Arc<Rosout>)>>,
+    stop: AtomicBool,
+    thread: Mutex<Option<Thread>>,
+}
+
+/// What we tell.
+#[derive(Debug, Default)]
+struct Own {
+    readers: BTreeSet<GuidBytes>,
+    writers: BTreeSet<GuidBytes>,
+    changed: bool,
+    /// Those that were not seen to be announced, and since when they are there.
+    unseen: BTreeMap<GUID, Instant>,
+}
+
+/// What others told.
+#[derive(Debug, Default)]
+struct Others {
+    participants: BTreeMap<ParticipantPrefix, (GidLength, Vec<NodeEntities>)>,
+    malformed: u64,
+    /// Names that were warned of.
+    doubles: BTreeSet<ParticipantPrefix>,
+}
+
+/// What the GUIDs of all entities of a participant begin with.
+pub type ParticipantPrefix = [u8; 12];
+
+impl Node {
+    /// Begins to tell of the node.
+    ///
+    /// # Errors
+    /// When the thread cannot be started.
+    pub(crate) fn start(options: NodeOptions, channels: Channels) -> std::io::Result<Self> {
+        let shared = Arc::new(Shared {
+            clock: RosClock::new(options.use_sim_time),
+            options,
+            own: Mutex::new(Own {
+                changed: true,
+                ..Own::default()
+            }),
+            others: Mutex::default(),
+            services: Mutex::default(),
+            stop: AtomicBool::new(false),
+            thread: Mutex::default(),
+        });
+        let teller = Teller::new(Arc::clone(&shared), channels);
+        let thread = std::thread::Builder::new()
+            .name("ros-node".to_owned())
+            .spawn(move || teller.run())?;
+        *lock(&shared.thread) = Some(thread.thread().clone());
+        Ok(Self {
+            shared,
+            thread: Some(thread),
+        })
+    }
+
+    /// Publishes the program's warnings and hears `/clock` from now on.
+    pub(crate) fn serve(&self, services: Services) {
+        let Some(thread) = lock(&self.shared.thread).clone() else {
+            return;
+        };
+        let rosout = Arc::new(Rosout::new(self.shared.clock.clone(), thread.clone()));
+        bridge_node::hear_log(&rosout);
+        *lock(&self.shared.services) = Some((services, rosout));
+        thread.unpark();
+    }
+
+    pub(crate) fn options(&self) -> &NodeOptions {
+        &self.shared.options
+    }
+
+    pub(crate) fn clock(&self) -> RosClock {
+        self.shared.clock.clone()
+    }
+
+    pub(crate) fn list_reader(&self, endpoint: RawReader) -> Reader {
+        let guid = endpoint.guid();
+        self.list(endpoint, guid, Kind::Reader)
+    }
+
+    pub(crate) fn list_writer(&self, endpoint: RawWriter) -> Writer {
+        let guid = endpoint.guid();
+        self.list(endpoint, guid, Kind::Writer)
+    }
+
+    fn list<E>(&self, endpoint: E, guid: GUID, kind: Kind) -> Listed<E> {
+        lock(&self.shared.own).unseen.insert(guid, Instant::now());
+        self.shared
+            .change(|own| own.of(kind).insert(guid.to_bytes()));
+        Listed {
+            endpoint,
+            entry: Entry {
+                node: Arc::clone(&self.shared),
+                guid,
+                kind,
+            },
+        }
+    }
+
+    /// The nodes of others.
+    pub(crate) fn others(&self) -> Vec<NodeEntities> {
+        let others = lock(&self.shared.others);
+        others
+            .participants
+            .values()
+            .flat_map(|(_, nodes)| nodes.iter().cloned())
+            .collect()
+    }
+
+    /// The full name of the node of others that has this endpoint.
+    pub(crate) fn owner(&self, endpoint: GUID) -> Option<String> {
+        let guid = endpoint.to_bytes();
+        let others = lock(&self.shared.others);
+        let (_, nodes) = others.participants.get(endpoint.prefix.as_ref())?;
+        nodes
+            .iter()
+            .find(|node| node.readers.contains(&guid) || node.writers.contains(&guid))
+            .map(NodeEntities::full_name)
+    }
+
+    /// Takes note of endpoints of ours that were announced, and returns those that should have been by now.
+    pub(crate) fn unannounced(&self, announced: &BTreeSet<GUID>) -> BTreeSet<GUID> {
+        let mut own = lock(&self.shared.own);
+        own.unseen.retain(|guid, _| !announced.contains(guid));
+        if announced.is_empty() {
+            // RustDDS does not hear itself here, so nothing follows.
+            return BTreeSet::new();
+        }
+        let now = Instant::now();
+        let late = |since: &Instant| now.duration_since(*since) >= ANNOUNCED_WITHIN;
+        own.unseen
+            .iter()
+            .filter(|(_, since)| late(since))
+            .map(|(guid, _)| *guid)
+            .collect()
+    }
+
+    /// Forgets the nodes of participants that are not there any more.
+    pub(crate) fn retain(&self, alive: impl Fn(&ParticipantPrefix) -> bool) {
+        let mut others = lock(&self.shared.others);
+        let before = others.participants.len();
+        others.participants.retain(|prefix, _| alive(prefix));
+        others.doubles.retain(|prefix| alive(prefix));
+        let gone = others.participants.len() != before;
+        drop(others);
+        if gone {
+            self.shared.wake();
+        }
+    }
+}
+
+impl Drop for Node {
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Ordering::Release);
+        self.shared.wake();
+        if let Some(thread) = self.thread.take() {
+            // It does not panic; if it did, its name goes with the participant.
+            thread.join().unwrap_or_default();
+        }
+    }
+}
+
+impl Shared {
+    fn change(&self, change: impl FnOnce(&mut Own) -> bool) {
+        let mut own = lock(&self.own);
+        own.changed |= change(&mut own);
+        drop(own);
+        self.wake();
+    }
+
+    fn wake(&self) {
+        if let Some(thread) = &*lock(&self.thread) {
+            thread.unpark();
+        }
+    }
+}
+
+impl Own {
+    fn of(&mut self, kind: Kind) -> &mut BTreeSet<GuidBytes> {
+        match kind {
+            Kind::Reader => &mut self.readers,
+            Kind::Writer => &mut self.writers,
+        }
+    }
+}
+
+impl Others {
+    /// The length most participants write; the newer one when as many write either.
+    fn majority(&self) -> GidLength {
+        let lengths = || self.participants.values().map(|(length, _)| *length);
+        let older = lengths().filter(|length| *length == GidLength::Bytes24);
+        if older.count() * 2 > self.participants.len() {
+            GidLength::Bytes24
+        } else {
+            GidLength::Bytes16
+        }
+    }
+}
+
+/// The thread's side.
+struct Teller {
+    shared: Arc<Shared>,
+    channels: Channels,
+    /// When the list is to be published.
+    due: Option<Instant>,
+    /// The length it was published in.
+    written: Option<GidLength>,
+}
+
+impl Teller {
+    fn new(shared: Arc<Shared>, channels: Channels) -> Self {
+        Self {
+            shared,
+            channels,
+            due: None,
+            written: None,
+        }
+    }
+
+    fn run(mut self) {
+        let waker = Waker::from(Arc::new(Unpark(std::thread::current())));
+        while !self.shared.stop.load(Ordering::Acquire) {
+            // Armed before each look: what arrives between the look and the sleep ends the sleep.
+            self.channels.info_reader.set_waker(Some(waker.clone()));
+            self.hear_others();
+            let waits = self.serve(&waker);
+            self.tell();
+            let now = Instant::now();
+            match (self.due, waits) {
+                (None, false) => std::thread::park(),
+                (None, true) => std::thread::park_timeout(RETRY),
+                (Some(due), false) => std::thread::park_timeout(due.duration_since(now)),
+                (Some(due), true) => std::thread::park_timeout(due.duration_since(now).min(RETRY)),
+            }
+        }
+        self.withdraw();
+    }
+
+    fn hear_others(&mut self) {
+        loop {
+            match self.channels.info_reader.try_take_one() {
+                Ok(Some(sample)) => {
+                    let writer = sample.writer_guid;
+                    if let Ok(prefix) = ParticipantPrefix::try_from(writer.prefix.as_ref()) {
+                        self.heard(prefix, &sample.into_value().into_bytes());
+                    }
+                }
+                Ok(None) => return,
+                Err(error) => debug!(%error, "unreadable list of nodes"),
+            }
+        }
+    }
+
+    fn heard(&self, prefix: ParticipantPrefix, payload: &[u8]) {
+        if self.channels.participant.starts_with(&prefix) {
+            return;
+        }
+        let mut others = lock(&self.shared.others);
+        let Ok((info, length)) = ParticipantEntitiesInfo::decode(payload) else {
+            others.malformed += 1;
+            debug!(total = others.malformed, "malformed list of nodes");
+            return;
+        };
+        if others.participants.len() >= MAX_PARTICIPANTS
+            && !others.participants.contains_key(&prefix)
+        {
+            return;
+        }
+        let own = self.shared.options.full_name();
+        let double = info.nodes.iter().any(|node| node.full_name() == own);
+        if double && others.doubles.insert(prefix) {
+            warn!(
+                node = own,
+                "another node of the domain has the same name; tools of ROS show them as one"
+            );
+        }
+        debug!(?prefix, ?length, nodes = info.nodes.len(), "heard of nodes");
+        others.participants.insert(prefix, (length, info.nodes));
+    }
+
+    /// Serves `/rosout` and `/clock`; says whether records wait for room.
+    fn serve(&self, waker: &Waker) -> bool {
+        let services = lock(&self.shared.services);
+        let Some((services, rosout)) = &*services else {
+            return false;
+        };
+        if let Some(reader) = &services.clock {
+            reader.set_waker(Some(waker.clone()));
+            while let Ok(Some(sample)) = reader.try_take_one() {
+                self.shared.clock.hear(&sample.into_value().into_bytes());
+            }
+        }
+        rosout.flush(&self.shared.options.logger(), |log| {
+            write(&services.rosout, log)
+        })
+    }
+
+    /// Publishes the list if it is due, and makes up the next time.
+    fn tell(&mut self) {
+        let length = self
+            .shared
+            .options
+            .gid
+            .unwrap_or_else(|| lock(&self.shared.others).majority());
+        let changed = lock(&self.shared.own).changed || self.written != Some(length);
+        if !changed {
+            self.due = None;
+            return;
+        }
+        let now = Instant::now();
+        let due = *self.due.get_or_insert(now + BATCH);
+        if now < due {
+            return;
+        }
+        self.due = None;
+        let info = self.info();
+        if write(&self.channels.info_writer, info.encode(length)) {
+            self.written = Some(length);
+        } else {
+            // The send window is full.
+            lock(&self.shared.own).changed = true;
+            self.due = Some(now + RETRY);
+        }
+    }
+
+    fn info(&self) -> ParticipantEntitiesInfo {
+        let mut own = lock(&self.shared.own);
+        own.changed = false;
+        ParticipantEntitiesInfo {
+            participant: self.channels.participant,
+            nodes: vec![NodeEntities {
+                namespace: self.shared.options.namespace.clone(),
+                name: self.shared.options.name.clone(),
+                readers: own.readers.iter().copied().collect(),
+                writers: own.writers.iter().copied().collect(),
+            }],
+        }
+    }
+
+    /// Tells the others that the node has gone before the participant does.
+    fn withdraw(self) {
+        drop(lock(&self.shared.services).take());
+        let info = ParticipantEntitiesInfo {
+            participant: self.channels.participant,
+            nodes: Vec::new(),
+        };
+        let writer = &self.channels.info_writer;
+        if write(writer, info.encode(self.written.unwrap_or_default())) {
+            // Whoever has not heard by then notices that the participant goes.
+            writer.wait_for_acknowledgments(WITHDRAW_WITHIN).ok();
+        }
+    }
+}
+
+/// Whether RustDDS took it.
+fn write(writer: &RawWriter, bytes: Bytes) -> bool {
+    // What is made here is little endian CDR.
+    Payload::to_write(bytes).is_ok_and(|payload| writer.write(payload, None).is_ok())
+}
+
+struct Unpark(Thread);
+
+impl Wake for Unpark {
+    fn wake(self: Arc<Self>) {
+        self.0.unpark();
+    }
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl<E> std::fmt::Debug for Listed<E>
+where
+    E: std::fmt::Debug,
+{
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.endpoint.fmt(f)
+    }
+}
+
+/// Changes of the list within this time are told at once.
+const BATCH: Duration = Duration::from_millis(50);
+/// When to try again what RustDDS had no room for.
+const RETRY: Duration = Duration::from_millis(100);
+/// How long an announcement may take: a full queue of RustDDS' discovery is worked off in less.
+const ANNOUNCED_WITHIN: Duration = Duration::from_secs(3);
+/// How long leaving waits for others to hear of it.
+const WITHDRAW_WITHIN: Duration = Duration::from_millis(200);
+/// Participants whose nodes are known; of further ones they are not.
+const MAX_PARTICIPANTS: usize = 4096;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn options(namespace: &str, name: &str) -> NodeOptions {
+        NodeOptions {
+            namespace: namespace.to_owned(),
+            ..NodeOptions::from(name)
+        }
+    }
+
+    #[test]
+    fn names_are_those_of_ros() {
+        assert_eq!(options("/", "bridge").full_name(), "/bridge");
+        assert_eq!(
+            options("/cell/left", "bridge").full_name(),
+            "/cell/left/bridge"
+        );
+        assert_eq!(options("/cell/left", "bridge").logger(), "cell.left.bridge");
+        for good in [options("/", "_b1"), options("/a/b_c", "B")] {
+            assert_eq!(good.fault(), None, "{good:?}");
+        }
+        for bad in [
+            options("/", ""),
+            options("/", "1b"),
+            options("/", "a/b"),
+            options("/", "a-b"),
+            options("", "a"),
+            options("a", "a"),
+            options("/a/", "a"),
+            options("/a//b", "a"),
+            options("/", &"a".repeat(256)),
+        ] {
+            assert!(bad.fault().is_some(), "{bad:?}");
+        }
+    }
+
+    #[test]
+    fn gids_are_written_as_most_others_write_them() {
+        let mut others = Others::default();
+        assert_eq!(others.majority(), GidLength::Bytes16);
+        let mut join = |number, length| {
+            others.participants.insert([number; 12], (length, vec![]));
+            others.majority()
+        };
+        assert_eq!(join(1, GidLength::Bytes24), GidLength::Bytes24);
+        assert_eq!(join(2, GidLength::Bytes16), GidLength::Bytes16);
+        assert_eq!(join(3, GidLength::Bytes24), GidLength::Bytes24);
+    }
+}

@@ -1,0 +1,100 @@
+//! What follows `--ros-args` on a command line, as `ros2 run` and launch files put it there (design.ros2.org, "ROS
+//! Command Line Arguments"): the node's name and namespace, and the one parameter a bridge has.
+
+/// What ROS arguments say of a node.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct RosArgs {
+    /// `-r __node:=NAME`.
+    pub name: Option<String>,
+    /// `-r __ns:=/NAMESPACE`.
+    pub namespace: Option<String>,
+    /// `-p use_sim_time:=true`.
+    pub use_sim_time: Option<bool>,
+}
+
+impl RosArgs {
+    /// Reads the words after `--ros-args`. Later ones win.
+    ///
+    /// # Errors
+    /// What a bridge cannot obey, such as another name for a topic: that would be left out without a word.
+    pub fn parse<S: AsRef<str>>(words: &[S]) -> Result<Self, String> {
+        let mut found = Self::default();
+        let mut words = words.iter().map(AsRef::as_ref);
+        while let Some(word) = words.next() {
+            let rule = match word {
+                "-r" | "--remap" | "-p" | "--param" => words
+                    .next()
+                    .ok_or_else(|| format!("{word}: a rule as NAME:=VALUE is missing"))?,
+                "--ros-args" => continue,
+                "--" => break,
+                other => {
+                    return Err(format!(
+                        "{other}: a bridge takes -r and -p after --ros-args"
+                    ));
+                }
+            };
+            let (name, value) = rule
+                .split_once(":=")
+                .ok_or_else(|| format!("{word} {rule}: a rule as NAME:=VALUE is expected"))?;
+            let is_parameter = word == "-p" || word == "--param";
+            match (is_parameter, name) {
+                (false, "__node" | "__name") => found.name = Some(value.to_owned()),
+                (false, "__ns") => found.namespace = Some(value.to_owned()),
+                (true, "use_sim_time") => {
+                    // As YAML has it.
+                    found.use_sim_time = Some(match value.to_ascii_lowercase().as_str() {
+                        "true" => true,
+                        "false" => false,
+                        _ => return Err(format!("use_sim_time is true or false, not {value}")),
+                    });
+                }
+                (false, _) => {
+                    return Err(format!(
+                        "{word} {rule}: the names of topics are the mapping's; a bridge takes __node and __ns"
+                    ));
+                }
+                (true, _) => {
+                    return Err(format!(
+                        "{word} {rule}: the parameter of a bridge is use_sim_time"
+                    ));
+                }
+            }
+        }
+        Ok(found)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_ros2_run_gives_a_node_is_taken() {
+        let words = "-r __node:=left -r __ns:=/cell -p use_sim_time:=True -- rest";
+        let words: Vec<&str> = words.split(' ').collect();
+        assert_eq!(
+            RosArgs::parse(&words).unwrap(),
+            RosArgs {
+                name: Some("left".into()),
+                namespace: Some("/cell".into()),
+                use_sim_time: Some(true),
+            }
+        );
+    }
+
+    #[test]
+    fn what_a_bridge_cannot_obey_is_refused() {
+        for (words, why) in [
+            ("-r /chatter:=/news", "mapping"),
+            ("-p rate:=3", "use_sim_time"),
+            ("-p use_sim_time:=soon", "soon"),
+            ("-r", "missing"),
+            ("-r __node", "NAME:=VALUE"),
+            ("--params-file x.yaml", "--params-file"),
+        ] {
+            let words: Vec<&str> = words.split(' ').collect();
+            let error = RosArgs::parse(&words).unwrap_err();
+            assert!(error.contains(why), "{error}");
+        }
+    }
+}

@@ -1,0 +1,469 @@
+//! Type hashes of ROS 2: the SHA-256 of a type's description in JSON (REP-2016, "Type Version Hash"; the description is
+//! `type_description_interfaces/msg/TypeDescription`).
+//!
+//! The description is of names and types of fields alone: constants, defaults and comments are no part of it. It holds
+//! the descriptions of all types needed, in the order of their names.
+
+use std::collections::BTreeMap;
+use std::fmt::{self, Write as _};
+use std::sync::Arc;
+
+use sha2::{Digest, Sha256};
+
+use crate::definition::{Arity, Definition, Field, FieldType, Number, Primitive, Text};
+use crate::resolve::hex;
+use crate::{DefinitionError, Registry, TypeName};
+
+/// The hash of a ROS 2 type, as nodes from Iron on announce it. Prints as `RIHS01_` and 64 hex digits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct TypeHash([u8; 32]);
+
+impl TypeHash {
+    /// The SHA-256 itself.
+    pub fn as_bytes(&self) -> &[u8; 32] {
+        &self.0
+    }
+}
+
+impl fmt::Display for TypeHash {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "RIHS01_{}", hex(&self.0))
+    }
+}
+
+/// The hashes of a service and its parts, each by its ROS 2 name, such as `std_srvs/srv/SetBool_Request`.
+///
+/// The endpoints of a service announce those of `_Request` and `_Response`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ServiceTypeHashes {
+    /// The service.
+    pub service: TypeHash,
+    /// `_Request`.
+    pub request: TypeHash,
+    /// `_Response`.
+    pub response: TypeHash,
+    /// `_Event`, the message of service introspection.
+    pub event: TypeHash,
+}
+
+/// The hashes of an action and its parts, by names such as `nav2_msgs/action/NavigateToPose_Goal`.
+///
+/// What the endpoints of an action announce are those of the two services' requests and responses, and of the feedback
+/// message.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ActionTypeHashes {
+    /// The action.
+    pub action: TypeHash,
+    /// `_Goal`, the first part of the text.
+    pub goal: TypeHash,
+    /// `_Result`, the second part.
+    pub result: TypeHash,
+    /// `_Feedback`, the third part.
+    pub feedback: TypeHash,
+    /// `_SendGoal`.
+    pub send_goal: ServiceTypeHashes,
+    /// `_GetResult`.
+    pub get_result: ServiceTypeHashes,
+    /// `_FeedbackMessage`.
+    pub feedback_message: TypeHash,
+}
+
+impl Registry {
+    /// The type hash of a message. Definitions are taken for ROS 2's; of a registry of ROS 1 it means nothing.
+    ///
+    /// # Errors
+    /// As [`Registry::get`].
+    pub fn type_hash(&self, name: &TypeName) -> Result<TypeHash, DefinitionError> {
+        // It knows whether a type contains itself, which is not looked at any more below.
+        self.get(name)?;
+        let mut types = Described::new(self);
+        types.message(name)?;
+        Ok(types.hash(&name.ros2()))
+    }
+
+    /// The type hashes of a service and of the messages rosidl makes of it.
+    ///
+    /// # Errors
+    /// As [`Registry::service`].
+    pub fn service_type_hashes(
+        &self,
+        name: &TypeName,
+    ) -> Result<ServiceTypeHashes, DefinitionError> {
+        self.service(name)?;
+        let mut types = Described::new(self);
+        let full = format!("{}/srv/{}", name.package(), name.name());
+        if let Some([request, response]) = self.service_definitions(name) {
+            types.definition(&format!("{full}_Request"), request)?;
+            types.definition(&format!("{full}_Response"), response)?;
+        }
+        types.service(&full);
+        Ok(types.service_hashes(&full))
+    }
+
+    /// The type hashes of an action, given by the definitions of its goal, result and feedback, and of the messages and
+    /// services rosidl makes of it (design.ros2.org, "Actions").
+    ///
+    /// # Errors
+    /// As [`Registry::get`], and [`DefinitionError::Syntax`] for a text that has not three parts.
+    pub fn action_type_hashes(
+        &self,
+        name: &TypeName,
+        text: &str,
+    ) -> Result<ActionTypeHashes, DefinitionError> {
+        let parts = crate::service::action_parts(self.dialect(), name, text)?;
+        let full = format!("{}/action/{}", name.package(), name.name());
+        let mut types = Described::new(self);
+        for (suffix, part) in ["Goal", "Result", "Feedback"].into_iter().zip(&parts) {
+            for needed in part.needs() {
+                self.get(needed)?;
+            }
+            types.definition(&format!("{full}_{suffix}"), part)?;
+        }
+        types.action(&full);
+        let of = |suffix: &str| types.hash(&format!("{full}_{suffix}"));
+        Ok(ActionTypeHashes {
+            action: types.hash(&full),
+            goal: of("Goal"),
+            result: of("Result"),
+            feedback: of("Feedback"),
+            send_goal: types.service_hashes(&format!("{full}_SendGoal")),
+            get_result: types.service_hashes(&format!("{full}_GetResult")),
+            feedback_message: of("FeedbackMessage"),
+        })
+    }
+}
+
+/// Types by their ROS 2 names.
+struct Described<'r> {
+    registry: &'r Registry,
+    types: BTreeMap<String, Vec<FieldDescription>>,
+}
+
+/// `type_description_interfaces/msg/Field` without its default.
+struct FieldDescription {
+    name: String,
+    type_id: u8,
+    capacity: u32,
+    string_capacity: u32,
+    /// Empty unless it is a message.
+    nested: String,
+}
+
+impl<'r> Described<'r> {
+    fn new(registry: &'r Registry) -> Self {
+        Self {
+            registry,
+            types: BTreeMap::new(),
+        }
+    }
+
+    fn message(&mut self, name: &TypeName) -> Result<(), DefinitionError> {
+        match self.registry.definition(name) {
+            Some(definition) => self.definition(&name.ros2(), definition),
+            None => Err(DefinitionError::Unknown {
+                name: name.clone(),
+                needed_by: None,
+                suggestion: self.registry.suggest(name),
+            }),
+        }
+    }
+
+    /// Describes a message and what it needs. The depth is bounded, as the message has been resolved before.
+    fn definition(
+        &mut self,
+        full: &str,
+        definition: &Arc<Definition>,
+    ) -> Result<(), DefinitionError> {
+        if self.types.contains_key(full) {
+            return Ok(());
+        }
+        let mut fields: Vec<FieldDescription> =
+            definition.fields.iter().map(FieldDescription::of).collect();
+        if fields.is_empty() {
+            // What rosidl puts into an empty message, as C has no empty struct.
+            fields.push(FieldDescription::new(
+                "structure_needs_at_least_one_member",
+                Number::UInt8.type_id(),
+            ));
+        }
+        self.types.insert(full.to_owned(), fields);
+        for needed in definition.needs() {
+            self.message(needed)?;
+        }
+        Ok(())
+    }
+
+    /// Describes a service of that name, whose request and response are described already.
+    fn service(&mut self, full: &str) {
+        let part = |suffix: &str| format!("{full}_{suffix}");
+        let (request, response, event) = (part("Request"), part("Response"), part("Event"));
+        self.known();
+        self.types.insert(
+            event.clone(),
+            vec![
+                FieldDescription::nested("info", "service_msgs/msg/ServiceEventInfo"),
+                FieldDescription::at_most_one("request", &request),
+                FieldDescription::at_most_one("response", &response),
+            ],
+        );
+        self.types.insert(
+            full.to_owned(),
+            vec![
+                FieldDescription::nested("request_message", &request),
+                FieldDescription::nested("response_message", &response),
+                FieldDescription::nested("event_message", &event),
+            ],
+        );
+    }
+
+    /// Describes an action of that name, whose goal, result and feedback are described already.
+    fn action(&mut self, full: &str) {
+        let part = |suffix: &str| format!("{full}_{suffix}");
+        self.known();
+        let goal_id = || FieldDescription::nested("goal_id", UUID);
+        let stamp = FieldDescription::nested("stamp", TIME);
+        let accepted = FieldDescription::new("accepted", Number::Bool.type_id());
+        let status = FieldDescription::new("status", Number::Int8.type_id());
+        let nested = |name, suffix| FieldDescription::nested(name, &part(suffix));
+        let messages = [
+            ("SendGoal_Request", vec![goal_id(), nested("goal", "Goal")]),
+            ("SendGoal_Response", vec![accepted, stamp]),
+            ("GetResult_Request", vec![goal_id()]),
+            (
+                "GetResult_Response",
+                vec![status, nested("result", "Result")],
+            ),
+            (
+                "FeedbackMessage",
+                vec![goal_id(), nested("feedback", "Feedback")],
+            ),
+        ];
+        for (suffix, fields) in messages {
+            self.types.insert(part(suffix), fields);
+        }
+        self.service(&part("SendGoal"));
+        self.service(&part("GetResult"));
+        let action = vec![
+            nested("goal", "Goal"),
+            nested("result", "Result"),
+            nested("feedback", "Feedback"),
+            nested("send_goal_service", "SendGoal"),
+            nested("get_result_service", "GetResult"),
+            nested("feedback_message", "FeedbackMessage"),
+        ];
+        self.types.insert(full.to_owned(), action);
+    }
+
+    /// The messages that services and actions are made with, whatever the registry has.
+    fn known(&mut self) {
+        let field = |name: &str, number: Number| FieldDescription::new(name, number.type_id());
+        let fixed = |name: &str| FieldDescription {
+            type_id: Number::UInt8.type_id() + ARRAY,
+            capacity: 16,
+            ..field(name, Number::UInt8)
+        };
+        let known = [
+            (
+                TIME,
+                vec![
+                    field("sec", Number::Int32),
+                    field("nanosec", Number::UInt32),
+                ],
+            ),
+            (UUID, vec![fixed("uuid")]),
+            (
+                "service_msgs/msg/ServiceEventInfo",
+                vec![
+                    field("event_type", Number::UInt8),
+                    FieldDescription::nested("stamp", TIME),
+                    // A `char[16]`, which rosidl takes for `uint8[16]`.
+                    fixed("client_gid"),
+                    field("sequence_number", Number::Int64),
+                ],
+            ),
+        ];
+        for (name, fields) in known {
+            self.types.insert(name.to_owned(), fields);
+        }
+    }
+
+    fn service_hashes(&self, full: &str) -> ServiceTypeHashes {
+        let of = |suffix: &str| self.hash(&format!("{full}_{suffix}"));
+        ServiceTypeHashes {
+            service: self.hash(full),
+            request: of("Request"),
+            response: of("Response"),
+            event: of("Event"),
+        }
+    }
+
+    fn hash(&self, full: &str) -> TypeHash {
+        TypeHash(Sha256::digest(self.json(full)).into())
+    }
+
+    /// The description as Python's `json.dumps` writes it. All names are identifiers, so nothing is to be escaped.
+    fn json(&self, full: &str) -> String {
+        let mut needed = BTreeMap::new();
+        self.needs(full, &mut needed);
+        needed.remove(full);
+        let mut text = String::from("{\"type_description\": ");
+        self.write_type(&mut text, full);
+        text.push_str(", \"referenced_type_descriptions\": [");
+        for (at, name) in needed.keys().enumerate() {
+            if at > 0 {
+                text.push_str(", ");
+            }
+            self.write_type(&mut text, name);
+        }
+        text.push_str("]}");
+        text
+    }
+
+    fn needs<'s>(&'s self, full: &'s str, found: &mut BTreeMap<&'s str, ()>) {
+        if found.insert(full, ()).is_some() {
+            return;
+        }
+        for field in self.types.get(full).into_iter().flatten() {
+            if !field.nested.is_empty() {
+                self.needs(&field.nested, found);
+            }
+        }
+    }
+
+    fn write_type(&self, text: &mut String, full: &str) {
+        // Writing to a String cannot fail.
+        write!(text, "{{\"type_name\": \"{full}\", \"fields\": [").unwrap_or_default();
+        for (at, field) in self.types.get(full).into_iter().flatten().enumerate() {
+            if at > 0 {
+                text.push_str(", ");
+            }
+            let FieldDescription {
+                name,
+                type_id,
+                capacity,
+                string_capacity,
+                nested,
+            } = field;
+            write!(
+                text,
+                "{{\"name\": \"{name}\", \"type\": {{\"type_id\": {type_id}, \"capacity\": {capacity}, \
+                 \"string_capacity\": {string_capacity}, \"nested_type_name\": \"{nested}\"}}}}"
+            )
+            .unwrap_or_default();
+        }
+        text.push_str("]}");
+    }
+}
+
+impl FieldDescription {
+    fn new(name: &str, type_id: u8) -> Self {
+        Self {
+            name: name.to_owned(),
+            type_id,
+            capacity: 0,
+            string_capacity: 0,
+            nested: String::new(),
+        }
+    }
+
+    fn nested(name: &str, type_name: &str) -> Self {
+        Self {
+            nested: type_name.to_owned(),
+            ..Self::new(name, NESTED)
+        }
+    }
+
+    fn at_most_one(name: &str, type_name: &str) -> Self {
+        Self {
+            capacity: 1,
+            nested: type_name.to_owned(),
+            ..Self::new(name, NESTED + BOUNDED_SEQUENCE)
+        }
+    }
+
+    fn of(field: &Field) -> Self {
+        let mut found = match &field.kind {
+            FieldType::Message(name) => Self::nested(&field.name, &name.ros2()),
+            // The parser takes it for `uint8`, whose values and bytes are the same.
+            FieldType::Primitive(_) if base(&field.written) == "byte" => {
+                Self::new(&field.name, BYTE)
+            }
+            FieldType::Primitive(Primitive::Number(number)) => {
+                Self::new(&field.name, number.type_id())
+            }
+            FieldType::Primitive(Primitive::Text(text)) => Self::text(&field.name, *text),
+            // `time` and `duration` of ROS 1.
+            FieldType::Primitive(Primitive::Clock(_)) => Self::nested(&field.name, TIME),
+        };
+        let (more, capacity) = match field.arity {
+            Arity::One => (0, 0),
+            Arity::Fixed(length) => (ARRAY, length),
+            Arity::Sequence { bound: Some(bound) } => (BOUNDED_SEQUENCE, bound),
+            Arity::Sequence { bound: None } => (UNBOUNDED_SEQUENCE, 0),
+        };
+        found.type_id += more;
+        found.capacity = capacity;
+        found
+    }
+
+    fn text(name: &str, text: Text) -> Self {
+        let bounded = text.bound != u32::MAX;
+        let type_id = match (text.wide, bounded) {
+            (false, false) => STRING,
+            (true, false) => WSTRING,
+            (false, true) => BOUNDED_STRING,
+            (true, true) => BOUNDED_WSTRING,
+        };
+        Self {
+            string_capacity: if bounded { text.bound } else { 0 },
+            ..Self::new(name, type_id)
+        }
+    }
+}
+
+impl Definition {
+    /// The messages among its fields.
+    fn needs(&self) -> impl Iterator<Item = &TypeName> {
+        self.fields.iter().filter_map(|field| match &field.kind {
+            FieldType::Message(name) => Some(name),
+            FieldType::Primitive(_) => None,
+        })
+    }
+}
+
+impl Number {
+    /// The constants of `type_description_interfaces/msg/FieldType`.
+    const fn type_id(self) -> u8 {
+        match self {
+            Self::Int8 => 2,
+            Self::UInt8 => 3,
+            Self::Int16 => 4,
+            Self::UInt16 => 5,
+            Self::Int32 => 6,
+            Self::UInt32 => 7,
+            Self::Int64 => 8,
+            Self::UInt64 => 9,
+            Self::Float32 => 10,
+            Self::Float64 => 11,
+            Self::Bool => 15,
+        }
+    }
+}
+
+/// A type as written without the length of an array.
+fn base(written: &str) -> &str {
+    written.split('[').next().unwrap_or(written)
+}
+
+const TIME: &str = "builtin_interfaces/msg/Time";
+const UUID: &str = "unique_identifier_msgs/msg/UUID";
+// `type_description_interfaces/msg/FieldType`, whose arrays of a type are numbered as far behind it as this:
+const NESTED: u8 = 1;
+const BYTE: u8 = 16;
+const STRING: u8 = 17;
+const WSTRING: u8 = 18;
+const BOUNDED_STRING: u8 = 21;
+const BOUNDED_WSTRING: u8 = 22;
+const ARRAY: u8 = 48;
+const BOUNDED_SEQUENCE: u8 = 96;
+const UNBOUNDED_SEQUENCE: u8 = 144;

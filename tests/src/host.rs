@@ -1,0 +1,151 @@
+//! A second host: a network of its own, joined to the cell's by a wire that can lose and delay.
+
+mod wire;
+
+use std::{
+    fs::File,
+    os::fd::AsRawFd,
+    path::PathBuf,
+    process::Command,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread::JoinHandle,
+};
+
+use nix::sched::{CloneFlags, setns, unshare};
+
+pub use wire::Wire;
+
+use crate::{Cell, Started};
+
+/// The cell's end of the wire.
+pub const HERE: &str = "10.77.0.1";
+/// The other host's end.
+pub const THERE: &str = "10.77.0.2";
+/// What both ends are called.
+pub const WIRE: &str = "wire0";
+
+/// The other host. Programs are started on it by [`Started::on`].
+pub struct Host {
+    namespace: Namespace,
+    ends: Arc<AtomicBool>,
+    wire: Option<JoinHandle<()>>,
+}
+
+impl Cell {
+    /// A second host at the end of a wire of MTU 1500 that carries multicast. The cell keeps its loopback beside it.
+    ///
+    /// # Panics
+    /// When the network cannot be made.
+    #[must_use]
+    pub fn host(&self, wire: Wire) -> Host {
+        let (here, middle, there) = (Namespace::current(), Namespace::fresh(), Namespace::fresh());
+        here.join("near", &middle, HERE);
+        there.join("far", &middle, THERE);
+        there.ip(&["route", "add", "224.0.0.0/4", "dev", WIRE]);
+        for end in ["near", "far"] {
+            middle.ip(&["link", "set", end, "mtu", "1500", "up"]);
+        }
+        let ends = Arc::new(AtomicBool::new(false));
+        let asked = Arc::clone(&ends);
+        let wire = std::thread::Builder::new()
+            .name("wire".to_owned())
+            .spawn(move || {
+                setns(&middle.0, CloneFlags::CLONE_NEWNET).unwrap();
+                wire.carry(["near", "far"], &asked);
+            })
+            .unwrap();
+        Host {
+            namespace: there,
+            ends,
+            wire: Some(wire),
+        }
+    }
+}
+
+impl Host {
+    /// The namespace, for programs that are to run in it.
+    pub(crate) fn path(&self) -> PathBuf {
+        self.namespace.path()
+    }
+
+    /// The Fast DDS peer on this host, in domain 2, not started yet.
+    #[must_use]
+    pub fn fastdds_started(&self, cell: &Cell, args: &[&str]) -> Started {
+        cell.fastdds_started(args)
+            .args(["--interface", THERE])
+            .on(self)
+    }
+
+    /// The Cyclone DDS peer in C on this host, in domain 2, not started yet.
+    #[must_use]
+    pub fn cyclone_c_started(&self, cell: &Cell, args: &[&str]) -> Started {
+        cell.cyclone_c_started(args)
+            .env("CYCLONEDDS_URI", crate::peers::cyclone_uri(WIRE))
+            .on(self)
+    }
+}
+
+impl Drop for Host {
+    fn drop(&mut self) {
+        self.ends.store(true, Ordering::Relaxed);
+        if let Some(wire) = self.wire.take()
+            && wire.join().is_err()
+        {
+            eprintln!("the wire between the hosts had failed");
+        }
+    }
+}
+
+/// A network namespace, which lives as long as this.
+struct Namespace(File);
+
+impl Namespace {
+    fn current() -> Self {
+        Self(File::open("/proc/thread-self/ns/net").unwrap())
+    }
+
+    fn fresh() -> Self {
+        let made = std::thread::spawn(|| {
+            unshare(CloneFlags::CLONE_NEWNET).unwrap();
+            Self::current()
+        });
+        let made = made.join().unwrap();
+        made.ip(&["link", "set", "lo", "multicast", "on", "up"]);
+        made
+    }
+
+    fn path(&self) -> PathBuf {
+        PathBuf::from(format!(
+            "/proc/{}/fd/{}",
+            std::process::id(),
+            self.0.as_raw_fd()
+        ))
+    }
+
+    /// Lays a wire from here to `other`, where its end is called `name`.
+    fn join(&self, name: &str, other: &Self, address: &str) {
+        self.ip(&["link", "add", WIRE, "type", "veth", "peer", "name", name]);
+        let path = other.path();
+        self.ip(&["link", "set", name, "netns", &path.to_string_lossy()]);
+        self.ip(&["address", "add", &format!("{address}/24"), "dev", WIRE]);
+        self.ip(&["link", "set", WIRE, "mtu", "1500", "multicast", "on", "up"]);
+    }
+
+    fn ip(&self, args: &[&str]) {
+        let output = Command::new("nsenter")
+            .arg(format!("--net={}", self.path().display()))
+            .args(["--", "ip"])
+            .args(args)
+            .output()
+            .unwrap();
+        assert!(
+            output.status.success(),
+            "ip {}: {}",
+            args.join(" "),
+            String::from_utf8_lossy(&output.stderr)
+        );
+    }
+}

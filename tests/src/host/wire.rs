@@ -1,0 +1,204 @@
+//! The wire between two hosts: frames go in at one end and come out at the other, later, or never.
+//!
+//! `tc netem` would do the same where the kernel has it; this needs nothing but packet sockets, and loses the same
+//! frames of a sequence each time.
+
+use std::{
+    collections::VecDeque,
+    os::fd::{AsFd, AsRawFd, OwnedFd},
+    sync::atomic::{AtomicBool, Ordering},
+    time::{Duration, Instant},
+};
+
+use nix::{
+    errno::Errno,
+    ifaddrs::getifaddrs,
+    poll::{PollFd, PollFlags, ppoll},
+    sys::{
+        socket::{
+            AddressFamily, MsgFlags, SockFlag, SockProtocol, SockType, bind, recv, send,
+            setsockopt, socket, sockopt,
+        },
+        time::TimeSpec,
+    },
+};
+
+/// What a wire does to frames, in each direction.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Wire {
+    /// The share of frames that is lost, 0 to 1.
+    pub loss: f64,
+    /// How long a frame takes.
+    pub delay: Duration,
+}
+
+/// How long a direction looks away from its orders.
+const LOOK_UP: Duration = Duration::from_millis(50);
+/// Room of a packet socket, for bursts.
+const ROOM: usize = 64 << 20;
+
+impl Wire {
+    /// Carries frames between two interfaces of this thread's network until it is asked to end.
+    pub(super) fn carry(self, ends: [&str; 2], asked_to_end: &AtomicBool) {
+        let sockets = ends.map(packet_socket);
+        let mut directions = [
+            Direction::new(self, 0x2545_f491),
+            Direction::new(self, 0x9e37_79b9),
+        ];
+        let mut frame = vec![0; 65_536];
+        while !asked_to_end.load(Ordering::Relaxed) {
+            let due = directions.iter().filter_map(Direction::due).min();
+            let wait = due.map_or(LOOK_UP, |due| {
+                due.saturating_duration_since(Instant::now()).min(LOOK_UP)
+            });
+            let mut polled = sockets
+                .each_ref()
+                .map(|socket| PollFd::new(socket.as_fd(), PollFlags::POLLIN));
+            ppoll(&mut polled, Some(TimeSpec::from_duration(wait)), None).unwrap();
+            for (from, to) in [(0, 1), (1, 0)] {
+                while let Some(length) = receive(&sockets[from], &mut frame) {
+                    directions[from].take(&mut frame[..length]);
+                }
+                directions[from].deliver(&sockets[to]);
+            }
+        }
+    }
+}
+
+struct Direction {
+    wire: Wire,
+    random: u64,
+    under_way: VecDeque<(Instant, Vec<u8>)>,
+}
+
+impl Direction {
+    fn new(wire: Wire, seed: u64) -> Self {
+        Self {
+            wire,
+            random: seed,
+            under_way: VecDeque::new(),
+        }
+    }
+
+    fn due(&self) -> Option<Instant> {
+        self.under_way.front().map(|(due, _)| *due)
+    }
+
+    fn take(&mut self, frame: &mut [u8]) {
+        // xorshift64
+        self.random ^= self.random << 13;
+        self.random ^= self.random >> 7;
+        self.random ^= self.random << 17;
+        let chance = (self.random >> 11) as f64 / (1_u64 << 53) as f64;
+        if chance >= self.wire.loss {
+            forget_checksum(frame);
+            self.under_way
+                .push_back((Instant::now() + self.wire.delay, frame.to_vec()));
+        }
+    }
+
+    fn deliver(&mut self, socket: &OwnedFd) {
+        let now = Instant::now();
+        while self.due().is_some_and(|due| due <= now) {
+            let Some((_, frame)) = self.under_way.pop_front() else {
+                return;
+            };
+            match send(socket.as_raw_fd(), &frame, MsgFlags::empty()) {
+                // The other host is leaving, or its queue is full: as on any wire, the frame is gone.
+                Ok(_) | Err(Errno::ENETDOWN | Errno::ENOBUFS | Errno::ENXIO) => {}
+                Err(error) => panic!("a frame of {} bytes: {error}", frame.len()),
+            }
+        }
+    }
+}
+
+/// Takes the checksum out of a UDP datagram over IPv4, which may go without. The sender's kernel left it to the network
+/// card, which a pair of veth does not have, and here the frame has left the kernel that would know.
+fn forget_checksum(frame: &mut [u8]) {
+    const ETHERNET: usize = 14;
+    let udp_over_ipv4 = frame.len() > ETHERNET + 20
+        && frame[12..14] == [0x08, 0x00]
+        && frame[ETHERNET + 9] == 17
+        // The first fragment has the header of UDP.
+        && u16::from_be_bytes([frame[ETHERNET + 6], frame[ETHERNET + 7]]) & 0x1fff == 0;
+    if udp_over_ipv4 {
+        let header = ETHERNET + usize::from(frame[ETHERNET] & 0x0f) * 4;
+        if let Some(checksum) = frame.get_mut(header + 6..header + 8) {
+            checksum.fill(0);
+        }
+    }
+}
+
+/// A socket that sees all frames that reach the interface, and sends frames out of it.
+fn packet_socket(interface: &str) -> OwnedFd {
+    let made = socket(
+        AddressFamily::Packet,
+        SockType::Raw,
+        SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK,
+        SockProtocol::EthAll,
+    )
+    .unwrap();
+    setsockopt(&made, sockopt::RcvBufForce, &ROOM).unwrap();
+    let address = getifaddrs()
+        .unwrap()
+        .filter(|found| found.interface_name == interface)
+        .find_map(|found| found.address?.as_link_addr().copied())
+        .unwrap_or_else(|| panic!("there is no interface {interface}"));
+    bind(made.as_raw_fd(), &address).unwrap();
+    made
+}
+
+fn receive(socket: &OwnedFd, frame: &mut [u8]) -> Option<usize> {
+    match recv(socket.as_raw_fd(), frame, MsgFlags::empty()) {
+        Ok(length) => Some(length),
+        Err(Errno::EAGAIN | Errno::ENETDOWN) => None,
+        Err(error) => panic!("the wire cannot be read: {error}"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lossy_wire_loses_about_its_share_and_the_same_frames_each_time() {
+        let wire = Wire {
+            loss: 0.05,
+            delay: Duration::ZERO,
+        };
+        let arrived = || {
+            let mut direction = Direction::new(wire, 0x2545_f491);
+            for number in 0..10_000_u32 {
+                direction.take(&mut number.to_be_bytes().to_vec());
+            }
+            direction
+                .under_way
+                .into_iter()
+                .map(|(_, frame)| frame)
+                .collect::<Vec<_>>()
+        };
+        let first = arrived();
+        assert!((9_300..9_700).contains(&first.len()), "{}", first.len());
+        assert_eq!(first, arrived());
+    }
+
+    #[test]
+    fn only_the_checksum_of_a_datagram_is_forgotten() {
+        let mut frame = vec![0xff; 60];
+        frame[12..14].copy_from_slice(&[0x08, 0x00]);
+        frame[14] = 0x45;
+        frame[20..22].copy_from_slice(&[0x20, 0x00]);
+        frame[23] = 17;
+        let mut expected = frame.clone();
+        expected[40..42].copy_from_slice(&[0, 0]);
+        forget_checksum(&mut frame);
+        assert_eq!(frame, expected);
+
+        // A later fragment has data there.
+        frame[20..22].copy_from_slice(&[0x20, 0xb9]);
+        frame[40..42].copy_from_slice(&[7, 7]);
+        let later = frame.clone();
+        forget_checksum(&mut frame);
+        assert_eq!(frame, later);
+    }
+}

@@ -1,0 +1,54 @@
+//! What a process takes of the machine, from `/proc`.
+
+use std::{
+    fs,
+    time::{Duration, Instant},
+};
+
+/// Threads of a process.
+///
+/// # Panics
+/// When it is gone.
+#[must_use]
+pub fn threads(process: u32) -> u64 {
+    status(process, "Threads:")
+}
+
+/// Memory of a process that is in RAM, in bytes.
+///
+/// # Panics
+/// When it is gone.
+#[must_use]
+pub fn resident(process: u32) -> u64 {
+    status(process, "VmRSS:") * 1024
+}
+
+/// The share of one processor that a process takes within `window`.
+///
+/// # Panics
+/// When it is gone.
+#[must_use]
+pub fn cpu_share(process: u32, window: Duration) -> f64 {
+    let (start, before) = (Instant::now(), cpu_time(process));
+    std::thread::sleep(window);
+    (cpu_time(process) - before).as_secs_f64() / start.elapsed().as_secs_f64()
+}
+
+fn status(process: u32, field: &str) -> u64 {
+    let text = fs::read_to_string(format!("/proc/{process}/status")).unwrap();
+    let value = text.lines().find_map(|line| line.strip_prefix(field));
+    let number = value.and_then(|value| value.split_whitespace().next());
+    number.unwrap().parse().unwrap()
+}
+
+fn cpu_time(process: u32) -> Duration {
+    // The name may contain spaces; after it, user and system time are the 12th and 13th field, in 1/100 s.
+    let text = fs::read_to_string(format!("/proc/{process}/stat")).unwrap();
+    let (_, fields) = text.rsplit_once(')').unwrap();
+    let fields: Vec<&str> = fields.split_whitespace().collect();
+    let ticks: u64 = [fields[11], fields[12]]
+        .iter()
+        .map(|ticks| ticks.parse::<u64>().unwrap())
+        .sum();
+    Duration::from_millis(ticks * 10)
+}

@@ -1,0 +1,306 @@
+//! bridge-ros2 among peers that come, vanish, are many, and ask for what is not offered.
+
+use std::collections::BTreeSet;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::Signal;
+use system_tests::{
+    Cell, Child, METRICS_ROS2, Peer, Started, Triple, UaSide, cpu_share, eventually, metrics,
+    program, resident, threads,
+};
+use uadp::Scalar;
+
+const SOON: Duration = Duration::from_secs(30);
+const BOTH: &[Peer] = &[Peer::FastDds, Peer::CycloneC];
+const STRING: &str = "std_msgs/String";
+/// A value of the space, and one of the domain.
+const THERE: (Triple, &str) = ((1, 2, 10), "/ua_1_2_10");
+const BACK: (Triple, &str) = ((2, 2, 20), "/ua_2_2_20");
+
+type Peers = [fn(&Cell, &[&str]) -> Child; 2];
+const MAKERS: Peers = [Cell::fastdds, Cell::cyclone_c];
+
+/// Writes the text to the space ten times a second until all readers have it as their newest.
+fn reaches(ua: &mut UaSide, triple: Triple, text: &str, readers: &mut [&mut Child]) {
+    let mut written: Option<Instant> = None;
+    eventually(&format!("all readers have `{text}`"), SOON, || {
+        if written.is_none_or(|at| at.elapsed() > Duration::from_millis(100)) {
+            ua.write(triple, Scalar::String(Some(text)));
+            written = Some(Instant::now());
+        }
+        readers
+            .iter_mut()
+            .all(|reader| {
+                reader
+                    .values()
+                    .last()
+                    .is_some_and(|last| last["data"] == *text)
+            })
+            .then_some(())
+    });
+}
+
+fn kill(mut child: Child) {
+    child.signal(Signal::SIGKILL);
+    child.wait_for_end(SOON);
+}
+
+fn sends<'a>(topic: &'a str, text: &'a str) -> [&'a str; 9] {
+    [
+        "pub", topic, STRING, "--text", text, "--count", "0", "--rate", "20",
+    ]
+}
+
+#[test]
+fn values_flow_again_each_time_a_peer_is_killed_and_started() {
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let mut ua = UaSide::join();
+    let mut bridge = cell.bridge_ros2(&[]);
+    for turn in 0..20 {
+        let peer = MAKERS[turn % MAKERS.len()];
+        let mut reader = peer(&cell, &["sub", THERE.1, STRING]);
+        let back = format!("back {turn}");
+        let writer = peer(&cell, &sends(BACK.1, &back));
+        reaches(
+            &mut ua,
+            THERE.0,
+            &format!("there {turn}"),
+            &mut [&mut reader],
+        );
+        ua.hear_scalar(BACK.0, Scalar::String(Some(&back)));
+        kill(reader);
+        kill(writer);
+    }
+    assert!(bridge.runs());
+}
+
+#[test]
+fn values_flow_again_each_time_the_bridge_is_killed_and_started() {
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let mut ua = UaSide::join();
+    let mut readers = MAKERS.map(|peer| peer(&cell, &["sub", THERE.1, STRING]));
+    let topics = [(2, 2, 20), (2, 2, 21)];
+    let _writers = [
+        cell.fastdds(&sends("/ua_2_2_20", "fast")),
+        cell.cyclone_c(&sends("/ua_2_2_21", "cyclone")),
+    ];
+    for turn in 0..20 {
+        let bridge = cell.bridge_ros2(&[]);
+        let [fast, cyclone] = &mut readers;
+        reaches(
+            &mut ua,
+            THERE.0,
+            &format!("there {turn}"),
+            &mut [fast, cyclone],
+        );
+        for (triple, text) in topics.into_iter().zip(["fast", "cyclone"]) {
+            ua.hear_scalar(triple, Scalar::String(Some(text)));
+        }
+        kill(bridge);
+        // What the killed one had sent is read away.
+        ua.drain();
+    }
+}
+
+/// Hears texts of topics `2_3_k` until each of `count` has brought its k.
+fn hear_each(ua: &UaSide, count: u16) {
+    for number in 1..=count {
+        ua.hear_scalar((2, 3, number), Scalar::String(Some(&number.to_string())));
+    }
+}
+
+#[test]
+fn thirteen_participants_that_join_at_once_exchange_values_with_the_bridge() {
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let mut ua = UaSide::join();
+    let _bridge = cell.bridge_ros2(&[]);
+    for peer in MAKERS {
+        let mut crowd = peer(&cell, &["crowd", "/ua_2_3_", "--hear", THERE.1]);
+        hear_each(&ua, 13);
+        eventually("all members hear the bridge", SOON, || {
+            ua.write(THERE.0, Scalar::String(Some("hello")));
+            std::thread::sleep(Duration::from_millis(50));
+            (members(&crowd).len() == 13).then_some(())
+        });
+        crowd.tell("leave");
+        crowd.wait_for_end(SOON);
+    }
+}
+
+fn members(crowd: &Child) -> BTreeSet<u64> {
+    let lines = crowd.json_lines();
+    lines
+        .iter()
+        .filter_map(|line| line["member"].as_u64())
+        .collect()
+}
+
+#[test]
+fn five_hundred_topics_take_few_threads_little_memory_and_no_processor_when_idle() {
+    const EACH_WAY: u16 = 250;
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let mut ua = UaSide::join();
+    let mut bridge = cell.bridge_ros2(&[]);
+    for peer in MAKERS {
+        let number = EACH_WAY.to_string();
+        let many = [
+            "crowd",
+            "/ua_2_3_",
+            "--hear-each",
+            "/ua_1_3_",
+            "--members",
+            &number,
+        ];
+        let mut crowd = peer(&cell, &[&many[..], &["--one-participant"]].concat());
+        hear_each(&ua, EACH_WAY);
+        let start = Instant::now();
+        while members(&crowd).len() < usize::from(EACH_WAY) {
+            assert!(start.elapsed() < SOON, "{} heard", members(&crowd).len());
+            for number in 1..=EACH_WAY {
+                ua.write((1, 3, number), Scalar::String(Some("there")));
+            }
+            std::thread::sleep(Duration::from_millis(500));
+        }
+        crowd.tell("leave");
+        crowd.wait_for_end(SOON);
+    }
+    let (threads, memory) = (threads(bridge.id()), resident(bridge.id()));
+    let idle = cpu_share(bridge.id(), Duration::from_secs(5));
+    println!(
+        "500 topics: {threads} threads, {} MB, {:.1} % of a processor when idle",
+        memory / 1_000_000,
+        idle * 100.0
+    );
+    assert!(threads < 10, "{threads} threads");
+    assert!(memory < 100_000_000, "{memory} bytes");
+    assert!(idle < 0.05, "{:.1} %", idle * 100.0);
+    assert!(bridge.runs());
+}
+
+/// A second bridge on the domain, for the values of that space, as it answers.
+fn second_bridge(space: &str) -> Child {
+    const METRICS: &str = "127.0.0.1:9202";
+    let bridge = Started::new("the second bridge", &program("bridge-ros2"))
+        .args(["--domain", "2", "--space", space, "--interface", "lo"])
+        .args(["--metrics", METRICS])
+        .start();
+    eventually("the second bridge answers", SOON, || metrics(METRICS));
+    bridge
+}
+
+/// A value published once is heard once by a subscriber, and the space falls silent but for its repetitions.
+fn is_heard_once_beside(space: &str) {
+    let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
+        return;
+    };
+    let ua = UaSide::join();
+    let _bridges = (cell.bridge_ros2(&[]), second_bridge(space));
+    let mut reader = cell.cyclone_c(&["sub", BACK.1, STRING]);
+    let once = [
+        "pub",
+        BACK.1,
+        STRING,
+        "--text",
+        "once",
+        "--wait-readers",
+        "2",
+    ];
+    let _writer = cell.cyclone_c(&once);
+    ua.hear_scalar(BACK.0, Scalar::String(Some("once")));
+    reader.wait_for_line("once", SOON);
+    let _settling = ua.triples_for(Duration::from_secs(2));
+    let repeated = ua.triples_for(Duration::from_secs(3));
+    // Of each bridge a key frame or keep-alive a second, and some air.
+    assert!(repeated.len() <= 10, "{}: {repeated:?}", repeated.len());
+    assert_eq!(reader.values().len(), 1);
+}
+
+#[test]
+fn two_bridges_of_one_space_on_one_domain_make_no_loop() {
+    is_heard_once_beside("2");
+}
+
+#[test]
+#[ignore = "each takes what the other publishes on the domain for a value produced there"]
+fn two_bridges_of_two_spaces_on_one_domain_make_no_loop() {
+    is_heard_once_beside("3");
+}
+
+#[test]
+fn every_quality_a_peer_offers_or_asks_for_is_met() {
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let mut ua = UaSide::join();
+    let _bridge = cell.bridge_ros2(&[]);
+    let mut id = 100;
+    for peer in MAKERS {
+        for reliability in ["reliable", "best_effort"] {
+            for durability in ["volatile", "transient_local"] {
+                let quality = ["--reliability", reliability, "--durability", durability];
+                id += 1;
+                let text = format!("{reliability} {durability}");
+                let there = format!("/ua_1_2_{id}");
+                let mut reader = peer(&cell, &[&["sub", &there, STRING], &quality[..]].concat());
+                reaches(&mut ua, (1, 2, id), &text, &mut [&mut reader]);
+                let back = format!("/ua_2_2_{id}");
+                let _writer = peer(&cell, &[&sends(&back, &text)[..], &quality].concat());
+                ua.hear_scalar((2, 2, id), Scalar::String(Some(&text)));
+            }
+        }
+    }
+}
+
+#[test]
+fn writers_of_different_qualities_on_one_topic_are_all_heard() {
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let ua = UaSide::join();
+    let _bridge = cell.bridge_ros2(&[]);
+    let reliable = ["--durability", "transient_local"];
+    let _reliable = cell.cyclone_c(&[&sends(BACK.1, "cyclone")[..], &reliable].concat());
+    ua.hear_scalar(BACK.0, Scalar::String(Some("cyclone")));
+    let best_effort = ["--reliability", "best_effort"];
+    let _best_effort = cell.fastdds(&[&sends(BACK.1, "fast")[..], &best_effort].concat());
+    ua.hear_scalar(BACK.0, Scalar::String(Some("fast")));
+    ua.hear_scalar(BACK.0, Scalar::String(Some("cyclone")));
+}
+
+#[test]
+fn a_reader_that_asks_for_more_than_an_event_topic_offers_is_told_so_and_others_hear() {
+    const EVENTS: &str = r#"
+spaces: [{id: 1}, {id: 2}]
+namespaces: {2: "urn:cell"}
+variables:
+  - {node: "ns=2;i=12", name: events, type: String, origin: 1, queue: {drop_oldest: 100}}
+"#;
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let mut ua = UaSide::join();
+    let mapping = cell.file("events.yaml", EVENTS);
+    let _bridge = cell.bridge_ros2(&[mapping.to_str().unwrap()]);
+    let topic = ["sub", "/ua_1_2_12", STRING];
+    let old = ["--durability", "transient_local"];
+    let mut asking = MAKERS.map(|peer| peer(&cell, &[&topic[..], &old].concat()));
+    let mut readers = MAKERS.map(|peer| peer(&cell, &topic));
+    let [fast, cyclone] = &mut readers;
+    reaches(&mut ua, (1, 2, 12), "event", &mut [fast, cyclone]);
+    for reader in &mut asking {
+        // DURABILITY of DDS 1.4, 2.2.3.4, has the number 2.
+        reader.wait_for_json("the policy is named", SOON, |line| {
+            (line["incompatible"] == 2).then_some(())
+        });
+        assert_eq!(reader.values().len(), 0);
+    }
+    assert!(metrics(METRICS_ROS2).is_some());
+}

@@ -1,0 +1,353 @@
+//! Large samples between our endpoints and those of other makers, with the socket buffers a system has by default.
+
+use std::num::NonZeroU16;
+use std::time::{Duration, Instant};
+
+use bridge_ros2::domain::{Domain, DomainOptions};
+use bridge_ros2::graph::Graph;
+use bridge_ros2::inbox::{Inbox, Taken};
+use bridge_ros2::limits;
+use bridge_ros2::outlet::{Outlet, Refusal};
+use bridge_ros2::qos::{Offered, Requested};
+use bridge_ros2::raw::Payload;
+use system_tests::{
+    Cell, Child, HERE, Host, Peer, THERE, UaSide, WIRE, Wire, eventually, numbered, resident,
+    without_data,
+};
+use uadp::Scalar;
+
+const SOON: Duration = Duration::from_secs(30);
+const BOTH: &[Peer] = &[Peer::FastDds, Peer::CycloneC];
+const TEXT: &str = "std_msgs/String";
+const STRING: &str = "std_msgs::msg::dds_::String_";
+const TOPIC: (&str, &str) = ("/ua_1_1_1", "rt/ua_1_1_1");
+const MEGA: usize = 1_000_000;
+const EVENTS: Offered = Offered::DropOldest(NonZeroU16::new(100).unwrap());
+
+/// Whether RustDDS is the patched one; else the test is not for it.
+fn patched() -> bool {
+    if !limits::PATCHED {
+        without_data("RustDDS is as published; `cargo xtask test` builds with the patches");
+    }
+    limits::PATCHED
+}
+
+fn now() -> tokio::time::Instant {
+    tokio::time::Instant::now()
+}
+
+fn join(network: &str) -> Domain {
+    Domain::join(&options(network)).unwrap()
+}
+
+fn options(network: &str) -> DomainOptions {
+    DomainOptions {
+        domain: 2,
+        networks: vec![network.parse().unwrap()],
+        peers: Vec::new(),
+        node: "large".into(),
+    }
+}
+
+/// A writer of the topic that knows so many readers, and is known to them.
+fn outlet(domain: &Domain, offered: Offered, readers: usize) -> Outlet {
+    let mut outlet = Outlet::new(domain.writer(TOPIC.1, STRING, offered).unwrap(), offered);
+    eventually("the readers are discovered", SOON, || {
+        let graph = Graph::snapshot(domain.participant());
+        let known = graph.readers(TOPIC.1);
+        outlet.set_readers(known, now()).unwrap();
+        (known.len() == readers).then_some(())
+    });
+    outlet
+}
+
+fn payload(text: &str) -> Payload {
+    let mut bytes = vec![0, 1, 0, 0];
+    bytes.extend_from_slice(&u32::try_from(text.len() + 1).unwrap().to_le_bytes());
+    bytes.extend_from_slice(text.as_bytes());
+    bytes.push(0);
+    Payload::to_write(bytes.into()).unwrap()
+}
+
+/// Writes a text of each size, `rate` a second.
+async fn write(outlet: &mut Outlet, sizes: impl IntoIterator<Item = usize>, rate: u32) {
+    let begin = Instant::now();
+    for (number, size) in (0_u32..).zip(sizes) {
+        let due = begin + Duration::from_secs(1) * number / rate;
+        while Instant::now() < due || outlet.is_waiting() {
+            assert!(begin.elapsed() < SOON * 4, "still waiting");
+            tokio::time::sleep(Duration::from_millis(1)).await;
+            outlet.flush(now()).unwrap();
+        }
+        outlet
+            .offer(payload(&numbered(number, size)), None, now())
+            .unwrap();
+    }
+    let deadline = now() + SOON;
+    while outlet.is_waiting() {
+        assert!(now() < deadline, "still waiting");
+        tokio::time::sleep(Duration::from_millis(1)).await;
+        outlet.flush(now()).unwrap();
+    }
+}
+
+fn have_all(reader: &mut Child, count: usize) {
+    reader.wait_for_json(&format!("all {count}, whole"), SOON, |line| {
+        (line["distinct"] == count && line["bad"] == 0 && line["repeated"] == 0).then_some(())
+    });
+}
+
+fn inbox(domain: &Domain, topic: &str) -> Inbox<()> {
+    let requested = Requested::from_writers(&[]);
+    let mut inbox = Inbox::new();
+    inbox.insert((), domain.reader(topic, STRING, requested).unwrap());
+    inbox
+}
+
+/// The text of the next sample.
+async fn text(inbox: &mut Inbox<()>) -> String {
+    match tokio::time::timeout(SOON, inbox.recv()).await.unwrap() {
+        Taken::Sample {
+            payload, missing, ..
+        } => {
+            assert_eq!(missing, 0);
+            let bytes = payload.into_bytes();
+            let length = u32::from_le_bytes(bytes[4..8].try_into().unwrap()) as usize - 1;
+            String::from_utf8(bytes[8..8 + length].to_vec()).unwrap()
+        }
+        Taken::Unreadable { why, .. } => panic!("{why}"),
+    }
+}
+
+/// Asserts that the texts are the same, and prints little of them when they are not.
+fn is_whole(got: &str, sent: &str) {
+    let differs = got.bytes().zip(sent.bytes()).position(|(a, b)| a != b);
+    let head = |text: &str| text.get(..30).unwrap_or(text).to_owned();
+    assert_eq!(
+        (differs, head(got), got.len()),
+        (None, head(sent), sent.len())
+    );
+}
+
+async fn all_thirty_arrive(size: usize) {
+    if !patched() {
+        return;
+    }
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let reads = ["sub", TOPIC.0, TEXT, "--counts"];
+    let mut readers = [cell.fastdds(&reads), cell.cyclone_c(&reads)];
+    let domain = join("127.0.0.1");
+    let mut outlet = outlet(&domain, EVENTS, readers.len());
+    write(&mut outlet, [size; 30], 5).await;
+    for reader in &mut readers {
+        have_all(reader, 30);
+    }
+}
+
+#[tokio::test]
+async fn all_thirty_samples_of_1_mb_reach_fast_dds_and_cyclone() {
+    all_thirty_arrive(MEGA).await;
+}
+
+#[tokio::test]
+async fn all_thirty_samples_of_2_mb_reach_fast_dds_and_cyclone() {
+    all_thirty_arrive(2 * MEGA).await;
+}
+
+#[tokio::test]
+async fn all_thirty_samples_of_5_mb_reach_fast_dds_and_cyclone() {
+    all_thirty_arrive(5 * MEGA).await;
+}
+
+#[tokio::test]
+async fn the_first_sample_arrives_even_when_it_is_large() {
+    if !patched() {
+        return;
+    }
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    for _ in 0..5 {
+        let reads = ["sub", TOPIC.0, TEXT, "--counts"];
+        let mut readers = [cell.fastdds(&reads), cell.cyclone_c(&reads)];
+        let domain = join("127.0.0.1");
+        let mut outlet = outlet(&domain, EVENTS, readers.len());
+        write(&mut outlet, [3 * MEGA], 1).await;
+        for reader in &mut readers {
+            have_all(reader, 1);
+        }
+    }
+}
+
+#[tokio::test]
+async fn ten_megabytes_cross_between_two_of_ours() {
+    if !patched() {
+        return;
+    }
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    let domains = [join("127.0.0.1"), join("127.0.0.1")];
+    for (writer, reader) in [(0, 1), (1, 0)] {
+        let mut inbox = inbox(&domains[reader], TOPIC.1);
+        let mut outlet = outlet(&domains[writer], EVENTS, 1);
+        for number in 0..5 {
+            let sent = numbered(number, 10 * MEGA);
+            outlet.offer(payload(&sent), None, now()).unwrap();
+            let deadline = now() + SOON;
+            while outlet.is_waiting() {
+                assert!(now() < deadline, "still waiting");
+                tokio::time::sleep(Duration::from_millis(1)).await;
+                outlet.flush(now()).unwrap();
+            }
+            is_whole(&text(&mut inbox).await, &sent);
+        }
+        drop(inbox);
+        eventually("the reader is gone", SOON, || {
+            let graph = Graph::snapshot(domains[writer].participant());
+            graph.readers(TOPIC.1).is_empty().then_some(())
+        });
+    }
+}
+
+#[tokio::test]
+async fn ten_megabytes_of_cyclone_and_fast_dds_are_read() {
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let size = (10 * MEGA).to_string();
+    let writes = [
+        "pub", TOPIC.0, TEXT, "--size", &size, "--count", "5", "--rate", "2",
+    ];
+    let args = [&writes[..], &["--wait-readers", "1"]].concat();
+    for writer in [Cell::cyclone_c, Cell::fastdds] {
+        // A participant each: RustDDS gives a new reader what it still holds of the topic.
+        let domain = join("127.0.0.1");
+        let mut inbox = inbox(&domain, TOPIC.1);
+        let _writer = writer(&cell, &args);
+        for number in 0..5 {
+            is_whole(&text(&mut inbox).await, &numbered(number, 10 * MEGA));
+        }
+    }
+}
+
+#[tokio::test]
+async fn texts_of_every_length_cross_an_ethernet() {
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let host = cell.host(Wire::default());
+    let reads = ["sub", TOPIC.0, TEXT, "--counts"];
+    let mut readers = [
+        host.fastdds_started(&cell, &reads),
+        host.cyclone_c_started(&cell, &reads),
+    ]
+    .map(|peer| peer.start().ready(SOON));
+    let domain = join(HERE);
+    let mut outlet = outlet(&domain, EVENTS, readers.len());
+    // Around the size where samples are fragmented, and those of which Cyclone once got every fourth only.
+    let sizes: Vec<usize> = (1280..1400).chain(1995..2010).chain(2555..2570).collect();
+    let count = sizes.len();
+    write(&mut outlet, sizes, 200).await;
+    for reader in &mut readers {
+        have_all(reader, count);
+    }
+}
+
+#[tokio::test]
+async fn large_samples_survive_a_wire_that_loses() {
+    if !patched() {
+        return;
+    }
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let host = cell.host(Wire {
+        loss: 0.05,
+        delay: Duration::from_millis(20),
+    });
+    let reads = ["sub", TOPIC.0, TEXT, "--counts"];
+    let mut readers = [
+        host.fastdds_started(&cell, &reads),
+        host.cyclone_c_started(&cell, &reads),
+    ]
+    .map(|peer| peer.start().ready(SOON));
+    let domain = join(HERE);
+    let mut outlet = outlet(&domain, EVENTS, readers.len());
+    write(&mut outlet, [MEGA; 10], 2).await;
+    for reader in &mut readers {
+        have_all(reader, 10);
+    }
+}
+
+#[tokio::test]
+async fn a_history_of_large_samples_takes_little_memory() {
+    if !patched() {
+        return;
+    }
+    let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
+        return;
+    };
+    let mut reader = cell.cyclone_c(&["sub", TOPIC.0, TEXT, "--counts"]);
+    let domain = join("127.0.0.1");
+    let mut outlet = outlet(&domain, EVENTS, 1);
+    let own = std::process::id();
+    let before = resident(own);
+    write(&mut outlet, [100_000; 1000], 200).await;
+    have_all(&mut reader, 1000);
+    let grown = resident(own).saturating_sub(before);
+    assert!(grown < 15 << 20, "{grown} bytes more");
+}
+
+#[tokio::test]
+async fn a_sample_beyond_the_limit_is_refused_by_name() {
+    let Some(cell) = Cell::with(&[Peer::FastDds]) else {
+        return;
+    };
+    let mut reader = cell.fastdds(&["sub", TOPIC.0, TEXT, "--counts"]);
+    let domain = join("127.0.0.1");
+    let mut outlet = outlet(&domain, EVENTS, 1);
+    let limit = limits::sample_size(Graph::snapshot(domain.participant()).readers(TOPIC.1));
+    let refused = outlet.offer(payload(&numbered(7, limit)), None, now());
+    assert_eq!(refused, Err(Refusal::TooLarge(limit)));
+    write(&mut outlet, [limit - 64], 1).await;
+    have_all(&mut reader, 1);
+}
+
+/// Cyclone on the other host, deaf and dumb to multicast.
+fn without_multicast(cell: &Cell, host: &Host, args: &[&str]) -> Child {
+    let uri = format!(
+        "<CycloneDDS><Domain id=\"any\"><General><AllowMulticast>false</AllowMulticast>\
+         <Interfaces><NetworkInterface name=\"{WIRE}\"/></Interfaces></General>\
+         <Discovery><ParticipantIndex>auto</ParticipantIndex></Discovery></Domain></CycloneDDS>"
+    );
+    host.cyclone_c_started(cell, args)
+        .env("CYCLONEDDS_URI", uri)
+        .start()
+        .ready(SOON)
+}
+
+#[test]
+fn a_listed_peer_is_found_without_multicast() {
+    if !patched() {
+        return;
+    }
+    let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
+        return;
+    };
+    let host = cell.host(Wire::default());
+    let reader = without_multicast(&cell, &host, &["sub", "/ua_1_1_1", TEXT]);
+    let mut ua = UaSide::join();
+    let _bridge = cell.bridge_ros2(&["--ros-interface", HERE, "--ros-peer", THERE]);
+    eventually("the value arrives", SOON, || {
+        ua.write((1, 1, 1), Scalar::String(Some("hello")));
+        std::thread::sleep(Duration::from_millis(100));
+        reader
+            .values()
+            .iter()
+            .any(|value| value["data"] == "hello")
+            .then_some(())
+    });
+}

@@ -1,0 +1,237 @@
+//! RustDDS as this project changes it: the published source and the patches of `patches/`, put together under `target/`.
+//!
+//! Cargo then builds with that folder through its configuration key `paths`. A `[patch]` table, in the manifest or in the
+//! configuration, would rewrite `Cargo.lock`, which `--locked` refuses; `paths` leaves it alone, since a path override
+//! may change the source of a package, not its dependencies.
+
+use std::{
+    env,
+    ffi::OsString,
+    fs,
+    io::ErrorKind,
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use anyhow::{Context as _, bail, ensure};
+use serde_json::Value;
+
+use crate::{
+    shell::{Ended, line, step},
+    workspace::Workspace,
+};
+
+/// The patched source, ready to be built with.
+pub(crate) struct Rustdds {
+    folder: PathBuf,
+}
+
+impl Rustdds {
+    /// Brings the patched source up to date. It is written only when a patch or the version changed: cargo looks at the
+    /// times of its files.
+    ///
+    /// # Errors
+    /// When the locked version has no patches, one of them does not apply, or a folder cannot be written.
+    pub(crate) fn prepare(workspace: &Workspace) -> anyhow::Result<Self> {
+        let published = Published::find(workspace)?;
+        let patches = Patches::read(workspace, &published.version)?;
+        let name = format!("rustdds-{}", published.version);
+        let patched = workspace.target.join("patched");
+        let folder = patched.join(&name);
+        let stamp = patched.join(format!("{name}.made-of"));
+        let made_of = patches.text(&published.folder);
+        if folder.is_dir() && fs::read_to_string(&stamp).is_ok_and(|text| text == made_of) {
+            return Ok(Self { folder });
+        }
+        step(&format!(
+            "patching RustDDS {} into {}",
+            published.version,
+            folder.display()
+        ));
+        remove(&stamp)?;
+        remove(&folder)?;
+        copy(&published.folder, &folder)?;
+        patches.apply(&folder)?;
+        fs::write(&stamp, made_of).with_context(|| stamp.display().to_string())?;
+        Ok(Self { folder })
+    }
+
+    /// A command of cargo that compiles with the patched source, in the root. The verb, such as `build`, comes first in
+    /// `arguments`, and `bridge-ros2` must be among the packages.
+    ///
+    /// Everything that is built or tested goes through here: with other flags cargo would build it all again.
+    pub(crate) fn cargo(&self, workspace: &Workspace, arguments: &[&str]) -> Command {
+        let mut command = workspace.cargo(&[]);
+        let (verb, rest) = arguments.split_at(1.min(arguments.len()));
+        command
+            .args(self.configuration())
+            .args(verb)
+            .args(FEATURES)
+            .args(rest);
+        command
+    }
+
+    fn configuration(&self) -> [OsString; 2] {
+        // A JSON string is a TOML string.
+        let folder = Value::from(self.folder.display().to_string());
+        ["--config".into(), format!("paths=[{folder}]").into()]
+    }
+}
+
+/// What `bridge-ros2` may use of the patched source only.
+const FEATURES: [&str; 2] = ["--features", "bridge-ros2/patched-dds"];
+
+/// Prepares the source and prints how to build with it by hand.
+pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
+    let rustdds = Rustdds::prepare(workspace)?;
+    let [config, paths] = rustdds.configuration();
+    println!(
+        "cargo {} '{}' build {}",
+        config.display(),
+        paths.display(),
+        FEATURES.join(" ")
+    );
+    Ok(Ended::WELL)
+}
+
+/// The crate as its authors published it.
+struct Published {
+    version: String,
+    folder: PathBuf,
+}
+
+impl Published {
+    /// Asks cargo, which fetches it when it is not there.
+    fn find(workspace: &Workspace) -> anyhow::Result<Self> {
+        let mut command = workspace.cargo(&[
+            "metadata",
+            "--format-version",
+            "1",
+            "--locked",
+            // Else it fetches what only other systems need.
+            "--filter-platform",
+        ]);
+        let output = command
+            .arg(host()?)
+            .output()
+            .context("cargo does not start")?;
+        ensure!(
+            output.status.success(),
+            "cargo metadata: {}",
+            String::from_utf8_lossy(&output.stderr)
+        );
+        let metadata: Value = serde_json::from_slice(&output.stdout)?;
+        let packages = metadata.get("packages").and_then(Value::as_array);
+        let text = |package: &Value, key: &str| Some(package.get(key)?.as_str()?.to_owned());
+        let found = packages.into_iter().flatten().find_map(|package| {
+            (text(package, "name")? == "rustdds").then_some(())?;
+            Some(Self {
+                version: text(package, "version")?,
+                folder: PathBuf::from(text(package, "manifest_path")?)
+                    .parent()?
+                    .to_owned(),
+            })
+        });
+        found.context("Cargo.lock has no package rustdds")
+    }
+}
+
+/// The system cargo builds for.
+fn host() -> anyhow::Result<String> {
+    let rustc = env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
+    let output = Command::new(rustc)
+        .arg("-vV")
+        .output()
+        .context("rustc does not start")?;
+    let version = String::from_utf8(output.stdout)?;
+    let host = version.lines().find_map(|line| line.strip_prefix("host: "));
+    host.map(str::to_owned)
+        .context("rustc -vV does not name the host")
+}
+
+/// The patches for one version, in their order.
+struct Patches(Vec<(PathBuf, String)>);
+
+impl Patches {
+    fn read(workspace: &Workspace, version: &str) -> anyhow::Result<Self> {
+        let folder = workspace.root.join(format!("patches/rustdds-{version}"));
+        ensure!(
+            folder.is_dir(),
+            "Cargo.lock has rustdds {version}, but there are no patches for it ({}). Bring those of another version \
+             over, or take that version: cargo update -p rustdds --precise VERSION",
+            folder.display()
+        );
+        let mut patches = Vec::new();
+        for entry in fs::read_dir(&folder)? {
+            let path = entry?.path();
+            if path.extension().is_some_and(|ending| ending == "patch") {
+                let text = fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+                patches.push((path, text));
+            }
+        }
+        patches.sort();
+        ensure!(!patches.is_empty(), "{} holds no *.patch", folder.display());
+        Ok(Self(patches))
+    }
+
+    /// Everything the patched source depends on.
+    fn text(&self, published: &Path) -> String {
+        let texts: String = self.0.iter().map(|(_, text)| text.as_str()).collect();
+        format!("{}\n{texts}", published.display())
+    }
+
+    fn apply(&self, folder: &Path) -> anyhow::Result<()> {
+        for (path, _) in &self.0 {
+            let mut git = Command::new("git");
+            git.current_dir(folder)
+                .args(["apply", "--unidiff-zero", "--whitespace=nowarn"])
+                .arg(path)
+                // In a repository git would take the paths to be those of the repository, and skip them as foreign to it.
+                .env_remove("GIT_DIR")
+                .env("GIT_CEILING_DIRECTORIES", folder.parent().unwrap_or(folder));
+            let output = git
+                .output()
+                .context("git, which applies the patches, does not start")?;
+            if !output.status.success() {
+                bail!(
+                    "{} does not apply to the published source: {}({})",
+                    path.display(),
+                    String::from_utf8_lossy(&output.stderr),
+                    line(&git)
+                );
+            }
+        }
+        Ok(())
+    }
+}
+
+fn remove(path: &Path) -> anyhow::Result<()> {
+    let removed = if path.is_dir() {
+        fs::remove_dir_all(path)
+    } else {
+        fs::remove_file(path)
+    };
+    match removed {
+        Err(error) if error.kind() != ErrorKind::NotFound => {
+            Err(error).with_context(|| format!("{} cannot be removed", path.display()))
+        }
+        _ => Ok(()),
+    }
+}
+
+fn copy(from: &Path, to: &Path) -> anyhow::Result<()> {
+    fs::create_dir_all(to).with_context(|| to.display().to_string())?;
+    for entry in fs::read_dir(from).with_context(|| from.display().to_string())? {
+        let entry = entry?;
+        let target = to.join(entry.file_name());
+        if entry.file_type()?.is_dir() {
+            copy(&entry.path(), &target)?;
+        } else {
+            // Contents only: a registry may keep its files read-only.
+            let contents =
+                fs::read(entry.path()).with_context(|| entry.path().display().to_string())?;
+            fs::write(&target, contents).with_context(|| target.display().to_string())?;
+        }
+    }
+    Ok(())
+}

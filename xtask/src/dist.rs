@@ -1,0 +1,34 @@
+//! `cargo xtask dist`: the programs as they are handed out.
+
+use std::fs;
+
+use anyhow::Context as _;
+
+use crate::{
+    dds::Rustdds,
+    shell::{Ended, run as must, step},
+    workspace::Workspace,
+};
+
+/// Packages with one program each, of the same name.
+const PROGRAMS: [&str; 4] = ["bridge-ros1", "bridge-ros2", "ua-server", "ua-space"];
+
+/// Builds the programs with optimisation and puts them into `target/dist`.
+pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
+    let rustdds = Rustdds::prepare(workspace)?;
+    step("building the programs with optimisation (some minutes the first time)");
+    let mut build = rustdds.cargo(workspace, &["build", "--release", "--locked", "--bins"]);
+    for package in PROGRAMS {
+        build.args(["--package", package]);
+    }
+    must(&mut build)?;
+    let folder = workspace.target.join("dist");
+    fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
+    for program in PROGRAMS {
+        let target = folder.join(program);
+        fs::copy(workspace.target.join("release").join(program), &target)
+            .with_context(|| target.display().to_string())?;
+        println!("{}", target.display());
+    }
+    Ok(Ended::WELL)
+}
