@@ -12,6 +12,7 @@ mod metrics;
 mod port;
 mod program;
 mod run;
+mod services;
 mod status;
 
 pub use arguments::Arguments;
@@ -22,3 +23,4 @@ pub use exit::{Failure, FailureKind};
 pub use logging::{LogFormat, LogRecord, LogSink, hear_log};
 pub use port::{Delivery, Port, PortEvent};
 pub use program::{Context, Program, run};
+pub use services::{CallFault, Outcome, ServiceCall, ServiceGraph, Services};

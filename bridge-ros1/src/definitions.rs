@@ -5,11 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use bridge_node::Wanted;
-use bytes::Bytes;
-use messages::{
-    DefinitionError, Dialect, MessageType, NameError, NoFields, Plan, Selection, ServiceType,
-    TypeName, Wire,
-};
+use messages::{DefinitionError, Dialect, MessageType, NameError, ServiceType, TypeName};
 use tcpros::ConnectionHeader;
 use uadp::BuiltinType;
 
@@ -153,19 +149,6 @@ fn find_below(
     below
         .into_iter()
         .find_map(|folder| find_below(&folder, file, depth - 1, budget))
-}
-
-/// The message of a template without a value in it.
-pub(crate) fn constant(
-    message_type: &Arc<MessageType>,
-    template: &Selection,
-) -> Result<Bytes, String> {
-    let plan =
-        Plan::compile(message_type, template, Wire::Ros1).map_err(|error| error.to_string())?;
-    let mut bytes = Vec::new();
-    plan.write(&mut NoFields, &mut bytes)
-        .map_err(|error| error.to_string())?;
-    Ok(bytes.into())
 }
 
 /// The checksum of a definition without fields, such as std_msgs/Empty.

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use bridge_node::{Delivery, Kept, Port, PortEvent, timestamp};
+use bridge_node::{Delivery, Kept, Port, PortEvent, Services, timestamp};
 use mappings::{Mapping, SpaceId, TopicId, Variable};
 use messages::{MessageType, Selection, TypeName};
 use tcpros::{
@@ -18,7 +18,7 @@ use tracing::{info, warn};
 use uadp::{BuiltinType, Timestamp};
 
 use crate::definitions::Definitions;
-use crate::services::Services;
+use crate::services::Ros1Graph;
 use crate::sink::{Open, Sink};
 use crate::source::{Met, Source};
 use crate::watcher::{Seen, Watcher};
@@ -76,7 +76,11 @@ impl Ros1Port {
         let node = Node::start(node)?;
         info!(node = node.name(), uri = node.uri(), master, space = %own, "started the ROS 1 node");
         let mut definitions = Definitions::new(packages);
-        let (services, bound) = Services::start(&node, own, &mapping, &mut definitions);
+        let mut graph = Ros1Graph {
+            node: &node,
+            definitions: &mut definitions,
+        };
+        let (services, bound) = Services::start(&mut graph, own, &mapping);
         let mut port = Self {
             watcher: Watcher::of(&node),
             node,
@@ -544,7 +548,7 @@ impl Port for Ros1Port {
                     }
                 },
                 outcome = self.services.recv() => {
-                    let events = self.services.ended(outcome, utc());
+                    let events = self.services.ended(outcome, timestamp(utc()));
                     self.events.extend(events);
                 }
                 (index, event) = self.inbox.recv() => self.taken(index, event),

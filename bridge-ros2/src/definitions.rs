@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use bridge_node::Wanted;
-use messages::{DefinitionError, Dialect, MessageType, TypeHash, TypeName};
+use messages::{DefinitionError, Dialect, MessageType, ServiceType, TypeHash, TypeName};
 use uadp::BuiltinType;
 
 /// Finds message types by name; a type once found stays.
@@ -30,17 +30,17 @@ impl Definitions {
     /// [`DefinitionError`].
     pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
         let prefixes = &self.prefixes;
-        self.known.find(name, |Wanted { name, kind }| {
-            // Neither part of a type name can hold a separator or a dot.
-            let file = PathBuf::from("share")
-                .join(name.package())
-                .join(kind)
-                .join(format!("{}.{kind}", name.name()));
-            prefixes
-                .iter()
-                .map(|prefix| prefix.join(&file))
-                .find(|file| file.is_file())
-        })
+        self.known.find(name, |wanted| locate(prefixes, wanted))
+    }
+
+    /// The service of that name, found likewise.
+    ///
+    /// # Errors
+    /// [`DefinitionError`].
+    pub(crate) fn service(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
+        let prefixes = &self.prefixes;
+        self.known
+            .find_service(name, |wanted| locate(prefixes, wanted))
     }
 
     /// The type hash of a type that was found.
@@ -52,6 +52,18 @@ impl Definitions {
     pub(crate) fn standard_type(&self, builtin: BuiltinType, array: bool) -> Option<TypeName> {
         self.known.registry().standard_type(builtin, array)
     }
+}
+
+fn locate(prefixes: &[PathBuf], Wanted { name, kind }: Wanted<'_>) -> Option<PathBuf> {
+    // Neither part of a type name can hold a separator or a dot.
+    let file = PathBuf::from("share")
+        .join(name.package())
+        .join(kind)
+        .join(format!("{}.{kind}", name.name()));
+    prefixes
+        .iter()
+        .map(|prefix| prefix.join(&file))
+        .find(|file| file.is_file())
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 //! Discovery, reliability and fragments are RustDDS'; what makes a participant a ROS node is here. The samples go past
 //! RustDDS as bytes, because their types are known at run time only.
 
+mod cdr;
 pub mod clock;
 pub mod compatibility;
 mod definitions;
@@ -13,11 +14,13 @@ pub mod inbox;
 pub mod limits;
 pub mod node;
 pub mod outlet;
+pub mod parameters;
 mod port;
 pub mod qos;
 pub mod raw;
 mod ros_args;
 mod rosout;
+pub mod service;
 mod sink;
 mod source;
 

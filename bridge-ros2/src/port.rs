@@ -6,6 +6,7 @@
 
 mod reconcile;
 mod schedule;
+mod services;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::future::poll_fn;
@@ -13,7 +14,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use bridge_node::{Delivery, Kept, Port, PortEvent, now};
+use bridge_node::{Delivery, Kept, Port, PortEvent, Services, now};
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::TypeName;
@@ -29,12 +30,15 @@ use crate::graph::{Graph, dds_topic};
 use crate::inbox::{Inbox, Taken};
 use crate::limits;
 use crate::outlet::Refusal;
+use crate::parameters::ParameterServer;
 use crate::raw::{Payload, Reader};
+use crate::service::ServicePeers;
 use crate::sink::Sink;
 use crate::source::{Source, same_participant};
 
 use reconcile::MAX_BATCH;
 use schedule::Schedule;
+use services::Ros2Graph;
 
 /// What a [`Ros2Port`] is started with.
 #[derive(Debug, Clone)]
@@ -61,6 +65,9 @@ pub struct Ros2Port {
     sources: Vec<Source>,
     source_of: BTreeMap<String, usize>,
     inbox: Inbox<usize>,
+    /// Services that are called for values.
+    services: Services,
+    parameters: ParameterServer,
     /// Topics we write.
     sinks: HashMap<TopicId, Sink>,
     /// Readers that were replaced; they hear on until their successor is matched.
@@ -99,20 +106,32 @@ impl Ros2Port {
             dds = limits::RUSTDDS,
             "joined the DDS domain"
         );
+        let mut definitions = Definitions::new(prefixes);
+        let peers = ServicePeers::new(&domain);
+        let declared = services::parameters(own, domain_options.domain);
+        let parameters = ParameterServer::open(&domain, &peers, declared)?;
+        let mut graph = Ros2Graph {
+            peers: &peers,
+            domain: &domain,
+            definitions: &mut definitions,
+        };
+        let (services, bound) = Services::start(&mut graph, own, &mapping);
         let clock = domain.clock();
         let mut port = Self {
             discovery: domain.status_listener(),
             domain,
             own,
             mapping: Arc::clone(&mapping),
-            definitions: Definitions::new(prefixes),
+            definitions,
+            services,
+            parameters,
             graph: Graph::default(),
             sources: Vec::new(),
             source_of: BTreeMap::new(),
             inbox: Inbox::new(),
             sinks: HashMap::new(),
             retired: VecDeque::new(),
-            events: VecDeque::new(),
+            events: bound.into(),
             budget: MAX_BATCH,
             clock,
             incompatible: BTreeSet::new(),
@@ -158,6 +177,11 @@ impl Ros2Port {
             // Before the samples, so that a flood of them does not keep new topics out.
             if self.schedule.is_due(cx) {
                 self.look_again();
+                continue;
+            }
+            if let Poll::Ready(outcome) = self.services.poll_recv(cx) {
+                let events = self.services.ended(outcome, now().utc);
+                self.events.extend(events);
                 continue;
             }
             match self.inbox.poll_recv(cx) {
@@ -292,6 +316,13 @@ impl Port for Ros2Port {
         if status & STATUS_BAD != 0 {
             return Err("bad status");
         }
+        if let Some(replaced) = self.services.hand_over(topic, &payload) {
+            if replaced > 0 {
+                self.events
+                    .push_back(lost(topic, "service too slow", replaced));
+            }
+            return Ok(());
+        }
         let Some(Sink {
             open: Some(open),
             dds_topic,
@@ -321,7 +352,7 @@ impl Port for Ros2Port {
     }
 
     fn wanted(&mut self, topic: TopicId, shape: &[(BuiltinType, bool)]) {
-        if topic.space == self.own {
+        if topic.space == self.own || self.services.takes(topic) {
             return;
         }
         if !self.sinks.contains_key(&topic) {
@@ -359,10 +390,12 @@ impl Port for Ros2Port {
             inbox,
             sinks,
             retired,
+            services,
+            parameters,
             ..
         } = self;
-        // It holds the participant.
-        drop(discovery);
+        // They hold the participant.
+        drop((discovery, services, parameters));
         if !domain.leave((inbox, sinks, retired)).await {
             warn!("the DDS endpoints were not disposed in time; peers notice when the lease ends");
         }

@@ -72,7 +72,7 @@ codes! {
     OpcUaBinding = "M071", "Space 0 is the OPC UA side and has no ROS topics.";
     FieldOfBytes = "M072", "A message bound `as: bytes` crosses as it is, so no field of it can be named.";
     BindingKind = "M073", "A ROS binding has exactly one of `topic`, `call`, `answer` and `poll`, and beside it only the keys that go with it.";
-    ServiceSpace = "M074", "Services of the ROS 1 space are bound, not of ROS 2 spaces. `call` takes values from other spaces; what `answer` and `poll` bring is produced in the space of the service, its origin.";
+    ServiceSpace = "M074", "`call` takes values from other spaces; what `answer` and `poll` bring is produced in the space of the service, its origin.";
     UnknownServiceType = "M075", "No definition of the service type is built in. The connection to a service does not carry it, so a package with the .srv file must be below one of the folders of ROS_PACKAGE_PATH when the bridge runs.";
     RequestConstant = "M076", "A constant of a request is a value of its field: the field exists, is given once, does not take the value too, and the value is of its type and range.";
     Answer = "M077", "`answer` names the node of a variable that has a `call`; its value is what that service answers.";

@@ -188,7 +188,7 @@ impl Mapping {
 /// A ROS service tied to a variable.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct ServiceBinding {
-    /// Whose ROS graph the service is in; so far [`SpaceId::ROS1`].
+    /// Whose ROS graph the service is in.
     pub space: SpaceId,
     /// What is done with it.
     pub role: ServiceRole,

@@ -367,6 +367,21 @@ fn a_topic_of_the_space_is_fed_by_polling_a_service() {
 }
 
 #[test]
+fn services_of_a_ros_2_space_are_bound_by_their_own_definitions() {
+    let text = format!(
+        "{HEAD}  - {{node: ns=2;i=20, name: Run, origin: 0, ros: {{space: 2, call: /run, type: std_srvs/SetBool, \
+         field: data}}}}\n  - {{node: ns=2;i=21, name: Sim, origin: 2, ros: {{poll: /arm/get_parameters, \
+         type: rcl_interfaces/srv/ListParameters, field: result.names}}}}\n"
+    );
+    let mapping = sound(&text);
+    let space = SpaceId::new(2).unwrap();
+    assert_eq!(mapping.services(space).count(), 2);
+    let shape = |at: usize| mapping.variables()[at].value_type;
+    assert_eq!(shape(0), Some((BuiltinType::Boolean, false)));
+    assert_eq!(shape(1), Some((BuiltinType::String, true)));
+}
+
+#[test]
 fn a_service_type_that_is_not_built_in_is_a_warning_and_runs() {
     let text = format!(
         "{HEAD}  - {{node: ns=2;i=20, name: Run, type: Boolean, origin: 0, ros: {{space: 1, call: /c, \

@@ -1,7 +1,7 @@
 //! The common interfaces, one file per package.
 //!
 //! A line `message Name` begins a definition of both dialects, `message Name 1` and `message Name 2` one of ROS 1 and of
-//! ROS 2, where they differ; a line `service Name 1` begins a service. Field names, types and constants only.
+//! ROS 2, where they differ; a line `service Name`, with `1` or `2` likewise, begins a service. Field names, types and constants only.
 
 use crate::{Dialect, TypeName};
 

@@ -52,6 +52,12 @@ pub(super) struct Site<'s> {
     pub(super) subject: &'s Subject,
 }
 
+impl Site<'_> {
+    pub(super) fn dialect(&self) -> Dialect {
+        self.space.map_or(Dialect::Ros1, dialect)
+    }
+}
+
 /// What is done to one ROS topic of one space.
 struct Use {
     place: Place,
@@ -396,7 +402,7 @@ fn topic_name(
     site: &Site<'_>,
     findings: &mut Findings,
 ) -> Option<(String, Place)> {
-    let dialect = site.space.map_or(Dialect::Ros1, dialect);
+    let dialect = site.dialect();
     ros_name(text, place, (dialect, "topic"), findings)?;
     if let Some(other) = text
         .strip_prefix('/')

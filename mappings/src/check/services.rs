@@ -92,7 +92,7 @@ impl Service {
             *when = match (self.when, value_type) {
                 (Some((text, place)), value_type) => {
                     if let Some(value_type) = value_type {
-                        check_when(&text, value_type, place, findings);
+                        check_when(&text, value_type, (self.binding.space, place), findings);
                     }
                     Trigger::Equals(text)
                 }
@@ -105,8 +105,14 @@ impl Service {
 }
 
 /// The value that calls is compared as the std_msgs type of the variable's: the text has to be a value of it.
-fn check_when(text: &str, value_type: ValueType, place: Place, findings: &mut Findings) {
-    let registry = Types::registry(Dialect::Ros1);
+fn check_when(
+    text: &str,
+    value_type: ValueType,
+    (space, place): (SpaceId, Place),
+    findings: &mut Findings,
+) {
+    let dialect = types::dialect(space);
+    let registry = Types::registry(dialect);
     let carrier = registry.standard_type(value_type.0, value_type.1);
     let carrier = carrier.and_then(|name| registry.get(&name).ok());
     let data = ("data".to_owned(), Literal::One(text.to_owned()));
@@ -114,7 +120,7 @@ fn check_when(text: &str, value_type: ValueType, place: Place, findings: &mut Fi
         field: None,
         rest: BTreeMap::from([data]),
     };
-    let fits = |carrier| Plan::compile(&carrier, &template, Wire::Ros1).is_ok();
+    let fits = |carrier| Plan::compile(&carrier, &template, wire(dialect)).is_ok();
     if !carrier.is_some_and(fits) {
         let told = types::print(value_type);
         let message = format!("`{}` is no value of type {told}", short(text));
@@ -245,12 +251,7 @@ type Checked = (ServiceRole, Option<Vec<Leaf>>, Option<(String, Place)>);
 /// The space of the service, when one can be bound there.
 fn space_of(kind: Kind, site: &Site<'_>, findings: &mut Findings) -> Option<SpaceId> {
     let (space, origin) = (site.space?, site.subject.origin);
-    let (message, help) = if space.is_ros2() {
-        (
-            format!("space {space} is a ROS 2 space, whose services are not bound"),
-            "bind a topic there, or a service of the ROS 1 space",
-        )
-    } else if kind == Kind::Call && origin == Some(space) {
+    let (message, help) = if kind == Kind::Call && origin == Some(space) {
         (
             format!("the value comes from space {space}, and cannot call a service of it"),
             "`call` is for values of other spaces; a value that is asked for has a `poll`",
@@ -293,7 +294,7 @@ fn answer(
     let service = call
         .service_type
         .as_ref()
-        .and_then(|name| known.types.service(name));
+        .and_then(|name| known.types.service(site.dialect(), name));
     let response = service.as_ref().map(|service| service.response());
     let (selection, fields) = response_field(entry, response, place, site, findings)?;
     let of = call.topic?;
@@ -314,13 +315,14 @@ fn asked(
         &entry.poll
     };
     let service = given(name).and_then(|(text, place)| {
-        ros_name(text, place, (Dialect::Ros1, "service"), findings)?;
+        ros_name(text, place, (site.dialect(), "service"), findings)?;
         Some(text.clone())
     });
     let timeout = duration(&entry.timeout, findings).unwrap_or(TIMEOUT);
     let every = duration(&entry.every, findings).unwrap_or(EVERY);
     let (service_type, place) = service_type(entry, kind, site.place, findings)?;
-    let known = built_in(&service_type, place, types, findings);
+    let dialect = site.dialect();
+    let known = built_in(&service_type, (dialect, place), types, findings);
     let request_type = known.as_ref().map(|service| service.request());
     if kind == Kind::Call {
         let taken = given(&entry.field);
@@ -339,7 +341,8 @@ fn asked(
                 .help("leave `field` out to send the same request each time");
         }
         let when = given(&entry.when).map(|(text, place)| (text.clone(), place));
-        let request = template(entry, taken.map(|(path, _)| path), request_type, findings)?;
+        let taken = taken.map(|(path, _)| path);
+        let request = template(entry, taken, (dialect, request_type), findings)?;
         let role = ServiceRole::Call {
             service: service?,
             service_type,
@@ -349,7 +352,7 @@ fn asked(
         };
         return Some((role, fields, when));
     }
-    let request = template(entry, None, request_type, findings);
+    let request = template(entry, None, (dialect, request_type), findings);
     let response = known.as_ref().map(|service| service.response());
     let (selection, fields) = response_field(entry, response, place, site, findings)?;
     let role = ServiceRole::Poll {
@@ -390,24 +393,36 @@ fn service_type(
 /// `None` when it is not built in, which is noted.
 fn built_in(
     name: &TypeName,
-    place: Place,
+    (dialect, place): (Dialect, Place),
     types: &mut Types,
     findings: &mut Findings,
 ) -> Option<Arc<ServiceType>> {
-    let known = types.service(name);
+    let known = types.service(dialect, name);
     if known.is_none() {
         let message = format!("no definition of the service type `{name}` is built in");
         let note = findings.warning(Code::UnknownServiceType, place, message);
         note.help_with(|| {
-            let why = "a package with its .srv file must be below ROS_PACKAGE_PATH when the bridge \
-                       runs, and fields are checked then";
-            match Types::registry(Dialect::Ros1).suggest_service(name) {
+            let folders = match dialect {
+                Dialect::Ros1 => "ROS_PACKAGE_PATH",
+                Dialect::Ros2 => "a prefix in AMENT_PREFIX_PATH",
+            };
+            let why = format!(
+                "a package with its .srv file must be below {folders} when the bridge runs, and fields are checked then"
+            );
+            match Types::registry(dialect).suggest_service(name) {
                 Some(near) => format!("did you mean `{near}`? If not: {why}"),
-                None => why.to_owned(),
+                None => why,
             }
         });
     }
     known
+}
+
+const fn wire(dialect: Dialect) -> Wire {
+    match dialect {
+        Dialect::Ros1 => Wire::Ros1,
+        Dialect::Ros2 => Wire::Cdr,
+    }
 }
 
 /// What of the response is the value, and its fields where the type is known.
@@ -439,7 +454,7 @@ fn response_field(
 fn template(
     entry: &BindingEntry,
     field: Option<&String>,
-    request: Option<&Arc<MessageType>>,
+    (dialect, request): (Dialect, Option<&Arc<MessageType>>),
     findings: &mut Findings,
 ) -> Option<Selection> {
     let constants = match &entry.request {
@@ -460,7 +475,7 @@ fn template(
                     field: None,
                     rest: BTreeMap::from([(path.clone(), literal.clone())]),
                 };
-                let error = Plan::compile(request, &one, Wire::Ros1).err()?;
+                let error = Plan::compile(request, &one, wire(dialect)).err()?;
                 Some(told_fault(path, error))
             })
         };

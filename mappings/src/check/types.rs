@@ -79,7 +79,7 @@ type Answer = Result<Arc<MessageType>, Box<DefinitionError>>;
 /// The message types that are built in.
 pub(super) struct Types {
     asked: HashMap<(Dialect, TypeName), Answer>,
-    services: HashMap<TypeName, Option<Arc<ServiceType>>>,
+    services: HashMap<(Dialect, TypeName), Option<Arc<ServiceType>>>,
 }
 
 static ROS1: LazyLock<Registry> = LazyLock::new(|| Registry::bundle(Dialect::Ros1));
@@ -100,10 +100,16 @@ impl Types {
         }
     }
 
-    /// A ROS 1 service that is built in.
-    pub(super) fn service(&mut self, name: &TypeName) -> Option<Arc<ServiceType>> {
-        let known = self.services.entry(name.clone());
-        known.or_insert_with(|| ROS1.service(name).ok()).clone()
+    /// A service that is built in.
+    pub(super) fn service(
+        &mut self,
+        dialect: Dialect,
+        name: &TypeName,
+    ) -> Option<Arc<ServiceType>> {
+        let known = self.services.entry((dialect, name.clone()));
+        known
+            .or_insert_with(|| Self::registry(dialect).service(name).ok())
+            .clone()
     }
 
     pub(super) fn get(&mut self, dialect: Dialect, name: &TypeName) -> &Answer {

@@ -11,14 +11,14 @@ use tokio::sync::Notify;
 ///
 /// `None` stands for a value that calls nothing: of a state it says that no earlier one is to be called for any more.
 #[derive(Debug)]
-pub(crate) struct Pending {
+pub(super) struct Pending {
     depth: usize,
     waiting: Mutex<VecDeque<Option<Bytes>>>,
     changed: Notify,
 }
 
 impl Pending {
-    pub(crate) fn new(overflow: Overflow) -> Self {
+    pub(super) fn new(overflow: Overflow) -> Self {
         let depth = match overflow {
             Overflow::KeepLatest => 1,
             Overflow::DropOldest(depth) => usize::from(depth.get()),
@@ -31,7 +31,7 @@ impl Pending {
     }
 
     /// Queues a request and says how many requests had to go for it.
-    pub(crate) fn push(&self, request: Option<Bytes>) -> u64 {
+    pub(super) fn push(&self, request: Option<Bytes>) -> u64 {
         let mut waiting = self.lock();
         let oldest = if waiting.len() >= self.depth {
             waiting.pop_front().flatten()
@@ -45,7 +45,7 @@ impl Pending {
     }
 
     /// The oldest, when there is one. Cancel-safe: it is taken only when it is returned.
-    pub(crate) async fn take(&self) -> Option<Bytes> {
+    pub(super) async fn take(&self) -> Option<Bytes> {
         loop {
             let next = self.lock().pop_front();
             if let Some(request) = next {

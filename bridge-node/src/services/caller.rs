@@ -5,25 +5,45 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use mappings::TopicId;
-use tcpros::{ServiceClient, ServiceError};
 use tokio::sync::mpsc;
 use tokio::time::{MissedTickBehavior, interval, sleep};
 use tracing::info;
 
-use crate::pending::Pending;
+use super::pending::Pending;
+
+/// One service of a ROS graph, to be called.
+pub trait ServiceCall: Send + 'static {
+    /// Its name there.
+    fn service(&self) -> &str;
+
+    /// One call: a request as the messages of that ROS are on the wire, and the answer likewise.
+    ///
+    /// # Errors
+    /// [`CallFault`]; a call ends in bounded time.
+    fn call(&self, request: Bytes) -> impl Future<Output = Result<Bytes, CallFault>> + Send;
+}
+
+/// Why a call brought no answer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CallFault {
+    /// For people.
+    pub text: String,
+    /// Whether the same call may succeed later, with nobody changing anything but the service coming back.
+    pub may_pass: bool,
+}
 
 /// What became of a call.
 #[derive(Debug)]
-pub(crate) struct Outcome {
+pub struct Outcome {
     /// What it was made for.
-    pub(crate) of: Source,
+    pub(super) of: Source,
     /// The answer, or why there is none.
-    pub(crate) result: Result<Bytes, String>,
+    pub(super) result: Result<Bytes, String>,
 }
 
 /// What makes calls.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub(crate) enum Source {
+pub(super) enum Source {
     /// The values of a topic.
     Value(TopicId),
     /// The clock; the number of the poll.
@@ -32,20 +52,16 @@ pub(crate) enum Source {
 
 /// Calls one service and reports what came of it.
 #[derive(Debug)]
-pub(crate) struct Caller {
-    client: ServiceClient,
+pub(super) struct Caller<C> {
+    client: C,
     of: Source,
     report: mpsc::Sender<Outcome>,
     /// Whether the last call came to nothing.
     failing: bool,
 }
 
-impl Caller {
-    pub(crate) const fn new(
-        client: ServiceClient,
-        of: Source,
-        report: mpsc::Sender<Outcome>,
-    ) -> Self {
+impl<C: ServiceCall> Caller<C> {
+    pub(super) const fn new(client: C, of: Source, report: mpsc::Sender<Outcome>) -> Self {
         Self {
             client,
             of,
@@ -56,7 +72,7 @@ impl Caller {
 
     /// Calls with each request in turn. A state (`insist`) is tried until the service takes it or a newer value has
     /// come, an event once.
-    pub(crate) async fn serve(mut self, pending: Arc<Pending>, insist: bool) {
+    pub(super) async fn serve(mut self, pending: Arc<Pending>, insist: bool) {
         loop {
             let mut request = pending.take().await;
             let mut wait = FIRST_WAIT;
@@ -72,7 +88,7 @@ impl Caller {
     }
 
     /// Calls with one request every so often.
-    pub(crate) async fn poll(mut self, request: Bytes, every: Duration) {
+    pub(super) async fn poll(mut self, request: Bytes, every: Duration) {
         let mut ticks = interval(every);
         // A slow service is asked again in its turn, not twice in a row.
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -85,13 +101,13 @@ impl Caller {
     async fn call(&mut self, request: Bytes, insist: bool) -> Next {
         let answer = self.client.call(request).await;
         let mut next = Next::Done;
-        let result = answer.map_err(|error| {
+        let result = answer.map_err(|CallFault { text, may_pass }| {
             self.failing = true;
-            if insist && may_pass(&error) {
+            if insist && may_pass {
                 next = Next::Again;
-                return format!("{error}; trying again");
+                return format!("{text}; trying again");
             }
-            error.to_string()
+            text
         });
         if result.is_ok() && std::mem::take(&mut self.failing) {
             info!(service = self.client.service(), "the service answers again");
@@ -110,18 +126,6 @@ impl Caller {
 enum Next {
     Done,
     Again,
-}
-
-/// Whether the same call may succeed later, with nobody changing anything but the service coming back.
-fn may_pass(error: &ServiceError) -> bool {
-    matches!(
-        error,
-        ServiceError::NotAdvertised { .. }
-            | ServiceError::Master { .. }
-            | ServiceError::NoConnection { .. }
-            | ServiceError::Timeout { .. }
-            | ServiceError::Lost { .. }
-    )
 }
 
 /// The first wait before a state is handed to its service again, doubling to the last.

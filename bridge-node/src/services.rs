@@ -1,0 +1,383 @@
+//! Services of the graph as values of the space: calls made for values that arrive, calls made by the clock, and what
+//! they bring.
+//!
+//! Each variable that calls and each service that is polled has a task of its own, so that no call holds up another or
+//! the port.
+
+mod caller;
+mod pending;
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use bytes::Bytes;
+use mappings::{Mapping, Overflow, ServiceRole, SpaceId, TopicId, Trigger, Variable};
+use messages::{Literal, MessageType, NoFields, Plan, Selection, ServiceType, TypeName, Wire};
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use tracing::warn;
+use uadp::{BuiltinType, Timestamp};
+
+pub use self::caller::{CallFault, Outcome, ServiceCall};
+
+use self::caller::{Caller, Source};
+use self::pending::Pending;
+use crate::PortEvent;
+
+/// A ROS graph with services, as a port has it.
+pub trait ServiceGraph {
+    /// Calls one service.
+    type Client: ServiceCall;
+
+    /// How its messages are on the wire.
+    const WIRE: Wire;
+
+    /// The service type of that name.
+    ///
+    /// # Errors
+    /// Why there is none, for people.
+    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String>;
+
+    /// The message type that carries one value of that type, and nothing else; `None` when there is none.
+    ///
+    /// # Errors
+    /// Why its definition is not known, for people.
+    fn carrier(
+        &mut self,
+        builtin: BuiltinType,
+        array: bool,
+    ) -> Result<Option<Arc<MessageType>>, String>;
+
+    /// A client of a service, with the time that a call may take.
+    ///
+    /// # Errors
+    /// Why there can be none, for people.
+    fn client(
+        &mut self,
+        service: &str,
+        service_type: &ServiceType,
+        timeout: Duration,
+    ) -> Result<Self::Client, String>;
+}
+
+/// The calls of one bridge.
+#[derive(Debug)]
+pub struct Services {
+    callers: HashMap<TopicId, Callee>,
+    /// Which values are made of the answers.
+    takers: HashMap<Source, Vec<TopicId>>,
+    /// Polls whose last call was answered.
+    answering: HashSet<Source>,
+    outcomes: mpsc::Receiver<Outcome>,
+    report: mpsc::Sender<Outcome>,
+    tasks: JoinSet<()>,
+}
+
+/// What the values of one variable call.
+#[derive(Debug)]
+struct Callee {
+    pending: Arc<Pending>,
+    /// Where the request is the same each time: that request, and the value that calls, if not any does.
+    constant: Option<(Bytes, Option<Vec<u8>>)>,
+}
+
+/// A service as a binding has it.
+struct Target<'m> {
+    service: &'m str,
+    service_type: Arc<ServiceType>,
+    timeout: Duration,
+}
+
+/// What makes two polls the same.
+type Polled<'m> = (&'m str, &'m TypeName, &'m Selection, Duration, Duration);
+
+impl Services {
+    /// Starts what the mapping ties to services. Reports the types of the values; a binding that cannot be served is
+    /// told of.
+    pub fn start(
+        graph: &mut impl ServiceGraph,
+        own: SpaceId,
+        mapping: &Mapping,
+    ) -> (Self, Vec<PortEvent>) {
+        // What the port has not taken yet delays the next calls: no more than these wait.
+        let (report, outcomes) = mpsc::channel(64);
+        let mut services = Self {
+            callers: HashMap::new(),
+            takers: HashMap::new(),
+            answering: HashSet::new(),
+            outcomes,
+            report,
+            tasks: JoinSet::new(),
+        };
+        let mut events = Vec::new();
+        let mut polls: Vec<Polled<'_>> = Vec::new();
+        for (variable, binding) in mapping.services(own) {
+            let bound = match &binding.role {
+                ServiceRole::Call { .. } => services.open_call(graph, variable, &binding.role),
+                ServiceRole::Answer { of, selection } => {
+                    services.take_answers(graph, mapping, variable, (*of, selection))
+                }
+                ServiceRole::Poll { .. } => {
+                    services.open_poll(graph, variable, &binding.role, &mut polls)
+                }
+            };
+            match bound {
+                Ok(event) => events.push(event),
+                Err(error) => warn!(
+                    topic = %variable.topic,
+                    name = variable.name,
+                    "no service is called for this value: {error}"
+                ),
+            }
+        }
+        (services, events)
+    }
+
+    fn open_call<G: ServiceGraph>(
+        &mut self,
+        graph: &mut G,
+        variable: &Variable,
+        role: &ServiceRole,
+    ) -> Result<PortEvent, String> {
+        let ServiceRole::Call {
+            service,
+            service_type,
+            request,
+            when,
+            timeout,
+        } = role
+        else {
+            return Err("it has no call".to_owned());
+        };
+        let service_type = graph.service_type(service_type)?;
+        let message_type = service_type.request();
+        let (bound, constant) = match request {
+            Selection::Template { field: None, .. } => {
+                let request = constant::<G>(message_type, request)?;
+                let carrier = carrier(graph, variable)?;
+                let value = match when {
+                    Trigger::Any => None,
+                    Trigger::Equals(text) => Some(constant::<G>(&carrier, &only(text))?.to_vec()),
+                };
+                let event = PortEvent::Bound {
+                    topic: variable.topic,
+                    message_type: carrier,
+                    selection: Selection::Whole,
+                };
+                (event, Some((request, value)))
+            }
+            Selection::Whole
+            | Selection::Field(_)
+            | Selection::Template { .. }
+            | Selection::Bytes => {
+                let event = PortEvent::Bound {
+                    topic: variable.topic,
+                    message_type: Arc::clone(message_type),
+                    selection: request.clone(),
+                };
+                (event, None)
+            }
+        };
+        let target = Target {
+            service,
+            service_type: Arc::clone(&service_type),
+            timeout: *timeout,
+        };
+        let of = Source::Value(variable.topic);
+        let caller = self.caller(graph, &target, of)?;
+        let pending = Arc::new(Pending::new(variable.overflow));
+        let insist = variable.overflow == Overflow::KeepLatest;
+        self.tasks.spawn(caller.serve(Arc::clone(&pending), insist));
+        self.callers
+            .insert(variable.topic, Callee { pending, constant });
+        Ok(bound)
+    }
+
+    fn take_answers(
+        &mut self,
+        graph: &mut impl ServiceGraph,
+        mapping: &Mapping,
+        variable: &Variable,
+        (of, selection): (TopicId, &Selection),
+    ) -> Result<PortEvent, String> {
+        let role = mapping
+            .variable(of)
+            .and_then(|of| of.service.as_ref())
+            .map(|binding| &binding.role);
+        let Some(ServiceRole::Call { service_type, .. }) = role else {
+            return Err(format!("{of} calls no service"));
+        };
+        let service_type = graph.service_type(service_type)?;
+        let takers = self.takers.entry(Source::Value(of)).or_default();
+        takers.push(variable.topic);
+        Ok(bound(variable.topic, &service_type, selection))
+    }
+
+    fn open_poll<'m, G: ServiceGraph>(
+        &mut self,
+        graph: &mut G,
+        variable: &Variable,
+        role: &'m ServiceRole,
+        polls: &mut Vec<Polled<'m>>,
+    ) -> Result<PortEvent, String> {
+        let ServiceRole::Poll {
+            service,
+            service_type: name,
+            request,
+            selection,
+            every,
+            timeout,
+        } = role
+        else {
+            return Err("it has no poll".to_owned());
+        };
+        let service_type = graph.service_type(name)?;
+        let poll = (service.as_str(), name, request, *every, *timeout);
+        let known = polls.iter().position(|known| *known == poll);
+        let of = Source::Poll(known.unwrap_or(polls.len()));
+        if known.is_none() {
+            let request = constant::<G>(service_type.request(), request)?;
+            let target = Target {
+                service,
+                service_type: Arc::clone(&service_type),
+                timeout: *timeout,
+            };
+            let caller = self.caller(graph, &target, of)?;
+            self.tasks.spawn(caller.poll(request, *every));
+            polls.push(poll);
+        }
+        self.takers.entry(of).or_default().push(variable.topic);
+        Ok(bound(variable.topic, &service_type, selection))
+    }
+
+    fn caller<G: ServiceGraph>(
+        &self,
+        graph: &mut G,
+        target: &Target<'_>,
+        of: Source,
+    ) -> Result<Caller<G::Client>, String> {
+        let client = graph.client(target.service, &target.service_type, target.timeout)?;
+        Ok(Caller::new(client, of, self.report.clone()))
+    }
+
+    /// Whether the values of a topic are for a service.
+    #[must_use]
+    pub fn takes(&self, topic: TopicId) -> bool {
+        self.callers.contains_key(&topic)
+    }
+
+    /// Hands a value to the service of its topic; `None` when it has none. Else says how many older values gave way.
+    #[must_use]
+    pub fn hand_over(&self, topic: TopicId, value: &Bytes) -> Option<u64> {
+        let callee = self.callers.get(&topic)?;
+        let request = match &callee.constant {
+            None => Some(value.clone()),
+            // It calls nothing, and of a state it takes the place of one that still does.
+            Some((_, Some(wanted))) if wanted != value => None,
+            Some((request, _)) => Some(request.clone()),
+        };
+        Some(callee.pending.push(request))
+    }
+
+    /// The end of the next call. Cancel-safe.
+    pub async fn recv(&mut self) -> Outcome {
+        match self.outcomes.recv().await {
+            Some(outcome) => outcome,
+            // Not while we hold a sender ourselves.
+            None => std::future::pending().await,
+        }
+    }
+
+    /// As [`recv`](Self::recv), for ports that poll.
+    pub fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<Outcome> {
+        match self.outcomes.poll_recv(cx) {
+            Poll::Ready(Some(outcome)) => Poll::Ready(outcome),
+            // Never `None` while we hold a sender ourselves.
+            Poll::Ready(None) | Poll::Pending => Poll::Pending,
+        }
+    }
+
+    /// What the end of a call is for the values made of it.
+    #[must_use]
+    pub fn ended(&mut self, outcome: Outcome, received: Timestamp) -> Vec<PortEvent> {
+        let Outcome { of, result } = outcome;
+        let takers = self.takers.get(&of).map_or(&[][..], Vec::as_slice);
+        let mut events = Vec::new();
+        let mut live = |live: bool| {
+            events.extend(takers.iter().map(|topic| PortEvent::Live {
+                topic: *topic,
+                live,
+            }));
+        };
+        match result {
+            Ok(answer) => {
+                if self.answering.insert(of) {
+                    live(true);
+                }
+                events.extend(takers.iter().map(|topic| PortEvent::Sample {
+                    topic: *topic,
+                    payload: answer.clone(),
+                    received,
+                    latched_by: None,
+                }));
+            }
+            Err(detail) => {
+                let failed = |topic: &TopicId| PortEvent::CallFailed {
+                    topic: *topic,
+                    detail: detail.clone(),
+                };
+                match of {
+                    // What the service answered before is still its last answer.
+                    Source::Value(topic) => events.push(failed(&topic)),
+                    Source::Poll(_) => {
+                        if self.answering.remove(&of) {
+                            live(false);
+                        }
+                        events.extend(takers.iter().map(failed));
+                    }
+                }
+            }
+        }
+        events
+    }
+}
+
+fn bound(topic: TopicId, service_type: &ServiceType, selection: &Selection) -> PortEvent {
+    PortEvent::Bound {
+        topic,
+        message_type: Arc::clone(service_type.response()),
+        selection: selection.clone(),
+    }
+}
+
+/// The type a value comes as that is only compared.
+fn carrier(graph: &mut impl ServiceGraph, variable: &Variable) -> Result<Arc<MessageType>, String> {
+    let (builtin, array) = variable
+        .value_type
+        .ok_or("a variable whose value does not go into the request needs a `type`")?;
+    graph
+        .carrier(builtin, array)?
+        .ok_or_else(|| format!("a value of type {builtin:?} cannot be compared with `when`"))
+}
+
+/// The message of a template without a value in it.
+fn constant<G: ServiceGraph>(
+    message_type: &Arc<MessageType>,
+    template: &Selection,
+) -> Result<Bytes, String> {
+    let plan = Plan::compile(message_type, template, G::WIRE).map_err(|error| error.to_string())?;
+    let mut bytes = Vec::new();
+    plan.write(&mut NoFields, &mut bytes)
+        .map_err(|error| error.to_string())?;
+    Ok(bytes.into())
+}
+
+/// A std_msgs type with that text as its `data`.
+fn only(text: &str) -> Selection {
+    Selection::Template {
+        field: None,
+        rest: BTreeMap::from([("data".to_owned(), Literal::One(text.to_owned()))]),
+    }
+}

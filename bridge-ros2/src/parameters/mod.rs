@@ -1,0 +1,134 @@
+//! The parameters of our own node, so that `ros2 param` of either vendor lists, gets, sets and describes them.
+//!
+//! Six services below the node's name and the topic `/parameter_events` (rcl_interfaces). Parameters are declared at
+//! the start and keep their types.
+
+mod store;
+mod value;
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use bridge_node::now;
+use bytes::Bytes;
+use messages::TypeName;
+use rustdds::policy::{Durability, History};
+use rustdds::{QosPolicies, QosPolicyBuilder};
+use tracing::{info, warn};
+
+pub use self::store::Parameter;
+pub use self::value::ParameterValue;
+
+use self::store::{Question, Store};
+use crate::cdr::Malformed;
+use crate::domain::{Domain, DomainError};
+use crate::raw::{Payload, Writer};
+use crate::service::{Service, ServiceOptions, ServicePeers, ServiceServer};
+
+/// Serves the parameters of a node. Dropping it withdraws the services.
+#[derive(Debug)]
+pub struct ParameterServer {
+    shared: Arc<Shared>,
+    _services: Vec<ServiceServer>,
+}
+
+struct Shared {
+    node: String,
+    store: Mutex<Store>,
+    events: Mutex<Writer>,
+}
+
+impl ParameterServer {
+    /// Declares `parameters` for the domain's node and serves them. To be called on a tokio runtime.
+    ///
+    /// # Errors
+    /// [`DomainError::Endpoint`].
+    pub fn open(
+        domain: &Domain,
+        peers: &ServicePeers,
+        parameters: Vec<Parameter>,
+    ) -> Result<Self, DomainError> {
+        let node = domain.node_name();
+        let events = domain.open_writer(EVENTS, EVENT_TYPE, &policies())?;
+        let shared = Arc::new(Shared {
+            node: node.clone(),
+            store: Mutex::new(Store::new(parameters)),
+            events: Mutex::new(events),
+        });
+        let mut services = Vec::new();
+        for question in Question::ALL {
+            let (name, service_type) = question.names();
+            let Ok(service_type) = TypeName::new("rcl_interfaces", service_type) else {
+                continue;
+            };
+            let service = Service::new(&format!("{node}/{name}"), &service_type);
+            let shared = Arc::clone(&shared);
+            services.push(ServiceServer::open(
+                domain,
+                peers,
+                &service,
+                ServiceOptions::default(),
+                move |request| {
+                    let answer = shared.answer(question, &request.bytes);
+                    async { answer.map_err(|Malformed| "a request cut short".to_owned()) }
+                },
+            )?);
+        }
+        Ok(Self {
+            shared,
+            _services: services,
+        })
+    }
+
+    /// The value of a parameter now; `None` when it is not declared.
+    #[must_use]
+    pub fn value(&self, name: &str) -> Option<ParameterValue> {
+        let store = self.shared.store.lock();
+        let store = store.unwrap_or_else(PoisonError::into_inner);
+        store.get(name).map(|parameter| parameter.value.clone())
+    }
+}
+
+impl Shared {
+    fn answer(&self, question: Question, request: &[u8]) -> Result<Bytes, Malformed> {
+        let (answer, changed) = self
+            .store
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .answer(question, request)?;
+        if !changed.is_empty() {
+            for Parameter { name, value, .. } in &changed {
+                info!(parameter = name, ?value, "parameter set");
+            }
+            let event = store::event(&self.node, now().utc.unix_nanos(), &changed);
+            let written = Payload::to_write(event).map(|event| {
+                let events = self.events.lock().unwrap_or_else(PoisonError::into_inner);
+                events.write(event, None).is_ok()
+            });
+            if written != Ok(true) {
+                warn!("subscribers of /parameter_events were not told of a change");
+            }
+        }
+        Ok(answer)
+    }
+}
+
+impl std::fmt::Debug for Shared {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Shared")
+            .field("node", &self.node)
+            .field("store", &self.store)
+            .finish_non_exhaustive()
+    }
+}
+
+/// As rmw's default for parameter events, which are reliable and volatile.
+fn policies() -> QosPolicies {
+    QosPolicyBuilder::new()
+        .reliable(rustdds::Duration::ZERO)
+        .durability(Durability::Volatile)
+        .history(History::KeepLast { depth: 100 })
+        .build()
+}
+
+const EVENTS: &str = "rt/parameter_events";
+const EVENT_TYPE: &str = "rcl_interfaces::msg::dds_::ParameterEvent_";

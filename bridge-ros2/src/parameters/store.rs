@@ -1,0 +1,304 @@
+//! The parameters of a node and the answers to the six services about them. Pure: bytes in, bytes out.
+
+use std::collections::BTreeSet;
+
+use bytes::Bytes;
+
+use super::ParameterValue;
+use crate::cdr::{CdrReader, CdrWriter, Malformed};
+
+/// A declared parameter.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Parameter {
+    /// Parts joined by dots.
+    pub name: String,
+    /// Its value; of this type for ever.
+    pub value: ParameterValue,
+    /// For people.
+    pub description: String,
+    /// Whether nobody may set it.
+    pub read_only: bool,
+}
+
+/// The declared parameters, ordered by name.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Store(Vec<Parameter>);
+
+/// One of the six services.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Question {
+    Describe,
+    Types,
+    Get,
+    List,
+    Set,
+    SetAtomically,
+}
+
+impl Question {
+    pub(super) const ALL: [Self; 6] = [
+        Self::Describe,
+        Self::Types,
+        Self::Get,
+        Self::List,
+        Self::Set,
+        Self::SetAtomically,
+    ];
+
+    /// The service's name below the node's, and its type in `rcl_interfaces`.
+    pub(super) const fn names(self) -> (&'static str, &'static str) {
+        match self {
+            Self::Describe => ("describe_parameters", "DescribeParameters"),
+            Self::Types => ("get_parameter_types", "GetParameterTypes"),
+            Self::Get => ("get_parameters", "GetParameters"),
+            Self::List => ("list_parameters", "ListParameters"),
+            Self::Set => ("set_parameters", "SetParameters"),
+            Self::SetAtomically => ("set_parameters_atomically", "SetParametersAtomically"),
+        }
+    }
+}
+
+impl Store {
+    pub(super) fn new(mut parameters: Vec<Parameter>) -> Self {
+        parameters.sort_by(|a, b| a.name.cmp(&b.name));
+        Self(parameters)
+    }
+
+    pub(super) fn get(&self, name: &str) -> Option<&Parameter> {
+        self.0.iter().find(|parameter| parameter.name == name)
+    }
+
+    /// The answer to a request, and the parameters it changed.
+    pub(super) fn answer(
+        &mut self,
+        question: Question,
+        request: &[u8],
+    ) -> Result<(Bytes, Vec<Parameter>), Malformed> {
+        let mut reader = CdrReader::new(request)?;
+        let mut writer = CdrWriter::new();
+        let mut changed = Vec::new();
+        match question {
+            Question::Describe => {
+                let names = reader.sequence(CdrReader::string)?;
+                writer.sequence(&names, |writer, name| self.describe(writer, name));
+            }
+            Question::Types => {
+                let names = reader.sequence(CdrReader::string)?;
+                writer.sequence(&names, |writer, name| {
+                    writer.u8(self.get(name).map_or(0, |found| found.value.kind()));
+                });
+            }
+            Question::Get => {
+                let names = reader.sequence(CdrReader::string)?;
+                writer.sequence(&names, |writer, name| match self.get(name) {
+                    Some(found) => found.value.write(writer),
+                    None => ParameterValue::NotSet.write(writer),
+                });
+            }
+            Question::List => {
+                let prefixes = reader.sequence(CdrReader::string)?;
+                let depth = reader.u64()?;
+                self.list(&mut writer, &prefixes, depth);
+            }
+            Question::Set => {
+                let wanted = reader.sequence(assignment)?;
+                writer.sequence(&wanted, |writer, one| {
+                    let result = self.set(std::slice::from_ref(one));
+                    write_result(writer, &result);
+                    changed.extend(result.unwrap_or_default());
+                });
+            }
+            Question::SetAtomically => {
+                let wanted = reader.sequence(assignment)?;
+                let result = self.set(&wanted);
+                write_result(&mut writer, &result);
+                changed = result.unwrap_or_default();
+            }
+        }
+        Ok((writer.finish(), changed))
+    }
+
+    /// Of a parameter that is not declared no more than the name.
+    fn describe(&self, writer: &mut CdrWriter, name: &str) {
+        let found = self.get(name);
+        writer.string(name);
+        writer.u8(found.map_or(0, |found| found.value.kind()));
+        writer.string(found.map_or("", |found| &found.description));
+        writer.string("");
+        writer.bool(found.is_some_and(|found| found.read_only));
+        writer.bool(false);
+        // No range, neither of numbers nor of whole ones.
+        writer.u32(0);
+        writer.u32(0);
+    }
+
+    /// As rclcpp: the names at or below one of the prefixes, at most `depth` parts below it; 0 is any number.
+    fn list(&self, writer: &mut CdrWriter, prefixes: &[String], depth: u64) {
+        let near = |rest: &str| {
+            let parts = rest.split('.').count();
+            depth == 0 || u64::try_from(parts).is_ok_and(|parts| parts <= depth)
+        };
+        let below = |name: &str, prefix: &str| {
+            let rest = name
+                .strip_prefix(prefix)
+                .and_then(|rest| rest.strip_prefix('.'));
+            name == prefix || rest.is_some_and(near)
+        };
+        let all = self.0.iter().map(|parameter| parameter.name.as_str());
+        let names: Vec<&str> = all
+            .filter(|name| match prefixes {
+                [] => near(name),
+                prefixes => prefixes.iter().any(|prefix| below(name, prefix)),
+            })
+            .collect();
+        let parents = names.iter().filter_map(|name| name.rsplit_once('.'));
+        let parents: BTreeSet<&str> = parents.map(|(parent, _)| parent).collect();
+        let parents: Vec<&str> = parents.into_iter().collect();
+        writer.sequence(&names, |writer, name| writer.string(name));
+        writer.sequence(&parents, |writer, name| writer.string(name));
+    }
+
+    /// Sets all or none; those that have another value now.
+    fn set(&mut self, wanted: &[(String, ParameterValue)]) -> Result<Vec<Parameter>, String> {
+        for (name, value) in wanted {
+            let Some(found) = self.get(name) else {
+                return Err(format!(
+                    "parameter '{name}' cannot be set because it was not declared"
+                ));
+            };
+            if found.read_only {
+                return Err(format!(
+                    "parameter '{name}' cannot be set because it is read-only"
+                ));
+            }
+            if found.value.kind() != value.kind() {
+                return Err(format!(
+                    "parameter '{name}' cannot have a value of another type"
+                ));
+            }
+        }
+        let mut changed = Vec::new();
+        for (name, value) in wanted {
+            let found = self.0.iter_mut().find(|parameter| parameter.name == *name);
+            if let Some(found) = found
+                && found.value != *value
+            {
+                found.value = value.clone();
+                changed.push(found.clone());
+            }
+        }
+        Ok(changed)
+    }
+}
+
+/// A `rcl_interfaces/msg/Parameter`.
+fn assignment(reader: &mut CdrReader<'_>) -> Result<(String, ParameterValue), Malformed> {
+    Ok((reader.string()?, ParameterValue::read(reader)?))
+}
+
+/// A `rcl_interfaces/msg/SetParametersResult`.
+fn write_result(writer: &mut CdrWriter, result: &Result<Vec<Parameter>, String>) {
+    writer.bool(result.is_ok());
+    writer.string(result.as_ref().err().map_or("", String::as_str));
+}
+
+/// A `rcl_interfaces/msg/ParameterEvent` about parameters that changed.
+pub(super) fn event(node: &str, unix_nanos: i128, changed: &[Parameter]) -> Bytes {
+    let (seconds, nanos) = (
+        unix_nanos.div_euclid(1_000_000_000),
+        unix_nanos.rem_euclid(1_000_000_000),
+    );
+    let mut writer = CdrWriter::new();
+    writer.i32(i32::try_from(seconds).unwrap_or(i32::MAX));
+    writer.u32(u32::try_from(nanos).unwrap_or_default());
+    writer.string(node);
+    // New ones.
+    writer.u32(0);
+    writer.sequence(changed, |writer, parameter| {
+        writer.string(&parameter.name);
+        parameter.value.write(writer);
+    });
+    // Deleted ones.
+    writer.u32(0);
+    writer.finish()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parameter(name: &str, value: ParameterValue, read_only: bool) -> Parameter {
+        Parameter {
+            name: name.to_owned(),
+            value,
+            description: String::new(),
+            read_only,
+        }
+    }
+
+    fn store() -> Store {
+        Store::new(vec![
+            parameter("use_sim_time", ParameterValue::Bool(false), false),
+            parameter("arm.speed", ParameterValue::Double(1.0), false),
+            parameter("arm.joint.limit", ParameterValue::Integer(3), true),
+        ])
+    }
+
+    fn listed(prefixes: &[&str], depth: u64) -> Vec<String> {
+        let mut writer = CdrWriter::new();
+        writer.sequence(prefixes, |writer, name| writer.string(name));
+        writer.i64(i64::try_from(depth).unwrap());
+        let (answer, _) = store().answer(Question::List, &writer.finish()).unwrap();
+        CdrReader::new(&answer)
+            .unwrap()
+            .sequence(CdrReader::string)
+            .unwrap()
+    }
+
+    #[test]
+    fn names_are_listed_by_prefix_and_depth_as_rclcpp_does() {
+        let all = ["arm.joint.limit", "arm.speed", "use_sim_time"];
+        assert_eq!(listed(&[], 0), all);
+        assert_eq!(listed(&[], 1), ["use_sim_time"]);
+        assert_eq!(listed(&["arm"], 1), ["arm.speed"]);
+        assert_eq!(listed(&["arm", "use_sim_time"], 0), all);
+        assert_eq!(listed(&["ar"], 0), [""; 0]);
+    }
+
+    #[test]
+    fn of_several_set_together_all_are_or_none() {
+        let mut store = store();
+        let set = |name: &str, value| (name.to_owned(), value);
+        let refused = store.set(&[
+            set("use_sim_time", ParameterValue::Bool(true)),
+            set("arm.joint.limit", ParameterValue::Integer(4)),
+        ]);
+        assert!(refused.unwrap_err().contains("read-only"));
+        assert_eq!(
+            store.get("use_sim_time").unwrap().value,
+            ParameterValue::Bool(false)
+        );
+        for (name, value, why) in [
+            ("nothing", ParameterValue::Bool(true), "not declared"),
+            ("arm.speed", ParameterValue::Integer(1), "another type"),
+        ] {
+            let refused = store.set(&[set(name, value)]);
+            assert!(refused.unwrap_err().contains(why));
+        }
+        let changed = store.set(&[
+            set("use_sim_time", ParameterValue::Bool(true)),
+            set("arm.speed", ParameterValue::Double(1.0)),
+        ]);
+        // The other has the value already.
+        assert_eq!(changed.unwrap().len(), 1);
+    }
+
+    #[test]
+    fn a_request_that_ends_early_is_refused() {
+        for question in Question::ALL {
+            for bytes in [&[0, 1, 0][..], &[0, 1, 0, 0, 9, 0, 0, 0]] {
+                assert_eq!(store().answer(question, bytes).unwrap_err(), Malformed);
+            }
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! Services of the domain, as values of the space call them.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge_node::{CallFault, ServiceCall, ServiceGraph};
+use bytes::Bytes;
+use mappings::SpaceId;
+use messages::{MessageType, ServiceType, TypeName, Wire};
+use uadp::BuiltinType;
+
+use crate::definitions::Definitions;
+use crate::domain::Domain;
+use crate::parameters::{Parameter, ParameterValue};
+use crate::service::{Service, ServiceClient, ServiceClientOptions, ServiceError, ServicePeers};
+
+/// A domain and what is known of types.
+pub(super) struct Ros2Graph<'p> {
+    pub(super) domain: &'p Domain,
+    pub(super) peers: &'p ServicePeers,
+    pub(super) definitions: &'p mut Definitions,
+}
+
+impl ServiceGraph for Ros2Graph<'_> {
+    type Client = Client;
+
+    const WIRE: Wire = Wire::Cdr;
+
+    fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String> {
+        self.definitions.service(name).map_err(|error| {
+            format!(
+                "{error}; discovery does not bring the definition of a service, so a prefix in AMENT_PREFIX_PATH must \
+                 have share/{}/srv/{}.srv",
+                name.package(),
+                name.name()
+            )
+        })
+    }
+
+    fn carrier(
+        &mut self,
+        builtin: BuiltinType,
+        array: bool,
+    ) -> Result<Option<Arc<MessageType>>, String> {
+        let name = self.definitions.standard_type(builtin, array);
+        name.map(|name| self.definitions.get(&name))
+            .transpose()
+            .map_err(|error| error.to_string())
+    }
+
+    fn client(
+        &mut self,
+        service: &str,
+        service_type: &ServiceType,
+        timeout: Duration,
+    ) -> Result<Client, String> {
+        let service = Service::new(service, service_type.name());
+        let options = ServiceClientOptions {
+            timeout: Some(timeout),
+            ..ServiceClientOptions::default()
+        };
+        ServiceClient::open(self.domain, self.peers, &service, options)
+            .map(Client)
+            .map_err(|error| error.to_string())
+    }
+}
+
+/// What `ros2 param` shows of the bridge.
+pub(super) fn parameters(own: SpaceId, domain: u16) -> Vec<Parameter> {
+    let parameter = |name: &str, value, description: &str, read_only| Parameter {
+        name: name.to_owned(),
+        value,
+        description: description.to_owned(),
+        read_only,
+    };
+    let (space, domain) = (i64::from(u16::from(own)), i64::from(domain));
+    vec![
+        parameter(
+            "use_sim_time",
+            ParameterValue::Bool(false),
+            "Every ROS node has it; messages keep their own stamps",
+            false,
+        ),
+        parameter(
+            "space",
+            ParameterValue::Integer(space),
+            "The space whose values are produced in this domain",
+            true,
+        ),
+        parameter(
+            "domain",
+            ParameterValue::Integer(domain),
+            "The DDS domain",
+            true,
+        ),
+    ]
+}
+
+/// Calls one service.
+pub(super) struct Client(ServiceClient);
+
+impl ServiceCall for Client {
+    fn service(&self) -> &str {
+        self.0.service()
+    }
+
+    async fn call(&self, request: Bytes) -> Result<Bytes, CallFault> {
+        self.0.call(request).await.map_err(|error| CallFault {
+            text: error.to_string(),
+            // A server of another type may give way to the right one as well as none.
+            may_pass: matches!(
+                error,
+                ServiceError::Timeout { .. }
+                    | ServiceError::Lost { .. }
+                    | ServiceError::OtherType { .. }
+            ),
+        })
+    }
+}

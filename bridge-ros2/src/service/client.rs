@@ -1,0 +1,481 @@
+//! Calling a service: finding its servers, asking each in its own way, and telling what went wrong.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
+use std::time::Duration;
+
+use bytes::Bytes;
+use rustdds::dds::WriteError;
+use rustdds::{GUID, WriteOptionsBuilder};
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::AbortHandle;
+use tokio::time::{Instant, sleep_until, timeout_at};
+use tracing::debug;
+
+use super::error::{CallPhase, ServiceError};
+use super::mapping::{ClientId, Outgoing, Received, RequestKey};
+use super::opening::Opening;
+use super::peers::{ServicePeers, Snapshot};
+use super::{BUSY, IDLE, SETTLE, Service, ServiceMapping, next, policies};
+use crate::domain::{Domain, DomainError};
+use crate::raw::{Payload, Reader, Writer};
+
+/// How long a client waits, and how much.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ServiceClientOptions {
+    /// For a whole call: waiting for a server, request and reply. `None` waits until the server is gone.
+    pub timeout: Option<Duration>,
+    /// Calls in progress at once; one more is refused.
+    pub max_calls: usize,
+}
+
+impl Default for ServiceClientOptions {
+    /// 10 seconds, 1024 calls.
+    fn default() -> Self {
+        Self {
+            timeout: Some(Duration::from_secs(10)),
+            max_calls: 1024,
+        }
+    }
+}
+
+/// Calls one service. Clones share its endpoints, which go with the last of them.
+#[derive(Clone, Debug)]
+pub struct ServiceClient {
+    shared: Arc<Shared>,
+}
+
+#[derive(Debug)]
+struct Shared {
+    service: Service,
+    options: ServiceClientOptions,
+    calls: mpsc::Sender<Call>,
+    ignored: Arc<AtomicU64>,
+    servers: Arc<AtomicU64>,
+    task: AbortHandle,
+}
+
+impl Drop for Shared {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+impl ServiceClient {
+    /// Makes the endpoints and starts to look for servers. To be called on a tokio runtime.
+    ///
+    /// # Errors
+    /// [`DomainError::Endpoint`].
+    pub fn open(
+        domain: &Domain,
+        peers: &ServicePeers,
+        service: &Service,
+        options: ServiceClientOptions,
+    ) -> Result<Self, DomainError> {
+        // The reader first: who knows our writer then most likely knows it too.
+        let reader =
+            domain.open_reader(&service.reply_topic(), &service.types.response, &policies())?;
+        let writer = domain.open_writer(
+            &service.request_topic(),
+            &service.types.request,
+            &policies(),
+        )?;
+        let (calls, inbox) = mpsc::channel(QUEUE);
+        let (ignored, servers) = (Arc::default(), Arc::default());
+        let driver = Driver {
+            id: ClientId {
+                writer: writer.guid(),
+                reader: reader.guid(),
+            },
+            service: service.clone(),
+            peers: peers.clone(),
+            writer,
+            max_calls: options.max_calls,
+            servers: BTreeMap::new(),
+            other_type: None,
+            waiting: VecDeque::new(),
+            asked: BTreeMap::new(),
+            keys: HashMap::new(),
+            count: 0,
+            looked: None,
+            readers: Vec::new(),
+            opening: Opening::default(),
+            ignored: Arc::clone(&ignored),
+            ready: Arc::clone(&servers),
+        };
+        let task = tokio::spawn(driver.run(reader, inbox)).abort_handle();
+        Ok(Self {
+            shared: Arc::new(Shared {
+                service: service.clone(),
+                options,
+                calls,
+                ignored,
+                servers,
+                task,
+            }),
+        })
+    }
+
+    /// The service's ROS name.
+    #[must_use]
+    pub fn service(&self) -> &str {
+        &self.shared.service.name
+    }
+
+    /// Servers that would be asked now: those of other participants whose reader and writer are both matched.
+    #[must_use]
+    pub fn servers(&self) -> u64 {
+        self.shared.servers.load(Ordering::Relaxed)
+    }
+
+    /// Replies so far that were for nobody here: to calls of other clients, to calls given up, or malformed.
+    #[must_use]
+    pub fn ignored(&self) -> u64 {
+        self.shared.ignored.load(Ordering::Relaxed)
+    }
+
+    /// Sends a request, CDR with its encapsulation header, and returns the reply likewise. With several servers all
+    /// are asked, as everywhere in ROS 2, and the first reply counts.
+    ///
+    /// It is never sent twice: when it fails, [`ServiceError::may_have_run`] tells whether a server may have acted.
+    /// Dropping the future gives the call up; a server may still act.
+    ///
+    /// # Errors
+    /// [`ServiceError`].
+    pub async fn call(&self, request: Bytes) -> Result<Bytes, ServiceError> {
+        let phase = Arc::new(AtomicU8::new(CallPhase::Queue.into()));
+        let (done, reply) = oneshot::channel();
+        let call = Call {
+            request,
+            phase: Arc::clone(&phase),
+            done,
+        };
+        let at = || CallPhase::from(phase.load(Ordering::Relaxed));
+        let exchange = async {
+            match self.shared.calls.send(call).await {
+                Ok(()) => reply.await.unwrap_or(Err(Failure::Closed)),
+                Err(_) => Err(Failure::Closed),
+            }
+        };
+        let Some(limit) = self.shared.options.timeout else {
+            return exchange.await.map_err(|failure| self.error(failure, at()));
+        };
+        match timeout_at(Instant::now() + limit, exchange).await {
+            Ok(done) => done.map_err(|failure| self.error(failure, at())),
+            Err(_) => Err(ServiceError::Timeout {
+                service: self.service().to_owned(),
+                phase: at(),
+                limit,
+            }),
+        }
+    }
+
+    fn error(&self, failure: Failure, phase: CallPhase) -> ServiceError {
+        let service = self.service().to_owned();
+        match failure {
+            Failure::Busy => ServiceError::Busy {
+                service,
+                limit: self.shared.options.max_calls,
+            },
+            Failure::Request(why) => ServiceError::Request { service, why },
+            Failure::OtherType(theirs) => ServiceError::OtherType {
+                service,
+                theirs,
+                ours: self.shared.service.types.request.clone(),
+            },
+            Failure::Lost => ServiceError::Lost { service },
+            Failure::Closed => ServiceError::Closed { service, phase },
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Call {
+    request: Bytes,
+    phase: Arc<AtomicU8>,
+    done: oneshot::Sender<Result<Bytes, Failure>>,
+}
+
+impl Call {
+    fn enter(&self, phase: CallPhase) {
+        self.phase.store(phase.into(), Ordering::Relaxed);
+    }
+
+    fn end(self, result: Result<Bytes, Failure>) {
+        // Who gave the call up does not listen.
+        drop(self.done.send(result));
+    }
+}
+
+/// What ended a call, but for time.
+#[derive(Debug)]
+enum Failure {
+    Busy,
+    Request(&'static str),
+    OtherType(String),
+    Lost,
+    Closed,
+}
+
+/// Owns the endpoints and all calls in progress.
+struct Driver {
+    service: Service,
+    id: ClientId,
+    peers: ServicePeers,
+    writer: Writer,
+    max_calls: usize,
+    /// By the reader of the requests; since when both halves are known.
+    servers: BTreeMap<GUID, Instant>,
+    /// A type that a server has instead of ours.
+    other_type: Option<String>,
+    /// Calls that wait for a server or for the send window, oldest first.
+    waiting: VecDeque<Call>,
+    /// Calls that wait for a reply.
+    asked: BTreeMap<u64, Asked>,
+    keys: HashMap<RequestKey, u64>,
+    count: u64,
+    looked: Option<Instant>,
+    /// All that read the requests.
+    readers: Vec<GUID>,
+    opening: Opening,
+    ignored: Arc<AtomicU64>,
+    ready: Arc<AtomicU64>,
+}
+
+struct Asked {
+    call: Call,
+    keys: Vec<RequestKey>,
+    servers: Vec<GUID>,
+}
+
+impl Driver {
+    async fn run(mut self, reader: Reader, mut calls: mpsc::Receiver<Call>) {
+        loop {
+            // Each branch is cancel-safe: nothing is taken but by the branch that completes.
+            let tick = self.next_look().unwrap_or_else(Instant::now);
+            tokio::select! {
+                reply = next(&reader) => self.replied(reply),
+                call = calls.recv() => match call {
+                    Some(call) => self.called(call),
+                    None => return,
+                },
+                () = sleep_until(tick) => self.look(Instant::now()),
+            }
+        }
+    }
+
+    fn pause(&self) -> Duration {
+        if self.waiting.is_empty() { IDLE } else { BUSY }
+    }
+
+    fn next_look(&self) -> Option<Instant> {
+        self.looked.map(|looked| looked + self.pause())
+    }
+
+    fn called(&mut self, call: Call) {
+        if self.waiting.len() + self.asked.len() >= self.max_calls {
+            self.forget_given_up();
+        }
+        if self.waiting.len() + self.asked.len() >= self.max_calls {
+            call.end(Err(Failure::Busy));
+            return;
+        }
+        call.enter(CallPhase::Discovery);
+        self.waiting.push_back(call);
+        let now = Instant::now();
+        if self.next_look().is_none_or(|due| due <= now) {
+            self.look(now);
+        } else {
+            self.ask_waiting(now);
+        }
+    }
+
+    /// Takes note of the servers there are, and asks them what waits.
+    fn look(&mut self, now: Instant) {
+        self.looked = Some(now);
+        self.forget_given_up();
+        let snapshot = self.peers.look(now, self.pause());
+        self.meet(&snapshot, now);
+        self.give_up_lost();
+        let count = self.ready(now);
+        self.ready
+            .store(u64::try_from(count).unwrap_or(u64::MAX), Ordering::Relaxed);
+        self.ask_waiting(now);
+        if self.servers.is_empty()
+            && let Some(theirs) = &self.other_type
+        {
+            for call in self.waiting.drain(..) {
+                call.end(Err(Failure::OtherType(theirs.clone())));
+            }
+        }
+    }
+
+    /// How many servers know us by now.
+    fn ready(&self, now: Instant) -> usize {
+        let settled = |since: &&Instant| now.saturating_duration_since(**since) >= SETTLE;
+        self.servers.values().filter(settled).count()
+    }
+
+    fn ask_waiting(&mut self, now: Instant) {
+        if self.ready(now) == 0 {
+            return;
+        }
+        // Those too that are new: the others may be dead, with their leases still running.
+        let servers: Vec<GUID> = self.servers.keys().copied().collect();
+        while self.opening.is_over(&self.writer, now)
+            && let Some(call) = self.waiting.pop_front()
+        {
+            call.enter(CallPhase::Request);
+            if let Some(unsent) = self.ask(call, &servers) {
+                self.waiting.push_front(unsent);
+                return;
+            }
+            self.opening.written(self.readers.iter().copied(), now);
+        }
+    }
+
+    fn meet(&mut self, snapshot: &Snapshot, now: Instant) {
+        let readers = snapshot.readers(&self.service.request_topic());
+        let reply_topic = self.service.reply_topic();
+        let writers = snapshot.writers(&reply_topic);
+        let answers = |server: &GUID| {
+            writers.iter().any(|writer| {
+                writer.guid.prefix == server.prefix
+                    && writer.type_name == self.service.types.response
+            })
+        };
+        let found: Vec<GUID> = readers
+            .iter()
+            .filter(|reader| reader.type_name == self.service.types.request)
+            .map(|reader| reader.guid)
+            .filter(answers)
+            .collect();
+        self.servers.retain(|guid, _| found.contains(guid));
+        for guid in found {
+            self.servers.entry(guid).or_insert(now);
+        }
+        self.other_type = readers
+            .iter()
+            .find(|reader| reader.type_name != self.service.types.request)
+            .map(|reader| reader.type_name.clone());
+        self.readers = readers.iter().map(|reader| reader.guid).collect();
+    }
+
+    /// Writes a request to the servers; returns it when the send window is full.
+    fn ask(&mut self, call: Call, servers: &[GUID]) -> Option<Call> {
+        self.count += 1;
+        let mut keys = Vec::new();
+        for server in servers {
+            match self.write(&call.request, *server) {
+                Ok(key) => keys.push(key),
+                Err(Unsent::Full) => {}
+                Err(Unsent::Request(why)) => {
+                    call.end(Err(Failure::Request(why)));
+                    return None;
+                }
+            }
+        }
+        if keys.is_empty() {
+            return Some(call);
+        }
+        call.enter(CallPhase::Answer);
+        for key in &keys {
+            self.keys.insert(*key, self.count);
+        }
+        let asked = Asked {
+            call,
+            keys,
+            servers: servers.to_vec(),
+        };
+        self.asked.insert(self.count, asked);
+        None
+    }
+
+    fn write(&self, request: &Bytes, server: GUID) -> Result<RequestKey, Unsent> {
+        let mapping = ServiceMapping::of(server);
+        let count = i64::try_from(self.count).unwrap_or(i64::MAX);
+        let Outgoing { payload, related } = self
+            .id
+            .seal_request(mapping, count, request.clone())
+            .map_err(|fault| Unsent::Request(fault.label()))?;
+        let payload = Payload::to_write(payload).map_err(|error| Unsent::Request(error.label()))?;
+        // To each server alone: a request in one vendor's way is garbage to the servers of another. Besides, what goes to
+        // all readers RustDDS puts together into larger datagrams, and of 100 requests so sent at once some never
+        // reached Cyclone DDS.
+        let options = WriteOptionsBuilder::new()
+            .related_sample_identity_opt(related)
+            .to_single_reader(server)
+            .build();
+        match self.writer.write_with_options(payload, options) {
+            Ok(identity) => Ok(match mapping {
+                ServiceMapping::Cyclone => RequestKey::Counted(count),
+                ServiceMapping::Enhanced => {
+                    RequestKey::Written(i64::from(identity.sequence_number))
+                }
+            }),
+            Err(WriteError::WouldBlock { .. }) => Err(Unsent::Full),
+            Err(
+                WriteError::Serialization { .. }
+                | WriteError::Poisoned { .. }
+                | WriteError::Io(_)
+                | WriteError::Internal { .. },
+            ) => Err(Unsent::Request("the DDS writer failed")),
+        }
+    }
+
+    fn replied(&mut self, reply: Option<Received>) {
+        // Ourselves as server, which no client here is for.
+        let foreign = reply.filter(|reply| !self.peers.is_own(reply.writer));
+        let opened = foreign.map(|reply| self.id.open_reply(reply));
+        if let Some(Ok(Some((key, body)))) = opened
+            && let Some(asked) = self.keys.get(&key).and_then(|id| self.asked.remove(id))
+        {
+            self.forget_keys(&asked.keys);
+            asked.call.end(Ok(body));
+            return;
+        }
+        debug!(service = self.service.name, "a reply for nobody here");
+        self.ignored.fetch_add(1, Ordering::Relaxed);
+    }
+
+    fn forget_keys(&mut self, keys: &[RequestKey]) {
+        for key in keys {
+            self.keys.remove(key);
+        }
+    }
+
+    fn forget_given_up(&mut self) {
+        self.waiting.retain(|call| !call.done.is_closed());
+        for asked in self.take_asked(|asked| asked.call.done.is_closed()) {
+            self.forget_keys(&asked.keys);
+        }
+    }
+
+    /// Ends the calls whose servers have all gone.
+    fn give_up_lost(&mut self) {
+        let servers: BTreeSet<GUID> = self.servers.keys().copied().collect();
+        let lost = |asked: &Asked| !asked.servers.iter().any(|guid| servers.contains(guid));
+        for asked in self.take_asked(lost) {
+            self.forget_keys(&asked.keys);
+            asked.call.end(Err(Failure::Lost));
+        }
+    }
+
+    fn take_asked(&mut self, which: impl Fn(&Asked) -> bool) -> Vec<Asked> {
+        let found = self.asked.iter().filter(|(_, asked)| which(asked));
+        let found: Vec<u64> = found.map(|(id, _)| *id).collect();
+        found
+            .iter()
+            .filter_map(|id| self.asked.remove(id))
+            .collect()
+    }
+}
+
+enum Unsent {
+    Full,
+    Request(&'static str),
+}
+
+/// Calls that may wait to be taken; more wait in [`ServiceClient::call`].
+const QUEUE: usize = 64;
