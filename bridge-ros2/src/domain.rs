@@ -15,7 +15,7 @@ use thiserror::Error;
 
 use crate::clock::{self, RosClock};
 use crate::discovery_info::{self, NodeEntities};
-use crate::graph::Graph;
+use crate::graph::{BRIDGE_TYPE, Graph, bridge_topic};
 use crate::node::{Channels, Node, NodeOptions, Services};
 use crate::qos::{Offered, Requested};
 use crate::raw::{Opaque, Payload, RawReader, RawWriter, Reader, Writer};
@@ -338,6 +338,23 @@ impl Domain {
             })
             .map(|writer| self.node.list_writer(writer))
             .map_err(|source| endpoint_error(topic, source))
+    }
+
+    /// Tells other bridges that this participant is one too, for as long as the writer returned is there. It is on no
+    /// node's list.
+    ///
+    /// # Errors
+    /// [`DomainError::Endpoint`].
+    pub(crate) fn announce_bridge(&self, space: u16) -> Result<RawWriter, DomainError> {
+        let qos = QosPolicyBuilder::new()
+            .reliable(rustdds::Duration::ZERO)
+            .build();
+        let name = bridge_topic(space);
+        create_topic(&self.participant, (&name, BRIDGE_TYPE), &qos)
+            .and_then(|topic| -> Result<RawWriter, CreateError> {
+                self.publisher.create_datawriter_no_key(&topic, Some(qos))
+            })
+            .map_err(|source| endpoint_error(&name, source))
     }
 
     /// The policies with the type hash, if it is known.

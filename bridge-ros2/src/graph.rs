@@ -43,6 +43,8 @@ pub struct Graph {
     participants: BTreeSet<ParticipantPrefix>,
     /// Endpoints of our own that came back to us as announced: RustDDS hears itself.
     own: BTreeSet<GUID>,
+    /// Participants of other bridges, and the number of the space each serves.
+    bridges: BTreeMap<ParticipantPrefix, u16>,
 }
 
 impl Graph {
@@ -91,25 +93,57 @@ impl Graph {
         }
     }
 
-    /// Sorts endpoints by topic, leaving out what is not a ROS topic.
+    /// Sorts endpoints by topic, leaving out what is not a ROS topic, and what bridges write: values of the space, which
+    /// would come back to it under another name or go round for ever.
     pub fn from_endpoints(
         writers: impl IntoIterator<Item = (String, Endpoint)>,
         readers: impl IntoIterator<Item = (String, Endpoint)>,
     ) -> Self {
         let mut participants = BTreeSet::new();
-        let mut note = |endpoint: &Endpoint| {
-            if let Ok(prefix) = ParticipantPrefix::try_from(endpoint.guid.prefix.as_ref()) {
+        let mut bridges = BTreeMap::new();
+        let mut note = |topic: &str, endpoint: &Endpoint| {
+            if let Some(prefix) = prefix(endpoint.guid) {
                 participants.insert(prefix);
+                if let Some(space) = bridge_of(topic) {
+                    bridges.insert(prefix, space);
+                }
             }
         };
-        let writers = by_topic(writers.into_iter().inspect(|(_, writer)| note(writer)));
-        let readers = by_topic(readers.into_iter().inspect(|(_, reader)| note(reader)));
+        let mut writers = by_topic(
+            writers
+                .into_iter()
+                .inspect(|(topic, writer)| note(topic, writer)),
+        );
+        let readers = by_topic(
+            readers
+                .into_iter()
+                .inspect(|(topic, reader)| note(topic, reader)),
+        );
+        if !bridges.is_empty() {
+            writers.retain(|_, writers| {
+                writers.retain(|one| !prefix(one.guid).is_some_and(|of| bridges.contains_key(&of)));
+                !writers.is_empty()
+            });
+        }
         Self {
             writers,
             readers,
             participants,
             own: BTreeSet::new(),
+            bridges,
         }
+    }
+
+    /// Whether this is an endpoint of another bridge.
+    #[must_use]
+    pub fn is_bridge(&self, guid: GUID) -> bool {
+        !self.bridges.is_empty() && prefix(guid).is_some_and(|of| self.bridges.contains_key(&of))
+    }
+
+    /// Whether another bridge serves this space in the same domain: its values are at home there.
+    #[must_use]
+    pub fn is_at_home(&self, space: u16) -> bool {
+        self.bridges.values().any(|other| *other == space)
     }
 
     /// The writers of a topic, in the order of their GUIDs.
@@ -164,6 +198,21 @@ pub fn ros_topic(dds_topic: &str) -> Option<&str> {
     dds_topic.strip_prefix(TOPIC_PREFIX)
 }
 
+/// The DDS topic by whose writer others know that a participant is a bridge, and of which space. It is no topic of ROS, so
+/// no tool of ROS shows it.
+#[must_use]
+pub fn bridge_topic(space: u16) -> String {
+    format!("{BRIDGE_PREFIX}{space}")
+}
+
+fn bridge_of(dds_topic: &str) -> Option<u16> {
+    dds_topic.strip_prefix(BRIDGE_PREFIX)?.parse().ok()
+}
+
+fn prefix(guid: GUID) -> Option<ParticipantPrefix> {
+    guid.prefix.as_ref().try_into().ok()
+}
+
 fn by_topic(
     endpoints: impl IntoIterator<Item = (String, Endpoint)>,
 ) -> BTreeMap<String, Vec<Endpoint>> {
@@ -185,3 +234,36 @@ fn is_durable(durability: Option<Durability>) -> bool {
 
 /// What ROS 2 puts before the name of a topic (design.ros2.org, topic and service names).
 const TOPIC_PREFIX: &str = "rt/";
+const BRIDGE_PREFIX: &str = "ua_bridge_";
+/// The type of that topic, of which there is never a sample.
+pub const BRIDGE_TYPE: &str = "ua_bridge::Presence_";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn writer(topic: &str, participant: u8) -> (String, Endpoint) {
+        let endpoint = Endpoint {
+            guid: GUID::from_bytes([participant; 16]),
+            type_name: "std_msgs::msg::dds_::Bool_".into(),
+            reliable: true,
+            transient_local: false,
+            qos: Arc::default(),
+        };
+        (topic.to_owned(), endpoint)
+    }
+
+    #[test]
+    fn what_another_bridge_writes_is_no_source() {
+        let (marker, of_bridge) = (writer("ua_bridge_3", 7), writer("rt/ua_2_5_10", 7));
+        let of_robot = writer("rt/ua_2_5_10", 8);
+        let all = [marker, of_bridge.clone(), of_robot.clone()];
+        let graph = Graph::from_endpoints(all, []);
+        assert_eq!(
+            graph.writers("rt/ua_2_5_10"),
+            std::slice::from_ref(&of_robot.1)
+        );
+        assert!(graph.is_bridge(of_bridge.1.guid) && !graph.is_bridge(of_robot.1.guid));
+        assert!(graph.is_at_home(3) && !graph.is_at_home(2));
+    }
+}

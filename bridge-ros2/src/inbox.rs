@@ -195,12 +195,18 @@ impl<K: Clone> Slot<K> {
     /// How many samples of `writer` were skipped before this one; `None` when it was delivered already, which happens
     /// after a reader was replaced, as all readers of a topic share one cache in RustDDS.
     fn advance(&mut self, writer: GUID, sequence: i64) -> Option<u64> {
-        let last = self.delivered.entry(writer).or_insert(sequence - 1);
-        let missing = u64::try_from(sequence - *last - 1).ok()?;
+        let last = self
+            .delivered
+            .entry(writer)
+            .or_insert_with(|| sequence.saturating_sub(1));
+        let missing = u64::try_from(sequence.saturating_sub(*last).saturating_sub(1)).ok()?;
         *last = sequence;
-        Some(missing)
+        Some(missing.min(MAX_MISSING))
     }
 }
+
+/// The most one gap counts: a peer says by itself how many it has written.
+const MAX_MISSING: u64 = 1 << 16;
 
 /// Who has something to read, in the order they said so.
 #[derive(Debug, Default)]

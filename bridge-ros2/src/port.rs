@@ -31,7 +31,7 @@ use crate::inbox::{Inbox, Taken};
 use crate::limits;
 use crate::outlet::Refusal;
 use crate::parameters::ParameterServer;
-use crate::raw::{Payload, Reader};
+use crate::raw::{Payload, RawWriter, Reader};
 use crate::service::ServicePeers;
 use crate::sink::Sink;
 use crate::source::{Source, same_participant};
@@ -56,6 +56,8 @@ pub struct PortOptions {
 /// The ROS 2 side of a bridge.
 pub struct Ros2Port {
     domain: Domain,
+    /// By it other bridges know this one.
+    presence: RawWriter,
     discovery: DomainParticipantStatusListener,
     own: SpaceId,
     mapping: Arc<Mapping>,
@@ -106,6 +108,7 @@ impl Ros2Port {
             dds = limits::RUSTDDS,
             "joined the DDS domain"
         );
+        let presence = domain.announce_bridge(own.into())?;
         let mut definitions = Definitions::new(prefixes);
         let peers = ServicePeers::new(&domain);
         let declared = services::parameters(own, domain_options.domain);
@@ -120,6 +123,7 @@ impl Ros2Port {
         let mut port = Self {
             discovery: domain.status_listener(),
             domain,
+            presence,
             own,
             mapping: Arc::clone(&mapping),
             definitions,
@@ -215,6 +219,13 @@ impl Ros2Port {
                 };
                 // Our own publication, which RustDDS hands to our own reader as well.
                 if same_participant(writer, self.domain.participant()) {
+                    return;
+                }
+                if self.graph.is_bridge(writer) {
+                    for (topic, _) in &source.values {
+                        self.events
+                            .push_back(lost(*topic, "published by another bridge", 1));
+                    }
                     return;
                 }
                 let received = now().utc;
@@ -313,6 +324,9 @@ impl Port for Ros2Port {
             // A writer of depth 1 has no place for more than the last value.
             return Ok(());
         }
+        if self.graph.is_at_home(topic.space.into()) {
+            return Err("at home in this domain");
+        }
         if status & STATUS_BAD != 0 {
             return Err("bad status");
         }
@@ -386,6 +400,7 @@ impl Port for Ros2Port {
     async fn shutdown(self) {
         let Self {
             domain,
+            presence,
             discovery,
             inbox,
             sinks,
@@ -396,7 +411,7 @@ impl Port for Ros2Port {
         } = self;
         // They hold the participant.
         drop((discovery, services, parameters));
-        if !domain.leave((inbox, sinks, retired)).await {
+        if !domain.leave((inbox, sinks, retired, presence)).await {
             warn!("the DDS endpoints were not disposed in time; peers notice when the lease ends");
         }
     }

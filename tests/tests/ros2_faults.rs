@@ -229,7 +229,6 @@ fn two_bridges_of_one_space_on_one_domain_make_no_loop() {
 }
 
 #[test]
-#[ignore = "each takes what the other publishes on the domain for a value produced there"]
 fn two_bridges_of_two_spaces_on_one_domain_make_no_loop() {
     is_heard_once_beside("3");
 }

@@ -295,6 +295,11 @@ impl Ros2Port {
         let Some(sink) = self.sinks.get_mut(&topic) else {
             return;
         };
+        if self.graph.is_at_home(topic.space.into()) {
+            // Another bridge serves its space in this domain. What was written would stand beside it, and grow old.
+            sink.open = None;
+            return;
+        }
         let readers = self.graph.readers(&sink.dds_topic);
         if let Some(open) = &mut sink.open {
             match open.outlet.set_readers(readers, now) {

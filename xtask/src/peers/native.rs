@@ -43,7 +43,8 @@ pub(super) fn build(workspace: &Workspace) -> anyhow::Result<()> {
     let mut first = Ok(());
     for program in PROGRAMS {
         let built = program.build(&workspace.root.join("tests/peers/dds"), &workspace.peers());
-        first = first.and(built.with_context(|| program.name));
+        let built = built.with_context(|| program.name);
+        first = first.and(built);
     }
     first
 }
