@@ -13,6 +13,7 @@ mod port;
 mod program;
 mod run;
 mod services;
+mod stamp;
 mod status;
 
 pub use arguments::Arguments;
@@ -24,3 +25,4 @@ pub use logging::{LogFormat, LogRecord, LogSink, hear_log};
 pub use port::{Delivery, Port, PortEvent};
 pub use program::{Context, Program, run};
 pub use services::{CallFault, Outcome, ServiceCall, ServiceGraph, Services};
+pub use stamp::wants_stamp;

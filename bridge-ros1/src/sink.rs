@@ -118,10 +118,8 @@ impl Sink {
 
     /// Whether the stamp at the beginning of such messages is no part of the value.
     pub(crate) fn stamps(&self, message_type: &MessageType) -> bool {
-        let header = message_type.leaves().first();
         let selected = self.mapped.as_ref().map(|(_, selection)| selection);
-        header.is_some_and(|leaf| leaf.path == STAMP)
-            && matches!(selected, Some(Selection::Field(path)) if path != STAMP)
+        bridge_node::wants_stamp(message_type, selected)
     }
 
     /// The Router's queue says what waits; behind it, as much is held for a slow subscriber as for any.
@@ -132,9 +130,6 @@ impl Sink {
         }
     }
 }
-
-/// The first field of a message that begins with a header.
-const STAMP: &str = "header.stamp";
 
 #[cfg(test)]
 mod tests {

@@ -131,10 +131,8 @@ impl Sink {
 
     /// Whether the stamp at the beginning of such messages is no part of the value.
     pub(crate) fn stamps(&self, message_type: &MessageType) -> bool {
-        let header = message_type.leaves().first();
         let selected = self.mapped.as_ref().map(|(_, selection)| selection);
-        header.is_some_and(|leaf| leaf.path == STAMP)
-            && matches!(selected, Some(Selection::Field(path)) if path != STAMP)
+        bridge_node::wants_stamp(message_type, selected)
     }
 
     pub(crate) fn selection(&self) -> Selection {
@@ -144,8 +142,6 @@ impl Sink {
     }
 }
 
-/// The first field of a message that begins with a header.
-const STAMP: &str = "header.stamp";
 /// Each other deadline needs another writer, so readers get that many.
 const MOST_TIGHTENED: u32 = 8;
 

@@ -101,6 +101,8 @@ fn it_is_driven_by_stamped_velocities() {
     let _bridge = bridge(&cell, MAPPING);
     let told = drive(&mut robot, &mut side);
     assert_eq!(told["twist"], expected());
+    let stamp = told["header"]["stamp"]["sec"].as_i64();
+    assert!(stamp.is_some_and(|sec| sec > 0), "{told}");
 }
 
 #[test]

@@ -1,0 +1,39 @@
+//! Which messages of ours want a stamp.
+
+use messages::{Leaf, MessageType, Selection};
+
+/// Whether a message that is made of `selection` alone begins with a header whose stamp nobody gives, so that it is to
+/// be the time of the graph. A message that crosses as a whole keeps its own.
+#[must_use]
+pub fn wants_stamp(message_type: &MessageType, selection: Option<&Selection>) -> bool {
+    let is_stamp = |leaf: &Leaf| leaf.path == STAMP;
+    let Some(stamp) = message_type.leaves().first().filter(|leaf| is_stamp(leaf)) else {
+        return false;
+    };
+    matches!(selection, Some(Selection::Field(path)) if path != STAMP && !stamp.is_inside(path))
+}
+
+/// The first field of a message that begins with a header.
+const STAMP: &str = "header.stamp";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use messages::{Dialect, Registry};
+
+    #[test]
+    fn a_stamp_is_wanted_where_only_a_part_without_it_is_given() {
+        let name = "geometry_msgs/TwistStamped".parse().unwrap();
+        let stamped = Registry::bundle(Dialect::Ros2).get(&name).unwrap();
+        let field = |path: &str| wants_stamp(&stamped, Some(&Selection::Field(path.to_owned())));
+        assert!(field("twist") && field("twist.linear.x") && field("header.frame_id"));
+        assert!(!field("header.stamp") && !field("header"));
+        assert!(!wants_stamp(&stamped, Some(&Selection::Whole)) && !wants_stamp(&stamped, None));
+        let name = "geometry_msgs/Twist".parse().unwrap();
+        let plain = Registry::bundle(Dialect::Ros2).get(&name).unwrap();
+        assert!(!wants_stamp(
+            &plain,
+            Some(&Selection::Field("linear".to_owned()))
+        ));
+    }
+}
