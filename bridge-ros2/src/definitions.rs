@@ -4,7 +4,9 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use bridge_node::Wanted;
-use messages::{DefinitionError, Dialect, MessageType, ServiceType, TypeHash, TypeName};
+use messages::{
+    DefinitionError, Dialect, MessageType, ServiceType, ServiceTypeHashes, TypeHash, TypeName,
+};
 use uadp::BuiltinType;
 
 /// Finds message types by name; a type once found stays.
@@ -46,6 +48,11 @@ impl Definitions {
     /// The type hash of a type that was found.
     pub(crate) fn type_hash(&self, name: &TypeName) -> Option<TypeHash> {
         self.known.registry().type_hash(name).ok()
+    }
+
+    /// The type hashes of a service that was found.
+    pub(crate) fn service_type_hashes(&self, name: &TypeName) -> Option<ServiceTypeHashes> {
+        self.known.registry().service_type_hashes(name).ok()
     }
 
     /// The ROS type that carries one value of that type, and nothing else.

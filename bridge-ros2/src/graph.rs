@@ -101,24 +101,12 @@ impl Graph {
     ) -> Self {
         let mut participants = BTreeSet::new();
         let mut bridges = BTreeMap::new();
-        let mut note = |topic: &str, endpoint: &Endpoint| {
-            if let Some(prefix) = prefix(endpoint.guid) {
-                participants.insert(prefix);
-                if let Some(space) = bridge_of(topic) {
-                    bridges.insert(prefix, space);
-                }
-            }
-        };
-        let mut writers = by_topic(
-            writers
-                .into_iter()
-                .inspect(|(topic, writer)| note(topic, writer)),
-        );
-        let readers = by_topic(
-            readers
-                .into_iter()
-                .inspect(|(topic, reader)| note(topic, reader)),
-        );
+        let mut note = |endpoint: &Endpoint| participants.extend(prefix(endpoint.guid));
+        let mut writers = by_topic(writers.into_iter().inspect(|(topic, writer)| {
+            note(writer);
+            bridges.extend(prefix(writer.guid).zip(bridge_of(topic)));
+        }));
+        let readers = by_topic(readers.into_iter().inspect(|(_, reader)| note(reader)));
         if !bridges.is_empty() {
             writers.retain(|_, writers| {
                 writers.retain(|one| !prefix(one.guid).is_some_and(|of| bridges.contains_key(&of)));

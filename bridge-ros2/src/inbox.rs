@@ -105,9 +105,12 @@ impl<K: Clone> Inbox<K> {
         self.slots.remove(&id.0).map(|slot| slot.reader)
     }
 
-    /// Forgets the writers of a slot that are not in `alive`.
+    /// Forgets writers of a slot that are not in `alive`, once there are many of them: what they wrote stays in the
+    /// cache of the topic, and another reader of it would hand it out again.
     pub fn retain_writers(&mut self, id: SlotId, mut alive: impl FnMut(&GUID) -> bool) {
-        if let Some(slot) = self.slots.get_mut(&id.0) {
+        if let Some(slot) = self.slots.get_mut(&id.0)
+            && slot.delivered.len() > MAX_WRITERS
+        {
             slot.delivered.retain(|writer, _| alive(writer));
         }
     }
@@ -205,6 +208,8 @@ impl<K: Clone> Slot<K> {
     }
 }
 
+/// Writers whose last sample is remembered, the dead ones included.
+const MAX_WRITERS: usize = 1024;
 /// The most one gap counts: a peer says by itself how many it has written.
 const MAX_MISSING: u64 = 1 << 16;
 

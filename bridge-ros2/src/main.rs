@@ -2,6 +2,7 @@
 
 use std::fmt::Display;
 use std::net::{IpAddr, SocketAddr, ToSocketAddrs as _};
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -27,12 +28,12 @@ struct BridgeRos2 {
     arguments: Arguments,
     /// The DDS domain to join, or several as 2,3; without it the domain of the space, or of the mapping's only ROS 2
     /// space
-    #[arg(long, value_name = "N", env = "ROS_DOMAIN_ID", value_delimiter = ',', value_parser = clap::value_parser!(u16).range(0..=232))]
-    domain: Vec<u16>,
+    #[arg(long, value_name = "N", env = "ROS_DOMAIN_ID", value_delimiter = ',', value_parser = domain_number)]
+    domain: Vec<Option<u16>>,
     /// The space of this domain's values, 2 to 232, or one for each domain as 40,41; without it the one the mapping
     /// gives the domain, or the one of the domain's number
-    #[arg(long, value_name = "N", env = "UA_SPACE", value_delimiter = ',', value_parser = clap::value_parser!(u16).range(2..=232))]
-    space: Vec<u16>,
+    #[arg(long, value_name = "N", env = "UA_SPACE", value_delimiter = ',', value_parser = space_number)]
+    space: Vec<Option<u16>>,
     /// The network interface of the ROS 2 side, by name or address; without it what `ROS_AUTOMATIC_DISCOVERY_RANGE`
     /// and `ROS_LOCALHOST_ONLY` say, else all
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_ROS_INTERFACE")]
@@ -83,12 +84,16 @@ impl BridgeRos2 {
 
     /// The domain to join for the space `own`.
     fn domain(&self, own: SpaceId, mapping: &Mapping) -> u16 {
-        let spaces = choose_spaces(&self.space, &self.domain, mapping).unwrap_or_default();
+        let spaces = self.chosen(mapping).unwrap_or_default();
         let asked = spaces.iter().position(|space| *space == own);
         asked
-            .and_then(|place| self.domain.get(place).copied())
+            .and_then(|place| given(&self.domain).get(place).copied())
             .or_else(|| mapping.domain_of(own))
             .unwrap_or_else(|| own.into())
+    }
+
+    fn chosen(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, String> {
+        choose_spaces(&given(&self.space), &given(&self.domain), mapping)
     }
 
     fn networks(&self) -> Result<Vec<IpAddr>, Failure> {
@@ -110,6 +115,33 @@ impl BridgeRos2 {
         )
         .map(DiscoveryRange::networks)
         .map_err(|error| Failure::new(FailureKind::Usage, error.to_string()))
+    }
+}
+
+/// What was given; a variable of the environment that is set to nothing gives nothing, as in rcl.
+fn given(numbers: &[Option<u16>]) -> Vec<u16> {
+    numbers.iter().copied().flatten().collect()
+}
+
+fn domain_number(text: &str) -> Result<Option<u16>, String> {
+    number(text, 0..=232)
+}
+
+fn space_number(text: &str) -> Result<Option<u16>, String> {
+    number(text, 2..=232)
+}
+
+fn number(text: &str, range: RangeInclusive<u16>) -> Result<Option<u16>, String> {
+    match text.trim() {
+        "" => Ok(None),
+        text => {
+            let number = text.parse().ok().filter(|number| range.contains(number));
+            let (least, most) = range.into_inner();
+            number.map_or_else(
+                || Err(format!("it is {least} to {most}")),
+                |number| Ok(Some(number)),
+            )
+        }
     }
 }
 
@@ -158,7 +190,7 @@ impl Program for BridgeRos2 {
     }
 
     fn spaces(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
-        choose_spaces(&self.space, &self.domain, mapping)
+        self.chosen(mapping)
             .map_err(|message| Failure::new(FailureKind::Usage, message))
     }
 
@@ -323,6 +355,14 @@ mod tests {
     fn a_domain_is_the_space_of_its_number() {
         let space = choose_space(None, Some(7), &Mapping::default()).unwrap();
         assert_eq!(space.get(), 7);
+    }
+
+    #[test]
+    fn a_variable_that_is_set_to_nothing_names_no_domain() {
+        assert_eq!(domain_number(""), Ok(None));
+        assert_eq!(domain_number("232"), Ok(Some(232)));
+        assert!(domain_number("233").is_err() && space_number("1").is_err());
+        assert!(domain_number("two").is_err());
     }
 
     #[test]

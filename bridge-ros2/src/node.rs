@@ -114,8 +114,10 @@ enum Kind {
 
 impl Drop for Entry {
     fn drop(&mut self) {
-        self.node
-            .change(|own| own.of(self.kind).remove(&self.guid.to_bytes()));
+        self.node.change(|own| {
+            own.unseen.remove(&self.guid);
+            own.of(self.kind).remove(&self.guid.to_bytes())
+        });
     }
 }
 
@@ -163,6 +165,8 @@ struct Own {
 struct Others {
     participants: BTreeMap<ParticipantPrefix, (GidLength, Vec<NodeEntities>)>,
     malformed: u64,
+    /// Those whose lease ran out. They may come back, and do not tell again then.
+    absent: BTreeSet<ParticipantPrefix>,
     /// Names that were warned of.
     doubles: BTreeSet<ParticipantPrefix>,
 }
@@ -246,8 +250,7 @@ impl Node {
     pub(crate) fn others(&self) -> Vec<NodeEntities> {
         let others = lock(&self.shared.others);
         others
-            .participants
-            .values()
+            .present()
             .flat_map(|(_, nodes)| nodes.iter().cloned())
             .collect()
     }
@@ -280,15 +283,20 @@ impl Node {
             .collect()
     }
 
-    /// Forgets the nodes of participants that are not there any more.
+    /// Takes note of which participants are there. The nodes of the others are kept for when they come back.
     pub(crate) fn retain(&self, alive: impl Fn(&ParticipantPrefix) -> bool) {
         let mut others = lock(&self.shared.others);
-        let before = others.participants.len();
-        others.participants.retain(|prefix, _| alive(prefix));
+        let absent: BTreeSet<_> = others
+            .participants
+            .keys()
+            .filter(|prefix| !alive(prefix))
+            .copied()
+            .collect();
+        let changed = others.absent != absent;
+        others.absent = absent;
         others.doubles.retain(|prefix| alive(prefix));
-        let gone = others.participants.len() != before;
         drop(others);
-        if gone {
+        if changed {
             self.shared.wake();
         }
     }
@@ -339,17 +347,28 @@ impl Others {
     ) -> bool {
         let full = self.participants.len() >= MAX_PARTICIPANTS;
         if full && !self.participants.contains_key(&prefix) {
-            return false;
+            let Some(gone) = self.absent.pop_first() else {
+                return false;
+            };
+            self.participants.remove(&gone);
         }
+        self.absent.remove(&prefix);
         self.participants.insert(prefix, (length, nodes));
         true
     }
 
+    /// What those told that are there.
+    fn present(&self) -> impl Iterator<Item = &(GidLength, Vec<NodeEntities>)> {
+        let there = |(prefix, told)| (!self.absent.contains(prefix)).then_some(told);
+        self.participants.iter().filter_map(there)
+    }
+
     /// The length most participants write; the newer one when as many write either.
     fn majority(&self) -> GidLength {
-        let lengths = || self.participants.values().map(|(length, _)| *length);
-        let older = lengths().filter(|length| *length == GidLength::Bytes24);
-        if older.count() * 2 > self.participants.len() {
+        let older = self
+            .present()
+            .filter(|(length, _)| *length == GidLength::Bytes24);
+        if older.count() * 2 > self.present().count() {
             GidLength::Bytes24
         } else {
             GidLength::Bytes16

@@ -29,9 +29,11 @@ pub struct Outlet {
     full_since: Option<Instant>,
     /// Bytes written since every reader had acknowledged everything.
     in_flight: usize,
+    /// Of a state topic, the value its readers have: another writer has to begin with it.
+    last: Option<Sample>,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Sample {
     payload: Payload,
     source: Option<Timestamp>,
@@ -82,6 +84,7 @@ impl Outlet {
             waiting: VecDeque::new(),
             full_since: None,
             in_flight: 0,
+            last: None,
         }
     }
 
@@ -100,6 +103,9 @@ impl Outlet {
         self.writer = writer;
         self.full_since = None;
         self.in_flight = 0;
+        if self.waiting.is_empty() {
+            self.waiting.extend(self.last.clone());
+        }
         if let Audience::Present { since, .. } = &mut self.audience {
             *since = now + SETTLE;
         }
@@ -250,10 +256,15 @@ impl Outlet {
                 Err(_) => return Err(Refusal::Failed),
             }
         }
+        let kept = (self.offered == Offered::KeepLatest).then(|| Sample {
+            payload: payload.clone(),
+            source,
+        });
         match self.writer.write(payload, source) {
             Ok(()) => {
                 self.full_since = None;
                 self.in_flight += size;
+                self.last = kept;
                 Ok(None)
             }
             Err(WriteError::WouldBlock { data }) => {

@@ -111,7 +111,8 @@ impl Ros2Port {
         let presence = domain.announce_bridge(own.into())?;
         let mut definitions = Definitions::new(prefixes);
         let peers = ServicePeers::new(&domain);
-        let declared = services::parameters(own, domain_options.domain);
+        let declared =
+            services::parameters(own, domain_options.domain, domain_options.node.use_sim_time);
         let parameters = ParameterServer::open(&domain, &peers, declared)?;
         let mut graph = Ros2Graph {
             peers: &peers,
@@ -324,9 +325,6 @@ impl Port for Ros2Port {
             // A writer of depth 1 has no place for more than the last value.
             return Ok(());
         }
-        if self.graph.is_at_home(topic.space.into()) {
-            return Err("at home in this domain");
-        }
         if status & STATUS_BAD != 0 {
             return Err("bad status");
         }
@@ -335,6 +333,10 @@ impl Port for Ros2Port {
                 self.events
                     .push_back(lost(topic, "service too slow", replaced));
             }
+            return Ok(());
+        }
+        if self.graph.is_at_home(topic.space.into()) {
+            // Whoever listens here hears the node that produces it.
             return Ok(());
         }
         let Some(Sink {
@@ -366,7 +368,8 @@ impl Port for Ros2Port {
     }
 
     fn wanted(&mut self, topic: TopicId, shape: &[(BuiltinType, bool)]) {
-        if topic.space == self.own || self.services.takes(topic) {
+        let at_home = topic.space == self.own || self.graph.is_at_home(topic.space.into());
+        if at_home || self.services.takes(topic) {
             return;
         }
         if !self.sinks.contains_key(&topic) {

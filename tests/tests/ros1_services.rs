@@ -222,7 +222,9 @@ fn our_client_calls_a_rospy_server_of_known_and_of_unknown_type() {
     rospy.wait_for_json("who calls, on a kept connection", SOON, |line| {
         (line["callerid"] == "/cell" && line["persistent"] == true).then_some(())
     });
-    assert_eq!(rospy.values().len(), 9);
+    eventually("nine calls are told of", SOON, || {
+        (rospy.values().len() == 9).then_some(())
+    });
 
     let refused = ours
         .call(&ours.client(of(&"0".repeat(32))), true)

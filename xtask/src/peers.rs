@@ -37,6 +37,10 @@ const APT: &[&str] = &[
     "iproute2",
     "valgrind",
     "python3-venv",
+];
+
+/// For the peers of ROS 2 that are compiled here.
+const APT_DDS: &[&str] = &[
     "g++",
     "libfastrtps-dev",
     "libfastcdr-dev",
@@ -75,7 +79,15 @@ pub(crate) fn python(workspace: &Workspace) -> PathBuf {
 }
 
 fn apt() -> anyhow::Result<()> {
-    let missing: Vec<&str> = APT
+    // One at a time: a distribution that lacks a name of the second installs nothing of it, and all of the first.
+    [APT, APT_DDS]
+        .into_iter()
+        .map(apt_install)
+        .fold(Ok(()), Result::and)
+}
+
+fn apt_install(packages: &[&'static str]) -> anyhow::Result<()> {
+    let missing: Vec<&str> = packages
         .iter()
         .copied()
         .filter(|name| !is_installed(name))

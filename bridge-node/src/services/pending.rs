@@ -9,10 +9,12 @@ use tokio::sync::Notify;
 
 /// The bounded queue between the port and the task that calls one service. When it is full, the oldest gives way.
 ///
-/// `None` stands for a value that calls nothing: of a state it says that no earlier one is to be called for any more.
+/// `None` stands for a value that calls nothing: of a state it says that no earlier one is to be called for any more, of
+/// events nothing.
 #[derive(Debug)]
 pub(super) struct Pending {
     depth: usize,
+    is_state: bool,
     waiting: Mutex<VecDeque<Option<Bytes>>>,
     changed: Notify,
 }
@@ -25,6 +27,7 @@ impl Pending {
         };
         Self {
             depth,
+            is_state: overflow == Overflow::KeepLatest,
             waiting: Mutex::default(),
             changed: Notify::new(),
         }
@@ -32,6 +35,9 @@ impl Pending {
 
     /// Queues a request and says how many requests had to go for it.
     pub(super) fn push(&self, request: Option<Bytes>) -> u64 {
+        if request.is_none() && !self.is_state {
+            return 0;
+        }
         let mut waiting = self.lock();
         let oldest = if waiting.len() >= self.depth {
             waiting.pop_front().flatten()
@@ -78,6 +84,9 @@ mod tests {
                 .map(|request| pending.push(Some(request.clone())))
                 .sum();
             assert_eq!(gone, dropped);
+            if overflow != Overflow::KeepLatest {
+                assert_eq!(pending.push(None), 0, "what calls nothing takes no place");
+            }
             assert_eq!(pending.take().await.as_ref(), Some(&requests[first]));
         }
     }

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use bridge_node::now;
 use bytes::Bytes;
-use messages::TypeName;
+use messages::{Dialect, Registry, TypeName};
 use rustdds::policy::{Durability, History};
 use rustdds::{QosPolicies, QosPolicyBuilder};
 use tracing::{info, warn};
@@ -48,6 +48,11 @@ impl ParameterServer {
         parameters: Vec<Parameter>,
     ) -> Result<Self, DomainError> {
         let node = domain.node_name();
+        let bundle = Registry::bundle(Dialect::Ros2);
+        let event = TypeName::new("rcl_interfaces", "ParameterEvent");
+        if let Some(hash) = event.ok().and_then(|name| bundle.type_hash(&name).ok()) {
+            domain.learn_type_hash(EVENT_TYPE, hash.to_string());
+        }
         let events = domain.open_writer(EVENTS, EVENT_TYPE, &policies())?;
         let shared = Arc::new(Shared {
             node: node.clone(),
@@ -61,6 +66,9 @@ impl ParameterServer {
                 continue;
             };
             let service = Service::new(&format!("{node}/{name}"), &service_type);
+            if let Ok(hashes) = bundle.service_type_hashes(&service_type) {
+                service.announce(domain, &hashes);
+            }
             let shared = Arc::clone(&shared);
             services.push(ServiceServer::open(
                 domain,

@@ -75,8 +75,13 @@ impl Ros2Port {
         for topic in sinks {
             made += usize::from(self.advertise_anew(topic, now).is_some());
         }
-        // What is left are readers that were replaced and hear on for a while.
-        if made > 0 {
+        // What is left are endpoints of services and of the node itself, and readers that were replaced and hear on.
+        if made == 0 {
+            let count = lost.len();
+            self.tell_once("", "unannounced", || {
+                format!("{count} endpoints of services or of the node were not announced by the DDS stack; start again")
+            });
+        } else {
             warn!(
                 endpoints = made,
                 "readers and writers of ours were not announced by the DDS stack; made anew"
@@ -297,7 +302,16 @@ impl Ros2Port {
         };
         if self.graph.is_at_home(topic.space.into()) {
             // Another bridge serves its space in this domain. What was written would stand beside it, and grow old.
-            sink.open = None;
+            let given_up = sink.open.take().is_some();
+            let dds_topic = sink.dds_topic.clone();
+            if given_up {
+                self.tell_once(&dds_topic, "at home", || {
+                    format!(
+                        "another bridge of this domain serves space {}: its values are left to it",
+                        topic.space
+                    )
+                });
+            }
             return;
         }
         let readers = self.graph.readers(&sink.dds_topic);
@@ -312,9 +326,9 @@ impl Ros2Port {
                 return;
             }
             if let Some(deadline) = open.shorter_deadline(readers) {
-                open.deadline = Some(deadline);
+                let before = open.deadline.replace(deadline);
                 open.tightened += 1;
-                self.offer_deadline(topic, now);
+                self.offer_deadline(topic, before, now);
                 return;
             }
             let offered = sink.offered.with_deadline(open.deadline);
@@ -346,12 +360,19 @@ impl Ros2Port {
     }
 
     /// A reader that asks for a deadline is matched by a writer that offers it.
-    fn offer_deadline(&mut self, topic: TopicId, now: Instant) {
+    fn offer_deadline(&mut self, topic: TopicId, before: Option<rustdds::Duration>, now: Instant) {
         if let Some(dds_topic) = self.advertise_anew(topic, now) {
             info!(
                 topic = dds_topic,
                 "a subscriber asks for a deadline; advertised anew with it"
             );
+        } else if let Some(open) = self
+            .sinks
+            .get_mut(&topic)
+            .and_then(|sink| sink.open.as_mut())
+        {
+            // The writer there is goes on with what it offers; the next look tries again.
+            open.deadline = before;
         }
     }
 

@@ -55,6 +55,9 @@ impl ServiceGraph for Ros2Graph<'_> {
         timeout: Duration,
     ) -> Result<Client, String> {
         let service = Service::new(service, service_type.name());
+        if let Some(hashes) = self.definitions.service_type_hashes(service_type.name()) {
+            service.announce(self.domain, &hashes);
+        }
         let options = ServiceClientOptions {
             timeout: Some(timeout),
             ..ServiceClientOptions::default()
@@ -66,7 +69,7 @@ impl ServiceGraph for Ros2Graph<'_> {
 }
 
 /// What `ros2 param` shows of the bridge.
-pub(super) fn parameters(own: SpaceId, domain: u16) -> Vec<Parameter> {
+pub(super) fn parameters(own: SpaceId, domain: u16, sim_time: bool) -> Vec<Parameter> {
     let parameter = |name: &str, value, description: &str, read_only| Parameter {
         name: name.to_owned(),
         value,
@@ -77,9 +80,9 @@ pub(super) fn parameters(own: SpaceId, domain: u16) -> Vec<Parameter> {
     vec![
         parameter(
             "use_sim_time",
-            ParameterValue::Bool(false),
-            "Every ROS node has it; messages keep their own stamps",
-            false,
+            ParameterValue::Bool(sim_time),
+            "Whether stamps of messages made here are of /clock; said at the start",
+            true,
         ),
         parameter(
             "space",

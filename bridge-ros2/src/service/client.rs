@@ -326,6 +326,10 @@ impl Driver {
         while self.opening.is_over(&self.writer, now)
             && let Some(call) = self.waiting.pop_front()
         {
+            if call.done.is_closed() {
+                // Whoever called has given it up.
+                continue;
+            }
             call.enter(CallPhase::Request);
             if let Some(unsent) = self.ask(call, &servers) {
                 self.waiting.push_front(unsent);
@@ -365,11 +369,15 @@ impl Driver {
     /// Writes a request to the servers; returns it when the send window is full.
     fn ask(&mut self, call: Call, servers: &[GUID]) -> Option<Call> {
         self.count += 1;
-        let mut keys = Vec::new();
+        let (mut keys, mut asked) = (Vec::new(), Vec::new());
         for server in servers {
             match self.write(&call.request, *server) {
-                Ok(key) => keys.push(key),
+                Ok(key) => {
+                    keys.push(key);
+                    asked.push(*server);
+                }
                 Err(Unsent::Full) => {}
+                // The request itself is at fault, so the first server tells it.
                 Err(Unsent::Request(why)) => {
                     call.end(Err(Failure::Request(why)));
                     return None;
@@ -386,7 +394,7 @@ impl Driver {
         let asked = Asked {
             call,
             keys,
-            servers: servers.to_vec(),
+            servers: asked,
         };
         self.asked.insert(self.count, asked);
         None

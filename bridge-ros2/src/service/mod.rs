@@ -15,7 +15,7 @@ use std::future::poll_fn;
 use std::task::Poll;
 use std::time::Duration;
 
-use messages::TypeName;
+use messages::{ServiceTypeHashes, TypeName};
 use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{QosPolicies, QosPolicyBuilder};
 
@@ -26,6 +26,7 @@ pub use self::peers::ServicePeers;
 pub use self::server::{ServiceCounters, ServiceOptions, ServiceRequest, ServiceServer};
 
 use self::mapping::Received;
+use crate::domain::Domain;
 use crate::raw::Reader;
 
 /// The DDS types of a service's two topics.
@@ -72,6 +73,12 @@ impl Service {
             name: name.to_owned(),
             types: ServiceTypes::of(service_type),
         }
+    }
+
+    /// Has the domain announce the hashes of the types, for endpoints that are made from now on.
+    pub(crate) fn announce(&self, domain: &Domain, hashes: &ServiceTypeHashes) {
+        domain.learn_type_hash(&self.types.request, hashes.request.to_string());
+        domain.learn_type_hash(&self.types.response, hashes.response.to_string());
     }
 
     /// The DDS topic with the requests.

@@ -450,6 +450,12 @@ fn response_field(
     Some((selection, Some(fields)))
 }
 
+/// Whether the value in `field` is that of `path` too: its own, or that of the message it is in.
+fn takes(field: &str, path: &str) -> bool {
+    path.strip_prefix(field)
+        .is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+}
+
 /// The request with its constants, each checked where its type is known.
 fn template(
     entry: &BindingEntry,
@@ -466,7 +472,7 @@ fn template(
     for (path, place, literal) in constants {
         let fault = if rest.insert(path.clone(), literal.clone()).is_some() {
             Some((format!("field `{}` is given twice", short(path)), None))
-        } else if field == Some(path) {
+        } else if field.is_some_and(|field| takes(field, path)) {
             let message = format!("field `{}` takes the value already", short(path));
             Some((message, Some("leave it out of `request`".to_owned())))
         } else {

@@ -256,7 +256,9 @@ fn given<'m>(
 ) -> Result<BTreeMap<usize, Given<'m>>, PlanError> {
     let each = rest.iter().map(|(path, literal)| {
         let at = index(message, path)?;
-        if field == Some(path) {
+        let leaf = message.leaves().get(at);
+        let inside = |field: &String| leaf.is_some_and(|leaf| leaf.is_inside(field));
+        if field == Some(path) || field.is_some_and(inside) {
             return Err(PlanError::ConstantOfField {
                 name: message.name().clone(),
                 path: path.clone(),
