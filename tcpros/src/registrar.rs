@@ -110,12 +110,14 @@ impl Registrar {
         }
         let mut jobs = self.jobs();
         jobs.sort_by_key(Job::rank);
-        let mut jobs = jobs.into_iter().peekable();
+        let mut batches = batches(jobs).into_iter();
         let mut running: JoinSet<Result<Vec<Outcome>, MasterError>> = JoinSet::new();
         let mut failure = None;
         loop {
-            while failure.is_none() && running.len() < PARALLEL && jobs.peek().is_some() {
-                let batch = jobs.by_ref().take(BATCH).collect();
+            while failure.is_none()
+                && running.len() < PARALLEL
+                && let Some(batch) = batches.next()
+            {
                 running.spawn(perform(Arc::clone(&self.node), batch));
             }
             let Some(finished) = running.join_next().await else {
@@ -259,12 +261,33 @@ impl Registrar {
     }
 }
 
-/// Tells the master several things in one request.
+/// What is told to the master in one request: what is new or gone, many at a time. Whatever takes another's place goes by
+/// itself, in two requests: rospy takes two lists of publishers that come at once for one, sees no difference, and
+/// leaves it to its retry half a second later to connect anew.
+fn batches(jobs: Vec<Job>) -> Vec<Vec<Job>> {
+    let (alone, mut together): (Vec<Job>, Vec<Job>) = jobs.into_iter().partition(Job::replaces);
+    let mut batches: Vec<Vec<Job>> = alone.into_iter().map(|job| vec![job]).collect();
+    while !together.is_empty() {
+        let rest = together.split_off(BATCH.min(together.len()));
+        batches.push(std::mem::replace(&mut together, rest));
+    }
+    batches
+}
+
+/// Tells the master several things.
 async fn perform(node: Arc<Inner>, jobs: Vec<Job>) -> Result<Vec<Outcome>, MasterError> {
     // Lists of publishers that come while the master answers are newer than its answer.
     let seen: Vec<u64> = jobs.iter().map(|job| job.updates(&node)).collect();
-    let requests = jobs.iter().flat_map(|job| job.requests(&node)).collect();
-    let mut results = node.master.call_all(requests).await?.into_iter();
+    let requests: Vec<Request> = jobs.iter().flat_map(|job| job.requests(&node)).collect();
+    let mut results = Vec::with_capacity(requests.len());
+    if jobs.iter().any(Job::replaces) {
+        for request in requests {
+            results.extend(node.master.call_all(vec![request]).await?);
+        }
+    } else {
+        results = node.master.call_all(requests).await?;
+    }
+    let mut results = results.into_iter();
     let settle = |(job, seen): (Job, u64)| {
         let answer = || MasterError::Shape("system.multicall");
         let mut next = || results.next().unwrap_or_else(|| Err(answer()));
@@ -323,6 +346,10 @@ impl Job {
         }
     }
 
+    const fn replaces(&self) -> bool {
+        matches!(self, Self::Register { replaces: true, .. })
+    }
+
     fn updates(&self, node: &Inner) -> u64 {
         match self {
             Self::Register { registration, .. }
@@ -370,4 +397,4 @@ const LONGEST_WAIT: Duration = Duration::from_secs(2);
 /// Registrations in one request.
 const BATCH: usize = 64;
 /// Requests at a time.
-const PARALLEL: usize = 4;
+const PARALLEL: usize = 16;
