@@ -20,7 +20,7 @@ fn crowd(cell: &Cell, args: &[&str]) -> Child {
 }
 
 fn measured(crowd: &mut Child, what: &str) -> Value {
-    let line = crowd.wait_for_json(what, 5 * SOON, |line| line.get(what).map(|_| line.clone()));
+    let line = crowd.wait_for_json(what, 3 * SOON, |line| line.get(what).map(|_| line.clone()));
     println!("{line}");
     line
 }
