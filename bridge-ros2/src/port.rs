@@ -337,7 +337,7 @@ impl Port for Ros2Port {
         }
         if self.graph.is_at_home(topic.space.into()) {
             // Whoever listens here hears the node that produces it.
-            return Ok(());
+            return Err("at home in this domain");
         }
         let Some(Sink {
             open: Some(open),
