@@ -175,14 +175,38 @@ impl Child {
         self
     }
 
+    /// Tells the process a line and gives the JSON line it answers with, the first after those that are there.
+    ///
+    /// # Panics
+    /// As [`Self::wait_for_line`].
+    pub fn ask(&mut self, line: &str, deadline: Duration) -> Value {
+        let before = self.output.lines.lock().unwrap().kept.len();
+        self.tell(line);
+        self.wait_after(
+            before,
+            &format!("an answer to `{line}`"),
+            deadline,
+            Line::json,
+        )
+    }
+
     fn wait_for<T>(
         &mut self,
+        what: &str,
+        deadline: Duration,
+        pick: impl FnMut(&Line) -> Option<T>,
+    ) -> T {
+        self.wait_after(0, what, deadline, pick)
+    }
+
+    fn wait_after<T>(
+        &mut self,
+        mut seen: usize,
         what: &str,
         deadline: Duration,
         mut pick: impl FnMut(&Line) -> Option<T>,
     ) -> T {
         let start = Instant::now();
-        let mut seen = 0;
         loop {
             // Asked before the lines are read, so that the last lines of a process that has ended are seen.
             let ended = self.process.try_wait().unwrap();

@@ -69,6 +69,12 @@ impl Cell {
             .args(["--interface", "lo", "--metrics", METRICS_ROS2])
     }
 
+    /// The example of bridge-ros2 that repeats one topic of domain 2 as another, not started yet.
+    #[must_use]
+    pub fn ros2_relay_started(&self, from: &str, to: &str) -> Started {
+        Started::new("relay", &program("examples/ros2_relay")).args([from, to, "2"])
+    }
+
     /// ua-server as it answers, with `args` after those every cell needs.
     #[must_use]
     pub fn ua_server(&self, args: &[&str]) -> Child {

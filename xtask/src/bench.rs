@@ -22,6 +22,12 @@ pub(crate) fn ros1(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<
     measured(workspace, "bench-ros1", &packages, arguments)
 }
 
+/// Measures relays of DDS samples beside a UDP echo, and both bridges between ROS 1 and ROS 2, all in one run.
+pub(crate) fn ros2(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    let packages = ["bridge-ros1", "bridge-ros2", "system-tests"];
+    measured(workspace, "bench-ros2", &packages, arguments)
+}
+
 /// Builds the packages with all their programs, then runs the one that measures.
 fn measured(
     workspace: &Workspace,

@@ -32,6 +32,7 @@ cargo xtask <verb>
   dds                            only patch RustDDS, which all verbs build with, and print the flags to do so by hand
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
   bench ros1 [ARGS]              measure relays of ROS 1 messages beside a raw echo; bridge-ros1 with 50 topics (--help)
+  bench ros2 [ARGS]              measure relays of DDS samples beside a UDP echo; both bridges from ROS 1 to ROS 2 and back
   bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
 ";
 
@@ -62,6 +63,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["bench", "uadp", rest @ ..] => instructions::run(&Workspace::find()?, rest),
         ["bench", "hop", rest @ ..] => bench::hop(&Workspace::find()?, rest),
         ["bench", "ros1", rest @ ..] => bench::ros1(&Workspace::find()?, rest),
+        ["bench", "ros2", rest @ ..] => bench::ros2(&Workspace::find()?, rest),
         _ => {
             eprint!("xtask: there is no `{}`\n\n{VERBS}", arguments.join(" "));
             Ok(Ended::USAGE)

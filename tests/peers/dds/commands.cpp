@@ -226,7 +226,7 @@ bool run_shared(const std::string& command, const Arguments& arguments) {
     } else if (command == "crowd") {
         crowd(arguments);
     } else {
-        return false;
+        return run_measuring(command, arguments);
     }
     return true;
 }

@@ -73,3 +73,6 @@ inline std::string dds_type(const std::string& kind, const std::string& name, co
 
 // Runs pub, sub, relay or crowd; false when `command` is none of them.
 bool run_shared(const std::string& command, const Arguments& arguments);
+
+// Runs ping, pace or meter; false when `command` is none of them.
+bool run_measuring(const std::string& command, const Arguments& arguments);

@@ -3,9 +3,12 @@
 
 #include <atomic>
 #include <chrono>
+#include <condition_variable>
 #include <csignal>
 #include <cstdio>
+#include <deque>
 #include <mutex>
+#include <optional>
 #include <string>
 #include <thread>
 #include <unistd.h>
@@ -64,11 +67,7 @@ public:
             std::fprintf(stderr, "peer: its %g s are over\n", seconds);
             _exit(3);
         }).detach();
-        std::thread([] {
-            for (int byte = std::getchar(); byte != EOF; byte = std::getchar()) {
-                told_ = told_ || byte == '\n';
-            }
-        }).detach();
+        std::thread(listen).detach();
     }
 
     // Whether a line came on standard input. Its end is no line.
@@ -80,6 +79,43 @@ public:
         }
     }
 
+    // The next line of standard input, for peers that are told more than to end; nothing once it has ended.
+    static std::optional<std::string> line() {
+        std::unique_lock<std::mutex> guard(lines_lock_);
+        lines_changed_.wait(guard, [] { return !lines_.empty() || ended_; });
+        if (lines_.empty()) {
+            return std::nullopt;
+        }
+        const std::string line = lines_.front();
+        lines_.pop_front();
+        return line;
+    }
+
 private:
+    static void listen() {
+        std::string line;
+        for (int byte = std::getchar(); byte != EOF; byte = std::getchar()) {
+            if (byte != '\n') {
+                line += static_cast<char>(byte);
+                continue;
+            }
+            told_ = true;
+            const std::lock_guard<std::mutex> guard(lines_lock_);
+            if (lines_.size() < MOST_LINES) {
+                lines_.push_back(line);
+            }
+            line.clear();
+            lines_changed_.notify_all();
+        }
+        const std::lock_guard<std::mutex> guard(lines_lock_);
+        ended_ = true;
+        lines_changed_.notify_all();
+    }
+
+    static constexpr size_t MOST_LINES = 1024;
     static inline std::atomic<bool> told_ = false;
+    static inline bool ended_ = false;
+    static inline std::deque<std::string> lines_;
+    static inline std::mutex lines_lock_;
+    static inline std::condition_variable lines_changed_;
 };

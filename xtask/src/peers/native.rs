@@ -21,13 +21,13 @@ struct Program {
 const PROGRAMS: &[Program] = &[
     Program {
         name: "fastdds-peer",
-        sources: &["fastdds.cpp", "commands.cpp"],
+        sources: &["fastdds.cpp", "commands.cpp", "measure.cpp"],
         types: None,
         libraries: &["-lfastrtps", "-lfastcdr", "-pthread"],
     },
     Program {
         name: "cyclone-peer",
-        sources: &["cyclone.cpp", "commands.cpp"],
+        sources: &["cyclone.cpp", "commands.cpp", "measure.cpp"],
         types: Some("std_msgs_string"),
         libraries: &["-lddsc", "-pthread"],
     },

@@ -7,9 +7,9 @@ use std::net::{TcpStream, UdpSocket};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use system_tests::{BareNode, Cell, GROUP, eventually, group_member, string_frame};
-
-use crate::usage::{per_message, processor_time};
+use system_tests::{
+    BareNode, Cell, GROUP, eventually, group_member, per_message, processor_time, string_frame,
+};
 
 pub(crate) fn measure(cell: &Cell, seconds: u64) {
     let mapping = cell.file("fifty.yaml", &mapping());

@@ -1,7 +1,7 @@
 //! 500 messages of 1 KiB in one piece, as a node sends them that had to wait for its data.
 
 use crate::path::Path;
-use crate::usage::Times;
+use system_tests::Times;
 
 pub(crate) fn measure(paths: &mut [Path], bursts: u64) {
     let mut all: Vec<(Times, u64)> = paths.iter().map(|_| (Times::default(), SIZE)).collect();

@@ -4,9 +4,7 @@ use std::io::Write;
 use std::net::TcpStream;
 use std::time::{Duration, Instant};
 
-use system_tests::{BareNode, BareSubscription, PATIENCE, eventually, string_frame};
-
-use crate::usage::Times;
+use system_tests::{BareNode, BareSubscription, PATIENCE, Times, eventually, string_frame};
 
 /// The two ends of a way.
 pub(crate) struct Lane {

@@ -11,7 +11,6 @@ mod open_loop;
 mod path;
 mod round_trip;
 mod topics;
-mod usage;
 
 use std::process::ExitCode;
 

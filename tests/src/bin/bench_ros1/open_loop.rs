@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use crate::path::Path;
-use crate::usage::{Times, per_message};
+use system_tests::{Times, per_message};
 
 pub(crate) fn measure(paths: &mut [Path], seconds: u64) {
     println!(

@@ -6,10 +6,9 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use rustix::event::epoll;
-use system_tests::{BareNode, BareSubscription, Cell, Child, Started};
+use system_tests::{BareNode, BareSubscription, Cell, Child, Started, processor_time};
 
 use crate::lane::Lane;
-use crate::usage::processor_time;
 
 /// One relay with both ends of its one lane.
 pub(crate) struct Path {

@@ -2,11 +2,10 @@
 
 use std::time::Duration;
 
-use system_tests::string_frame;
+use system_tests::{Times, per_message, string_frame};
 
 use crate::lane::DIGITS;
 use crate::path::Path;
-use crate::usage::{Times, per_message};
 
 pub(crate) fn measure(paths: &mut [Path], messages: u64) {
     println!("\nRound trip, one message at a time, {messages} per size and path; microseconds:\n");

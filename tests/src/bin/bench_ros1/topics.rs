@@ -4,10 +4,12 @@
 use std::net::TcpStream;
 use std::time::Duration;
 
-use system_tests::{BareNode, BareSubscription, Cell, Child, Started, string_frame};
+use system_tests::{
+    BareNode, BareSubscription, Cell, Child, Started, Times, per_message, processor_time,
+    string_frame,
+};
 
 use crate::lane::{DIGITS, Lane};
-use crate::usage::{Times, per_message, processor_time};
 
 /// A relay of so many topics, with both ends of each.
 struct Crowd {

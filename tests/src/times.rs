@@ -1,4 +1,4 @@
-//! What a process costs, and how figures are summed up.
+//! What a process costs by the scheduler's count, and how figures of a benchmark are summed up.
 
 use std::fs;
 use std::time::Duration;
@@ -6,7 +6,11 @@ use std::time::Duration;
 /// The processor time a process has had so far, over its threads that live.
 ///
 /// `/proc/PID/stat` counts in ticks of 10 ms; the scheduler's own count is in nanoseconds.
-pub(crate) fn processor_time(pid: u32) -> Duration {
+///
+/// # Panics
+/// When it is gone.
+#[must_use]
+pub fn processor_time(pid: u32) -> Duration {
     let threads = fs::read_dir(format!("/proc/{pid}/task")).unwrap();
     let nanoseconds = threads.filter_map(|thread| {
         // A thread may end between the listing and the look.
@@ -17,24 +21,29 @@ pub(crate) fn processor_time(pid: u32) -> Duration {
 }
 
 /// Times of many messages.
-#[derive(Default)]
-pub(crate) struct Times(Vec<Duration>);
+#[derive(Debug, Default)]
+pub struct Times(Vec<Duration>);
 
 impl Times {
-    pub(crate) fn add(&mut self, time: Duration) {
+    /// One more message.
+    pub fn add(&mut self, time: Duration) {
         self.0.push(time);
     }
 
-    pub(crate) fn extend(&mut self, other: Self) {
+    /// Those of other messages of the same kind.
+    pub fn extend(&mut self, other: Self) {
         self.0.extend(other.0);
     }
 
-    pub(crate) fn count(&self) -> u64 {
+    /// How many messages.
+    #[must_use]
+    pub fn count(&self) -> u64 {
         self.0.len() as u64
     }
 
     /// The time that this share of the messages did not exceed, in microseconds.
-    pub(crate) fn at(&mut self, share: f64) -> f64 {
+    #[must_use]
+    pub fn at(&mut self, share: f64) -> f64 {
         self.0.sort_unstable();
         let last = self.0.len().saturating_sub(1);
         let place = (last as f64 * share) as usize;
@@ -42,11 +51,14 @@ impl Times {
     }
 }
 
-pub(crate) fn micros(time: Duration) -> f64 {
+/// The time in microseconds.
+#[must_use]
+pub fn micros(time: Duration) -> f64 {
     time.as_secs_f64() * 1e6
 }
 
 /// Microseconds of processor time for each of so many messages.
-pub(crate) fn per_message(time: Duration, messages: u64) -> f64 {
+#[must_use]
+pub fn per_message(time: Duration, messages: u64) -> f64 {
     micros(time) / messages as f64
 }

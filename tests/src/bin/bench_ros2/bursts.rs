@@ -1,0 +1,58 @@
+//! Bursts of a hundred messages through both bridges.
+
+use std::time::Duration;
+
+use system_tests::{Cell, METRICS_ROS1, METRICS_ROS2, drops, metrics, number};
+
+use crate::ends::{Pace, Report};
+use crate::through::{NAMES, Ways};
+
+pub(crate) fn measure(cell: &Cell, bursts: u64) {
+    let mut ways = Ways::stand(cell);
+    println!("\n{bursts} bursts of {BURST} messages of 1 KiB; microseconds:\n");
+    println!(
+        "| rate in a burst | way | sent | lost | repeated | out of order | dropped by the bridges | p50 | last of 100 |"
+    );
+    println!("|---|---|---|---|---|---|---|---|---|");
+    for rate in [10_000, 30_000] {
+        let mut all = [Report::default(), Report::default(), Report::default()];
+        let mut dropped = [0; 3];
+        for _ in 0..bursts {
+            for (way, (all, dropped)) in all.iter_mut().zip(&mut dropped).enumerate() {
+                let pace = Pace {
+                    ticks: BURST,
+                    size: 1024,
+                    period: Duration::from_secs(1) / rate,
+                    burst: 0,
+                    pause: Duration::ZERO,
+                };
+                let before = bridges_dropped();
+                all.extend(ways.send(way, pace));
+                *dropped += bridges_dropped() - before;
+            }
+        }
+        for ((name, mut all), dropped) in NAMES.into_iter().zip(all).zip(dropped) {
+            let sent = bursts * BURST;
+            println!(
+                "| {} k/s | {name} | {sent} | {} | {} | {} | {dropped} | {:.0} | {:.0} |",
+                rate / 1000,
+                sent - all.distinct,
+                all.repeated,
+                all.disordered,
+                all.times.at(0.5),
+                all.times.at(0.99)
+            );
+        }
+    }
+}
+
+/// What both bridges have counted as dropped or missing, but for their own datagrams, which the group brings back.
+fn bridges_dropped() -> u64 {
+    let bridges = [METRICS_ROS1, METRICS_ROS2];
+    let statuses = bridges.into_iter().filter_map(metrics);
+    statuses
+        .map(|status| drops(&status) - number(&status, "looped"))
+        .sum()
+}
+
+const BURST: u64 = 100;

@@ -1,0 +1,199 @@
+//! The ends of the paths: Cyclone DDS in C told what to do by lines, ROS 1 by a blocking socket.
+
+use std::collections::HashSet;
+use std::io::Write as _;
+use std::net::TcpStream;
+use std::time::Duration;
+
+use serde_json::Value;
+use system_tests::{BareNode, BareSubscription, Cell, Child, Times, eventually, string_frame};
+
+use crate::stamp::{Stamp, now};
+
+/// Sends stamped texts on topics of DDS.
+pub(crate) struct Pacer(Child);
+
+/// When to send: ticks of `period`, with a pause after each `burst` of them.
+#[derive(Clone, Copy)]
+pub(crate) struct Pace {
+    pub(crate) ticks: u64,
+    pub(crate) size: usize,
+    pub(crate) period: Duration,
+    pub(crate) burst: u64,
+    pub(crate) pause: Duration,
+}
+
+impl Pace {
+    /// 1 kHz without a pause.
+    pub(crate) const fn kilohertz(seconds: u64, size: usize) -> Self {
+        Self {
+            ticks: seconds * 1000,
+            size,
+            period: Duration::from_millis(1),
+            burst: 0,
+            pause: Duration::ZERO,
+        }
+    }
+
+    fn took_at_most(self) -> Duration {
+        let ticks = u32::try_from(self.ticks).unwrap();
+        let pauses = ticks / u32::try_from(self.burst.max(1)).unwrap();
+        (self.period * ticks + self.pause * pauses) * 3 + PATIENCE
+    }
+}
+
+impl Pacer {
+    pub(crate) fn start(cell: &Cell, topic: &str, more: &[&str]) -> Self {
+        let args = ["pace", topic, "--limit", LIMIT];
+        Self(cell.cyclone_c(&[&args, more].concat()))
+    }
+
+    /// Sends, and says how many samples were refused.
+    pub(crate) fn send(&mut self, pace: Pace) -> u64 {
+        let (period, pause) = (pace.period.as_nanos(), pace.pause.as_nanos());
+        let line = format!(
+            "{} {} {period} {} {pause}",
+            pace.ticks, pace.size, pace.burst
+        );
+        let answer = self.0.ask(&line, pace.took_at_most());
+        count(&answer, "refused")
+    }
+}
+
+/// Hears stamped texts on topics of DDS.
+pub(crate) struct Meter(Child);
+
+/// What a [`Meter`] or a [`Listener`] has heard.
+#[derive(Debug, Default)]
+pub(crate) struct Report {
+    pub(crate) distinct: u64,
+    pub(crate) repeated: u64,
+    pub(crate) disordered: u64,
+    pub(crate) times: Times,
+}
+
+impl Report {
+    pub(crate) fn extend(&mut self, other: Self) {
+        self.distinct += other.distinct;
+        self.repeated += other.repeated;
+        self.disordered += other.disordered;
+        self.times.extend(other.times);
+    }
+}
+
+impl Meter {
+    pub(crate) fn start(cell: &Cell, topic: &str, more: &[&str]) -> Self {
+        let args = ["meter", topic, "--limit", LIMIT, "--depth", "2000"];
+        Self(cell.cyclone_c(&[&args, more].concat()))
+    }
+
+    /// Waits for so many samples, or until none comes any more, and begins anew.
+    pub(crate) fn report(&mut self, expected: u64) -> Report {
+        let answer = self.0.ask(&format!("{expected} {SILENCE_MS}"), PATIENCE);
+        Report {
+            distinct: count(&answer, "distinct"),
+            repeated: count(&answer, "repeated"),
+            disordered: count(&answer, "disordered"),
+            times: times(&answer),
+        }
+    }
+}
+
+/// Reads the count of a peer's answer.
+pub(crate) fn count(answer: &Value, field: &str) -> u64 {
+    answer[field]
+        .as_u64()
+        .unwrap_or_else(|| panic!("no {field} in {answer}"))
+}
+
+/// Reads the times of a peer's answer.
+pub(crate) fn times(answer: &Value) -> Times {
+    let mut times = Times::default();
+    for time in answer["ns"].as_array().unwrap() {
+        times.add(Duration::from_nanos(time.as_u64().unwrap()));
+    }
+    times
+}
+
+/// Sends stamped texts on one topic of ROS 1.
+pub(crate) struct Talker {
+    stream: TcpStream,
+    number: u64,
+}
+
+impl Talker {
+    pub(crate) fn of(stream: TcpStream) -> Self {
+        Self { stream, number: 0 }
+    }
+
+    /// Sends at absolute times.
+    pub(crate) fn send(&mut self, pace: Pace) {
+        let mut due = now();
+        for tick in 0..pace.ticks {
+            if pace.burst > 0 && tick > 0 && tick % pace.burst == 0 {
+                due = now() + pace.pause;
+            }
+            std::thread::sleep(due.saturating_sub(now()));
+            self.say(pace.size);
+            due += pace.period;
+        }
+    }
+
+    /// One text, which measurements count too.
+    pub(crate) fn say(&mut self, size: usize) {
+        let text = Stamp::text(0, self.number, size);
+        self.number += 1;
+        self.stream.write_all(&string_frame(&text)).unwrap();
+    }
+}
+
+/// Hears stamped texts on one topic of ROS 1.
+pub(crate) struct Listener {
+    subscription: BareSubscription,
+    heard: HashSet<u64>,
+    next: u64,
+}
+
+impl Listener {
+    /// Waits until somebody publishes the topic.
+    pub(crate) fn of(node: &BareNode, topic: &str) -> Self {
+        let what = format!("{topic} is published");
+        Self {
+            subscription: eventually(&what, START, || node.subscribe(topic)),
+            heard: HashSet::new(),
+            next: 0,
+        }
+    }
+
+    /// Hears so many texts, or until none comes any more.
+    pub(crate) fn report(&mut self, expected: u64) -> Report {
+        self.subscription
+            .wait_at_most(Duration::from_millis(SILENCE_MS));
+        let mut report = Report::default();
+        while report.distinct < expected
+            && let Ok(frame) = self.subscription.receive()
+        {
+            let Some(stamp) = Stamp::of(frame) else {
+                continue;
+            };
+            if !self.heard.insert(stamp.number) {
+                report.repeated += 1;
+                continue;
+            }
+            report.disordered += u64::from(stamp.number < self.next);
+            self.next = stamp.number + 1;
+            report.distinct += 1;
+            report.times.add(now().saturating_sub(stamp.sent));
+        }
+        report
+    }
+}
+
+/// How long peers may live: longer than any measurement.
+pub(crate) const LIMIT: &str = "1800";
+/// A path needs seconds to stand.
+pub(crate) const START: Duration = Duration::from_secs(30);
+/// For an answer that needs no time.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
+/// Nothing more comes after so long without anything.
+const SILENCE_MS: u64 = 1000;

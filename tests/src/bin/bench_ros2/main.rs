@@ -1,0 +1,123 @@
+//! `cargo xtask bench ros2`: relays of DDS samples beside a UDP echo, and both bridges between ROS 1 and ROS 2.
+//!
+//! The DDS ends of every path are Cyclone DDS in C, the ROS 1 and UADP ends blocking sockets without any library. What
+//! is compared takes turns, so that all of it sees the same machine.
+
+mod bursts;
+mod ends;
+mod idle;
+mod joining;
+mod many;
+mod relays;
+mod stamp;
+mod through;
+
+use std::process::ExitCode;
+
+use system_tests::{Cell, Peer};
+
+fn main() -> ExitCode {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    if args.first().is_some_and(|arg| arg == "echo") {
+        return relays::echo();
+    }
+    let Some(plan) = Plan::of(&args) else {
+        print!("{HELP}");
+        return ExitCode::from(64);
+    };
+    if plan.help {
+        print!("{HELP}");
+        return ExitCode::SUCCESS;
+    }
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::FastDds, Peer::CycloneC]) else {
+        return ExitCode::FAILURE;
+    };
+    if plan.has("round-trip") || plan.has("throughput") {
+        relays::measure(&cell, &plan);
+    }
+    if plan.has("joining") {
+        joining::measure(&cell, plan.turns);
+    }
+    if plan.has("idle") {
+        idle::measure(&cell, plan.seconds);
+    }
+    if plan.has("many") {
+        many::measure(&cell, plan.seconds);
+    }
+    if plan.has("through") || plan.has("bursts") {
+        let _core = cell.roscore();
+        if plan.has("through") {
+            through::measure(&cell, plan.seconds);
+        }
+        if plan.has("bursts") {
+            bursts::measure(&cell, plan.turns);
+        }
+    }
+    ExitCode::SUCCESS
+}
+
+/// How much of what.
+struct Plan {
+    help: bool,
+    /// Those to run; all when empty.
+    parts: Vec<String>,
+    /// Of each size, one at a time, through each relay; a tenth of it where samples are large.
+    messages: u64,
+    /// At 1 kHz, and of doing nothing.
+    seconds: u64,
+    /// Of what happens a few times only.
+    turns: u64,
+}
+
+impl Plan {
+    /// `None` when the arguments make no sense.
+    fn of(args: &[String]) -> Option<Self> {
+        let mut plan = Self {
+            help: false,
+            parts: Vec::new(),
+            messages: 5000,
+            seconds: 20,
+            turns: 20,
+        };
+        let mut args = args.iter();
+        while let Some(arg) = args.next() {
+            match arg.as_str() {
+                "--help" | "-h" => plan.help = true,
+                "--quick" => {
+                    plan = Self {
+                        messages: 500,
+                        seconds: 2,
+                        turns: 3,
+                        ..plan
+                    }
+                }
+                "--seconds" => plan.seconds = args.next()?.parse().ok()?,
+                part if PARTS.contains(&part) => plan.parts.push(part.to_owned()),
+                _ => return None,
+            }
+        }
+        Some(plan)
+    }
+
+    fn has(&self, part: &str) -> bool {
+        self.parts.is_empty() || self.parts.iter().any(|wanted| wanted == part)
+    }
+}
+
+const PARTS: [&str; 7] = [
+    "round-trip",
+    "throughput",
+    "joining",
+    "idle",
+    "many",
+    "through",
+    "bursts",
+];
+
+const HELP: &str = "\
+bench-ros2 [--quick] [--seconds N] [PART..]
+
+  --quick      a trial of a minute; its figures are no measurement
+  --seconds N  how long each path gets messages at 1 kHz, 20 unless told
+  PART         round-trip, throughput, joining, idle, many, through, bursts; all unless told
+";

@@ -1,0 +1,157 @@
+//! Fifty topics at 1 kHz each through `bridge-ros2`, from UADP to DDS and back.
+
+use std::collections::HashSet;
+use std::fmt::Write as _;
+use std::time::Duration;
+
+use system_tests::{Cell, GROUP, UaSide, eventually, group_member, per_message, processor_time};
+use uadp::Scalar;
+
+use crate::ends::{Meter, Pace, Pacer, Report, START};
+use crate::stamp::{Stamp, now};
+
+pub(crate) fn measure(cell: &Cell, seconds: u64) {
+    println!(
+        "\n{TOPICS} topics of {SIZE} B at 1 kHz each through bridge-ros2, {seconds} s; microseconds:\n"
+    );
+    println!("| way | sent | received | p50 | p99 | CPU share of the bridge | CPU per message |");
+    println!("|---|---|---|---|---|---|---|");
+    to_dds(cell, seconds);
+    to_uadp(cell, seconds);
+}
+
+fn to_dds(cell: &Cell, seconds: u64) {
+    let mapping = cell.file("to-dds.yaml", &mapping(0));
+    let bridge = cell.bridge_ros2(&[&mapping.to_string_lossy()]);
+    let (topics, first) = (TOPICS.to_string(), FIRST.to_string());
+    let mut meter = Meter::start(cell, "/ua_0_2_", &["--topics", &topics, "--first", &first]);
+    let mut side = UaSide::join();
+    let mut number = 0;
+    let mut tick = |number: u64| {
+        for topic in 0..TOPICS {
+            let text = Stamp::text(topic, number, SIZE);
+            side.write((0, 2, id(topic)), Scalar::String(Some(&text)));
+        }
+    };
+    let mut whole = 0;
+    eventually("all topics cross", START, || {
+        tick(number);
+        number += 1;
+        let heard = meter.report(TOPICS as u64).distinct;
+        // Twice in a row: what settles has settled.
+        whole = if heard == TOPICS as u64 { whole + 1 } else { 0 };
+        (whole == 2).then_some(())
+    });
+    let before = processor_time(bridge.id());
+    let start = now();
+    let mut due = start;
+    for _ in 0..seconds * 1000 {
+        std::thread::sleep(due.saturating_sub(now()));
+        tick(number);
+        number += 1;
+        due += Duration::from_millis(1);
+    }
+    let took = now() - start;
+    let sent = seconds * 1000 * TOPICS as u64;
+    let report = meter.report(sent);
+    let used = processor_time(bridge.id()) - before;
+    row("UADP -> DDS", sent, report, used, took);
+}
+
+fn to_uadp(cell: &Cell, seconds: u64) {
+    let mapping = cell.file("to-uadp.yaml", &mapping(2));
+    let listener = group_member(GROUP);
+    listener.set_read_timeout(Some(SILENCE)).unwrap();
+    let bridge = cell.bridge_ros2(&[&mapping.to_string_lossy()]);
+    let (topics, first) = (TOPICS.to_string(), FIRST.to_string());
+    let more = ["--topics", &topics, "--first", &first, "--depth", "1000"];
+    let mut pacer = Pacer::start(cell, "/ua_2_2_", &more);
+    let mut heard = Heard::default();
+    let mut buffer = vec![0; 65_536];
+    eventually("all topics cross", START, || {
+        pacer.send(Pace::kilohertz(1, SIZE));
+        let mut crossed = HashSet::new();
+        while let Ok(length) = listener.recv(&mut buffer) {
+            crossed.extend(heard.add(&buffer[..length]));
+        }
+        (crossed.len() == TOPICS).then_some(())
+    });
+    heard.report = Report::default();
+    let before = processor_time(bridge.id());
+    let start = now();
+    let sent = seconds * 1000 * TOPICS as u64;
+    let took = std::thread::scope(|scope| {
+        let sender = scope.spawn(|| {
+            pacer.send(Pace::kilohertz(seconds, SIZE));
+            now() - start
+        });
+        while heard.report.distinct < sent {
+            match listener.recv(&mut buffer) {
+                Ok(length) => drop(heard.add(&buffer[..length])),
+                Err(_) if sender.is_finished() => break,
+                Err(_) => {}
+            }
+        }
+        sender.join().unwrap()
+    });
+    let used = processor_time(bridge.id()) - before;
+    row("DDS -> UADP", sent, heard.report, used, took);
+}
+
+fn row(way: &str, sent: u64, mut report: Report, used: Duration, took: Duration) {
+    println!(
+        "| {way} | {sent} | {} | {:.0} | {:.0} | {:.0} % of one core | {:.1} |",
+        report.distinct,
+        report.times.at(0.5),
+        report.times.at(0.99),
+        used.as_secs_f64() / took.as_secs_f64() * 100.0,
+        per_message(used, sent)
+    );
+}
+
+/// What a member of the group hears of stamped texts.
+#[derive(Default)]
+struct Heard {
+    seen: HashSet<(usize, u64)>,
+    report: Report,
+}
+
+impl Heard {
+    /// The topic, when the datagram ends with a text that was not heard before.
+    fn add(&mut self, datagram: &[u8]) -> Option<usize> {
+        let stamp = Stamp::of(datagram)?;
+        if !self.seen.insert((stamp.topic, stamp.number)) {
+            self.report.repeated += 1;
+            return None;
+        }
+        self.report.distinct += 1;
+        self.report.times.add(now().saturating_sub(stamp.sent));
+        Some(stamp.topic)
+    }
+}
+
+/// Events, of which none may give way.
+pub(crate) fn mapping(origin: u16) -> String {
+    let mut text =
+        "spaces:\n  - id: 1\n  - id: 2\nnamespaces:\n  2: urn:ua-bridge:bench\nvariables:\n"
+            .to_owned();
+    for topic in 0..TOPICS {
+        let id = id(topic);
+        write!(
+            text,
+            "  - node: ns=2;i={id}\n    name: v{topic}\n    type: String\n    origin: {origin}\n    queue: {{drop_oldest: 2000}}\n"
+        )
+        .unwrap();
+    }
+    text
+}
+
+fn id(topic: usize) -> u16 {
+    u16::try_from(FIRST + topic).unwrap()
+}
+
+pub(crate) const TOPICS: usize = 50;
+pub(crate) const FIRST: usize = 10;
+const SIZE: usize = 64;
+/// Nothing more comes after this long without a datagram.
+const SILENCE: Duration = Duration::from_millis(500);
