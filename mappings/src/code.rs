@@ -24,6 +24,18 @@ macro_rules! codes {
             pub const fn explanation(self) -> &'static str {
                 match self { $(Self::$name => $explanation),* }
             }
+
+            /// A short document with such a finding, and what is told of it as [`Checked::render`](crate::Checked::render)
+            /// has it.
+            #[must_use]
+            pub const fn example(self) -> (&'static str, &'static str) {
+                match self {
+                    $(Self::$name => (
+                        include_str!(concat!("../tests/bad/", $text, ".yaml")),
+                        include_str!(concat!("../tests/bad/", $text, ".txt")),
+                    )),*
+                }
+            }
         }
     };
 }

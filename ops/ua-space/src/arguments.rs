@@ -3,8 +3,9 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
+use mappings::Code;
 
-/// Looks into the space: datagrams of OPC UA PubSub as JSON and back.
+/// Looks into the space: mappings and what is wrong with them, datagrams of OPC UA PubSub as JSON and back.
 #[derive(Debug, Parser)]
 #[command(name = "ua-space", version)]
 pub(crate) struct Arguments {
@@ -14,6 +15,25 @@ pub(crate) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Verb {
+    /// Tell everything that is wrong with a mapping
+    ///
+    /// Each finding has a code, its place with the line it is about, and what to do; `ua-space explain CODE` says more of
+    /// a code. Nothing is asked of the network: definitions of messages are those built in.
+    ///
+    /// Exit codes: 0 all can run, with or without warnings, 64 usage, 74 a file that cannot be read or an output that
+    /// cannot be written, 78 one of them cannot run.
+    Check(Check),
+    /// Say what the code of a finding means, with an example
+    ///
+    /// Without a code: all of them, a line each.
+    ///
+    /// Exit codes: 0 done, 64 a code that there is not, 74 an output that cannot be written.
+    Explain(Explain),
+    /// Print the JSON Schema of mappings, for editors
+    ///
+    /// With `# yaml-language-server: $schema=PATH` as a mapping's first line, editors that know YAML schemas complete its
+    /// keys and show what they mean.
+    Schema,
     /// Show what a datagram, or each datagram of a capture, holds
     ///
     /// Reads a datagram as hexadecimal text or as its bytes, or the UDP datagrams of a pcap or pcapng file. One datagram
@@ -31,6 +51,23 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, 65 JSON that is no datagram, 74 a file that cannot be read or an output that cannot
     /// be written.
     Encode(Encode),
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Check {
+    /// The mappings, or - for stdin
+    #[arg(value_name = "FILE", required = true)]
+    pub(crate) files: Vec<String>,
+    /// One JSON object a file, with its findings
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Explain {
+    /// Such as M014
+    #[arg(value_name = "CODE")]
+    pub(crate) code: Option<Code>,
 }
 
 #[derive(Debug, Args)]

@@ -12,6 +12,9 @@ pub(crate) enum Failure {
     /// Datagrams that were not; each was told of when it came.
     #[error("some datagrams are malformed")]
     Told,
+    /// A mapping that cannot run; why was told.
+    #[error("a mapping cannot run")]
+    Configuration,
     /// A file that cannot be read, or an output that cannot be written.
     #[error("{0}")]
     Io(String),
@@ -41,6 +44,7 @@ impl From<&Failure> for ExitCode {
     fn from(failure: &Failure) -> Self {
         match failure {
             Failure::Data(_) | Failure::Told => Self::from(65),
+            Failure::Configuration => Self::from(78),
             Failure::Io(_) => Self::from(74),
             Failure::Closed => Self::SUCCESS,
         }

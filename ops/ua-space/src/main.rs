@@ -2,10 +2,12 @@
 
 mod arguments;
 mod capture;
+mod check;
 mod decode;
 mod discovery;
 mod encode;
 mod exit;
+mod explain;
 mod fault;
 mod hex;
 mod input;
@@ -48,6 +50,9 @@ fn main() -> ExitCode {
         }
     };
     let ended = match &arguments.verb {
+        Verb::Check(arguments) => check::check(arguments),
+        Verb::Explain(arguments) => explain::explain(arguments),
+        Verb::Schema => explain::schema(),
         Verb::Decode(arguments) => session::decode(arguments),
         Verb::Encode(arguments) => session::encode(arguments),
     };

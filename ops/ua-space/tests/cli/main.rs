@@ -3,6 +3,7 @@
 #![expect(clippy::unwrap_used, clippy::indexing_slicing, reason = "test code")]
 
 mod captures;
+mod check;
 mod malformed;
 mod normal;
 mod program;

@@ -1,0 +1,117 @@
+//! What is wrong with a mapping, for people and for programs.
+
+use std::io::{self, BufWriter, Read as _, Write as _};
+
+use mappings::{Checked, Diagnostic, Mapping};
+use serde::Serialize;
+
+use crate::arguments::Check;
+use crate::exit::Failure;
+
+pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
+    let mut out = BufWriter::new(io::stdout().lock());
+    let mut all_can_run = true;
+    for file in &arguments.files {
+        let text = read(file)?;
+        let name = if file == "-" { "<stdin>" } else { file };
+        let checked = Mapping::from_yaml(&text, name);
+        all_can_run &= checked.mapping.is_some();
+        if arguments.json {
+            let line = serde_json::to_string(&Told::of(name, &checked))
+                .map_err(|error| Failure::Data(format!("{name}: {error}")))?;
+            writeln!(out, "{line}")?;
+        } else {
+            out.write_all(checked.render(&text).as_bytes())?;
+            writeln!(out, "{}", sum(name, &checked))?;
+        }
+    }
+    out.flush()?;
+    if all_can_run {
+        Ok(())
+    } else {
+        Err(Failure::Configuration)
+    }
+}
+
+fn read(file: &str) -> Result<String, Failure> {
+    let mut text = Vec::new();
+    let read = if file == "-" {
+        io::stdin().lock().take(MOST).read_to_end(&mut text)
+    } else {
+        std::fs::File::open(file).and_then(|file| file.take(MOST).read_to_end(&mut text))
+    };
+    read.map_err(|error| Failure::reading(file, &error))?;
+    String::from_utf8(text).map_err(|error| {
+        let at = error.utf8_error().valid_up_to();
+        Failure::Io(format!(
+            "cannot read {file}: it is not UTF-8 from byte {at} on; save it as UTF-8"
+        ))
+    })
+}
+
+/// What there is, in a line.
+fn sum(name: &str, checked: &Checked) -> String {
+    let Some(mapping) = &checked.mapping else {
+        return format!("{name} cannot run");
+    };
+    let several = |count: usize, what: &str| match count {
+        1 => format!("1 {what}"),
+        _ => format!("{count} {what}s"),
+    };
+    let parts = [
+        several(mapping.variables().len(), "variable"),
+        several(mapping.patterns().len(), "pattern"),
+        several(mapping.spaces().len(), "ROS space"),
+    ];
+    format!("{name} can run: {}", parts.join(", "))
+}
+
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Told<'a> {
+    file: &'a str,
+    can_run: bool,
+    findings: Vec<Finding<'a>>,
+}
+
+#[derive(Serialize)]
+struct Finding<'a> {
+    code: &'static str,
+    severity: String,
+    line: usize,
+    column: usize,
+    length: usize,
+    message: &'a str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    label: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    help: Option<&'a str>,
+}
+
+impl<'a> Told<'a> {
+    fn of(file: &'a str, checked: &'a Checked) -> Self {
+        Self {
+            file,
+            can_run: checked.mapping.is_some(),
+            findings: checked.findings.iter().map(Finding::of).collect(),
+        }
+    }
+}
+
+impl<'a> Finding<'a> {
+    fn of(found: &'a Diagnostic) -> Self {
+        Self {
+            code: found.code.as_str(),
+            severity: found.severity.to_string(),
+            line: found.at.line,
+            column: found.at.column,
+            length: found.at.len,
+            message: &found.message,
+            label: found.label.as_deref(),
+            help: found.help.as_deref(),
+        }
+    }
+}
+
+/// More than a mapping may have (M002): a device that never ends is not read for ever.
+const MOST: u64 = 5 << 20;

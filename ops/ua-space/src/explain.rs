@@ -1,0 +1,39 @@
+//! What a code means, and what a mapping may hold.
+
+use std::io::{self, BufWriter, Write as _};
+
+use mappings::Code;
+
+use crate::arguments::Explain;
+use crate::exit::Failure;
+
+pub(crate) fn explain(arguments: &Explain) -> Result<(), Failure> {
+    let mut out = BufWriter::new(io::stdout().lock());
+    match arguments.code {
+        None => {
+            for code in Code::ALL {
+                writeln!(out, "{code}  {}", first_sentence(code.explanation()))?;
+            }
+        }
+        Some(code) => {
+            let (document, told) = code.example();
+            writeln!(out, "{code}: {}\n\nFor example, of\n", code.explanation())?;
+            for (number, line) in document.lines().enumerate() {
+                writeln!(out, "{:3} | {line}", number + 1)?;
+            }
+            writeln!(out, "\nis told:\n")?;
+            out.write_all(told.as_bytes())?;
+        }
+    }
+    Ok(out.flush()?)
+}
+
+pub(crate) fn schema() -> Result<(), Failure> {
+    let mut out = io::stdout().lock();
+    out.write_all(mappings::schema().as_bytes())?;
+    Ok(out.flush()?)
+}
+
+fn first_sentence(text: &str) -> &str {
+    text.split_once(". ").map_or(text, |(first, _)| first)
+}

@@ -1,0 +1,122 @@
+//! Mappings checked, codes explained, the schema.
+
+use std::fs;
+use std::path::Path;
+
+use serde_json::{Value, json};
+
+use crate::program::{file, run, run_on};
+
+const SHIPPED: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../mappings");
+
+fn shipped(name: &str) -> String {
+    Path::new(SHIPPED).join(name).to_str().unwrap().to_owned()
+}
+
+const FAULTY: &str =
+    "spaces:\n  - id: 1\nvariables:\n  - node: ns=2;i=10\n    name: a\n    orgin: 1\n";
+
+#[test]
+fn a_mapping_that_can_run_is_summed_up() {
+    let minimal = shipped("minimal.yaml");
+    let ended = run(&["check", &minimal]);
+    assert_eq!(ended.code, 0, "{}", ended.stdout);
+    let last = ended.stdout.lines().last().unwrap();
+    assert!(
+        last.starts_with(&format!("{minimal} can run: ")),
+        "{}",
+        ended.stdout
+    );
+}
+
+#[test]
+fn all_faults_of_all_files_are_told_and_end_with_78() {
+    let faulty = file("faulty.yaml", FAULTY);
+    let ended = run(&["check", &faulty, &shipped("minimal.yaml")]);
+    assert_eq!(ended.code, 78);
+    for wanted in [
+        "error[M003]",
+        "did you mean `origin`?",
+        "error[M006]",
+        "error[M031]",
+        &format!("--> {faulty}:6:5"),
+        &format!("{faulty} cannot run"),
+        "minimal.yaml can run",
+    ] {
+        assert!(
+            ended.stdout.contains(wanted),
+            "{wanted}\n---\n{}",
+            ended.stdout
+        );
+    }
+}
+
+#[test]
+fn a_program_gets_the_same_as_json() {
+    let ended = run_on(&["check", "--json", "-"], FAULTY.as_bytes());
+    assert_eq!(ended.code, 78);
+    let [told] = &ended.lines()[..] else {
+        panic!("{}", ended.stdout)
+    };
+    assert_eq!(
+        (&told["file"], &told["canRun"]),
+        (&json!("<stdin>"), &json!(false))
+    );
+    let findings = told["findings"].as_array().unwrap();
+    let unknown = findings.iter().find(|one| one["code"] == "M003").unwrap();
+    assert_eq!(
+        (&unknown["severity"], &unknown["line"], &unknown["column"]),
+        (&json!("error"), &json!(6), &json!(5))
+    );
+    assert!(unknown["help"].as_str().unwrap().contains("origin"));
+    let minimal = run(&["check", "--json", &shipped("minimal.yaml")]).quiet();
+    let minimal: Value = serde_json::from_str(&minimal).unwrap();
+    assert_eq!(minimal["canRun"], true);
+}
+
+#[test]
+fn a_file_that_is_no_text_or_not_there_is_told_with_74() {
+    let bytes = file("binary.yaml", b"spaces: \xff\n");
+    for (name, why) in [
+        (bytes.as_str(), "not UTF-8 from byte 8"),
+        ("/nowhere/cell.yaml", "No such file"),
+    ] {
+        let ended = run(&["check", name]);
+        assert_eq!(ended.code, 74);
+        assert!(
+            ended.stderr.starts_with(&format!("cannot read {name}")) && ended.stderr.contains(why),
+            "{}",
+            ended.stderr
+        );
+    }
+}
+
+#[test]
+fn a_code_is_explained_with_an_example_in_either_case() {
+    let told = run(&["explain", "M014"]).quiet();
+    assert_eq!(told, run(&["explain", "m014"]).quiet());
+    assert!(told.starts_with("M014: A variable names a space"), "{told}");
+    assert!(
+        told.contains("| ") && told.contains("origin 3 is not one of the declared spaces"),
+        "{told}"
+    );
+    let ended = run(&["explain", "M999"]);
+    assert_eq!((ended.code, ended.stdout.as_str()), (64, ""));
+    assert!(ended.stderr.contains("no finding has that code"));
+}
+
+#[test]
+fn all_codes_are_listed_a_line_each() {
+    let listed = run(&["explain"]).quiet();
+    let codes: Vec<&str> = listed.lines().map(|line| &line[..4]).collect();
+    assert!(codes.is_sorted() && codes.contains(&"M001") && codes.contains(&"M080"));
+    for code in codes {
+        assert!(run(&["explain", code]).quiet().starts_with(code));
+    }
+}
+
+#[test]
+fn the_schema_is_the_one_that_is_shipped() {
+    let told = run(&["schema"]).quiet();
+    assert_eq!(told, fs::read_to_string(shipped("schema.json")).unwrap());
+}
