@@ -407,6 +407,15 @@ impl Router {
         });
     }
 
+    /// What a port dropped that belongs to no topic.
+    pub fn dropped(&mut self, reason: Reason, count: u64, why: &'static str) {
+        let about = About {
+            topic: None,
+            from: None,
+        };
+        self.count(about, reason, count, || why.to_owned());
+    }
+
     /// Takes back the buffer of a datagram or payload that has been used, so that the next one needs no allocation.
     pub fn recycle(&mut self, mut buffer: Vec<u8>) {
         if self.spare.len() < SPARE_BUFFERS && buffer.capacity() <= SPARE_CAPACITY {

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use bridge_core::{Kept, PublisherKey};
+use bridge_core::{Kept, PublisherKey, Reason};
 use bytes::Bytes;
 use mappings::TopicId;
 use messages::{MessageType, Selection};
@@ -98,6 +98,15 @@ pub enum PortEvent {
         topic: TopicId,
         /// Whether anybody publishes it.
         live: bool,
+    },
+    /// Something was dropped that is no sample of a value.
+    Dropped {
+        /// The counter.
+        reason: Reason,
+        /// What it was, in two or three words.
+        why: &'static str,
+        /// How many.
+        count: u64,
     },
     /// Samples were lost before the Router saw them, in a bounded queue that was full.
     Lost {

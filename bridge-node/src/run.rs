@@ -120,6 +120,7 @@ impl<P: Port> Shell<P> {
             PortEvent::Left { topic, publisher } => self.router.left(topic, publisher),
             PortEvent::Live { topic, live } => self.router.set_live(topic, live, now()),
             PortEvent::Lost { topic, why, count } => self.router.lost(topic, count, why),
+            PortEvent::Dropped { reason, why, count } => self.router.dropped(reason, count, why),
             PortEvent::Unmatched { topic } => self.router.unmatched(topic),
             PortEvent::CallFailed { topic, detail } => self.router.call_failed(topic, &detail),
             PortEvent::Ended(why) => return Err(Failure::new(FailureKind::Unavailable, why)),

@@ -244,6 +244,12 @@ impl Domain {
         self.node.owner(endpoint)
     }
 
+    /// How many lists of nodes, of those that others publish, could not be read.
+    #[must_use]
+    pub fn malformed_lists(&self) -> u64 {
+        self.node.malformed_lists()
+    }
+
     /// The node's clock.
     #[must_use]
     pub fn clock(&self) -> RosClock {

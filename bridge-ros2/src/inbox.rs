@@ -115,6 +115,14 @@ impl<K: Clone> Inbox<K> {
         }
     }
 
+    /// Has the last sample of a writer delivered once more, should the reader in that slot get it again.
+    pub fn repeat_last(&mut self, id: SlotId, writer: GUID) {
+        let slot = self.slots.get_mut(&id.0);
+        if let Some(last) = slot.and_then(|slot| slot.delivered.get_mut(&writer)) {
+            *last = last.saturating_sub(1);
+        }
+    }
+
     /// The next sample of any reader. Cancel-safe: a sample is only taken in the poll that returns it.
     pub async fn recv(&mut self) -> Taken<K> {
         poll_fn(|cx| self.poll_recv(cx)).await

@@ -255,6 +255,11 @@ impl Node {
             .collect()
     }
 
+    /// How many lists of nodes could not be read.
+    pub(crate) fn malformed_lists(&self) -> u64 {
+        lock(&self.shared.others).malformed
+    }
+
     /// The full name of the node of others that has this endpoint.
     pub(crate) fn owner(&self, endpoint: GUID) -> Option<String> {
         let guid = endpoint.to_bytes();

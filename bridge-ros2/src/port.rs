@@ -4,6 +4,7 @@
 //! [`reconcile`], which compares what the domain holds with what is open: every 200 ms, and soon
 //! after RustDDS reports a change.
 
+mod drops;
 mod reconcile;
 mod schedule;
 mod services;
@@ -36,6 +37,7 @@ use crate::service::ServicePeers;
 use crate::sink::Sink;
 use crate::source::{Source, same_participant};
 
+use drops::Drops;
 use reconcile::MAX_BATCH;
 use schedule::Schedule;
 use services::Ros2Graph;
@@ -83,6 +85,7 @@ pub struct Ros2Port {
     incompatible: BTreeSet<GUID>,
     /// What was already told, so that it is told once.
     told: BTreeSet<(String, &'static str)>,
+    drops: Drops,
     schedule: Schedule,
 }
 
@@ -141,6 +144,7 @@ impl Ros2Port {
             clock,
             incompatible: BTreeSet::new(),
             told: BTreeSet::new(),
+            drops: Drops::default(),
             schedule: Schedule::new(),
         };
         port.take_bindings(&mapping);

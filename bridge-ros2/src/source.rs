@@ -27,6 +27,11 @@ pub(crate) struct Source {
     latched: BTreeMap<GUID, PublisherKey>,
     /// The key for the next of them.
     next_key: u32,
+    /// The writers there are that are transient-local.
+    durable: BTreeSet<GUID>,
+    /// Transient-local writers that have sent something and gone. One that comes back, as after the network was out for
+    /// longer than its lease, is to be read again.
+    lapsed: BTreeSet<GUID>,
 }
 
 /// What there is of a reader.
@@ -49,15 +54,18 @@ impl Source {
             strangers: BTreeSet::new(),
             latched: BTreeMap::new(),
             next_key: 0,
+            durable: BTreeSet::new(),
+            lapsed: BTreeSet::new(),
         }
     }
 
-    /// What a writer is called to the Router, if all writers of the topic are transient-local.
+    /// What a writer is called to the Router, if it is transient-local.
     pub(crate) fn latched_by(&mut self, writer: GUID) -> Option<PublisherKey> {
         let Reading::Open { requested, .. } = self.reading else {
             return None;
         };
-        if !requested.is_transient_local() {
+        // A transient-local reader is matched with no other writers, be they met or not.
+        if !requested.is_transient_local() && !self.durable.contains(&writer) {
             return None;
         }
         let next_key = &mut self.next_key;
@@ -72,14 +80,30 @@ impl Source {
     /// The transient-local writers that have gone; `writers` are there.
     pub(crate) fn gone(&mut self, writers: &[Endpoint]) -> Vec<PublisherKey> {
         let mut gone = Vec::new();
+        let lapsed = &mut self.lapsed;
         self.latched.retain(|guid, key| {
             let there = writers.iter().any(|writer| writer.guid == *guid);
             if !there {
                 gone.push(*key);
+                lapsed.insert(*guid);
             }
             there
         });
+        while self.lapsed.len() > MAX_LAPSED {
+            self.lapsed.pop_first();
+        }
         gone
+    }
+
+    /// The transient-local writers among `writers` that had gone and were not read since.
+    pub(crate) fn returned(&self, writers: &[Endpoint]) -> Vec<GUID> {
+        let returned = writers.iter().map(|writer| writer.guid);
+        returned.filter(|guid| self.lapsed.contains(guid)).collect()
+    }
+
+    /// A writer that had returned is being read again.
+    pub(crate) fn reread(&mut self, writer: GUID) {
+        self.lapsed.remove(&writer);
     }
 
     /// Sorts the writers the topic has by now into ours and strangers; returns ours.
@@ -90,9 +114,14 @@ impl Source {
             .cloned()
             .partition(|writer| writer.type_name == dds_type);
         self.strangers = strangers.iter().map(|writer| writer.guid).collect();
+        let durable = ours.iter().filter(|writer| writer.transient_local);
+        self.durable = durable.map(|writer| writer.guid).collect();
         ours
     }
 }
+
+/// How many writers are remembered that have gone: more do not come back at once.
+const MAX_LAPSED: usize = 1024;
 
 /// The prefix all endpoints of a participant share.
 pub(crate) fn same_participant(endpoint: GUID, participant: &impl RTPSEntity) -> bool {

@@ -96,6 +96,8 @@ ParameterEvent = struct(
         ("deleted_parameters", sequence[Parameter], list),
     ],
 )
+# Messages that nothing but the services of parameters brings about.
+MESSAGES = {"rcl_interfaces/ParameterEvent": ParameterEvent}
 
 NAMES = [("names", sequence[str], list)]
 PARAMETERS = [("parameters", sequence[Parameter], list)]

@@ -9,6 +9,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 import lifetime
+import ros2_service_types
 import ros2_types
 
 
@@ -20,7 +21,7 @@ def main():
 
     qos = ros2_types.qos(args)
     participant = DomainParticipant(args.domain)
-    kind = ros2_types.kind_of(args.type)
+    kind = ros2_service_types.MESSAGES.get(args.type) or ros2_types.kind_of(args.type)
     topic = Topic(participant, ros2_types.dds_topic(args.topic), kind, qos=qos)
     reader = DataReader(participant, topic, qos=qos)
     news = ReadCondition(reader, SampleState.NotRead | ViewState.Any | InstanceState.Any)

@@ -7,15 +7,13 @@ use std::{
     os::fd::AsRawFd,
     path::PathBuf,
     process::Command,
-    sync::{
-        Arc,
-        atomic::{AtomicBool, Ordering},
-    },
+    sync::{Arc, atomic::Ordering},
     thread::JoinHandle,
 };
 
 use nix::sched::{CloneFlags, setns, unshare};
 
+use wire::Orders;
 pub use wire::Wire;
 
 use crate::{Cell, Started};
@@ -30,7 +28,7 @@ pub const WIRE: &str = "wire0";
 /// The other host. Programs are started on it by [`Started::on`].
 pub struct Host {
     namespace: Namespace,
-    ends: Arc<AtomicBool>,
+    orders: Arc<Orders>,
     wire: Option<JoinHandle<()>>,
 }
 
@@ -48,8 +46,8 @@ impl Cell {
         for end in ["near", "far"] {
             middle.ip(&["link", "set", end, "mtu", "1500", "up"]);
         }
-        let ends = Arc::new(AtomicBool::new(false));
-        let asked = Arc::clone(&ends);
+        let orders = Arc::new(Orders::default());
+        let asked = Arc::clone(&orders);
         let wire = std::thread::Builder::new()
             .name("wire".to_owned())
             .spawn(move || {
@@ -59,13 +57,23 @@ impl Cell {
             .unwrap();
         Host {
             namespace: there,
-            ends,
+            orders,
             wire: Some(wire),
         }
     }
 }
 
 impl Host {
+    /// Cuts the wire: every frame is lost until it is mended.
+    pub fn cut(&self) {
+        self.orders.cut.store(true, Ordering::Relaxed);
+    }
+
+    /// Ends [`cut`](Self::cut).
+    pub fn mend(&self) {
+        self.orders.cut.store(false, Ordering::Relaxed);
+    }
+
     /// The namespace, for programs that are to run in it.
     pub(crate) fn path(&self) -> PathBuf {
         self.namespace.path()
@@ -82,15 +90,21 @@ impl Host {
     /// The Cyclone DDS peer in C on this host, in domain 2, not started yet.
     #[must_use]
     pub fn cyclone_c_started(&self, cell: &Cell, args: &[&str]) -> Started {
+        self.cyclone_c_with(cell, "", args)
+    }
+
+    /// The same with more elements of XML in the section `Discovery` of its configuration.
+    #[must_use]
+    pub fn cyclone_c_with(&self, cell: &Cell, discovery: &str, args: &[&str]) -> Started {
         cell.cyclone_c_started(args)
-            .env("CYCLONEDDS_URI", crate::peers::cyclone_uri(WIRE))
+            .env("CYCLONEDDS_URI", crate::peers::cyclone_uri(WIRE, discovery))
             .on(self)
     }
 }
 
 impl Drop for Host {
     fn drop(&mut self) {
-        self.ends.store(true, Ordering::Relaxed);
+        self.orders.end.store(true, Ordering::Relaxed);
         if let Some(wire) = self.wire.take()
             && wire.join().is_err()
         {

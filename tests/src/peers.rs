@@ -19,13 +19,13 @@ pub const MASTER: &str = "127.0.0.1:11311";
 /// Python and a ROS graph on a busy machine need seconds to come up.
 const START: Duration = Duration::from_secs(30);
 
-/// Cyclone's configuration, which keeps to one interface.
-pub(crate) fn cyclone_uri(interface: &str) -> String {
+/// Cyclone's configuration, which keeps to one interface, with more elements in its section `Discovery`.
+pub(crate) fn cyclone_uri(interface: &str, discovery: &str) -> String {
     format!(
         "<CycloneDDS><Domain id=\"any\">\
          <General><Interfaces><NetworkInterface name=\"{interface}\" multicast=\"true\"/></Interfaces></General>\
          <Discovery><ParticipantIndex>auto</ParticipantIndex>\
-         <MaxAutoParticipantIndex>60</MaxAutoParticipantIndex></Discovery></Domain></CycloneDDS>"
+         <MaxAutoParticipantIndex>60</MaxAutoParticipantIndex>{discovery}</Discovery></Domain></CycloneDDS>"
     )
 }
 
@@ -116,7 +116,7 @@ impl Cell {
     #[must_use]
     pub fn cyclone_started(&self, script: &str, args: &[&str]) -> Started {
         self.python(script, args)
-            .env("CYCLONEDDS_URI", cyclone_uri("lo"))
+            .env("CYCLONEDDS_URI", cyclone_uri("lo", ""))
     }
 
     /// The Fast DDS peer, whose commands `peers/dds/README.md` lists, in domain 2; it has said that it is ready.
@@ -145,7 +145,7 @@ impl Cell {
     #[must_use]
     pub fn cyclone_c_started(&self, args: &[&str]) -> Started {
         Started::new("cyclone-peer", &compiled(CYCLONE))
-            .env("CYCLONEDDS_URI", cyclone_uri("lo"))
+            .env("CYCLONEDDS_URI", cyclone_uri("lo", ""))
             .args(args)
             .args(["--domain", "2"])
             .told()

@@ -156,6 +156,42 @@ fn a_late_reader_of_the_space_gets_the_value_of_each_latched_publisher_that_is_t
     });
 }
 
+#[test]
+fn a_late_reader_of_the_space_gets_the_value_of_each_transient_local_writer_also_beside_a_volatile_one()
+ {
+    let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
+        return;
+    };
+    let _ros2 = cell.bridge_ros2(&[]);
+    let write = |text: &str, durability: &str| {
+        let what = ["pub", "/ua_2_5_10", "std_msgs/String", "--text", text];
+        let kept = ["--count", "1", "--depth", "1", "--durability", durability];
+        cell.cyclone_c(&[&what[..], &kept, &["--wait-readers", "1"]].concat())
+    };
+    let mut writers = ["left", "right", "base"].map(|text| Some(write(text, "transient_local")));
+    let late = UadpSocket::join();
+    let all = BTreeSet::from(["left", "right", "base"].map(str::to_owned));
+    eventually("all three are repeated", SOON, || {
+        (repeated(&late) == all).then_some(())
+    });
+    // What does not latch is the last value of all that do not, beside theirs.
+    let volatile = write("passing", "volatile");
+    eventually("the volatile one is heard", SOON, || {
+        repeated(&late).contains("passing").then_some(())
+    });
+    let _another = write("another", "transient_local");
+    let five = &all | &BTreeSet::from(["passing", "another"].map(str::to_owned));
+    eventually("all five are repeated", SOON, || {
+        (repeated(&late) == five).then_some(())
+    });
+    drop(volatile);
+    drop(writers[1].take());
+    eventually("the one that left is not", SOON, || {
+        let now = repeated(&late);
+        (now.contains("left") && now.contains("base") && !now.contains("right")).then_some(())
+    });
+}
+
 /// A std_msgs/String of space 2 taken at `stamp`, as a key frame.
 fn key_frame(sequence: u16, stamp: i128, text: &str) -> Vec<u8> {
     let header = NetworkHeader {

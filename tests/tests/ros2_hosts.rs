@@ -244,3 +244,41 @@ fn the_last_state_of_best_effort_writers_reaches_the_space_on_a_wire_that_loses_
         ua.hear_scalar((2, 2, 20), Scalar::String(Some(text)));
     }
 }
+
+/// How long Cyclone DDS says it may be silent before it counts as gone, in this test.
+const LEASE: &str = "<LeaseDuration>2s</LeaseDuration>";
+
+/// Hears whether the topic is repeated, which it is every second while somebody latches it.
+fn is_repeated(ua: &UaSide, triple: Triple) -> bool {
+    ua.drain();
+    ua.triples_for(Duration::from_millis(2500))
+        .contains(&triple)
+}
+
+/// A robot has written its map once, and then the radio is out for longer than the robot's lease.
+#[test]
+fn a_latched_value_is_back_after_the_wire_was_cut_for_longer_than_the_lease() {
+    const MAP: (Triple, &str) = ((2, 2, 20), "/ua_2_2_20");
+    let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
+        return;
+    };
+    let host = cell.host(CLEAN);
+    let ua = UaSide::join();
+    let _bridge = bridge(&cell);
+    let what = ["pub", MAP.1, STRING, "--text", "map", "--count", "1"];
+    let kept = ["--durability", "transient_local", "--depth", "1"];
+    let _robot = host
+        .cyclone_c_with(&cell, LEASE, &[&what[..], &kept].concat())
+        .start()
+        .ready(SOON);
+    ua.hear_scalar(MAP.0, Scalar::String(Some("map")));
+    host.cut();
+    eventually("the robot counts as gone", SOON, || {
+        (!is_repeated(&ua, MAP.0)).then_some(())
+    });
+    host.mend();
+    ua.hear_scalar(MAP.0, Scalar::String(Some("map")));
+    eventually("the map is repeated again", SOON, || {
+        is_repeated(&ua, MAP.0).then_some(())
+    });
+}

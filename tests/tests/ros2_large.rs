@@ -302,6 +302,30 @@ async fn a_history_of_large_samples_takes_little_memory() {
 }
 
 #[tokio::test]
+async fn large_samples_that_were_read_take_no_memory_any_more() {
+    const COUNT: u32 = 100;
+    if !patched() {
+        return;
+    }
+    let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
+        return;
+    };
+    let domain = join("127.0.0.1");
+    let mut inbox = inbox(&domain, TOPIC.1);
+    let (size, count) = (MEGA.to_string(), COUNT.to_string());
+    let writes = ["pub", TOPIC.0, TEXT, "--size", &size, "--count", &count];
+    let paced = ["--rate", "20", "--wait-readers", "1"];
+    let own = std::process::id();
+    let before = resident(own);
+    let _writer = cell.cyclone_c(&[&writes[..], &paced].concat());
+    for number in 0..COUNT {
+        is_whole(&text(&mut inbox).await, &numbered(number, MEGA));
+    }
+    let grown = resident(own).saturating_sub(before);
+    assert!(grown < 30 << 20, "{grown} bytes more after {COUNT} MB");
+}
+
+#[tokio::test]
 async fn a_sample_beyond_the_limit_is_refused_by_name() {
     let Some(cell) = Cell::with(&[Peer::FastDds]) else {
         return;

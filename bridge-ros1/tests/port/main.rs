@@ -147,6 +147,7 @@ fn line(event: &PortEvent) -> String {
         PortEvent::Live { topic, live } => format!("{topic} live {live}"),
         PortEvent::Left { topic, .. } => format!("{topic} left"),
         PortEvent::Unmatched { topic } => format!("{topic} unmatched"),
+        PortEvent::Dropped { reason, why, count } => format!("{count} {} {why}", reason.label()),
         PortEvent::CallFailed { topic, detail } => format!("{topic} call failed: {detail}"),
         PortEvent::Lost { topic, why, count } => {
             format!(

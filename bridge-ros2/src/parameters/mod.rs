@@ -22,13 +22,13 @@ use self::store::{Question, Store};
 use crate::cdr::Malformed;
 use crate::domain::{Domain, DomainError};
 use crate::raw::{Payload, Writer};
-use crate::service::{Service, ServiceOptions, ServicePeers, ServiceServer};
+use crate::service::{Service, ServiceCounters, ServiceOptions, ServicePeers, ServiceServer};
 
 /// Serves the parameters of a node. Dropping it withdraws the services.
 #[derive(Debug)]
 pub struct ParameterServer {
     shared: Arc<Shared>,
-    _services: Vec<ServiceServer>,
+    services: Vec<ServiceServer>,
 }
 
 struct Shared {
@@ -81,10 +81,14 @@ impl ParameterServer {
                 },
             )?);
         }
-        Ok(Self {
-            shared,
-            _services: services,
-        })
+        Ok(Self { shared, services })
+    }
+
+    /// What its services have counted so far, all together.
+    #[must_use]
+    pub fn counters(&self) -> ServiceCounters {
+        let each = self.services.iter().map(ServiceServer::counters);
+        each.fold(ServiceCounters::default(), ServiceCounters::plus)
     }
 
     /// The value of a parameter now; `None` when it is not declared.

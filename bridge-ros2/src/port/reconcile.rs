@@ -33,6 +33,7 @@ impl Ros2Port {
         self.graph = self.domain.graph();
         let graph = &self.graph;
         self.incompatible.retain(|guid| graph.holds(*guid));
+        self.report_drops();
         self.announce_anew(now);
         self.find_topics_of_the_space();
         for index in 0..self.sources.len() {
@@ -186,11 +187,12 @@ impl Ros2Port {
             .find(|writer| !ours.contains(writer))
             .cloned();
         let requested = Requested::from_writers(&ours);
+        let returned = requested.is_transient_local() && !source.returned(writers).is_empty();
         match source.reading {
             Reading::Pending => self.open_source(index, requested),
             Reading::Open {
                 requested: before, ..
-            } if before != requested && !ours.is_empty() => {
+            } if (before != requested && !ours.is_empty()) || returned => {
                 self.reopen_source(index, requested, now);
             }
             Reading::Open { slot, .. } => self
@@ -241,8 +243,9 @@ impl Ros2Port {
         }
     }
 
-    /// Another QoS needs another reader. The one before stays for a while: it fills the cache both share, until the
-    /// writers have matched the new one.
+    /// Another QoS needs another reader, and so do transient-local writers that were gone for a while and are to tell again
+    /// what they keep: to the reader there is, that is nothing new. It stays for a while: it fills the cache both share,
+    /// until the writers have matched the new one.
     fn reopen_source(&mut self, index: usize, requested: Requested, now: Instant) {
         let Some(source) = self.sources.get(index) else {
             return;
@@ -259,6 +262,12 @@ impl Ros2Port {
         }
         if let Some(source) = self.sources.get_mut(index) {
             source.reading = Reading::Open { slot, requested };
+            if requested.is_transient_local() {
+                for writer in source.returned(self.graph.writers(&topic)) {
+                    source.reread(writer);
+                    self.inbox.repeat_last(slot, writer);
+                }
+            }
             debug!(
                 topic,
                 ?requested,

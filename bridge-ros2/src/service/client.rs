@@ -16,8 +16,9 @@ use tracing::debug;
 use super::error::{CallPhase, ServiceError};
 use super::mapping::{ClientId, Outgoing, Received, RequestKey};
 use super::opening::Opening;
+use super::pace::{Awaited, Pace};
 use super::peers::{ServicePeers, Snapshot};
-use super::{BUSY, IDLE, SETTLE, Service, ServiceMapping, next, policies};
+use super::{SETTLE, Service, ServiceMapping, next, policies};
 use crate::domain::{Domain, DomainError};
 use crate::raw::{Payload, Reader, Writer};
 
@@ -99,6 +100,7 @@ impl ServiceClient {
             keys: HashMap::new(),
             count: 0,
             looked: None,
+            pace: Pace::new(),
             readers: Vec::new(),
             opening: Opening::default(),
             ignored: Arc::clone(&ignored),
@@ -236,6 +238,7 @@ struct Driver {
     keys: HashMap<RequestKey, u64>,
     count: u64,
     looked: Option<Instant>,
+    pace: Pace,
     /// All that read the requests.
     readers: Vec<GUID>,
     opening: Opening,
@@ -265,12 +268,17 @@ impl Driver {
         }
     }
 
-    fn pause(&self) -> Duration {
-        if self.waiting.is_empty() { IDLE } else { BUSY }
+    fn awaited(&self) -> Awaited {
+        match (self.waiting.is_empty(), self.servers.is_empty()) {
+            (true, _) => Awaited::Nothing,
+            (false, true) => Awaited::Server,
+            (false, false) => Awaited::Turn,
+        }
     }
 
     fn next_look(&self) -> Option<Instant> {
-        self.looked.map(|looked| looked + self.pause())
+        let pause = self.pace.pause(self.awaited());
+        self.looked.map(|looked| looked + pause)
     }
 
     fn called(&mut self, call: Call) {
@@ -295,8 +303,9 @@ impl Driver {
     fn look(&mut self, now: Instant) {
         self.looked = Some(now);
         self.forget_given_up();
-        let snapshot = self.peers.look(now, self.pause());
+        let snapshot = self.peers.look(now, self.pace.age(self.awaited()));
         self.meet(&snapshot, now);
+        self.pace.looked(self.awaited());
         self.give_up_lost();
         let count = self.ready(now);
         self.ready

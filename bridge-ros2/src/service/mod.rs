@@ -8,6 +8,7 @@ mod client;
 mod error;
 mod mapping;
 mod opening;
+mod pace;
 mod peers;
 mod server;
 

@@ -13,6 +13,9 @@ use crate::raw::Writer;
 /// A reader of Cyclone DDS takes what the first heartbeat it hears of a volatile writer announces for older than
 /// itself. RustDDS sends that heartbeat ahead of samples that wait to be sent, so of a burst some would be lost in its
 /// middle. With a single sample the heartbeat comes behind it.
+///
+/// RustDDS as published needs this. With the patches, of which `late-readers` is for the same reader, 20 of 20 bursts of 100
+/// requests were answered without it; it costs them one acknowledgement per new reader.
 #[derive(Debug, Default)]
 pub(super) struct Opening {
     known: BTreeSet<GUID>,

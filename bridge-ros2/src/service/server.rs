@@ -76,6 +76,20 @@ pub struct ServiceCounters {
     pub undelivered: u64,
 }
 
+impl ServiceCounters {
+    /// Of two services together.
+    #[must_use]
+    pub fn plus(self, other: Self) -> Self {
+        Self {
+            calls: self.calls + other.calls,
+            failures: self.failures + other.failures,
+            malformed: self.malformed + other.malformed,
+            overflowed: self.overflowed + other.overflowed,
+            undelivered: self.undelivered + other.undelivered,
+        }
+    }
+}
+
 #[derive(Debug, Default)]
 struct Counters {
     calls: AtomicU64,

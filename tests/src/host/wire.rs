@@ -32,6 +32,13 @@ pub struct Wire {
     pub delay: Duration,
 }
 
+/// What a wire is told while it carries.
+#[derive(Debug, Default)]
+pub(super) struct Orders {
+    pub(super) end: AtomicBool,
+    pub(super) cut: AtomicBool,
+}
+
 /// How long a direction looks away from its orders.
 const LOOK_UP: Duration = Duration::from_millis(50);
 /// Room of a packet socket, for bursts.
@@ -39,14 +46,14 @@ const ROOM: usize = 64 << 20;
 
 impl Wire {
     /// Carries frames between two interfaces of this thread's network until it is asked to end.
-    pub(super) fn carry(self, ends: [&str; 2], asked_to_end: &AtomicBool) {
+    pub(super) fn carry(self, ends: [&str; 2], orders: &Orders) {
         let sockets = ends.map(packet_socket);
         let mut directions = [
             Direction::new(self, 0x2545_f491),
             Direction::new(self, 0x9e37_79b9),
         ];
         let mut frame = vec![0; 65_536];
-        while !asked_to_end.load(Ordering::Relaxed) {
+        while !orders.end.load(Ordering::Relaxed) {
             let due = directions.iter().filter_map(Direction::due).min();
             let wait = due.map_or(LOOK_UP, |due| {
                 due.saturating_duration_since(Instant::now()).min(LOOK_UP)
@@ -57,6 +64,9 @@ impl Wire {
             ppoll(&mut polled, Some(TimeSpec::from_duration(wait)), None).unwrap();
             for (from, to) in [(0, 1), (1, 0)] {
                 while let Some(length) = receive(&sockets[from], &mut frame) {
+                    if orders.cut.load(Ordering::Relaxed) {
+                        continue;
+                    }
                     directions[from].take(&mut frame[..length]);
                 }
                 directions[from].deliver(&sockets[to]);

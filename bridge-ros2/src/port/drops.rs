@@ -1,0 +1,85 @@
+//! What was dropped beside the topics: by the node, its clock and its services.
+
+use std::collections::BTreeMap;
+
+use bridge_core::Reason;
+use bridge_node::PortEvent;
+
+use super::Ros2Port;
+
+/// The counts that were reported, by the reason and by what it was.
+#[derive(Debug, Default)]
+pub(super) struct Drops(BTreeMap<(&'static str, &'static str), u64>);
+
+impl Drops {
+    /// What came on top of what was reported.
+    fn since(
+        &mut self,
+        totals: impl IntoIterator<Item = (Reason, &'static str, u64)>,
+    ) -> Vec<PortEvent> {
+        let mut events = Vec::new();
+        for (reason, why, total) in totals {
+            let told = self.0.entry((reason.label(), why)).or_default();
+            let count = total.saturating_sub(*told);
+            if count > 0 {
+                *told = total;
+                events.push(PortEvent::Dropped { reason, why, count });
+            }
+        }
+        events
+    }
+}
+
+impl Ros2Port {
+    /// Reports what was dropped since the last time.
+    pub(super) fn report_drops(&mut self) {
+        let served = self.parameters.counters();
+        let totals = [
+            (
+                Reason::Malformed,
+                "list of nodes",
+                self.domain.malformed_lists(),
+            ),
+            (Reason::Malformed, "clock", self.clock.malformed()),
+            (Reason::Malformed, "service request", served.malformed),
+            // Our services fail at nothing but a request that they cannot read.
+            (
+                Reason::Malformed,
+                "body of a service request",
+                served.failures,
+            ),
+            (Reason::Overflow, "service request", served.overflowed),
+            (Reason::NotPublished, "service reply", served.undelivered),
+        ];
+        self.events.extend(self.drops.since(totals));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_drop_is_reported_once() {
+        let mut drops = Drops::default();
+        let mut counts = |malformed, failed| {
+            let totals = [
+                (Reason::Malformed, "clock", malformed),
+                (Reason::Overflow, "clock", failed),
+            ];
+            let events = drops.since(totals).into_iter();
+            let counts = events.map(|event| {
+                let PortEvent::Dropped { reason, count, .. } = event else {
+                    panic!("{event:?}");
+                };
+                (reason, count)
+            });
+            counts.collect::<Vec<_>>()
+        };
+        assert_eq!(counts(0, 0), []);
+        let (malformed, overflow) = (Reason::Malformed, Reason::Overflow);
+        assert_eq!(counts(3, 1), [(malformed, 3), (overflow, 1)]);
+        assert_eq!(counts(3, 1), []);
+        assert_eq!(counts(4, 1), [(malformed, 1)]);
+    }
+}
