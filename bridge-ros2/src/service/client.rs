@@ -100,7 +100,7 @@ impl ServiceClient {
             count: 0,
             looked: None,
             readers: Vec::new(),
-            opening: Opening::default(),
+            opening: Opening::new(),
             ignored: Arc::clone(&ignored),
             ready: Arc::clone(&servers),
         };

@@ -13,16 +13,23 @@ use crate::raw::Writer;
 /// A reader of Cyclone DDS takes what the first heartbeat it hears of a volatile writer announces for older than
 /// itself. RustDDS sends that heartbeat ahead of samples that wait to be sent, so of a burst some would be lost in its
 /// middle. With a single sample the heartbeat comes behind it.
-#[derive(Debug, Default)]
-pub(super) struct Opening {
+#[derive(Debug)]
+pub(crate) struct Opening {
     known: BTreeSet<GUID>,
     /// When a sample was written that some reader is yet to acknowledge as its first.
     since: Option<Instant>,
 }
 
 impl Opening {
+    pub(crate) const fn new() -> Self {
+        Self {
+            known: BTreeSet::new(),
+            since: None,
+        }
+    }
+
     /// Whether a sample may be written now.
-    pub(super) fn is_over(&mut self, writer: &Writer, now: Instant) -> bool {
+    pub(crate) fn is_over(&mut self, writer: &Writer, now: Instant) -> bool {
         if let Some(since) = self.since
             && now.saturating_duration_since(since) < PATIENCE
             // The answer is immediate with a wait of zero.
@@ -35,7 +42,7 @@ impl Opening {
     }
 
     /// To be called when a sample was written that all of `readers` get.
-    pub(super) fn written(&mut self, readers: impl Iterator<Item = GUID>, now: Instant) {
+    pub(crate) fn written(&mut self, readers: impl Iterator<Item = GUID>, now: Instant) {
         let readers: BTreeSet<GUID> = readers.collect();
         if !readers.is_subset(&self.known) {
             self.since = Some(now);

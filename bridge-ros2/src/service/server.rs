@@ -139,7 +139,7 @@ impl ServiceServer {
             handled: JoinSet::new(),
             replies: VecDeque::new(),
             readers: BTreeMap::new(),
-            opening: Opening::default(),
+            opening: Opening::new(),
         };
         let task = tokio::spawn(driver.run(reader)).abort_handle();
         Ok(Self {
