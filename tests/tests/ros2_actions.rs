@@ -1,5 +1,7 @@
 //! Actions of ROS 2 between us and the middleware of each vendor, in both roles.
 
+#[path = "ros2_actions/fastdds.rs"]
+mod fastdds;
 #[path = "ros2_actions/fibonacci.rs"]
 mod fibonacci;
 #[path = "ros2_actions/served.rs"]
@@ -12,7 +14,6 @@ use bridge_ros2::action::{
     Outcome, Status,
 };
 use nix::sys::signal::Signal;
-use serde_json::json;
 use system_tests::{Cell, Child, Peer};
 use tokio::time::timeout;
 

@@ -16,7 +16,7 @@ use tokio::task::AbortHandle;
 use crate::fibonacci::{self, ACTION, Ours, SOON, feedback, result, until};
 
 /// A server at work, until dropped.
-struct Serving {
+pub(crate) struct Serving {
     counters: watch::Receiver<ServerCounters>,
     task: AbortHandle,
 }
@@ -28,17 +28,17 @@ impl Drop for Serving {
 }
 
 impl Serving {
-    fn counters(&self) -> ServerCounters {
+    pub(crate) fn counters(&self) -> ServerCounters {
         *self.counters.borrow()
     }
 }
 
-fn options() -> ActionServerOptions {
+pub(crate) fn options() -> ActionServerOptions {
     ActionServerOptions::new(Bytes::from(result(&[])))
 }
 
 /// What the Cyclone peer does with goals, so does this.
-fn serve(ours: &Ours, options: ActionServerOptions) -> Serving {
+pub(crate) fn serve(ours: &Ours, options: ActionServerOptions) -> Serving {
     let action = fibonacci::action();
     let mut server = ActionServer::open(&ours.domain, &ours.peers, &action, options).unwrap();
     let (counters, heard) = watch::channel(server.counters());
