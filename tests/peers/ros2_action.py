@@ -5,10 +5,11 @@ order of 100 and more it sends those up to 3 and waits to be cancelled, which it
 -1 is rejected, -2 aborted.
 
 `call` does what lines of standard input say: `send ORDER`, `cancel N`, `cancel_all`, `cancel_unknown`, `cancel_until N`,
-`result N` and `result_unknown`, with N counting goals from 0; by itself it asks for no result unless told --results.
+`result N`, `result_unknown` and `repeat N`, with N counting goals from 0; by itself it asks for no result unless told --results.
 """
 
 import argparse
+import os
 import queue
 import sys
 import threading
@@ -50,6 +51,11 @@ def nanos(time_):
     return time_.sec * 10**9 + time_.nanosec
 
 
+def valid(reader):
+    """What a reader has, without the word that a writer has left."""
+    return [sample for sample in reader.take(N=1000) if sample.sample_info.valid_data]
+
+
 class Goal:
     def __init__(self, goal_id, order):
         self.id, self.order, self.stamp = goal_id, order, stamp()
@@ -79,15 +85,12 @@ class ActionServer:
         )
 
     def turn(self):
-        for request in self.send.reader.take(N=1000):
-            if hasattr(request, "count"):
-                self.goal(request)
-        for request in self.cancel.reader.take(N=1000):
-            if hasattr(request, "count"):
-                self.cancel_goals(request)
-        for request in self.result.reader.take(N=1000):
-            if hasattr(request, "count"):
-                self.ask(request)
+        for request in valid(self.send.reader):
+            self.goal(request)
+        for request in valid(self.cancel.reader):
+            self.cancel_goals(request)
+        for request in valid(self.result.reader):
+            self.ask(request)
         for goal in list(self.goals.values()):
             if goal.status < SUCCEEDED:
                 self.work(goal)
@@ -272,11 +275,11 @@ class ActionClient:
                 known = self.pending.pop((part, count), None)
                 if known:
                     self.answered(*known, reply)
-        for sample in self.feedback.take(N=1000):
+        for sample in valid(self.feedback):
             number = self.number(sample.goal_id)
             if number is not None:
                 lifetime.say(feedback=number, sequence=list(sample.sequence))
-        for sample in self.status.take(N=1000):
+        for sample in valid(self.status):
             for status in sample.status_list:
                 number = self.number(status.goal_info.goal_id)
                 if number is not None and self.said.get(number) != status.status:
@@ -302,7 +305,7 @@ def status(args, participant):
     reader = DataReader(participant, topic, qos=STATUS_QOS)
     lifetime.say(ready=args.action)
     while True:
-        for sample in reader.take(N=1000):
+        for sample in valid(reader):
             lifetime.say(list=[NAMES[goal.status] for goal in sample.status_list])
         time.sleep(0.002)
 
@@ -349,9 +352,14 @@ def main():
     parser.add_argument("--results", action="store_true", help="the client asks for the result of what is accepted")
     parser.add_argument("--count", type=int, default=3)
     parser.add_argument("--wait", type=float, default=20.0)
+    parser.add_argument("--lease", type=int, help="seconds after which it counts as gone when nothing is heard of it")
     parser.add_argument("--limit", type=float, default=120.0)
     args = parser.parse_args()
     lifetime.bound(args.limit)
+    if args.lease:
+        lease = f"<Discovery><LeaseDuration>{args.lease}s</LeaseDuration></Discovery>"
+        more = f'<CycloneDDS><Domain id="any">{lease}</Domain></CycloneDDS>'
+        os.environ["CYCLONEDDS_URI"] = os.environ.get("CYCLONEDDS_URI", "") + "," + more
     participant = DomainParticipant(args.domain)
     {"serve": serve, "call": call, "status": status, "garbage": garbage}[args.role](args, participant)
 

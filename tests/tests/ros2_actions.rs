@@ -4,6 +4,8 @@
 mod fastdds;
 #[path = "ros2_actions/fibonacci.rs"]
 mod fibonacci;
+#[path = "ros2_actions/graph.rs"]
+mod graph;
 #[path = "ros2_actions/served.rs"]
 mod served;
 
@@ -200,7 +202,7 @@ async fn a_goal_whose_server_is_killed_is_lost_and_the_next_one_is_served_again(
     };
     let ours = Ours::join();
     let client = client(&ours);
-    let server = cyclone(&cell, &[]);
+    let server = cyclone(&cell, &["--lease", "3"]);
     let mut running = client.send_goal(&goal(100));
     feedback(&mut running, 3).await;
     server.signal(Signal::SIGKILL);

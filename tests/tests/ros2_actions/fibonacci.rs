@@ -7,8 +7,8 @@ use bridge_ros2::domain::{Domain, DomainOptions};
 use bridge_ros2::service::ServicePeers;
 use bytes::Bytes;
 
-/// How long a peer may take; the lease of one that was killed is 10 s.
-pub(crate) const SOON: Duration = Duration::from_secs(25);
+/// How long a peer may take.
+pub(crate) const SOON: Duration = Duration::from_secs(20);
 pub(crate) const ACTION: &str = "/count";
 
 /// A participant of ours on the cell's loopback.
@@ -36,6 +36,8 @@ impl Ours {
 pub(crate) fn action() -> Action {
     Action::new(ACTION, &"demo_msgs/Fibonacci".parse().unwrap())
 }
+
+pub(crate) const DEFINITION: &str = "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n";
 
 /// A `Fibonacci_Goal`.
 pub(crate) fn goal(order: i32) -> Vec<u8> {

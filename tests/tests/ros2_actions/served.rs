@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::time::Duration;
 
 use bridge_ros2::action::{
-    ActionServer, ActionServerOptions, NewGoal, ServerCounters, ServerEvent, ServerGoal,
+    ActionServer, ActionServerOptions, GoalError, NewGoal, ServerCounters, ServerEvent, ServerGoal,
 };
 use bytes::Bytes;
 use nix::sys::signal::Signal;
@@ -95,7 +95,9 @@ async fn work(goal: ServerGoal, order: i32) {
     }
     if order >= 100 {
         goal.cancel_agreed().await;
-        goal.canceled(&result(&numbers)).unwrap();
+        // Or the server is no more.
+        let end = goal.canceled(&result(&numbers));
+        assert!(matches!(end, Ok(()) | Err(GoalError::Closed)), "{end:?}");
     } else {
         goal.succeed(&result(&numbers)).unwrap();
     }
@@ -217,45 +219,52 @@ async fn a_client_of_cyclone_cancels_until_a_time_and_all() {
     assert_eq!(of(&client.json_lines(), "result", 1).count(), 0);
 }
 
+fn kept_for(time: Option<Duration>) -> ActionServerOptions {
+    ActionServerOptions {
+        result_timeout: time,
+        ..options()
+    }
+}
+
+/// Hears the status.
+fn watches(cell: &Cell) -> Child {
+    cell.cyclone("ros2_action.py", &["status", ACTION, "--domain", "2"])
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
-async fn a_result_is_kept_for_who_asks_late_and_forgotten_after_its_time() {
+async fn a_result_and_a_status_are_kept_for_who_comes_late() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
     };
     let ours = Ours::join();
-    let options = ActionServerOptions {
-        result_timeout: Some(Duration::from_secs(2)),
-        ..options()
-    };
-    let _serving = serve(&ours, options);
+    let _serving = serve(&ours, kept_for(None));
     let mut client = cyclone(&cell, &[]);
     client.tell("result_unknown");
-    said(
-        &client,
-        &json!({"result": null, "status": "UNKNOWN", "sequence": []}),
-    )
-    .await;
+    let unknown = json!({"result": null, "status": "UNKNOWN", "sequence": []});
+    said(&client, &unknown).await;
     client.tell("send 3");
     said(&client, &json!({"state": 0, "status": "SUCCEEDED"})).await;
-    // Who comes after the end is told of it too.
-    let late = ["status", ACTION, "--domain", "2"];
-    let late = cell.cyclone("ros2_action.py", &late);
-    said(&late, &json!({"list": ["SUCCEEDED"]})).await;
-    client.tell("send 3");
-    said(&client, &json!({"state": 1, "status": "SUCCEEDED"})).await;
-    client.tell("result 1");
-    let end = said(&client, &json!({"result": 1})).await;
-    assert_eq!(
-        (&end["status"], &end["sequence"]),
-        (&json!("SUCCEEDED"), &json!([1, 1, 2]))
-    );
-    said(&late, &json!({"list": []})).await;
+    said(&watches(&cell), &json!({"list": ["SUCCEEDED"]})).await;
     client.tell("result 0");
-    let end = said(&client, &json!({"result": 0})).await;
-    assert_eq!(
-        (&end["status"], &end["sequence"]),
-        (&json!("UNKNOWN"), &json!([]))
-    );
+    let end = json!({"result": 0, "status": "SUCCEEDED", "sequence": [1, 1, 2]});
+    said(&client, &end).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_result_is_forgotten_after_its_time() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let ours = Ours::join();
+    let _serving = serve(&ours, kept_for(Some(Duration::from_secs(1))));
+    let mut client = cyclone(&cell, &[]);
+    let watch = watches(&cell);
+    client.tell("send 3");
+    said(&client, &json!({"state": 0, "status": "SUCCEEDED"})).await;
+    said(&watch, &json!({"list": []})).await;
+    client.tell("result 0");
+    let unknown = json!({"result": 0, "status": "UNKNOWN", "sequence": []});
+    said(&client, &unknown).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
@@ -362,4 +371,39 @@ async fn a_goal_whose_worker_gives_it_up_is_aborted_and_one_nobody_decides_about
     client.tell("send 1");
     drop(server.recv().await);
     said(&client, &json!({"goal": 1, "accepted": false})).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_server_that_comes_back_serves_a_client_that_stayed_and_knows_no_old_goals() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let ours = Ours::join();
+    let serving = serve(&ours, options());
+    let mut client = cyclone(&cell, &["--results"]);
+    client.tell("send 100");
+    said(&client, &json!({"feedback": 0, "sequence": [1, 1, 2]})).await;
+    drop((serving, ours));
+    let again = Ours::join();
+    let _serving = serve(&again, options());
+    // The client does not wait for it, so what it asks before both know each other is lost.
+    let asked = async {
+        while of(&client.json_lines(), "result", 0).count() == 0 {
+            client.tell("result 0");
+            tokio::time::sleep(Duration::from_millis(200)).await;
+        }
+    };
+    tokio::time::timeout(SOON, asked).await.unwrap();
+    said(
+        &client,
+        &json!({"result": 0, "status": "UNKNOWN", "sequence": []}),
+    )
+    .await;
+    client.tell("send 3");
+    said(
+        &client,
+        &json!({"result": 1, "status": "SUCCEEDED", "sequence": [1, 1, 2]}),
+    )
+    .await;
+    said(&client, &json!({"feedback": 1, "sequence": [1, 1, 2]})).await;
 }
