@@ -209,12 +209,17 @@ class ActionClient:
         self.pending = {}
 
     def wait(self, seconds):
-        for part in (self.send, self.cancel, self.result):
-            part.wait(seconds)
+        """Until a server has matched all, as `rcl_action_server_is_available` says it; no longer."""
         end = time.monotonic() + seconds
-        while not (self.feedback.get_matched_publications() and self.status.get_matched_publications()):
+        services = (self.send, self.cancel, self.result)
+        readers = [self.feedback, self.status] + [service.reader for service in services]
+        writers = [service.writer for service in services]
+        while not (
+            all(reader.get_matched_publications() for reader in readers)
+            and all(writer.get_matched_subscriptions() for writer in writers)
+        ):
             if time.monotonic() > end:
-                raise SystemExit("no feedback or status within the time")
+                raise SystemExit("no server within the time")
             time.sleep(0.005)
 
     def number(self, goal_id):

@@ -22,7 +22,7 @@ pub struct ActionServerOptions {
     /// unknown, and those that end without a result of yours. Clients of the type have to be able to read it.
     pub empty_result: Bytes,
     /// How long the result of a goal is kept after its end, by the steady clock; `None` keeps it until there is no
-    /// room. `rcl_action_server_get_default_options` says 10 seconds, before ROS 2 Jazzy 15 minutes.
+    /// room. `rcl_action_server_get_default_options` says 10 seconds, up to ROS 2 Humble 15 minutes.
     pub result_timeout: Option<Duration>,
     /// How many goals are known at once, ended ones included. When there are more, ended ones are forgotten early; when
     /// none has ended, goals are rejected.

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use bridge_ros2::domain::can_announce_type_hashes;
-use messages::{Dialect, Registry};
+use messages::{ActionTypeHashes, Dialect, Registry, TypeHash};
 use serde_json::Value;
 use system_tests::{Cell, Child, Peer};
 
@@ -13,8 +13,8 @@ use crate::served::{options, serve};
 /// The graph as a peer last printed it.
 fn graph(peer: &Child) -> Value {
     let lines = peer.json_lines();
-    let graphs = lines.iter().filter_map(|line| line.get("graph"));
-    graphs.last().cloned().unwrap_or_default()
+    let mut graphs = lines.iter().filter_map(|line| line.get("graph"));
+    graphs.next_back().cloned().unwrap_or_default()
 }
 
 /// Guid, type and user data of the endpoint on a topic.
@@ -22,6 +22,62 @@ fn endpoint(graph: &Value, kind: &str, topic: &str) -> Option<(String, Value)> {
     let endpoints = graph[kind].as_object()?;
     let found = endpoints.iter().find(|(_, one)| one["topic"] == topic)?;
     Some((found.0.clone(), found.1.clone()))
+}
+
+/// Kind, topic, type and hash of an endpoint.
+type Wanted = (&'static str, String, String, TypeHash);
+
+/// The endpoints of the server.
+fn wanted(registry: &Registry, hashes: &ActionTypeHashes) -> Vec<Wanted> {
+    let shared = |name: &str| name.parse().unwrap();
+    let cancel = registry.service_type_hashes(&shared("action_msgs/CancelGoal"));
+    let list = registry.type_hash(&shared("action_msgs/GoalStatusArray"));
+    let own = "demo_msgs::action::dds_::Fibonacci";
+    let feedback = format!("{own}_FeedbackMessage_");
+    let status = "action_msgs::msg::dds_::GoalStatusArray_".to_owned();
+    let topic = |name: &str| format!("rt/count/_action/{name}");
+    let mut found = vec![
+        (
+            "publications",
+            topic("feedback"),
+            feedback,
+            hashes.feedback_message,
+        ),
+        ("publications", topic("status"), status, list.unwrap()),
+    ];
+    for (name, types, hashes) in [
+        (
+            "send_goal",
+            format!("{own}_SendGoal"),
+            hashes.send_goal.clone(),
+        ),
+        (
+            "get_result",
+            format!("{own}_GetResult"),
+            hashes.get_result.clone(),
+        ),
+        (
+            "cancel_goal",
+            "action_msgs::srv::dds_::CancelGoal".to_owned(),
+            cancel.unwrap(),
+        ),
+    ] {
+        let request = format!("rq/count/_action/{name}Request");
+        found.push((
+            "subscriptions",
+            request,
+            format!("{types}_Request_"),
+            hashes.request,
+        ));
+        let reply = format!("rr/count/_action/{name}Reply");
+        found.push((
+            "publications",
+            reply,
+            format!("{types}_Response_"),
+            hashes.response,
+        ));
+    }
+    found
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
@@ -37,62 +93,7 @@ async fn an_action_is_on_the_list_of_its_node_with_the_types_and_hashes_of_ros()
     let hashes = registry.action_type_hashes(&fibonacci, DEFINITION).unwrap();
     fibonacci::action().announce(&ours.domain, &hashes);
     let _serving = serve(&ours, options());
-    let cancel = registry
-        .service_type_hashes(&"action_msgs/CancelGoal".parse().unwrap())
-        .unwrap();
-    let list = registry
-        .type_hash(&"action_msgs/GoalStatusArray".parse().unwrap())
-        .unwrap();
-    let wanted = [
-        (
-            "subscriptions",
-            "rq/count/_action/send_goalRequest",
-            "demo_msgs::action::dds_::Fibonacci_SendGoal_Request_",
-            &hashes.send_goal.request,
-        ),
-        (
-            "publications",
-            "rr/count/_action/send_goalReply",
-            "demo_msgs::action::dds_::Fibonacci_SendGoal_Response_",
-            &hashes.send_goal.response,
-        ),
-        (
-            "subscriptions",
-            "rq/count/_action/cancel_goalRequest",
-            "action_msgs::srv::dds_::CancelGoal_Request_",
-            &cancel.request,
-        ),
-        (
-            "publications",
-            "rr/count/_action/cancel_goalReply",
-            "action_msgs::srv::dds_::CancelGoal_Response_",
-            &cancel.response,
-        ),
-        (
-            "subscriptions",
-            "rq/count/_action/get_resultRequest",
-            "demo_msgs::action::dds_::Fibonacci_GetResult_Request_",
-            &hashes.get_result.request,
-        ),
-        (
-            "publications",
-            "rr/count/_action/get_resultReply",
-            "demo_msgs::action::dds_::Fibonacci_GetResult_Response_",
-            &hashes.get_result.response,
-        ),
-        (
-            "publications",
-            "rt/count/_action/feedback",
-            "demo_msgs::action::dds_::Fibonacci_FeedbackMessage_",
-            &hashes.feedback_message,
-        ),
-        (
-            "publications",
-            "rt/count/_action/status",
-            "action_msgs::msg::dds_::GoalStatusArray_",
-            &list,
-        ),
-    ];
+    let wanted = wanted(&registry, &hashes);
     until("all are announced", || {
         let graph = graph(&peer);
         wanted
@@ -103,7 +104,7 @@ async fn an_action_is_on_the_list_of_its_node_with_the_types_and_hashes_of_ros()
     let seen = graph(&peer);
     let mut guids = BTreeSet::new();
     for (kind, topic, type_name, hash) in wanted {
-        let (guid, endpoint) = endpoint(&seen, kind, topic).unwrap();
+        let (guid, endpoint) = endpoint(&seen, kind, &topic).unwrap();
         assert_eq!(endpoint["type"], type_name);
         let told = if can_announce_type_hashes() {
             format!("typehash={hash};")

@@ -184,6 +184,24 @@ async fn a_client_of_cyclone_sees_its_goals_end_in_every_way() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_burst_of_feedback_is_heard_whole_by_each_new_client() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let ours = Ours::join();
+    let _serving = serve(&ours, options());
+    let mut clients = Vec::new();
+    for _ in 0..6 {
+        let mut client = cyclone(&cell, &["--results"]);
+        client.tell("send 46");
+        said(&client, &json!({"result": 0, "status": "SUCCEEDED"})).await;
+        let heard = || of(&client.json_lines(), "feedback", 0).count();
+        until("the last is heard", || heard() == 46).await;
+        clients.push(client);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_client_of_cyclone_cancels_until_a_time_and_all() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;

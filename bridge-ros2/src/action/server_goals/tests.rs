@@ -63,29 +63,31 @@ fn all() -> impl Iterator<Item = Status> {
 fn each_step_is_taken_from_the_states_of_rcl_and_no_other() {
     use Status as S;
     type Step = fn(&mut ServerGoals<u8>, Ticket) -> Result<(), GoalError>;
-    let end = |end| {
-        move |goals: &mut ServerGoals<u8>, ticket| {
-            goals.end(ticket, end, result(1), now()).map(|_| ())
-        }
-    };
-    let steps: [(&dyn Fn(&mut ServerGoals<u8>, Ticket) -> _, &[S], S); 5] = [
+    fn end(goals: &mut ServerGoals<u8>, ticket: Ticket, end: End) -> Result<(), GoalError> {
+        goals.end(ticket, end, result(1), now()).map(drop)
+    }
+    let steps: [(Step, &[S], S); 5] = [
+        (ServerGoals::execute, &[S::Accepted], S::Executing),
         (
-            &(ServerGoals::execute as Step),
-            &[S::Accepted],
-            S::Executing,
-        ),
-        (
-            &(ServerGoals::cancel as Step),
+            ServerGoals::cancel,
             &[S::Accepted, S::Executing, S::Canceling],
             S::Canceling,
         ),
         (
-            &end(End::Succeed),
+            |goals, ticket| end(goals, ticket, End::Succeed),
             &[S::Executing, S::Canceling],
             S::Succeeded,
         ),
-        (&end(End::Abort), &[S::Executing, S::Canceling], S::Aborted),
-        (&end(End::Cancel), &[S::Canceling], S::Canceled),
+        (
+            |goals, ticket| end(goals, ticket, End::Abort),
+            &[S::Executing, S::Canceling],
+            S::Aborted,
+        ),
+        (
+            |goals, ticket| end(goals, ticket, End::Cancel),
+            &[S::Canceling],
+            S::Canceled,
+        ),
     ];
     for (step, allowed, to) in steps {
         for from in all() {
