@@ -48,6 +48,10 @@ impl<'b> CdrReader<'b> {
         self.u8().map(|byte| byte != 0)
     }
 
+    pub(crate) fn i32(&mut self) -> Result<i32, Malformed> {
+        self.take().map(i32::from_le_bytes)
+    }
+
     pub(crate) fn u32(&mut self) -> Result<u32, Malformed> {
         self.take().map(u32::from_le_bytes)
     }

@@ -6,6 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+use rustdds::discovery::{DiscoveredReaderData, DiscoveredWriterData};
 use rustdds::policy::{Durability, Reliability};
 use rustdds::{DomainParticipant, GUID, QosPolicies, RTPSEntity};
 
@@ -27,6 +28,35 @@ pub struct Endpoint {
 }
 
 impl Endpoint {
+    /// A writer as discovered, and its DDS topic.
+    pub(crate) fn of_writer(writer: DiscoveredWriterData) -> (String, Self) {
+        let data = writer.publication_topic_data;
+        let qos = Arc::new(data.qos());
+        let endpoint = Self {
+            guid: writer.writer_proxy.remote_writer_guid,
+            type_name: data.type_name,
+            // The default of a writer is reliable, that of a reader is best effort (DDS 1.4, 2.2.3.14).
+            reliable: data.reliability != Some(Reliability::BestEffort),
+            transient_local: is_durable(data.durability),
+            qos,
+        };
+        (data.topic_name, endpoint)
+    }
+
+    /// A reader as discovered, and its DDS topic.
+    pub(crate) fn of_reader(reader: DiscoveredReaderData) -> (String, Self) {
+        let data = reader.subscription_topic_data;
+        let qos = data.qos();
+        let endpoint = Self {
+            guid: reader.reader_proxy.remote_reader_guid,
+            type_name: data.type_name().clone(),
+            reliable: matches!(qos.reliability(), Some(Reliability::Reliable { .. })),
+            transient_local: is_durable(qos.durability()),
+            qos: Arc::new(qos),
+        };
+        (data.topic_name().clone(), endpoint)
+    }
+
     /// Whether the endpoint is of Fast DDS, by the vendor in its GUID (eProsima is 01.0f in the OMG's list).
     #[must_use]
     pub fn is_fast_dds(&self) -> bool {
@@ -53,31 +83,10 @@ impl Graph {
     pub fn snapshot(participant: &DomainParticipant) -> Self {
         let prefix = participant.guid().prefix;
         let mut own = BTreeSet::new();
-        let writers = participant.discovered_writers().into_iter().map(|writer| {
-            let data = writer.publication_topic_data;
-            let qos = Arc::new(data.qos());
-            let endpoint = Endpoint {
-                guid: writer.writer_proxy.remote_writer_guid,
-                type_name: data.type_name,
-                // The default of a writer is reliable, that of a reader is best effort (DDS 1.4, 2.2.3.14).
-                reliable: data.reliability != Some(Reliability::BestEffort),
-                transient_local: is_durable(data.durability),
-                qos,
-            };
-            (data.topic_name, endpoint)
-        });
-        let readers = participant.discovered_readers().into_iter().map(|reader| {
-            let data = reader.subscription_topic_data;
-            let qos = data.qos();
-            let endpoint = Endpoint {
-                guid: reader.reader_proxy.remote_reader_guid,
-                type_name: data.type_name().clone(),
-                reliable: matches!(qos.reliability(), Some(Reliability::Reliable { .. })),
-                transient_local: is_durable(qos.durability()),
-                qos: Arc::new(qos),
-            };
-            (data.topic_name().clone(), endpoint)
-        });
+        let writers = participant.discovered_writers();
+        let writers = writers.into_iter().map(Endpoint::of_writer);
+        let readers = participant.discovered_readers();
+        let readers = readers.into_iter().map(Endpoint::of_reader);
         let mut foreign = |(_, endpoint): &(String, Endpoint)| {
             let foreign = endpoint.guid.prefix != prefix;
             if !foreign {

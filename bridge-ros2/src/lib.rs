@@ -3,6 +3,7 @@
 //! Discovery, reliability and fragments are RustDDS'; what makes a participant a ROS node is here. The samples go past
 //! RustDDS as bytes, because their types are known at run time only.
 
+pub mod action;
 mod cdr;
 pub mod clock;
 pub mod compatibility;

@@ -23,8 +23,9 @@
 //! hostile ones (an array length of twenty digits) or know one dialect only.
 //!
 //! # Services and actions
-//! A `.srv` text is two messages, `package/NameRequest` and `package/NameResponse`; an `.action` text is seven, as
-//! genaction makes them. They are messages like any other, but those of a service are found only through it.
+//! A `.srv` text is two messages, `package/NameRequest` and `package/NameResponse`; an `.action` text of ROS 1 is seven, as
+//! genaction makes them, and one of ROS 2 those of [`ActionMessages`]. They are messages like any other, but those of a
+//! service are found only through it.
 //!
 //! # Values
 //! | ROS | field |
@@ -73,5 +74,5 @@ pub use message::{Leaf, MessageType, Rank, standard_type};
 pub use name::{Dialect, TypeName};
 pub use plan::{Literal, Plan, Selection, Wire};
 pub use registry::Registry;
-pub use service::{ActionType, ServiceType};
+pub use service::{ActionMessages, ActionType, ServiceType};
 pub use type_hash::{ActionTypeHashes, ServiceTypeHashes, TypeHash};

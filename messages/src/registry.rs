@@ -7,7 +7,9 @@ use crate::bundle;
 use crate::definition::Definition;
 use crate::resolve::{self, Resolver};
 use crate::service::{self, ServiceDefinition};
-use crate::{ActionType, DefinitionError, Dialect, MessageType, ServiceType, TypeName};
+use crate::{
+    ActionMessages, ActionType, DefinitionError, Dialect, MessageType, ServiceType, TypeName,
+};
 
 /// Message definitions of one dialect by name.
 ///
@@ -141,8 +143,8 @@ impl Registry {
         definition.resolve(name, &mut resolver).map(Arc::new)
     }
 
-    /// Adds the text of an `.action` file, goal, result and feedback parted by two lines `---`: the seven messages
-    /// genaction makes of it, in place of messages of the same names.
+    /// Adds the text of an `.action` file, goal, result and feedback parted by two lines `---`, in place of messages of the
+    /// same names: for ROS 1 the seven messages genaction makes of it, for ROS 2 those of [`ActionMessages`].
     ///
     /// # Errors
     /// [`DefinitionError::Syntax`]; then nothing is added.
@@ -152,13 +154,21 @@ impl Registry {
         Ok(())
     }
 
-    /// The action of that name. Its messages suffice, wherever they are from: a package that was built has a `.msg` file
+    /// The action of ROS 1 of that name. Its messages suffice, wherever they are from: a package that was built has a `.msg` file
     /// of each beside the `.action` file.
     ///
     /// # Errors
     /// As [`Registry::get`], of one of the messages.
     pub fn action(&self, name: &TypeName) -> Result<Arc<ActionType>, DefinitionError> {
         ActionType::of(name, |name| self.get(name)).map(Arc::new)
+    }
+
+    /// The action of ROS 2 of that name, which was added.
+    ///
+    /// # Errors
+    /// As [`Registry::get`], of one of the messages.
+    pub fn action_messages(&self, name: &TypeName) -> Result<ActionMessages, DefinitionError> {
+        ActionMessages::of(name, |name| self.get(name))
     }
 
     /// As [`Registry::suggest`], among the services.

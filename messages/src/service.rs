@@ -112,6 +112,46 @@ impl ActionType {
     }
 }
 
+/// The messages in which an action of ROS 2, `package/Name`, says what only it says (design.ros2.org, "Actions"). Goals and
+/// feedback travel behind the 16 bytes of an id; a result travels in a message of its own, as what comes behind its
+/// status is aligned otherwise than by itself.
+#[derive(Debug)]
+pub struct ActionMessages {
+    goal: Arc<MessageType>,
+    result_response: Arc<MessageType>,
+    feedback: Arc<MessageType>,
+}
+
+impl ActionMessages {
+    pub(crate) fn of(
+        name: &TypeName,
+        get: impl Fn(&TypeName) -> Result<Arc<MessageType>, DefinitionError>,
+    ) -> Result<Self, DefinitionError> {
+        let part = |suffix| get(&derived(name, suffix)?);
+        Ok(Self {
+            goal: part("Goal")?,
+            result_response: part(RESULT_RESPONSE)?,
+            feedback: part("Feedback")?,
+        })
+    }
+
+    /// `Name_Goal`, the first part of the text.
+    pub fn goal(&self) -> &Arc<MessageType> {
+        &self.goal
+    }
+
+    /// `Name_GetResult_Response`: the field `status`, of `action_msgs/GoalStatus`, and the fields of `Name_Result`, the
+    /// second part of the text, below `result`.
+    pub fn result_response(&self) -> &Arc<MessageType> {
+        &self.result_response
+    }
+
+    /// `Name_Feedback`, the third part of the text.
+    pub fn feedback(&self) -> &Arc<MessageType> {
+        &self.feedback
+    }
+}
+
 /// The two messages of a `.srv` text.
 #[derive(Clone, Debug)]
 pub(crate) struct ServiceDefinition {
@@ -187,9 +227,10 @@ pub(crate) fn action_parts(
     ])
 }
 
+const RESULT_RESPONSE: &str = "_GetResult_Response";
 const ACTION_PARTS: &str = "two lines `---` expected, between goal, result and feedback";
 
-/// The seven messages genaction makes of an `.action` text.
+/// The messages genaction makes of an `.action` text, or those rosidl makes that are not alike for all actions.
 pub(crate) fn action(
     dialect: Dialect,
     name: &TypeName,
@@ -197,9 +238,26 @@ pub(crate) fn action(
 ) -> Result<Vec<(TypeName, Arc<Definition>)>, DefinitionError> {
     let goal_result_feedback = action_parts(dialect, name, text)?;
     let x = name.name();
+    let made = match dialect {
+        Dialect::Ros1 => wrappers(x),
+        Dialect::Ros2 => vec![(RESULT_RESPONSE, format!("int8 status\n{x}Result result\n"))],
+    };
+    let mut found = goal_result_feedback.to_vec();
+    for (suffix, text) in made {
+        let part = Part { before: 0, text };
+        found.push(part.parse(dialect, &derived(name, suffix)?)?);
+    }
+    let named = found
+        .into_iter()
+        .map(|definition| (definition.name.clone(), definition));
+    Ok(named.collect())
+}
+
+/// `XAction` and what it consists of.
+fn wrappers(x: &str) -> Vec<(&'static str, String)> {
     let status =
         |part| format!("std_msgs/Header header\nactionlib_msgs/GoalStatus status\n{x}{part}");
-    let made = [
+    vec![
         (
             "Action",
             format!(
@@ -212,16 +270,7 @@ pub(crate) fn action(
         ),
         ("ActionResult", status("Result result\n")),
         ("ActionFeedback", status("Feedback feedback\n")),
-    ];
-    let mut found = goal_result_feedback.to_vec();
-    for (suffix, text) in made {
-        let part = Part { before: 0, text };
-        found.push(part.parse(dialect, &derived(name, suffix)?)?);
-    }
-    let named = found
-        .into_iter()
-        .map(|definition| (definition.name.clone(), definition));
-    Ok(named.collect())
+    ]
 }
 
 /// A piece of a text, and how many lines of it come before.

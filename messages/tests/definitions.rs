@@ -1,11 +1,12 @@
 //! What becomes of definitions: flattened, incomplete, hostile, or a peer's.
 #![expect(clippy::unwrap_used, reason = "test code")]
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use messages::{
-    DefinitionError, Dialect, Leaf, MessageType, Plan, PlanError, Rank, Registry, Selection,
-    TypeName, Wire, standard_type,
+    DefinitionError, Dialect, Leaf, MessageType, NoFields, Plan, PlanError, Rank, Registry,
+    Selection, TypeName, Wire, standard_type,
 };
 use uadp::BuiltinType;
 
@@ -397,4 +398,40 @@ fn a_service_or_action_text_in_the_wrong_number_of_parts_is_refused() {
     let long = format!("t/{}", "S".repeat(250));
     assert!(registry.add_service(&name(&long), "---").is_err());
     assert_eq!(registry.names().count() + registry.services().count(), 0);
+}
+
+#[test]
+fn an_action_of_ros_2_has_its_status_before_its_result() {
+    let mut registry = Registry::bundle(Dialect::Ros2);
+    let fibonacci = name("demo_msgs/Fibonacci");
+    let text = "int32 order\n---\nint32[] sequence\n---\nint32[] partial\n";
+    registry.add_action(&fibonacci, text).unwrap();
+    let action = registry.action_messages(&fibonacci).unwrap();
+    let paths = |message: &MessageType| -> Vec<String> {
+        let leaves = message.leaves().iter();
+        leaves.map(|leaf| leaf.path.clone()).collect()
+    };
+    assert_eq!(paths(action.goal()), ["order"]);
+    assert_eq!(paths(action.feedback()), ["partial"]);
+    let result = action.result_response();
+    assert_eq!(paths(result), ["status", "result.sequence"]);
+    let field = Selection::Field("result".to_owned());
+    let plan = Plan::compile(result, &field, Wire::Cdr).unwrap();
+    assert_eq!(plan.leaves().len(), 1);
+    let nothing = Selection::Template {
+        field: None,
+        rest: BTreeMap::new(),
+    };
+    let plan = Plan::compile(result, &nothing, Wire::Cdr).unwrap();
+    let mut empty = Vec::new();
+    plan.write(&mut NoFields, &mut empty).unwrap();
+    // The count of the sequence is aligned behind the status.
+    assert_eq!(empty, [0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
+    let error = registry
+        .action_messages(&name("demo_msgs/Fibonaci"))
+        .unwrap_err();
+    assert!(
+        error.to_string().contains("demo_msgs/FibonaciGoal"),
+        "{error}"
+    );
 }

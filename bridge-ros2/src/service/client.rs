@@ -102,7 +102,7 @@ impl ServiceClient {
             looked: None,
             pace: Pace::new(),
             readers: Vec::new(),
-            opening: Opening::default(),
+            opening: Opening::new(),
             ignored: Arc::clone(&ignored),
             ready: Arc::clone(&servers),
         };

@@ -100,6 +100,12 @@ pub enum ServiceError {
         /// What is wrong with it.
         why: &'static str,
     },
+    /// The reply is none of the service's type.
+    #[error("the reply of {service} does not read")]
+    Reply {
+        /// The service.
+        service: String,
+    },
     /// The client was closed.
     #[error("the client of {service} was closed while {phase}")]
     Closed {
@@ -119,7 +125,7 @@ impl ServiceError {
             Self::Timeout { phase, .. } | Self::Closed { phase, .. } => {
                 matches!(phase, CallPhase::Answer)
             }
-            Self::Lost { .. } => true,
+            Self::Lost { .. } | Self::Reply { .. } => true,
             Self::OtherType { .. } | Self::Busy { .. } | Self::Request { .. } => false,
         }
     }

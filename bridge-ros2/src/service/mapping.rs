@@ -34,12 +34,12 @@ impl ServiceMapping {
 
 /// A sample as it was read.
 #[derive(Debug, Clone)]
-pub(super) struct Received {
+pub(crate) struct Received {
     /// Encapsulation header first.
-    pub(super) payload: Bytes,
-    pub(super) writer: GUID,
-    pub(super) sequence: i64,
-    pub(super) related: Option<SampleIdentity>,
+    pub(crate) payload: Bytes,
+    pub(crate) writer: GUID,
+    pub(crate) sequence: i64,
+    pub(crate) related: Option<SampleIdentity>,
 }
 
 /// A sample to be written.

@@ -26,7 +26,9 @@ pub use self::mapping::ServiceMapping;
 pub use self::peers::ServicePeers;
 pub use self::server::{ServiceCounters, ServiceOptions, ServiceRequest, ServiceServer};
 
-use self::mapping::Received;
+pub(crate) use self::mapping::Received;
+pub(crate) use self::opening::Opening;
+pub(crate) use self::server::{Answer, Never};
 use crate::domain::Domain;
 use crate::raw::Reader;
 
@@ -97,7 +99,7 @@ impl Service {
 
 /// Reliable and volatile, as rmw's default for services. Depths are no part of discovery; ours is longer than the 10
 /// of rmw, so that a burst of calls is kept.
-fn policies() -> QosPolicies {
+pub(crate) fn policies() -> QosPolicies {
     QosPolicyBuilder::new()
         .reliable(rustdds::Duration::ZERO)
         .durability(Durability::Volatile)
@@ -111,7 +113,7 @@ fn policies() -> QosPolicies {
 }
 
 /// The next sample, or `None` for one that cannot be read. Cancel-safe: a sample is taken only when it is returned.
-async fn next(reader: &Reader) -> Option<Received> {
+pub(crate) async fn next(reader: &Reader) -> Option<Received> {
     poll_fn(|cx| {
         let mut armed = false;
         loop {
@@ -138,8 +140,8 @@ async fn next(reader: &Reader) -> Option<Received> {
 }
 
 /// How often endpoints of peers are looked at when nothing waits for them, and when something does.
-const IDLE: Duration = Duration::from_millis(200);
-const BUSY: Duration = Duration::from_millis(10);
+pub(crate) const IDLE: Duration = Duration::from_millis(200);
+pub(crate) const BUSY: Duration = Duration::from_millis(10);
 /// How long peers take to learn of our endpoints after we learned of theirs: 30 to 190 ms measured.
 const SETTLE: Duration = Duration::from_millis(250);
 /// Samples a writer keeps for repairs, and a reader for us.

@@ -16,16 +16,23 @@ use crate::raw::Writer;
 ///
 /// RustDDS as published needs this. With the patches, of which `late-readers` is for the same reader, 20 of 20 bursts of 100
 /// requests were answered without it; it costs them one acknowledgement per new reader.
-#[derive(Debug, Default)]
-pub(super) struct Opening {
+#[derive(Debug)]
+pub(crate) struct Opening {
     known: BTreeSet<GUID>,
     /// When a sample was written that some reader is yet to acknowledge as its first.
     since: Option<Instant>,
 }
 
 impl Opening {
+    pub(crate) const fn new() -> Self {
+        Self {
+            known: BTreeSet::new(),
+            since: None,
+        }
+    }
+
     /// Whether a sample may be written now.
-    pub(super) fn is_over(&mut self, writer: &Writer, now: Instant) -> bool {
+    pub(crate) fn is_over(&mut self, writer: &Writer, now: Instant) -> bool {
         if let Some(since) = self.since
             && now.saturating_duration_since(since) < PATIENCE
             // The answer is immediate with a wait of zero.
@@ -38,7 +45,7 @@ impl Opening {
     }
 
     /// To be called when a sample was written that all of `readers` get.
-    pub(super) fn written(&mut self, readers: impl Iterator<Item = GUID>, now: Instant) {
+    pub(crate) fn written(&mut self, readers: impl Iterator<Item = GUID>, now: Instant) {
         let readers: BTreeSet<GUID> = readers.collect();
         if !readers.is_subset(&self.known) {
             self.since = Some(now);

@@ -8,8 +8,9 @@ use rustdds::{DomainParticipant, GUID, RTPSEntity};
 use tokio::time::Instant;
 
 use crate::domain::Domain;
+use crate::graph::Endpoint;
 
-/// The endpoints of other participants on the topics of services, shared by all services of a process: RustDDS'
+/// The endpoints of other participants on the topics of services and actions, shared by all of a process: RustDDS'
 /// discovery is copied once for all that look at the same time.
 ///
 /// Our own endpoints are left out: that we call a service does not make it available.
@@ -21,18 +22,11 @@ struct Shared {
     seen: Mutex<Option<(Instant, Arc<Snapshot>)>>,
 }
 
-/// An endpoint and the DDS name of its type.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Peer {
-    pub(super) guid: GUID,
-    pub(super) type_name: String,
-}
-
-/// The endpoints at one moment, by topic.
+/// The endpoints at one moment, by DDS topic.
 #[derive(Debug, Default)]
-pub(super) struct Snapshot {
-    readers: BTreeMap<String, Vec<Peer>>,
-    writers: BTreeMap<String, Vec<Peer>>,
+pub(crate) struct Snapshot {
+    readers: BTreeMap<String, Vec<Endpoint>>,
+    writers: BTreeMap<String, Vec<Endpoint>>,
 }
 
 impl ServicePeers {
@@ -46,7 +40,7 @@ impl ServicePeers {
     }
 
     /// What is known, no older than `age`.
-    pub(super) fn look(&self, now: Instant, age: Duration) -> Arc<Snapshot> {
+    pub(crate) fn look(&self, now: Instant, age: Duration) -> Arc<Snapshot> {
         let mut seen = self.0.seen.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some((at, snapshot)) = seen.as_ref()
             && now.saturating_duration_since(*at) < age
@@ -59,7 +53,7 @@ impl ServicePeers {
     }
 
     /// Whether an endpoint is one of ours.
-    pub(super) fn is_own(&self, endpoint: GUID) -> bool {
+    pub(crate) fn is_own(&self, endpoint: GUID) -> bool {
         endpoint.prefix == self.0.participant.guid().prefix
     }
 }
@@ -75,39 +69,33 @@ impl Snapshot {
         let own = participant.guid().prefix;
         let mut snapshot = Self::default();
         for reader in participant.discovered_readers() {
-            let guid = reader.reader_proxy.remote_reader_guid;
-            let data = reader.subscription_topic_data;
-            if guid.prefix != own && is_service(data.topic_name()) {
-                let peers = snapshot.readers.entry(data.topic_name().clone());
-                peers.or_default().push(Peer {
-                    guid,
-                    type_name: data.type_name().clone(),
-                });
+            if reader.reader_proxy.remote_reader_guid.prefix != own
+                && is_wanted(reader.subscription_topic_data.topic_name())
+            {
+                let (topic, endpoint) = Endpoint::of_reader(reader);
+                snapshot.readers.entry(topic).or_default().push(endpoint);
             }
         }
         for writer in participant.discovered_writers() {
-            let guid = writer.writer_proxy.remote_writer_guid;
-            let data = writer.publication_topic_data;
-            if guid.prefix != own && is_service(&data.topic_name) {
-                let peers = snapshot.writers.entry(data.topic_name);
-                peers.or_default().push(Peer {
-                    guid,
-                    type_name: data.type_name,
-                });
+            if writer.writer_proxy.remote_writer_guid.prefix != own
+                && is_wanted(&writer.publication_topic_data.topic_name)
+            {
+                let (topic, endpoint) = Endpoint::of_writer(writer);
+                snapshot.writers.entry(topic).or_default().push(endpoint);
             }
         }
         snapshot
     }
 
-    pub(super) fn readers(&self, topic: &str) -> &[Peer] {
+    pub(crate) fn readers(&self, topic: &str) -> &[Endpoint] {
         self.readers.get(topic).map_or(&[], Vec::as_slice)
     }
 
-    pub(super) fn writers(&self, topic: &str) -> &[Peer] {
+    pub(crate) fn writers(&self, topic: &str) -> &[Endpoint] {
         self.writers.get(topic).map_or(&[], Vec::as_slice)
     }
 }
 
-fn is_service(topic: &str) -> bool {
-    topic.starts_with("rq/") || topic.starts_with("rr/")
+fn is_wanted(topic: &str) -> bool {
+    topic.starts_with("rq/") || topic.starts_with("rr/") || topic.contains("/_action/")
 }

@@ -9,15 +9,17 @@ use std::time::Duration;
 use bytes::Bytes;
 use rustdds::dds::WriteError;
 use rustdds::{GUID, WriteOptionsBuilder};
+use tokio::sync::oneshot;
 use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, warn};
 
 use super::mapping::{self, Outgoing, Received, ReplyTo};
 use super::opening::Opening;
-use super::peers::{Peer, ServicePeers};
+use super::peers::ServicePeers;
 use super::{BUSY, IDLE, Service, next, policies};
 use crate::domain::{Domain, DomainError};
+use crate::graph::Endpoint;
 use crate::raw::{Payload, Reader, Writer};
 
 /// What a service does for its clients, at most.
@@ -116,6 +118,25 @@ impl ServiceServer {
         H: Fn(ServiceRequest) -> F + Send + Sync + 'static,
         F: Future<Output = Result<Bytes, String>> + Send + 'static,
     {
+        let handler = move |request| {
+            let reply = handler(request);
+            async { reply.await.map(Answer::from) }
+        };
+        Self::open_told(domain, peers, service, options, handler)
+    }
+
+    /// As [`open`](Self::open), for a handler that has to know when its reply is out.
+    pub(crate) fn open_told<H, F>(
+        domain: &Domain,
+        peers: &ServicePeers,
+        service: &Service,
+        options: ServiceOptions,
+        handler: H,
+    ) -> Result<Self, DomainError>
+    where
+        H: Fn(ServiceRequest) -> F + Send + Sync + 'static,
+        F: Future<Output = Result<Answer, String>> + Send + 'static,
+    {
         let types = &service.types;
         // The writer first: who finds our reader then most likely finds it too.
         let writer = domain.open_writer(&service.reply_topic(), &types.response, &policies())?;
@@ -132,7 +153,7 @@ impl ServiceServer {
             handled: JoinSet::new(),
             replies: VecDeque::new(),
             readers: BTreeMap::new(),
-            opening: Opening::default(),
+            opening: Opening::new(),
         };
         let task = tokio::spawn(driver.run(reader)).abort_handle();
         Ok(Self {
@@ -175,7 +196,29 @@ impl Drop for ServiceServer {
     }
 }
 
-type Answer = Pin<Box<dyn Future<Output = Result<Bytes, String>> + Send>>;
+/// What a handler answers.
+#[derive(Debug)]
+pub(crate) struct Answer {
+    /// CDR in little endian with its encapsulation header.
+    pub(crate) bytes: Bytes,
+    /// Dropped once the reply is given to the client's reader, or given up.
+    pub(crate) written: Option<oneshot::Sender<Never>>,
+}
+
+/// What is never sent: that the sender is gone tells all.
+#[derive(Debug)]
+pub(crate) enum Never {}
+
+impl From<Bytes> for Answer {
+    fn from(bytes: Bytes) -> Self {
+        Self {
+            bytes,
+            written: None,
+        }
+    }
+}
+
+type Pending = Pin<Box<dyn Future<Output = Result<Answer, String>> + Send>>;
 
 /// Owns the endpoints and all requests in progress.
 struct Driver {
@@ -183,10 +226,10 @@ struct Driver {
     peers: ServicePeers,
     writer: Writer,
     options: ServiceOptions,
-    handler: Box<dyn Fn(ServiceRequest) -> Answer + Send + Sync>,
+    handler: Box<dyn Fn(ServiceRequest) -> Pending + Send + Sync>,
     counters: Arc<Counters>,
     waiting: VecDeque<(ReplyTo, Bytes)>,
-    handled: JoinSet<(ReplyTo, Result<Bytes, String>)>,
+    handled: JoinSet<(ReplyTo, Result<Answer, String>)>,
     /// Replies whose client is not matched yet, or that find the send window full, oldest first.
     replies: VecDeque<Reply>,
     /// Readers of replies, and since when they are known.
@@ -199,6 +242,7 @@ struct Reply {
     payload: Payload,
     related: Option<rustdds::rpc::SampleIdentity>,
     until: Instant,
+    _written: Option<oneshot::Sender<Never>>,
 }
 
 impl Driver {
@@ -278,15 +322,15 @@ impl Driver {
         }
     }
 
-    fn done(&mut self, to: ReplyTo, result: Result<Bytes, String>, now: Instant) {
-        let sealed = result.and_then(|body| {
+    fn done(&mut self, to: ReplyTo, result: Result<Answer, String>, now: Instant) {
+        let sealed = result.and_then(|Answer { bytes, written }| {
             let Outgoing { payload, related } =
-                mapping::seal_reply(&to, body).map_err(|fault| fault.label().to_owned())?;
+                mapping::seal_reply(&to, bytes).map_err(|fault| fault.label().to_owned())?;
             let payload = Payload::to_write(payload).map_err(|error| error.label().to_owned())?;
-            Ok((payload, related))
+            Ok((payload, related, written))
         });
         match sealed {
-            Ok((payload, related)) => {
+            Ok((payload, related, written)) => {
                 if self.replies.len() >= self.options.max_waiting {
                     self.replies.pop_front();
                     count(&self.counters.undelivered);
@@ -296,6 +340,7 @@ impl Driver {
                     payload,
                     related,
                     until: now + DELIVERY,
+                    _written: written,
                 });
             }
             Err(why) => self.failed(&why),
@@ -352,7 +397,7 @@ impl Driver {
         }
     }
 
-    fn meet(&mut self, readers: &[Peer], now: Instant) {
+    fn meet(&mut self, readers: &[Endpoint], now: Instant) {
         if readers.len() == self.readers.len()
             && readers
                 .iter()

@@ -61,7 +61,7 @@ inline std::string dds_topic(const std::string& prefix, const std::string& name,
     return prefix + (name.rfind('/', 0) == 0 ? name : "/" + name) + suffix;
 }
 
-// `std_msgs/String` and `std_msgs/msg/String` as ROS 2 names them on DDS; `kind` is msg or srv.
+// `std_msgs/String` and `std_msgs/msg/String` as ROS 2 names them on DDS; `kind` is msg, srv or action.
 inline std::string dds_type(const std::string& kind, const std::string& name, const std::string& suffix = "") {
     const auto first = name.find('/');
     const auto last = name.rfind('/');

@@ -21,7 +21,12 @@ struct Program {
 const PROGRAMS: &[Program] = &[
     Program {
         name: "fastdds-peer",
-        sources: &["fastdds.cpp", "commands.cpp", "measure.cpp"],
+        sources: &[
+            "fastdds.cpp",
+            "fastdds_action.cpp",
+            "commands.cpp",
+            "measure.cpp",
+        ],
         types: None,
         libraries: &["-lfastrtps", "-lfastcdr", "-pthread"],
     },
@@ -33,7 +38,14 @@ const PROGRAMS: &[Program] = &[
     },
 ];
 
-const HEADERS: &[&str] = &["arguments.hpp", "body.hpp", "domain.hpp", "lines.hpp"];
+const HEADERS: &[&str] = &[
+    "arguments.hpp",
+    "body.hpp",
+    "domain.hpp",
+    "fastdds.hpp",
+    "fastdds_action.hpp",
+    "lines.hpp",
+];
 
 /// Compiles what is not there yet, or was made from other sources.
 ///

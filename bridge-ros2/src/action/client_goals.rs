@@ -1,0 +1,275 @@
+//! The client's side of goals: what became of each, and what of it waits to be told.
+//!
+//! No clock and no network: answers, statuses, feedback and results come in, events come out.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+
+use bytes::Bytes;
+use tokio::sync::Notify;
+
+use super::error::LostReason;
+use super::types::{GoalId, Status};
+use crate::clock::RosTime;
+
+/// What happens to a goal that was sent, in the order in which it is told.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum GoalEvent {
+    /// A server has taken it, then, by the clock of the server. The first event, unless the goal ends before.
+    Accepted(RosTime),
+    /// It is [`Status::Executing`] or [`Status::Canceling`] now. A state that did not last may not be told of.
+    Status(Status),
+    /// The server reports progress: the `X_Feedback`, CDR with its encapsulation header, in the server's byte order.
+    Feedback(Bytes),
+    /// So many reports of progress gave way to newer ones since the last event.
+    FeedbackDropped(u64),
+    /// The last event.
+    Ended(Outcome),
+}
+
+/// How a goal ended.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// The server did not take it.
+    Rejected,
+    /// The server has ended it.
+    Done {
+        /// Succeeded, canceled or aborted.
+        status: Status,
+        /// The `X_GetResult_Response`: CDR with its encapsulation header, in the server's byte order, status first.
+        result: Bytes,
+    },
+    /// Nothing more will be heard of it.
+    Lost(LostReason),
+}
+
+/// What a client has received and could not use.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ClientCounters {
+    /// Feedback and statuses that do not read.
+    pub malformed: u64,
+    /// Feedback for goals that are not of this client, or have ended.
+    pub others_feedback: u64,
+    /// Reports of progress that gave way to newer ones because nobody asked for them.
+    pub feedback_dropped: u64,
+}
+
+/// How much of each goal may wait.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Limits {
+    pub(super) goals: usize,
+    pub(super) feedback_messages: usize,
+    pub(super) feedback_bytes: usize,
+}
+
+/// The goals somebody holds.
+#[derive(Debug)]
+pub(super) struct ClientGoals {
+    goals: BTreeMap<GoalId, Goal>,
+    limits: Limits,
+    pub(super) counters: ClientCounters,
+}
+
+#[derive(Debug)]
+struct Goal {
+    answer: Answer,
+    status: Status,
+    events: VecDeque<GoalEvent>,
+    /// Of the feedback in `events`.
+    messages: usize,
+    bytes: usize,
+    dropped: u64,
+    outcome: Option<Outcome>,
+    wake: Arc<Notify>,
+}
+
+/// Whether the server has answered. What it says before is kept, and told after the answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Answer {
+    Awaited,
+    Had,
+}
+
+impl ClientGoals {
+    pub(super) fn new(limits: Limits) -> Self {
+        Self {
+            goals: BTreeMap::new(),
+            limits,
+            counters: ClientCounters::default(),
+        }
+    }
+
+    /// A goal is about to be sent. `wake` is rung for each event.
+    pub(super) fn sent(&mut self, id: GoalId, wake: Arc<Notify>) {
+        let open = self.goals.values().filter(|goal| goal.outcome.is_none());
+        let full = open.count() >= self.limits.goals;
+        let goal = Goal {
+            answer: Answer::Awaited,
+            status: Status::Unknown,
+            events: VecDeque::new(),
+            messages: 0,
+            bytes: 0,
+            dropped: 0,
+            outcome: None,
+            wake,
+        };
+        self.goals.insert(id, goal);
+        if full {
+            let busy = LostReason::Busy(self.limits.goals);
+            self.end(id, Outcome::Lost(busy));
+        }
+    }
+
+    /// A server has accepted the goal.
+    pub(super) fn accepted(&mut self, id: GoalId, stamp: RosTime) {
+        if let Some(goal) = self.open(id)
+            && goal.answer == Answer::Awaited
+        {
+            goal.answer = Answer::Had;
+            if goal.status == Status::Unknown {
+                goal.status = Status::Accepted;
+            }
+            goal.events.push_front(GoalEvent::Accepted(stamp));
+            goal.wake.notify_one();
+        }
+    }
+
+    /// The server's list says so. It may be older than what is known, as other topics overtake it.
+    pub(super) fn status(&mut self, id: GoalId, status: Status) {
+        let Some(goal) = self.open(id) else {
+            return;
+        };
+        if rank(status) <= rank(goal.status) {
+            return;
+        }
+        goal.status = status;
+        if matches!(status, Status::Executing | Status::Canceling) {
+            goal.tell(GoalEvent::Status(status));
+        }
+    }
+
+    /// The server reports progress.
+    pub(super) fn feedback(&mut self, id: GoalId, body: Bytes) {
+        let Limits {
+            feedback_messages,
+            feedback_bytes,
+            ..
+        } = self.limits;
+        let Some(goal) = self.open(id) else {
+            self.counters.others_feedback += 1;
+            return;
+        };
+        goal.messages += 1;
+        goal.bytes += body.len();
+        goal.tell(GoalEvent::Feedback(body));
+        let mut dropped = 0;
+        while goal.messages > 1
+            && (goal.messages > feedback_messages || goal.bytes > feedback_bytes)
+        {
+            goal.drop_oldest();
+            dropped += 1;
+        }
+        goal.dropped += dropped;
+        self.counters.feedback_dropped += dropped;
+    }
+
+    /// The goal has ended.
+    pub(super) fn end(&mut self, id: GoalId, outcome: Outcome) {
+        let Some(goal) = self.open(id) else {
+            return;
+        };
+        match &outcome {
+            Outcome::Rejected => goal.forget_events(),
+            Outcome::Done { status, .. } => goal.status = *status,
+            Outcome::Lost(_) if goal.answer == Answer::Awaited => goal.forget_events(),
+            Outcome::Lost(_) => {}
+        }
+        goal.answer = Answer::Had;
+        goal.outcome = Some(outcome.clone());
+        goal.tell(GoalEvent::Ended(outcome));
+    }
+
+    /// Ends all goals.
+    pub(super) fn end_all(&mut self, outcome: &Outcome) {
+        for id in self.goals.keys().copied().collect::<Vec<_>>() {
+            self.end(id, outcome.clone());
+        }
+    }
+
+    /// The next event of a goal.
+    pub(super) fn next_event(&mut self, id: GoalId) -> Option<GoalEvent> {
+        let goal = self.goals.get_mut(&id)?;
+        if goal.answer == Answer::Awaited {
+            return None;
+        }
+        // What was dropped was older than what waits, but for the acceptance.
+        if goal.dropped > 0 && !matches!(goal.events.front(), Some(GoalEvent::Accepted(_))) {
+            return Some(GoalEvent::FeedbackDropped(std::mem::take(
+                &mut goal.dropped,
+            )));
+        }
+        let event = goal.events.pop_front()?;
+        if let GoalEvent::Feedback(body) = &event {
+            goal.messages -= 1;
+            goal.bytes -= body.len();
+        }
+        Some(event)
+    }
+
+    /// What is known of a goal: unknown until it was answered.
+    pub(super) fn known_status(&self, id: GoalId) -> Status {
+        let goal = self.goals.get(&id);
+        let goal = goal.filter(|goal| goal.answer == Answer::Had);
+        goal.map_or(Status::Unknown, |goal| goal.status)
+    }
+
+    /// How a goal ended.
+    pub(super) fn outcome(&self, id: GoalId) -> Option<&Outcome> {
+        self.goals.get(&id)?.outcome.as_ref()
+    }
+
+    /// Nobody holds the goal any more.
+    pub(super) fn forget(&mut self, id: GoalId) {
+        self.goals.remove(&id);
+    }
+
+    fn open(&mut self, id: GoalId) -> Option<&mut Goal> {
+        let goal = self.goals.get_mut(&id);
+        goal.filter(|goal| goal.outcome.is_none())
+    }
+}
+
+impl Goal {
+    fn tell(&mut self, event: GoalEvent) {
+        self.events.push_back(event);
+        self.wake.notify_one();
+    }
+
+    fn drop_oldest(&mut self) {
+        let is_feedback = |event: &GoalEvent| matches!(event, GoalEvent::Feedback(_));
+        let oldest = self.events.iter().position(is_feedback);
+        if let Some(GoalEvent::Feedback(body)) = oldest.and_then(|at| self.events.remove(at)) {
+            self.messages -= 1;
+            self.bytes -= body.len();
+        }
+    }
+
+    fn forget_events(&mut self) {
+        self.events.clear();
+        (self.messages, self.bytes, self.dropped) = (0, 0, 0);
+    }
+}
+
+/// Which status is the later one; the ends are each other's equal.
+const fn rank(status: Status) -> u8 {
+    match status {
+        Status::Unknown => 0,
+        Status::Accepted => 1,
+        Status::Executing => 2,
+        Status::Canceling => 3,
+        Status::Succeeded | Status::Canceled | Status::Aborted => 4,
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,87 @@
+//! The Fibonacci action as bytes.
+
+use std::time::Duration;
+
+use bridge_ros2::action::Action;
+use bridge_ros2::domain::{Domain, DomainOptions};
+use bridge_ros2::service::ServicePeers;
+use bytes::Bytes;
+
+/// How long a peer may take.
+pub(crate) const SOON: Duration = Duration::from_secs(20);
+pub(crate) const ACTION: &str = "/count";
+
+/// A participant of ours on the cell's loopback.
+pub(crate) struct Ours {
+    pub(crate) peers: ServicePeers,
+    pub(crate) domain: Domain,
+}
+
+impl Ours {
+    pub(crate) fn join() -> Self {
+        let domain = Domain::join(&DomainOptions {
+            domain: 2,
+            networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
+            peers: Vec::new(),
+            node: "actions".into(),
+        })
+        .unwrap();
+        Self {
+            peers: ServicePeers::new(&domain),
+            domain,
+        }
+    }
+}
+
+pub(crate) fn action() -> Action {
+    Action::new(ACTION, &"demo_msgs/Fibonacci".parse().unwrap())
+}
+
+pub(crate) const DEFINITION: &str = "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n";
+
+/// A `Fibonacci_Goal`.
+pub(crate) fn goal(order: i32) -> Vec<u8> {
+    [&[0, 1, 0, 0], &order.to_le_bytes()[..]].concat()
+}
+
+/// A `Fibonacci_Feedback`.
+pub(crate) fn feedback(numbers: &[i32]) -> Vec<u8> {
+    let mut bytes = vec![0, 1, 0, 0];
+    bytes.extend_from_slice(&u32::try_from(numbers.len()).unwrap().to_le_bytes());
+    for number in numbers {
+        bytes.extend_from_slice(&number.to_le_bytes());
+    }
+    bytes
+}
+
+/// A `Fibonacci_GetResult_Response` without its status.
+pub(crate) fn result(numbers: &[i32]) -> Vec<u8> {
+    let mut bytes = vec![0, 1, 0, 0, 0, 0, 0, 0];
+    bytes.extend_from_slice(&feedback(numbers)[4..]);
+    bytes
+}
+
+/// The numbers of a sequence that begins that many bytes into a message's body.
+pub(crate) fn numbers(message: &Bytes, at: usize) -> Vec<i32> {
+    let (count, numbers) = message[4 + at..].split_first_chunk::<4>().unwrap();
+    let count = usize::try_from(u32::from_le_bytes(*count)).unwrap();
+    let numbers: Vec<i32> = numbers
+        .chunks_exact(4)
+        .take(count)
+        .map(|number| i32::from_le_bytes(number.try_into().unwrap()))
+        .collect();
+    assert_eq!(numbers.len(), count);
+    numbers
+}
+
+/// Fails when the condition does not hold within [`SOON`]. Lets other tasks run.
+pub(crate) async fn until(what: &str, mut condition: impl FnMut() -> bool) {
+    let deadline = tokio::time::Instant::now() + SOON;
+    while !condition() {
+        assert!(
+            tokio::time::Instant::now() < deadline,
+            "within {SOON:?} not so: {what}"
+        );
+        tokio::time::sleep(Duration::from_millis(5)).await;
+    }
+}
