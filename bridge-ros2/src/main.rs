@@ -248,12 +248,18 @@ impl Program for BridgeRos2 {
 
 /// Whose it is to mend.
 const fn kind(error: &DomainError) -> FailureKind {
-    match error {
-        DomainError::Domain(_) | DomainError::NodeName { .. } | DomainError::Peers => {
-            FailureKind::Usage
-        }
-        DomainError::Security(_) | DomainError::Enclave { .. } => FailureKind::Configuration,
-        _ => FailureKind::Unavailable,
+    if matches!(
+        error,
+        DomainError::Domain(_) | DomainError::NodeName { .. } | DomainError::Peers
+    ) {
+        FailureKind::Usage
+    } else if matches!(
+        error,
+        DomainError::Security(_) | DomainError::Enclave { .. }
+    ) {
+        FailureKind::Configuration
+    } else {
+        FailureKind::Unavailable
     }
 }
 

@@ -7,7 +7,6 @@
 #[cfg(feature = "security")]
 mod files;
 
-use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 use thiserror::Error;
@@ -78,10 +77,10 @@ impl Security {
         enclave: Option<&str>,
     ) -> Result<Self, SecurityError> {
         let set = |name| variable(name).filter(|value| !value.is_empty());
-        if !one_of(&set, "ROS_SECURITY_ENABLE", ["true", "false"])? {
+        if !one_of(set, "ROS_SECURITY_ENABLE", ["true", "false"])? {
             return Ok(Self::Off);
         }
-        let enforced = one_of(&set, "ROS_SECURITY_STRATEGY", ["Enforce", "Permissive"])?;
+        let enforced = one_of(set, "ROS_SECURITY_STRATEGY", ["Enforce", "Permissive"])?;
         let name = set("ROS_SECURITY_ENCLAVE_OVERRIDE");
         let name = name.as_deref().or(enclave).unwrap_or("/");
         if !is_enclave(name) {
@@ -213,7 +212,8 @@ impl Enclave {
     }
 
     /// An error about one of its files.
-    pub(crate) fn fault(folder: &Path, file: &str, why: impl Display) -> SecurityError {
+    #[cfg(feature = "security")]
+    fn fault(folder: &Path, file: &str, why: impl std::fmt::Display) -> SecurityError {
         SecurityError::File {
             path: folder.join(file),
             why: why.to_string(),

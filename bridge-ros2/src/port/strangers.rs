@@ -29,26 +29,22 @@ impl Strangers {
         event: &DomainParticipantStatusEvent,
         now: Instant,
     ) -> Option<Stranger> {
-        match event {
-            DomainParticipantStatusEvent::Authentication {
-                participant,
-                status,
-            } => {
-                let participant = participant.as_ref().try_into().ok()?;
-                self.turn(participant, *status, now)
-            }
-            DomainParticipantStatusEvent::ParticipantLost { id, .. } => {
-                let gone: ParticipantPrefix = id.as_ref().try_into().ok()?;
-                self.0.remove(&gone);
-                None
-            }
-            _ => None,
+        if let DomainParticipantStatusEvent::ParticipantLost { id, .. } = event {
+            let gone: ParticipantPrefix = id.as_ref().try_into().ok()?;
+            self.0.remove(&gone);
         }
+        let DomainParticipantStatusEvent::Authentication {
+            participant,
+            status,
+        } = event
+        else {
+            return None;
+        };
+        self.turn(participant.as_ref().try_into().ok()?, *status, now)
     }
 
     /// Nobody is kept out.
     #[cfg(not(feature = "security"))]
-    #[expect(clippy::unused_self, reason = "as with the feature")]
     pub(super) const fn note(
         &mut self,
         _event: &DomainParticipantStatusEvent,
