@@ -2,9 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, Ipv4Addr};
+use std::path::PathBuf;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
+#[cfg(feature = "security")]
+use rustdds::DomainParticipantSecurityConfigFiles;
 use rustdds::dds::CreateError;
 use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{
@@ -12,6 +15,7 @@ use rustdds::{
     QosPolicies, QosPolicyBuilder, RTPSEntity, Subscriber, Topic, TopicKind,
 };
 use thiserror::Error;
+use tracing::warn;
 
 use crate::clock::{self, RosClock};
 use crate::discovery_info::{self, NodeEntities};
@@ -20,6 +24,7 @@ use crate::node::{Channels, Node, NodeOptions, Services};
 use crate::qos::{Offered, Requested};
 use crate::raw::{Opaque, Payload, RawReader, RawWriter, Reader, Writer};
 use crate::rosout;
+use crate::security::{Enclave, SecurityError};
 
 /// Which domain to join and how.
 #[derive(Debug, Clone)]
@@ -32,6 +37,8 @@ pub struct DomainOptions {
     pub peers: Vec<IpAddr>,
     /// The ROS node it is there; a name alone is one in the root namespace.
     pub node: NodeOptions,
+    /// The enclave by whose files it is secured, if it is.
+    pub enclave: Option<Enclave>,
 }
 
 impl DomainOptions {
@@ -114,6 +121,19 @@ pub enum DomainError {
         /// What RustDDS says.
         source: CreateError,
     },
+    /// The files of the enclave are wrong.
+    #[error("the bridge cannot be secured: {0}")]
+    Security(#[from] SecurityError),
+    /// RustDDS does not join with these files.
+    #[error("the enclave in {} does not let the bridge into domain {domain}: {why}", .folder.display())]
+    Enclave {
+        /// Where the files are.
+        folder: PathBuf,
+        /// The domain.
+        domain: u16,
+        /// What RustDDS says.
+        why: CreateError,
+    },
     /// The ROS node could not be created.
     #[error("cannot create the ROS node: {0}")]
     Node(#[from] std::io::Error),
@@ -161,7 +181,7 @@ impl Domain {
             domain: options.domain,
             source,
         };
-        let participant = participant(options)?.build().map_err(failed)?;
+        let participant = join(options)?;
         let none = QosPolicies::qos_none();
         let publisher = participant.create_publisher(&none).map_err(failed)?;
         let subscriber = participant.create_subscriber(&none).map_err(failed)?;
@@ -406,6 +426,43 @@ impl std::fmt::Debug for Domain {
     }
 }
 
+fn join(options: &DomainOptions) -> Result<DomainParticipant, DomainError> {
+    let domain = options.domain;
+    let builder = participant(options)?;
+    let Some(enclave) = &options.enclave else {
+        return builder
+            .build()
+            .map_err(|source| DomainError::Join { domain, source });
+    };
+    for advice in enclave.check()? {
+        warn!("{advice}");
+    }
+    secured(builder, enclave)
+        .build()
+        .map_err(|why| DomainError::Enclave {
+            folder: enclave.folder.clone(),
+            domain,
+            why,
+        })
+}
+
+#[cfg(feature = "security")]
+fn secured(builder: DomainParticipantBuilder, enclave: &Enclave) -> DomainParticipantBuilder {
+    let files = DomainParticipantSecurityConfigFiles::with_ros_default_names(
+        &enclave.folder,
+        String::new(),
+    );
+    builder.builtin_security(files)
+}
+
+#[cfg(not(feature = "security"))]
+fn secured(
+    builder: DomainParticipantBuilder,
+    _nothing_to_secure_with: &Enclave,
+) -> DomainParticipantBuilder {
+    builder
+}
+
 fn participant(options: &DomainOptions) -> Result<DomainParticipantBuilder, DomainError> {
     // Announcements to 127.0.0.1 find peers on this machine without multicast; they would contradict a choice of
     // other interfaces.
@@ -414,9 +471,12 @@ fn participant(options: &DomainOptions) -> Result<DomainParticipantBuilder, Doma
     if !options.networks.is_empty() {
         builder = builder.with_only_networks(options.networks.iter().copied());
     }
-    // The security enclave, of which ROS tools show that it is the default one.
     #[cfg(feature = "patched-dds")]
-    let builder = builder.user_data(b"enclave=/;".to_vec());
+    let builder = {
+        let enclave = options.enclave.as_ref();
+        let name = enclave.map_or("/", |enclave| enclave.name.as_str());
+        builder.user_data(format!("enclave={name};").into_bytes())
+    };
     with_peers(builder, &options.peers)
 }
 

@@ -21,6 +21,7 @@ pub mod qos;
 pub mod raw;
 mod ros_args;
 mod rosout;
+pub mod security;
 pub mod service;
 mod sink;
 mod source;

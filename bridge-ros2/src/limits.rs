@@ -9,7 +9,21 @@ use crate::graph::Endpoint;
 #[cfg(feature = "patched-dds")]
 macro_rules! rustdds {
     () => {
-        "RustDDS 0.15.1 with 13 patches, samples up to 10 MB"
+        "RustDDS 0.15.1 with 17 patches, samples up to 10 MB"
+    };
+}
+
+#[cfg(feature = "security")]
+macro_rules! security {
+    () => {
+        "with DDS Security"
+    };
+}
+
+#[cfg(not(feature = "security"))]
+macro_rules! security {
+    () => {
+        "without DDS Security"
     };
 }
 
@@ -27,7 +41,14 @@ pub const PATCHED: bool = cfg!(feature = "patched-dds");
 pub const RUSTDDS: &str = rustdds!();
 
 /// The version of this program, and of RustDDS in it.
-pub const VERSION: &str = concat!(env!("CARGO_PKG_VERSION"), " (", rustdds!(), ")");
+pub const VERSION: &str = concat!(
+    env!("CARGO_PKG_VERSION"),
+    " (",
+    rustdds!(),
+    ", ",
+    security!(),
+    ")"
+);
 
 /// The largest serialized sample, in bytes, that all readers with the system's default socket buffers receive. A larger
 /// one is not written, but refused ([`Refusal::TooLarge`](crate::outlet::Refusal::TooLarge)).

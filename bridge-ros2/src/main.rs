@@ -11,9 +11,11 @@ use bridge_node::{Arguments, Context, Failure, FailureKind, Program};
 use bridge_ros2::discovery_info::GidLength;
 use bridge_ros2::domain::{DiscoveryRange, DomainError, DomainOptions};
 use bridge_ros2::node::NodeOptions;
+use bridge_ros2::security::Security;
 use bridge_ros2::{PortOptions, Ros2Port, RosArgs, limits};
 use clap::Parser;
 use mappings::{Mapping, SpaceId};
+use tracing::{info, warn};
 use transport::{Interface, InterfaceError};
 
 fn main() -> ExitCode {
@@ -54,7 +56,8 @@ struct BridgeRos2 {
     /// How many bytes a Gid has in the node's list of readers and writers: 24 up to ROS 2 Humble, 16 from Iron on
     #[arg(long, value_name = "16|24|auto", default_value = "auto", value_parser = gid_length)]
     gid: GidChoice,
-    /// Arguments as `ros2 run` has them: -r __node:=NAME, -r __ns:=/NAMESPACE, -p use_sim_time:=true; ends with `--`
+    /// Arguments as `ros2 run` has them: -r __node:=NAME, -r __ns:=/NAMESPACE, -p use_sim_time:=true, --enclave /NAME;
+    /// ends with `--`
     #[arg(
         long,
         value_name = "ROS_ARGS",
@@ -66,14 +69,33 @@ struct BridgeRos2 {
 }
 
 impl BridgeRos2 {
+    fn ros_args(&self) -> Result<RosArgs, Failure> {
+        RosArgs::parse(&self.ros_args).map_err(|error| Failure::new(FailureKind::Usage, error))
+    }
+
+    /// Whether and with what the ROS 2 side is secured.
+    fn security(&self) -> Result<Security, Failure> {
+        let enclave = self.ros_args()?.enclave;
+        let variable = |name: &str| std::env::var(name).ok();
+        let security = Security::from_env(variable, enclave.as_deref())
+            .map_err(|error| Failure::new(FailureKind::Configuration, error.to_string()))?;
+        if let Security::Refrained(why) = &security {
+            warn!(
+                "ROS_SECURITY_ENABLE is true, and the bridge is NOT secured: {why}. With ROS_SECURITY_STRATEGY=Enforce \
+                 it would not start"
+            );
+        }
+        Ok(security)
+    }
+
     /// The node to be; ROS arguments win.
     fn node(&self) -> Result<NodeOptions, Failure> {
         let RosArgs {
             name,
             namespace,
             use_sim_time,
-        } = RosArgs::parse(&self.ros_args)
-            .map_err(|error| Failure::new(FailureKind::Usage, error))?;
+            enclave: _,
+        } = self.ros_args()?;
         Ok(NodeOptions {
             namespace: namespace.unwrap_or_else(|| self.node_namespace.clone()),
             name: name.unwrap_or_else(|| self.node_name.clone()),
@@ -182,8 +204,13 @@ impl Program for BridgeRos2 {
     const NAME: &'static str = "bridge-ros2";
     const LOCAL: Local = Local::Cdr;
     // On leaving a domain RustDDS reports errors that mean nothing, and at all times much that only its authors need.
-    const QUIET: &'static str = "rustdds=error,rustdds::dds::pubsub=off,rustdds::network=off,\
-                                 rustdds::rtps::dp_event_loop=off";
+    // Of security it reports what a stranger sends, each time; the port tells of strangers, once.
+    const QUIET: &'static str = if cfg!(feature = "security") {
+        "rustdds=error,rustdds::dds::pubsub=off,rustdds::network=off,rustdds::rtps=off,rustdds::security=off,\
+         rustdds::discovery::secure_discovery=off"
+    } else {
+        "rustdds=error,rustdds::dds::pubsub=off,rustdds::network=off,rustdds::rtps::dp_event_loop=off"
+    };
 
     fn arguments(&self) -> &Arguments {
         &self.arguments
@@ -196,6 +223,7 @@ impl Program for BridgeRos2 {
 
     async fn start(&self, context: Context) -> Result<Ros2Port, Failure> {
         let Context { mapping, own } = context;
+        let security = self.security()?;
         let options = PortOptions {
             domain: DomainOptions {
                 domain: self.domain(own, &mapping),
@@ -205,6 +233,7 @@ impl Program for BridgeRos2 {
                     std::env::var("ROS_STATIC_PEERS").ok().as_deref(),
                 )?,
                 node: self.node()?,
+                enclave: security.enclave().cloned(),
             },
             own,
             mapping,
@@ -212,17 +241,25 @@ impl Program for BridgeRos2 {
                 .map(|list| std::env::split_paths(&list).collect::<Vec<PathBuf>>())
                 .unwrap_or_default(),
         };
-        Ros2Port::start(options).map_err(|error| {
-            let kind = if matches!(
-                error,
-                DomainError::Domain(_) | DomainError::NodeName { .. } | DomainError::Peers
-            ) {
-                FailureKind::Usage
-            } else {
-                FailureKind::Unavailable
-            };
-            Failure::new(kind, error.to_string())
-        })
+        info!("DDS Security is {}", security.label());
+        Ros2Port::start(options).map_err(|error| Failure::new(kind(&error), error.to_string()))
+    }
+}
+
+/// Whose it is to mend.
+const fn kind(error: &DomainError) -> FailureKind {
+    if matches!(
+        error,
+        DomainError::Domain(_) | DomainError::NodeName { .. } | DomainError::Peers
+    ) {
+        FailureKind::Usage
+    } else if matches!(
+        error,
+        DomainError::Security(_) | DomainError::Enclave { .. }
+    ) {
+        FailureKind::Configuration
+    } else {
+        FailureKind::Unavailable
     }
 }
 

@@ -8,6 +8,7 @@ mod drops;
 mod reconcile;
 mod schedule;
 mod services;
+mod strangers;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::future::poll_fn;
@@ -41,6 +42,7 @@ use drops::Drops;
 use reconcile::MAX_BATCH;
 use schedule::Schedule;
 use services::Ros2Graph;
+use strangers::{KEPT_OUT, Stranger, Strangers};
 
 /// What a [`Ros2Port`] is started with.
 #[derive(Debug, Clone)]
@@ -61,6 +63,7 @@ pub struct Ros2Port {
     /// By it other bridges know this one.
     presence: RawWriter,
     discovery: DomainParticipantStatusListener,
+    strangers: Strangers,
     own: SpaceId,
     mapping: Arc<Mapping>,
     definitions: Definitions,
@@ -126,6 +129,7 @@ impl Ros2Port {
         let clock = domain.clock();
         let mut port = Self {
             discovery: domain.status_listener(),
+            strangers: Strangers::default(),
             domain,
             presence,
             own,
@@ -204,11 +208,29 @@ impl Ros2Port {
     /// Whether discovery reported a change that is not scheduled for a look yet.
     fn noticed_change(&mut self, cx: &mut Context<'_>) -> bool {
         let before = self.schedule.changed;
+        let now = Instant::now();
+        let mut kept_out = Vec::new();
         let mut events = self.discovery.as_async_status_stream();
         while let Poll::Ready(Some(event)) = events.poll_next_unpin(cx) {
             self.schedule.changed |= is_change(&event);
+            kept_out.extend(self.strangers.note(&event, now));
         }
-        self.schedule.changed && !before
+        self.tell_strangers(&kept_out);
+        self.schedule.changed && !before || !kept_out.is_empty()
+    }
+
+    fn tell_strangers(&mut self, strangers: &[Stranger]) {
+        for stranger in strangers {
+            let told = (stranger.to_string(), KEPT_OUT);
+            if self.told.len() < MAX_TOLD && self.told.insert(told) {
+                warn!("DDS Security: {stranger}");
+            }
+            self.events.push_back(PortEvent::Lost {
+                topic: None,
+                why: KEPT_OUT,
+                count: 1,
+            });
+        }
     }
 
     fn taken(&mut self, taken: Taken<usize>) {
@@ -278,6 +300,8 @@ impl Ros2Port {
         if self.schedule.waiting {
             self.flush(now);
         }
+        let overdue = self.strangers.overdue(now);
+        self.tell_strangers(&overdue);
         if now >= self.schedule.next_reconcile() {
             self.reconcile(now);
         }

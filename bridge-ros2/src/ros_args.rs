@@ -8,6 +8,8 @@ pub struct RosArgs {
     pub name: Option<String>,
     /// `-r __ns:=/NAMESPACE`.
     pub namespace: Option<String>,
+    /// `--enclave /NAME`.
+    pub enclave: Option<String>,
     /// `-p use_sim_time:=true`.
     pub use_sim_time: Option<bool>,
 }
@@ -25,11 +27,18 @@ impl RosArgs {
                 "-r" | "--remap" | "-p" | "--param" => words
                     .next()
                     .ok_or_else(|| format!("{word}: a rule as NAME:=VALUE is missing"))?,
+                "-e" | "--enclave" => {
+                    let name = words
+                        .next()
+                        .ok_or_else(|| format!("{word}: the name of an enclave is missing"))?;
+                    found.enclave = Some(name.to_owned());
+                    continue;
+                }
                 "--ros-args" => continue,
                 "--" => break,
                 other => {
                     return Err(format!(
-                        "{other}: a bridge takes -r and -p after --ros-args"
+                        "{other}: a bridge takes -r, -p and --enclave after --ros-args"
                     ));
                 }
             };
@@ -70,13 +79,15 @@ mod tests {
 
     #[test]
     fn what_ros2_run_gives_a_node_is_taken() {
-        let words = "-r __node:=left -r __ns:=/cell -p use_sim_time:=True -- rest";
+        let words =
+            "-r __node:=left -r __ns:=/cell --enclave /cell/left -p use_sim_time:=True -- rest";
         let words: Vec<&str> = words.split(' ').collect();
         assert_eq!(
             RosArgs::parse(&words).unwrap(),
             RosArgs {
                 name: Some("left".into()),
                 namespace: Some("/cell".into()),
+                enclave: Some("/cell/left".into()),
                 use_sim_time: Some(true),
             }
         );
@@ -90,6 +101,7 @@ mod tests {
             ("-p use_sim_time:=soon", "soon"),
             ("-r", "missing"),
             ("-r __node", "NAME:=VALUE"),
+            ("--enclave", "missing"),
             ("--params-file x.yaml", "--params-file"),
         ] {
             let words: Vec<&str> = words.split(' ').collect();

@@ -66,6 +66,14 @@ impl Cell {
         Some(Self::enter(python))
     }
 
+    /// Reports a test that cannot run with the programs as they were built.
+    ///
+    /// # Panics
+    /// When `CI=true`.
+    pub fn skip(reason: &str) {
+        skip(reason);
+    }
+
     fn enter(python: PathBuf) -> Self {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         // A test that failed with the lock has left nothing behind that the next one could trip over.

@@ -18,6 +18,7 @@ const STRING: &str = "std_msgs::msg::dds_::String_";
 fn join(node: NodeOptions) -> Domain {
     Domain::join(&DomainOptions {
         domain: DOMAIN,
+        enclave: None,
         networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
         peers: Vec::new(),
         node,

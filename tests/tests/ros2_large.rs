@@ -43,6 +43,7 @@ fn join(network: &str) -> Domain {
 fn options(network: &str) -> DomainOptions {
     DomainOptions {
         domain: 2,
+        enclave: None,
         networks: vec![network.parse().unwrap()],
         peers: Vec::new(),
         node: "large".into(),

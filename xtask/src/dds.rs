@@ -17,13 +17,14 @@ use anyhow::{Context as _, bail, ensure};
 use serde_json::Value;
 
 use crate::{
-    shell::{Ended, line, step},
+    shell::{Ended, line, step, succeeds},
     workspace::Workspace,
 };
 
 /// The patched source, ready to be built with.
 pub(crate) struct Rustdds {
     folder: PathBuf,
+    features: [&'static str; 2],
 }
 
 impl Rustdds {
@@ -33,6 +34,12 @@ impl Rustdds {
     /// # Errors
     /// When the locked version has no patches, one of them does not apply, or a folder cannot be written.
     pub(crate) fn prepare(workspace: &Workspace) -> anyhow::Result<Self> {
+        let features = features();
+        if !features.concat().contains("security") {
+            step(
+                "OpenSSL is not there (libssl-dev, pkg-config): bridge-ros2 is built without DDS Security",
+            );
+        }
         let published = Published::find(workspace)?;
         let patches = Patches::read(workspace, &published.version)?;
         let name = format!("rustdds-{}", published.version);
@@ -41,7 +48,7 @@ impl Rustdds {
         let stamp = patched.join(format!("{name}.made-of"));
         let made_of = patches.text(&published.folder);
         if folder.is_dir() && fs::read_to_string(&stamp).is_ok_and(|text| text == made_of) {
-            return Ok(Self { folder });
+            return Ok(Self { folder, features });
         }
         step(&format!(
             "patching RustDDS {} into {}",
@@ -53,7 +60,7 @@ impl Rustdds {
         copy(&published.folder, &folder)?;
         patches.apply(&folder)?;
         fs::write(&stamp, made_of).with_context(|| stamp.display().to_string())?;
-        Ok(Self { folder })
+        Ok(Self { folder, features })
     }
 
     /// A command of cargo that compiles with the patched source, in the root. The verb, such as `build`, comes first in
@@ -67,7 +74,7 @@ impl Rustdds {
         command
             .args(verb)
             .args(self.configuration())
-            .args(FEATURES)
+            .args(self.features)
             .args(rest);
         command
     }
@@ -79,8 +86,19 @@ impl Rustdds {
     }
 }
 
-/// What `bridge-ros2` may use of the patched source only.
-const FEATURES: [&str; 2] = ["--features", "bridge-ros2/patched-dds"];
+/// What `bridge-ros2` may use of the patched source only. For `security` it is linked with OpenSSL: where that is not
+/// there it is left out, so that the demo runs anywhere, but never in CI, whose tests need it.
+fn features() -> [&'static str; 2] {
+    let is_there = env::var_os("OPENSSL_DIR").is_some()
+        || succeeds("pkg-config", &["--exists", "openssl"])
+        || env::var_os("CI").is_some_and(|ci| ci == "true");
+    let features = if is_there {
+        "bridge-ros2/patched-dds,bridge-ros2/security"
+    } else {
+        "bridge-ros2/patched-dds"
+    };
+    ["--features", features]
+}
 
 /// Prepares the source and prints how to build with it by hand.
 pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
@@ -90,7 +108,7 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
         "cargo build {} '{}' {}",
         config.display(),
         paths.display(),
-        FEATURES.join(" ")
+        rustdds.features.join(" ")
     );
     Ok(Ended::WELL)
 }

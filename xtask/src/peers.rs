@@ -16,6 +16,9 @@ use crate::{
     workspace::Workspace,
 };
 
+/// What the programs are built with, beside Rust.
+const APT_BUILD: &[&str] = &["libssl-dev", "pkg-config"];
+
 const APT: &[&str] = &[
     "python3-roslaunch",
     "python3-rosmaster",
@@ -37,6 +40,8 @@ const APT: &[&str] = &[
     "iproute2",
     "valgrind",
     "python3-venv",
+    // Makes the keystores of the tests of DDS Security.
+    "openssl",
 ];
 
 /// For the peers of ROS 2 that are compiled here.
@@ -79,8 +84,8 @@ pub(crate) fn python(workspace: &Workspace) -> PathBuf {
 }
 
 fn apt() -> anyhow::Result<()> {
-    // One at a time: a distribution that lacks a name of the second installs nothing of it, and all of the first.
-    [APT, APT_DDS]
+    // One at a time: a distribution that lacks a name of one installs nothing of it, and all of the others.
+    [APT_BUILD, APT, APT_DDS]
         .into_iter()
         .map(apt_install)
         .fold(Ok(()), Result::and)

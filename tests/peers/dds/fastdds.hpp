@@ -160,6 +160,26 @@ private:
     fast::DataReader* reader_;
 };
 
+// As rmw_fastrtps does with the enclave of a node.
+inline void secure(fast::DomainParticipantQos& qos, const std::string& folder) {
+    const std::string auth = "dds.sec.auth.builtin.PKI-DH.";
+    const std::string access = "dds.sec.access.builtin.Access-Permissions.";
+    const std::pair<std::string, std::string> properties[] = {
+        {"dds.sec.auth.plugin", "builtin.PKI-DH"},
+        {auth + "identity_ca", "file://" + folder + "/identity_ca.cert.pem"},
+        {auth + "identity_certificate", "file://" + folder + "/cert.pem"},
+        {auth + "private_key", "file://" + folder + "/key.pem"},
+        {"dds.sec.crypto.plugin", "builtin.AES-GCM-GMAC"},
+        {"dds.sec.access.plugin", "builtin.Access-Permissions"},
+        {access + "permissions_ca", "file://" + folder + "/permissions_ca.cert.pem"},
+        {access + "governance", "file://" + folder + "/governance.p7s"},
+        {access + "permissions", "file://" + folder + "/permissions.p7s"},
+    };
+    for (const auto& [name, value] : properties) {
+        qos.properties().properties().emplace_back(name, value);
+    }
+}
+
 class FastParticipant : public Participant {
 public:
     explicit FastParticipant(const Arguments& arguments) {
@@ -173,6 +193,9 @@ public:
         }
         qos.transport().use_builtin_transports = false;
         qos.transport().user_transports.push_back(udp);
+        if (const std::string enclave_folder = arguments.text("enclave", ""); !enclave_folder.empty()) {
+            secure(qos, enclave_folder);
+        }
         const auto domain = static_cast<uint32_t>(arguments.number("domain", 0));
         participant_
             = made(fast::DomainParticipantFactory::get_instance()->create_participant(domain, qos), "participant");

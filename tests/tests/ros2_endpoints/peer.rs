@@ -14,6 +14,7 @@ pub(crate) const SOON: Duration = Duration::from_secs(10);
 pub(crate) fn options() -> DomainOptions {
     DomainOptions {
         domain: DOMAIN,
+        enclave: None,
         networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
         peers: Vec::new(),
         node: "endpoints".into(),

@@ -21,6 +21,7 @@ impl Ours {
     pub(crate) fn join() -> Self {
         let domain = Domain::join(&DomainOptions {
             domain: 2,
+            enclave: None,
             networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
             peers: Vec::new(),
             node: "services".into(),

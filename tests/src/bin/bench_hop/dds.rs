@@ -25,6 +25,7 @@ impl Reader {
             .unwrap();
         let options = DomainOptions {
             domain: 2,
+            enclave: None,
             networks: vec![IpAddr::V4(Ipv4Addr::LOCALHOST)],
             peers: Vec::new(),
             node: "bench".into(),

@@ -1,0 +1,136 @@
+//! Participants DDS Security keeps out, so that somebody hears why a robot is not there.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+#[cfg(feature = "security")]
+use rustdds::AuthenticationStatus;
+use rustdds::DomainParticipantStatusEvent;
+use tokio::time::Instant;
+
+use crate::node::ParticipantPrefix;
+
+/// Who is being authenticated, and since when.
+#[derive(Debug, Default)]
+pub(super) struct Strangers(BTreeMap<ParticipantPrefix, Instant>);
+
+/// One that is not let in.
+#[derive(Debug, PartialEq, Eq)]
+pub(super) struct Stranger {
+    participant: ParticipantPrefix,
+    why: &'static str,
+}
+
+impl Strangers {
+    /// Takes note of what discovery reports; the return value is to be told and counted.
+    #[cfg(feature = "security")]
+    pub(super) fn note(
+        &mut self,
+        event: &DomainParticipantStatusEvent,
+        now: Instant,
+    ) -> Option<Stranger> {
+        if let DomainParticipantStatusEvent::ParticipantLost { id, .. } = event {
+            let gone: ParticipantPrefix = id.as_ref().try_into().ok()?;
+            self.0.remove(&gone);
+        }
+        let DomainParticipantStatusEvent::Authentication {
+            participant,
+            status,
+        } = event
+        else {
+            return None;
+        };
+        self.turn(participant.as_ref().try_into().ok()?, *status, now)
+    }
+
+    /// Nobody is kept out.
+    #[cfg(not(feature = "security"))]
+    pub(super) const fn note(
+        &mut self,
+        _event: &DomainParticipantStatusEvent,
+        _now: Instant,
+    ) -> Option<Stranger> {
+        None
+    }
+
+    #[cfg(feature = "security")]
+    fn turn(
+        &mut self,
+        participant: ParticipantPrefix,
+        status: AuthenticationStatus,
+        now: Instant,
+    ) -> Option<Stranger> {
+        match status {
+            AuthenticationStatus::Authenticating => {
+                if self.0.len() < MAX_WAITING {
+                    self.0.entry(participant).or_insert(now);
+                }
+                None
+            }
+            AuthenticationStatus::Authenticated | AuthenticationStatus::Unauthenticated => {
+                self.0.remove(&participant);
+                None
+            }
+            AuthenticationStatus::Rejected => {
+                self.0.remove(&participant);
+                let why = "it is not secured, or by another governance or without permission here";
+                Some(Stranger { participant, why })
+            }
+        }
+    }
+
+    /// Those that should have proved who they are by now. Each is returned once.
+    pub(super) fn overdue(&mut self, now: Instant) -> Vec<Stranger> {
+        let late = |since: &Instant| now.saturating_duration_since(*since) > PATIENCE;
+        let overdue = self.0.iter().filter(|(_, since)| late(since));
+        let strangers: Vec<Stranger> = overdue
+            .map(|(participant, _)| Stranger {
+                participant: *participant,
+                why: "it does not prove who it is: its certificate may be of another identity CA",
+            })
+            .collect();
+        for stranger in &strangers {
+            self.0.remove(&stranger.participant);
+        }
+        strangers
+    }
+}
+
+impl std::fmt::Display for Stranger {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("participant ")?;
+        for byte in self.participant {
+            write!(f, "{byte:02x}")?;
+        }
+        write!(f, " is kept out: {}", self.why)
+    }
+}
+
+/// The reason under which they are counted.
+pub(super) const KEPT_OUT: &str = "participant not authenticated";
+/// A handshake is three messages, each repeated every second.
+const PATIENCE: Duration = Duration::from_secs(8);
+/// Anybody can claim to be somebody.
+#[cfg(feature = "security")]
+const MAX_WAITING: usize = 1024;
+
+#[cfg(all(test, feature = "security"))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_does_not_prove_itself_in_time_is_told_once() {
+        let (mut strangers, start) = (Strangers::default(), Instant::now());
+        let mut turn = |who: u8, status, at| strangers.turn([who; 12], status, at);
+        assert_eq!(turn(1, AuthenticationStatus::Authenticating, start), None);
+        assert_eq!(turn(2, AuthenticationStatus::Authenticating, start), None);
+        assert_eq!(turn(2, AuthenticationStatus::Authenticated, start), None);
+        let refused = turn(3, AuthenticationStatus::Rejected, start).unwrap();
+        assert!(refused.to_string().contains("030303"), "{refused}");
+        assert_eq!(strangers.overdue(start + PATIENCE), []);
+        let late = start + PATIENCE + Duration::from_millis(1);
+        let overdue = strangers.overdue(late);
+        assert!(matches!(overdue.as_slice(), [one] if one.participant == [1; 12]));
+        assert_eq!(strangers.overdue(late), []);
+    }
+}

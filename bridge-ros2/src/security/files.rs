@@ -1,0 +1,124 @@
+//! The files of an enclave, looked at before RustDDS does: it says that something does not verify, not which file to
+//! mend; and it looks neither at the dates of certificates nor at who may read a key.
+
+use std::fs;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
+
+use openssl::asn1::Asn1Time;
+use openssl::error::ErrorStack;
+use openssl::pkcs7::{Pkcs7, Pkcs7Flags};
+use openssl::pkey::{PKey, Private};
+use openssl::stack::Stack;
+use openssl::x509::X509;
+use openssl::x509::store::X509StoreBuilder;
+
+use super::{Enclave, SecurityError};
+
+/// Looks at all files in `folder`; what works but should be mended is returned.
+pub(super) fn check(folder: &Path) -> Result<Vec<String>, SecurityError> {
+    let identity_ca = certificate(folder, "identity_ca.cert.pem")?;
+    let permissions_ca = certificate(folder, "permissions_ca.cert.pem")?;
+    let own = certificate(folder, "cert.pem")?;
+    let fault = |file: &str, why: &str| Err(Enclave::fault(folder, file, why));
+
+    let signed = identity_ca.public_key().and_then(|ca| own.verify(&ca));
+    if !signed.unwrap_or(false) {
+        return fault(
+            "cert.pem",
+            "this certificate is not signed by identity_ca.cert.pem: take both from one keystore",
+        );
+    }
+    let key = private_key(folder)?;
+    if !own.public_key().is_ok_and(|public| public.public_eq(&key)) {
+        return fault(
+            "key.pem",
+            "this key is not that of cert.pem: take both from one enclave",
+        );
+    }
+    for file in ["governance.p7s", "permissions.p7s"] {
+        signed_document(folder, file, &permissions_ca)?;
+    }
+    Ok(readable_by_others(folder).into_iter().collect())
+}
+
+fn read(folder: &Path, file: &str) -> Result<Vec<u8>, SecurityError> {
+    fs::read(folder.join(file))
+        .map_err(|error| Enclave::fault(folder, file, format!("cannot be read: {error}")))
+}
+
+/// A certificate that is valid now.
+fn certificate(folder: &Path, file: &str) -> Result<X509, SecurityError> {
+    let pem = read(folder, file)?;
+    let fault = |why: String| Enclave::fault(folder, file, why);
+    let found =
+        X509::from_pem(&pem).map_err(|error| fault(format!("not a PEM certificate: {error}")))?;
+    let now = Asn1Time::days_from_now(0).map_err(|error| fault(error.to_string()))?;
+    if found.not_after() < &*now {
+        return Err(fault(format!(
+            "this certificate expired on {}: make the enclave anew, or mend the clock of this machine",
+            found.not_after()
+        )));
+    }
+    if found.not_before() > &*now {
+        return Err(fault(format!(
+            "this certificate is not valid before {}: mend the clock of this machine",
+            found.not_before()
+        )));
+    }
+    Ok(found)
+}
+
+fn private_key(folder: &Path) -> Result<PKey<Private>, SecurityError> {
+    let pem = read(folder, "key.pem")?;
+    let fault = |why: &str| Enclave::fault(folder, "key.pem", why);
+    let text = String::from_utf8_lossy(&pem);
+    if text.contains("ENCRYPTED") {
+        return Err(fault(
+            "this key is encrypted with a password, which nobody could type: `openssl pkey` takes it off",
+        ));
+    }
+    if !text.contains("-----BEGIN PRIVATE KEY-----") {
+        return Err(fault(
+            "not a key in PKCS#8, the form of `ros2 security`: `openssl pkcs8 -topk8 -nocrypt` makes it of others",
+        ));
+    }
+    PKey::private_key_from_pem(&pem).map_err(|error| fault(&format!("not a private key: {error}")))
+}
+
+/// A document in S/MIME whose signature is by that authority.
+fn signed_document(folder: &Path, file: &str, authority: &X509) -> Result<(), SecurityError> {
+    let text = read(folder, file)?;
+    let verify = || -> Result<(), ErrorStack> {
+        let (signature, content) = Pkcs7::from_smime(&text)?;
+        let mut signers = Stack::new()?;
+        signers.push(authority.clone())?;
+        let nobody = X509StoreBuilder::new()?.build();
+        // By this certificate and no other that came along; its own chain is of no matter (DDS Security 1.1, 9.4.1.1).
+        let flags = Pkcs7Flags::NOINTERN | Pkcs7Flags::NOVERIFY;
+        signature.verify(&signers, &nobody, content.as_deref(), None, flags)
+    };
+    verify().map_err(|error| {
+        let why = error.errors().last().and_then(|last| last.reason());
+        Enclave::fault(
+            folder,
+            file,
+            format!(
+                "its signature is not by permissions_ca.cert.pem, or the text was changed since ({}): sign it anew",
+                why.unwrap_or("no reason given")
+            ),
+        )
+    })
+}
+
+/// Tells of a key that not only its owner can read.
+fn readable_by_others(folder: &Path) -> Option<String> {
+    let path = folder.join("key.pem");
+    let mode = fs::metadata(&path).ok()?.permissions().mode() & 0o777;
+    (mode & 0o077 != 0).then(|| {
+        format!(
+            "{}: others on this machine can read this key (mode {mode:o}): chmod 600",
+            path.display()
+        )
+    })
+}

@@ -1,0 +1,258 @@
+//! DDS Security: keystores as `ros2 security` lays them out, peers that are secured by them, and what is on the wire.
+
+use std::{
+    fs,
+    io::{ErrorKind, Read as _},
+    os::unix::fs::PermissionsExt as _,
+    path::{Path, PathBuf},
+    process::Command,
+    time::Duration,
+};
+
+use socket2::{Domain, Protocol, Socket, Type};
+
+use crate::{Cell, GROUP, Started, peers::cyclone_uri};
+
+/// A keystore with one certificate authority for everything, and the enclaves `/bridge` and `/peer`, in which all may
+/// read and write all topics of all domains.
+pub struct Keystore(PathBuf);
+
+impl Keystore {
+    /// Makes one in the cell's folder, its domain governed as by `ros2 security create_keystore`: all is encrypted,
+    /// discovery too, and datagrams are signed as a whole.
+    ///
+    /// # Panics
+    /// When `openssl` does not do it.
+    #[must_use]
+    pub fn make(cell: &Cell, name: &str) -> Self {
+        let keystore = Self(cell.folder().join(name));
+        fs::create_dir_all(&keystore.0).unwrap();
+        keystore.key("ca.key.pem");
+        // As sros2 names it; two keystores have authorities of the same name and of different keys.
+        keystore.openssl(
+            "req -x509 -new -key ca.key.pem -sha256 -days 3650 -subj /CN=sros2CA \
+             -addext basicConstraints=critical,CA:TRUE,pathlen:1 -out ca.cert.pem",
+        );
+        keystore.sign("governance", GOVERNANCE);
+        for enclave in ["bridge", "peer"] {
+            keystore.add(enclave);
+        }
+        keystore
+    }
+
+    fn add(&self, name: &str) {
+        let folder = format!("enclaves/{name}");
+        fs::create_dir_all(self.0.join(&folder)).unwrap();
+        self.key(&format!("{folder}/key.pem"));
+        self.openssl(&format!(
+            "req -new -key {folder}/key.pem -subj /CN=\\/{name} -out {folder}/request.pem"
+        ));
+        self.certify(name, 3650);
+        let permissions = PERMISSIONS.replace("NAME", name);
+        self.sign(&format!("{folder}/permissions"), &permissions);
+        for (from, to) in [
+            ("ca.cert.pem", "identity_ca.cert.pem"),
+            ("ca.cert.pem", "permissions_ca.cert.pem"),
+            ("governance.p7s", "governance.p7s"),
+        ] {
+            fs::copy(self.0.join(from), self.enclave(name).join(to)).unwrap();
+        }
+    }
+
+    /// Makes the certificate of an enclave anew, for so many days from now.
+    ///
+    /// # Panics
+    /// When `openssl` does not do it.
+    pub fn certify(&self, name: &str, days: i32) {
+        self.openssl(&format!(
+            "x509 -req -in enclaves/{name}/request.pem -CA ca.cert.pem -CAkey ca.key.pem -CAcreateserial -sha256 \
+             -days {days} -out enclaves/{name}/cert.pem"
+        ));
+    }
+
+    /// What `ROS_SECURITY_KEYSTORE` is set to.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.0
+    }
+
+    /// The folder of an enclave, given without the slash.
+    #[must_use]
+    pub fn enclave(&self, name: &str) -> PathBuf {
+        self.0.join("enclaves").join(name)
+    }
+
+    /// A key as `ros2 security` makes them, which only its owner reads.
+    fn key(&self, file: &str) {
+        self.openssl(&format!(
+            "genpkey -algorithm EC -pkeyopt ec_paramgen_curve:P-256 -out {file}"
+        ));
+        fs::set_permissions(self.0.join(file), fs::Permissions::from_mode(0o600)).unwrap();
+    }
+
+    fn sign(&self, file: &str, text: &str) {
+        fs::write(self.0.join(format!("{file}.xml")), text).unwrap();
+        self.openssl(&format!(
+            "smime -sign -text -in {file}.xml -signer ca.cert.pem -inkey ca.key.pem -out {file}.p7s"
+        ));
+    }
+
+    fn openssl(&self, arguments: &str) {
+        let output = Command::new("openssl")
+            .current_dir(&self.0)
+            .args(arguments.split_whitespace())
+            .output()
+            .unwrap_or_else(|error| panic!("`openssl` does not start: {error}"));
+        assert!(
+            output.status.success(),
+            "openssl {arguments}: {}",
+            String::from_utf8_lossy(&output.stderr)
+        );
+    }
+}
+
+impl Cell {
+    /// bridge-ros2 in domain 2 as the enclave `/bridge`, or not at all. Not started yet.
+    #[must_use]
+    pub fn secured_bridge(&self, keystore: &Keystore, args: &[&str]) -> Started {
+        self.bridge_ros2_started(args)
+            .args(["--ros-args", "--enclave", "/bridge", "--"])
+            .env("ROS_SECURITY_ENABLE", "true")
+            .env("ROS_SECURITY_STRATEGY", "Enforce")
+            .env("ROS_SECURITY_KEYSTORE", keystore.path())
+    }
+
+    /// The Cyclone DDS peer in C as the enclave `/peer`, not started yet.
+    #[must_use]
+    pub fn secured_cyclone(&self, keystore: &Keystore, args: &[&str]) -> Started {
+        let folder = keystore.enclave("peer");
+        let file = |name: &str| format!("file:{}", folder.join(name).display());
+        let library = |kind: &str, call: &str| {
+            let path = plugin(&format!("dds_security_{kind}"));
+            format!(
+                "<Library initFunction=\"init_{call}\" finalizeFunction=\"finalize_{call}\" path=\"{path}\"/>"
+            )
+        };
+        let security = format!(
+            "<Security><Authentication>{}<IdentityCA>{}</IdentityCA><IdentityCertificate>{}</IdentityCertificate>\
+             <PrivateKey>{}</PrivateKey></Authentication><Cryptographic>{}</Cryptographic><AccessControl>{}\
+             <PermissionsCA>{}</PermissionsCA><Governance>{}</Governance><Permissions>{}</Permissions>\
+             </AccessControl></Security></Domain>",
+            library("auth", "authentication"),
+            file("identity_ca.cert.pem"),
+            file("cert.pem"),
+            file("key.pem"),
+            library("crypto", "crypto"),
+            library("ac", "access_control"),
+            file("permissions_ca.cert.pem"),
+            file("governance.p7s"),
+            file("permissions.p7s"),
+        );
+        self.cyclone_c_started(args).env(
+            "CYCLONEDDS_URI",
+            cyclone_uri("lo").replace("</Domain>", &security),
+        )
+    }
+
+    /// The Fast DDS peer as the enclave `/peer`, not started yet.
+    #[must_use]
+    pub fn secured_fastdds(&self, keystore: &Keystore, args: &[&str]) -> Started {
+        self.fastdds_started(args)
+            .args(["--enclave".into(), keystore.enclave("peer")])
+    }
+}
+
+/// Where Debian and Ubuntu put a plugin of Cyclone DDS, which its loader does not look into; else its bare name.
+fn plugin(name: &str) -> String {
+    let folders = fs::read_dir("/usr/lib").into_iter().flatten().flatten();
+    folders
+        .map(|entry| entry.path().join(format!("libddsc0debian/lib{name}.so")))
+        .find(|path| path.is_file())
+        .map_or_else(|| name.to_owned(), |path| path.display().to_string())
+}
+
+/// Hears every UDP datagram of a cell but those of the UADP group.
+pub struct Wiretap(Socket);
+
+impl Wiretap {
+    /// From now on.
+    ///
+    /// # Panics
+    /// When the socket cannot be made.
+    #[must_use]
+    pub fn tap() -> Self {
+        let socket = Socket::new(Domain::IPV4, Type::RAW, Some(Protocol::UDP)).unwrap();
+        socket.set_recv_buffer_size(8 << 20).unwrap();
+        socket
+            .set_read_timeout(Some(Duration::from_millis(1)))
+            .unwrap();
+        Self(socket)
+    }
+
+    /// What came since the last call: IPv4 packets.
+    ///
+    /// # Panics
+    /// When reading fails.
+    #[must_use]
+    pub fn heard(&mut self) -> Vec<Vec<u8>> {
+        let mut packets = Vec::new();
+        let mut buffer = vec![0; 65_536];
+        loop {
+            match self.0.read(&mut buffer) {
+                Ok(length) => packets.push(buffer[..length].to_vec()),
+                Err(error) if error.kind() == ErrorKind::WouldBlock => break,
+                Err(error) => panic!("the wire cannot be heard: {error}"),
+            }
+        }
+        packets.retain(|packet: &Vec<u8>| packet.get(22..24) != Some(&GROUP.port().to_be_bytes()));
+        packets
+    }
+}
+
+const GOVERNANCE: &str = r#"<?xml version="1.0" encoding="utf-8"?>
+<dds xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance"
+    xsi:noNamespaceSchemaLocation="http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governance.xsd">
+  <domain_access_rules>
+    <domain_rule>
+      <domains><id_range><min>0</min><max>230</max></id_range></domains>
+      <allow_unauthenticated_participants>false</allow_unauthenticated_participants>
+      <enable_join_access_control>true</enable_join_access_control>
+      <discovery_protection_kind>ENCRYPT</discovery_protection_kind>
+      <liveliness_protection_kind>ENCRYPT</liveliness_protection_kind>
+      <rtps_protection_kind>SIGN</rtps_protection_kind>
+      <topic_access_rules>
+        <topic_rule>
+          <topic_expression>*</topic_expression>
+          <enable_discovery_protection>true</enable_discovery_protection>
+          <enable_liveliness_protection>true</enable_liveliness_protection>
+          <enable_read_access_control>true</enable_read_access_control>
+          <enable_write_access_control>true</enable_write_access_control>
+          <metadata_protection_kind>ENCRYPT</metadata_protection_kind>
+          <data_protection_kind>ENCRYPT</data_protection_kind>
+        </topic_rule>
+      </topic_access_rules>
+    </domain_rule>
+  </domain_access_rules>
+</dds>
+"#;
+
+const PERMISSIONS: &str = r#"<?xml version="1.0" encoding="utf-8"?>
+<dds xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance"
+    xsi:noNamespaceSchemaLocation="http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_permissions.xsd">
+  <permissions>
+    <grant name="/NAME">
+      <subject_name>CN=/NAME</subject_name>
+      <validity>
+        <not_before>2020-01-01T00:00:00</not_before>
+        <not_after>2037-01-01T00:00:00</not_after>
+      </validity>
+      <allow_rule>
+        <domains><id_range><min>0</min><max>230</max></id_range></domains>
+        <publish><topics><topic>*</topic></topics></publish>
+        <subscribe><topics><topic>*</topic></topics></subscribe>
+      </allow_rule>
+      <default>DENY</default>
+    </grant>
+  </permissions>
+</dds>
+"#;

@@ -1,0 +1,287 @@
+//! bridge-ros2 with DDS Security, by the enclaves of SROS2.
+//!
+//! What needs a bridge that has it is skipped where it was built without (`bridge-ros2 --version`); `cargo xtask` builds
+//! it with.
+
+use std::{
+    fs,
+    os::unix::fs::PermissionsExt as _,
+    process::Command,
+    time::{Duration, Instant},
+};
+
+use system_tests::{
+    Cell, Child, Keystore, METRICS_ROS2, Peer, Started, Triple, UaSide, Wiretap, drops, eventually,
+    metrics, program,
+};
+use uadp::Scalar;
+
+const SOON: Duration = Duration::from_secs(30);
+const STRING: &str = "std_msgs/String";
+/// A value of the space, and one of the domain.
+const THERE: (Triple, &str) = ((1, 2, 10), "/ua_1_2_10");
+const BACK: (Triple, &str) = ((2, 2, 20), "/ua_2_2_20");
+
+type Secured = fn(&Cell, &Keystore, &[&str]) -> Started;
+
+fn sends<'a>(topic: &'a str, text: &'a str) -> [&'a str; 9] {
+    [
+        "pub", topic, STRING, "--text", text, "--count", "0", "--rate", "10",
+    ]
+}
+
+fn has_security() -> bool {
+    let version = Command::new(program("bridge-ros2"))
+        .arg("--version")
+        .output();
+    let version = String::from_utf8(version.unwrap().stdout).unwrap();
+    let [with, without] =
+        ["with", "without"].map(|it| version.contains(&format!(", {it} DDS Security)")));
+    assert!(with != without, "{version}");
+    with
+}
+
+/// The cell, if there is a bridge with DDS Security and the peers.
+fn secured_cell(peers: &[Peer]) -> Option<Cell> {
+    if !has_security() {
+        Cell::skip("bridge-ros2 is built without its feature `security`");
+        return None;
+    }
+    Cell::with(peers)
+}
+
+/// The value reaches the reader; it is written again until then.
+fn reaches(ua: &mut UaSide, text: &str, reader: &Child) {
+    let mut written: Option<Instant> = None;
+    eventually(&format!("the reader has `{text}`"), SOON, || {
+        if written.is_none_or(|at| at.elapsed() > Duration::from_millis(100)) {
+            ua.write(THERE.0, Scalar::String(Some(text)));
+            written = Some(Instant::now());
+        }
+        let values = reader.values();
+        let mut texts = values.iter().map(|value| &value["data"]);
+        texts.any(|found| found == text).then_some(())
+    });
+}
+
+fn answering(bridge: Started) -> Child {
+    let bridge = bridge.start();
+    eventually("the bridge answers", SOON, || metrics(METRICS_ROS2));
+    bridge
+}
+
+/// Whether the text is anywhere, in one byte a character as CDR has it.
+fn is_in(packets: &[Vec<u8>], text: &str) -> bool {
+    packets.iter().any(|packet| {
+        let mut windows = packet.windows(text.len());
+        windows.any(|window| window == text.as_bytes())
+    })
+}
+
+#[test]
+fn values_cross_both_ways_with_secured_peers_and_nothing_of_them_is_readable_on_the_wire() {
+    let Some(cell) = secured_cell(&[Peer::CycloneC, Peer::FastDds]) else {
+        return;
+    };
+    let keystore = Keystore::make(&cell, "keystore");
+    let mut ua = UaSide::join();
+    let mut tap = Wiretap::tap();
+    let mut bridge = answering(cell.secured_bridge(&keystore, &[]));
+    bridge.wait_for_line("DDS Security is on, enclave /bridge", SOON);
+    let makers: [(Secured, &str); 2] = [
+        (Cell::secured_cyclone, "cyclone"),
+        (Cell::secured_fastdds, "fast"),
+    ];
+    for (maker, name) in makers {
+        // Of lengths that are no multiple of 4, which the makers pad differently.
+        let (there, back) = (format!("there {name}"), format!("and back {name}"));
+        let reader = maker(&cell, &keystore, &["sub", THERE.1, STRING])
+            .start()
+            .ready(SOON);
+        reaches(&mut ua, &there, &reader);
+        let _writer = maker(&cell, &keystore, &sends(BACK.1, &back)).start();
+        ua.hear_scalar(BACK.0, Scalar::String(Some(&back)));
+        let packets = tap.heard();
+        assert!(is_in(&packets, "RTPS"), "the wire is heard");
+        for secret in [&there, &back, THERE.1, BACK.1] {
+            assert!(
+                !is_in(&packets, secret.trim_start_matches('/')),
+                "{secret} can be read"
+            );
+        }
+    }
+}
+
+#[test]
+fn who_is_not_of_the_enclave_gets_and_gives_nothing_and_is_told_of() {
+    let Some(cell) = secured_cell(&[Peer::CycloneC]) else {
+        return;
+    };
+    let keystore = Keystore::make(&cell, "keystore");
+    let others = Keystore::make(&cell, "others");
+    let mut ua = UaSide::join();
+    let mut bridge = answering(cell.secured_bridge(&keystore, &[]));
+
+    let mut tap = Wiretap::tap();
+    let open = cell.cyclone_c(&["sub", THERE.1, STRING]);
+    let _open_writer = cell.cyclone_c(&sends(BACK.1, "in the open"));
+    let _open_reader = cell.cyclone_c(&["sub", BACK.1, STRING]);
+    bridge.wait_for_line("is kept out: it is not secured", SOON);
+    let stranger = cell
+        .secured_cyclone(&others, &["sub", THERE.1, STRING])
+        .start()
+        .ready(SOON);
+    let _strange_writer = cell
+        .secured_cyclone(&others, &sends(BACK.1, "of a stranger"))
+        .start();
+    bridge.wait_for_line("does not prove who it is", SOON);
+
+    // Those of the enclave are heard all the while.
+    let reader = cell
+        .secured_cyclone(&keystore, &["sub", THERE.1, STRING])
+        .start()
+        .ready(SOON);
+    let _writer = cell
+        .secured_cyclone(&keystore, &sends(BACK.1, "of the enclave"))
+        .start();
+    reaches(&mut ua, "for the enclave", &reader);
+    ua.hear(BACK.0, "the first value", |fields| {
+        assert!(
+            matches!(
+                fields,
+                [uadp::Variant::Scalar(Scalar::String(Some(
+                    "of the enclave"
+                )))]
+            ),
+            "{fields:?}"
+        );
+        Some(())
+    });
+    assert_eq!(open.values(), Vec::<serde_json::Value>::new());
+    assert_eq!(stranger.values(), Vec::<serde_json::Value>::new());
+    eventually("what is sent in the open can be read", SOON, || {
+        is_in(&tap.heard(), "in the open").then_some(())
+    });
+    let status = metrics(METRICS_ROS2).unwrap();
+    assert!(
+        drops(&status) >= 4,
+        "two in the open, two of another authority: {status}"
+    );
+}
+
+/// How a bridge ends that must not run, and what it says.
+fn refusal(started: Started) -> (Option<i32>, String) {
+    let mut bridge = started.start();
+    let code = bridge.wait_for_end(SOON).code();
+    (code, bridge.lines().join("\n"))
+}
+
+#[test]
+fn an_enclave_that_is_not_in_order_is_refused_with_the_file_to_mend() {
+    let Some(cell) = secured_cell(&[]) else {
+        return;
+    };
+    let keystore = Keystore::make(&cell, "keystore");
+    let others = Keystore::make(&cell, "others");
+    let enclave = keystore.enclave("bridge");
+    let refused = |why: &[&str]| {
+        let (code, lines) = refusal(cell.secured_bridge(&keystore, &[]));
+        assert_eq!(code, Some(78), "{lines}");
+        for text in why {
+            assert!(lines.contains(text), "no `{text}` in {lines}");
+        }
+    };
+    let with = |file: &str, from: &std::path::Path, why: &[&str]| {
+        let (path, kept) = (enclave.join(file), enclave.join("kept"));
+        fs::rename(&path, &kept).unwrap();
+        fs::copy(from, &path).unwrap();
+        refused(why);
+        fs::rename(&kept, &path).unwrap();
+    };
+    let theirs = others.enclave("bridge");
+    let own = keystore.enclave("peer");
+    with(
+        "governance.p7s",
+        &theirs.join("governance.p7s"),
+        &["governance.p7s", "signature", "sign it anew"],
+    );
+    with(
+        "permissions.p7s",
+        &theirs.join("permissions.p7s"),
+        &["permissions.p7s", "signature"],
+    );
+    // Of another enclave, but signed: RustDDS finds no grant for the bridge in it.
+    with(
+        "permissions.p7s",
+        &own.join("permissions.p7s"),
+        &["does not let the bridge into domain 2"],
+    );
+    with(
+        "identity_ca.cert.pem",
+        &theirs.join("identity_ca.cert.pem"),
+        &["cert.pem", "not signed by identity_ca"],
+    );
+    with(
+        "key.pem",
+        &theirs.join("key.pem"),
+        &["key.pem", "not that of cert.pem"],
+    );
+    with("key.pem", &own.join("cert.pem"), &["key.pem", "PKCS#8"]);
+    with(
+        "cert.pem",
+        &own.join("key.pem"),
+        &["cert.pem", "not a PEM certificate"],
+    );
+
+    keystore.certify("bridge", -1);
+    refused(&["cert.pem", "expired on"]);
+    keystore.certify("bridge", 10);
+    fs::remove_file(enclave.join("permissions.p7s")).unwrap();
+    refused(&["lacks permissions.p7s", "create_enclave"]);
+}
+
+#[test]
+fn a_key_others_can_read_is_told_of() {
+    let Some(cell) = secured_cell(&[]) else {
+        return;
+    };
+    let keystore = Keystore::make(&cell, "keystore");
+    let key = keystore.enclave("bridge").join("key.pem");
+    fs::set_permissions(key, fs::Permissions::from_mode(0o644)).unwrap();
+    let mut bridge = answering(cell.secured_bridge(&keystore, &[]));
+    bridge.wait_for_line("others on this machine can read this key (mode 644)", SOON);
+}
+
+/// With either build: without DDS Security nothing else can be had of it.
+#[test]
+fn a_bridge_that_cannot_be_secured_does_not_run_in_the_clear_unless_it_may() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let bridge = |strategy: &str| {
+        cell.bridge_ros2_started(&[])
+            .env("ROS_SECURITY_ENABLE", "true")
+            .env("ROS_SECURITY_STRATEGY", strategy)
+            .env("ROS_SECURITY_KEYSTORE", cell.folder().join("nowhere"))
+    };
+    let why = if has_security() {
+        "there is no folder"
+    } else {
+        "built without DDS Security"
+    };
+    let (code, lines) = refusal(bridge("Enforce"));
+    assert_eq!(code, Some(78), "{lines}");
+    assert!(
+        lines.contains("the bridge cannot be secured") && lines.contains(why),
+        "{lines}"
+    );
+
+    let (code, lines) = refusal(bridge("enforce"));
+    assert_eq!(code, Some(78), "{lines}");
+    assert!(lines.contains("Enforce or Permissive"), "{lines}");
+
+    let mut open = answering(bridge("Permissive"));
+    let warned = open.wait_for_line("NOT secured", SOON);
+    assert!(warned.contains(why), "{warned}");
+    open.wait_for_line("DDS Security is off", SOON);
+}
