@@ -19,6 +19,8 @@ use tracing::warn;
 
 use crate::clock::{self, RosClock};
 use crate::discovery_info::{self, NodeEntities};
+#[cfg(feature = "patched-dds")]
+use crate::driver;
 use crate::graph::{BRIDGE_TYPE, Graph, bridge_topic};
 use crate::node::{Channels, Node, NodeOptions, Services};
 use crate::qos::{Offered, Requested};
@@ -430,20 +432,16 @@ fn join(options: &DomainOptions) -> Result<DomainParticipant, DomainError> {
     let domain = options.domain;
     let builder = participant(options)?;
     let Some(enclave) = &options.enclave else {
-        return builder
-            .build()
-            .map_err(|source| DomainError::Join { domain, source });
+        return build(builder).map_err(|source| DomainError::Join { domain, source });
     };
     for advice in enclave.check()? {
         warn!("{advice}");
     }
-    secured(builder, enclave)
-        .build()
-        .map_err(|why| DomainError::Enclave {
-            folder: enclave.folder.clone(),
-            domain,
-            why,
-        })
+    build(secured(builder, enclave)).map_err(|why| DomainError::Enclave {
+        folder: enclave.folder.clone(),
+        domain,
+        why,
+    })
 }
 
 #[cfg(feature = "security")]
@@ -461,6 +459,24 @@ fn secured(
     _nothing_to_secure_with: &Enclave,
 ) -> DomainParticipantBuilder {
     builder
+}
+
+/// In a runtime, which needs its IO driver, the participant's traffic is a task of it; else a thread.
+#[cfg(feature = "patched-dds")]
+fn build(builder: DomainParticipantBuilder) -> Result<DomainParticipant, CreateError> {
+    if tokio::runtime::Handle::try_current().is_err() {
+        return builder.build();
+    }
+    let (participant, event_loop) = builder.build_with_event_loop()?;
+    driver::spawn(event_loop).map_err(|error| CreateError::OutOfResources {
+        reason: format!("the event loop cannot be watched: {error}"),
+    })?;
+    Ok(participant)
+}
+
+#[cfg(not(feature = "patched-dds"))]
+fn build(builder: DomainParticipantBuilder) -> Result<DomainParticipant, CreateError> {
+    builder.build()
 }
 
 fn participant(options: &DomainOptions) -> Result<DomainParticipantBuilder, DomainError> {

@@ -10,6 +10,8 @@ pub mod compatibility;
 mod definitions;
 pub mod discovery_info;
 pub mod domain;
+#[cfg(feature = "patched-dds")]
+mod driver;
 pub mod graph;
 pub mod inbox;
 pub mod limits;
