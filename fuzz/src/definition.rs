@@ -5,7 +5,8 @@ use std::sync::Arc;
 use messages::{Dialect, MessageType, Plan, Registry, Selection, TypeName, Wire};
 
 /// The first byte says what the text is: `m` a .msg, `s` a .srv, `a` an .action of ROS 1, in capitals of ROS 2, and `f` the
-/// full definition of a ROS 1 connection header. A type that is made of it has a definition that makes it again.
+/// full definition of a ROS 1 connection header. A type that is made of it has a definition that makes it again; for that
+/// of a connection header what it lacks is taken from the bundle, both times.
 pub fn definition(input: &[u8]) {
     let Some((kind, text)) = input.split_first() else {
         return;
@@ -25,15 +26,15 @@ pub fn definition(input: &[u8]) {
             if registry.add(&name, text).is_ok()
                 && let Ok(made) = registry.get(&name)
             {
-                check(&made);
+                check(&made, Registry::empty(dialect));
             }
         }
         b's' => {
             if registry.add_service(&name, text).is_ok()
                 && let Ok(made) = registry.service(&name)
             {
-                check(made.request());
-                check(made.response());
+                check(made.request(), Registry::empty(dialect));
+                check(made.response(), Registry::empty(dialect));
             }
         }
         b'a' => {
@@ -41,20 +42,21 @@ pub fn definition(input: &[u8]) {
                 && let Ok(made) = registry.action(&name)
             {
                 for part in [made.goal(), made.result(), made.feedback(), made.action()] {
-                    check(part);
+                    check(part, Registry::empty(dialect));
                 }
             }
         }
         b'f' => {
             if let Ok(made) = registry.add_ros1_definition(&name, text) {
-                check(&made);
+                check(&made, Registry::bundle(dialect));
             }
         }
         _ => {}
     }
 }
 
-fn check(made: &Arc<MessageType>) {
+/// `others`: where the types are that its definition lacks.
+fn check(made: &Arc<MessageType>, mut others: Registry) {
     assert!(made.leaves().len() <= 4096, "flattening is bounded");
     let wire = match made.dialect() {
         Dialect::Ros1 => Wire::Ros1,
@@ -71,7 +73,7 @@ fn check(made: &Arc<MessageType>) {
         }
     }
     if made.dialect() == Dialect::Ros1 {
-        let again = Registry::empty(Dialect::Ros1)
+        let again = others
             .add_ros1_definition(made.name(), made.definition())
             .expect("a definition names all it needs");
         assert_eq!(again.md5(), made.md5());
