@@ -14,12 +14,10 @@ pub fn mapping(input: &[u8]) {
         .filter(|found| found.severity == Severity::Error);
     assert_eq!(checked.mapping.is_none(), errors.count() > 0);
     assert!(checked.findings.len() <= 256, "findings are bounded");
-    let lines = text.lines().count();
+    // YAML breaks lines at a carriage return alone too.
+    let lines = 1 + text.matches(['\n', '\r']).count();
     for found in &checked.findings {
-        assert!(
-            found.at.line >= 1 && found.at.line <= lines + 1,
-            "{found:?}"
-        );
+        assert!(found.at.line >= 1 && found.at.line <= lines, "{found:?}");
     }
     let told = checked.render(text);
     assert_eq!(told.is_empty(), checked.findings.is_empty());

@@ -27,6 +27,14 @@ impl<'a> StructureReader<'a> {
         Scalar::read(builtin, &mut self.reader)
     }
 
+    /// The next `count` fields at once, single values of `builtin`, a type of fixed size: little endian, back to back.
+    /// `None`, and nothing taken, when the body ends before.
+    pub fn take_scalars(&mut self, builtin: BuiltinType, count: u16) -> Option<&'a [u8]> {
+        let size = builtin.fixed_size()?;
+        let len = usize::from(count).checked_mul(size)?;
+        self.reader.bytes(len, "structure").ok()
+    }
+
     /// The next field, an array.
     ///
     /// # Errors

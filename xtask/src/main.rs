@@ -33,6 +33,7 @@ cargo xtask <verb>
   bench hop [ARGS]               measure one hop beside the floor and roscpp's relay
   bench ros1 [ARGS]              measure relays of ROS 1 messages beside a raw echo; bridge-ros1 with 50 topics (--help)
   bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
+  bench messages [--instructions]  measure messages on their way to fields and back, beside memcpy, a tree of values and Python
 ";
 
 fn main() -> ExitCode {
@@ -59,7 +60,10 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["dist"] => dist::run(&Workspace::find()?),
         ["dds"] => dds::run(&Workspace::find()?),
         ["lint"] => lint::run(&Workspace::find()?),
-        ["bench", "uadp", rest @ ..] => instructions::run(&Workspace::find()?, rest),
+        ["bench", "uadp", rest @ ..] => {
+            instructions::run(&Workspace::find()?, "uadp", rest, |_| Ok(()))
+        }
+        ["bench", "messages", rest @ ..] => bench::messages(&Workspace::find()?, rest),
         ["bench", "hop", rest @ ..] => bench::hop(&Workspace::find()?, rest),
         ["bench", "ros1", rest @ ..] => bench::ros1(&Workspace::find()?, rest),
         _ => {

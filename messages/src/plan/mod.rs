@@ -81,6 +81,8 @@ struct Op {
 #[derive(Clone, Debug)]
 enum What {
     One(Primitive),
+    /// The next so many steps are each one number of that kind, and all cross: they may be moved at once.
+    Run(Number, u16),
     /// Array of elements that are on the wire as in OPC UA.
     Packed(Number, Len),
     /// Array of `uint8`: a ByteString.
@@ -153,7 +155,8 @@ impl Plan {
         if let Some(fault) = compiler.fault {
             return Err(fault);
         }
-        write::try_constants(wire, &compiler.ops).map_err(|(leaf, fault)| {
+        let ops = coalesced(&compiler.ops);
+        write::try_constants(wire, &ops).map_err(|(leaf, fault)| {
             let path = paths.get(leaf).cloned().unwrap_or_default();
             PlanError::ConstantFault {
                 name: message.name().clone(),
@@ -164,7 +167,7 @@ impl Plan {
         let leaves = message.leaves().get(carried).unwrap_or_default().to_vec();
         Ok(Self {
             wire,
-            body: Body::Steps(compiler.ops),
+            body: Body::Steps(ops),
             leaves,
             paths,
         })
@@ -267,6 +270,46 @@ fn given<'m>(
         Ok((at, Given::new(message, path, literal)))
     });
     each.collect()
+}
+
+/// The steps with a [`What::Run`] before those that may be moved at once.
+fn coalesced(mut ops: &[Op]) -> Vec<Op> {
+    let mut all = Vec::with_capacity(ops.len());
+    while let Some((op, after)) = ops.split_first() {
+        ops = after;
+        match &op.what {
+            What::Messages { steps, .. } => {
+                let (body, after) = ops.split_at_checked(*steps).unwrap_or((ops, &[]));
+                ops = after;
+                let body = coalesced(body);
+                let mut head = op.clone();
+                if let What::Messages { steps, .. } = &mut head.what {
+                    *steps = body.len();
+                }
+                all.push(head);
+                all.extend(body);
+            }
+            What::One(Primitive::Number(number)) if op.carry && *number != Number::Bool => {
+                let more = ops.iter().take_while(|next| {
+                    let same = matches!(next.what, What::One(Primitive::Number(n)) if n == *number);
+                    same && next.carry && next.constant.is_none()
+                });
+                let more = more.count().min(usize::from(u16::MAX - 1));
+                let (run, after) = ops.split_at_checked(more).unwrap_or((ops, &[]));
+                ops = after;
+                if let Ok(count) = u16::try_from(more + 1) {
+                    all.push(Op {
+                        what: What::Run(*number, count),
+                        ..op.clone()
+                    });
+                }
+                all.push(op.clone());
+                all.extend_from_slice(run);
+            }
+            _ => all.push(op.clone()),
+        }
+    }
+    all
 }
 
 struct Compiler<'m> {
