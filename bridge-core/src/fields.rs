@@ -39,6 +39,7 @@ pub(crate) fn read(
         Payload::Ros(plan, bytes) => {
             encode_fields(plan, bytes, namespace, frame).map_err(|error| match &error {
                 ReadError::Malformed { .. } => (Reason::Malformed, error.to_string()),
+                ReadError::Value { .. } => (Reason::Mismatch, error.to_string()),
                 ReadError::Sink { source, .. } => (Reason::TooBig, source.to_string()),
             })
         }

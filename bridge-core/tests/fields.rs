@@ -2,6 +2,7 @@
 #![expect(clippy::unwrap_used, reason = "test code")]
 
 #[path = "../../messages/tests/support/inventor.rs"]
+#[expect(dead_code, reason = "the tests of `messages` use all of it")]
 mod inventor;
 #[path = "../../messages/tests/support/mod.rs"]
 #[expect(dead_code, reason = "the tests of `messages` use all of it")]

@@ -46,7 +46,9 @@ pub fn message(input: &[u8]) {
             assert!(at <= payload.len(), "the fault is at {at}, behind the end");
             return;
         }
-        Err(ReadError::Sink { .. }) => panic!("a recorder refuses nothing"),
+        Err(ReadError::Sink { .. } | ReadError::Value { .. }) => {
+            panic!("a recorder takes all, and nothing is converted")
+        }
     }
     // An element is a byte at the least, and each has an event or two around it; of a fixed array none.
     let most = 4 * payload.len() + 4096;
