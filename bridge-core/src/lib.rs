@@ -10,6 +10,7 @@
 
 mod counters;
 mod fields;
+mod gate;
 mod hops;
 mod loop_rule;
 mod network;

@@ -83,6 +83,7 @@ codes! {
     PartWritten = "M082", "A part of an array is read from ROS. It cannot be written, since nothing says what stands in the rest of the array.";
     Conversion = "M083", "`scale` and `offset` go with a number, `invert` with a Boolean, all of them with one field; `out_of_range` says what becomes of values that a conversion makes too big.";
     LossyConversion = "M084", "The type the value becomes cannot hold all that the other type can, so a number would be rounded or not fit. With `out_of_range: refuse` such a value does not cross and is counted, with `clamp` it becomes the nearest that fits.";
+    Publish = "M085", "`deadband` is a number above 0, of values that are numbers; `at_most` a rate as 10 Hz, from 0.001 Hz to 1000 Hz.";
 }
 
 impl fmt::Display for Code {
@@ -105,7 +106,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M084")]
+#[error("no finding has that code; codes are M001 to M085")]
 pub struct UnknownCode;
 
 #[cfg(test)]

@@ -108,6 +108,14 @@ document! {
         /// values that call a service, `keep_latest` tries the newest until it is taken or replaced, `drop_oldest` each
         /// once within its `timeout`.
         queue: Queue,
+        /// Which values its origin sends: `always` (the default) each, `on_change` those that differ from the last one sent.
+        publish: PublishEntry,
+        /// As `publish: on_change`, and numbers (each of an array) have to differ by more than this.
+        deadband: f64,
+        /// Highest rate at which its origin sends it, as 10 Hz: of values that come faster the newest follows when the time
+        /// is over.
+        #[schemars(regex(pattern = r"^[0-9]+(\.[0-9]+)? ?Hz$"))]
+        at_most: String,
     }
 
     /// ROS topics that become values as they appear.
@@ -199,6 +207,13 @@ choice! {
         Exact = "exact",
         /// The number in any unsigned integer type.
         AnyWidth = "any_width",
+    }
+
+    enum PublishEntry {
+        /// Each value.
+        Always = "always",
+        /// Values that differ from the last one sent.
+        OnChange = "on_change",
     }
 
     enum AsEntry {
