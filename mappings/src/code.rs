@@ -79,7 +79,7 @@ codes! {
     When = "M078", "`when` is a value of the variable's type, and goes with a `call` that has no `field`: with one, each value is sent.";
     TopicPattern = "M079", "A pattern of topics is a topic name in which `*` stands for one or more characters of a part, and at most one part `**` for any number of parts.";
     PatternCapture = "M080", "`{1}` in the `node`, `alias` or `name` of a pattern stands for what its first wildcard does, and so on. Node and alias have one, or all topics would be one node.";
-    FieldPart = "M081", "In brackets behind a field that is an array of values stands the part of it: [2] the third element, [name=joint_3] the one whose place has joint_3 in the array `name` beside it, [0:90] the first ninety.";
+    FieldPart = "M081", "In brackets behind a field that is an array of values stands the part of it: `[2]` the third element, `[name=joint_3]` the one whose place has joint_3 in the array `name` beside it, `[0:90]` the first ninety.";
     PartWritten = "M082", "A part of an array is read from ROS. It cannot be written, since nothing says what stands in the rest of the array.";
     Conversion = "M083", "`scale` and `offset` go with a number, `invert` with a Boolean, all of them with one field; `out_of_range` says what becomes of values that a conversion makes too big.";
     LossyConversion = "M084", "The type the value becomes cannot hold all that the other type can, so a number would be rounded or not fit. With `out_of_range: refuse` such a value does not cross and is counted, with `clamp` it becomes the nearest that fits.";

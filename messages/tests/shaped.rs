@@ -1,7 +1,6 @@
 //! Parts of arrays and converted values, on both wires.
 #![expect(clippy::unwrap_used, reason = "test code")]
 
-#[expect(dead_code, reason = "other tests use all of it")]
 mod support;
 
 use messages::{

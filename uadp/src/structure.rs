@@ -74,6 +74,34 @@ mod tests {
     use crate::{ExtensionBody, Variant};
 
     #[test]
+    fn numbers_of_one_kind_are_written_and_taken_at_once_or_not_at_all() {
+        let mut datagram = Vec::new();
+        let mut message =
+            NetworkMessageEncoder::new(&mut datagram, &NetworkHeader::default(), Some(&[1]))
+                .unwrap();
+        let mut frame = message.key_frame(&DataSetHeader::default()).unwrap();
+        assert!(frame.scalars(BuiltinType::Int32, &[1, 0, 0]).is_err());
+        assert!(frame.scalars(BuiltinType::String, &[1]).is_err());
+        frame
+            .scalars(BuiltinType::Int16, &[1, 0, 0xFE, 0xFF])
+            .unwrap();
+        frame.scalar(Scalar::Byte(7)).unwrap();
+        frame.finish().unwrap();
+        message.finish().unwrap();
+        let message = NetworkMessage::decode(&datagram).unwrap();
+        let message = message.messages().next().unwrap().unwrap();
+        let mut fields = message.fields().unwrap();
+        assert_eq!(fields.len(), 3);
+        assert_eq!(fields.take_scalars(BuiltinType::Int16, 3), None);
+        assert_eq!(fields.take_scalars(BuiltinType::Int16, 4), None);
+        assert_eq!(fields.take_scalars(BuiltinType::UInt16, 2), None);
+        let taken = fields.take_scalars(BuiltinType::Int16, 2).unwrap();
+        assert_eq!(taken, [4, 1, 0, 4, 0xFE, 0xFF]);
+        let rest: Vec<_> = fields.collect();
+        assert_eq!(rest, [Ok(Variant::Scalar(Scalar::Byte(7)))]);
+    }
+
+    #[test]
     fn what_was_written_into_a_structure_is_read_back() {
         let mut datagram = Vec::new();
         let mut message =
