@@ -50,11 +50,15 @@ pub enum Reason {
     /// No sample, but a publisher or subscriber that the local side cannot be matched with, as their qualities of service
     /// exclude each other.
     IncompatibleQos,
+    /// The value says nothing new, and its topic is published on change or has a deadband.
+    Unchanged,
+    /// A newer value took its place before its topic's rate let it go.
+    Outpaced,
 }
 
 impl Reason {
     /// All of them, in the order of their counters.
-    pub const ALL: [Self; 22] = [
+    pub const ALL: [Self; 24] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -77,6 +81,8 @@ impl Reason {
         Self::NotSent,
         Self::CallFailed,
         Self::IncompatibleQos,
+        Self::Unchanged,
+        Self::Outpaced,
     ];
 
     /// The label of its counter.
@@ -105,6 +111,8 @@ impl Reason {
             Self::NotSent => "not_sent",
             Self::CallFailed => "call_failed",
             Self::IncompatibleQos => "incompatible_qos",
+            Self::Unchanged => "unchanged",
+            Self::Outpaced => "outpaced",
         }
     }
 
@@ -113,7 +121,12 @@ impl Reason {
     pub const fn is_routine(self) -> bool {
         matches!(
             self,
-            Self::Looped | Self::Repeat | Self::NotInSpace | Self::IncompatibleQos
+            Self::Looped
+                | Self::Repeat
+                | Self::NotInSpace
+                | Self::IncompatibleQos
+                | Self::Unchanged
+                | Self::Outpaced
         )
     }
 }

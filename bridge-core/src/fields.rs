@@ -4,7 +4,7 @@
 //! [`FieldEncoder`] and the source that reads [`Fields`]. A message in an array of messages is an ExtensionObject with
 //! a binary body, its TypeId a string NodeId of the ROS type's name in the topic's namespace.
 
-use messages::{Plan, ReadError, Sink, Source, SourceError, TypeName};
+use messages::{Plan, ReadError, Sink, Source, SourceError, TypeName, WriteError};
 use uadp::{
     Array, BuiltinType, DecodeError, Elements, EncodeError, ExtensionBody, FieldEncoder, Fields,
     NodeId, Scalar, StructureReader, Variant,
@@ -37,13 +37,35 @@ pub(crate) fn read(
                 .map_err(|error| (Reason::TooBig, error.to_string()))
         }
         Payload::Ros(plan, bytes) => {
-            let mut sink = FrameSink { frame, namespace };
-            plan.read(bytes, &mut sink).map_err(|error| match &error {
+            encode_fields(plan, bytes, namespace, frame).map_err(|error| match &error {
                 ReadError::Malformed { .. } => (Reason::Malformed, error.to_string()),
+                ReadError::Value { .. } => (Reason::Mismatch, error.to_string()),
                 ReadError::Sink { source, .. } => (Reason::TooBig, source.to_string()),
             })
         }
     }
+}
+
+/// Writes the fields of a ROS message into a frame, as the [`Router`](crate::Router) does. `namespace` is that of the
+/// TypeIds of structures.
+///
+/// # Errors
+/// The message is none of the plan's type, or is too long for UADP; the frame is then to be thrown away.
+pub fn encode_fields(
+    plan: &Plan,
+    message: &[u8],
+    namespace: u16,
+    frame: &mut FieldEncoder<'_>,
+) -> Result<(), ReadError<EncodeError>> {
+    plan.read(message, &mut FrameSink { frame, namespace })
+}
+
+/// Appends the ROS message that the fields make to `out`, as the [`Router`](crate::Router) does.
+///
+/// # Errors
+/// The fields are not those of the plan; `out` is then as it was.
+pub fn decode_fields(plan: &Plan, fields: Fields<'_>, out: &mut Vec<u8>) -> Result<(), WriteError> {
+    plan.write(&mut FieldSource::new(fields), out)
 }
 
 /// Appends the ROS message that the fields make.
@@ -52,9 +74,7 @@ pub(crate) fn write(
     fields: Fields<'_>,
     out: &mut Vec<u8>,
 ) -> Result<(), (Reason, String)> {
-    let mut source = FieldSource::new(fields);
-    plan.write(&mut source, out)
-        .map_err(|error| (Reason::Mismatch, error.to_string()))
+    decode_fields(plan, fields, out).map_err(|error| (Reason::Mismatch, error.to_string()))
 }
 
 /// Appends the fields as they are, once it is sure that they can be read.
@@ -90,6 +110,11 @@ impl Sink for FrameSink<'_, '_> {
         self.frame.scalar(value)
     }
 
+    #[inline]
+    fn scalars(&mut self, builtin: BuiltinType, bytes: &[u8]) -> Result<bool, EncodeError> {
+        self.frame.scalars(builtin, bytes).map(|()| true)
+    }
+
     fn packed_array(
         &mut self,
         element: BuiltinType,
@@ -118,7 +143,7 @@ impl Sink for FrameSink<'_, '_> {
 
     fn begin_structure(&mut self, of: &TypeName) -> Result<(), EncodeError> {
         self.frame
-            .begin_structure(NodeId::string(self.namespace, &of.to_string()))
+            .begin_structure(NodeId::string(self.namespace, of.as_str()))
     }
 
     fn end_structure(&mut self) -> Result<(), EncodeError> {
@@ -185,6 +210,31 @@ impl<'a> Source<'a> for FieldSource<'a> {
             | Variant::Array(_)
             | Variant::Matrix(_)) => Err(unexpected(expected, false, &other)),
         }
+    }
+
+    #[inline]
+    fn scalars(&mut self, expected: BuiltinType, count: u16, out: &mut Vec<u8>) -> bool {
+        if let Some(structure) = &mut self.structure {
+            let taken = structure.take_scalars(expected, count);
+            out.extend_from_slice(taken.unwrap_or_default());
+            return taken.is_some();
+        }
+        let (Some(taken), Some(size)) = (
+            self.fields.take_scalars(expected, count),
+            expected.fixed_size(),
+        ) else {
+            return false;
+        };
+        out.reserve(taken.len());
+        match size {
+            8 => push_untagged::<9>(out, taken),
+            4 => push_untagged::<5>(out, taken),
+            2 => push_untagged::<3>(out, taken),
+            _ => taken
+                .chunks_exact(1 + size)
+                .for_each(|value| out.extend_from_slice(value.get(1..).unwrap_or_default())),
+        }
+        true
     }
 
     fn packed_array(&mut self, expected: BuiltinType) -> Result<(usize, &'a [u8]), SourceError> {
@@ -263,6 +313,15 @@ impl<'a> Source<'a> for FieldSource<'a> {
             0 => Ok(()),
             left => Err(SourceError::LeftOver(left)),
         }
+    }
+}
+
+/// Of a size the compiler knows, which makes it a few moves each. `N` counts the encoding byte.
+#[inline]
+fn push_untagged<const N: usize>(out: &mut Vec<u8>, variants: &[u8]) {
+    let (variants, _) = variants.as_chunks::<N>();
+    for variant in variants {
+        out.extend_from_slice(variant.get(1..).unwrap_or_default());
     }
 }
 

@@ -10,6 +10,7 @@
 
 mod counters;
 mod fields;
+mod gate;
 mod hops;
 mod loop_rule;
 mod network;
@@ -24,6 +25,7 @@ mod transcoder;
 mod writer;
 
 pub use counters::{Counters, Reason, Verdict};
+pub use fields::{decode_fields, encode_fields};
 pub use hops::{Delays, Hop, Hops};
 pub use loop_rule::{Side, may_cross};
 pub use output::{Delivery, Heard, Kept, Notice, Output, PublisherKey};

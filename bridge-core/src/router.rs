@@ -15,6 +15,7 @@ use uadp::{Fields, Timestamp};
 
 use crate::counters::{Counters, Reason, Verdict, is_told};
 use crate::fields;
+use crate::gate::{Gate, Passage, Waiting};
 use crate::hops::{Hop, Hops};
 use crate::loop_rule::{Side, may_cross};
 use crate::network::{chunk, data_set_header, encode, keep_alive, prepare_chunks};
@@ -157,7 +158,7 @@ impl Router {
         let Some(Topic {
             role: Role::Ours(writer),
             plan,
-            overflow,
+            gate,
             ..
         }) = self.entry(topic, None, now)
         else {
@@ -184,8 +185,49 @@ impl Router {
             self.recycle(encoded.bytes);
             return self.refuse(topic, reason, detail);
         }
+        let passage = gate
+            .as_mut()
+            .map_or(Passage::Passes, |gate| gate.judge(&encoded, now.monotonic));
+        match passage {
+            Passage::Passes => self.forward(topic, encoded, (received, latched_by), now),
+            Passage::Unchanged => {
+                self.recycle(encoded.bytes);
+                self.refuse(topic, Reason::Unchanged, String::new())
+            }
+            Passage::TooEarly => {
+                let outpaced = gate
+                    .as_mut()
+                    .and_then(|gate| gate.hold((encoded, latched_by)));
+                self.schedule(topic);
+                if let Some((outpaced, _)) = outpaced {
+                    self.recycle(outpaced.bytes);
+                    self.count(About::topic(topic), Reason::Outpaced, 1, String::new);
+                }
+                Verdict::Forward
+            }
+        }
+    }
+
+    /// Queues a sample that is encoded, under the next sequence number.
+    fn forward(
+        &mut self,
+        topic: TopicId,
+        mut encoded: Encoded,
+        (received, latched_by): (Timestamp, Option<PublisherKey>),
+        now: Now,
+    ) -> Verdict {
+        let (max_datagram, _) = self.sizes();
+        let large = encoded.bytes.len() > usize::from(max_datagram);
+        let Some(Topic {
+            role: Role::Ours(writer),
+            overflow,
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return Verdict::Drop(Reason::TooManyTopics);
+        };
         // The number is used up only by a message that goes out.
-        writer.next_sequence();
+        encoded.number(writer.next_sequence());
         let message = if large {
             Message::Large(Arc::new(encoded))
         } else {
@@ -458,6 +500,14 @@ impl Router {
                 }
             }
             Role::Ours(writer) => {
+                if let Some(held) = entry
+                    .gate
+                    .as_mut()
+                    .and_then(|gate| gate.release(now.monotonic))
+                {
+                    self.let_go(topic, held, now);
+                    return;
+                }
                 let Some((at, idle)) = writer.due(key_frames, keep_alives) else {
                     return;
                 };
@@ -490,6 +540,21 @@ impl Router {
         }
     }
 
+    /// Sends the newest sample that came too early.
+    fn let_go(&mut self, topic: TopicId, (held, latched_by): Waiting, now: Now) {
+        let judged = self
+            .topics
+            .get_mut(&topic)
+            .and_then(|entry| entry.gate.as_mut())
+            .map_or(Passage::Passes, |gate| gate.judge(&held, now.monotonic));
+        if judged == Passage::Passes {
+            // Whether it went first or another gave way is counted there.
+            let _verdict = self.forward(topic, held, (now.utc, latched_by), now);
+        } else {
+            self.recycle(held.bytes);
+        }
+    }
+
     /// Puts the topic on the timer list at the time it wants to be looked at.
     fn schedule(&mut self, topic: TopicId) {
         let (key_frames, keep_alives, silence) = self.periods();
@@ -497,7 +562,11 @@ impl Router {
             return;
         };
         let due = match &entry.role {
-            Role::Ours(writer) => writer.due(key_frames, keep_alives).map(|(at, _)| at),
+            Role::Ours(writer) => {
+                let held = entry.gate.as_ref().and_then(|gate| gate.due());
+                let idle = writer.due(key_frames, keep_alives).map(|(at, _)| at);
+                held.into_iter().chain(idle).min()
+            }
             Role::Theirs(reader) => reader.due(silence),
         };
         // An earlier entry stays: it finds nothing due and asks again, which spares the list an entry per sample.
@@ -534,7 +603,12 @@ impl Router {
                 let from = from.unwrap_or_else(|| SocketAddr::from(([0, 0, 0, 0], 0)));
                 Role::Theirs(Reader::new(from, now.monotonic))
             };
-            self.topics.insert(topic, Topic::new(role, overflow));
+            let mut entry = Topic::new(role, overflow);
+            entry.gate = match self.mapping.variable(topic) {
+                Some(variable) if topic.space == self.settings.own => Gate::new(variable.publish),
+                Some(_) | None => None,
+            };
+            self.topics.insert(topic, entry);
             if from.is_some() {
                 self.schedule(topic);
             }

@@ -7,6 +7,7 @@ use mappings::Overflow;
 use messages::Plan;
 
 use crate::counters::Counters;
+use crate::gate::Gate;
 use crate::output::Delivery;
 use crate::queue::Queue;
 use crate::reader::Reader;
@@ -26,6 +27,8 @@ pub(crate) struct Topic {
     /// A large message of which chunks are still to be sent, before anything of the queue.
     pub(crate) sending: Option<Sending>,
     pub(crate) overflow: Overflow,
+    /// What holds samples of our own space back.
+    pub(crate) gate: Option<Box<Gate>>,
     pub(crate) counters: Counters,
     /// Whether it stands in the Router's list of topics with something to poll.
     pub(crate) ready: bool,
@@ -76,6 +79,7 @@ impl Topic {
             queue: Queue::new(overflow),
             sending: None,
             overflow,
+            gate: None,
             counters: Counters::default(),
             ready: false,
             timer: None,

@@ -109,7 +109,7 @@ impl Encoded {
             .map_or(0, |number| u16::from_le_bytes(*number))
     }
 
-    fn number(&mut self, sequence: u16) {
+    pub(crate) fn number(&mut self, sequence: u16) {
         patch(&mut self.bytes, self.sequence_at, &sequence.to_le_bytes());
     }
 }

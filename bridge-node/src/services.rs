@@ -170,6 +170,7 @@ impl Services {
             }
             Selection::Whole
             | Selection::Field(_)
+            | Selection::Value { .. }
             | Selection::Template { .. }
             | Selection::Bytes => {
                 let event = PortEvent::Bound {

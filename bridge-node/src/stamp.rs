@@ -10,7 +10,11 @@ pub fn wants_stamp(message_type: &MessageType, selection: Option<&Selection>) ->
     let Some(stamp) = message_type.leaves().first().filter(|leaf| is_stamp(leaf)) else {
         return false;
     };
-    matches!(selection, Some(Selection::Field(path)) if path != STAMP && !stamp.is_inside(path))
+    matches!(
+        selection,
+        Some(Selection::Field(path) | Selection::Value { field: path, .. })
+            if path != STAMP && !stamp.is_inside(path)
+    )
 }
 
 /// The first field of a message that begins with a header.
@@ -27,6 +31,12 @@ mod tests {
         let stamped = Registry::bundle(Dialect::Ros2).get(&name).unwrap();
         let field = |path: &str| wants_stamp(&stamped, Some(&Selection::Field(path.to_owned())));
         assert!(field("twist") && field("twist.linear.x") && field("header.frame_id"));
+        let converted = Selection::Value {
+            field: "twist.linear.x".to_owned(),
+            part: None,
+            conversion: messages::Conversion::default(),
+        };
+        assert!(wants_stamp(&stamped, Some(&converted)));
         assert!(!field("header.stamp") && !field("header"));
         assert!(!wants_stamp(&stamped, Some(&Selection::Whole)) && !wants_stamp(&stamped, None));
         let name = "geometry_msgs/Twist".parse().unwrap();

@@ -1,28 +1,39 @@
-//! Each function takes bytes that may be anything and panics when the codec does not keep its word.
+//! Each function takes bytes that may be anything and panics when the code they are for does not keep its word.
 //!
 //! `libfuzzer/` feeds them with inputs that reach new code; `corpus/` holds those found, and the tests run them all.
 
 mod chunks;
 mod decode;
+mod definition;
 mod discovery;
 mod input;
+mod mapping;
+mod message;
 mod reader_state;
 mod secured;
+#[path = "../../messages/tests/support/mod.rs"]
+mod tape;
 
 pub use chunks::chunks;
 pub use decode::decode;
+pub use definition::definition;
 pub use discovery::discovery;
+pub use mapping::mapping;
+pub use message::message;
 pub use reader_state::reader_state;
 pub use secured::secured;
 
-/// Panics when the codec does not keep its word on the input.
+/// Panics when the code does not keep its word on the input.
 pub type Target = fn(&[u8]);
 
 /// The targets by their names, which are also those of their folders under `corpus/`.
 pub const TARGETS: &[(&str, Target)] = &[
     ("chunks", chunks),
     ("decode", decode),
+    ("definition", definition),
     ("discovery", discovery),
+    ("mapping", mapping),
+    ("message", message),
     ("reader_state", reader_state),
     ("secured", secured),
 ];

@@ -1,29 +1,114 @@
 //! Every input that was kept, and every real datagram, through every target.
 
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use uadp_fuzz::TARGETS;
+
+/// Where the inputs of a target are: documents are kept beside what they are documents of.
+fn inputs(name: &str) -> Vec<PathBuf> {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let folders = match name {
+        "mapping" => vec![here.join("../mappings/tests/bad"), here.join("../mappings")],
+        _ => vec![here.join("corpus").join(name)],
+    };
+    let files = |folder: &PathBuf| {
+        fs::read_dir(folder).unwrap_or_else(|error| panic!("{}: {error}", folder.display()))
+    };
+    let mut found: Vec<PathBuf> = folders
+        .iter()
+        .flat_map(files)
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| name != "mapping" || path.extension() == Some("yaml".as_ref()))
+        .collect();
+    found.sort();
+    found
+}
 
 #[test]
 fn every_kept_input_is_taken_without_a_finding() {
     for (name, target) in TARGETS {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR"))
-            .join("corpus")
-            .join(name);
-        let mut inputs = 0;
-        for entry in
-            fs::read_dir(&folder).unwrap_or_else(|error| panic!("{}: {error}", folder.display()))
-        {
-            let path = entry.unwrap().path();
-            let input = fs::read(&path).unwrap();
+        let inputs = inputs(name);
+        for path in &inputs {
+            let input = fs::read(path).unwrap();
             if let Err(panic) = std::panic::catch_unwind(|| target(&input)) {
                 panic!("{}: {panic:?}", path.display());
             }
-            inputs += 1;
         }
-        assert!(inputs > 10, "{} holds {inputs} inputs", folder.display());
-        println!("{name}: {inputs} inputs");
+        let count = inputs.len();
+        assert!(count > 10, "{name} has {count} inputs");
+        println!("{name}: {count} inputs");
+    }
+}
+
+/// Numbers out of a seed (Marsaglia's xorshift64), so that every run tries the same.
+struct Chance(u64);
+
+impl Chance {
+    fn below(&mut self, bound: usize) -> usize {
+        self.0 ^= self.0 << 13;
+        self.0 ^= self.0 >> 7;
+        self.0 ^= self.0 << 17;
+        usize::try_from(self.0 >> 1).unwrap() % bound.max(1)
+    }
+
+    /// One change of those that break parsers: a byte, a length, a piece left out, doubled or of another input.
+    fn change(&mut self, input: &mut Vec<u8>, other: &[u8]) {
+        let at = self.below(input.len() + 1);
+        let piece = at..(at + self.below(16)).min(input.len());
+        match self.below(7) {
+            0 => {
+                if let Some(byte) = input.get_mut(at) {
+                    *byte ^= 1 << self.below(8);
+                }
+            }
+            1 => input.insert(at, u8::try_from(self.below(256)).unwrap()),
+            2 => {
+                const LENGTHS: [u32; 6] = [0, 1, 0x7F, 0xFFFF, 0x7FFF_FFFF, u32::MAX];
+                let length = LENGTHS[self.below(LENGTHS.len())].to_le_bytes();
+                for (byte, to) in input.iter_mut().skip(at).zip(length) {
+                    *byte = to;
+                }
+            }
+            3 => drop(input.drain(piece)),
+            4 => {
+                let doubled = input[piece].to_vec();
+                drop(input.splice(at..at, doubled));
+            }
+            5 => {
+                let from = self.below(other.len() + 1);
+                let to = (from + self.below(32)).min(other.len());
+                drop(input.splice(at..at, other[from..to].iter().copied()));
+            }
+            _ => input.truncate(at),
+        }
+    }
+}
+
+/// `UA_FUZZ_CHANGES` inputs of each target, 2000 by default; `UA_FUZZ_SEED` says which.
+#[test]
+fn changed_inputs_are_taken_without_a_finding() {
+    let number = |variable: &str, default: u64| {
+        std::env::var(variable).map_or(default, |text| text.parse().unwrap())
+    };
+    let (changes, seed) = (number("UA_FUZZ_CHANGES", 2_000), number("UA_FUZZ_SEED", 1));
+    for (name, target) in TARGETS {
+        let kept: Vec<Vec<u8>> = inputs(name)
+            .iter()
+            .map(|path| fs::read(path).unwrap())
+            .filter(|input| input.len() <= 4096)
+            .collect();
+        let mut chance = Chance(seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1);
+        for _ in 0..changes {
+            let mut input = kept[chance.below(kept.len())].clone();
+            for _ in 0..=chance.below(4) {
+                let other = chance.below(kept.len());
+                chance.change(&mut input, &kept[other]);
+            }
+            if let Err(panic) = std::panic::catch_unwind(|| target(&input)) {
+                panic!("{name}: {panic:?} of {input:02x?}");
+            }
+        }
     }
 }
 

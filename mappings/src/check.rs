@@ -6,6 +6,7 @@ mod names;
 mod network;
 mod patterns;
 mod services;
+mod shaping;
 mod types;
 mod variables;
 

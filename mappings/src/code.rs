@@ -91,6 +91,11 @@ codes! {
     When = "M078", "`when` is a value of the variable's type, and goes with a `call` that has no `field`: with one, each value is sent.";
     TopicPattern = "M079", "A pattern of topics is a topic name in which `*` stands for one or more characters of a part, and at most one part `**` for any number of parts.";
     PatternCapture = "M080", "`{1}` in the `node`, `alias` or `name` of a pattern stands for what its first wildcard does, and so on. Node and alias have one, or all topics would be one node.";
+    FieldPart = "M081", "In brackets behind a field that is an array of values stands the part of it: `[2]` the third element, `[name=joint_3]` the one whose place has joint_3 in the array `name` beside it, `[0:90]` the first ninety.";
+    PartWritten = "M082", "A part of an array is read from ROS. It cannot be written, since nothing says what stands in the rest of the array.";
+    Conversion = "M083", "`scale` and `offset` go with a number, `invert` with a Boolean, all of them with one field; `out_of_range` says what becomes of values that a conversion makes too big.";
+    LossyConversion = "M084", "The type the value becomes cannot hold all that the other type can, so a number would be rounded or not fit. With `out_of_range: refuse` such a value does not cross and is counted, with `clamp` it becomes the nearest that fits.";
+    Publish = "M085", "`deadband` is a number above 0, of values that are numbers; `at_most` a rate as 10 Hz, from 0.001 Hz to 1000 Hz.";
 }
 
 impl fmt::Display for Code {
@@ -113,7 +118,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M080")]
+#[error("no finding has that code; codes are M001 to M085")]
 pub struct UnknownCode;
 
 #[cfg(test)]

@@ -108,6 +108,14 @@ document! {
         /// values that call a service, `keep_latest` tries the newest until it is taken or replaced, `drop_oldest` each
         /// once within its `timeout`.
         queue: Queue,
+        /// Which values its origin sends: `always` (the default) each, `on_change` those that differ from the last one sent.
+        publish: PublishEntry,
+        /// As `publish: on_change`, and numbers (each of an array) have to differ by more than this.
+        deadband: f64,
+        /// Highest rate at which its origin sends it, as 10 Hz: of values that come faster the newest follows when the time
+        /// is over.
+        #[schemars(regex(pattern = r"^[0-9]+(\.[0-9]+)? ?Hz$"))]
+        at_most: String,
     }
 
     /// ROS topics that become values as they appear.
@@ -162,8 +170,19 @@ document! {
         /// Message type, as std_msgs/Bool. Left out: the std_msgs type of the variable's `type`. With `call` and `poll` the
         /// service type, as std_srvs/SetBool, which is never left out.
         r#type: String,
-        /// The field that holds the value, as data or pose.position.x. Left out: the whole message, a field per leaf.
+        /// The field that holds the value, as data or pose.position.x. Left out: the whole message, a field per leaf. Of an
+        /// array that is read a part: an element as position[2], by the text at its place in another array of the message as
+        /// position[name=joint_3], several as ranges[0:90].
         field: String,
+        /// The value in OPC UA is the field's times this, and `offset`; written to ROS the other way round.
+        scale: f64,
+        /// Added to the field's value for OPC UA, after `scale`; written to ROS it is taken off again.
+        offset: f64,
+        /// The value in OPC UA is true where the field is false.
+        invert: bool,
+        /// Numbers that the type they become cannot hold: `refuse` (the default), they do not cross and are counted, or
+        /// `clamp`, they become the nearest it can hold. Needed where that can happen; integers are rounded to the nearest.
+        out_of_range: OutOfRangeEntry,
         /// With `call` and `poll`: fields of the request that stay the same, as {id: 12, pose: {x: 1.5}} or
         /// {pose.x: 1.5}; the name of a constant of the request stands for its value. All others are zero or empty.
         request: Request,
@@ -190,11 +209,25 @@ choice! {
         AnyWidth = "any_width",
     }
 
+    enum PublishEntry {
+        /// Each value.
+        Always = "always",
+        /// Values that differ from the last one sent.
+        OnChange = "on_change",
+    }
+
     enum AsEntry {
         /// A value per field.
         Fields = "fields",
         /// The message as it is, one ByteString.
         Bytes = "bytes",
+    }
+
+    enum OutOfRangeEntry {
+        /// The value does not cross.
+        Refuse = "refuse",
+        /// The nearest value that fits.
+        Clamp = "clamp",
     }
 
     enum SecurityEntry {

@@ -18,7 +18,7 @@ pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use document::schema;
 pub use mapping::{
-    Binding, Endpoint, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, Server,
+    Binding, Endpoint, Mapping, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy, Server,
     ServiceBinding, ServiceRole, Space, Trigger, Variable,
 };
 pub use node_id::{Identifier, NodeIdError, NodeIdText};

@@ -425,6 +425,37 @@ pub struct Variable {
     pub service: Option<ServiceBinding>,
     /// What its queue does when full.
     pub overflow: Overflow,
+    /// Which of its values its origin sends.
+    pub publish: Publish,
+}
+
+/// Which values of a variable are sent: by default each.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Publish {
+    /// Only those that differ from the one sent last, by more than the deadband.
+    pub on_change: bool,
+    /// By its bits.
+    deadband: u64,
+    /// At least this long from one to the next; the newest of those in between follows when it is over.
+    pub period: Duration,
+}
+
+impl Publish {
+    /// `deadband` is 0 or greater.
+    #[must_use]
+    pub const fn new(on_change: bool, deadband: f64, period: Duration) -> Self {
+        Self {
+            on_change,
+            deadband: deadband.to_bits(),
+            period,
+        }
+    }
+
+    /// By how much a number may differ from the one sent last without being sent itself.
+    #[must_use]
+    pub const fn deadband(&self) -> f64 {
+        f64::from_bits(self.deadband)
+    }
 }
 
 impl Variable {

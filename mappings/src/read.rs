@@ -197,6 +197,36 @@ impl Read for u16 {
     }
 }
 
+impl Read for f64 {
+    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+        let text = reader.text(node, "a number")?;
+        // `inf` and `nan` are numbers to Rust, and to YAML with a dot before them.
+        let number = text
+            .parse()
+            .ok()
+            .filter(|_| text.contains(|c: char| c.is_ascii_digit()));
+        if number.is_none() {
+            let message = format!("expected a number as 0.001, found `{}`", short(text));
+            reader.findings.error(Code::WrongValue, node.place, message);
+        }
+        number
+    }
+}
+
+impl Read for bool {
+    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+        match reader.text(node, "true or false")? {
+            "true" => Some(true),
+            "false" => Some(false),
+            other => {
+                let message = format!("expected true or false, found `{}`", short(other));
+                reader.findings.error(Code::WrongValue, node.place, message);
+                None
+            }
+        }
+    }
+}
+
 impl<T: Read> Read for Vec<At<T>> {
     fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
         let Kind::List(items) = &node.kind else {

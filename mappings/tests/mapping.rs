@@ -14,7 +14,7 @@ use mappings::{
     Checked, Code, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, ServiceRole,
     SpaceId, TopicId, Trigger,
 };
-use messages::{Leaf, Literal, Rank, Selection};
+use messages::{Conversion, Leaf, Literal, Part, Rank, Selection};
 use proptest::prelude::*;
 use uadp::BuiltinType;
 
@@ -185,6 +185,57 @@ fn several_variables_read_fields_of_one_topic() {
     assert_eq!(
         bound,
         [(topic("ua_1_2_10"), "/v"), (topic("ua_1_2_11"), "/v")]
+    );
+}
+
+#[test]
+fn a_part_of_an_array_and_a_converted_value_have_the_type_they_have_in_opc_ua() {
+    let mapping = sound(&format!(
+        "{HEAD}\
+         - {{node: ns=2;i=10, name: A, origin: 1, ros: {{topic: /j, type: sensor_msgs/JointState, field: 'position[name=a b]'}}}}\n\
+         - {{node: ns=2;i=11, name: B, origin: 1, ros: {{topic: /s, type: sensor_msgs/LaserScan, field: 'ranges[0:90]'}}}}\n\
+         - {{node: ns=2;i=12, name: C, origin: 1, type: Double, ros: {{topic: /c, type: std_msgs/Int16, scale: 0.1}}}}\n\
+         - {{node: ns=2;i=13, name: D, origin: 1, type: Double, ros: {{topic: /d, type: std_msgs/Float32}}}}\n\
+         - {{node: ns=2;i=14, name: E, origin: 0, type: Double, ros: {{space: 2, topic: /e, type: std_msgs/UInt8, out_of_range: clamp}}}}\n"
+    ));
+    let types: Vec<_> = mapping
+        .variables()
+        .iter()
+        .map(|variable| variable.value_type.unwrap())
+        .collect();
+    let (double, float) = (BuiltinType::Double, BuiltinType::Float);
+    let expected = [
+        (double, false),
+        (float, true),
+        (double, false),
+        (double, false),
+        (double, false),
+    ];
+    assert_eq!(types, expected);
+    let selections: Vec<&Selection> = mapping
+        .variables()
+        .iter()
+        .map(|variable| &variable.bindings.first().unwrap().selection)
+        .collect();
+    let value = |field: &str, part, conversion| Selection::Value {
+        field: field.to_owned(),
+        part,
+        conversion,
+    };
+    let none = Conversion::default();
+    let name = Part::Named {
+        by: "name".to_owned(),
+        name: "a b".to_owned(),
+    };
+    let slice = Part::Slice { from: 0, to: 90 };
+    assert_eq!(*selections[0], value("position", Some(name), none));
+    assert_eq!(*selections[1], value("ranges", Some(slice), none));
+    let tenth = none.scaled(0.1, 0.0).to(double);
+    assert_eq!(*selections[2], value("data", None, tenth));
+    assert_eq!(*selections[3], value("data", None, none.to(double)));
+    assert_eq!(
+        *selections[4],
+        value("data", None, none.clamped().to(double))
     );
 }
 

@@ -109,6 +109,16 @@ pub enum PlanError {
         /// The path of the field.
         path: String,
     },
+    /// A part the field has not, or a conversion that is none of its type.
+    #[error("field `{path}` of `{name}` {what}")]
+    Shape {
+        /// The message type.
+        name: TypeName,
+        /// The path of the field.
+        path: String,
+        /// Why not, as the rest of a sentence about the field.
+        what: &'static str,
+    },
     /// ROS 1 bytes of a ROS 2 type, or CDR of a ROS 1 type.
     #[error("`{name}` is a type of the other ROS: its bytes do not travel on this wire")]
     Wire {
@@ -151,6 +161,33 @@ pub enum Fault {
     Encapsulation(u16),
 }
 
+/// A message is sound, and what is wanted of it is not there or cannot become what it should.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum ValueFault {
+    /// The array is too short for the element.
+    #[error("element {at} is not there: the array has {found}")]
+    Absent {
+        /// The element, from 0.
+        at: usize,
+        /// How many there are.
+        found: usize,
+    },
+    /// No element has that name.
+    #[error("no element is named `{0}`")]
+    NoName(String),
+    /// The type it is to become cannot hold the value.
+    #[error("{value} does not fit {}", to.name())]
+    OutOfRange {
+        /// The value, scaled.
+        value: String,
+        /// What it should become.
+        to: BuiltinType,
+    },
+    /// The value is no number.
+    #[error("a value that is no number cannot become one")]
+    NoNumber,
+}
+
 /// [`Plan::read`](crate::Plan::read) stopped.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum ReadError<E> {
@@ -163,6 +200,14 @@ pub enum ReadError<E> {
         at: usize,
         /// What is wrong there.
         fault: Fault,
+    },
+    /// What is wanted of a field cannot be had.
+    #[error("{}{fault}", in_field(field))]
+    Value {
+        /// Path of the field.
+        field: String,
+        /// Why not.
+        fault: ValueFault,
     },
     /// The sink refused a value.
     #[error("the field `{field}` cannot be taken")]
@@ -198,6 +243,9 @@ pub enum SourceError {
     /// The field's own bytes are wrong.
     #[error("{0}")]
     Malformed(String),
+    /// The value cannot become what the field of the message holds.
+    #[error(transparent)]
+    Value(ValueFault),
 }
 
 /// What is wrong with a value to be written.
@@ -222,6 +270,9 @@ pub enum WriteFault {
         /// What the value has.
         found: usize,
     },
+    /// Part of an array: what stands in the rest of it, nobody says.
+    #[error("a part of an array is read and cannot be written")]
+    Part,
     /// A text with a NUL, which CDR cannot carry.
     #[error("a NUL inside a text")]
     Nul,

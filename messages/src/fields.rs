@@ -13,6 +13,15 @@ pub trait Sink {
     /// A single value.
     fn scalar(&mut self, value: Scalar<'_>) -> Result<(), Self::Error>;
 
+    /// Several fields of a single number each: `bytes` are the values, little endian, without gaps.
+    ///
+    /// Returns whether they were taken; where they were not, each comes as a call of `scalar`. A sink for which that is as
+    /// good leaves this out.
+    fn scalars(&mut self, builtin: BuiltinType, bytes: &[u8]) -> Result<bool, Self::Error> {
+        let _ = (builtin, bytes);
+        Ok(false)
+    }
+
     /// An array of numbers, Booleans or none: `bytes` are `count` elements, little endian, without gaps.
     fn packed_array(
         &mut self,
@@ -51,6 +60,15 @@ pub trait Sink {
 pub trait Source<'a> {
     /// The next field, or inside a structure the next value, as a scalar of `expected`.
     fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'a>, SourceError>;
+
+    /// The next `count` fields, of a single number each: appends the values to `out`, little endian, without gaps.
+    ///
+    /// Returns whether it did; where it did not, nothing was taken, and each is asked for with `scalar`, which says what is
+    /// wrong with it. A source for which that is as good leaves this out.
+    fn scalars(&mut self, expected: BuiltinType, count: u16, out: &mut Vec<u8>) -> bool {
+        let _ = (expected, count, out);
+        false
+    }
 
     /// The next field as an array of fixed-size elements: their count, and the elements little endian without gaps.
     fn packed_array(&mut self, expected: BuiltinType) -> Result<(usize, &'a [u8]), SourceError>;

@@ -67,12 +67,13 @@ mod type_hash;
 pub use convert::{date_time_to_time, duration_to_millis, millis_to_duration, time_to_date_time};
 pub use definition::Constant;
 pub use error::{
-    DefinitionError, Fault, NameError, PlanError, ReadError, SourceError, WriteError, WriteFault,
+    DefinitionError, Fault, NameError, PlanError, ReadError, SourceError, ValueFault, WriteError,
+    WriteFault,
 };
 pub use fields::{NoFields, Sink, Source};
 pub use message::{Leaf, MessageType, Rank, standard_type};
 pub use name::{Dialect, TypeName};
-pub use plan::{Literal, Plan, Selection, Wire};
+pub use plan::{Conversion, Literal, Part, Plan, Selection, Wire, is_lossless, is_number};
 pub use registry::Registry;
 pub use service::{ActionMessages, ActionType, ServiceType};
 pub use type_hash::{ActionTypeHashes, ServiceTypeHashes, TypeHash};

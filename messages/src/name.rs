@@ -38,6 +38,11 @@ impl TypeName {
         })
     }
 
+    /// `std_msgs/Bool`.
+    pub fn as_str(&self) -> &str {
+        &self.text
+    }
+
     /// `std_msgs` of `std_msgs/Bool`.
     pub fn package(&self) -> &str {
         self.text.get(..self.slash).unwrap_or_default()

@@ -2,170 +2,20 @@
 #![expect(
     clippy::unwrap_used,
     clippy::panic,
-    clippy::indexing_slicing,
-    clippy::wildcard_enum_match_arm,
     clippy::cast_possible_truncation,
     reason = "test code"
 )]
 
+#[path = "support/inventor.rs"]
+mod inventor;
 mod support;
 
-use std::collections::HashMap;
-
-use messages::{
-    Dialect, Fault, Leaf, Plan, ReadError, Registry, Selection, Source, SourceError, Wire,
-    WriteFault,
-};
+use inventor::{invent, unnamed};
+use messages::{Dialect, Fault, Leaf, Plan, ReadError, Registry, Selection, Wire};
 use proptest::prelude::*;
-use proptest::test_runner::{TestRng, TestRunner};
+use proptest::test_runner::TestRunner;
 use support::{Event, Player, Recorder, Value};
-use uadp::{BuiltinType, Scalar};
-
-/// Makes up whatever is asked for and remembers it.
-struct Inventor<'r> {
-    rng: &'r mut TestRng,
-    made: Vec<Event>,
-    /// Lengths the type wants, by the number of the array they are for.
-    lengths: &'r HashMap<usize, usize>,
-    arrays: usize,
-}
-
-const TEXTS: [&str; 6] = [
-    "",
-    "x",
-    "Grüße",
-    "日本語",
-    "🤖 robot",
-    "a longer text, to move what follows",
-];
-const BYTES: [&[u8]; 3] = [&[], &[0], &[1, 2, 3, 255]];
-
-impl Inventor<'_> {
-    fn length(&mut self) -> usize {
-        let number = self.arrays;
-        self.arrays += 1;
-        self.lengths
-            .get(&number)
-            .copied()
-            .unwrap_or_else(|| (self.rng.next_u32() % 4) as usize)
-    }
-
-    fn value(&mut self, builtin: BuiltinType) -> Value {
-        let random = self.rng.next_u64();
-        match builtin {
-            BuiltinType::String => Value::Text(TEXTS[(random % 6) as usize].to_owned()),
-            // Any Double may be a duration, so each is one that a nanosecond tells apart.
-            BuiltinType::Double => {
-                let eighths = (random % 16_000_000) as f64 / 8.0 - 1_000_000.0;
-                Value::of(Scalar::Double(eighths))
-            }
-            // From 1970 to 2037, in both ROS.
-            BuiltinType::DateTime => {
-                let ticks =
-                    116_444_736_000_000_000 + (random % 21_000_000_000_000_000).cast_signed();
-                Value::Fixed(builtin, ticks.to_le_bytes().to_vec())
-            }
-            BuiltinType::Boolean => Value::Fixed(builtin, vec![(random % 2) as u8]),
-            other => Value::Fixed(
-                other,
-                random.to_le_bytes()[..other.fixed_size().unwrap()].to_vec(),
-            ),
-        }
-    }
-}
-
-fn leak<T>(value: T) -> &'static T {
-    Box::leak(Box::new(value))
-}
-
-impl Source<'static> for Inventor<'_> {
-    fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'static>, SourceError> {
-        let value = if expected == BuiltinType::ByteString {
-            let number = self.arrays;
-            let length = self.length();
-            let free = BYTES[length % 3].to_vec();
-            Value::Bytes(if self.lengths.contains_key(&number) {
-                vec![7; length]
-            } else {
-                free
-            })
-        } else {
-            self.value(expected)
-        };
-        self.made.push(Event::Scalar(value.clone()));
-        Ok(leak(value).scalar())
-    }
-    fn packed_array(
-        &mut self,
-        expected: BuiltinType,
-    ) -> Result<(usize, &'static [u8]), SourceError> {
-        let count = self.length();
-        let mut bytes = Vec::new();
-        for _ in 0..count {
-            if let Value::Fixed(_, each) = self.value(expected) {
-                bytes.extend(each);
-            }
-        }
-        self.made
-            .push(Event::Packed(expected, count, bytes.clone()));
-        Ok((count, leak(bytes)))
-    }
-    fn array(&mut self, expected: BuiltinType) -> Result<usize, SourceError> {
-        let count = self.length();
-        self.made.push(Event::Array(expected, count));
-        Ok(count)
-    }
-    fn element(&mut self, expected: BuiltinType) -> Result<Scalar<'static>, SourceError> {
-        let value = self.value(expected);
-        self.made.push(Event::Element(value.clone()));
-        Ok(leak(value).scalar())
-    }
-    fn structures(&mut self) -> Result<usize, SourceError> {
-        let count = self.length();
-        self.made.push(Event::Structures(String::new(), count));
-        Ok(count)
-    }
-    fn begin_structure(&mut self) -> Result<(), SourceError> {
-        self.made.push(Event::Begin(String::new()));
-        Ok(())
-    }
-    fn end_structure(&mut self) -> Result<(), SourceError> {
-        self.made.push(Event::End);
-        Ok(())
-    }
-    fn finish(&mut self) -> Result<(), SourceError> {
-        Ok(())
-    }
-}
-
-/// Values of the plan's fields and the message they make. A fixed length is learnt from the refusal of another.
-fn invent(plan: &Plan, rng: &TestRng) -> (Vec<Event>, Vec<u8>) {
-    let mut lengths = HashMap::new();
-    for _ in 0..1000 {
-        let mut out = Vec::new();
-        let mut inventor = Inventor {
-            rng: &mut rng.clone(),
-            made: Vec::new(),
-            lengths: &lengths,
-            arrays: 0,
-        };
-        let done = plan.write(&mut inventor, &mut out);
-        let (made, arrays) = (inventor.made, inventor.arrays);
-        match done {
-            Ok(()) => return (made, out),
-            Err(error) => {
-                assert!(out.is_empty(), "a message that failed left bytes");
-                let length = match error.fault {
-                    WriteFault::Length { expected, .. } => expected,
-                    WriteFault::Bound { bound, .. } => bound,
-                    fault => panic!("{fault}"),
-                };
-                lengths.insert(arrays - 1, length as usize);
-            }
-        }
-    }
-    panic!("no values found");
-}
+use uadp::BuiltinType;
 
 fn plans() -> Vec<(String, Wire, Plan)> {
     let mut plans = Vec::new();
@@ -178,16 +28,6 @@ fn plans() -> Vec<(String, Wire, Plan)> {
         }
     }
     plans
-}
-
-/// Structures of an inventor have no name.
-fn unnamed(events: Vec<Event>) -> Vec<Event> {
-    let strip = |event| match event {
-        Event::Structures(_, count) => Event::Structures(String::new(), count),
-        Event::Begin(_) => Event::Begin(String::new()),
-        other => other,
-    };
-    events.into_iter().map(strip).collect()
 }
 
 fn runner() -> TestRunner {

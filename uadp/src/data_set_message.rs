@@ -347,6 +347,25 @@ impl<'a> Fields<'a> {
         self.block
     }
 
+    /// The next `count` fields at once, when each is a single value of `builtin`, a type of fixed size: their Variants as
+    /// on the wire, each an encoding byte and the value, little endian. `None`, and nothing taken, when one is otherwise or
+    /// not there.
+    #[inline]
+    pub fn take_scalars(&mut self, builtin: crate::BuiltinType, count: u16) -> Option<&'a [u8]> {
+        let left = self.left.checked_sub(count)?;
+        let size = 1 + builtin.fixed_size()?;
+        let mut reader = self.reader;
+        let taken = reader
+            .bytes(usize::from(count).checked_mul(size)?, "Variant")
+            .ok()?;
+        let id = builtin.id();
+        if !taken.chunks_exact(size).all(|one| one.first() == Some(&id)) {
+            return None;
+        }
+        (self.reader, self.left) = (reader, left);
+        Some(taken)
+    }
+
     /// Reads all fields to the end; the block without padding.
     ///
     /// # Errors

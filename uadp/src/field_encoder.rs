@@ -112,6 +112,47 @@ impl<'m> FieldEncoder<'m> {
         }
     }
 
+    /// Fields of one value each, all of `builtin`, a type of fixed size; inside a structure, its next fields. `bytes` are
+    /// the values as on the wire: little endian, back to back.
+    ///
+    /// # Errors
+    /// [`EncodeError::PackedSize`] when `bytes` are no whole number of values or the type has no fixed size,
+    /// [`EncodeError::Misplaced`] while an array wants elements.
+    #[inline]
+    pub fn scalars(&mut self, builtin: BuiltinType, bytes: &[u8]) -> Result<(), EncodeError> {
+        let size = builtin.fixed_size().unwrap_or_default();
+        if size == 0 || !bytes.len().is_multiple_of(size) {
+            return Err(EncodeError::PackedSize {
+                element: builtin,
+                count: 1,
+                bytes: bytes.len(),
+            });
+        }
+        if self.depth > 0 {
+            self.begin_value()?;
+            self.buf.extend_from_slice(bytes);
+            return Ok(());
+        }
+        if self.wanted != 0 {
+            return Err(ELEMENTS_WANTED);
+        }
+        let count = bytes.len() / size;
+        self.fields += count;
+        self.buf.reserve(bytes.len() + count);
+        match size {
+            8 => push_tagged::<8>(self.buf, builtin.id(), bytes),
+            4 => push_tagged::<4>(self.buf, builtin.id(), bytes),
+            2 => push_tagged::<2>(self.buf, builtin.id(), bytes),
+            _ => {
+                for value in bytes.chunks_exact(size) {
+                    self.buf.push(builtin.id());
+                    self.buf.extend_from_slice(value);
+                }
+            }
+        }
+        Ok(())
+    }
+
     /// A field as it was read, or as it shall be read.
     ///
     /// # Errors
@@ -346,6 +387,16 @@ impl<'m> FieldEncoder<'m> {
             _ => self.buf.extend_from_slice(&[a, b, c, d]),
         }
         Ok(())
+    }
+}
+
+/// Of a size the compiler knows, which makes it a few moves each.
+#[inline]
+fn push_tagged<const N: usize>(buf: &mut Vec<u8>, id: u8, bytes: &[u8]) {
+    let (values, _) = bytes.as_chunks::<N>();
+    for value in values {
+        buf.push(id);
+        buf.extend_from_slice(value);
     }
 }
 

@@ -27,6 +27,14 @@ impl<'a> StructureReader<'a> {
         Scalar::read(builtin, &mut self.reader)
     }
 
+    /// The next `count` fields at once, single values of `builtin`, a type of fixed size: little endian, back to back.
+    /// `None`, and nothing taken, when the body ends before.
+    pub fn take_scalars(&mut self, builtin: BuiltinType, count: u16) -> Option<&'a [u8]> {
+        let size = builtin.fixed_size()?;
+        let len = usize::from(count).checked_mul(size)?;
+        self.reader.bytes(len, "structure").ok()
+    }
+
     /// The next field, an array.
     ///
     /// # Errors
@@ -64,6 +72,34 @@ mod tests {
         DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder, NodeId,
     };
     use crate::{ExtensionBody, Variant};
+
+    #[test]
+    fn numbers_of_one_kind_are_written_and_taken_at_once_or_not_at_all() {
+        let mut datagram = Vec::new();
+        let mut message =
+            NetworkMessageEncoder::new(&mut datagram, &NetworkHeader::default(), Some(&[1]))
+                .unwrap();
+        let mut frame = message.key_frame(&DataSetHeader::default()).unwrap();
+        assert!(frame.scalars(BuiltinType::Int32, &[1, 0, 0]).is_err());
+        assert!(frame.scalars(BuiltinType::String, &[1]).is_err());
+        frame
+            .scalars(BuiltinType::Int16, &[1, 0, 0xFE, 0xFF])
+            .unwrap();
+        frame.scalar(Scalar::Byte(7)).unwrap();
+        frame.finish().unwrap();
+        message.finish().unwrap();
+        let message = NetworkMessage::decode(&datagram).unwrap();
+        let message = message.messages().next().unwrap().unwrap();
+        let mut fields = message.fields().unwrap();
+        assert_eq!(fields.len(), 3);
+        assert_eq!(fields.take_scalars(BuiltinType::Int16, 3), None);
+        assert_eq!(fields.take_scalars(BuiltinType::Int16, 4), None);
+        assert_eq!(fields.take_scalars(BuiltinType::UInt16, 2), None);
+        let taken = fields.take_scalars(BuiltinType::Int16, 2).unwrap();
+        assert_eq!(taken, [4, 1, 0, 4, 0xFE, 0xFF]);
+        let rest: Vec<_> = fields.collect();
+        assert_eq!(rest, [Ok(Variant::Scalar(Scalar::Byte(7)))]);
+    }
 
     #[test]
     fn what_was_written_into_a_structure_is_read_back() {

@@ -1,9 +1,16 @@
 //! `cargo xtask bench`: measurements, with optimised programs.
 
-use anyhow::ensure;
+use std::{
+    io::Write as _,
+    path::PathBuf,
+    process::{Command, Stdio},
+};
+
+use anyhow::{Context as _, ensure};
 
 use crate::{
     dds::Rustdds,
+    instructions,
     namespace::{Namespaces, REFUSED},
     peers,
     shell::{Ended, run as must, status, step},
@@ -26,6 +33,33 @@ pub(crate) fn ros1(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<
 pub(crate) fn ros2(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     let packages = ["bridge-ros1", "bridge-ros2", "system-tests"];
     measured(workspace, "bench-ros2", &packages, arguments)
+}
+
+/// Measures messages between ROS bytes and UADP fields, and what serializers in Python take for the ROS half of it.
+pub(crate) fn messages(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    instructions::run(workspace, "messages", arguments, |bench| {
+        step("the same messages in Python, without UADP");
+        let dump = Command::new(bench).arg("dump").output()?;
+        for (python, library) in [
+            (PathBuf::from("/usr/bin/python3"), "genpy"),
+            (peers::python(workspace), "rosbags"),
+        ] {
+            let script = workspace.root.join("messages/bench/serializers.py");
+            let mut measured = Command::new(&python)
+                .arg(script)
+                .arg(library)
+                .stdin(Stdio::piped())
+                .spawn()
+                .with_context(|| {
+                    format!("{}: `cargo xtask peers` installs it", python.display())
+                })?;
+            if let Some(mut to) = measured.stdin.take() {
+                to.write_all(&dump.stdout)?;
+            }
+            ensure!(measured.wait()?.success(), "{library} was not measured");
+        }
+        Ok(())
+    })
 }
 
 /// Builds the packages with all their programs, then runs the one that measures.

@@ -1,6 +1,12 @@
-//! `cargo xtask bench uadp`: wall time of the codec, and its instructions, which no busy machine changes.
+//! `cargo xtask bench uadp` and `bench messages`: wall time, and instructions, which no busy machine changes.
 
-use std::{collections::BTreeMap, fmt::Write as _, fs, path::PathBuf, process::Command};
+use std::{
+    collections::BTreeMap,
+    fmt::Write as _,
+    fs,
+    path::{Path, PathBuf},
+    process::Command,
+};
 
 use anyhow::{Context as _, bail, ensure};
 
@@ -15,23 +21,31 @@ const TOLERANCE: u64 = 10;
 const FEW: u64 = 1_000;
 const MANY: u64 = 3_000;
 
-/// Measures. `--instructions` compares only the instructions with the list, `--update` writes the list anew.
-pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+/// Measures the crate `of`, which has a package `of-bench` in its folder `bench`. `--instructions` compares only the
+/// instructions with the list there, `--update` writes the list anew. `after` follows the wall time.
+pub(crate) fn run(
+    workspace: &Workspace,
+    of: &str,
+    arguments: &[&str],
+    after: impl FnOnce(&Path) -> anyhow::Result<()>,
+) -> anyhow::Result<Ended> {
     let (wall, update) = match arguments {
         [] => (true, false),
         ["--instructions"] => (false, false),
         ["--update"] => (false, true),
         _ => {
-            eprintln!("xtask: bench uadp takes --instructions or --update");
+            eprintln!("xtask: bench {of} takes --instructions or --update");
             return Ok(Ended::USAGE);
         }
     };
     step("building the measurement with optimisation");
-    must(&mut workspace.cargo(&["build", "--release", "--locked", "-p", "uadp-bench"]))?;
-    let bench = workspace.target.join("release/uadp-bench");
+    let package = format!("{of}-bench");
+    must(&mut workspace.cargo(&["build", "--release", "--locked", "-p", &package]))?;
+    let bench = workspace.target.join("release").join(package);
     if wall {
         step("wall time, nanoseconds per message, the best of all rounds");
         must(&mut Command::new(&bench))?;
+        after(&bench)?;
     }
     ensure!(
         succeeds("valgrind", &["--version"]),
@@ -39,7 +53,7 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
     );
     step("instructions per message");
     let counted = count_all(&bench)?;
-    let list = List::of(workspace);
+    let list = List::of(workspace, of);
     if update {
         list.write(&counted)?;
         return Ok(Ended::WELL);
@@ -77,12 +91,15 @@ fn count(bench: &PathBuf, name: &str, messages: u64) -> anyhow::Result<u64> {
 /// What the codec took when the list was last written.
 struct List {
     path: PathBuf,
+    /// The crate.
+    of: String,
 }
 
 impl List {
-    fn of(workspace: &Workspace) -> Self {
+    fn of(workspace: &Workspace, of: &str) -> Self {
         Self {
-            path: workspace.root.join("uadp/bench/instructions.txt"),
+            path: workspace.root.join(of).join("bench/instructions.txt"),
+            of: of.to_owned(),
         }
     }
 
@@ -126,8 +143,9 @@ impl List {
         }
         if ended != Ended::WELL {
             println!(
-                "the list is {}; `cargo xtask bench uadp --update` writes it anew",
-                self.path.display()
+                "the list is {}; `cargo xtask bench {} --update` writes it anew",
+                self.path.display(),
+                self.of
             );
         }
         Ok(ended)

@@ -34,6 +34,7 @@ cargo xtask <verb>
   bench ros1 [ARGS]              measure relays of ROS 1 messages beside a raw echo; bridge-ros1 with 50 topics (--help)
   bench ros2 [ARGS]              measure relays of DDS samples beside a UDP echo; both bridges from ROS 1 to ROS 2 and back
   bench uadp [--instructions]    measure the codec beside another one; only count instructions and hold them against the list
+  bench messages [--instructions]  measure messages on their way to fields and back, beside memcpy, a tree of values and Python
 ";
 
 fn main() -> ExitCode {
@@ -60,7 +61,10 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["dist"] => dist::run(&Workspace::find()?),
         ["dds"] => dds::run(&Workspace::find()?),
         ["lint"] => lint::run(&Workspace::find()?),
-        ["bench", "uadp", rest @ ..] => instructions::run(&Workspace::find()?, rest),
+        ["bench", "uadp", rest @ ..] => {
+            instructions::run(&Workspace::find()?, "uadp", rest, |_| Ok(()))
+        }
+        ["bench", "messages", rest @ ..] => bench::messages(&Workspace::find()?, rest),
         ["bench", "hop", rest @ ..] => bench::hop(&Workspace::find()?, rest),
         ["bench", "ros1", rest @ ..] => bench::ros1(&Workspace::find()?, rest),
         ["bench", "ros2", rest @ ..] => bench::ros2(&Workspace::find()?, rest),

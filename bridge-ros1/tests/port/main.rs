@@ -138,6 +138,7 @@ fn line(event: &PortEvent) -> String {
             let field = match selection {
                 Selection::Whole => "whole",
                 Selection::Field(field) => field,
+                Selection::Value { field, .. } => field,
                 Selection::Bytes => "bytes",
                 Selection::Template { .. } => "template",
             };

@@ -8,6 +8,7 @@ use messages::{DefinitionError, Dialect, Leaf, MessageType, Selection, TypeName}
 
 use super::names::{mended, topic_fault};
 use super::services::{self, Calls, Kind, Known, Service};
+use super::shaping::{self, Way};
 use super::types::{self, Types, ValueType, dialect};
 use super::{Declared, required, variables};
 use crate::code::Code;
@@ -195,14 +196,25 @@ impl<'c> Bindings<'c> {
         let (name, place) = named?;
         let space = site.space?;
         let message_type = self.message_type(&name, place, site, findings);
-        let selection = selection(entry, findings)?;
         let chosen = match (&entry.field, &entry.r#as) {
             (Some(at), _) => at.place,
             (None, Some(at)) => at.place,
             (None, None) => place,
         };
+        let way = Way {
+            reads: site.subject.origin == Some(space),
+            declared: site.subject.declared,
+        };
+        let known = message_type.as_deref();
+        let selection = selection(entry, known, (chosen, way), findings)?;
         let fields = match (&selection, message_type) {
             (Selection::Bytes, _) => Some(vec![Leaf::bytes()]),
+            (Selection::Value { .. }, Some(message_type)) => Some(shaping::leaves(
+                &message_type,
+                &selection,
+                chosen,
+                findings,
+            )?),
             (_, Some(message_type)) => Some(select(&message_type, &selection, chosen, findings)?),
             (_, None) => None,
         };
@@ -355,11 +367,38 @@ impl<'c> Bindings<'c> {
 }
 
 /// `None` when it is faulty, which is noted.
-fn selection(entry: &BindingEntry, findings: &mut Findings) -> Option<Selection> {
+fn selection(
+    entry: &BindingEntry,
+    message_type: Option<&MessageType>,
+    (place, way): (Place, Way),
+    findings: &mut Findings,
+) -> Option<Selection> {
     let bytes = matches!(given(&entry.r#as), Some((AsEntry::Bytes, _)));
+    let shaping = shaping::shaping(entry, findings)?;
     match &entry.field {
-        None if bytes => Some(Selection::Bytes),
-        None => Some(Selection::Whole),
+        None => {
+            // Of a type with one field that one is meant.
+            let only = message_type.and_then(|message| match message.leaves() {
+                [only] if !bytes => Some(only.path.clone()),
+                _ => None,
+            });
+            match only {
+                Some(only) => {
+                    let shaped =
+                        shaping.select((only, None), message_type, (place, way), findings)?;
+                    let alone = matches!(shaped, Selection::Field(_));
+                    Some(if alone { Selection::Whole } else { shaped })
+                }
+                None => {
+                    shaping.of_several(findings)?;
+                    Some(if bytes {
+                        Selection::Bytes
+                    } else {
+                        Selection::Whole
+                    })
+                }
+            }
+        }
         Some(at) if bytes => {
             let note = findings.error(
                 Code::FieldOfBytes,
@@ -369,7 +408,10 @@ fn selection(entry: &BindingEntry, findings: &mut Findings) -> Option<Selection>
             note.help("leave `field` out, or `as: bytes`");
             None
         }
-        Some(at) => Some(Selection::Field(at.value.clone()?)),
+        Some(at) => {
+            let field = shaping::part(at.value.as_ref()?, at.place, findings)?;
+            shaping.select(field, message_type, (place, way), findings)
+        }
     }
 }
 

@@ -2,9 +2,10 @@
 
 use std::collections::BTreeMap;
 
-use messages::{Selection, TypeName};
+use messages::{Conversion, Selection, TypeName};
 
 use super::bindings::select;
+use super::shaping;
 use super::types::{Types, dialect};
 use super::{Declared, required, variables};
 use crate::code::Code;
@@ -241,7 +242,14 @@ fn kind(
                 .help("leave `field` out, or `as: bytes`");
             return None;
         }
-        Some(at) => Selection::Field(at.value.clone()?),
+        Some(at) => match shaping::part(at.value.as_ref()?, at.place, findings)? {
+            (field, None) => Selection::Field(field),
+            (field, part) => Selection::Value {
+                field,
+                part,
+                conversion: Conversion::default(),
+            },
+        },
         None if bytes => Selection::Bytes,
         None => Selection::Whole,
     };
@@ -257,8 +265,14 @@ fn kind(
         return None;
     };
     let known = origin.and_then(|origin| types.get(dialect(origin), &name).as_ref().ok());
-    if let (Selection::Field(_), Some(known), Some(field)) = (&selection, known, &entry.field) {
-        select(known, &selection, field.place, findings)?;
+    if let (Some(known), Some(field)) = (known, &entry.field) {
+        match &selection {
+            Selection::Value { .. } => shaping::leaves(known, &selection, field.place, findings)?,
+            Selection::Whole
+            | Selection::Field(_)
+            | Selection::Template { .. }
+            | Selection::Bytes => select(known, &selection, field.place, findings)?,
+        };
     }
     Some((Some(name), selection))
 }

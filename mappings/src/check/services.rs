@@ -205,6 +205,14 @@ pub(super) fn kind(entry: &BindingEntry, owner: Place, findings: &mut Findings) 
     let strange = [
         ("type", place(&entry.r#type), kind == Kind::Answer),
         ("as", r#as, !topic),
+        ("scale", entry.scale.as_ref().map(|at| at.place), !topic),
+        ("offset", entry.offset.as_ref().map(|at| at.place), !topic),
+        ("invert", entry.invert.as_ref().map(|at| at.place), !topic),
+        (
+            "out_of_range",
+            entry.out_of_range.as_ref().map(|at| at.place),
+            !topic,
+        ),
         ("request", request, !call && !poll),
         ("when", place(&entry.when), !call),
         ("timeout", place(&entry.timeout), !call && !poll),
@@ -516,6 +524,7 @@ fn told_fault(path: &str, error: PlanError) -> (String, Option<String>) {
         }
         PlanError::Wire { .. }
         | PlanError::EmptyElements { .. }
+        | PlanError::Shape { .. }
         | PlanError::Constant { .. }
         | PlanError::ConstantFault { .. }
         | PlanError::ConstantOfField { .. } => (error.to_string(), None),

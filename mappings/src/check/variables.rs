@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::num::NonZeroU16;
 use std::ops::RangeInclusive;
+use std::time::Duration;
 
 use messages::{Leaf, Rank};
 
@@ -11,9 +12,9 @@ use super::services::Calls;
 use super::types::{self, ValueType};
 use super::{Declared, required};
 use crate::code::Code;
-use crate::document::{Queue, VariableEntry};
+use crate::document::{PublishEntry, Queue, VariableEntry};
 use crate::findings::Findings;
-use crate::mapping::{Overflow, Space, Variable};
+use crate::mapping::{Overflow, Publish, Space, Variable};
 use crate::node_id::{Identifier, NodeIdText};
 use crate::read::{At, given, short};
 use crate::topic::{SpaceId, TopicId};
@@ -332,6 +333,7 @@ fn variable(
         Some((Queue::DropOldest(size), _)) => Overflow::DropOldest(NonZeroU16::new(*size)?),
         Some((Queue::KeepLatest, _)) | None => Overflow::KeepLatest,
     };
+    let publish = publish(entry, value_type, findings);
     let service = bound
         .service
         .map(|service| service.settled(value_type, findings));
@@ -346,7 +348,67 @@ fn variable(
         bindings: bound.bindings,
         service,
         overflow,
+        publish: publish?,
     })
+}
+
+/// `None` when it is faulty, which is noted.
+fn publish(
+    entry: &VariableEntry,
+    value_type: Option<ValueType>,
+    findings: &mut Findings,
+) -> Option<Publish> {
+    let mut on_change = matches!(given(&entry.publish), Some((PublishEntry::OnChange, _)));
+    let (mut deadband, mut sound) = (0.0, Some(()));
+    if let Some((width, place)) = given(&entry.deadband) {
+        (deadband, on_change) = (*width, true);
+        let fault = if *width <= 0.0 || !width.is_finite() {
+            Some((
+                format!("a deadband of {width}"),
+                "a number above 0, in the unit of the value",
+            ))
+        } else if value_type.is_some_and(|(builtin, _)| !messages::is_number(builtin)) {
+            let told = value_type.map(types::print).unwrap_or_default();
+            Some((
+                format!("a deadband goes with numbers, and this is {told}"),
+                "`publish: on_change` goes with all values",
+            ))
+        } else if matches!(given(&entry.publish), Some((PublishEntry::Always, _))) {
+            Some((
+                "a deadband holds values back, and `publish: always` does not".to_owned(),
+                "leave one of them out",
+            ))
+        } else {
+            None
+        };
+        if let Some((message, help)) = fault {
+            findings.error(Code::Publish, place, message).help(help);
+            sound = None;
+        }
+    }
+    let mut period = Duration::ZERO;
+    if let Some((text, place)) = given(&entry.at_most) {
+        match rate(text) {
+            Some(found) => period = found,
+            None => {
+                let message = format!("`{}` is no rate", short(text));
+                findings
+                    .error(Code::Publish, place, message)
+                    .help("from 0.001 Hz to 1000 Hz, as 10 Hz");
+                sound = None;
+            }
+        }
+    }
+    sound.map(|()| Publish::new(on_change, deadband, period))
+}
+
+/// The time between two of so many in a second: `10 Hz`.
+fn rate(text: &str) -> Option<Duration> {
+    let number = text.strip_suffix("Hz")?.trim_end();
+    let rate: f64 = number.parse().ok()?;
+    (0.001..=1000.0)
+        .contains(&rate)
+        .then(|| Duration::from_secs_f64(1.0 / rate))
 }
 
 /// As the std_msgs type of a value has it.

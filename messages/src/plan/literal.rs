@@ -71,7 +71,7 @@ impl<'m> Given<'m> {
             (What::Bytes(_) | What::Packed(..) | What::Many(..), Literal::One(text)) => {
                 Err(self.fault(text, "a list, as [1, 2]"))
             }
-            (What::Messages { .. } | What::Skip { .. }, literal) => {
+            (What::Messages { .. } | What::Skip { .. } | What::Run(..), literal) => {
                 let text = match literal {
                     Literal::One(text) => text,
                     Literal::List(_) => "a list",

@@ -1,7 +1,9 @@
 //! A message type compiled for one wire and selection.
 
+mod conversion;
 mod literal;
 mod read;
+mod shaped;
 mod write;
 
 use std::collections::BTreeMap;
@@ -10,8 +12,11 @@ use std::sync::Arc;
 
 use uadp::Scalar;
 
+pub use conversion::{Conversion, is_lossless, is_number};
 pub use literal::Literal;
 use literal::{Given, Typed};
+pub use shaped::Part;
+use shaped::Shaped;
 
 use crate::definition::{Arity, Number, Primitive};
 use crate::resolve::{Shape, ShapeKind};
@@ -34,6 +39,15 @@ pub enum Selection {
     Whole,
     /// The one of that path; where that is a message of its own, all fields of it.
     Field(String),
+    /// The one field of that path, which is no message: a part of it, where it is an array, and converted.
+    Value {
+        /// The path.
+        field: String,
+        /// What of an array crosses; `None`: all of it.
+        part: Option<Part>,
+        /// What each value goes through.
+        conversion: Conversion,
+    },
     /// A message of constants, to be written: `field` takes the value, or without it no value crosses; the fields of
     /// `rest` have what stands there, all others are zero or empty. Read, it is as [`Selection::Field`].
     Template {
@@ -62,6 +76,8 @@ pub struct Plan {
 #[derive(Clone, Debug)]
 enum Body {
     Steps(Vec<Op>),
+    /// One field, of which a part crosses or which is converted.
+    Shaped(Box<Shaped>),
     /// The message crosses as it is.
     Bytes,
 }
@@ -81,6 +97,8 @@ struct Op {
 #[derive(Clone, Debug)]
 enum What {
     One(Primitive),
+    /// The next so many steps are each one number of that kind, and all cross: they may be moved at once.
+    Run(Number, u16),
     /// Array of elements that are on the wire as in OPC UA.
     Packed(Number, Len),
     /// Array of `uint8`: a ByteString.
@@ -128,43 +146,26 @@ impl Plan {
             .iter()
             .map(|leaf| leaf.path.clone())
             .collect();
-        let none = BTreeMap::new();
-        let (field, rest) = match selection {
-            Selection::Whole => (None, &none),
-            Selection::Field(path) => (Some(path), &none),
-            Selection::Template { field, rest } => (field.as_ref(), rest),
+        let (body, leaves) = match selection {
             Selection::Bytes => return Ok(Self::bytes(wire)),
-        };
-        let carried = match field {
-            Some(path) => range(message, path)?,
-            None if *selection == Selection::Whole => 0..message.leaves().len(),
-            None => 0..0,
-        };
-        let mut compiler = Compiler {
-            wire,
-            carried: carried.clone(),
-            given: given(message, field, rest)?,
-            leaf: 0,
-            ops: Vec::new(),
-            body: 0,
-            fault: None,
-        };
-        compiler.message(&message.shape, false);
-        if let Some(fault) = compiler.fault {
-            return Err(fault);
-        }
-        write::try_constants(wire, &compiler.ops).map_err(|(leaf, fault)| {
-            let path = paths.get(leaf).cloned().unwrap_or_default();
-            PlanError::ConstantFault {
-                name: message.name().clone(),
-                path,
-                fault,
+            Selection::Value {
+                field,
+                part,
+                conversion,
+            } => {
+                let steps =
+                    |selection: &Selection| steps(message, selection, wire).map(|(ops, _)| ops);
+                let (shaped, leaf) = Shaped::compile(message, (field, part, conversion), steps)?;
+                (Body::Shaped(Box::new(shaped)), vec![leaf])
             }
-        })?;
-        let leaves = message.leaves().get(carried).unwrap_or_default().to_vec();
+            Selection::Whole | Selection::Field(_) | Selection::Template { .. } => {
+                let (ops, leaves) = steps(message, selection, wire)?;
+                (Body::Steps(ops), leaves)
+            }
+        };
         Ok(Self {
             wire,
-            body: Body::Steps(compiler.ops),
+            body,
             leaves,
             paths,
         })
@@ -191,6 +192,7 @@ impl Plan {
     pub fn read<S: Sink>(&self, payload: &[u8], sink: &mut S) -> Result<(), ReadError<S::Error>> {
         match &self.body {
             Body::Steps(ops) => read::read(self, ops, payload, sink),
+            Body::Shaped(shaped) => shaped.read(self, payload, sink),
             Body::Bytes => sink
                 .scalar(Scalar::ByteString(Some(payload)))
                 .map_err(|source| ReadError::Sink {
@@ -208,6 +210,7 @@ impl Plan {
     ) -> Result<(), WriteError> {
         match &self.body {
             Body::Steps(ops) => write::write(self, ops, source, out),
+            Body::Shaped(shaped) => shaped.write(self, source, out),
             Body::Bytes => write::bytes(source, out),
         }
     }
@@ -217,6 +220,50 @@ impl Plan {
             .cloned()
             .unwrap_or_default()
     }
+}
+
+/// The steps of a selection that is no part of a field and not the bytes, and the fields that cross.
+fn steps(
+    message: &Arc<MessageType>,
+    selection: &Selection,
+    wire: Wire,
+) -> Result<(Vec<Op>, Vec<Leaf>), PlanError> {
+    let none = BTreeMap::new();
+    let (field, rest) = match selection {
+        Selection::Field(path) => (Some(path), &none),
+        Selection::Template { field, rest } => (field.as_ref(), rest),
+        Selection::Whole | Selection::Value { .. } | Selection::Bytes => (None, &none),
+    };
+    let carried = match field {
+        Some(path) => range(message, path)?,
+        None if *selection == Selection::Whole => 0..message.leaves().len(),
+        None => 0..0,
+    };
+    let mut compiler = Compiler {
+        wire,
+        carried: carried.clone(),
+        given: given(message, field, rest)?,
+        leaf: 0,
+        ops: Vec::new(),
+        body: 0,
+        fault: None,
+    };
+    compiler.message(&message.shape, false);
+    if let Some(fault) = compiler.fault {
+        return Err(fault);
+    }
+    let ops = coalesced(&compiler.ops);
+    write::try_constants(wire, &ops).map_err(|(leaf, fault)| PlanError::ConstantFault {
+        name: message.name().clone(),
+        path: message
+            .leaves()
+            .get(leaf)
+            .map(|leaf| leaf.path.clone())
+            .unwrap_or_default(),
+        fault,
+    })?;
+    let leaves = message.leaves().get(carried).unwrap_or_default().to_vec();
+    Ok((ops, leaves))
 }
 
 /// The fields of a path: one, or those of a message, which follow each other.
@@ -267,6 +314,51 @@ fn given<'m>(
         Ok((at, Given::new(message, path, literal)))
     });
     each.collect()
+}
+
+/// The steps with a [`What::Run`] before those that may be moved at once.
+fn coalesced(mut ops: &[Op]) -> Vec<Op> {
+    let mut all = Vec::with_capacity(ops.len());
+    while let Some((op, after)) = ops.split_first() {
+        ops = after;
+        match &op.what {
+            What::Messages { steps, .. } => {
+                let (body, after) = ops.split_at_checked(*steps).unwrap_or((ops, &[]));
+                ops = after;
+                let body = coalesced(body);
+                let mut head = op.clone();
+                if let What::Messages { steps, .. } = &mut head.what {
+                    *steps = body.len();
+                }
+                all.push(head);
+                all.extend(body);
+            }
+            What::One(Primitive::Number(number)) if op.carry && *number != Number::Bool => {
+                let more = ops.iter().take_while(|next| {
+                    let same = matches!(next.what, What::One(Primitive::Number(n)) if n == *number);
+                    same && next.carry && next.constant.is_none()
+                });
+                let more = more.count().min(usize::from(u16::MAX - 1));
+                let (run, after) = ops.split_at_checked(more).unwrap_or((ops, &[]));
+                ops = after;
+                if let Ok(count) = u16::try_from(more + 1) {
+                    all.push(Op {
+                        what: What::Run(*number, count),
+                        ..op.clone()
+                    });
+                }
+                all.push(op.clone());
+                all.extend_from_slice(run);
+            }
+            What::One(_)
+            | What::Run(..)
+            | What::Packed(..)
+            | What::Bytes(_)
+            | What::Many(..)
+            | What::Skip { .. } => all.push(op.clone()),
+        }
+    }
+    all
 }
 
 struct Compiler<'m> {

@@ -120,6 +120,11 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
             match &op.what {
                 What::One(primitive) if op.carry => self.one(*primitive, S::scalar)?,
                 What::One(primitive) => self.skip_one(*primitive)?,
+                What::Run(number, count) => {
+                    if self.run(*number, *count).map_err(Stop::Sink)? {
+                        ops = ops.get(usize::from(*count)..).unwrap_or_default();
+                    }
+                }
                 What::Skip { align, bytes } => {
                     self.take(*align, *bytes)?;
                 }
@@ -227,6 +232,24 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
             Number::Float64 => hand!(Double, f64::from_bits(self.u64()?)),
         };
         given.map_err(Stop::Sink)
+    }
+
+    /// Hands over `count` numbers at once, or none: then they are read one by one, and what is wrong is found where it is.
+    #[inline]
+    fn run(&mut self, number: Number, count: u16) -> Result<bool, S::Error> {
+        if L::SWAPPED {
+            return Ok(false);
+        }
+        let before = self.at;
+        let size = number.size();
+        let taken = match self.take(size, usize::from(count) * size) {
+            Ok(bytes) => self.sink.scalars(number.builtin(), bytes)?,
+            Err(_) => false,
+        };
+        if !taken {
+            self.at = before;
+        }
+        Ok(taken)
     }
 
     fn skip_one(&mut self, primitive: Primitive) -> Result<(), Fault> {

@@ -75,8 +75,8 @@ fn constant_of(
         What::Packed(number, len) => writer.packed(*number, *len, true),
         What::Bytes(len) => writer.bytes(*len, true),
         What::Many(primitive, len) => writer.many(*primitive, *len, true),
-        // Neither has a constant.
-        What::Messages { .. } | What::Skip { .. } => Ok(()),
+        // None of them has a constant.
+        What::Messages { .. } | What::Skip { .. } | What::Run(..) => Ok(()),
     }
 }
 
@@ -113,6 +113,12 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
             match &op.what {
                 What::One(primitive) if op.carry => self.single(*primitive)?,
                 What::One(primitive) => self.zero(*primitive),
+                What::Run(number, count) => {
+                    self.align(number.size());
+                    if self.source.scalars(number.builtin(), *count, self.out) {
+                        ops = ops.get(usize::from(*count)..).unwrap_or_default();
+                    }
+                }
                 What::Skip { align, bytes } => self.zeros(*align, *bytes),
                 What::Packed(number, len) => self.packed(*number, *len, op.carry)?,
                 What::Bytes(len) => self.bytes(*len, op.carry)?,
@@ -256,11 +262,16 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
         }
         let count = self.source.array(primitive.builtin())?;
         self.count(len, count)?;
-        for _ in 0..count {
+        (0..count).try_for_each(|_| {
             let value = self.source.element(primitive.builtin())?;
-            self.one(primitive, value)?;
-        }
-        Ok(())
+            match (primitive, value) {
+                // What names of joints are.
+                (Primitive::Text(text), Scalar::String(value)) if !text.wide => {
+                    self.narrow(text.bound, value.unwrap_or_default())
+                }
+                (primitive, value) => self.one(primitive, value),
+            }
+        })
     }
 
     fn narrow(&mut self, bound: u32, text: &str) -> Result<(), WriteFault> {

@@ -1,0 +1,156 @@
+//! Which samples of a topic go out at all: those that say something new, and not too many of them.
+
+use std::time::Instant;
+
+use mappings::Publish;
+use uadp::{Array, BuiltinType, DecodeError, Fields, NetworkMessage, Scalar, Variant};
+
+use crate::output::PublisherKey;
+use crate::writer::Encoded;
+
+/// What holds samples of one topic back, by the rule of its variable.
+#[derive(Debug)]
+pub(crate) struct Gate {
+    rule: Publish,
+    /// The fields that went out last; empty before the first.
+    last: Vec<u8>,
+    /// When the next may go out.
+    opens: Option<Instant>,
+    /// The newest sample that came too early.
+    held: Option<Waiting>,
+}
+
+/// A sample and its publisher, if that latches.
+pub(crate) type Waiting = (Encoded, Option<PublisherKey>);
+
+/// What becomes of a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Passage {
+    Passes,
+    /// It says what was said already.
+    Unchanged,
+    /// It is to wait, unless a newer one takes its place.
+    TooEarly,
+}
+
+impl Gate {
+    /// `None` where all samples pass.
+    pub(crate) fn new(rule: Publish) -> Option<Box<Self>> {
+        let gate = Self {
+            rule,
+            last: Vec::new(),
+            opens: None,
+            held: None,
+        };
+        (rule != Publish::default()).then(|| Box::new(gate))
+    }
+
+    /// Judges a sample; one that passes is the last that went out.
+    pub(crate) fn judge(&mut self, sample: &Encoded, now: Instant) -> Passage {
+        let fields = block(sample).unwrap_or_default();
+        if self.rule.on_change && self.says_the_same(fields) {
+            // What waited is not true any more.
+            self.held = None;
+            return Passage::Unchanged;
+        }
+        if self.opens.is_some_and(|opens| now < opens) {
+            return Passage::TooEarly;
+        }
+        self.last.clear();
+        self.last.extend_from_slice(fields);
+        self.opens = (!self.rule.period.is_zero()).then(|| now + self.rule.period);
+        Passage::Passes
+    }
+
+    /// Lets a sample wait; the one that waited before gives way.
+    pub(crate) fn hold(&mut self, sample: Waiting) -> Option<Waiting> {
+        self.held.replace(sample)
+    }
+
+    /// When the sample that waits may go.
+    pub(crate) fn due(&self) -> Option<Instant> {
+        self.held.as_ref().and(self.opens)
+    }
+
+    /// The sample that waited, when its time has come.
+    pub(crate) fn release(&mut self, now: Instant) -> Option<Waiting> {
+        if self.due().is_none_or(|due| now < due) {
+            return None;
+        }
+        self.held.take()
+    }
+
+    fn says_the_same(&self, fields: &[u8]) -> bool {
+        if self.last.is_empty() {
+            return false;
+        }
+        if self.last == fields {
+            return true;
+        }
+        let deadband = self.rule.deadband();
+        deadband > 0.0 && within(&self.last, fields, deadband).unwrap_or(false)
+    }
+}
+
+/// The fields of a sample as on the wire.
+fn block(sample: &Encoded) -> Result<&[u8], DecodeError> {
+    let network = NetworkMessage::decode(&sample.bytes)?;
+    let message = network.messages().next().transpose()?;
+    let fields = message.map(|message| message.fields()).transpose()?;
+    Ok(fields.map(|fields| fields.bytes()).unwrap_or_default())
+}
+
+/// Whether all numbers of the two differ by no more than `deadband`, and nothing else does.
+fn within(one: &[u8], other: &[u8], deadband: f64) -> Result<bool, DecodeError> {
+    let (mut one, mut other) = (Fields::parse(one)?, Fields::parse(other)?);
+    loop {
+        match (one.next().transpose()?, other.next().transpose()?) {
+            (None, None) => return Ok(true),
+            (Some(a), Some(b)) if near(&a, &b, deadband) => {}
+            _ => return Ok(false),
+        }
+    }
+}
+
+fn near(one: &Variant<'_>, other: &Variant<'_>, deadband: f64) -> bool {
+    match (one, other) {
+        (Variant::Scalar(a), Variant::Scalar(b)) => near_scalars(*a, *b, deadband),
+        (Variant::Array(a), Variant::Array(b)) => {
+            let alike = |a: &Array<'_>| (a.element(), a.len());
+            alike(a) == alike(b)
+                && a.element() != BuiltinType::ExtensionObject
+                && a.iter()
+                    .zip(b.iter())
+                    .all(|(a, b)| near_scalars(a, b, deadband))
+        }
+        (one, other) => one == other,
+    }
+}
+
+fn near_scalars(one: Scalar<'_>, other: Scalar<'_>, deadband: f64) -> bool {
+    match (number(one), number(other)) {
+        (Some(a), Some(b)) => (a - b).abs() <= deadband || (a.is_nan() && b.is_nan()),
+        _ => one == other,
+    }
+}
+
+#[expect(
+    clippy::wildcard_enum_match_arm,
+    clippy::cast_precision_loss,
+    reason = "only numbers are near each other, and whether 64 bits are is known to 53 of them"
+)]
+fn number(value: Scalar<'_>) -> Option<f64> {
+    Some(match value {
+        Scalar::SByte(value) => value.into(),
+        Scalar::Byte(value) => value.into(),
+        Scalar::Int16(value) => value.into(),
+        Scalar::UInt16(value) => value.into(),
+        Scalar::Int32(value) => value.into(),
+        Scalar::UInt32(value) => value.into(),
+        Scalar::Int64(value) => value as f64,
+        Scalar::UInt64(value) => value as f64,
+        Scalar::Float(value) => value.into(),
+        Scalar::Double(value) => value,
+        _ => return None,
+    })
+}

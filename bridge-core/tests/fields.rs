@@ -1,0 +1,94 @@
+//! Every type of the bundle crosses UADP as the fields its leaves say, and returns.
+#![expect(clippy::unwrap_used, reason = "test code")]
+
+#[path = "../../messages/tests/support/inventor.rs"]
+#[expect(dead_code, reason = "the tests of `messages` use all of it")]
+mod inventor;
+#[path = "../../messages/tests/support/mod.rs"]
+#[expect(dead_code, reason = "the tests of `messages` use all of it")]
+mod support;
+
+use bridge_core::{decode_fields, encode_fields};
+use messages::{Dialect, Plan, Rank, Registry, Selection, Wire};
+use proptest::test_runner::TestRunner;
+use uadp::{
+    BuiltinType, DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
+    Variant,
+};
+
+fn encode(plan: &Plan, message: &[u8]) -> Vec<u8> {
+    let mut datagram = Vec::new();
+    let network = NetworkHeader::default();
+    let mut encoder = NetworkMessageEncoder::new(&mut datagram, &network, Some(&[1])).unwrap();
+    let mut frame = encoder.key_frame(&DataSetHeader::default()).unwrap();
+    encode_fields(plan, message, 2, &mut frame).unwrap();
+    frame.finish().unwrap();
+    encoder.finish().unwrap();
+    datagram
+}
+
+fn fields(datagram: &[u8]) -> Fields<'_> {
+    let network = NetworkMessage::decode(datagram).unwrap();
+    let message = network.messages().next().unwrap().unwrap();
+    message.fields().unwrap()
+}
+
+fn shape(field: &Variant<'_>) -> (Option<BuiltinType>, bool) {
+    (field.builtin_type(), matches!(field, Variant::Array(_)))
+}
+
+#[test]
+fn random_messages_of_every_type_cross_and_return() {
+    let mut runner = TestRunner::deterministic();
+    let mut types = 0;
+    for (dialect, wire) in [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)] {
+        let registry = Registry::bundle(dialect);
+        for name in registry.names() {
+            let message = registry.get(name).unwrap();
+            let plan = Plan::compile(&message, &Selection::Whole, wire).unwrap();
+            let shapes = plan
+                .leaves()
+                .iter()
+                .map(|leaf| (Some(leaf.builtin), matches!(leaf.rank, Rank::Array { .. })));
+            let shapes: Vec<_> = shapes.collect();
+            for _ in 0..10 {
+                let (_, bytes) = inventor::invent(&plan, &runner.new_rng());
+                let datagram = encode(&plan, &bytes);
+                let found: Vec<_> = fields(&datagram)
+                    .map(|field| shape(&field.unwrap()))
+                    .collect();
+                assert_eq!(found, shapes, "{name} {wire:?}");
+                let mut back = Vec::new();
+                decode_fields(&plan, fields(&datagram), &mut back).unwrap();
+                assert_eq!(back, bytes, "{name} {wire:?}");
+            }
+            types += 1;
+        }
+    }
+    assert!(types > 250, "{types}");
+}
+
+#[test]
+fn a_field_of_another_type_among_numbers_is_named() {
+    let message = Registry::bundle(Dialect::Ros1)
+        .get(&"geometry_msgs/Vector3".parse().unwrap())
+        .unwrap();
+    let plan = Plan::compile(&message, &Selection::Whole, Wire::Ros1).unwrap();
+    let mut datagram = Vec::new();
+    let network = NetworkHeader::default();
+    let mut encoder = NetworkMessageEncoder::new(&mut datagram, &network, Some(&[1])).unwrap();
+    let mut frame = encoder.key_frame(&DataSetHeader::default()).unwrap();
+    for value in [
+        uadp::Scalar::Double(1.0),
+        uadp::Scalar::Float(2.0),
+        uadp::Scalar::Double(3.0),
+    ] {
+        frame.scalar(value).unwrap();
+    }
+    frame.finish().unwrap();
+    encoder.finish().unwrap();
+    let mut out = vec![7];
+    let error = decode_fields(&plan, fields(&datagram), &mut out).unwrap_err();
+    assert_eq!(error.to_string(), "field `y`: Double expected, found Float");
+    assert_eq!(out, [7]);
+}

@@ -1,0 +1,82 @@
+//! Any text as a definition.
+
+use std::sync::Arc;
+
+use messages::{Dialect, MessageType, Plan, Registry, Selection, TypeName, Wire};
+
+/// The first byte says what the text is: `m` a .msg, `s` a .srv, `a` an .action of ROS 1, in capitals of ROS 2, and `f` the
+/// full definition of a ROS 1 connection header. A type that is made of it has a definition that makes it again; for that
+/// of a connection header what it lacks is taken from the bundle, both times.
+pub fn definition(input: &[u8]) {
+    let Some((kind, text)) = input.split_first() else {
+        return;
+    };
+    let Ok(text) = std::str::from_utf8(text) else {
+        return;
+    };
+    let name: TypeName = "fuzz_msgs/Any".parse().expect("a name");
+    let dialect = if kind.is_ascii_uppercase() {
+        Dialect::Ros2
+    } else {
+        Dialect::Ros1
+    };
+    let mut registry = Registry::bundle(dialect);
+    match kind.to_ascii_lowercase() {
+        b'm' => {
+            if registry.add(&name, text).is_ok()
+                && let Ok(made) = registry.get(&name)
+            {
+                check(&made, Registry::empty(dialect));
+            }
+        }
+        b's' => {
+            if registry.add_service(&name, text).is_ok()
+                && let Ok(made) = registry.service(&name)
+            {
+                check(made.request(), Registry::empty(dialect));
+                check(made.response(), Registry::empty(dialect));
+            }
+        }
+        b'a' => {
+            if registry.add_action(&name, text).is_ok()
+                && let Ok(made) = registry.action(&name)
+            {
+                for part in [made.goal(), made.result(), made.feedback(), made.action()] {
+                    check(part, Registry::empty(dialect));
+                }
+            }
+        }
+        b'f' => {
+            if let Ok(made) = registry.add_ros1_definition(&name, text) {
+                check(&made, Registry::bundle(dialect));
+            }
+        }
+        _ => {}
+    }
+}
+
+/// `others`: where the types are that its definition lacks.
+fn check(made: &Arc<MessageType>, mut others: Registry) {
+    assert!(made.leaves().len() <= 4096, "flattening is bounded");
+    let wire = match made.dialect() {
+        Dialect::Ros1 => Wire::Ros1,
+        Dialect::Ros2 => Wire::Cdr,
+    };
+    // Of arrays of messages without fields there is none, which is told.
+    if let Ok(plan) = Plan::compile(made, &Selection::Whole, wire) {
+        assert_eq!(plan.leaves(), made.leaves());
+    }
+    for leaf in made.leaves().iter().take(8) {
+        let selection = Selection::Field(leaf.path.clone());
+        if let Ok(plan) = Plan::compile(made, &selection, wire) {
+            assert_eq!(plan.leaves().len(), 1, "{}", leaf.path);
+        }
+    }
+    if made.dialect() == Dialect::Ros1 {
+        let again = others
+            .add_ros1_definition(made.name(), made.definition())
+            .expect("a definition names all it needs");
+        assert_eq!(again.md5(), made.md5());
+        assert_eq!(again.leaves(), made.leaves());
+    }
+}

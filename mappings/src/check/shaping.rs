@@ -1,0 +1,254 @@
+//! Parts of arrays, and values that are converted: what stands in `field`, `scale`, `offset`, `invert` and `out_of_range`.
+
+use messages::{
+    Conversion, Leaf, MessageType, Part, Plan, PlanError, Selection, Wire, is_lossless, is_number,
+};
+use uadp::BuiltinType;
+
+use super::types::ValueType;
+use crate::code::Code;
+use crate::document::{BindingEntry, OutOfRangeEntry};
+use crate::findings::Findings;
+use crate::read::{given, short};
+use crate::tree::Place;
+
+/// What a binding says about its one value beside its field.
+pub(super) struct Shaping {
+    conversion: Conversion,
+    /// Of the first key that converts.
+    place: Option<Place>,
+    scaled: bool,
+    /// What becomes of values that do not fit is said.
+    said: bool,
+}
+
+/// Which way the value goes, and what it is in OPC UA.
+#[derive(Clone, Copy)]
+pub(super) struct Way {
+    pub(super) reads: bool,
+    pub(super) declared: Option<ValueType>,
+}
+
+/// The field and the part of it; `None` when that is faulty, which is noted.
+pub(super) fn part(
+    text: &str,
+    place: Place,
+    findings: &mut Findings,
+) -> Option<(String, Option<Part>)> {
+    let split = Part::split(text);
+    if split.is_none() {
+        let message = format!("`{}` is no field and part of an array", short(text));
+        findings
+            .error(Code::FieldPart, place, message)
+            .help("an element as position[2] or position[name=joint_3], several as ranges[0:90]");
+    }
+    split.map(|(field, part)| (field.to_owned(), part))
+}
+
+/// `None` when something is faulty, which is noted.
+pub(super) fn shaping(entry: &BindingEntry, findings: &mut Findings) -> Option<Shaping> {
+    let mut sound = Some(());
+    let mut conversion = Conversion::default();
+    let (scale, offset) = (given(&entry.scale), given(&entry.offset));
+    let scaled = entry.scale.is_some() || entry.offset.is_some();
+    if let Some((scale, place)) = scale
+        && (*scale == 0.0 || !scale.is_normal())
+    {
+        findings
+            .error(
+                Code::Conversion,
+                place,
+                format!("no value can be scaled by {scale}"),
+            )
+            .help("a number other than 0; to turn a sign, -1");
+        sound = None;
+    }
+    if let Some((offset, place)) = offset
+        && !offset.is_finite()
+    {
+        findings.error(
+            Code::Conversion,
+            place,
+            format!("no value can be moved by {offset}"),
+        );
+        sound = None;
+    }
+    if scaled {
+        let scale = scale.map_or(1.0, |(scale, _)| *scale);
+        conversion = conversion.scaled(scale, offset.map_or(0.0, |(offset, _)| *offset));
+    }
+    if let Some((true, _)) = given(&entry.invert) {
+        conversion = conversion.inverted();
+    }
+    if let Some((OutOfRangeEntry::Clamp, _)) = given(&entry.out_of_range) {
+        conversion = conversion.clamped();
+    }
+    let places = [
+        entry.scale.as_ref().map(|at| at.place),
+        entry.offset.as_ref().map(|at| at.place),
+        entry.invert.as_ref().map(|at| at.place),
+        entry.out_of_range.as_ref().map(|at| at.place),
+    ];
+    sound.map(|()| Shaping {
+        conversion,
+        place: places.into_iter().flatten().next(),
+        scaled,
+        said: entry.out_of_range.is_some(),
+    })
+}
+
+impl Shaping {
+    /// Selection of a field with what is said about it, checked against the type where that is known. `None` when
+    /// something is faulty, which is noted.
+    pub(super) fn select(
+        self,
+        (field, part): (String, Option<Part>),
+        message_type: Option<&MessageType>,
+        (place, way): (Place, Way),
+        findings: &mut Findings,
+    ) -> Option<Selection> {
+        if part.is_some() && !way.reads {
+            let note = findings.error(
+                Code::PartWritten,
+                place,
+                "a part of an array is read, and this topic is written",
+            );
+            note.help("what stands in the rest of the array, nobody says: bind the whole field, or a field that is one value");
+            return None;
+        }
+        let leaf = message_type.and_then(|message| message.leaf(&field));
+        let element = leaf.map(|leaf| element(leaf, part.as_ref()));
+        let conversion = self.conversion(element, (place, way), findings)?;
+        if part.is_none() && conversion.is_none() {
+            return Some(Selection::Field(field));
+        }
+        Some(Selection::Value {
+            field,
+            part,
+            conversion,
+        })
+    }
+
+    /// Of a whole message nothing is converted.
+    pub(super) fn of_several(&self, findings: &mut Findings) -> Option<()> {
+        let Some(place) = self.place else {
+            return Some(());
+        };
+        findings
+            .error(
+                Code::Conversion,
+                place,
+                "only one value is converted, and this is a message",
+            )
+            .help("name the value with `field`");
+        None
+    }
+
+    fn conversion(
+        &self,
+        element: Option<BuiltinType>,
+        (place, way): (Place, Way),
+        findings: &mut Findings,
+    ) -> Option<Conversion> {
+        let mut conversion = self.conversion;
+        let declared = way.declared.map(|(builtin, _)| builtin);
+        let to = declared.filter(|to| {
+            is_number(*to)
+                && element.map_or_else(
+                    || self.place.is_some(),
+                    |from| is_number(from) && from != *to,
+                )
+        });
+        if let Some(to) = to {
+            conversion = conversion.to(to);
+        }
+        let (Some(inside), Some(place)) = (element, self.place.or(Some(place))) else {
+            return Some(conversion);
+        };
+        let outside = to.unwrap_or(inside);
+        let (from, into) = if way.reads {
+            (inside, outside)
+        } else {
+            (outside, inside)
+        };
+        let whole = !matches!(into, BuiltinType::Float | BuiltinType::Double);
+        let lossy = (is_number(from) && !is_lossless(from, into))
+            || (self.scaled && is_number(into) && whole);
+        if lossy && !self.said {
+            let message = match self.scaled && from == into {
+                true => format!("scaled values do not fit {} without rounding", into.name()),
+                false => format!("not every {} fits {}", from.name(), into.name()),
+            };
+            let help = match way.reads && self.scaled && declared.is_none() {
+                true => {
+                    "give the variable a `type: Double`, or say what becomes of a value that does not fit: `out_of_range: refuse` or `clamp`"
+                }
+                false => {
+                    "say what becomes of a value that does not fit, after rounding: `out_of_range: refuse` or `clamp`"
+                }
+            };
+            findings
+                .error(Code::LossyConversion, place, message)
+                .help(help);
+            return None;
+        }
+        if self.said && conversion.is_none() {
+            findings.error(
+                Code::Conversion,
+                place,
+                "nothing is converted here, so every value fits",
+            );
+            return None;
+        }
+        Some(conversion)
+    }
+}
+
+/// The builtin type of one value of that.
+fn element(leaf: &Leaf, part: Option<&Part>) -> BuiltinType {
+    match (leaf.builtin, part) {
+        (BuiltinType::ByteString, Some(Part::Element(_) | Part::Named { .. })) => BuiltinType::Byte,
+        (builtin, _) => builtin,
+    }
+}
+
+/// The fields of a selection with a part or conversion; `None` when the type has it not, which is noted.
+pub(super) fn leaves(
+    message_type: &std::sync::Arc<MessageType>,
+    selection: &Selection,
+    place: Place,
+    findings: &mut Findings,
+) -> Option<Vec<Leaf>> {
+    let Selection::Value { field, part, .. } = selection else {
+        return None;
+    };
+    let wire = match message_type.dialect() {
+        messages::Dialect::Ros1 => Wire::Ros1,
+        messages::Dialect::Ros2 => Wire::Cdr,
+    };
+    let alone = Selection::Value {
+        field: field.clone(),
+        part: part.clone(),
+        conversion: Conversion::default(),
+    };
+    let code = match part {
+        Some(_) => Code::FieldPart,
+        None => Code::Conversion,
+    };
+    let found = Plan::compile(message_type, &alone, wire)
+        .map_err(|error| (code, error))
+        .and_then(|_| {
+            Plan::compile(message_type, selection, wire).map_err(|error| (Code::Conversion, error))
+        });
+    let (code, error) = match found {
+        Ok(plan) => return Some(plan.leaves().to_vec()),
+        Err((_, PlanError::UnknownField { path, .. })) => {
+            let missing = Selection::Field(path);
+            super::bindings::select(message_type, &missing, place, findings);
+            return None;
+        }
+        Err(fault) => fault,
+    };
+    findings.error(code, place, error.to_string());
+    None
+}

@@ -1,0 +1,316 @@
+//! Parts of arrays and converted values, on both wires.
+#![expect(clippy::unwrap_used, reason = "test code")]
+
+mod support;
+
+use messages::{
+    Conversion, Dialect, MessageType, Part, Plan, PlanError, ReadError, Registry, Selection,
+    ValueFault, Wire, WriteFault,
+};
+use proptest::prelude::*;
+use std::sync::Arc;
+use support::{Event, Player, Recorder, Value};
+use uadp::{BuiltinType, Scalar};
+
+const WIRES: [(Dialect, Wire); 2] = [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)];
+
+fn message(dialect: Dialect, text: &str) -> Arc<MessageType> {
+    let mut registry = Registry::bundle(dialect);
+    let name = "test_msgs/T".parse().unwrap();
+    registry.add(&name, text).unwrap();
+    registry.get(&name).unwrap()
+}
+
+fn select(text: &str, conversion: Conversion) -> Selection {
+    let (field, part) = Part::split(text).unwrap();
+    Selection::Value {
+        field: field.to_owned(),
+        part,
+        conversion,
+    }
+}
+
+fn written(plan: &Plan, events: &[Event]) -> Vec<u8> {
+    let mut out = Vec::new();
+    plan.write(&mut Player::new(events), &mut out).unwrap();
+    out
+}
+
+fn read(plan: &Plan, payload: &[u8]) -> Result<Vec<String>, ReadError<()>> {
+    let mut recorder = Recorder::default();
+    plan.read(payload, &mut recorder)?;
+    Ok(recorder.events.iter().map(ToString::to_string).collect())
+}
+
+fn scalar(value: Scalar<'_>) -> Event {
+    Event::Scalar(Value::of(value))
+}
+
+fn text(text: &str) -> Event {
+    Event::Element(Value::Text(text.to_owned()))
+}
+
+fn doubles(values: &[f64]) -> Event {
+    let bytes = values.iter().flat_map(|value| value.to_le_bytes());
+    Event::Packed(BuiltinType::Double, values.len(), bytes.collect())
+}
+
+/// Names after the values too, as one message or another has them.
+const JOINTS: &str = "float64[] before\nstring[] name\nuint8 gap\nfloat64[] position\nbool[] on\nuint8[] raw\nduration[] late";
+
+fn joints(dialect: Dialect, wire: Wire) -> (Arc<MessageType>, Vec<u8>) {
+    let text_of = match dialect {
+        Dialect::Ros1 => JOINTS.to_owned(),
+        Dialect::Ros2 => JOINTS.replace("duration", "builtin_interfaces/Duration"),
+    };
+    let of = message(dialect, &text_of);
+    let whole = Plan::compile(&of, &Selection::Whole, wire).unwrap();
+    let late = |millis| Event::Element(Value::of(Scalar::Double(millis)));
+    let events = [
+        doubles(&[7.0, 8.0]),
+        Event::Array(BuiltinType::String, 3),
+        text("joint_1"),
+        text("joint_2"),
+        text("joint_3"),
+        scalar(Scalar::Byte(9)),
+        doubles(&[0.25, 0.5, 0.75]),
+        Event::Packed(BuiltinType::Boolean, 2, vec![0, 1]),
+        scalar(Scalar::ByteString(Some(&[1, 2, 3]))),
+        Event::Array(BuiltinType::Double, 2),
+        late(1500.0),
+        late(2500.0),
+    ];
+    let bytes = written(&whole, &events);
+    (of, bytes)
+}
+
+#[test]
+fn a_part_of_an_array_is_an_element_the_one_of_a_name_or_a_slice() {
+    for (dialect, wire) in WIRES {
+        let (of, bytes) = joints(dialect, wire);
+        for (part, expected, builtin) in [
+            ("position[2]", "scalar Double 0.75", BuiltinType::Double),
+            (
+                "position[name=joint_2]",
+                "scalar Double 0.5",
+                BuiltinType::Double,
+            ),
+            (
+                "before[name=joint_1]",
+                "scalar Double 7.0",
+                BuiltinType::Double,
+            ),
+            (
+                "position[0:2]",
+                "packed Double 2 0.25 0.5",
+                BuiltinType::Double,
+            ),
+            (
+                "position[1:]",
+                "packed Double 2 0.5 0.75",
+                BuiltinType::Double,
+            ),
+            (
+                "position[2:90]",
+                "packed Double 1 0.75",
+                BuiltinType::Double,
+            ),
+            ("position[5:9]", "packed Double 0", BuiltinType::Double),
+            ("name[1]", "scalar String joint_2", BuiltinType::String),
+            ("on[1]", "scalar Boolean true", BuiltinType::Boolean),
+            ("raw[1]", "scalar Byte 2", BuiltinType::Byte),
+            (
+                "raw[1:3]",
+                "scalar ByteString 0203",
+                BuiltinType::ByteString,
+            ),
+            ("late[1]", "scalar Double 2500.0", BuiltinType::Double),
+        ] {
+            let plan = Plan::compile(&of, &select(part, Conversion::default()), wire).unwrap();
+            assert_eq!(read(&plan, &bytes).unwrap(), [expected], "{part} {wire:?}");
+            let [leaf] = plan.leaves() else {
+                unreachable!("{part} is one field")
+            };
+            assert_eq!((leaf.builtin, leaf.path.as_str()), (builtin, part));
+        }
+        let names = Plan::compile(&of, &select("name[1:3]", Conversion::default()), wire).unwrap();
+        assert_eq!(
+            read(&names, &bytes).unwrap(),
+            [
+                "array String 2",
+                "element String joint_2",
+                "element String joint_3"
+            ]
+        );
+    }
+}
+
+#[test]
+fn what_a_message_has_not_is_told_with_its_field() {
+    for (dialect, wire) in WIRES {
+        let (of, bytes) = joints(dialect, wire);
+        let fault = |part: &str| {
+            let plan = Plan::compile(&of, &select(part, Conversion::default()), wire).unwrap();
+            read(&plan, &bytes).unwrap_err().to_string()
+        };
+        assert_eq!(
+            fault("position[3]"),
+            "field `position`: element 3 is not there: the array has 3"
+        );
+        assert_eq!(
+            fault("name[7]"),
+            "field `name`: element 7 is not there: the array has 3"
+        );
+        assert_eq!(
+            fault("position[name=elbow]"),
+            "field `position`: no element is named `elbow`"
+        );
+        let cut = &bytes[..bytes.len() / 2];
+        let plan = Plan::compile(&of, &select("late[0]", Conversion::default()), wire).unwrap();
+        assert!(matches!(read(&plan, cut), Err(ReadError::Malformed { .. })));
+    }
+}
+
+#[test]
+fn a_part_that_is_none_of_its_type_is_refused_when_compiled() {
+    let of = message(
+        Dialect::Ros1,
+        "float64[3] fixed\nfloat64 one\nstring[] name\ngeometry_msgs/Point[] points",
+    );
+    for part in [
+        "one[0]",
+        "fixed[3]",
+        "fixed[one=a]",
+        "points[0]",
+        "gone[0]",
+        "fixed[gone=a]",
+    ] {
+        let refused = Plan::compile(&of, &select(part, Conversion::default()), Wire::Ros1);
+        let refused = refused.map(|plan| plan.leaves().to_vec());
+        assert!(
+            matches!(
+                refused,
+                Err(PlanError::Shape { .. } | PlanError::UnknownField { .. })
+            ),
+            "{part}: {refused:?}"
+        );
+    }
+    for text in [
+        "a[",
+        "a]",
+        "a[]",
+        "a[-1]",
+        "a[1:1]",
+        "a[2:1]",
+        "a[x=]",
+        "a[=x]",
+        "a[1]b",
+        "a[+1]",
+        "a[4294967296]",
+    ] {
+        assert_eq!(Part::split(text), None, "{text}");
+    }
+}
+
+#[test]
+fn a_part_is_not_written() {
+    let of = message(Dialect::Ros1, "float64[] x");
+    let plan = Plan::compile(&of, &select("x[0]", Conversion::default()), Wire::Ros1).unwrap();
+    let mut out = Vec::new();
+    let error = plan.write(&mut Player::new(&[doubles(&[1.0])]), &mut out);
+    assert_eq!(error.unwrap_err().fault, WriteFault::Part);
+    assert!(out.is_empty());
+}
+
+#[test]
+fn a_converted_value_crosses_both_ways_and_what_does_not_fit_does_not() {
+    for (dialect, wire) in WIRES {
+        let of = message(dialect, "uint8 first\nint16 raw\nbool open\nint16[] many");
+        let scaled = Conversion::default()
+            .scaled(0.1, -5.0)
+            .to(BuiltinType::Double);
+        let plan = Plan::compile(&of, &select("raw", scaled), wire).unwrap();
+        let bytes = written(&plan, &[scalar(Scalar::Double(18.0))]);
+        let raw = Plan::compile(&of, &Selection::Field("raw".to_owned()), wire).unwrap();
+        assert_eq!(read(&raw, &bytes).unwrap(), ["scalar Int16 230"]);
+        assert_eq!(read(&plan, &bytes).unwrap(), ["scalar Double 18.0"]);
+        let mut out = vec![1];
+        let refused = plan.write(&mut Player::new(&[scalar(Scalar::Double(1e6))]), &mut out);
+        assert_eq!(
+            refused.unwrap_err().to_string(),
+            "field `raw`: 10000050 does not fit Int16"
+        );
+        assert_eq!(out, [1]);
+
+        let inverted = select("open", Conversion::default().inverted());
+        let inverted = Plan::compile(&of, &inverted, wire).unwrap();
+        let bytes = written(&inverted, &[scalar(Scalar::Boolean(false))]);
+        let open = Plan::compile(&of, &Selection::Field("open".to_owned()), wire).unwrap();
+        assert_eq!(read(&open, &bytes).unwrap(), ["scalar Boolean true"]);
+        assert_eq!(read(&inverted, &bytes).unwrap(), ["scalar Boolean false"]);
+
+        let many = Plan::compile(&of, &select("many", scaled), wire).unwrap();
+        let element = |value| Event::Element(Value::of(Scalar::Double(value)));
+        let events = [
+            Event::Array(BuiltinType::Double, 2),
+            element(-5.0),
+            element(0.5),
+        ];
+        let bytes = written(&many, &events);
+        let whole = Plan::compile(&of, &Selection::Field("many".to_owned()), wire).unwrap();
+        assert_eq!(read(&whole, &bytes).unwrap(), ["packed Int16 2 0 55"]);
+        assert_eq!(
+            read(&many, &bytes).unwrap(),
+            [
+                "array Double 2",
+                "element Double -5.0",
+                "element Double 0.5"
+            ]
+        );
+        let slice = Plan::compile(&of, &select("many[1:]", scaled), wire).unwrap();
+        assert_eq!(
+            read(&slice, &bytes).unwrap(),
+            ["array Double 1", "element Double 0.5"]
+        );
+    }
+}
+
+#[test]
+fn a_value_out_of_range_is_named_with_its_field() {
+    let of = message(Dialect::Ros1, "float64 x");
+    let to = Conversion::default().to(BuiltinType::Byte);
+    let plan = Plan::compile(&of, &select("x", to), Wire::Ros1).unwrap();
+    let fault = ValueFault::OutOfRange {
+        value: "300".to_owned(),
+        to: BuiltinType::Byte,
+    };
+    let field = "x".to_owned();
+    assert_eq!(
+        read(&plan, &300f64.to_le_bytes()),
+        Err(ReadError::Value { field, fault })
+    );
+    let plan = Plan::compile(&of, &select("x", to.clamped()), Wire::Ros1).unwrap();
+    assert_eq!(
+        read(&plan, &300f64.to_le_bytes()).unwrap(),
+        ["scalar Byte 255"]
+    );
+}
+
+proptest! {
+    #[test]
+    fn an_element_is_what_stands_there_in_the_whole(values in proptest::collection::vec(any::<i32>(), 0..20), at in 0u32..24) {
+        for (dialect, wire) in WIRES {
+            let of = message(dialect, "bool odd\nint32[] x\nuint8 after");
+            let whole = Plan::compile(&of, &Selection::Field("x".to_owned()), wire).unwrap();
+            let bytes = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+            let bytes = written(&whole, &[Event::Packed(BuiltinType::Int32, values.len(), bytes)]);
+            let plan = Plan::compile(&of, &select(&format!("x[{at}]"), Conversion::default()), wire).unwrap();
+            let expected = values.get(at as usize).map(|value| vec![format!("scalar Int32 {value}")]);
+            prop_assert_eq!(read(&plan, &bytes).ok(), expected);
+            let slice = Plan::compile(&of, &select(&format!("x[3:{}]", at + 4), Conversion::default()), wire).unwrap();
+            let picked: Vec<String> = values.iter().skip(3).take(at as usize + 1).map(ToString::to_string).collect();
+            let expected = [vec![format!("packed Int32 {}", picked.len())], picked].concat().join(" ");
+            prop_assert_eq!(read(&slice, &bytes).unwrap(), [expected]);
+        }
+    }
+}
