@@ -44,6 +44,7 @@ async fn relay(from: &str, to: &str, domain: u16) -> Result<(), Box<dyn std::err
         networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
         peers: Vec::new(),
         node: "relay".into(),
+        enclave: None,
     })?;
     let (from, to) = (format!("rt{from}"), format!("rt{to}"));
     let offered = Offered::DropOldest(ROOM);

@@ -150,7 +150,7 @@ impl Cell {
         );
         self.cyclone_c_started(args).env(
             "CYCLONEDDS_URI",
-            cyclone_uri("lo").replace("</Domain>", &security),
+            cyclone_uri("lo", "").replace("</Domain>", &security),
         )
     }
 
