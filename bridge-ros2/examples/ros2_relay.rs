@@ -3,6 +3,12 @@
 //!
 //! `ros2_relay FROM TO [DOMAIN]`: topics of `std_msgs/msg/String`, on loopback, until SIGTERM.
 
+#![expect(
+    clippy::print_stdout,
+    clippy::print_stderr,
+    reason = "a program without a log"
+)]
+
 use std::num::NonZeroU16;
 use std::process::ExitCode;
 use std::time::Duration;

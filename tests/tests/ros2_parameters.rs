@@ -111,6 +111,7 @@ async fn who_listens_to_parameter_events_is_told_what_was_set_and_of_which_node(
         networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
         peers: Vec::new(),
         node: "ua_bridge_ros2".into(),
+        enclave: None,
     })
     .unwrap();
     let peers = ServicePeers::new(&domain);

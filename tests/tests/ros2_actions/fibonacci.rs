@@ -24,6 +24,7 @@ impl Ours {
             networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
             peers: Vec::new(),
             node: "actions".into(),
+            enclave: None,
         })
         .unwrap();
         Self {

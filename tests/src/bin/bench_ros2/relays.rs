@@ -49,8 +49,14 @@ fn round_trip(paths: &mut [Path], pinger: &mut Pinger, messages: u64) {
         } else {
             messages
         };
-        pass(paths, pinger, messages / 10, size, 1);
-        let passed = pass(paths, pinger, messages, size, 1);
+        let load = Load {
+            samples: messages / 10,
+            size,
+            window: 1,
+        };
+        pass(paths, pinger, load);
+        let samples = messages;
+        let passed = pass(paths, pinger, Load { samples, ..load });
         print(shown, paths, passed);
     }
 }
@@ -65,12 +71,17 @@ fn throughput(paths: &mut [Path], pinger: &mut Pinger, messages: u64) {
     );
     println!("|---|---|---|---|---|---|---|");
     for (size, shown) in SIZES {
-        let (messages, window) = if size > LARGE {
+        let (samples, window) = if size > LARGE {
             (messages / 10, 2)
         } else {
             (messages * 4, 32)
         };
-        let passed = pass(paths, pinger, messages, size, window);
+        let load = Load {
+            samples,
+            size,
+            window,
+        };
+        let passed = pass(paths, pinger, load);
         for (path, passed) in paths.iter().zip(passed) {
             let Some(mut passed) = passed else { continue };
             let count = passed.times.count();
@@ -110,30 +121,35 @@ fn print(size: &str, paths: &[Path], passed: Vec<Option<Passed>>) {
 }
 
 /// Sends through all paths in turns. `None` for a path that does not carry so much at once.
-fn pass(
-    paths: &mut [Path],
-    pinger: &mut Pinger,
-    messages: u64,
-    size: usize,
-    window: u64,
-) -> Vec<Option<Passed>> {
+fn pass(paths: &mut [Path], pinger: &mut Pinger, load: Load) -> Vec<Option<Passed>> {
     let mut all: Vec<Option<Passed>> = paths
         .iter()
-        .map(|path| path.carries(size, window).then(Passed::default))
+        .map(|path| path.carries(load).then(Passed::default))
         .collect();
-    let turn = if window == 1 { TURN } else { TURN * 20 };
-    let mut left = messages;
+    let turn = if load.window == 1 { TURN } else { TURN * 20 };
+    let mut left = load.samples;
     while left > 0 {
-        let now = left.min(turn);
-        left -= now;
+        let samples = left.min(turn);
+        left -= samples;
         for (path, all) in paths.iter_mut().zip(&mut all) {
             let Some(all) = all else { continue };
             let before = processor_time(path.relay.id());
-            path.pass(pinger, now, size, window, all);
+            let passed = path.pass(pinger, Load { samples, ..load });
             all.used += processor_time(path.relay.id()) - before;
+            all.times.extend(passed.times);
+            all.lost += passed.lost;
+            all.took += passed.took;
         }
     }
     all
+}
+
+/// So many samples of a size, of which `window` may be on the way.
+#[derive(Clone, Copy)]
+struct Load {
+    samples: u64,
+    size: usize,
+    window: u64,
 }
 
 /// What has gone through one path.
@@ -180,15 +196,20 @@ impl Path {
         }
     }
 
-    fn carries(&self, size: usize, window: u64) -> bool {
-        self.socket.is_none() || (size <= LARGE && window == 1)
+    fn carries(&self, load: Load) -> bool {
+        self.socket.is_none() || (load.size <= LARGE && load.window == 1)
     }
 
     /// Passes samples until a whole turn of them comes back: endpoints that have just met may miss some.
     fn begin(&self, pinger: &mut Pinger) {
         let Some(lane) = self.lane else { return };
         let start = Instant::now();
-        while pinger.pass(lane, 10, 100, 1).lost > 0 {
+        let load = Load {
+            samples: 10,
+            size: 100,
+            window: 1,
+        };
+        while pinger.pass(lane, load).lost > 0 {
             assert!(
                 start.elapsed() < START,
                 "nothing comes back from {}",
@@ -197,23 +218,20 @@ impl Path {
         }
     }
 
-    fn pass(&self, pinger: &mut Pinger, count: u64, size: usize, window: u64, all: &mut Passed) {
-        let passed = match (&self.socket, self.lane) {
-            (Some(socket), _) => datagrams(socket, count, size),
-            (None, Some(lane)) => pinger.pass(lane, count, size, window),
-            (None, None) => return,
-        };
-        all.times.extend(passed.times);
-        all.lost += passed.lost;
-        all.took += passed.took;
+    fn pass(&self, pinger: &mut Pinger, load: Load) -> Passed {
+        match (&self.socket, self.lane) {
+            (Some(socket), _) => datagrams(socket, load),
+            (None, Some(lane)) => pinger.pass(lane, load),
+            (None, None) => Passed::default(),
+        }
     }
 }
 
-fn datagrams(socket: &UdpSocket, count: u64, size: usize) -> Passed {
+fn datagrams(socket: &UdpSocket, Load { samples, size, .. }: Load) -> Passed {
     let mut passed = Passed::default();
     let sent = vec![b'.'; size];
     let mut heard = vec![0; size];
-    for _ in 0..count {
+    for _ in 0..samples {
         let start = Instant::now();
         socket.send(&sent).unwrap();
         socket.recv(&mut heard).unwrap();
@@ -248,7 +266,12 @@ impl Pinger {
         Self(cell.cyclone_c(&args))
     }
 
-    fn pass(&mut self, lane: usize, samples: u64, size: usize, window: u64) -> Passed {
+    fn pass(&mut self, lane: usize, load: Load) -> Passed {
+        let Load {
+            samples,
+            size,
+            window,
+        } = load;
         let line = format!("{lane} {samples} {size} {window}");
         let answer = self.0.ask(&line, PATIENCE * 10);
         Passed {
