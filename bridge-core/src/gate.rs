@@ -6,7 +6,7 @@ use mappings::Publish;
 use uadp::{Array, BuiltinType, DecodeError, Fields, NetworkMessage, Scalar, Variant};
 
 use crate::output::PublisherKey;
-use crate::writer::Encoded;
+use crate::writer::{Encoded, MAX_KEPT};
 
 /// What holds samples of one topic back, by the rule of its variable.
 #[derive(Debug)]
@@ -14,6 +14,10 @@ pub(crate) struct Gate {
     rule: Publish,
     /// The fields that went out last; empty before the first.
     last: Vec<u8>,
+    /// Whose they were, if that publisher latches.
+    last_by: Option<PublisherKey>,
+    /// Latched publishers of which a sample has gone out.
+    met: Vec<PublisherKey>,
     /// When the next may go out.
     opens: Option<Instant>,
     /// The newest sample that came too early.
@@ -39,27 +43,67 @@ impl Gate {
         let gate = Self {
             rule,
             last: Vec::new(),
+            last_by: None,
+            met: Vec::new(),
             opens: None,
             held: None,
         };
         (rule != Publish::default()).then(|| Box::new(gate))
     }
 
-    /// Judges a sample; one that passes is the last that went out.
-    pub(crate) fn judge(&mut self, sample: &Encoded, now: Instant) -> Passage {
+    /// Judges a sample; one that passes is the last that went out. What waited before a sample that passes, or that says
+    /// nothing new, is not true any more and is given back.
+    ///
+    /// The first sample of a latched publisher passes in any case, as late joiners get the last one of each.
+    pub(crate) fn judge(
+        &mut self,
+        sample: &Encoded,
+        latched_by: Option<PublisherKey>,
+        now: Instant,
+    ) -> (Passage, Option<Waiting>) {
         let fields = block(sample).unwrap_or_default();
-        if self.rule.on_change && self.says_the_same(fields) {
-            // What waited is not true any more.
-            self.held = None;
-            return Passage::Unchanged;
+        let first =
+            latched_by.is_some_and(|key| self.met.len() < MAX_KEPT && !self.met.contains(&key));
+        if !first {
+            let same = self.last_by == latched_by && self.says_the_same(fields);
+            if self.rule.on_change && same {
+                return (Passage::Unchanged, self.held.take());
+            }
+            if self.opens.is_some_and(|opens| now < opens) {
+                return (Passage::TooEarly, None);
+            }
         }
-        if self.opens.is_some_and(|opens| now < opens) {
-            return Passage::TooEarly;
-        }
+        self.say(fields, latched_by, now);
+        // That of another publisher is still true.
+        let outpaced = self.held.take_if(|(_, by)| !first || *by == latched_by);
+        (Passage::Passes, outpaced)
+    }
+
+    fn say(&mut self, fields: &[u8], latched_by: Option<PublisherKey>, now: Instant) {
         self.last.clear();
         self.last.extend_from_slice(fields);
+        self.last_by = latched_by;
+        if let Some(key) = latched_by.filter(|key| !self.met.contains(key))
+            && self.met.len() < MAX_KEPT
+        {
+            self.met.push(key);
+        }
         self.opens = (!self.rule.period.is_zero()).then(|| now + self.rule.period);
-        Passage::Passes
+    }
+
+    /// The sample that waits, to go out at once: nothing may come after it.
+    pub(crate) fn hurry(&mut self, now: Instant) -> Option<Waiting> {
+        let (sample, latched_by) = self.held.take()?;
+        self.say(block(&sample).unwrap_or_default(), latched_by, now);
+        Some((sample, latched_by))
+    }
+
+    /// A latched publisher has gone: the sample of it that waits, to go out at once.
+    pub(crate) fn left(&mut self, publisher: PublisherKey, now: Instant) -> Option<Waiting> {
+        let waits = matches!(self.held, Some((_, by)) if by == Some(publisher));
+        let held = if waits { self.hurry(now) } else { None };
+        self.met.retain(|key| *key != publisher);
+        held
     }
 
     /// Lets a sample wait; the one that waited before gives way.
@@ -77,7 +121,7 @@ impl Gate {
         if self.due().is_none_or(|due| now < due) {
             return None;
         }
-        self.held.take()
+        self.hurry(now)
     }
 
     fn says_the_same(&self, fields: &[u8]) -> bool {
@@ -129,7 +173,8 @@ fn near(one: &Variant<'_>, other: &Variant<'_>, deadband: f64) -> bool {
 
 fn near_scalars(one: Scalar<'_>, other: Scalar<'_>, deadband: f64) -> bool {
     match (number(one), number(other)) {
-        (Some(a), Some(b)) => (a - b).abs() <= deadband || (a.is_nan() && b.is_nan()),
+        // Of two infinities there is no difference.
+        (Some(a), Some(b)) => a == b || (a - b).abs() <= deadband || (a.is_nan() && b.is_nan()),
         _ => one == other,
     }
 }

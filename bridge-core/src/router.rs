@@ -185,9 +185,10 @@ impl Router {
             self.recycle(encoded.bytes);
             return self.refuse(topic, reason, detail);
         }
-        let passage = gate
-            .as_mut()
-            .map_or(Passage::Passes, |gate| gate.judge(&encoded, now.monotonic));
+        let (passage, outpaced) = gate.as_mut().map_or((Passage::Passes, None), |gate| {
+            gate.judge(&encoded, latched_by, now.monotonic)
+        });
+        self.outpaced(topic, outpaced);
         match passage {
             Passage::Passes => self.forward(topic, encoded, (received, latched_by), now),
             Passage::Unchanged => {
@@ -195,16 +196,23 @@ impl Router {
                 self.refuse(topic, Reason::Unchanged, String::new())
             }
             Passage::TooEarly => {
-                let outpaced = gate
-                    .as_mut()
+                let outpaced = self
+                    .topics
+                    .get_mut(&topic)
+                    .and_then(|entry| entry.gate.as_mut())
                     .and_then(|gate| gate.hold((encoded, latched_by)));
+                self.outpaced(topic, outpaced);
                 self.schedule(topic);
-                if let Some((outpaced, _)) = outpaced {
-                    self.recycle(outpaced.bytes);
-                    self.count(About::topic(topic), Reason::Outpaced, 1, String::new);
-                }
                 Verdict::Forward
             }
+        }
+    }
+
+    /// Counts a sample that waited until a newer one made it old.
+    fn outpaced(&mut self, topic: TopicId, sample: Option<Waiting>) {
+        if let Some((outpaced, _)) = sample {
+            self.recycle(outpaced.bytes);
+            self.count(About::topic(topic), Reason::Outpaced, 1, String::new);
         }
     }
 
@@ -253,7 +261,13 @@ impl Router {
     }
 
     /// A latched publisher of a topic of our own space has gone for good: its last message is no longer repeated.
-    pub fn left(&mut self, topic: TopicId, publisher: PublisherKey) {
+    pub fn left(&mut self, topic: TopicId, publisher: PublisherKey, now: Now) {
+        let held = self
+            .topics
+            .get_mut(&topic)
+            .and_then(|entry| entry.gate.as_mut())
+            .and_then(|gate| gate.left(publisher, now.monotonic));
+        self.let_go(topic, held, now);
         if let Some(Topic {
             role: Role::Ours(writer),
             ..
@@ -267,6 +281,15 @@ impl Router {
     /// Whether a topic of our own space has a producer. Without one its value is no longer repeated, so that
     /// readers see it fall silent; the next sample revives it.
     pub fn set_live(&mut self, topic: TopicId, live: bool, now: Now) {
+        if !live {
+            // What waits is the last there is.
+            let held = self
+                .topics
+                .get_mut(&topic)
+                .and_then(|entry| entry.gate.as_mut())
+                .and_then(|gate| gate.hurry(now.monotonic));
+            self.let_go(topic, held, now);
+        }
         if let Some(Topic {
             role: Role::Ours(writer),
             ..
@@ -505,7 +528,7 @@ impl Router {
                     .as_mut()
                     .and_then(|gate| gate.release(now.monotonic))
                 {
-                    self.let_go(topic, held, now);
+                    self.let_go(topic, Some(held), now);
                     return;
                 }
                 let Some((at, idle)) = writer.due(key_frames, keep_alives) else {
@@ -540,18 +563,11 @@ impl Router {
         }
     }
 
-    /// Sends the newest sample that came too early.
-    fn let_go(&mut self, topic: TopicId, (held, latched_by): Waiting, now: Now) {
-        let judged = self
-            .topics
-            .get_mut(&topic)
-            .and_then(|entry| entry.gate.as_mut())
-            .map_or(Passage::Passes, |gate| gate.judge(&held, now.monotonic));
-        if judged == Passage::Passes {
+    /// Sends a sample that waited.
+    fn let_go(&mut self, topic: TopicId, held: Option<Waiting>, now: Now) {
+        if let Some((held, latched_by)) = held {
             // Whether it went first or another gave way is counted there.
             let _verdict = self.forward(topic, held, (now.utc, latched_by), now);
-        } else {
-            self.recycle(held.bytes);
         }
     }
 

@@ -9,7 +9,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_core::{Heard, Local, Now, Output, Reason, Router, Settings, Verdict};
+use bridge_core::{Heard, Local, Now, Output, PublisherKey, Reason, Router, Settings, Verdict};
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{Dialect, Registry, Selection};
 use uadp::{NetworkMessage, Scalar, Timestamp, Variant};
@@ -50,19 +50,28 @@ impl Bench {
     }
 
     fn say(&mut self, value: f64) -> Verdict {
+        self.say_by(None, value)
+    }
+
+    fn say_by(&mut self, latched_by: Option<PublisherKey>, value: f64) -> Verdict {
         let heard = Heard {
             topic: self.topic,
             payload: &value.to_le_bytes(),
             received: self.now.utc,
-            latched_by: None,
+            latched_by,
         };
         self.router.handle_local(heard, self.now)
     }
 
-    fn wait(&mut self, time: Duration) {
+    /// Lets time pass that nobody has looked at yet.
+    fn pass(&mut self, time: Duration) {
         self.now.monotonic += time;
         let nanos = self.now.utc.unix_nanos() + i128::try_from(time.as_nanos()).unwrap();
         self.now.utc = Timestamp::from_unix_nanos(nanos);
+    }
+
+    fn wait(&mut self, time: Duration) {
+        self.pass(time);
         self.router.handle_timeout(self.now);
     }
 
@@ -173,4 +182,64 @@ fn a_value_that_returns_before_its_time_is_not_sent() {
     assert_eq!(bench.sent(), [(0, 1.0)]);
     bench.wait(200 * MS);
     assert_eq!(bench.sent(), []);
+}
+
+#[test]
+fn a_value_that_waits_gives_way_to_one_that_comes_when_its_time_is_over() {
+    let mut bench = Bench::new("at_most: 10 Hz");
+    for value in [1.0, 2.0] {
+        assert_eq!(bench.say(value), Verdict::Forward);
+    }
+    assert_eq!(bench.sent(), [(0, 1.0)]);
+    // The timer has not rung yet.
+    bench.pass(100 * MS);
+    assert_eq!(bench.say(3.0), Verdict::Forward);
+    bench.wait(500 * MS);
+    assert_eq!(bench.sent(), [(1, 3.0)], "2.0 is old");
+    assert_eq!(bench.dropped(Reason::Outpaced), 1);
+}
+
+#[test]
+fn what_waits_goes_out_when_the_last_publisher_stops_and_the_topic_stays_dead() {
+    let mut bench = Bench::new("at_most: 2 Hz");
+    for value in [1.0, 2.0] {
+        assert_eq!(bench.say(value), Verdict::Forward);
+    }
+    bench.router.set_live(bench.topic, false, bench.now);
+    assert_eq!(bench.sent(), [(0, 1.0), (1, 2.0)]);
+    bench.wait(60_000 * MS);
+    assert!(bench.sent().is_empty(), "nothing is repeated for the dead");
+}
+
+#[test]
+fn late_joiners_get_the_last_value_of_each_latched_publisher_but_of_none_that_left() {
+    let key = PublisherKey;
+    for rules in ["publish: on_change", "at_most: 2 Hz"] {
+        let mut bench = Bench::new(rules);
+        // The same value from two publishers, and another one, at once.
+        for (publisher, value) in [(1, 5.0), (2, 5.0), (3, 6.0)] {
+            let verdict = bench.say_by(Some(key(publisher)), value);
+            assert_eq!(verdict, Verdict::Forward, "{rules}");
+        }
+        assert_eq!(bench.sent().len(), 3, "{rules}");
+        assert_eq!(bench.say_by(Some(key(1)), 7.0), Verdict::Forward, "{rules}");
+        bench.router.left(bench.topic, key(1), bench.now);
+        bench.wait(1000 * MS);
+        assert_eq!(bench.sent().last(), Some(&(3, 7.0)), "{rules}");
+        bench.wait(10_000 * MS);
+        let mut repeated: Vec<f64> = bench.sent().into_iter().map(|(_, value)| value).collect();
+        repeated.sort_by(f64::total_cmp);
+        repeated.dedup();
+        assert_eq!(repeated, [5.0, 6.0], "{rules}");
+        // It starts anew under another key and latches what it had.
+        assert_eq!(bench.say_by(Some(key(9)), 7.0), Verdict::Forward, "{rules}");
+        assert_eq!(bench.sent().len(), 1, "{rules}");
+    }
+}
+
+#[test]
+fn an_infinity_is_no_change_of_an_infinity() {
+    let mut bench = Bench::new("deadband: 0.5");
+    let verdicts = [f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY].map(|value| bench.say(value));
+    assert_eq!(verdicts, [Verdict::Forward, UNCHANGED, Verdict::Forward]);
 }

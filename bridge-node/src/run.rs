@@ -117,7 +117,7 @@ impl<P: Port> Shell<P> {
                 Ok(()) => info!(%topic, message_type = %message_type.name(), "bound"),
                 Err(error) => warn!(%topic, %error, "the topic cannot cross"),
             },
-            PortEvent::Left { topic, publisher } => self.router.left(topic, publisher),
+            PortEvent::Left { topic, publisher } => self.router.left(topic, publisher, now()),
             PortEvent::Live { topic, live } => self.router.set_live(topic, live, now()),
             PortEvent::Lost { topic, why, count } => self.router.lost(topic, count, why),
             PortEvent::Dropped { reason, why, count } => self.router.dropped(reason, count, why),

@@ -167,6 +167,13 @@ pub struct Domain {
 impl Domain {
     /// Joins; returns when the discovery thread runs. Blocks for some milliseconds.
     ///
+    /// Called in a tokio runtime, and with the patched RustDDS, the domain's traffic is a task of that runtime: nothing
+    /// is sent or heard while the runtime does not run, and the domain is to be left by [`leave`](Self::leave), which lets
+    /// it run on until the goodbye is sent. Outside of one it has a thread of its own.
+    ///
+    /// # Panics
+    /// In a runtime without IO or time.
+    ///
     /// # Errors
     /// [`DomainError`].
     pub fn join(options: &DomainOptions) -> Result<Self, DomainError> {

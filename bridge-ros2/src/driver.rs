@@ -13,6 +13,7 @@ use rustdds::{EventLoop, Turned};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
 use tokio::time::{Instant, Sleep};
+use tracing::debug;
 
 /// Gives the loop its turns, in a task of the current runtime, until its participant is gone.
 ///
@@ -58,35 +59,53 @@ impl Driver {
             if !poll_fn(|cx| self.poll_wake(timer.as_mut(), cx)).await {
                 return;
             }
-            loop {
-                match self.event_loop.turn() {
-                    Turned::Done => break,
-                    Turned::Unfinished => tokio::task::yield_now().await,
-                    Turned::Ended => return,
+            while let turned @ (Turned::Unfinished | Turned::Ended) = self.event_loop.turn() {
+                if turned == Turned::Ended {
+                    debug!("the DDS traffic of a participant has ended");
+                    return;
                 }
+                tokio::task::yield_now().await;
+                // A socket that is never empty must not keep the others from being read.
+                poll_fn(|cx| Poll::Ready(self.poll_sockets(cx))).await;
             }
+            // Commands and datagrams may come for ever; everybody else has a turn.
+            tokio::task::consume_budget().await;
         }
     }
 
     /// Ready when the loop is to have a turn; false when the runtime ends.
     fn poll_wake(&mut self, timer: Pin<&mut Sleep>, cx: &mut Context<'_>) -> Poll<bool> {
-        let mut wake = self.event_loop.poll_commands(cx).is_ready();
+        let rung = self.event_loop.poll_commands(cx).is_ready();
+        match self.poll_sockets(cx) {
+            Sockets::Readable => Poll::Ready(true),
+            Sockets::Quiet if rung || timer.poll(cx).is_ready() => Poll::Ready(true),
+            Sockets::Quiet => Poll::Pending,
+            Sockets::Gone => Poll::Ready(false),
+        }
+    }
+
+    /// Tells the loop which sockets have become readable; the task is woken when one of the others does.
+    fn poll_sockets(&mut self, cx: &mut Context<'_>) -> Sockets {
+        let mut found = Sockets::Quiet;
         for (index, socket) in self.sockets.iter().enumerate() {
             match socket.poll_read_ready(cx) {
                 Poll::Ready(Ok(mut ready)) => {
                     // Before the turn, so that what comes during it is noticed.
                     ready.clear_ready();
                     self.event_loop.readable(index);
-                    wake = true;
+                    found = Sockets::Readable;
                 }
-                Poll::Ready(Err(_shutting_down)) => return Poll::Ready(false),
+                Poll::Ready(Err(_shutting_down)) => return Sockets::Gone,
                 Poll::Pending => {}
             }
         }
-        if wake || timer.poll(cx).is_ready() {
-            Poll::Ready(true)
-        } else {
-            Poll::Pending
-        }
+        found
     }
+}
+
+enum Sockets {
+    Readable,
+    Quiet,
+    /// With the runtime.
+    Gone,
 }

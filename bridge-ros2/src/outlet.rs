@@ -245,14 +245,17 @@ impl Outlet {
     fn write(&mut self, sample: Sample, now: Instant) -> Result<Option<Sample>, Refusal> {
         let Sample { payload, source } = sample;
         let size = payload.len();
-        if self.in_flight > 0 && self.in_flight + size > MAX_IN_FLIGHT {
+        // Long before there is no room: readers acknowledge one sample in several, so that now all may be acknowledged and
+        // at the next sample not.
+        if self.in_flight > MAX_IN_FLIGHT / 2 {
             // The answer is immediate with a wait of zero.
             match self.writer.wait_for_acknowledgments(Duration::ZERO) {
                 Ok(true) => self.in_flight = 0,
-                Ok(false) => {
+                Ok(false) if self.in_flight + size > MAX_IN_FLIGHT => {
                     self.full_since.get_or_insert(now);
                     return Ok(Some(Sample { payload, source }));
                 }
+                Ok(false) => {}
                 Err(_) => return Err(Refusal::Failed),
             }
         }

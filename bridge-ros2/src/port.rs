@@ -221,8 +221,7 @@ impl Ros2Port {
 
     fn tell_strangers(&mut self, strangers: &[Stranger]) {
         for stranger in strangers {
-            let told = (stranger.to_string(), KEPT_OUT);
-            if self.told.len() < MAX_TOLD && self.told.insert(told) {
+            if self.strangers.is_new(stranger) {
                 warn!("DDS Security: {stranger}");
             }
             self.events.push_back(PortEvent::Lost {

@@ -179,12 +179,6 @@ impl Enclave {
                 missing.join(", ")
             ));
         }
-        if folder.join(REVOKED).is_file() {
-            return Err(format!(
-                "{} has a list of revoked certificates, {REVOKED}, which RustDDS would not look at",
-                folder.display()
-            ));
-        }
         Ok(Self {
             name: name.to_owned(),
             folder,
@@ -231,6 +225,7 @@ const FILES: [&str; 6] = [
     "permissions.p7s",
 ];
 /// The one that may be there beside them.
+#[cfg(feature = "security")]
 const REVOKED: &str = "crl.pem";
 
 #[cfg(test)]

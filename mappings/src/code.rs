@@ -94,7 +94,7 @@ codes! {
     FieldPart = "M081", "In brackets behind a field that is an array of values stands the part of it: `[2]` the third element, `[name=joint_3]` the one whose place has joint_3 in the array `name` beside it, `[0:90]` the first ninety.";
     PartWritten = "M082", "A part of an array is read from ROS. It cannot be written, since nothing says what stands in the rest of the array.";
     Conversion = "M083", "`scale` and `offset` go with a number, `invert` with a Boolean, all of them with one field; `out_of_range` says what becomes of values that a conversion makes too big.";
-    LossyConversion = "M084", "The type the value becomes cannot hold all that the other type can, so a number would be rounded or not fit. With `out_of_range: refuse` such a value does not cross and is counted, with `clamp` it becomes the nearest that fits.";
+    LossyConversion = "M084", "The type the value becomes cannot hold all that the other type can, so a number would be rounded or not fit. With `out_of_range` it is rounded; one that does not fit then does not cross and is counted with `refuse`, and becomes the nearest that fits with `clamp`.";
     Publish = "M085", "`deadband` is a number above 0, of values that are numbers; `at_most` a rate as 10 Hz, from 0.001 Hz to 1000 Hz.";
 }
 

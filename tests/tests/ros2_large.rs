@@ -147,22 +147,22 @@ async fn all_thirty_arrive(size: usize) {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn all_thirty_samples_of_1_mb_reach_fast_dds_and_cyclone() {
     all_thirty_arrive(MEGA).await;
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn all_thirty_samples_of_2_mb_reach_fast_dds_and_cyclone() {
     all_thirty_arrive(2 * MEGA).await;
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn all_thirty_samples_of_5_mb_reach_fast_dds_and_cyclone() {
     all_thirty_arrive(5 * MEGA).await;
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn the_first_sample_arrives_even_when_it_is_large() {
     if !patched() {
         return;
@@ -182,7 +182,7 @@ async fn the_first_sample_arrives_even_when_it_is_large() {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn ten_megabytes_cross_between_two_of_ours() {
     if !patched() {
         return;
@@ -213,7 +213,7 @@ async fn ten_megabytes_cross_between_two_of_ours() {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn ten_megabytes_of_cyclone_and_fast_dds_are_read() {
     let Some(cell) = Cell::with(BOTH) else {
         return;
@@ -234,7 +234,7 @@ async fn ten_megabytes_of_cyclone_and_fast_dds_are_read() {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn texts_of_every_length_cross_an_ethernet() {
     let Some(cell) = Cell::with(BOTH) else {
         return;
@@ -257,7 +257,7 @@ async fn texts_of_every_length_cross_an_ethernet() {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn large_samples_survive_a_wire_that_loses() {
     if !patched() {
         return;
@@ -283,7 +283,7 @@ async fn large_samples_survive_a_wire_that_loses() {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_history_of_large_samples_takes_little_memory() {
     if !patched() {
         return;
@@ -302,7 +302,7 @@ async fn a_history_of_large_samples_takes_little_memory() {
     assert!(grown < 15 << 20, "{grown} bytes more");
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn large_samples_that_were_read_take_no_memory_any_more() {
     const COUNT: u32 = 100;
     if !patched() {
@@ -326,7 +326,7 @@ async fn large_samples_that_were_read_take_no_memory_any_more() {
     assert!(grown < 30 << 20, "{grown} bytes more after {COUNT} MB");
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_sample_beyond_the_limit_is_refused_by_name() {
     let Some(cell) = Cell::with(&[Peer::FastDds]) else {
         return;

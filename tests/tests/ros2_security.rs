@@ -233,6 +233,15 @@ fn an_enclave_that_is_not_in_order_is_refused_with_the_file_to_mend() {
         &["cert.pem", "not a PEM certificate"],
     );
 
+    // Also where the bridge may run in the clear: whose files are wrong means to be secured.
+    let revoked = enclave.join("crl.pem");
+    fs::write(&revoked, "").unwrap();
+    refused(&["crl.pem", "make a new keystore"]);
+    let permissive = cell.secured_bridge(&keystore, &[]);
+    let (code, lines) = refusal(permissive.env("ROS_SECURITY_STRATEGY", "Permissive"));
+    assert!(code == Some(78) && lines.contains("crl.pem"), "{lines}");
+    fs::remove_file(revoked).unwrap();
+
     keystore.certify("bridge", -1);
     refused(&["cert.pem", "expired on"]);
     keystore.certify("bridge", 10);

@@ -1,6 +1,6 @@
 //! Participants DDS Security keeps out, so that somebody hears why a robot is not there.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 #[cfg(feature = "security")]
@@ -10,9 +10,13 @@ use tokio::time::Instant;
 
 use crate::node::ParticipantPrefix;
 
-/// Who is being authenticated, and since when.
 #[derive(Debug, Default)]
-pub(super) struct Strangers(BTreeMap<ParticipantPrefix, Instant>);
+pub(super) struct Strangers {
+    /// Who is being authenticated, and since when.
+    waiting: BTreeMap<ParticipantPrefix, Instant>,
+    /// Those the log names already, the oldest first.
+    told: VecDeque<ParticipantPrefix>,
+}
 
 /// One that is not let in.
 #[derive(Debug, PartialEq, Eq)]
@@ -31,7 +35,7 @@ impl Strangers {
     ) -> Option<Stranger> {
         if let DomainParticipantStatusEvent::ParticipantLost { id, .. } = event {
             let gone: ParticipantPrefix = id.as_ref().try_into().ok()?;
-            self.0.remove(&gone);
+            self.waiting.remove(&gone);
         }
         let DomainParticipantStatusEvent::Authentication {
             participant,
@@ -62,27 +66,40 @@ impl Strangers {
     ) -> Option<Stranger> {
         match status {
             AuthenticationStatus::Authenticating => {
-                if self.0.len() < MAX_WAITING {
-                    self.0.entry(participant).or_insert(now);
+                if self.waiting.len() < MAX_WAITING {
+                    self.waiting.entry(participant).or_insert(now);
                 }
                 None
             }
             AuthenticationStatus::Authenticated | AuthenticationStatus::Unauthenticated => {
-                self.0.remove(&participant);
+                self.waiting.remove(&participant);
                 None
             }
             AuthenticationStatus::Rejected => {
-                self.0.remove(&participant);
+                self.waiting.remove(&participant);
                 let why = "it is not secured, or by another governance or without permission here";
                 Some(Stranger { participant, why })
             }
         }
     }
 
+    /// Whether the log does not name it yet, which it is taken to do from now on. Everybody who tries is another one, so
+    /// the oldest are forgotten.
+    pub(super) fn is_new(&mut self, stranger: &Stranger) -> bool {
+        let is_new = !self.told.contains(&stranger.participant);
+        if is_new {
+            if self.told.len() >= MAX_TOLD {
+                self.told.pop_front();
+            }
+            self.told.push_back(stranger.participant);
+        }
+        is_new
+    }
+
     /// Those that should have proved who they are by now. Each is returned once.
     pub(super) fn overdue(&mut self, now: Instant) -> Vec<Stranger> {
         let late = |since: &Instant| now.saturating_duration_since(*since) > PATIENCE;
-        let overdue = self.0.iter().filter(|(_, since)| late(since));
+        let overdue = self.waiting.iter().filter(|(_, since)| late(since));
         let strangers: Vec<Stranger> = overdue
             .map(|(participant, _)| Stranger {
                 participant: *participant,
@@ -90,7 +107,7 @@ impl Strangers {
             })
             .collect();
         for stranger in &strangers {
-            self.0.remove(&stranger.participant);
+            self.waiting.remove(&stranger.participant);
         }
         strangers
     }
@@ -110,6 +127,8 @@ impl std::fmt::Display for Stranger {
 pub(super) const KEPT_OUT: &str = "participant not authenticated";
 /// A handshake is three messages, each repeated every second.
 const PATIENCE: Duration = Duration::from_secs(8);
+/// How many the log is known to name.
+const MAX_TOLD: usize = 256;
 /// Anybody can claim to be somebody.
 #[cfg(feature = "security")]
 const MAX_WAITING: usize = 1024;
@@ -117,6 +136,24 @@ const MAX_WAITING: usize = 1024;
 #[cfg(all(test, feature = "security"))]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_log_names_each_once_however_many_come() {
+        let mut strangers = Strangers::default();
+        let stranger = |number: u32| {
+            let mut participant = [0; 12];
+            participant[..4].copy_from_slice(&number.to_le_bytes());
+            Stranger {
+                participant,
+                why: "of the test",
+            }
+        };
+        for number in 0..10_000 {
+            assert!(strangers.is_new(&stranger(number)), "{number}");
+            assert!(!strangers.is_new(&stranger(number)), "{number}");
+        }
+        assert!(strangers.told.len() <= MAX_TOLD);
+    }
 
     #[test]
     fn who_does_not_prove_itself_in_time_is_told_once() {

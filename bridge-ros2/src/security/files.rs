@@ -13,10 +13,18 @@ use openssl::stack::Stack;
 use openssl::x509::X509;
 use openssl::x509::store::X509StoreBuilder;
 
-use super::{Enclave, SecurityError};
+use super::{Enclave, REVOKED, SecurityError};
 
 /// Looks at all files in `folder`; what works but should be mended is returned.
 pub(super) fn check(folder: &Path) -> Result<Vec<String>, SecurityError> {
+    if folder.join(REVOKED).is_file() {
+        return Err(Enclave::fault(
+            folder,
+            REVOKED,
+            "RustDDS would not look at this list of revoked certificates and let them in: make a new keystore \
+             without those nodes",
+        ));
+    }
     let identity_ca = certificate(folder, "identity_ca.cert.pem")?;
     let permissions_ca = certificate(folder, "permissions_ca.cert.pem")?;
     let own = certificate(folder, "cert.pem")?;

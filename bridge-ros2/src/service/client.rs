@@ -16,7 +16,7 @@ use tracing::debug;
 use super::error::{CallPhase, ServiceError};
 use super::mapping::{ClientId, Outgoing, Received, RequestKey};
 use super::opening::Opening;
-use super::pace::{Awaited, Pace};
+use super::pace::{Awaited, FRESH, Pace};
 use super::peers::{ServicePeers, Snapshot};
 use super::{SETTLE, Service, ServiceMapping, next, policies};
 use crate::domain::{Domain, DomainError};
@@ -292,7 +292,7 @@ impl Driver {
         call.enter(CallPhase::Discovery);
         self.waiting.push_back(call);
         let now = Instant::now();
-        if self.next_look().is_none_or(|due| due <= now) {
+        if self.looked.is_none_or(|looked| looked + FRESH <= now) {
             self.look(now);
         } else {
             self.ask_waiting(now);

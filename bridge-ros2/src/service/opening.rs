@@ -15,7 +15,7 @@ use crate::raw::Writer;
 /// middle. With a single sample the heartbeat comes behind it.
 ///
 /// RustDDS as published needs this. With the patches, of which `late-readers` is for the same reader, 20 of 20 bursts of 100
-/// requests were answered without it; it costs them one acknowledgement per new reader.
+/// requests were answered without it; it costs them one acknowledgement per new reader, which may be asked for 20 ms later.
 #[derive(Debug)]
 pub(crate) struct Opening {
     known: BTreeSet<GUID>,

@@ -202,7 +202,8 @@ impl<'c> Bindings<'c> {
             (None, None) => place,
         };
         let way = Way {
-            reads: site.subject.origin == Some(space),
+            // Where no origin is known, that is the finding.
+            reads: site.subject.origin.is_none_or(|origin| origin == space),
             declared: site.subject.declared,
         };
         let known = message_type.as_deref();

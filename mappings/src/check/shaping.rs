@@ -153,11 +153,7 @@ impl Shaping {
         let mut conversion = self.conversion;
         let declared = way.declared.map(|(builtin, _)| builtin);
         let to = declared.filter(|to| {
-            is_number(*to)
-                && element.map_or_else(
-                    || self.place.is_some(),
-                    |from| is_number(from) && from != *to,
-                )
+            is_number(*to) && element.is_none_or(|from| is_number(from) && from != *to)
         });
         if let Some(to) = to {
             conversion = conversion.to(to);

@@ -83,7 +83,7 @@ async fn sent(outlet: &mut Outlet) {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_message_arrives_with_its_byte_order_in_front() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -98,7 +98,7 @@ async fn a_message_arrives_with_its_byte_order_in_front() {
     assert_eq!(missing, 0);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn five_thousand_messages_at_1_khz_arrive_in_order_without_loss() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -124,7 +124,7 @@ async fn five_thousand_messages_at_1_khz_arrive_in_order_without_loss() {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn five_thousand_messages_at_1_khz_are_written_without_loss() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -145,7 +145,7 @@ async fn five_thousand_messages_at_1_khz_are_written_without_loss() {
     assert_eq!(heard(&peer), expected);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_late_joiner_gets_the_last_value_and_no_older_one() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -166,7 +166,7 @@ async fn a_late_joiner_gets_the_last_value_and_no_older_one() {
     assert_eq!(heard(&later), ["last"]);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_transient_local_value_from_before_our_time_is_read() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -180,7 +180,7 @@ async fn a_transient_local_value_from_before_our_time_is_read() {
     assert!(is_string(&bytes, "old"), "{bytes:?}");
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn large_messages_of_odd_length_cross_both_ways() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -214,7 +214,7 @@ async fn large_messages_of_odd_length_cross_both_ways() {
     assert_eq!(got, lengths);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_replaced_reader_repeats_and_loses_nothing() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -240,7 +240,7 @@ async fn a_replaced_reader_repeats_and_loses_nothing() {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn leaving_a_domain_ends_in_time() {
     let Some(_cell) = Cell::with(&[]) else {
         return;

@@ -92,7 +92,7 @@ fn delivery(topic: TopicId, text: &str) -> Delivery {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_topic_of_the_space_crosses_without_configuration_whatever_its_type() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -115,7 +115,7 @@ async fn a_topic_of_the_space_crosses_without_configuration_whatever_its_type() 
     assert_eq!(payload[4..12], [1, 0, 0, 0, 2, 0, 0, 0]);
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_topic_whose_publisher_leaves_is_reported_dead() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -134,7 +134,7 @@ async fn a_topic_whose_publisher_leaves_is_reported_dead() {
     );
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_value_nobody_asks_for_gets_the_standard_type_and_waits_for_late_joiners() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -152,7 +152,7 @@ async fn a_value_nobody_asks_for_gets_the_standard_type_and_waits_for_late_joine
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_subscriber_decides_the_type() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -170,7 +170,7 @@ async fn a_subscriber_decides_the_type() {
     assert_eq!(bound(&mut port, topic("ua_0_2_3")).await, "std_msgs/UInt32");
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_subscriber_that_comes_later_changes_the_standard_type() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -183,7 +183,7 @@ async fn a_subscriber_that_comes_later_changes_the_standard_type() {
     assert_eq!(bound(&mut port, topic).await, "std_msgs/UInt32");
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_type_without_a_definition_is_counted_and_keeps_nobody_out() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -201,7 +201,7 @@ async fn a_type_without_a_definition_is_counted_and_keeps_nobody_out() {
     assert_eq!(bound(&mut port, topic("ua_2_1_2")).await, "std_msgs/Bool");
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn samples_of_another_type_than_the_topics_are_not_handed_up() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
@@ -225,7 +225,7 @@ async fn samples_of_another_type_than_the_topics_are_not_handed_up() {
     }
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_bad_value_is_not_published() {
     let Some(_cell) = Cell::with(&[]) else {
         return;
@@ -244,7 +244,7 @@ async fn a_bad_value_is_not_published() {
     assert_eq!(port.publish(delivery(topic, "fresh")), Ok(()));
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_thousand_topics_are_advertised_in_batches_and_disposed_within_two_seconds() {
     let Some(_cell) = Cell::with(&[]) else {
         return;
@@ -269,7 +269,7 @@ async fn a_thousand_topics_are_advertised_in_batches_and_disposed_within_two_sec
     );
 }
 
-#[tokio::test]
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_subscriber_that_is_killed_does_not_keep_the_newest_value_from_the_others() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
