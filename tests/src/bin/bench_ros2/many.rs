@@ -71,7 +71,11 @@ fn to_uadp(cell: &Cell, seconds: u64) {
     eventually("all topics cross", START, || {
         pacer.send(Pace::kilohertz(1, SIZE));
         let mut crossed = HashSet::new();
-        while let Ok(length) = listener.recv(&mut buffer) {
+        let start = now();
+        // Keep-alives come for ever.
+        while now() - start < SETTLES
+            && let Ok(length) = listener.recv(&mut buffer)
+        {
             crossed.extend(heard.add(&buffer[..length]));
         }
         (crossed.len() == TOPICS).then_some(())
@@ -85,11 +89,12 @@ fn to_uadp(cell: &Cell, seconds: u64) {
             pacer.send(Pace::kilohertz(seconds, SIZE));
             now() - start
         });
-        while heard.report.distinct < sent {
-            match listener.recv(&mut buffer) {
-                Ok(length) => drop(heard.add(&buffer[..length])),
-                Err(_) if sender.is_finished() => break,
-                Err(_) => {}
+        let mut last = now();
+        while heard.report.distinct < sent && (!sender.is_finished() || now() - last < SILENCE) {
+            if let Ok(length) = listener.recv(&mut buffer)
+                && heard.add(&buffer[..length]).is_some()
+            {
+                last = now();
             }
         }
         sender.join().unwrap()
@@ -153,5 +158,7 @@ fn id(topic: usize) -> u16 {
 pub(crate) const TOPICS: usize = 50;
 pub(crate) const FIRST: usize = 10;
 const SIZE: usize = 64;
-/// Nothing more comes after this long without a datagram.
+/// What was sent in a second is there after this long.
+const SETTLES: Duration = Duration::from_secs(2);
+/// Nothing more comes after this long without a new text.
 const SILENCE: Duration = Duration::from_millis(500);
