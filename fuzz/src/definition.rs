@@ -38,10 +38,17 @@ pub fn definition(input: &[u8]) {
             }
         }
         b'a' => {
-            if registry.add_action(&name, text).is_ok()
-                && let Ok(made) = registry.action(&name)
-            {
+            // ROS 1 and ROS 2 make different messages of one definition.
+            if registry.add_action(&name, text).is_err() {
+                return;
+            }
+            if let Ok(made) = registry.action(&name) {
                 for part in [made.goal(), made.result(), made.feedback(), made.action()] {
+                    check(part, Registry::empty(dialect));
+                }
+            }
+            if let Ok(made) = registry.action_messages(&name) {
+                for part in [made.goal(), made.result_response(), made.feedback()] {
                     check(part, Registry::empty(dialect));
                 }
             }
