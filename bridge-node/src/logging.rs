@@ -25,7 +25,7 @@ pub enum LogFormat {
 /// hush what a library says without need.
 pub(crate) fn start(format: LogFormat, quiet: &str) {
     let levels = std::env::var("UA_LOG").unwrap_or_else(|_| "info".to_owned());
-    let filter = EnvFilter::builder().parse_lossy(format!("{levels},{quiet}"));
+    let filter = EnvFilter::builder().parse_lossy(format!("{quiet},{levels}"));
     let lines = tracing_subscriber::fmt::layer()
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal());
