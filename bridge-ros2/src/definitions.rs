@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use bridge_node::Wanted;
+use bridge_node::Environment;
 use messages::{
     DefinitionError, Dialect, MessageType, ServiceType, ServiceTypeHashes, TypeHash, TypeName,
 };
@@ -13,16 +13,18 @@ use uadp::BuiltinType;
 #[derive(Debug)]
 pub(crate) struct Definitions {
     known: bridge_node::Definitions,
-    /// Folders that hold `share/<package>/msg/<Name>.msg`, first match wins.
-    prefixes: Vec<PathBuf>,
 }
 
 impl Definitions {
-    /// With the built-in definitions and the prefixes of a ROS 2 installation, as `AMENT_PREFIX_PATH` lists them.
-    pub(crate) fn new(prefixes: Vec<PathBuf>) -> Self {
+    /// With the built-in definitions, those of the mapping's `type_paths`, and the prefixes of ROS 2 installations, as
+    /// `AMENT_PREFIX_PATH` lists them.
+    pub(crate) fn new(type_paths: &[PathBuf], prefixes: Vec<PathBuf>) -> Self {
+        let environment = Environment {
+            ros1: Vec::new(),
+            ros2: prefixes,
+        };
         Self {
-            known: bridge_node::Definitions::new(Dialect::Ros2),
-            prefixes,
+            known: bridge_node::Definitions::new(Dialect::Ros2, type_paths, environment),
         }
     }
 
@@ -31,8 +33,7 @@ impl Definitions {
     /// # Errors
     /// [`DefinitionError`].
     pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
-        let prefixes = &self.prefixes;
-        self.known.find(name, |wanted| locate(prefixes, wanted))
+        self.known.find(name)
     }
 
     /// The service of that name, found likewise.
@@ -40,9 +41,12 @@ impl Definitions {
     /// # Errors
     /// [`DefinitionError`].
     pub(crate) fn service(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
-        let prefixes = &self.prefixes;
-        self.known
-            .find_service(name, |wanted| locate(prefixes, wanted))
+        self.known.find_service(name)
+    }
+
+    /// Where the definition of a type is from, for people.
+    pub(crate) fn source(&self, name: &TypeName) -> &str {
+        self.known.source(name)
     }
 
     /// The type hash of a type that was found.
@@ -61,18 +65,6 @@ impl Definitions {
     }
 }
 
-fn locate(prefixes: &[PathBuf], Wanted { name, kind }: Wanted<'_>) -> Option<PathBuf> {
-    // Neither part of a type name can hold a separator or a dot.
-    let file = PathBuf::from("share")
-        .join(name.package())
-        .join(kind)
-        .join(format!("{}.{kind}", name.name()));
-    prefixes
-        .iter()
-        .map(|prefix| prefix.join(&file))
-        .find(|file| file.is_file())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -85,14 +77,15 @@ mod tests {
         std::fs::write(folder.join("Arm.msg"), "robot_msgs/Joint[] joints\n").unwrap();
         std::fs::write(folder.join("Joint.msg"), "string name\nfloat64 angle\n").unwrap();
 
-        let found = Definitions::new(vec![prefix.clone()]).get(&"robot_msgs/Arm".parse().unwrap());
+        let found =
+            Definitions::new(&[], vec![prefix.clone()]).get(&"robot_msgs/Arm".parse().unwrap());
         std::fs::remove_dir_all(&prefix).unwrap();
         assert_eq!(found.unwrap().leaves()[0].path, "joints");
     }
 
     #[test]
     fn a_type_nobody_defines_is_named_in_the_error() {
-        let error = Definitions::new(vec![])
+        let error = Definitions::new(&[], vec![])
             .get(&"robot_msgs/Arm".parse().unwrap())
             .unwrap_err();
         assert!(error.to_string().contains("robot_msgs/Arm"), "{error}");

@@ -115,7 +115,7 @@ impl Ros2Port {
             "joined the DDS domain"
         );
         let presence = domain.announce_bridge(own.into())?;
-        let mut definitions = Definitions::new(prefixes);
+        let mut definitions = Definitions::new(mapping.type_paths(), prefixes);
         let peers = ServicePeers::new(&domain);
         let declared =
             services::parameters(own, domain_options.domain, domain_options.node.use_sim_time);

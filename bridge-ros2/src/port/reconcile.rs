@@ -232,7 +232,8 @@ impl Ros2Port {
         let slot = self.inbox.insert(index, reader);
         if let Some(source) = self.sources.get_mut(index) {
             source.reading = Reading::Open { slot, requested };
-            info!(topic, message_type = %name, ?requested, "subscribed");
+            let definition = self.definitions.source(&name);
+            info!(topic, message_type = %name, definition, ?requested, "subscribed");
             for (topic, selection) in &source.values {
                 self.events.push_back(PortEvent::Bound {
                     topic: *topic,
@@ -479,7 +480,8 @@ impl Ros2Port {
         else {
             return;
         };
-        info!(topic = dds_topic, message_type = %message_type.name(), ?offered, "advertised");
+        let definition = self.definitions.source(message_type.name());
+        info!(topic = dds_topic, message_type = %message_type.name(), definition, ?offered, "advertised");
         let mut outlet = Outlet::new(writer, offered);
         if let Err(refusal) = outlet.set_readers(self.graph.readers(&dds_topic), Instant::now()) {
             self.events.push_back(lost(topic, refusal.label(), 1));
