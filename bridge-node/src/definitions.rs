@@ -63,19 +63,23 @@ impl Definitions {
         found
     }
 
-    /// Notes that a peer brought a definition the registry did not have, as `connection header of /camera`.
+    /// Notes that a peer brought the definition that counts, as `type description of /camera`.
     pub fn learned(&mut self, name: &TypeName, from: impl FnOnce() -> String) {
-        if self.library.file(TextKind::Message, name).is_none() && self.peers.len() < MOST_PEERS {
-            self.peers.entry(name.clone()).or_insert_with(from);
+        if self.peers.len() < MOST_PEERS {
+            self.peers.insert(name.clone(), from());
         }
     }
 
     /// Where the definition of a type is from, for people.
     #[must_use]
     pub fn source(&self, name: &TypeName) -> &str {
-        let file = self.library.file(TextKind::Message, name);
-        let peer = || self.peers.get(name).map(String::as_str);
-        file.map(AsRef::as_ref).or_else(peer).unwrap_or("built in")
+        let file = || {
+            self.library
+                .file(TextKind::Message, name)
+                .map(AsRef::as_ref)
+        };
+        let peer = self.peers.get(name).map(String::as_str);
+        peer.or_else(file).unwrap_or("built in")
     }
 
     fn tell(&mut self) {

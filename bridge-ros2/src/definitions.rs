@@ -1,11 +1,13 @@
 //! Message definitions: those built in, and those of the ROS installation the program was started in.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use bridge_node::Environment;
 use messages::{
-    DefinitionError, Dialect, MessageType, ServiceType, ServiceTypeHashes, TypeHash, TypeName,
+    DefinitionError, DescribedType, Dialect, MessageType, ServiceType, ServiceTypeHashes, TypeHash,
+    TypeName,
 };
 use uadp::BuiltinType;
 
@@ -13,6 +15,9 @@ use uadp::BuiltinType;
 #[derive(Debug)]
 pub(crate) struct Definitions {
     known: bridge_node::Definitions,
+    /// What nodes told of their types, with the hash they announce.
+    described: BTreeMap<TypeName, Described>,
+    hashes: BTreeMap<TypeName, TypeHash>,
 }
 
 impl Definitions {
@@ -25,6 +30,8 @@ impl Definitions {
         };
         Self {
             known: bridge_node::Definitions::new(Dialect::Ros2, type_paths, environment),
+            described: BTreeMap::new(),
+            hashes: BTreeMap::new(),
         }
     }
 
@@ -33,7 +40,56 @@ impl Definitions {
     /// # Errors
     /// [`DefinitionError`].
     pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
-        self.known.find(name)
+        if let Some(described) = self.described.get(name) {
+            return Ok(Arc::clone(&described.message_type));
+        }
+        let found = self.known.find(name)?;
+        if !self.hashes.contains_key(name)
+            && let Ok(hash) = self.known.registry().type_hash(name)
+        {
+            self.hashes.insert(name.clone(), hash);
+        }
+        Ok(found)
+    }
+
+    /// Takes what a node told of a type in place of what is known under its name, if it is the type of that hash.
+    ///
+    /// # Errors
+    /// [`DefinitionError`].
+    pub(crate) fn add_described(
+        &mut self,
+        name: &TypeName,
+        types: &[DescribedType],
+        hash: TypeHash,
+        from: impl FnOnce() -> String,
+    ) -> Result<(), DefinitionError> {
+        let registry = self.known.registry_mut();
+        let message_type = registry.add_described(name, types, hash)?;
+        let described = Described {
+            hash,
+            message_type,
+            types: types.to_vec(),
+        };
+        self.described.insert(name.clone(), described);
+        self.known.learned(name, from);
+        Ok(())
+    }
+
+    /// The hash of a type that was asked for, or that a node told.
+    pub(crate) fn hash_of(&self, name: &TypeName) -> Option<TypeHash> {
+        let described = self.described.get(name).map(|described| described.hash);
+        described.or_else(|| self.hashes.get(name).copied())
+    }
+
+    /// The description of a type and what it needs.
+    ///
+    /// # Errors
+    /// [`DefinitionError`].
+    pub(crate) fn described(&self, name: &TypeName) -> Result<Vec<DescribedType>, DefinitionError> {
+        match self.described.get(name) {
+            Some(described) => Ok(described.types.clone()),
+            None => self.known.registry().describe(name),
+        }
     }
 
     /// The service of that name, found likewise.
@@ -49,11 +105,6 @@ impl Definitions {
         self.known.source(name)
     }
 
-    /// The type hash of a type that was found.
-    pub(crate) fn type_hash(&self, name: &TypeName) -> Option<TypeHash> {
-        self.known.registry().type_hash(name).ok()
-    }
-
     /// The type hashes of a service that was found.
     pub(crate) fn service_type_hashes(&self, name: &TypeName) -> Option<ServiceTypeHashes> {
         self.known.registry().service_type_hashes(name).ok()
@@ -63,6 +114,14 @@ impl Definitions {
     pub(crate) fn standard_type(&self, builtin: BuiltinType, array: bool) -> Option<TypeName> {
         self.known.registry().standard_type(builtin, array)
     }
+}
+
+/// What a node told of a type.
+#[derive(Debug)]
+struct Described {
+    hash: TypeHash,
+    message_type: Arc<MessageType>,
+    types: Vec<DescribedType>,
 }
 
 #[cfg(test)]

@@ -663,7 +663,9 @@ fn differences(found: &[Found], findings: &mut Findings) {
         };
         let note = findings.error(Code::BindingsDiffer, other.place, message);
         let label = format!("differs from line {}", first.place.line);
-        let help = match sides((first, fields), (other, others)) {
+        let several = fields.len() > 1 || others.len() > 1;
+        let sides = several.then(|| sides((first, fields), (other, others)));
+        let help = match sides.flatten() {
             Some(sides) => format!("{sides}; bind fields of one type on both sides"),
             None => "bind fields of one type on both sides".to_owned(),
         };
@@ -697,26 +699,30 @@ fn versions(first: Side<'_>, other: Side<'_>, findings: &mut Findings) {
         ));
 }
 
-/// The fields of each side that the other one has not; `None` when there is none. In ROS 2 names are in lower case
-/// with underscores, where in ROS 1 they could be as `D`.
+/// What the fields of two sides have not in common, by their names; `None` when nothing. In ROS 2 names are in lower
+/// case with underscores, where in ROS 1 they could be as `D`.
 fn sides((first, a): Side<'_>, (other, b): Side<'_>) -> Option<String> {
     let plain = |leaf: &Leaf| leaf.path.to_ascii_lowercase().replace('_', "");
-    let only = |these: &[Leaf], those: &[Leaf]| {
+    let only = |found: &Found, these: &[Leaf], those: &[Leaf]| {
         let those: HashSet<String> = those.iter().map(plain).collect();
         let only = these.iter().filter(|leaf| !those.contains(&plain(leaf)));
-        only.map(|leaf| leaf.path.clone()).collect::<Vec<_>>()
+        let only: Vec<&str> = only.map(|leaf| leaf.path.as_str()).collect();
+        let side = || format!("only in space {}: {}", found.binding.space, told(&only));
+        (!only.is_empty()).then(side)
     };
-    let (only_a, only_b) = (only(a, b), only(b, a));
-    if only_a.is_empty() && only_b.is_empty() {
-        return None;
-    }
-    let side = |found: &Found, only: &[String]| {
-        let only: Vec<&str> = only.iter().map(String::as_str).collect();
-        format!("only in space {}: {}", found.binding.space, told(&only))
-    };
-    Some(format!(
-        "{}; {}",
-        side(first, &only_a),
-        side(other, &only_b)
-    ))
+    let names: HashMap<String, &Leaf> = b.iter().map(|leaf| (plain(leaf), leaf)).collect();
+    let typed = a.iter().filter_map(|leaf| {
+        let (one, two) = (leaf, *names.get(&plain(leaf))?);
+        let (one, two) = (types::value_type(one), types::value_type(two));
+        (one != two).then(|| {
+            let (one, two) = (types::print(one), types::print(two));
+            format!("{} ({one}, {two})", leaf.path)
+        })
+    });
+    let typed: Vec<String> = typed.collect();
+    let typed: Vec<&str> = typed.iter().map(String::as_str).collect();
+    let typed = (!typed.is_empty()).then(|| format!("of other types: {}", told(&typed)));
+    let parts = [only(first, a, b), only(other, b, a), typed];
+    let parts: Vec<String> = parts.into_iter().flatten().collect();
+    (!parts.is_empty()).then(|| parts.join("; "))
 }
