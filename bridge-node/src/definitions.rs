@@ -1,120 +1,112 @@
-//! Message definitions for a port: those built in, and those in files beside a ROS installation.
+//! Type definitions for a port: those built in, those in files, and those that peers bring.
 
-use std::fs::File;
-use std::io::Read;
-use std::path::{Path, PathBuf};
+use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::sync::Arc;
 
-use messages::{DefinitionError, Dialect, MessageType, Registry, ServiceType, TypeName};
+use messages::{
+    DefinitionError, Dialect, Library, MessageType, Noted, Registry, ServiceType, TextKind,
+    TypeName,
+};
 use tracing::{info, warn};
+use type_files::{Environment, TypeFiles};
 
-/// Finds message types by name; a definition once read stays.
+/// Finds types by name; a definition once read stays.
 #[derive(Debug)]
 pub struct Definitions {
-    registry: Registry,
+    library: Library,
+    files: TypeFiles,
+    /// Who brought those that are from peers.
+    peers: BTreeMap<TypeName, String>,
 }
 
 impl Definitions {
-    /// With the built-in definitions of one ROS.
+    /// With the built-in definitions of one ROS, the mapping's `type_paths`, and the ROS installations there are.
     #[must_use]
-    pub fn new(dialect: Dialect) -> Self {
+    pub fn new(dialect: Dialect, type_paths: &[PathBuf], environment: Environment) -> Self {
         Self {
-            registry: Registry::bundle(dialect),
+            library: Library::new(Registry::bundle(dialect)),
+            // What is wrong with them was told when the mapping was checked.
+            files: TypeFiles::open(type_paths, environment),
+            peers: BTreeMap::new(),
         }
     }
 
     /// What is known by now.
     #[must_use]
     pub const fn registry(&self) -> &Registry {
-        &self.registry
+        self.library.registry()
     }
 
     /// For definitions that come another way than by files.
     pub const fn registry_mut(&mut self) -> &mut Registry {
-        &mut self.registry
+        self.library.registry_mut()
     }
 
-    /// The type of that name with all it needs. `locate` says where the definition of a type that is not known yet
-    /// could be: a few small files are read, once.
+    /// The type of that name with all it needs; files are read, once.
     ///
     /// # Errors
-    /// [`DefinitionError`]; a file that cannot be read is logged and counts as not there.
-    pub fn find(
-        &mut self,
-        name: &TypeName,
-        locate: impl Fn(Wanted<'_>) -> Option<PathBuf>,
-    ) -> Result<Arc<MessageType>, DefinitionError> {
-        self.search(|registry| registry.get(name), |_| "msg", locate)
+    /// [`DefinitionError`]; a file that does not parse is logged and counts as not there.
+    pub fn find(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
+        let found = self.library.message(name, &mut self.files);
+        self.tell();
+        found
     }
 
     /// The service of that name, found likewise.
     ///
     /// # Errors
     /// As [`find`](Self::find).
-    pub fn find_service(
-        &mut self,
-        name: &TypeName,
-        locate: impl Fn(Wanted<'_>) -> Option<PathBuf>,
-    ) -> Result<Arc<ServiceType>, DefinitionError> {
-        // What nothing needs is the service itself.
-        let kind = |by: Option<&TypeName>| if by.is_none() { "srv" } else { "msg" };
-        self.search(|registry| registry.service(name), kind, locate)
+    pub fn find_service(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
+        let found = self.library.service(name, &mut self.files);
+        self.tell();
+        found
     }
 
-    fn search<T>(
-        &mut self,
-        ask: impl Fn(&Registry) -> Result<T, DefinitionError>,
-        kind_of: impl Fn(Option<&TypeName>) -> &'static str,
-        locate: impl Fn(Wanted<'_>) -> Option<PathBuf>,
-    ) -> Result<T, DefinitionError> {
-        for _ in 0..MAX_FILES {
-            let unknown = match ask(&self.registry) {
-                Err(unknown @ DefinitionError::Unknown { .. }) => unknown,
-                found => return found,
-            };
-            let DefinitionError::Unknown {
-                name, needed_by, ..
-            } = &unknown
-            else {
-                return Err(unknown);
-            };
-            let kind = kind_of(needed_by.as_ref());
-            let file = locate(Wanted { name, kind });
-            let Some((text, file)) = file.and_then(|file| Some((read(&file)?, file))) else {
-                return Err(unknown);
-            };
-            if kind == "srv" {
-                self.registry.add_service(name, &text)?;
-            } else {
-                self.registry.add(name, &text)?;
+    /// Notes that a peer brought the definition that counts, as `type description of /camera`.
+    pub fn learned(&mut self, name: &TypeName, from: impl FnOnce() -> String) {
+        if self.peers.len() < MOST_PEERS {
+            self.peers.insert(name.clone(), from());
+        }
+    }
+
+    /// Where the definition of a type is from, for people.
+    #[must_use]
+    pub fn source(&self, name: &TypeName) -> &str {
+        let file = || {
+            self.library
+                .file(TextKind::Message, name)
+                .map(AsRef::as_ref)
+        };
+        let peer = self.peers.get(name).map(String::as_str);
+        peer.or_else(file).unwrap_or("built in")
+    }
+
+    fn tell(&mut self) {
+        for noted in self.library.take_noted() {
+            match noted {
+                Noted::Read { name, file } => {
+                    info!(definition = %name, %file, "definition read");
+                }
+                Noted::Refused { name, file, error } => {
+                    warn!(definition = %name, %file, "definition file does not count: {error}");
+                }
+                Noted::Differs {
+                    name,
+                    file,
+                    only_file,
+                    only_built_in,
+                } => warn!(
+                    definition = %name,
+                    %file,
+                    ?only_file,
+                    ?only_built_in,
+                    "the file counts, and differs from the definition that is built in"
+                ),
             }
-            info!(definition = %name, file = %file.display(), "definition read");
-        }
-        ask(&self.registry)
-    }
-}
-
-/// A definition that is not known yet.
-#[derive(Debug, Clone, Copy)]
-pub struct Wanted<'a> {
-    /// Package and name.
-    pub name: &'a TypeName,
-    /// `msg` or `srv`: the folder in its package, and the ending of the file's name.
-    pub kind: &'static str,
-}
-
-fn read(file: &Path) -> Option<String> {
-    let mut text = String::new();
-    match File::open(file).and_then(|open| open.take(MAX_BYTES).read_to_string(&mut text)) {
-        Ok(_) => Some(text),
-        Err(error) => {
-            warn!(file = %file.display(), %error, "definition not readable");
-            None
         }
     }
 }
 
-/// More types than any message needs.
-const MAX_FILES: usize = 512;
-/// More than any `.msg` file has.
-const MAX_BYTES: u64 = 1 << 20;
+/// Types of peers whose origin is kept in mind.
+const MOST_PEERS: usize = 4096;

@@ -102,7 +102,7 @@ fn load(arguments: &Arguments) -> Result<Option<Mapping>, Failure> {
             format!("cannot read the mapping {}: {error}", file.display()),
         )
     })?;
-    let mut checked = Mapping::from_yaml(&text, &file.display().to_string());
+    let mut checked = type_files::check_mapping(&text, &file.display().to_string());
     if !arguments.check && checked.mapping.is_some() {
         leave_to_the_run(&mut checked.findings, file);
     }

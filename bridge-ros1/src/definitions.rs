@@ -1,10 +1,10 @@
 //! Message definitions: those built in, those of publishers' connection headers, and those of the ROS packages the
 //! program is told of.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
-use bridge_node::Wanted;
+use bridge_node::Environment;
 use messages::{DefinitionError, Dialect, MessageType, NameError, ServiceType, TypeName};
 use tcpros::ConnectionHeader;
 use uadp::BuiltinType;
@@ -13,15 +13,17 @@ use uadp::BuiltinType;
 #[derive(Debug)]
 pub(crate) struct Definitions {
     known: bridge_node::Definitions,
-    /// Folders with packages somewhere below them, as `ROS_PACKAGE_PATH` lists; first match wins.
-    packages: Vec<PathBuf>,
 }
 
 impl Definitions {
-    pub(crate) fn new(packages: Vec<PathBuf>) -> Self {
+    /// With those of the mapping's `type_paths`, and of the folders with packages that `ROS_PACKAGE_PATH` lists.
+    pub(crate) fn new(type_paths: &[PathBuf], packages: Vec<PathBuf>) -> Self {
+        let environment = Environment {
+            ros1: packages,
+            ros2: Vec::new(),
+        };
         Self {
-            known: bridge_node::Definitions::new(Dialect::Ros1),
-            packages,
+            known: bridge_node::Definitions::new(Dialect::Ros1, type_paths, environment),
         }
     }
 
@@ -35,8 +37,16 @@ impl Definitions {
         let fits = |found: &MessageType| md5sum == "*" || found.md5() == md5sum;
         let text = header.message_definition().unwrap_or_default();
         if !text.trim().is_empty() || md5sum == EMPTY {
+            // What files have under that name is not to be taken for what this publisher sends, and stays what is written.
+            let before = self.known.find(&name).is_ok();
             match self.known.registry_mut().add_ros1_definition(&name, text) {
-                Ok(found) if fits(&found) => return Ok(found),
+                Ok(found) if fits(&found) => {
+                    if !before {
+                        self.known
+                            .learned(&name, || "a connection header".to_owned());
+                    }
+                    return Ok(found);
+                }
                 // Some writers of bags and bridges send a text that is not the one of their checksum.
                 Ok(_) | Err(_)
                     if self
@@ -69,14 +79,17 @@ impl Definitions {
 
     /// The type of that name with all it needs. One that is not known yet is looked for in the packages.
     pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
-        let packages = &self.packages;
-        self.known.find(name, |file| locate(packages, file))
+        self.known.find(name)
     }
 
     /// The service of that name, looked for likewise.
     pub(crate) fn service(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
-        let packages = &self.packages;
-        self.known.find_service(name, |file| locate(packages, file))
+        self.known.find_service(name)
+    }
+
+    /// Where the definition is from that [`get`](Self::get) has, for people.
+    pub(crate) fn source(&self, name: &TypeName) -> &str {
+        self.known.source(name)
     }
 
     /// The ROS type that carries one value of that type, and nothing else.
@@ -100,63 +113,8 @@ pub(crate) enum Unusable {
     },
 }
 
-fn locate(packages: &[PathBuf], file: Wanted<'_>) -> Option<PathBuf> {
-    let mut budget = MAX_FOLDERS;
-    packages
-        .iter()
-        .find_map(|root| find_below(root, file, MAX_DEPTH, &mut budget))
-}
-
-/// `<package>/msg/<Name>.msg`, or `srv`, at or below a folder. Packages lie flat in an installation and nested in a
-/// workspace.
-fn find_below(
-    folder: &Path,
-    file: Wanted<'_>,
-    depth: usize,
-    budget: &mut usize,
-) -> Option<PathBuf> {
-    *budget = budget.checked_sub(1)?;
-    let Wanted { name, kind } = file;
-    // Neither part of a type name can hold a separator or a dot.
-    let message = Path::new(kind).join(format!("{}.{kind}", name.name()));
-    let flat = folder.join(name.package()).join(&message);
-    if flat.is_file() {
-        return Some(flat);
-    }
-    if folder
-        .file_name()
-        .is_some_and(|last| last == name.package())
-    {
-        let own = folder.join(&message);
-        if own.is_file() {
-            return Some(own);
-        }
-    }
-    // Packages do not hold packages.
-    if depth == 0 || folder.join("package.xml").is_file() {
-        return None;
-    }
-    let mut below: Vec<PathBuf> = std::fs::read_dir(folder)
-        .ok()?
-        .filter_map(|entry| {
-            entry
-                .ok()
-                .filter(|entry| entry.file_type().is_ok_and(|t| t.is_dir()))
-        })
-        .map(|entry| entry.path())
-        .collect();
-    below.sort();
-    below
-        .into_iter()
-        .find_map(|folder| find_below(&folder, file, depth - 1, budget))
-}
-
 /// The checksum of a definition without fields, such as std_msgs/Empty.
 const EMPTY: &str = "d41d8cd98f00b204e9800998ecf8427e";
-/// How deep a package may lie in a workspace.
-const MAX_DEPTH: usize = 4;
-/// Folders looked at for one type; a large installation has some hundreds.
-const MAX_FOLDERS: usize = 20_000;
 
 #[cfg(test)]
 mod tests {
@@ -171,7 +129,7 @@ mod tests {
 
     #[test]
     fn a_type_nobody_has_heard_of_is_learned_from_its_publisher() {
-        let mut definitions = Definitions::new(vec![]);
+        let mut definitions = Definitions::new(&[], vec![]);
         let text = "robot_msgs/Joint[] joints\n\
             ================================================================================\n\
             MSG: robot_msgs/Joint\nstring name\nfloat64 angle\n";
@@ -187,7 +145,7 @@ mod tests {
 
     #[test]
     fn a_publisher_without_a_text_is_known_by_its_checksum() {
-        let mut definitions = Definitions::new(vec![]);
+        let mut definitions = Definitions::new(&[], vec![]);
         let string = "992ce8a1687cec8c8bd883ec73ca41d1";
         let found = definitions
             .of_publisher(&header("std_msgs/String", string, ""))
@@ -199,7 +157,7 @@ mod tests {
 
     #[test]
     fn a_text_that_is_not_that_of_the_checksum_is_not_believed() {
-        let mut definitions = Definitions::new(vec![]);
+        let mut definitions = Definitions::new(&[], vec![]);
         let lie = header("robot_msgs/Arm", &"0".repeat(32), "int32 a\n");
         assert!(matches!(
             definitions.of_publisher(&lie),
@@ -215,7 +173,8 @@ mod tests {
 
     #[test]
     fn a_message_without_fields_has_a_type() {
-        let found = Definitions::new(vec![]).of_publisher(&header("std_msgs/Empty", EMPTY, ""));
+        let found =
+            Definitions::new(&[], vec![]).of_publisher(&header("std_msgs/Empty", EMPTY, ""));
         assert_eq!(found.unwrap().leaves().len(), 0);
     }
 
@@ -225,7 +184,8 @@ mod tests {
         let folder = root.join("src/repository/robot_msgs/msg");
         std::fs::create_dir_all(&folder).unwrap();
         std::fs::write(folder.join("Leg.msg"), "float64 knee\n").unwrap();
-        let found = Definitions::new(vec![root.clone()]).get(&"robot_msgs/Leg".parse().unwrap());
+        let found =
+            Definitions::new(&[], vec![root.clone()]).get(&"robot_msgs/Leg".parse().unwrap());
         std::fs::remove_dir_all(&root).unwrap();
         assert_eq!(found.unwrap().leaves()[0].path, "knee");
     }

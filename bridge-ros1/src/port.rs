@@ -75,7 +75,7 @@ impl Ros1Port {
         let master = node.master_uri.clone();
         let node = Node::start(node)?;
         info!(node = node.name(), uri = node.uri(), master, space = %own, "started the ROS 1 node");
-        let mut definitions = Definitions::new(packages);
+        let mut definitions = Definitions::new(mapping.type_paths(), packages);
         let mut graph = Ros1Graph {
             node: &node,
             definitions: &mut definitions,
@@ -502,7 +502,12 @@ impl Ros1Port {
         };
         match self.node.advertise(&ros_topic, topic_type, sink.options()) {
             Ok(publisher) => {
-                info!(topic = publisher.topic(), message_type = %message_type.name(), "advertised");
+                info!(
+                    topic = publisher.topic(),
+                    message_type = %message_type.name(),
+                    definition = self.definitions.source(message_type.name()),
+                    "advertised"
+                );
                 let open = Open {
                     message_type: Arc::clone(&message_type),
                     publisher,

@@ -133,6 +133,10 @@ impl CdrWriter {
         self.put(value.to_le_bytes());
     }
 
+    pub(crate) fn u64(&mut self, value: u64) {
+        self.put(value.to_le_bytes());
+    }
+
     pub(crate) fn i64(&mut self, value: i64) {
         self.put(value.to_le_bytes());
     }

@@ -6,6 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+use messages::TypeHash;
 use rustdds::discovery::{DiscoveredReaderData, DiscoveredWriterData};
 use rustdds::policy::{Durability, Reliability};
 use rustdds::{DomainParticipant, GUID, QosPolicies, RTPSEntity};
@@ -23,6 +24,8 @@ pub struct Endpoint {
     pub reliable: bool,
     /// Offered or requested durability is transient-local or stronger.
     pub transient_local: bool,
+    /// The hash of its type, which nodes from ROS 2 Iron on announce.
+    pub type_hash: Option<TypeHash>,
     /// All it offers or requests.
     pub qos: Arc<QosPolicies>,
 }
@@ -38,6 +41,7 @@ impl Endpoint {
             // The default of a writer is reliable, that of a reader is best effort (DDS 1.4, 2.2.3.14).
             reliable: data.reliability != Some(Reliability::BestEffort),
             transient_local: is_durable(data.durability),
+            type_hash: type_hash(&writer.user_data),
             qos,
         };
         (data.topic_name, endpoint)
@@ -52,6 +56,7 @@ impl Endpoint {
             type_name: data.type_name().clone(),
             reliable: matches!(qos.reliability(), Some(Reliability::Reliable { .. })),
             transient_local: is_durable(qos.durability()),
+            type_hash: type_hash(&reader.user_data),
             qos: Arc::new(qos),
         };
         (data.topic_name().clone(), endpoint)
@@ -225,6 +230,13 @@ fn by_topic(
     topics
 }
 
+/// What `typehash=RIHS01_..;` in an endpoint's user data says (REP-2016).
+fn type_hash(user_data: &[u8]) -> Option<TypeHash> {
+    let text = String::from_utf8_lossy(user_data);
+    let (_, behind) = text.split_once("typehash=")?;
+    behind.split(';').next()?.parse().ok()
+}
+
 fn is_durable(durability: Option<Durability>) -> bool {
     durability.is_some_and(|durability| durability != Durability::Volatile)
 }
@@ -245,6 +257,7 @@ mod tests {
             type_name: "std_msgs::msg::dds_::Bool_".into(),
             reliable: true,
             transient_local: false,
+            type_hash: None,
             qos: Arc::default(),
         };
         (topic.to_owned(), endpoint)

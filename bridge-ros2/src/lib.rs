@@ -27,6 +27,7 @@ pub mod security;
 pub mod service;
 mod sink;
 mod source;
+mod type_description;
 
 pub use port::{PortOptions, Ros2Port};
 pub use ros_args::RosArgs;

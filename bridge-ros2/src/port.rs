@@ -4,6 +4,7 @@
 //! [`reconcile`], which compares what the domain holds with what is open: every 200 ms, and soon
 //! after RustDDS reports a change.
 
+mod descriptions;
 mod drops;
 mod reconcile;
 mod schedule;
@@ -37,7 +38,9 @@ use crate::raw::{Payload, RawWriter, Reader};
 use crate::service::ServicePeers;
 use crate::sink::Sink;
 use crate::source::{Source, same_participant};
+use crate::type_description::TypeServer;
 
+use descriptions::Descriptions;
 use drops::Drops;
 use reconcile::MAX_BATCH;
 use schedule::Schedule;
@@ -67,6 +70,9 @@ pub struct Ros2Port {
     own: SpaceId,
     mapping: Arc<Mapping>,
     definitions: Definitions,
+    descriptions: Descriptions,
+    /// Tells what the types are that are read and written here.
+    told_types: TypeServer,
     graph: Graph,
     /// Topics we read; a source never goes away, so that its index names it.
     sources: Vec<Source>,
@@ -115,7 +121,7 @@ impl Ros2Port {
             "joined the DDS domain"
         );
         let presence = domain.announce_bridge(own.into())?;
-        let mut definitions = Definitions::new(prefixes);
+        let mut definitions = Definitions::new(mapping.type_paths(), prefixes);
         let peers = ServicePeers::new(&domain);
         let declared =
             services::parameters(own, domain_options.domain, domain_options.node.use_sim_time);
@@ -126,6 +132,7 @@ impl Ros2Port {
             definitions: &mut definitions,
         };
         let (services, bound) = Services::start(&mut graph, own, &mapping);
+        let told_types = TypeServer::open(&domain, &peers)?;
         let clock = domain.clock();
         let mut port = Self {
             discovery: domain.status_listener(),
@@ -135,6 +142,8 @@ impl Ros2Port {
             own,
             mapping: Arc::clone(&mapping),
             definitions,
+            descriptions: Descriptions::new(peers),
+            told_types,
             services,
             parameters,
             graph: Graph::default(),
@@ -437,10 +446,12 @@ impl Port for Ros2Port {
             retired,
             services,
             parameters,
+            descriptions,
+            told_types,
             ..
         } = self;
         // They hold the participant.
-        drop((discovery, services, parameters));
+        drop((discovery, services, parameters, descriptions, told_types));
         if !domain.leave((inbox, sinks, retired, presence)).await {
             warn!("the DDS endpoints were not disposed in time; peers notice when the lease ends");
         }

@@ -143,6 +143,7 @@ mod tests {
             type_name: "std_msgs::msg::dds_::Bool_".into(),
             reliable,
             transient_local,
+            type_hash: None,
             qos: Default::default(),
         }
     }

@@ -163,6 +163,7 @@ mod tests {
             type_name: name.parse::<TypeName>().unwrap().dds(),
             reliable: true,
             transient_local: false,
+            type_hash: None,
             qos: Default::default(),
         }
     }

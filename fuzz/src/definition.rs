@@ -2,10 +2,10 @@
 
 use std::sync::Arc;
 
-use messages::{Dialect, MessageType, Plan, Registry, Selection, TypeName, Wire};
+use messages::{Dialect, MessageType, Plan, Registry, Selection, TextKind, TypeName, Wire};
 
-/// The first byte says what the text is: `m` a .msg, `s` a .srv, `a` an .action of ROS 1, in capitals of ROS 2, and `f` the
-/// full definition of a ROS 1 connection header. A type that is made of it has a definition that makes it again; for that
+/// The first byte says what the text is: `m` a .msg, `s` a .srv, `a` an .action of ROS 1, in capitals of ROS 2, `I` an .idl
+/// of each of the three, and `f` the full definition of a ROS 1 connection header. A type that is made of it has a definition that makes it again; for that
 /// of a connection header what it lacks is taken from the bundle, both times.
 pub fn definition(input: &[u8]) {
     let Some((kind, text)) = input.split_first() else {
@@ -53,12 +53,39 @@ pub fn definition(input: &[u8]) {
                 }
             }
         }
+        b'i' => idl(&mut registry, &name, text),
         b'f' => {
             if let Ok(made) = registry.add_ros1_definition(&name, text) {
                 check(&made, Registry::bundle(dialect));
             }
         }
         _ => {}
+    }
+}
+
+/// Of any kind; a message is described such that the description makes it again.
+fn idl(registry: &mut Registry, name: &TypeName, text: &str) {
+    for kind in TextKind::ALL {
+        let taken = registry.add_idl(kind, name, text).is_ok();
+        assert!(
+            !taken || registry.dialect() == Dialect::Ros2,
+            "ROS 1 has no IDL"
+        );
+    }
+    if let Ok(made) = registry.get(name) {
+        check(&made, Registry::empty(registry.dialect()));
+        let hash = registry
+            .type_hash(name)
+            .expect("a type that is known has a hash");
+        let described = registry.describe(name).expect("and a description");
+        let again = Registry::empty(Dialect::Ros2).add_described(name, &described, hash);
+        assert_eq!(again.expect("of that hash").leaves(), made.leaves());
+    }
+    if let Ok(made) = registry.service(name) {
+        check(made.request(), Registry::empty(registry.dialect()));
+    }
+    if let Ok(made) = registry.action_messages(name) {
+        check(made.goal(), Registry::empty(registry.dialect()));
     }
 }
 

@@ -10,12 +10,19 @@ mod shaping;
 mod types;
 mod variables;
 
+use std::path::{Path, PathBuf};
+
+use messages::{DefinitionTexts, Dialect, NoTexts, TypeName};
+
+use crate::code::Code;
 use crate::diagnostic::{Diagnostic, Severity};
 use crate::document;
 use crate::findings::Findings;
 use crate::mapping::Mapping;
-use crate::read::{Field, Reader};
+use crate::read::{At, Field, Reader};
 use crate::tree::{self, Place};
+
+use self::types::Types;
 
 /// What a document comes to.
 #[derive(Clone, Debug)]
@@ -24,6 +31,60 @@ pub struct Checked {
     pub mapping: Option<Mapping>,
     /// All findings in the order of the text; at most some 200, the last one then tells how many more there are.
     pub findings: Vec<Diagnostic>,
+    /// The message types that were looked for, and what was found.
+    pub types: Vec<TypeUse>,
+}
+
+/// A message or service type that a mapping names.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct TypeUse {
+    /// Of which ROS.
+    pub dialect: Dialect,
+    /// Its name.
+    pub name: TypeName,
+    /// Where its definition is from.
+    pub source: TypeOrigin,
+}
+
+/// Where a definition is from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum TypeOrigin {
+    /// It is built in.
+    BuiltIn,
+    /// A file.
+    File(String),
+    /// Nobody knows it yet.
+    Unknown,
+}
+
+/// Definition files, as [`Mapping::from_yaml_with`] needs them.
+pub trait TypeFiles: DefinitionTexts {
+    /// What is wrong with the `type_paths`; asked once.
+    fn faults(&mut self) -> Vec<PathFault>;
+}
+
+impl TypeFiles for NoTexts {
+    fn faults(&mut self) -> Vec<PathFault> {
+        Vec::new()
+    }
+}
+
+/// Something about one of the `type_paths`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct PathFault {
+    /// Which of them, from 0.
+    pub path: usize,
+    /// What.
+    pub what: PathFaultKind,
+}
+
+/// What can be wrong with one of the `type_paths`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum PathFaultKind {
+    /// It is not there, cannot be read, or holds no definitions; why, for people.
+    Empty(String),
+    /// A file of it does not count; which line of which file and why, for people.
+    File(String),
 }
 
 impl Checked {
@@ -62,16 +123,86 @@ impl Mapping {
     /// proportion to the text, of which at most 4 MiB are read.
     #[must_use]
     pub fn from_yaml(text: &str, file: &str) -> Checked {
+        Self::from_yaml_with(text, file, |_| Box::new(NoTexts))
+    }
+
+    /// As [`from_yaml`](Self::from_yaml), with the definitions of files besides those built in. `open` is given the
+    /// document's `type_paths`, those that are relative below the folder of `file`.
+    #[must_use]
+    pub fn from_yaml_with(
+        text: &str,
+        file: &str,
+        open: impl FnOnce(&[PathBuf]) -> Box<dyn TypeFiles>,
+    ) -> Checked {
         let mut findings = Findings::new(file);
-        let mapping = compile(text, &mut findings).filter(|_| !findings.has_errors());
+        let folder = Path::new(file).parent().unwrap_or_else(|| Path::new(""));
+        let mut used = Vec::new();
+        let open = |paths: &[String]| {
+            let paths: Vec<PathBuf> = paths.iter().map(|path| folder.join(path)).collect();
+            let files = open(&paths);
+            (paths, files)
+        };
+        let mapping = compile(text, &mut findings, open, &mut used);
         Checked {
-            mapping,
+            mapping: mapping.filter(|_| !findings.has_errors()),
             findings: findings.into_sorted(),
+            types: used,
         }
     }
 }
 
-fn compile(text: &str, findings: &mut Findings) -> Option<Mapping> {
+/// Faulty entries are left out; the places are those of the entries that are not.
+fn type_paths(
+    entries: &Field<Vec<At<String>>>,
+    findings: &mut Findings,
+) -> (Vec<String>, Vec<Place>) {
+    let entries = entries.as_ref().and_then(|at| at.value.as_deref());
+    let entries = entries.unwrap_or_default();
+    if let Some(first) = entries.get(MAX_TYPE_PATHS) {
+        let message = format!(
+            "{} type paths; at most {MAX_TYPE_PATHS} are read",
+            entries.len()
+        );
+        findings.error(Code::TooLarge, first.place, message);
+    }
+    let sound = entries
+        .iter()
+        .take(MAX_TYPE_PATHS)
+        .filter_map(|at| Some((at.value.clone()?, at.place)));
+    sound
+        .filter(|(path, place)| {
+            if path.is_empty() {
+                findings
+                    .error(Code::WrongValue, *place, "an empty path")
+                    .help("`.` is the folder of the mapping");
+            }
+            !path.is_empty()
+        })
+        .unzip()
+}
+
+fn note_faults(faults: Vec<PathFault>, places: &[Place], findings: &mut Findings) {
+    for PathFault { path, what } in faults {
+        let Some(place) = places.get(path) else {
+            continue;
+        };
+        match what {
+            PathFaultKind::Empty(why) => findings
+                .warning(Code::TypePath, *place, why)
+                .help("a folder with ROS packages in it, or a file as my_msgs/msg/Name.msg, relative to the mapping"),
+            PathFaultKind::File(why) => findings
+                .warning(Code::DefinitionFile, *place, why)
+                .help("the file counts as not there; all others count"),
+        };
+    }
+}
+
+fn compile(
+    text: &str,
+    findings: &mut Findings,
+    open: impl FnOnce(&[String]) -> (Vec<PathBuf>, Box<dyn TypeFiles>),
+    used: &mut Vec<TypeUse>,
+) -> Option<Mapping> {
     let root = match tree::parse(text) {
         Ok(root) => root,
         Err(fault) => {
@@ -83,6 +214,10 @@ fn compile(text: &str, findings: &mut Findings) -> Option<Mapping> {
         }
     };
     let (document, _) = document::read(&root, &mut Reader::new(findings))?;
+    let (paths, places) = type_paths(&document.type_paths, findings);
+    let (type_paths, mut files) = open(&paths);
+    note_faults(files.faults(), &places, findings);
+    let mut types = Types::new(files);
     let spaces = cell::spaces(document.spaces.as_ref(), findings);
     let namespaces = cell::namespaces(document.namespaces.as_ref(), findings);
     let pubsub = network::pubsub(document.pubsub.as_ref(), findings);
@@ -90,20 +225,24 @@ fn compile(text: &str, findings: &mut Findings) -> Option<Mapping> {
     let variables = match &document.variables {
         Some(entries) => {
             let entries = entries.value.as_deref().unwrap_or_default();
-            variables::check(entries, &spaces, &namespaces, findings)
+            variables::check(entries, (&spaces, &namespaces), &mut types, findings)
         }
         None => Vec::new(),
     };
     let patterns = match &document.patterns {
         Some(entries) => {
             let entries = entries.value.as_deref().unwrap_or_default();
-            patterns::check(entries, &spaces, &namespaces, findings)
+            patterns::check(entries, (&spaces, &namespaces), &mut types, findings)
         }
         None => Vec::new(),
     };
     let mapping = Mapping::new(pubsub, spaces.known, namespaces.known, server, variables);
-    Some(mapping.with_patterns(patterns))
+    *used = types.used();
+    Some(mapping.with_patterns(patterns).with_type_paths(type_paths))
 }
+
+/// Most entries of `type_paths`.
+const MAX_TYPE_PATHS: usize = 256;
 
 /// What a document declares.
 struct Declared<T> {
@@ -124,7 +263,7 @@ fn required<'d, T>(
         Some(at) => Some((at.value.as_ref()?, at.place)),
         None => {
             let message = format!("{of} has no `{key}`");
-            findings.error(crate::Code::MissingKey, owner, message);
+            findings.error(Code::MissingKey, owner, message);
             None
         }
     }

@@ -96,6 +96,10 @@ codes! {
     Conversion = "M083", "`scale` and `offset` go with a number, `invert` with a Boolean, all of them with one field; `out_of_range` says what becomes of values that a conversion makes too big.";
     LossyConversion = "M084", "The type the value becomes cannot hold all that the other type can, so a number would be rounded or not fit. With `out_of_range` it is rounded; one that does not fit then does not cross and is counted with `refuse`, and becomes the nearest that fits with `clamp`.";
     Publish = "M085", "`deadband` is a number above 0, of values that are numbers; `at_most` a rate as 10 Hz, from 0.001 Hz to 1000 Hz.";
+    TypePath = "M100", "An entry of `type_paths` is a folder with ROS packages or a definition file (.msg, .srv, .action, .idl), relative to the mapping. One that is not there, or holds none, brings no types; on the host of another program of the cell that may be as it should.";
+    DefinitionFile = "M101", "A definition file does not parse, in the ROS it is of. It counts as not there, and all others count.";
+    DefinitionsDiffer = "M102", "A definition in a file differs from the one that is built in under its name. The file counts. Where peers have the other one, ROS 1 refuses the connection, and ROS 2 messages are misread unless type hashes are announced.";
+    VersionsDiffer = "M103", "The message types of two bindings of one variable have different fields, beyond what ROS 2 renamed. Fields cross by their place in the message, so two of another name may be something else.";
 }
 
 impl fmt::Display for Code {
@@ -118,7 +122,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M085")]
+#[error("no finding has that code; codes are M001 to M103")]
 pub struct UnknownCode;
 
 #[cfg(test)]

@@ -15,6 +15,9 @@ document! {
     struct Document {
         /// The ROS sides of the cell. The OPC UA side is space 0 and always there.
         spaces: Vec<At<SpaceEntry>>,
+        /// Folders with ROS packages, or single files, whose definitions (.msg, .srv, .action, .idl) count before those built in;
+        /// relative to this file. At most 256.
+        type_paths: Vec<At<String>>,
         /// How values travel between the spaces.
         pubsub: PubSubEntry,
         /// The OPC UA server of the cell.
@@ -430,6 +433,7 @@ pub(crate) fn read(root: &Node, reader: &mut Reader<'_>) -> Option<(Document, Pl
     if matches!(root.kind, Kind::Null) {
         let document = Document {
             spaces: None,
+            type_paths: None,
             pubsub: None,
             server: None,
             namespaces: None,

@@ -13,7 +13,7 @@ mod read;
 mod topic;
 mod tree;
 
-pub use check::Checked;
+pub use check::{Checked, PathFault, PathFaultKind, TypeFiles, TypeOrigin, TypeUse};
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use document::schema;

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::net::{Ipv4Addr, SocketAddr};
 use std::num::NonZeroU16;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use messages::{Leaf, Selection, TypeName};
@@ -25,6 +26,7 @@ pub struct Mapping {
     variables: Vec<Variable>,
     by_topic: HashMap<TopicId, usize>,
     patterns: Vec<Pattern>,
+    type_paths: Vec<PathBuf>,
 }
 
 impl Mapping {
@@ -48,7 +50,20 @@ impl Mapping {
             variables,
             by_topic,
             patterns: Vec::new(),
+            type_paths: Vec::new(),
         }
+    }
+
+    pub(crate) fn with_type_paths(mut self, paths: Vec<PathBuf>) -> Self {
+        self.type_paths = paths;
+        self
+    }
+
+    /// Folders and files whose definitions count before those built in. Those written relative to the mapping are below
+    /// its folder.
+    #[must_use]
+    pub fn type_paths(&self) -> &[PathBuf] {
+        &self.type_paths
     }
 
     pub(crate) fn with_patterns(mut self, patterns: Vec<Pattern>) -> Self {

@@ -4,7 +4,9 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use mappings::{Checked, Code, Mapping, Severity};
+use mappings::{Checked, Code, Mapping, PathFault, PathFaultKind, Severity, TypeFiles, TypeOrigin};
+use messages::{DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName};
+use uadp::BuiltinType;
 
 fn documents() -> Vec<PathBuf> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/bad");
@@ -21,8 +23,90 @@ fn documents() -> Vec<PathBuf> {
 fn check(path: &Path) -> (String, Checked) {
     let text = std::fs::read_to_string(path).unwrap();
     let name = path.file_name().unwrap().to_string_lossy();
-    let checked = Mapping::from_yaml(&text, &name);
+    let checked = Mapping::from_yaml_with(&text, &name, |paths| Box::new(Folder(paths.to_vec())));
     (text, checked)
+}
+
+/// The folder `types`, wherever a document names it; there is no other.
+struct Folder(Vec<PathBuf>);
+
+impl DefinitionTexts for Folder {
+    fn find(&mut self, _: Dialect, kind: TextKind, name: &TypeName) -> Option<DefinitionText> {
+        let text = match (kind, name.as_str()) {
+            (TextKind::Message, "std_msgs/Bool") => "bool data\nuint8 quality\n",
+            (TextKind::Message, "robot_msgs/Arm") => "float64[] joints\n",
+            _ => return None,
+        };
+        self.0.first().map(|path| DefinitionText {
+            text: text.to_owned(),
+            language: Language::Ros,
+            file: format!("{}/{}.msg", path.display(), name.name()).into(),
+        })
+    }
+
+    fn names(&mut self, _: Dialect, kind: TextKind) -> Vec<TypeName> {
+        let known = !self.0.is_empty() && kind == TextKind::Message;
+        known
+            .then(|| "robot_msgs/Arm".parse().unwrap())
+            .into_iter()
+            .collect()
+    }
+
+    fn places(&self, _: Dialect) -> Vec<String> {
+        self.0
+            .iter()
+            .map(|path| path.display().to_string())
+            .collect()
+    }
+}
+
+impl TypeFiles for Folder {
+    fn faults(&mut self) -> Vec<PathFault> {
+        let fault = |(path, place): (usize, &PathBuf)| {
+            let what = match place.to_str() {
+                Some("types") => return None,
+                Some("broken") => {
+                    PathFaultKind::File("broken/msg/Leg.msg:3: a field name expected".to_owned())
+                }
+                _ => {
+                    PathFaultKind::Empty(format!("{}: no such file or directory", place.display()))
+                }
+            };
+            Some(PathFault { path, what })
+        };
+        self.0.iter().enumerate().filter_map(fault).collect()
+    }
+}
+
+#[test]
+fn a_type_of_a_file_is_as_good_as_one_that_is_built_in() {
+    let text = "spaces: [{id: 1}]\nnamespaces: {2: urn:x}\ntype_paths: [types]\nvariables:\n\
+        - {node: ns=2;i=1, name: Arm, origin: 1, ros: {topic: /arm, type: robot_msgs/Arm, field: joints}}\n\
+        - {node: ns=2;i=2, name: B, origin: 1, ros: {topic: /b, type: std_msgs/Int8}}\n";
+    let open = |paths: &[PathBuf]| -> Box<dyn TypeFiles> {
+        assert_eq!(paths, [PathBuf::from("cells/types")]);
+        Box::new(Folder(paths.to_vec()))
+    };
+    let checked = Mapping::from_yaml_with(text, "cells/one.yaml", open);
+    let mapping = checked.mapping.unwrap();
+    assert_eq!(mapping.type_paths(), [PathBuf::from("cells/types")]);
+    let arm = mapping.variable("ua_1_2_1".parse().unwrap()).unwrap();
+    assert_eq!(arm.value_type, Some((BuiltinType::Double, true)));
+    let used: Vec<_> = checked
+        .types
+        .iter()
+        .map(|used| (used.name.as_str(), used.source.clone()))
+        .collect();
+    assert_eq!(
+        used,
+        [
+            (
+                "robot_msgs/Arm",
+                TypeOrigin::File("cells/types/Arm.msg".to_owned())
+            ),
+            ("std_msgs/Int8", TypeOrigin::BuiltIn)
+        ]
+    );
 }
 
 #[test]

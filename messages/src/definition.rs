@@ -72,6 +72,33 @@ pub(crate) struct Field {
     pub(crate) arity: Arity,
 }
 
+impl Field {
+    /// Its type in the words of `.msg` files, `package/Name` with its package.
+    pub(crate) fn spelling(&self) -> String {
+        let bounded = |word: &str, bound: u32| match bound {
+            u32::MAX => word.to_owned(),
+            bound => format!("{word}<={bound}"),
+        };
+        let base = match &self.kind {
+            FieldType::Message(name) => name.to_string(),
+            FieldType::Primitive(Primitive::Text(text)) if text.wide => {
+                bounded("wstring", text.bound)
+            }
+            FieldType::Primitive(Primitive::Text(text)) => bounded("string", text.bound),
+            FieldType::Primitive(Primitive::Number(_) | Primitive::Clock(_)) => {
+                let written = self.written.split('[').next().unwrap_or_default();
+                written.to_owned()
+            }
+        };
+        match self.arity {
+            Arity::One => base,
+            Arity::Fixed(length) => format!("{base}[{length}]"),
+            Arity::Sequence { bound: None } => format!("{base}[]"),
+            Arity::Sequence { bound: Some(bound) } => format!("{base}[<={bound}]"),
+        }
+    }
+}
+
 /// A constant of a message type: `uint8 RED=1`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Constant {
@@ -93,7 +120,65 @@ pub(crate) struct Definition {
     pub(crate) fields: Vec<Field>,
 }
 
+/// A line of a definition that another language has: the type in the words of `.msg` files, and the value if it is a
+/// constant.
+#[derive(Clone, Debug)]
+pub(crate) struct Line {
+    /// From 1, in the text it is of.
+    pub(crate) number: usize,
+    pub(crate) written: String,
+    pub(crate) name: String,
+    pub(crate) value: Option<String>,
+}
+
+impl Line {
+    fn text(&self) -> String {
+        match &self.value {
+            None => format!("{} {}", self.written, self.name),
+            Some(value) => format!("{} {}={value}", self.written, self.name),
+        }
+    }
+}
+
 impl Definition {
+    /// Of the constants and fields of a text in another language. The text it has then is the one of a `.msg` file that
+    /// says the same.
+    pub(crate) fn of_lines(
+        dialect: Dialect,
+        name: &TypeName,
+        constants: Vec<Line>,
+        fields: Vec<Line>,
+    ) -> Result<Self, DefinitionError> {
+        let mut made = Self {
+            name: name.clone(),
+            text: String::new(),
+            constants: Vec::new(),
+            fields: Vec::new(),
+        };
+        for line in constants.into_iter().chain(fields) {
+            let Line {
+                number,
+                written,
+                name: of,
+                value,
+            } = &line;
+            let added = match value {
+                None => made.field(dialect, written, of),
+                Some(value) => made.constant(dialect, value, (written, of, value)),
+            };
+            let text = line.text();
+            added.map_err(|reason| DefinitionError::Syntax {
+                name: name.clone(),
+                line: *number,
+                reason,
+                text: text.chars().take(200).collect(),
+            })?;
+            made.text.push_str(&text);
+            made.text.push('\n');
+        }
+        Ok(made)
+    }
+
     pub(crate) fn parse(
         dialect: Dialect,
         name: &TypeName,

@@ -1,6 +1,6 @@
 use uadp::BuiltinType;
 
-use crate::TypeName;
+use crate::{TypeHash, TypeName};
 
 /// A text that is no message type name.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -51,6 +51,16 @@ pub enum DefinitionError {
         name: TypeName,
         /// The limit.
         what: &'static str,
+    },
+    /// A description of the type is not the one of the hash that was announced.
+    #[error("`{name}` is described with the type hash {found}, and {expected} was announced")]
+    OtherHash {
+        /// The type.
+        name: TypeName,
+        /// By the description.
+        found: TypeHash,
+        /// As announced.
+        expected: TypeHash,
     },
     /// A line of the text does not follow the dialect.
     #[error("`{name}` line {line}: {reason}: `{text}`")]

@@ -54,8 +54,11 @@
 mod bundle;
 mod convert;
 mod definition;
+mod description;
 mod error;
 mod fields;
+mod idl;
+mod library;
 mod message;
 mod name;
 mod plan;
@@ -66,14 +69,18 @@ mod type_hash;
 
 pub use convert::{date_time_to_time, duration_to_millis, millis_to_duration, time_to_date_time};
 pub use definition::Constant;
+pub use description::{DescribedField, DescribedType};
 pub use error::{
     DefinitionError, Fault, NameError, PlanError, ReadError, SourceError, ValueFault, WriteError,
     WriteFault,
 };
 pub use fields::{NoFields, Sink, Source};
+pub use library::{
+    DefinitionText, DefinitionTexts, Language, Library, NoTexts, Noted, TextKind, check_text,
+};
 pub use message::{Leaf, MessageType, Rank, standard_type};
 pub use name::{Dialect, TypeName};
 pub use plan::{Conversion, Literal, Part, Plan, Selection, Wire, is_lossless, is_number};
 pub use registry::Registry;
 pub use service::{ActionMessages, ActionType, ServiceType};
-pub use type_hash::{ActionTypeHashes, ServiceTypeHashes, TypeHash};
+pub use type_hash::{ActionTypeHashes, NoTypeHash, ServiceTypeHashes, TypeHash};

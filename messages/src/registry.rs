@@ -5,10 +5,12 @@ use uadp::BuiltinType;
 
 use crate::bundle;
 use crate::definition::Definition;
+use crate::idl;
 use crate::resolve::{self, Resolver};
 use crate::service::{self, ServiceDefinition};
 use crate::{
-    ActionMessages, ActionType, DefinitionError, Dialect, MessageType, ServiceType, TypeName,
+    ActionMessages, ActionType, DefinitionError, Dialect, MessageType, ServiceType, TextKind,
+    TypeName,
 };
 
 /// Message definitions of one dialect by name.
@@ -17,7 +19,7 @@ use crate::{
 #[derive(Clone, Debug)]
 pub struct Registry {
     dialect: Dialect,
-    definitions: BTreeMap<TypeName, Arc<Definition>>,
+    pub(crate) definitions: BTreeMap<TypeName, Arc<Definition>>,
     services: BTreeMap<TypeName, Arc<ServiceDefinition>>,
 }
 
@@ -49,7 +51,7 @@ impl Registry {
     }
 
     /// The dialect of the definitions.
-    pub fn dialect(&self) -> Dialect {
+    pub const fn dialect(&self) -> Dialect {
         self.dialect
     }
 
@@ -151,6 +153,44 @@ impl Registry {
     pub fn add_action(&mut self, name: &TypeName, text: &str) -> Result<(), DefinitionError> {
         let definitions = service::action(self.dialect, name, text)?;
         self.definitions.extend(definitions);
+        Ok(())
+    }
+
+    /// Adds what a `.idl` text of ROS 2 defines under that name: a struct in the modules of its package and kind, of a service
+    /// two (`_Request`, `_Response`), of an action three (`_Goal`, `_Result`, `_Feedback`). Other structs are left alone.
+    ///
+    /// # Errors
+    /// [`DefinitionError::Syntax`]; then nothing is added. In ROS 1 there are no such texts.
+    pub fn add_idl(
+        &mut self,
+        kind: TextKind,
+        name: &TypeName,
+        text: &str,
+    ) -> Result<(), DefinitionError> {
+        if self.dialect == Dialect::Ros1 {
+            return Err(DefinitionError::Syntax {
+                name: name.clone(),
+                line: 1,
+                reason: "ROS 1 has no definitions in IDL",
+                text: String::new(),
+            });
+        }
+        match kind {
+            TextKind::Message => {
+                let parts = [("", name.clone())];
+                for definition in idl::definitions(kind, name, text, parts)? {
+                    self.definitions.insert(name.clone(), Arc::new(definition));
+                }
+            }
+            TextKind::Service => {
+                let definition = ServiceDefinition::of_idl(name, text)?;
+                self.services.insert(name.clone(), Arc::new(definition));
+            }
+            TextKind::Action => {
+                let definitions = service::idl_action(name, text)?;
+                self.definitions.extend(definitions);
+            }
+        }
         Ok(())
     }
 

@@ -6,8 +6,9 @@ use std::sync::Arc;
 use md5::{Digest, Md5};
 
 use crate::definition::Definition;
+use crate::idl;
 use crate::resolve::{self, Resolver};
-use crate::{DefinitionError, Dialect, MessageType, TypeName};
+use crate::{DefinitionError, Dialect, MessageType, TextKind, TypeName};
 
 /// A service type with all it needs resolved.
 #[derive(Debug)]
@@ -176,6 +177,18 @@ impl ServiceDefinition {
         })
     }
 
+    pub(crate) fn of_idl(name: &TypeName, text: &str) -> Result<Self, DefinitionError> {
+        let parts = [
+            ("_Request", derived(name, "Request")?),
+            ("_Response", derived(name, "Response")?),
+        ];
+        let [request, response] = idl::definitions(TextKind::Service, name, text, parts)?;
+        Ok(Self {
+            request: Arc::new(request),
+            response: Arc::new(response),
+        })
+    }
+
     /// Request and response.
     pub(crate) fn parts(&self) -> [&Arc<Definition>; 2] {
         [&self.request, &self.response]
@@ -237,6 +250,29 @@ pub(crate) fn action(
     text: &str,
 ) -> Result<Vec<(TypeName, Arc<Definition>)>, DefinitionError> {
     let goal_result_feedback = action_parts(dialect, name, text)?;
+    with_made(dialect, name, goal_result_feedback)
+}
+
+/// As [`action`], of a `.idl` text.
+pub(crate) fn idl_action(
+    name: &TypeName,
+    text: &str,
+) -> Result<Vec<(TypeName, Arc<Definition>)>, DefinitionError> {
+    let parts = [
+        ("_Goal", derived(name, "Goal")?),
+        ("_Result", derived(name, "Result")?),
+        ("_Feedback", derived(name, "Feedback")?),
+    ];
+    let found = idl::definitions(TextKind::Action, name, text, parts)?;
+    with_made(Dialect::Ros2, name, found.map(Arc::new))
+}
+
+/// Goal, result and feedback, and the messages that are made around them.
+fn with_made(
+    dialect: Dialect,
+    name: &TypeName,
+    goal_result_feedback: [Arc<Definition>; 3],
+) -> Result<Vec<(TypeName, Arc<Definition>)>, DefinitionError> {
     let x = name.name();
     let made = match dialect {
         Dialect::Ros1 => wrappers(x),
@@ -329,7 +365,7 @@ fn parts<const N: usize>(
     })
 }
 
-fn derived(name: &TypeName, suffix: &str) -> Result<TypeName, DefinitionError> {
+pub(crate) fn derived(name: &TypeName, suffix: &str) -> Result<TypeName, DefinitionError> {
     TypeName::new(name.package(), &format!("{}{suffix}", name.name())).map_err(|_| {
         DefinitionError::TooBig {
             name: name.clone(),

@@ -6,13 +6,14 @@
 
 use std::collections::BTreeMap;
 use std::fmt::{self, Write as _};
+use std::str::FromStr;
 use std::sync::Arc;
 
 use sha2::{Digest, Sha256};
 
 use crate::definition::{Arity, Definition, Field, FieldType, Number, Primitive, Text};
 use crate::resolve::hex;
-use crate::{DefinitionError, Registry, TypeName};
+use crate::{DefinitionError, DescribedField, DescribedType, Registry, TypeName};
 
 /// The hash of a ROS 2 type, as nodes from Iron on announce it. Prints as `RIHS01_` and 64 hex digits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -29,6 +30,48 @@ impl fmt::Display for TypeHash {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "RIHS01_{}", hex(&self.0))
     }
+}
+
+impl FromStr for TypeHash {
+    type Err = NoTypeHash;
+
+    fn from_str(text: &str) -> Result<Self, NoTypeHash> {
+        let digits = text.strip_prefix("RIHS01_").ok_or(NoTypeHash)?;
+        let mut hash = [0; 32];
+        if digits.len() != 64 || !digits.bytes().all(|digit| digit.is_ascii_hexdigit()) {
+            return Err(NoTypeHash);
+        }
+        for (at, byte) in hash.iter_mut().enumerate() {
+            let pair = digits.get(at * 2..at * 2 + 2).ok_or(NoTypeHash)?;
+            *byte = u8::from_str_radix(pair, 16).map_err(|_| NoTypeHash)?;
+        }
+        Ok(Self(hash))
+    }
+}
+
+/// A text that is no type hash of the version known here.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("`RIHS01_` and 64 hex digits expected")]
+pub struct NoTypeHash;
+
+/// The description of a message and of what it needs.
+pub(crate) fn describe(
+    registry: &Registry,
+    name: &TypeName,
+) -> Result<Vec<DescribedType>, DefinitionError> {
+    registry.get(name)?;
+    let mut types = Described::new(registry);
+    types.message(name)?;
+    let full = name.ros2();
+    let mut needed = BTreeMap::new();
+    types.needs(&full, &mut needed);
+    needed.remove(full.as_str());
+    let all = std::iter::once(full.as_str()).chain(needed.into_keys());
+    let described = all.map(|name| DescribedType {
+        name: name.to_owned(),
+        fields: types.fields(name),
+    });
+    Ok(described.collect())
 }
 
 /// The hashes of a service and its parts, each by its ROS 2 name, such as `std_srvs/srv/SetBool_Request`.
@@ -330,6 +373,18 @@ impl<'r> Described<'r> {
         }
     }
 
+    fn fields(&self, full: &str) -> Vec<DescribedField> {
+        let fields = self.types.get(full).into_iter().flatten();
+        let described = fields.map(|field| DescribedField {
+            name: field.name.clone(),
+            type_id: field.type_id,
+            capacity: field.capacity.into(),
+            string_capacity: field.string_capacity.into(),
+            nested: field.nested.clone(),
+        });
+        described.collect()
+    }
+
     fn write_type(&self, text: &mut String, full: &str) {
         // Writing to a String cannot fail.
         write!(text, "{{\"type_name\": \"{full}\", \"fields\": [").unwrap_or_default();
@@ -421,16 +476,6 @@ impl FieldDescription {
     }
 }
 
-impl Definition {
-    /// The messages among its fields.
-    fn needs(&self) -> impl Iterator<Item = &TypeName> {
-        self.fields.iter().filter_map(|field| match &field.kind {
-            FieldType::Message(name) => Some(name),
-            FieldType::Primitive(_) => None,
-        })
-    }
-}
-
 impl Number {
     /// The constants of `type_description_interfaces/msg/FieldType`.
     const fn type_id(self) -> u8 {
@@ -458,12 +503,12 @@ fn base(written: &str) -> &str {
 const TIME: &str = "builtin_interfaces/msg/Time";
 const UUID: &str = "unique_identifier_msgs/msg/UUID";
 // `type_description_interfaces/msg/FieldType`, whose arrays of a type are numbered as far behind it as this:
-const NESTED: u8 = 1;
-const BYTE: u8 = 16;
-const STRING: u8 = 17;
-const WSTRING: u8 = 18;
-const BOUNDED_STRING: u8 = 21;
-const BOUNDED_WSTRING: u8 = 22;
-const ARRAY: u8 = 48;
-const BOUNDED_SEQUENCE: u8 = 96;
-const UNBOUNDED_SEQUENCE: u8 = 144;
+pub(crate) const NESTED: u8 = 1;
+pub(crate) const BYTE: u8 = 16;
+pub(crate) const STRING: u8 = 17;
+pub(crate) const WSTRING: u8 = 18;
+pub(crate) const BOUNDED_STRING: u8 = 21;
+pub(crate) const BOUNDED_WSTRING: u8 = 22;
+pub(crate) const ARRAY: u8 = 48;
+pub(crate) const BOUNDED_SEQUENCE: u8 = 96;
+pub(crate) const UNBOUNDED_SEQUENCE: u8 = 144;

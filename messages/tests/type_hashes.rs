@@ -3,7 +3,7 @@
 
 use std::collections::BTreeSet;
 
-use messages::{Dialect, Registry, TypeName};
+use messages::{Dialect, Registry, TextKind, TypeName};
 
 const HASHES: &str = include_str!("data/ros2_type_hashes.txt");
 
@@ -294,5 +294,32 @@ fn a_char_is_hashed_as_the_uint8_it_is_to_rosidl() {
     ] {
         let ours = registry.type_hash(&name(type_name)).unwrap();
         assert_eq!(ours.to_string(), format!("RIHS01_{hash}"), "{type_name}");
+    }
+}
+
+#[test]
+fn an_idl_text_makes_the_type_that_rosbags_reads_in_it() {
+    let bundle = Registry::bundle(Dialect::Ros2);
+    let samples: Vec<serde_json::Value> =
+        serde_json::from_str(include_str!("data/rosbags_idl.json")).unwrap();
+    assert_eq!(samples.len(), 16);
+    for sample in samples {
+        let of = |key: &str| sample[key].as_str().unwrap().to_owned();
+        let type_name = name(&of("type"));
+        let mut registry = bundle.clone();
+        registry
+            .add_idl(TextKind::Message, &type_name, &of("idl"))
+            .unwrap();
+        let hash = registry.type_hash(&type_name).unwrap();
+        assert_eq!(hash.to_string(), of("hash"), "{type_name}");
+        let (ours, built_in) = (
+            registry.get(&type_name).unwrap(),
+            bundle.get(&type_name).unwrap(),
+        );
+        assert_eq!(ours.leaves(), built_in.leaves(), "{type_name}");
+        let constants = |found: &messages::MessageType| -> Vec<String> {
+            found.constants().iter().map(|c| c.name.clone()).collect()
+        };
+        assert_eq!(constants(&ours), constants(&built_in), "{type_name}");
     }
 }

@@ -33,7 +33,7 @@ impl Drops {
 impl Ros2Port {
     /// Reports what was dropped since the last time.
     pub(super) fn report_drops(&mut self) {
-        let served = self.parameters.counters();
+        let served = self.parameters.counters().plus(self.told_types.counters());
         let totals = [
             (
                 Reason::Malformed,

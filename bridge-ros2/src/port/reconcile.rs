@@ -35,7 +35,8 @@ impl Ros2Port {
         self.incompatible.retain(|guid| graph.holds(*guid));
         self.report_drops();
         self.announce_anew(now);
-        self.find_topics_of_the_space();
+        self.take_descriptions(now);
+        self.find_topics_of_the_space(now);
         for index in 0..self.sources.len() {
             self.reconcile_source(index, now);
         }
@@ -91,7 +92,7 @@ impl Ros2Port {
     }
 
     /// Zero configuration: a topic named in our part of the space crosses as soon as somebody writes it.
-    fn find_topics_of_the_space(&mut self) {
+    fn find_topics_of_the_space(&mut self, now: Instant) {
         let found: Vec<(String, TopicId)> = self
             .graph
             .written_topics()
@@ -112,12 +113,21 @@ impl Ros2Port {
                 });
                 return;
             }
-            let types: Vec<String> = self
-                .graph
-                .writers(&dds_topic)
+            let writers = self.graph.writers(&dds_topic).to_vec();
+            let types: Vec<String> = writers
                 .iter()
                 .map(|writer| writer.type_name.clone())
                 .collect();
+            for name in types
+                .iter()
+                .filter_map(|name| TypeName::from_dds(name).ok())
+            {
+                // So that its hash is known; that it is not known is told below.
+                let _known = self.definitions.get(&name).is_ok();
+            }
+            if !self.types_are_settled(&writers, now) {
+                continue;
+            }
             let known = types
                 .iter()
                 .find_map(|name| self.message_type(topic, &dds_topic, name));
@@ -189,7 +199,14 @@ impl Ros2Port {
         let requested = Requested::from_writers(&ours);
         let returned = requested.is_transient_local() && !source.returned(writers).is_empty();
         match source.reading {
-            Reading::Pending => self.open_source(index, requested),
+            Reading::Pending => {
+                let name = source.message_type.clone();
+                let known = self.definitions.get(&name).is_ok();
+                // What nobody knows and nobody publishes is asked for when somebody does.
+                if (known || !ours.is_empty()) && self.types_are_settled(&ours, now) {
+                    self.open_source(index, requested);
+                }
+            }
             Reading::Open {
                 requested: before, ..
             } if (before != requested && !ours.is_empty()) || returned => {
@@ -232,7 +249,8 @@ impl Ros2Port {
         let slot = self.inbox.insert(index, reader);
         if let Some(source) = self.sources.get_mut(index) {
             source.reading = Reading::Open { slot, requested };
-            info!(topic, message_type = %name, ?requested, "subscribed");
+            let definition = self.definitions.source(&name);
+            info!(topic, message_type = %name, definition, ?requested, "subscribed");
             for (topic, selection) in &source.values {
                 self.events.push_back(PortEvent::Bound {
                     topic: *topic,
@@ -479,7 +497,8 @@ impl Ros2Port {
         else {
             return;
         };
-        info!(topic = dds_topic, message_type = %message_type.name(), ?offered, "advertised");
+        let definition = self.definitions.source(message_type.name());
+        info!(topic = dds_topic, message_type = %message_type.name(), definition, ?offered, "advertised");
         let mut outlet = Outlet::new(writer, offered);
         if let Err(refusal) = outlet.set_readers(self.graph.readers(&dds_topic), Instant::now()) {
             self.events.push_back(lost(topic, refusal.label(), 1));
@@ -502,8 +521,11 @@ impl Ros2Port {
 
     /// Has the domain announce the hash of a type.
     fn announce_type(&self, dds_type: &str, name: &TypeName) {
-        if let Some(hash) = self.definitions.type_hash(name) {
+        if let Some(hash) = self.definitions.hash_of(name) {
             self.domain.learn_type_hash(dds_type, hash.to_string());
+            if let Ok(described) = self.definitions.described(name) {
+                self.told_types.learn(&described, name, hash);
+            }
         }
     }
 
@@ -515,7 +537,10 @@ impl Ros2Port {
     }
 
     /// Makes an endpoint if the budget allows; `None` when it does not, or when RustDDS fails, which is told once.
-    fn make<E>(&mut self, make: impl FnOnce(&Domain) -> Result<E, DomainError>) -> Option<E> {
+    pub(super) fn make<E>(
+        &mut self,
+        make: impl FnOnce(&Domain) -> Result<E, DomainError>,
+    ) -> Option<E> {
         let Some(left) = self.budget.checked_sub(1) else {
             self.schedule.unfinished = true;
             return None;

@@ -1,10 +1,10 @@
 //! ROS bindings: topic, type and field of each, and what they do to one another.
 
-use std::collections::HashMap;
 use std::collections::hash_map::Entry;
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 
-use messages::{DefinitionError, Dialect, Leaf, MessageType, Selection, TypeName};
+use messages::{DefinitionError, Dialect, Leaf, MessageType, Selection, TextKind, TypeName};
 
 use super::names::{mended, topic_fault};
 use super::services::{self, Calls, Kind, Known, Service};
@@ -68,7 +68,7 @@ struct Use {
 
 pub(super) struct Bindings<'c> {
     spaces: &'c Declared<Vec<Space>>,
-    types: Types,
+    types: &'c mut Types,
     calls: Calls,
     uses: HashMap<(SpaceId, String), Vec<Use>>,
     /// The topics in the order they came, so that findings do.
@@ -76,11 +76,15 @@ pub(super) struct Bindings<'c> {
 }
 
 impl<'c> Bindings<'c> {
-    pub(super) fn new(spaces: &'c Declared<Vec<Space>>, calls: Calls) -> Self {
+    pub(super) fn new(
+        spaces: &'c Declared<Vec<Space>>,
+        calls: Calls,
+        types: &'c mut Types,
+    ) -> Self {
         Self {
             spaces,
             calls,
-            types: Types::new(),
+            types,
             uses: HashMap::new(),
             order: Vec::new(),
         }
@@ -120,7 +124,7 @@ impl<'c> Bindings<'c> {
                 Some(Kind::Topic) => found.extend(self.binding(entry, &site, findings)),
                 Some(kind) => {
                     let mut known = Known {
-                        types: &mut self.types,
+                        types: self.types,
                         calls: &self.calls,
                     };
                     let checked = services::check(kind, entry, &site, &mut known, findings);
@@ -284,33 +288,52 @@ impl<'c> Bindings<'c> {
     ) -> Option<Arc<MessageType>> {
         let space = site.space?;
         let dialect = dialect(space);
-        let error = match self.types.get(dialect, name) {
-            Ok(message_type) => return Some(Arc::clone(message_type)),
+        let error = match self.types.get((dialect, place), name, findings) {
+            Ok(message_type) => return Some(message_type),
             Err(error) => error,
         };
-        let message = match &**error {
-            DefinitionError::Unknown { .. } => {
-                format!("no definition of `{name}` is built in for {}", ros(dialect))
+        let looked = self.types.looked(dialect);
+        let built_in = if looked.is_empty() {
+            " is built in"
+        } else {
+            ""
+        };
+        let message = match &*error {
+            DefinitionError::Unknown {
+                needed_by: None, ..
+            } => {
+                format!("no definition of `{name}`{built_in} for {}", ros(dialect))
             }
-            DefinitionError::Cyclic { .. }
+            DefinitionError::Unknown { .. }
+            | DefinitionError::Cyclic { .. }
             | DefinitionError::TooDeep { .. }
             | DefinitionError::TooBig { .. }
+            | DefinitionError::OtherHash { .. }
             | DefinitionError::Syntax { .. } => error.to_string(),
         };
         // What is read from a ROS 1 topic brings its definition; an origin that could not be read may be space 1.
-        let read =
-            space == SpaceId::ROS1 && site.subject.origin.is_none_or(|origin| origin == space);
+        let read = site.subject.origin.is_none_or(|origin| origin == space);
         let (note, why) = if read {
-            let why = "the publisher's connection header brings it, and the field is checked then";
+            let why = match dialect {
+                Dialect::Ros1 => {
+                    "the publisher's connection header brings it, and the field is checked then"
+                }
+                Dialect::Ros2 => {
+                    "the publisher's node may tell it (ROS 2 Iron and later), and the field is checked then; a package \
+                     with its .msg file in `type_paths` or AMENT_PREFIX_PATH always does"
+                }
+            };
             (
                 findings.warning(Code::UnknownMessageType, place, message),
                 why,
             )
         } else {
             let why = match dialect {
-                Dialect::Ros1 => "what is written to ROS 1 must be known beforehand",
+                Dialect::Ros1 => {
+                    "what is written to ROS 1 must be known beforehand: name a folder with its .msg file in `type_paths`"
+                }
                 Dialect::Ros2 => {
-                    "ROS 2 peers do not send definitions, so only types built in can be bound"
+                    "what is written to ROS 2 must be known beforehand: name a folder with its .msg file in `type_paths`"
                 }
             };
             (
@@ -318,9 +341,10 @@ impl<'c> Bindings<'c> {
                 why,
             )
         };
-        note.help_with(|| match Types::registry(dialect).suggest(name) {
-            Some(near) => format!("did you mean `{near}`? If not: {why}"),
-            None => why.to_owned(),
+        let types = &mut *self.types;
+        note.help_with(|| match types.suggest(dialect, TextKind::Message, name) {
+            Some(near) => format!("did you mean `{near}`? If not: {why}{looked}"),
+            None => format!("{why}{looked}"),
         });
         None
     }
@@ -614,6 +638,7 @@ fn differences(found: &[Found], findings: &mut Findings) {
                 .help("bytes cross as they are: only topics of one type and of one ROS can both have them");
         }
         if shape(fields) == shape(others) {
+            versions((first, fields), (other, others), findings);
             continue;
         }
         let told = |fields: &[Leaf]| match fields {
@@ -637,7 +662,67 @@ fn differences(found: &[Found], findings: &mut Findings) {
             ),
         };
         let note = findings.error(Code::BindingsDiffer, other.place, message);
-        note.label(format!("differs from line {}", first.place.line))
-            .help("bind fields of one type on both sides");
+        let label = format!("differs from line {}", first.place.line);
+        let several = fields.len() > 1 || others.len() > 1;
+        let sides = several.then(|| sides((first, fields), (other, others)));
+        let help = match sides.flatten() {
+            Some(sides) => format!("{sides}; bind fields of one type on both sides"),
+            None => "bind fields of one type on both sides".to_owned(),
+        };
+        note.label(label).help(help);
     }
+}
+
+/// A whole message, whose fields go by their places.
+type Side<'f> = (&'f Found, &'f [Leaf]);
+
+/// Notes where fields of the same types have names that do not fit.
+fn versions(first: Side<'_>, other: Side<'_>, findings: &mut Findings) {
+    let whole =
+        |(found, fields): Side<'_>| found.binding.selection == Selection::Whole && fields.len() > 1;
+    if !whole(first) || !whole(other) {
+        return;
+    }
+    let Some(sides) = sides(first, other) else {
+        return;
+    };
+    let (a, b) = (&first.0.binding, &other.0.binding);
+    let message = format!(
+        "`{}` in space {} and `{}` in space {} have fields of other names in the same places",
+        a.message_type, a.space, b.message_type, b.space
+    );
+    findings
+        .warning(Code::VersionsDiffer, other.0.place, message)
+        .label(format!("differs from line {}", first.0.place.line))
+        .help(format!(
+            "{sides}; they cross by their place: bind single fields where that is not meant"
+        ));
+}
+
+/// What the fields of two sides have not in common, by their names; `None` when nothing. In ROS 2 names are in lower
+/// case with underscores, where in ROS 1 they could be as `D`.
+fn sides((first, a): Side<'_>, (other, b): Side<'_>) -> Option<String> {
+    let plain = |leaf: &Leaf| leaf.path.to_ascii_lowercase().replace('_', "");
+    let only = |found: &Found, these: &[Leaf], those: &[Leaf]| {
+        let those: HashSet<String> = those.iter().map(plain).collect();
+        let only = these.iter().filter(|leaf| !those.contains(&plain(leaf)));
+        let only: Vec<&str> = only.map(|leaf| leaf.path.as_str()).collect();
+        let side = || format!("only in space {}: {}", found.binding.space, told(&only));
+        (!only.is_empty()).then(side)
+    };
+    let names: HashMap<String, &Leaf> = b.iter().map(|leaf| (plain(leaf), leaf)).collect();
+    let typed = a.iter().filter_map(|leaf| {
+        let (one, two) = (leaf, *names.get(&plain(leaf))?);
+        let (one, two) = (types::value_type(one), types::value_type(two));
+        (one != two).then(|| {
+            let (one, two) = (types::print(one), types::print(two));
+            format!("{} ({one}, {two})", leaf.path)
+        })
+    });
+    let typed: Vec<String> = typed.collect();
+    let typed: Vec<&str> = typed.iter().map(String::as_str).collect();
+    let typed = (!typed.is_empty()).then(|| format!("of other types: {}", told(&typed)));
+    let parts = [only(first, a, b), only(other, b, a), typed];
+    let parts: Vec<String> = parts.into_iter().flatten().collect();
+    (!parts.is_empty()).then(|| parts.join("; "))
 }

@@ -23,8 +23,8 @@ const MAX_PATTERNS: usize = 1000;
 
 pub(super) fn check(
     entries: &[At<PatternEntry>],
-    spaces: &Declared<Vec<Space>>,
-    namespaces: &Declared<BTreeMap<u16, String>>,
+    (spaces, namespaces): (&Declared<Vec<Space>>, &Declared<BTreeMap<u16, String>>),
+    types: &mut Types,
     findings: &mut Findings,
 ) -> Vec<Pattern> {
     if let Some(first) = entries.get(MAX_PATTERNS) {
@@ -35,14 +35,13 @@ pub(super) fn check(
         findings.error(Code::TooLarge, first.place, message);
         return Vec::new();
     }
-    let mut types = Types::new();
     let mut patterns = Vec::new();
     for at in entries {
         let Some(entry) = &at.value else { continue };
         let origin = required(&entry.origin, "origin", "the pattern", at.place, findings);
         let origin = origin.and_then(|(number, place)| origin_of(*number, place, spaces, findings));
         let texts = texts(entry, at.place, namespaces, findings);
-        let kind = kind(entry, origin, &mut types, findings);
+        let kind = kind(entry, origin, types, findings);
         let (Some(origin), Some(texts), Some((message_type, selection))) = (origin, texts, kind)
         else {
             continue;
@@ -264,14 +263,15 @@ fn kind(
             .help("package and name, as std_msgs/Bool");
         return None;
     };
-    let known = origin.and_then(|origin| types.get(dialect(origin), &name).as_ref().ok());
+    let known =
+        origin.and_then(|origin| types.get((dialect(origin), at.place), &name, findings).ok());
     if let (Some(known), Some(field)) = (known, &entry.field) {
         match &selection {
-            Selection::Value { .. } => shaping::leaves(known, &selection, field.place, findings)?,
+            Selection::Value { .. } => shaping::leaves(&known, &selection, field.place, findings)?,
             Selection::Whole
             | Selection::Field(_)
             | Selection::Template { .. }
-            | Selection::Bytes => select(known, &selection, field.place, findings)?,
+            | Selection::Bytes => select(&known, &selection, field.place, findings)?,
         };
     }
     Some((Some(name), selection))

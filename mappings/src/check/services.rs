@@ -5,7 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use messages::{
-    Dialect, Leaf, Literal, MessageType, Plan, PlanError, Selection, ServiceType, TypeName, Wire,
+    Dialect, Leaf, Literal, MessageType, Plan, PlanError, Selection, ServiceType, TextKind,
+    TypeName, Wire,
 };
 use uadp::BuiltinType;
 
@@ -299,10 +300,11 @@ fn answer(
             .help("name the node of the variable whose values call the service");
         return None;
     };
-    let service = call
-        .service_type
-        .as_ref()
-        .and_then(|name| known.types.service(site.dialect(), name));
+    let service = call.service_type.as_ref().and_then(|name| {
+        known
+            .types
+            .service((site.dialect(), site.place), name, findings)
+    });
     let response = service.as_ref().map(|service| service.response());
     let (selection, fields) = response_field(entry, response, place, site, findings)?;
     let of = call.topic?;
@@ -405,9 +407,15 @@ fn built_in(
     types: &mut Types,
     findings: &mut Findings,
 ) -> Option<Arc<ServiceType>> {
-    let known = types.service(dialect, name);
+    let known = types.service((dialect, place), name, findings);
     if known.is_none() {
-        let message = format!("no definition of the service type `{name}` is built in");
+        let looked = types.looked(dialect);
+        let built_in = if looked.is_empty() {
+            " is built in"
+        } else {
+            ""
+        };
+        let message = format!("no definition of the service type `{name}`{built_in}");
         let note = findings.warning(Code::UnknownServiceType, place, message);
         note.help_with(|| {
             let folders = match dialect {
@@ -415,9 +423,10 @@ fn built_in(
                 Dialect::Ros2 => "a prefix in AMENT_PREFIX_PATH",
             };
             let why = format!(
-                "a package with its .srv file must be below {folders} when the bridge runs, and fields are checked then"
+                "a package with its .srv file must be in `type_paths` or below {folders} when the bridge runs, and fields \
+                 are checked then{looked}"
             );
-            match Types::registry(dialect).suggest_service(name) {
+            match types.suggest(dialect, TextKind::Service, name) {
                 Some(near) => format!("did you mean `{near}`? If not: {why}"),
                 None => why,
             }

@@ -4,12 +4,18 @@ use std::collections::HashMap;
 use std::sync::{Arc, LazyLock};
 
 use messages::{
-    DefinitionError, Dialect, Leaf, MessageType, Rank, Registry, ServiceType, TypeName,
+    DefinitionError, Dialect, Leaf, Library, MessageType, Noted, Rank, Registry, ServiceType,
+    TextKind, TypeName,
 };
 use uadp::BuiltinType;
 
+use super::bindings::told;
+use super::{TypeFiles, TypeOrigin, TypeUse};
+use crate::code::Code;
+use crate::findings::Findings;
 use crate::nearest::nearest;
 use crate::topic::SpaceId;
+use crate::tree::Place;
 
 /// Builtin type and whether it is an array.
 pub(super) type ValueType = (BuiltinType, bool);
@@ -76,23 +82,31 @@ pub(super) const fn dialect(space: SpaceId) -> Dialect {
 
 type Answer = Result<Arc<MessageType>, Box<DefinitionError>>;
 
-/// The message types that are built in.
+/// The message types that are built in or in files.
 pub(super) struct Types {
+    files: Box<dyn TypeFiles>,
+    /// Of ROS 1 and of ROS 2, once something of it was asked for.
+    libraries: [Option<Library>; 2],
     asked: HashMap<(Dialect, TypeName), Answer>,
     services: HashMap<(Dialect, TypeName), Option<Arc<ServiceType>>>,
+    used: Vec<TypeUse>,
 }
 
 static ROS1: LazyLock<Registry> = LazyLock::new(|| Registry::bundle(Dialect::Ros1));
 static ROS2: LazyLock<Registry> = LazyLock::new(|| Registry::bundle(Dialect::Ros2));
 
 impl Types {
-    pub(super) fn new() -> Self {
+    pub(super) fn new(files: Box<dyn TypeFiles>) -> Self {
         Self {
+            files,
+            libraries: [None, None],
             asked: HashMap::new(),
             services: HashMap::new(),
+            used: Vec::new(),
         }
     }
 
+    /// What is built in.
     pub(super) fn registry(dialect: Dialect) -> &'static Registry {
         match dialect {
             Dialect::Ros1 => &ROS1,
@@ -100,22 +114,137 @@ impl Types {
         }
     }
 
-    /// A service that is built in.
-    pub(super) fn service(
+    fn library(
         &mut self,
         dialect: Dialect,
-        name: &TypeName,
-    ) -> Option<Arc<ServiceType>> {
-        let known = self.services.entry((dialect, name.clone()));
-        known
-            .or_insert_with(|| Self::registry(dialect).service(name).ok())
-            .clone()
+    ) -> (&mut Library, &mut Box<dyn TypeFiles>, &mut Vec<TypeUse>) {
+        let [ros1, ros2] = &mut self.libraries;
+        let library = match dialect {
+            Dialect::Ros1 => ros1,
+            Dialect::Ros2 => ros2,
+        };
+        let library = library.get_or_insert_with(|| Library::new(Self::registry(dialect).clone()));
+        (library, &mut self.files, &mut self.used)
     }
 
-    pub(super) fn get(&mut self, dialect: Dialect, name: &TypeName) -> &Answer {
-        self.asked
-            .entry((dialect, name.clone()))
-            .or_insert_with(|| Self::registry(dialect).get(name).map_err(Box::new))
+    /// A service that is known; notes what is wrong with its file.
+    pub(super) fn service(
+        &mut self,
+        (dialect, place): (Dialect, Place),
+        name: &TypeName,
+        findings: &mut Findings,
+    ) -> Option<Arc<ServiceType>> {
+        if let Some(known) = self.services.get(&(dialect, name.clone())) {
+            return known.clone();
+        }
+        let (library, files, used) = self.library(dialect);
+        let found = library.service(name, files.as_mut()).ok();
+        used.push(TypeUse {
+            dialect,
+            name: name.clone(),
+            source: origin(library, TextKind::Service, name, found.is_some()),
+        });
+        note(library.take_noted(), place, findings);
+        self.services.insert((dialect, name.clone()), found.clone());
+        found
+    }
+
+    /// A message type; notes what is wrong with its files.
+    pub(super) fn get(
+        &mut self,
+        (dialect, place): (Dialect, Place),
+        name: &TypeName,
+        findings: &mut Findings,
+    ) -> Answer {
+        if let Some(known) = self.asked.get(&(dialect, name.clone())) {
+            return known.clone();
+        }
+        let (library, files, used) = self.library(dialect);
+        let found = library.message(name, files.as_mut()).map_err(Box::new);
+        used.push(TypeUse {
+            dialect,
+            name: name.clone(),
+            source: origin(library, TextKind::Message, name, found.is_ok()),
+        });
+        note(library.take_noted(), place, findings);
+        self.asked.insert((dialect, name.clone()), found.clone());
+        found
+    }
+
+    /// What may be meant by a name that is not known.
+    pub(super) fn suggest(
+        &mut self,
+        dialect: Dialect,
+        kind: TextKind,
+        name: &TypeName,
+    ) -> Option<TypeName> {
+        let (library, files, _) = self.library(dialect);
+        library.suggest(kind, name, files.as_mut())
+    }
+
+    /// `; looked in a, b`, or nothing where only what is built in is known.
+    pub(super) fn looked(&self, dialect: Dialect) -> String {
+        let places = self.files.places(dialect);
+        if places.is_empty() {
+            return String::new();
+        }
+        let places: Vec<&str> = places.iter().map(String::as_str).collect();
+        format!("; looked in {}", told(&places))
+    }
+
+    /// The types that were asked for.
+    pub(super) fn used(self) -> Vec<TypeUse> {
+        self.used
+    }
+}
+
+fn origin(library: &Library, kind: TextKind, name: &TypeName, known: bool) -> TypeOrigin {
+    match library.file(kind, name) {
+        Some(file) => TypeOrigin::File(file.to_string()),
+        None if known => TypeOrigin::BuiltIn,
+        None => TypeOrigin::Unknown,
+    }
+}
+
+fn note(noted: Vec<Noted>, place: Place, findings: &mut Findings) {
+    for one in noted {
+        match one {
+            Noted::Read { .. } => {}
+            Noted::Refused { file, error, .. } => {
+                findings
+                    .warning(Code::DefinitionFile, place, format!("{file}: {error}"))
+                    .help("the file counts as not there; what is built in under the name counts, if anything is");
+            }
+            Noted::Differs {
+                name,
+                file,
+                only_file,
+                only_built_in,
+            } => {
+                let sides = [
+                    ("only in the file", only_file),
+                    ("only built in", only_built_in),
+                ];
+                let sides: Vec<String> = sides
+                    .iter()
+                    .filter(|(_, lines)| !lines.is_empty())
+                    .map(|(side, lines)| {
+                        let lines: Vec<&str> = lines.iter().map(String::as_str).collect();
+                        format!("{side}: {}", told(&lines))
+                    })
+                    .collect();
+                let sides = if sides.is_empty() {
+                    "its fields are in another order".to_owned()
+                } else {
+                    sides.join("; ")
+                };
+                let message =
+                    format!("`{name}` of {file} differs from the one that is built in: {sides}");
+                findings
+                    .warning(Code::DefinitionsDiffer, place, message)
+                    .help("the file counts; are the peers built with it, too?");
+            }
+        }
     }
 }
 

@@ -9,7 +9,7 @@ use messages::{Leaf, Rank};
 
 use super::bindings::{self, Bindings};
 use super::services::Calls;
-use super::types::{self, ValueType};
+use super::types::{self, Types, ValueType};
 use super::{Declared, required};
 use crate::code::Code;
 use crate::document::{PublishEntry, Queue, VariableEntry};
@@ -57,8 +57,8 @@ impl Draft<'_> {
 
 pub(super) fn check(
     entries: &[At<VariableEntry>],
-    spaces: &Spaces,
-    namespaces: &Namespaces,
+    (spaces, namespaces): (&Spaces, &Namespaces),
+    types: &mut Types,
     findings: &mut Findings,
 ) -> Vec<Variable> {
     if let Some(first) = entries.get(MAX_VARIABLES) {
@@ -87,7 +87,7 @@ pub(super) fn check(
         let (node, _) = draft.node.as_ref()?;
         Some((node, draft.topic(), draft.entry.ros.as_ref()?))
     }));
-    let mut bindings = Bindings::new(spaces, calls);
+    let mut bindings = Bindings::new(spaces, calls, types);
     let variables = drafts
         .iter()
         .filter_map(|draft| variable(draft, &mut bindings, findings));

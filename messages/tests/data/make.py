@@ -7,6 +7,7 @@
     python3 make.py services  needs Debian's python3-std-srvs, -nav-msgs, -sensor-msgs, -tf2-msgs, -diagnostic-msgs,
                               -roscpp-msg, -move-base-msgs -> ros1_services.txt
     python3 make.py hashes    needs rosbags -> ros2_type_hashes.txt
+    python3 make.py idl       needs rosbags -> rosbags_idl.json
 
 ros1_md5.txt    name and md5 of each ROS 1 type: rosbags' store ROS1_NOETIC
 ros1_services.txt name and md5 of each service of those packages, of roscpp/Logger, and of the messages genaction made
@@ -14,7 +15,8 @@ ros1_services.txt name and md5 of each service of those packages, of roscpp/Logg
 ros2_fields.txt name and fields of each ROS 2 type: rosbags' store ROS2_JAZZY
 ros2_type_hashes.txt for each of rosbags' stores from Humble to Lyrical a line `# store`, then type hash, name and fields of
                 each type that the store before has not or has otherwise
-*.json          messages with made-up values: their bytes as that implementation writes them, and the fields a bridge
+rosbags_idl.json messages of ROS2_JAZZY in IDL, as rosbags reads them again, and their type hashes
+*.json          (others) messages with made-up values: their bytes as that implementation writes them, and the fields a bridge
                 is to make of them, one line each, by the rules of the crate's documentation (written here a second time)
 """
 import json
@@ -146,4 +148,81 @@ def hashes():
                     before[full] = line
 
 
-{"hashes": hashes, "rosbags": rosbags, "cyclone": cyclone, "genpy": genpy, "services": services}[sys.argv[1]]()
+IDL_WORDS = {"bool": "boolean", "byte": "octet", "char": "uint8", "float32": "float", "float64": "double"}
+
+
+def idl_text(store, full_name):
+    """A message as rosidl_adapter writes it in IDL."""
+    from rosbags.interfaces import Nodetype
+
+    package, _, name = full_name.split("/")
+    includes, typedefs, members = set(), [], []
+
+    def base(desc):
+        node, what = desc
+        if node == Nodetype.NAME:
+            of, _, message = what.split("/")
+            includes.add(f"{of}/msg/{message}.idl")
+            return f"{of}::msg::{message}"
+        word = IDL_WORDS.get(what[0], what[0])
+        return f"{word}<{what[1]}>" if what[1] else word
+
+    def typedef(of, to):
+        if (of, to) not in typedefs:
+            typedefs.append((of, to))
+
+    constants, fields = store.fielddefs[full_name]
+    for field, desc in fields:
+        node, what = desc
+        if node == Nodetype.ARRAY:
+            of = base(what[0])
+            flat = of.replace("::", "__")
+            if flat != of:
+                typedef(of, flat)
+            kind = f"{flat}__{what[1]}"
+            typedef(flat, f"{kind}[{what[1]}]")
+        elif node == Nodetype.SEQUENCE:
+            of = base(what[0])
+            kind = f"sequence<{of}, {what[1]}>" if what[1] else f"sequence<{of}>"
+        else:
+            kind = base(desc)
+        comment = f'      @verbatim (language="comment", text=\n        "About {field}; {{ it" "\\n" "is")\n'
+        members.append(f"{comment}      {kind} {field};\n")
+    lines = [f"// generated from rosidl_adapter/resource/msg.idl.em\n// with input from {package}/msg/{name}.msg\n\n"]
+    lines += [f'#include "{include}"\n' for include in sorted(includes)]
+    lines += [f"\nmodule {package} {{\n  module msg {{\n"]
+    lines += [f"    typedef {of} {to};\n" for of, to in typedefs]
+    if constants:
+        lines.append(f"    module {name}_Constants {{\n")
+        for constant, kind, value in constants:
+            word = IDL_WORDS.get(kind, kind)
+            value = str(value).upper() if word == "boolean" else json.dumps(value)
+            lines.append(f"      const {word} {constant} = {value};\n")
+        lines.append("    };\n")
+    lines.append(f'    @verbatim (language="comment", text=\n      "A message")\n    struct {name} {{\n')
+    return "".join([*lines, "\n".join(members), "    };\n  };\n};\n"])
+
+
+def idl():
+    from rosbags.typesys import Stores, get_types_from_idl, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    samples = []
+    for name in IDL_SAMPLES:
+        text = idl_text(store, full(name))
+        read = get_typestore(Stores.ROS2_JAZZY)
+        # Its parser does not know `#include`.
+        plain = "".join(line for line in text.splitlines(True) if not line.startswith("#"))
+        read.fielddefs.update(get_types_from_idl(plain))
+        assert read.fielddefs[full(name)] == store.fielddefs[full(name)], name
+        samples.append({"type": name, "hash": read.hash_rihs01(full(name)), "idl": text})
+    write("rosbags_idl.json", samples)
+
+
+IDL_SAMPLES = """geometry_msgs/PoseWithCovariance geometry_msgs/Polygon std_msgs/Empty std_msgs/Byte std_msgs/ByteMultiArray
+    sensor_msgs/CameraInfo sensor_msgs/JointState sensor_msgs/BatteryState sensor_msgs/PointField
+    shape_msgs/SolidPrimitive shape_msgs/Mesh diagnostic_msgs/DiagnosticStatus rcl_interfaces/ParameterDescriptor
+    lifecycle_msgs/Transition nav_msgs/OccupancyGrid builtin_interfaces/Duration""".split()
+
+
+{"hashes": hashes, "rosbags": rosbags, "cyclone": cyclone, "genpy": genpy, "services": services, "idl": idl}[sys.argv[1]]()

@@ -18,7 +18,8 @@ pub(crate) enum Verb {
     /// Tell everything that is wrong with a mapping
     ///
     /// Each finding has a code, its place with the line it is about, and what to do; `ua-space explain CODE` says more of
-    /// a code. Nothing is asked of the network: definitions of messages are those built in.
+    /// a code. Nothing is asked of the network: definitions of messages are those of its
+    /// type_paths, of ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, and those built in.
     ///
     /// Exit codes: 0 all can run, with or without warnings, 64 usage, 74 a file that cannot be read or an output that
     /// cannot be written, 78 one of them cannot run.

@@ -2,7 +2,8 @@
 
 use std::io::{self, BufWriter, Read as _, Write as _};
 
-use mappings::{Checked, Diagnostic, Mapping};
+use mappings::{Checked, Diagnostic, TypeOrigin, TypeUse};
+use messages::Dialect;
 use serde::Serialize;
 
 use crate::arguments::Check;
@@ -14,7 +15,7 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
     for file in &arguments.files {
         let text = read(file)?;
         let name = if file == "-" { "<stdin>" } else { file };
-        let checked = Mapping::from_yaml(&text, name);
+        let checked = type_files::check_mapping(&text, name);
         all_can_run &= checked.mapping.is_some();
         if arguments.json {
             let line = serde_json::to_string(&Told::of(name, &checked))
@@ -76,6 +77,33 @@ struct Told<'a> {
     file: &'a str,
     can_run: bool,
     findings: Vec<Finding<'a>>,
+    /// The message and service types it names.
+    types: Vec<Type<'a>>,
+}
+
+#[derive(Serialize)]
+struct Type<'a> {
+    ros: u8,
+    name: &'a str,
+    /// A file, `built in`, or `unknown`.
+    from: &'a str,
+}
+
+impl<'a> Type<'a> {
+    fn of(used: &'a TypeUse) -> Self {
+        Self {
+            ros: match used.dialect {
+                Dialect::Ros1 => 1,
+                Dialect::Ros2 => 2,
+            },
+            name: used.name.as_str(),
+            from: match &used.source {
+                TypeOrigin::BuiltIn => "built in",
+                TypeOrigin::File(file) => file,
+                TypeOrigin::Unknown => "unknown",
+            },
+        }
+    }
 }
 
 #[derive(Serialize)]
@@ -98,6 +126,7 @@ impl<'a> Told<'a> {
             file,
             can_run: checked.mapping.is_some(),
             findings: checked.findings.iter().map(Finding::of).collect(),
+            types: checked.types.iter().map(Type::of).collect(),
         }
     }
 }

@@ -3,3 +3,4 @@
 mod data_plane;
 mod peer;
 mod port;
+mod types;

@@ -15,7 +15,7 @@ use crate::peer::{DOMAIN, SOON, heard, options, reads, string, writes};
 
 const LATCHED: [&str; 4] = ["--durability", "transient_local", "--depth", "1"];
 
-fn port() -> Ros2Port {
+pub(crate) fn port() -> Ros2Port {
     Ros2Port::start(PortOptions {
         domain: options(),
         own: SpaceId::new(DOMAIN).unwrap(),
@@ -25,12 +25,15 @@ fn port() -> Ros2Port {
     .unwrap()
 }
 
-fn topic(name: &str) -> TopicId {
+pub(crate) fn topic(name: &str) -> TopicId {
     name.parse().unwrap()
 }
 
 /// The first event that `wanted` takes; others are let go. Fails after [`SOON`].
-async fn event<T>(port: &mut Ros2Port, mut wanted: impl FnMut(PortEvent) -> Option<T>) -> T {
+pub(crate) async fn event<T>(
+    port: &mut Ros2Port,
+    mut wanted: impl FnMut(PortEvent) -> Option<T>,
+) -> T {
     let deadline = tokio::time::Instant::now() + SOON;
     loop {
         let event = tokio::time::timeout_at(deadline, port.recv())
@@ -42,7 +45,7 @@ async fn event<T>(port: &mut Ros2Port, mut wanted: impl FnMut(PortEvent) -> Opti
     }
 }
 
-async fn bound(port: &mut Ros2Port, topic: TopicId) -> String {
+pub(crate) async fn bound(port: &mut Ros2Port, topic: TopicId) -> String {
     event(port, |event| match event {
         PortEvent::Bound {
             topic: bound,
@@ -63,7 +66,11 @@ async fn live(port: &mut Ros2Port, topic: TopicId) -> bool {
 }
 
 /// Runs the port until the condition holds. Fails after [`SOON`].
-async fn until(port: &mut Ros2Port, what: &str, mut condition: impl FnMut() -> bool) {
+pub(crate) async fn run_until(
+    port: &mut Ros2Port,
+    what: &str,
+    mut condition: impl FnMut() -> bool,
+) {
     let deadline = Instant::now() + SOON;
     while !condition() {
         assert!(Instant::now() < deadline, "within {SOON:?} not so: {what}");
@@ -147,7 +154,7 @@ async fn a_value_nobody_asks_for_gets_the_standard_type_and_waits_for_late_joine
     port.publish(delivery(topic, "latched")).unwrap();
     for _ in 0..2 {
         let peer = reads(&cell, "/ua_1_2_3", "std_msgs/String", &LATCHED);
-        until(&mut port, "the latched value", || last_is(&peer, "latched")).await;
+        run_until(&mut port, "the latched value", || last_is(&peer, "latched")).await;
         assert_eq!(heard(&peer), ["latched"]);
     }
 }
@@ -281,7 +288,7 @@ async fn a_subscriber_that_is_killed_does_not_keep_the_newest_value_from_the_oth
     port.wanted(topic, &[(BuiltinType::String, false)]);
     assert_eq!(bound(&mut port, topic).await, "std_msgs/String");
     port.publish(delivery(topic, "before")).unwrap();
-    until(&mut port, "both hear", || {
+    run_until(&mut port, "both hear", || {
         last_is(&killed, "before") && last_is(&other, "before")
     })
     .await;
@@ -294,5 +301,5 @@ async fn a_subscriber_that_is_killed_does_not_keep_the_newest_value_from_the_oth
         run(&mut port, Duration::from_millis(1)).await;
     }
     assert!(refused > 0, "the writer never stopped");
-    until(&mut port, "the newest value", || last_is(&other, "999")).await;
+    run_until(&mut port, "the newest value", || last_is(&other, "999")).await;
 }

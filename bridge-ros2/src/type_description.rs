@@ -1,0 +1,261 @@
+//! The service `get_type_description` of a node (`type_description_interfaces/srv/GetTypeDescription`, REP-2016).
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use bytes::Bytes;
+use messages::{DescribedField, DescribedType, Dialect, Registry, TypeHash, TypeName};
+use tracing::debug;
+
+use crate::cdr::{CdrReader, CdrWriter, Malformed};
+use crate::domain::{Domain, DomainError};
+use crate::service::{
+    Service, ServiceCounters, ServiceOptions, ServicePeers, ServiceRequest, ServiceServer,
+    ServiceTypes,
+};
+
+/// Tells others what the types are that this node reads and writes. Dropping it withdraws the service.
+#[derive(Debug)]
+pub(crate) struct TypeServer {
+    known: Arc<Mutex<Registry>>,
+    server: ServiceServer,
+}
+
+impl TypeServer {
+    /// Of the domain's node. To be called on a tokio runtime.
+    pub(crate) fn open(domain: &Domain, peers: &ServicePeers) -> Result<Self, DomainError> {
+        let service = service(&domain.node_name());
+        let hashes = TypeName::new(PACKAGE, SERVICE)
+            .ok()
+            .and_then(|name| definitions().service_type_hashes(&name).ok());
+        if let Some(hashes) = hashes {
+            service.announce(domain, &hashes);
+        }
+        let known = Arc::new(Mutex::new(Registry::empty(Dialect::Ros2)));
+        let asked = Arc::clone(&known);
+        let handler = move |request: ServiceRequest| {
+            let answer = read_request(&request.bytes).map(|(name, hash)| {
+                let known = asked.lock().unwrap_or_else(PoisonError::into_inner);
+                answer(&known, &name, &hash)
+            });
+            async { answer.map_err(|Malformed| "a request cut short".to_owned()) }
+        };
+        let options = ServiceOptions::default();
+        let server = ServiceServer::open(domain, peers, &service, options, handler)?;
+        Ok(Self { known, server })
+    }
+
+    /// A type that is read or written from now on.
+    pub(crate) fn learn(&self, described: &[DescribedType], name: &TypeName, hash: TypeHash) {
+        let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Err(error) = known.add_described(name, described, hash) {
+            debug!(message_type = %name, "the type is not told to others: {error}");
+        }
+    }
+
+    /// What it has counted so far.
+    pub(crate) fn counters(&self) -> ServiceCounters {
+        self.server.counters()
+    }
+}
+
+/// The service of a node.
+pub(crate) fn service(node: &str) -> Service {
+    let of = |half| format!("type_description_interfaces::srv::dds_::GetTypeDescription_{half}_");
+    Service {
+        name: format!("{node}/get_type_description"),
+        types: ServiceTypes {
+            request: of("Request"),
+            response: of("Response"),
+        },
+    }
+}
+
+/// Asks for a type without its sources.
+pub(crate) fn request(name: &TypeName, hash: TypeHash) -> Bytes {
+    let mut writer = CdrWriter::new();
+    writer.string(&name.ros2());
+    writer.string(&hash.to_string());
+    writer.bool(false);
+    writer.finish()
+}
+
+/// The type and those it needs, or why there is none.
+pub(crate) fn read_answer(bytes: &[u8]) -> Result<Vec<DescribedType>, String> {
+    let read = || -> Result<Result<Vec<DescribedType>, String>, Malformed> {
+        let mut reader = CdrReader::new(bytes)?;
+        let successful = reader.bool()?;
+        let reason = reader.string()?;
+        if !successful {
+            return Ok(Err(format!("it does not tell: {reason}")));
+        }
+        let mut types = vec![read_type(&mut reader)?];
+        types.extend(reader.sequence(read_type)?);
+        Ok(Ok(types))
+    };
+    read().unwrap_or_else(|Malformed| Err("its answer is malformed".to_owned()))
+}
+
+fn read_type(reader: &mut CdrReader<'_>) -> Result<DescribedType, Malformed> {
+    Ok(DescribedType {
+        name: reader.string()?,
+        fields: reader.sequence(|reader| {
+            let field = DescribedField {
+                name: reader.string()?,
+                type_id: reader.u8()?,
+                capacity: reader.u64()?,
+                string_capacity: reader.u64()?,
+                nested: reader.string()?,
+            };
+            // Its default.
+            reader.string()?;
+            Ok(field)
+        })?,
+    })
+}
+
+/// What a node asks for.
+pub(crate) fn read_request(bytes: &[u8]) -> Result<(String, String), Malformed> {
+    let mut reader = CdrReader::new(bytes)?;
+    Ok((reader.string()?, reader.string()?))
+}
+
+/// The answer to a request for a type that the registry has, or has not. Texts of definitions are not told.
+pub(crate) fn answer(registry: &Registry, name: &str, hash: &str) -> Bytes {
+    let described = describe(registry, name, hash);
+    let mut writer = CdrWriter::new();
+    writer.bool(described.is_ok());
+    writer.string(described.as_ref().err().map_or("", String::as_str));
+    let described = described.unwrap_or_default();
+    let nothing = DescribedType {
+        name: String::new(),
+        fields: Vec::new(),
+    };
+    write_type(&mut writer, described.first().unwrap_or(&nothing));
+    writer.sequence(described.get(1..).unwrap_or_default(), write_type);
+    // Sources and further information.
+    writer.u32(0);
+    writer.u32(0);
+    writer.finish()
+}
+
+fn describe(registry: &Registry, name: &str, hash: &str) -> Result<Vec<DescribedType>, String> {
+    let unknown = || format!("type {name} is none of this node");
+    let parsed: TypeName = name.parse().map_err(|_| unknown())?;
+    let ours = registry.type_hash(&parsed).map_err(|_| unknown())?;
+    // As in rcl, any hash will do where none is named.
+    if !hash.is_empty() && hash != ours.to_string() {
+        return Err(format!("type {name} has the hash {ours} here"));
+    }
+    registry.describe(&parsed).map_err(|_| unknown())
+}
+
+fn write_type(writer: &mut CdrWriter, described: &DescribedType) {
+    writer.string(&described.name);
+    writer.sequence(&described.fields, |writer, field| {
+        writer.string(&field.name);
+        writer.u8(field.type_id);
+        writer.u64(field.capacity);
+        writer.u64(field.string_capacity);
+        writer.string(&field.nested);
+        writer.string("");
+    });
+}
+
+/// What the service is in `.srv` and `.msg` files, for the hashes its endpoints announce.
+pub(crate) fn definitions() -> Registry {
+    let mut registry = Registry::empty(Dialect::Ros2);
+    for (name, text) in MESSAGES {
+        if let Ok(name) = TypeName::new(PACKAGE, name) {
+            // A test has the hash of the whole.
+            let added = registry.add(&name, text);
+            debug_assert!(added.is_ok(), "{name}");
+        }
+    }
+    if let Ok(name) = TypeName::new(PACKAGE, SERVICE) {
+        let added = registry.add_service(&name, SERVICE_TEXT);
+        debug_assert!(added.is_ok(), "{name}");
+    }
+    registry
+}
+
+pub(crate) const PACKAGE: &str = "type_description_interfaces";
+pub(crate) const SERVICE: &str = "GetTypeDescription";
+const SERVICE_TEXT: &str = "string type_name\nstring type_hash\nbool include_type_sources true\n---\nbool successful\n\
+    string failure_reason\nTypeDescription type_description\nTypeSource[] type_sources\nKeyValue[] extra_information\n";
+const MESSAGES: [(&str, &str); 6] = [
+    (
+        "FieldType",
+        "uint8 type_id 0\nuint64 capacity\nuint64 string_capacity\nstring<=255 nested_type_name\n",
+    ),
+    (
+        "Field",
+        "string name\nFieldType type\nstring default_value\n",
+    ),
+    (
+        "IndividualTypeDescription",
+        "string<=255 type_name\nField[] fields\n",
+    ),
+    (
+        "TypeDescription",
+        "IndividualTypeDescription type_description\nIndividualTypeDescription[] referenced_type_descriptions\n",
+    ),
+    (
+        "TypeSource",
+        "string type_name\nstring encoding\nstring raw_file_contents\n",
+    ),
+    ("KeyValue", "string key\nstring value\n"),
+];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn name(text: &str) -> TypeName {
+        text.parse().unwrap()
+    }
+
+    #[test]
+    fn what_is_answered_is_read_as_the_type_it_is() {
+        let registry = Registry::bundle(Dialect::Ros2);
+        let wanted = name("sensor_msgs/JointState");
+        let hash = registry.type_hash(&wanted).unwrap();
+        let asked = request(&wanted, hash);
+        let (type_name, type_hash) = read_request(&asked).unwrap();
+        assert_eq!(
+            (type_name.as_str(), type_hash),
+            ("sensor_msgs/msg/JointState", hash.to_string())
+        );
+        let types = read_answer(&answer(&registry, &type_name, &hash.to_string())).unwrap();
+        assert_eq!(types, registry.describe(&wanted).unwrap());
+        for (type_name, type_hash) in [
+            ("x/msg/Y", ""),
+            ("std_msgs/msg/Bool", hash.to_string().as_str()),
+        ] {
+            let refused = read_answer(&answer(&registry, type_name, type_hash)).unwrap_err();
+            assert!(refused.contains("it does not tell: type"), "{refused}");
+        }
+    }
+
+    #[test]
+    fn an_answer_that_is_cut_anywhere_is_malformed() {
+        let registry = Registry::bundle(Dialect::Ros2);
+        let whole = answer(&registry, "geometry_msgs/msg/Twist", "");
+        // Behind the types come two counts that are not read.
+        for length in 0..whole.len() - 8 {
+            assert!(read_answer(&whole[..length]).is_err(), "{length}");
+        }
+    }
+
+    /// `type_description_interfaces/msg/TypeDescription` as ROS 2 publishes it.
+    #[test]
+    fn the_messages_have_the_hash_of_ros() {
+        let hash = definitions().type_hash(&name("type_description_interfaces/TypeDescription"));
+        let published = "RIHS01_739f2508c9fa3a6f330913ff5b9d25fb74159a077da71e1087f51a60c12a080b";
+        assert_eq!(hash.unwrap().to_string(), published);
+        assert!(
+            definitions()
+                .service_type_hashes(&name("type_description_interfaces/GetTypeDescription"))
+                .is_ok()
+        );
+    }
+}

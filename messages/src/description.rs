@@ -1,0 +1,230 @@
+//! Descriptions of ROS 2 types, as nodes from Iron on tell them (`type_description_interfaces/msg/TypeDescription`).
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use crate::definition::{Definition, Line};
+use crate::resolve::Resolver;
+use crate::type_hash::{
+    ARRAY, BOUNDED_SEQUENCE, BOUNDED_STRING, BOUNDED_WSTRING, BYTE, NESTED, STRING,
+    UNBOUNDED_SEQUENCE, WSTRING,
+};
+use crate::{DefinitionError, Dialect, MessageType, Registry, TypeHash, TypeName};
+
+/// One type without those it needs.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DescribedType {
+    /// As `sensor_msgs/msg/JointState`.
+    pub name: String,
+    /// In their order.
+    pub fields: Vec<DescribedField>,
+}
+
+/// A field of a [`DescribedType`], without its default.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct DescribedField {
+    /// Its name.
+    pub name: String,
+    /// One of the constants of `type_description_interfaces/msg/FieldType`.
+    pub type_id: u8,
+    /// Length of an array, or bound of a sequence.
+    pub capacity: u64,
+    /// Bound of a string.
+    pub string_capacity: u64,
+    /// As [`DescribedType::name`], of a message.
+    pub nested: String,
+}
+
+impl Registry {
+    /// The type `name` as a description has it, with all it needs. Its type hash tells whether it is the one somebody
+    /// announced; the registry keeps the definitions of names new to it when it is `expected`.
+    ///
+    /// # Errors
+    /// [`DefinitionError`]; a hash that is not `expected` is [`DefinitionError::OtherHash`], and nothing is kept.
+    pub fn add_described(
+        &mut self,
+        name: &TypeName,
+        types: &[DescribedType],
+        expected: TypeHash,
+    ) -> Result<Arc<MessageType>, DefinitionError> {
+        let mut described = Self::empty(Dialect::Ros2);
+        for one in types.iter().take(MOST_TYPES) {
+            let made = definition(name, one)?;
+            described
+                .definitions
+                .insert(made.name.clone(), Arc::new(made));
+        }
+        let found = described.type_hash(name)?;
+        if found != expected {
+            return Err(DefinitionError::OtherHash {
+                name: name.clone(),
+                found,
+                expected,
+            });
+        }
+        let none = BTreeMap::new();
+        let message_type = Resolver::new(Dialect::Ros2, &[&described.definitions, &none])
+            .message_type(name, None)?;
+        for (name, definition) in described.definitions {
+            self.definitions.entry(name).or_insert(definition);
+        }
+        Ok(Arc::new(message_type))
+    }
+
+    /// The description of a message type: itself first, then what it needs in the order of the names.
+    ///
+    /// # Errors
+    /// As [`Registry::get`].
+    pub fn describe(&self, name: &TypeName) -> Result<Vec<DescribedType>, DefinitionError> {
+        crate::type_hash::describe(self, name)
+    }
+}
+
+fn definition(of: &TypeName, described: &DescribedType) -> Result<Definition, DefinitionError> {
+    let refused = |reason: &'static str, text: &str| DefinitionError::Syntax {
+        name: of.clone(),
+        line: 1,
+        reason,
+        text: text.chars().take(200).collect(),
+    };
+    let name: TypeName = described.name.parse().map_err(|_| {
+        refused(
+            "a described type whose name is none of a message",
+            &described.name,
+        )
+    })?;
+    let mut lines = Vec::new();
+    for (number, field) in described.fields.iter().enumerate() {
+        let Some(written) = written(field) else {
+            return Err(refused(
+                "a described field of a type that messages have not",
+                &field.name,
+            ));
+        };
+        lines.push(Line {
+            number: number + 1,
+            written,
+            name: field.name.clone(),
+            value: None,
+        });
+    }
+    if let [only] = lines.as_slice()
+        && only.name == "structure_needs_at_least_one_member"
+    {
+        lines.clear();
+    }
+    Definition::of_lines(Dialect::Ros2, &name, Vec::new(), lines)
+}
+
+/// The type in the words of `.msg` files.
+fn written(field: &DescribedField) -> Option<String> {
+    let DescribedField {
+        type_id,
+        capacity,
+        string_capacity,
+        nested,
+        ..
+    } = field;
+    let (base, arity) = match *type_id {
+        id if id > UNBOUNDED_SEQUENCE => (id - UNBOUNDED_SEQUENCE, "[]".to_owned()),
+        id if id > BOUNDED_SEQUENCE => (id - BOUNDED_SEQUENCE, format!("[<={capacity}]")),
+        id if id > ARRAY => (id - ARRAY, format!("[{capacity}]")),
+        id => (id, String::new()),
+    };
+    let base = match base {
+        NESTED => {
+            let name: TypeName = nested.parse().ok()?;
+            name.to_string()
+        }
+        2 => "int8".to_owned(),
+        3 => "uint8".to_owned(),
+        4 => "int16".to_owned(),
+        5 => "uint16".to_owned(),
+        6 => "int32".to_owned(),
+        7 => "uint32".to_owned(),
+        8 => "int64".to_owned(),
+        9 => "uint64".to_owned(),
+        10 => "float32".to_owned(),
+        11 => "float64".to_owned(),
+        15 => "bool".to_owned(),
+        BYTE => "byte".to_owned(),
+        STRING => "string".to_owned(),
+        WSTRING => "wstring".to_owned(),
+        BOUNDED_STRING => format!("string<={string_capacity}"),
+        BOUNDED_WSTRING => format!("wstring<={string_capacity}"),
+        _ => return None,
+    };
+    Some(base + &arity)
+}
+
+/// More types than any message needs.
+const MOST_TYPES: usize = 512;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_message_of_the_bundle_is_described_such_that_its_hash_is_the_same() {
+        let registry = Registry::bundle(Dialect::Ros2);
+        for name in registry.names() {
+            let hash = registry.type_hash(name).unwrap();
+            let described = registry.describe(name).unwrap();
+            let mut empty = Registry::empty(Dialect::Ros2);
+            let again = empty.add_described(name, &described, hash).unwrap();
+            assert_eq!(
+                again.leaves(),
+                registry.get(name).unwrap().leaves(),
+                "{name}"
+            );
+            assert_eq!(empty.type_hash(name).unwrap(), hash, "{name}");
+        }
+    }
+
+    #[test]
+    fn a_description_of_another_hash_is_not_believed() {
+        let mut registry = Registry::bundle(Dialect::Ros2);
+        let name: TypeName = "robot_msgs/Arm".parse().unwrap();
+        let bool_hash = registry
+            .type_hash(&"std_msgs/Bool".parse().unwrap())
+            .unwrap();
+        let field = DescribedField {
+            name: "on".to_owned(),
+            type_id: 15,
+            capacity: 0,
+            string_capacity: 0,
+            nested: String::new(),
+        };
+        let mut described = DescribedType {
+            name: "robot_msgs/msg/Arm".to_owned(),
+            fields: vec![field],
+        };
+        let refused = registry.add_described(&name, &[described.clone()], bool_hash);
+        assert!(matches!(refused, Err(DefinitionError::OtherHash { .. })));
+        assert!(registry.get(&name).is_err());
+        for bad in [0, 12, 14, 19, 49 + 11, 255] {
+            described.fields[0].type_id = bad;
+            assert!(
+                registry
+                    .add_described(&name, &[described.clone()], bool_hash)
+                    .is_err()
+            );
+        }
+        described.fields[0].type_id = NESTED;
+        described.fields[0].nested = "robot_msgs/msg/Arm".to_owned();
+        let cyclic = registry.add_described(&name, &[described], bool_hash);
+        assert!(matches!(cyclic, Err(DefinitionError::Cyclic { .. })));
+    }
+
+    #[test]
+    fn a_hash_is_read_back_from_its_text() {
+        let registry = Registry::bundle(Dialect::Ros2);
+        let hash = registry
+            .type_hash(&"std_msgs/Bool".parse().unwrap())
+            .unwrap();
+        assert_eq!(hash.to_string().parse(), Ok(hash));
+        for text in ["", "RIHS01_", "RIHS02_00", "RIHS01_zz"] {
+            assert!(text.parse::<TypeHash>().is_err(), "{text}");
+        }
+    }
+}

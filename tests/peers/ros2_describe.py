@@ -1,0 +1,136 @@
+"""A node of ROS 2 Iron and later, through Cyclone DDS, with a type of its own: it publishes it, announces the type's hash,
+and tells what the type is when it is asked.
+
+The type is `type_description_interfaces/msg/FieldType`, whose hash is the one ROS 2 publishes.
+"""
+
+import argparse
+import time
+
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl.types import bounded_str, sequence, uint8, uint64
+from cyclonedds.pub import DataWriter
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+import lifetime
+import ros2_service
+from ros2_service_types import service, struct
+
+HASH = "RIHS01_a70b6dd919645a03a3586f7f821defbc886ea3e531a1d95cc0f380a3973ccaa6"
+PACKAGE = "type_description_interfaces"
+
+FieldType = struct(
+    f"{PACKAGE}/msg/FieldType",
+    [("type_id", uint8, 0), ("capacity", uint64, 0), ("string_capacity", uint64, 0), ("nested_type_name", bounded_str[255], "")],
+)
+Field = struct(f"{PACKAGE}/msg/Field", [("name", str, ""), ("type", FieldType, FieldType), ("default_value", str, "")])
+Individual = struct(
+    f"{PACKAGE}/msg/IndividualTypeDescription", [("type_name", bounded_str[255], ""), ("fields", sequence[Field], list)]
+)
+Description = struct(
+    f"{PACKAGE}/msg/TypeDescription",
+    [("type_description", Individual, Individual), ("referenced_type_descriptions", sequence[Individual], list)],
+)
+Source = struct(
+    f"{PACKAGE}/msg/TypeSource", [("type_name", str, ""), ("encoding", str, ""), ("raw_file_contents", str, "")]
+)
+KeyValue = struct(f"{PACKAGE}/msg/KeyValue", [("key", str, ""), ("value", str, "")])
+GET = service(
+    f"{PACKAGE}/srv/GetTypeDescription",
+    [("type_name", str, ""), ("type_hash", str, ""), ("include_type_sources", bool, True)],
+    [
+        ("successful", bool, False),
+        ("failure_reason", str, ""),
+        ("type_description", Description, Description),
+        ("type_sources", sequence[Source], list),
+        ("extra_information", sequence[KeyValue], list),
+    ],
+)
+
+# type_description_interfaces/msg/FieldType: 3 is uint8, 9 uint64, 21 a bounded string.
+TRUE = [("type_id", 3, 0), ("capacity", 9, 0), ("string_capacity", 9, 0), ("nested_type_name", 21, 255)]
+LIE = TRUE[:-1]
+
+
+def described(fields):
+    made = [Field(name=name, type=FieldType(type_id=kind, string_capacity=bound)) for name, kind, bound in fields]
+    return Description(type_description=Individual(type_name=f"{PACKAGE}/msg/FieldType", fields=made))
+
+
+def announced():
+    return Qos(
+        Policy.Reliability.Reliable(duration(seconds=1)),
+        Policy.Durability.TransientLocal,
+        Policy.History.KeepLast(1),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+        Policy.Userdata(f"typehash={HASH};".encode()),
+    )
+
+
+def tell_node(participant, name, writer):
+    """The list of nodes, with the writer as the node's."""
+    import ros2_graph
+
+    gid, entities, kind = ros2_graph.KINDS[16]
+    topic = Topic(participant, "ros_discovery_info", kind)
+    info = DataWriter(participant, topic, qos=ros2_graph.qos(Policy.History.KeepLast(1)))
+    node = entities("/", name, [], [gid(list(writer.guid.bytes))])
+    info.write(kind(gid(list(participant.guid.bytes)), [node]))
+    return info
+
+
+def serve(args, participant):
+    server = ros2_service.Server(participant, "/robot/get_type_description", GET)
+    name = "robot"
+    topic = Topic(participant, f"rt/{args.topic.lstrip('/')}", FieldType, qos=announced())
+    writer = DataWriter(participant, topic, qos=announced())
+    kept = tell_node(participant, name, writer)
+    writer.write(FieldType(type_id=7, capacity=8, string_capacity=9, nested_type_name="ten"))
+    lifetime.say(ready=args.topic)
+    while kept:
+        for request in server.reader.take(N=100):
+            if not hasattr(request, "count"):
+                continue
+            lifetime.say(asked=request.type_name, hash=request.type_hash)
+            reply = GET[1](successful=True, type_description=described(LIE if args.lie else TRUE))
+            server.answer(request, reply)
+        time.sleep(0.005)
+
+
+def ask(args, participant):
+    """Asks the node --node what a type is."""
+    client = ros2_service.Client(participant, f"{args.node}/get_type_description", GET)
+    lifetime.say(ready=args.node)
+    client.wait(10.0)
+    reply = client.call(GET[0](type_name=args.type, type_hash=args.hash))
+    main = reply.type_description.type_description
+    lifetime.say(
+        value={
+            "successful": reply.successful,
+            "reason": reply.failure_reason,
+            "type": main.type_name,
+            "fields": [[one.name, one.type.type_id, one.type.nested_type_name] for one in main.fields],
+            "referenced": [one.type_name for one in reply.type_description.referenced_type_descriptions],
+        }
+    )
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("role", choices=["serve", "ask"])
+    parser.add_argument("--topic", default="/ua_2_2_9")
+    parser.add_argument("--domain", type=int, default=2)
+    parser.add_argument("--lie", action="store_true", help="leave a field out")
+    parser.add_argument("--node", default="/endpoints")
+    parser.add_argument("--type", default="std_msgs/msg/String")
+    parser.add_argument("--hash", default="")
+    parser.add_argument("--limit", type=float, default=60.0)
+    args = parser.parse_args()
+    lifetime.bound(args.limit)
+    {"serve": serve, "ask": ask}[args.role](args, DomainParticipant(args.domain))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,234 @@
+//! Which definition files there are.
+
+use std::collections::BTreeMap;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use messages::{Dialect, TextKind, TypeName};
+
+use crate::package::{MANIFEST, Package};
+
+/// Files by what they define; the first of a name counts.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Index {
+    files: BTreeMap<(Dialect, TextKind, TypeName), PathBuf>,
+}
+
+impl Index {
+    pub(crate) fn of(dialect: Dialect, files: impl Iterator<Item = DefinitionFile>) -> Self {
+        let mut index = Self::default();
+        for file in files.filter(|file| file.of(dialect)) {
+            if let Some(name) = file.name() {
+                index.insert(dialect, &file, &name);
+            }
+        }
+        index
+    }
+
+    pub(crate) fn insert(&mut self, dialect: Dialect, file: &DefinitionFile, name: &TypeName) {
+        let key = (dialect, file.kind, name.clone());
+        self.files.entry(key).or_insert_with(|| file.path.clone());
+    }
+
+    pub(crate) fn get(&self, dialect: Dialect, kind: TextKind, name: &TypeName) -> Option<&Path> {
+        let path = self.files.get(&(dialect, kind, name.clone()));
+        path.map(PathBuf::as_path)
+    }
+
+    pub(crate) fn names(
+        &self,
+        dialect: Dialect,
+        kind: TextKind,
+    ) -> impl Iterator<Item = &TypeName> {
+        self.files
+            .keys()
+            .filter(move |(of, what, _)| *of == dialect && *what == kind)
+            .map(|(_, _, name)| name)
+    }
+}
+
+/// A file by its place: `<package>/msg/<Name>.msg`.
+#[derive(Debug, Clone)]
+pub(crate) struct DefinitionFile {
+    pub(crate) path: PathBuf,
+    pub(crate) kind: TextKind,
+    package: String,
+    /// The only ROS it is of.
+    only: Option<Dialect>,
+}
+
+impl DefinitionFile {
+    /// `None` when it has no ending of a definition.
+    fn of_path(path: PathBuf, package: &Package, folder: Option<TextKind>) -> Option<Self> {
+        let ending = path.extension()?.to_str()?;
+        let own = TextKind::ALL.into_iter().find(|kind| kind.word() == ending);
+        let (kind, only) = match own {
+            Some(kind) => (kind, package.dialect),
+            None if ending == "idl" => (folder.unwrap_or(TextKind::Message), Some(Dialect::Ros2)),
+            None => return None,
+        };
+        Some(Self {
+            path,
+            kind,
+            package: package.name.clone(),
+            only,
+        })
+    }
+
+    pub(crate) fn of(&self, dialect: Dialect) -> bool {
+        self.only.is_none_or(|only| only == dialect)
+    }
+
+    pub(crate) fn name(&self) -> Option<TypeName> {
+        TypeName::new(&self.package, self.path.file_stem()?.to_str()?).ok()
+    }
+}
+
+/// Looks through folders, of which there may be only so many.
+#[derive(Debug)]
+pub(crate) struct Walk {
+    folders: usize,
+    files: usize,
+}
+
+impl Walk {
+    pub(crate) const fn new() -> Self {
+        Self {
+            folders: MOST_FOLDERS,
+            files: MOST_FILES,
+        }
+    }
+
+    /// The definitions at or below a path: of packages, and of files that lie beside a `package.xml` or in a folder named
+    /// after their package.
+    pub(crate) fn all(&mut self, path: &Path) -> io::Result<Vec<DefinitionFile>> {
+        if path.metadata()?.is_file() {
+            let folder = path.parent().unwrap_or_else(|| Path::new(""));
+            let (folder, kind) = match (kind_of(folder), folder.parent()) {
+                (Some(kind), Some(package)) => (package, Some(kind)),
+                _ => (folder, None),
+            };
+            let folder = folder.canonicalize()?;
+            let file = DefinitionFile::of_path(path.to_owned(), &Package::of(&folder), kind);
+            return Ok(file.into_iter().collect());
+        }
+        let mut found = Vec::new();
+        // Of a path to the `msg` folder itself the package is the folder around.
+        match (kind_of(path), path.parent()) {
+            (Some(kind), Some(around)) => {
+                let package = Package::of(&around.canonicalize()?);
+                self.folder_of(&package, (path, Some(kind)), &mut found);
+            }
+            _ => self.walk(path, crate::DEEPEST, true, &mut found),
+        }
+        Ok(found)
+    }
+
+    /// The definitions of the packages at or below a folder. Packages hold no packages.
+    pub(crate) fn packages(&mut self, root: &Path, depth: usize) -> Vec<DefinitionFile> {
+        let mut found = Vec::new();
+        self.walk(root, depth, false, &mut found);
+        found
+    }
+
+    fn walk(&mut self, folder: &Path, depth: usize, loose: bool, found: &mut Vec<DefinitionFile>) {
+        let Some(entries) = self.entries(folder) else {
+            return;
+        };
+        let holds = |name: &str| entries.iter().any(|entry| entry.ends_with(name));
+        if IGNORED.into_iter().any(holds) {
+            return;
+        }
+        let folders: Vec<&PathBuf> = entries
+            .iter()
+            .filter(|entry| is_real_folder(entry))
+            .collect();
+        let kinds: Vec<(&Path, TextKind)> = folders
+            .iter()
+            .filter_map(|path| Some((path.as_path(), kind_of(path)?)))
+            .collect();
+        let is_package = holds(MANIFEST);
+        if loose || is_package || !kinds.is_empty() {
+            let named = folder.canonicalize();
+            let package = Package::of(named.as_deref().unwrap_or(folder));
+            for (path, kind) in &kinds {
+                self.folder_of(&package, (path, Some(*kind)), found);
+            }
+            if loose {
+                self.files_of(&package, &entries, None, found);
+            }
+        }
+        if is_package && !loose {
+            return;
+        }
+        let Some(depth) = depth.checked_sub(1) else {
+            return;
+        };
+        for below in folders {
+            if kind_of(below).is_none() && !is_hidden(below) {
+                self.walk(below, depth, loose, found);
+            }
+        }
+    }
+
+    fn folder_of(
+        &mut self,
+        package: &Package,
+        (folder, kind): (&Path, Option<TextKind>),
+        found: &mut Vec<DefinitionFile>,
+    ) {
+        if let Some(entries) = self.entries(folder) {
+            self.files_of(package, &entries, kind, found);
+        }
+    }
+
+    fn files_of(
+        &mut self,
+        package: &Package,
+        entries: &[PathBuf],
+        kind: Option<TextKind>,
+        found: &mut Vec<DefinitionFile>,
+    ) {
+        let files = entries
+            .iter()
+            .filter_map(|path| DefinitionFile::of_path(path.clone(), package, kind))
+            .filter(|file| file.path.is_file());
+        let mut files: Vec<DefinitionFile> = files.take(self.files).collect();
+        self.files -= files.len().min(self.files);
+        // rosidl installs an .idl made of each .msg beside it.
+        files.sort_by_key(|file| file.path.extension().is_some_and(|ending| ending == "idl"));
+        found.append(&mut files);
+    }
+
+    /// In order; `None` when it cannot be read, or when enough were.
+    fn entries(&mut self, folder: &Path) -> Option<Vec<PathBuf>> {
+        self.folders = self.folders.checked_sub(1)?;
+        let entries = std::fs::read_dir(folder).ok()?;
+        let mut paths: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
+        paths.sort();
+        Some(paths)
+    }
+}
+
+/// A folder that is no link, as links may lead in circles.
+fn is_real_folder(path: &Path) -> bool {
+    path.symlink_metadata().is_ok_and(|found| found.is_dir())
+}
+
+fn is_hidden(path: &Path) -> bool {
+    let name = path.file_name().map(|name| name.to_string_lossy());
+    name.is_some_and(|name| name.starts_with('.'))
+}
+
+/// What the folder `msg`, `srv` or `action` of a package holds.
+fn kind_of(folder: &Path) -> Option<TextKind> {
+    let name = folder.file_name()?.to_str()?;
+    TextKind::ALL.into_iter().find(|kind| kind.word() == name)
+}
+
+/// Files that say that a folder is not to be looked at, and nothing below it.
+const IGNORED: [&str; 3] = ["CATKIN_IGNORE", "AMENT_IGNORE", "COLCON_IGNORE"];
+/// Folders looked at; a large installation has some thousands.
+const MOST_FOLDERS: usize = 20_000;
+/// Definitions; a large installation has some thousands.
+const MOST_FILES: usize = 20_000;

@@ -1,0 +1,238 @@
+use mappings::TypeFiles as _;
+use messages::{Library, Registry};
+
+use super::*;
+
+/// A folder of its own that goes away with it.
+struct Folder(PathBuf);
+
+impl Folder {
+    fn new(name: &str, files: &[(&str, &str)]) -> Self {
+        let root = std::env::temp_dir().join(format!("type-files-{name}-{}", std::process::id()));
+        for (file, text) in files {
+            let path = root.join(file);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, text).unwrap();
+        }
+        Self(root)
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.0.join(name)
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        std::fs::remove_dir_all(&self.0).unwrap();
+    }
+}
+
+fn name(text: &str) -> TypeName {
+    text.parse().unwrap()
+}
+
+fn file(files: &mut TypeFiles, dialect: Dialect, kind: TextKind, wanted: &str) -> Option<String> {
+    let found = files.find(dialect, kind, &name(wanted))?;
+    Some(found.file.to_string())
+}
+
+#[test]
+fn a_path_wins_over_the_installation_and_both_over_what_is_built_in() {
+    let folder = Folder::new(
+        "order",
+        &[
+            (
+                "types/robot_msgs/msg/Arm.msg",
+                "float64[] mine\nstd_msgs/Bool on\n",
+            ),
+            ("ws/src/repo/robot_msgs/msg/Arm.msg", "float64[] theirs\n"),
+            (
+                "ws/src/repo/robot_msgs/srv/Move.srv",
+                "robot_msgs/Arm arm\n---\nbool ok\n",
+            ),
+            (
+                "ws/src/repo/std_msgs/msg/Bool.msg",
+                "bool data\nuint8 quality\n",
+            ),
+        ],
+    );
+    let environment = Environment {
+        ros1: vec![folder.path("ws")],
+        ros2: vec![],
+    };
+    let mut files = TypeFiles::open(&[folder.path("types")], environment);
+    assert!(files.faults().is_empty());
+    let mut library = Library::new(Registry::bundle(Dialect::Ros1));
+    let service = library
+        .service(&name("robot_msgs/Move"), &mut files)
+        .unwrap();
+    let leaves: Vec<&str> = service
+        .request()
+        .leaves()
+        .iter()
+        .map(|l| l.path.as_str())
+        .collect();
+    assert_eq!(leaves, ["arm.mine", "arm.on.data", "arm.on.quality"]);
+    let differs: Vec<_> = library
+        .take_noted()
+        .into_iter()
+        .filter_map(|noted| match noted {
+            messages::Noted::Differs {
+                name,
+                only_file,
+                only_built_in,
+                ..
+            } => Some((name.to_string(), only_file, only_built_in)),
+            _ => None,
+        })
+        .collect();
+    let quality = vec!["uint8 quality".to_owned()];
+    assert_eq!(differs, [("std_msgs/Bool".to_owned(), quality, vec![])]);
+    assert!(
+        file(
+            &mut files,
+            Dialect::Ros2,
+            TextKind::Service,
+            "robot_msgs/Move"
+        )
+        .is_none()
+    );
+}
+
+#[test]
+fn an_installation_of_ros_2_is_read_below_share_and_prefers_the_msg_to_the_idl_made_of_it() {
+    let idl = "module nav { module msg { struct Leg { double knee; }; }; };";
+    let folder = Folder::new(
+        "ament",
+        &[
+            (
+                "install/share/nav/package.xml",
+                "<package><name>nav</name></package>",
+            ),
+            ("install/share/nav/msg/Leg.idl", idl),
+            ("install/share/nav/msg/Hip.msg", "Leg leg\n"),
+            ("install/share/nav/msg/Hip.idl", "broken"),
+            ("install/lib/nav/msg/Other.msg", "bool x\n"),
+        ],
+    );
+    let environment = Environment {
+        ros1: vec![],
+        ros2: vec![folder.path("install")],
+    };
+    let mut files = TypeFiles::open(&[], environment);
+    let mut library = Library::new(Registry::bundle(Dialect::Ros2));
+    let hip = library.message(&name("nav/Hip"), &mut files).unwrap();
+    assert_eq!(hip.leaves()[0].path, "leg.knee");
+    assert!(
+        library
+            .file(TextKind::Message, &name("nav/Leg"))
+            .unwrap()
+            .ends_with("msg/Leg.idl")
+    );
+    assert!(file(&mut files, Dialect::Ros2, TextKind::Message, "nav/Other").is_none());
+    assert_eq!(files.places(Dialect::Ros2), [AMENT_PREFIX_PATH]);
+}
+
+#[test]
+fn what_is_to_be_ignored_is_not_looked_into() {
+    let package =
+        "<package><name>robot_msgs</name><buildtool_depend>catkin</buildtool_depend></package>";
+    let folder = Folder::new(
+        "ignored",
+        &[
+            ("a/CATKIN_IGNORE", ""),
+            ("a/old_msgs/msg/Arm.msg", "bool x\n"),
+            ("b/AMENT_IGNORE", ""),
+            ("b/msg/Arm.msg", "bool x\n"),
+            ("c/COLCON_IGNORE", ""),
+            ("c/old_msgs/msg/Arm.msg", "bool x\n"),
+            ("d/.git/old_msgs/msg/Arm.msg", "bool x\n"),
+            ("d/folder/package.xml", package),
+            ("d/folder/msg/Arm.msg", "bool x\n"),
+            ("d/folder/inner_msgs/msg/Arm.msg", "bool x\n"),
+        ],
+    );
+    let environment = Environment {
+        ros1: vec![folder.0.clone()],
+        ros2: vec![],
+    };
+    let mut files = TypeFiles::open(&[], environment);
+    let names: Vec<String> = files
+        .names(Dialect::Ros1, TextKind::Message)
+        .iter()
+        .map(ToString::to_string)
+        .collect();
+    assert_eq!(
+        names,
+        ["robot_msgs/Arm"],
+        "by its package.xml, and none within it"
+    );
+}
+
+#[test]
+fn a_file_that_does_not_parse_is_told_with_its_line_and_the_others_count() {
+    let catkin =
+        "<package><name>robot_msgs</name><buildtool_depend>catkin</buildtool_depend></package>";
+    let folder = Folder::new(
+        "faults",
+        &[
+            ("types/robot_msgs/package.xml", catkin),
+            ("types/robot_msgs/msg/Bad.msg", "bool good\nint32 9lives\n"),
+            ("types/robot_msgs/msg/Only2.msg", "string<=4 x\n"),
+            ("types/robot_msgs/msg/Good.msg", "bool x\n"),
+            (
+                "types/robot_msgs/action/Turn.action",
+                "float64 a\n---\nbool ok\n---\nfloat64 left\n",
+            ),
+            ("empty/readme", ""),
+        ],
+    );
+    let paths = ["types", "empty", "nowhere", "types/robot_msgs/msg/Good.msg"]
+        .map(|path| folder.path(path));
+    let mut files = TypeFiles::open(&paths, Environment::default());
+    let faults = files.faults();
+    let told: Vec<(usize, String)> = faults
+        .into_iter()
+        .map(|fault| match fault.what {
+            PathFaultKind::Empty(why) | PathFaultKind::File(why) => {
+                (fault.path, why.replace(&*folder.0.to_string_lossy(), ""))
+            }
+        })
+        .collect();
+    let expected = [
+        (0, "/types/robot_msgs/msg/Bad.msg:2: a field name expected: letters, digits and `_`, a letter first: `int32 9lives`"),
+        (0, "/types/robot_msgs/msg/Only2.msg:1: bounded types are ROS 2's: `string<=4 x`"),
+        (1, "/empty: no definition files in it"),
+        (2, "/nowhere: No such file or directory (os error 2)"),
+    ]
+    .map(|(path, why)| (path, why.to_owned()));
+    assert_eq!(told, expected);
+    let mut library = Library::new(Registry::bundle(Dialect::Ros1));
+    assert!(
+        library
+            .message(&name("robot_msgs/Good"), &mut files)
+            .is_ok()
+    );
+    let action = library
+        .action(&name("robot_msgs/Turn"), &mut files)
+        .unwrap();
+    assert_eq!(action.goal().leaves()[0].path, "a");
+    assert!(
+        library
+            .file(TextKind::Action, &name("robot_msgs/Turn"))
+            .is_some()
+    );
+}
+
+#[test]
+fn a_single_file_is_of_the_package_around_its_folder() {
+    let folder = Folder::new("single", &[("robot_msgs/msg/Arm.msg", "bool x\n")]);
+    let mut files = TypeFiles::open(
+        &[folder.path("robot_msgs/msg/Arm.msg")],
+        Environment::default(),
+    );
+    for dialect in [Dialect::Ros1, Dialect::Ros2] {
+        assert!(file(&mut files, dialect, TextKind::Message, "robot_msgs/Arm").is_some());
+    }
+}
