@@ -2,6 +2,8 @@
 //!
 //! One task owns everything; [`Ros1Port::recv`](Port::recv) is its only wait.
 
+mod reload;
+
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -195,7 +197,7 @@ impl Ros1Port {
         let Some(source) = self.sources.get_mut(index) else {
             return;
         };
-        let latched_by = source.latched_by(&peer);
+        let latched_by = source.latched_by(&peer, &bytes);
         for (topic, _) in &source.values {
             let payload = bytes.clone();
             self.events.push_back(PortEvent::Sample {
@@ -637,6 +639,11 @@ impl Port for Ros1Port {
         {
             open.publisher.forget_latched(latch_key(instance));
         }
+    }
+
+    fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<String> {
+        self.go_over_to(mapping);
+        Vec::new()
     }
 
     async fn shutdown(self) {

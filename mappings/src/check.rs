@@ -10,6 +10,8 @@ mod shaping;
 mod types;
 mod variables;
 
+use std::sync::Arc;
+
 use crate::diagnostic::{Diagnostic, Severity};
 use crate::document;
 use crate::findings::Findings;
@@ -24,17 +26,42 @@ pub struct Checked {
     pub mapping: Option<Mapping>,
     /// All findings in the order of the text; at most some 200, the last one then tells how many more there are.
     pub findings: Vec<Diagnostic>,
+    /// What was read.
+    pub sources: Vec<Source>,
+}
+
+/// A text that was checked.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Source {
+    /// As findings name it.
+    pub name: Arc<str>,
+    /// As it is in the file.
+    pub text: String,
 }
 
 impl Checked {
     /// Every finding with its source line, then how many there are; empty when there is none. `source` is the text that
-    /// was checked.
+    /// was checked, of a document that includes no other.
     #[must_use]
-    pub fn render(&self, source: &str) -> String {
+    pub fn render<'s>(&'s self, source: &'s str) -> String {
+        self.render_with(|_| source)
+    }
+
+    /// As [`render`](Self::render), with the texts that were read.
+    #[must_use]
+    pub fn render_all(&self) -> String {
+        self.render_with(|found| {
+            let mut sources = self.sources.iter();
+            let source = sources.find(|source| source.name == found.at.file);
+            source.map_or("", |source| source.text.as_str())
+        })
+    }
+
+    fn render_with<'s>(&'s self, source: impl Fn(&Diagnostic) -> &'s str) -> String {
         let mut out: Vec<String> = self
             .findings
             .iter()
-            .map(|found| found.render(source))
+            .map(|found| found.render(source(found)))
             .collect();
         let count = |severity| {
             self.findings
@@ -64,9 +91,14 @@ impl Mapping {
     pub fn from_yaml(text: &str, file: &str) -> Checked {
         let mut findings = Findings::new(file);
         let mapping = compile(text, &mut findings).filter(|_| !findings.has_errors());
+        let sources = vec![Source {
+            name: file.into(),
+            text: text.to_owned(),
+        }];
         Checked {
             mapping,
             findings: findings.into_sorted(),
+            sources,
         }
     }
 }

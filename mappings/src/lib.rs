@@ -3,6 +3,7 @@
 mod check;
 mod code;
 mod diagnostic;
+mod difference;
 mod document;
 mod findings;
 mod mapping;
@@ -13,9 +14,10 @@ mod read;
 mod topic;
 mod tree;
 
-pub use check::Checked;
+pub use check::{Checked, Source};
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
+pub use difference::Difference;
 pub use document::schema;
 pub use mapping::{
     Binding, Endpoint, Mapping, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy, Server,

@@ -182,6 +182,10 @@ impl Port for ServerPort {
         self.space.set_silent(topic, silent);
     }
 
+    fn reload(&mut self, _mapping: &Arc<Mapping>) -> Vec<String> {
+        Vec::new()
+    }
+
     async fn shutdown(mut self) {
         self.handle.cancel();
         if let Some(serving) = &mut self.serving
