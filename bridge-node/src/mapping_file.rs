@@ -1,5 +1,6 @@
 //! The mapping as a file that people edit while the program runs.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::Write as _;
@@ -8,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use mappings::{Checked, Code, Diagnostic, Mapping, Severity};
+use mappings::{Checked, Code, Diagnostic, Mapping, Severity, Surroundings};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use tokio::signal::unix::Signal;
@@ -48,7 +49,10 @@ impl About {
     /// What Prometheus asks for: name and value.
     pub(crate) fn figures(&self) -> [(&'static str, u64); 4] {
         [
-            ("mapping_loaded_seconds", self.loaded.try_into().unwrap_or(0)),
+            (
+                "mapping_loaded_seconds",
+                self.loaded.try_into().unwrap_or(0),
+            ),
             ("mapping_reloads_total", self.reloads),
             ("mapping_refused_total", self.refused),
             ("mapping_stale", u64::from(self.stale.is_some())),
@@ -100,21 +104,63 @@ fn stamp(file: &Path) -> Option<Stamp> {
 /// # Errors
 /// Why the file cannot be read.
 fn read(file: &Path) -> Result<Reading, String> {
-    let files = BTreeMap::from([(file.to_owned(), stamp(file))]);
-    let text = std::fs::read_to_string(file)
-        .map_err(|error| format!("cannot read the mapping {}: {error}", file.display()))?;
-    let checked = Mapping::from_yaml(&text, &file.display().to_string());
+    let disk = Disk::default();
+    let name = file.display().to_string();
+    let text = disk
+        .read(&name)
+        .map_err(|error| format!("cannot read the mapping {name}: {error}"))?;
+    let checked = Mapping::from_text(&text, &name, &disk);
+    let mut all = Sha256::new();
+    for source in &checked.sources {
+        all.update(&source.text);
+        // Where one ends and the next begins.
+        all.update([0]);
+    }
     let mut hash = String::new();
-    for byte in Sha256::digest(&text).iter().take(8) {
+    for byte in all.finalize().iter().take(8) {
         // Writing to a string does not fail.
         let _written = write!(hash, "{byte:02x}");
     }
     Ok(Reading {
-        rendered: checked.render(&text),
+        rendered: checked.render_all(),
         checked,
         hash,
-        files,
+        files: disk.seen.into_inner(),
     })
+}
+
+/// The files and the environment of this process. Remembers each file and folder it was asked for, and how that was
+/// before it was read.
+#[derive(Debug, Default)]
+struct Disk {
+    seen: RefCell<Stamps>,
+}
+
+impl Disk {
+    fn see(&self, path: &str) {
+        let path = PathBuf::from(path);
+        let stamp = stamp(&path);
+        self.seen.borrow_mut().insert(path, stamp);
+    }
+}
+
+impl Surroundings for Disk {
+    fn read(&self, file: &str) -> Result<String, String> {
+        self.see(file);
+        std::fs::read_to_string(file).map_err(|error| error.to_string())
+    }
+
+    fn list(&self, folder: &str) -> Result<Vec<String>, String> {
+        let folder = if folder.is_empty() { "." } else { folder };
+        self.see(folder);
+        let entries = std::fs::read_dir(folder).map_err(|error| error.to_string())?;
+        let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+        Ok(names.collect())
+    }
+
+    fn variable(&self, name: &str) -> Option<String> {
+        std::env::var(name).ok()
+    }
 }
 
 /// The file and the mapping last taken from it.
@@ -215,7 +261,10 @@ impl MappingFile {
                 .map(|file| (file.clone(), stamp(file)))
                 .collect();
             // Written to until just now, or about to be: a file that is saved is gone or empty for a moment.
-            let settled = is == seen && is.get(&file).is_some_and(|at| at.is_some_and(|at| at.len > 0));
+            let settled = is == seen
+                && is
+                    .get(&file)
+                    .is_some_and(|at| at.is_some_and(|at| at.len > 0));
             let wanted = asked || (settled && is != self.files);
             seen = is;
             if !wanted {

@@ -102,7 +102,11 @@ impl<P: Port> Shell<P> {
 
     fn status(&self) -> Status {
         let about = Arc::clone(&self.changes.borrow().about);
-        Status::of((self.program, self.own), &self.router, (&about, &self.restart))
+        Status::of(
+            (self.program, self.own),
+            &self.router,
+            (&about, &self.restart),
+        )
     }
 
     /// Goes over to another mapping, where it is another.

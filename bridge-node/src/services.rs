@@ -197,9 +197,8 @@ impl Services {
         match bound {
             Ok(event) => {
                 let mut takers = self.takers.iter();
-                let answered = takers.any(|(of, takers)| {
-                    takers.contains(&topic) && self.answering.contains(of)
-                });
+                let answered = takers
+                    .any(|(of, takers)| takers.contains(&topic) && self.answering.contains(of));
                 let live = answered.then_some(PortEvent::Live { topic, live: true });
                 std::iter::once(event).chain(live).collect()
             }

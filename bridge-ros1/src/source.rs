@@ -247,7 +247,11 @@ mod tests {
     #[test]
     fn a_latched_publisher_is_gone_when_neither_connected_nor_named() {
         let mut source = source(None);
-        assert_eq!(source.latched_by(&peer(), &Bytes::new()), None, "it does not latch");
+        assert_eq!(
+            source.latched_by(&peer(), &Bytes::new()),
+            None,
+            "it does not latch"
+        );
         let (a, b) = (latching("/a"), latching("/b"));
         source.meet(&a, of("std_msgs/Bool"));
         source.meet(&b, of("std_msgs/Bool"));

@@ -183,7 +183,10 @@ impl Ros2Port {
         let declared = mapping.space(self.own).and_then(|space| space.domain);
         let other = declared.filter(|domain| *domain != self.domain_id);
         let fixed = other.map(|domain| {
-            format!("spaces (space {} in domain {domain}, not {})", self.own, self.domain_id)
+            format!(
+                "spaces (space {} in domain {domain}, not {})",
+                self.own, self.domain_id
+            )
         });
         fixed.into_iter().collect()
     }

@@ -13,11 +13,13 @@ mod variables;
 use std::sync::Arc;
 
 use crate::diagnostic::{Diagnostic, Severity};
-use crate::document;
+use crate::document::Document;
 use crate::findings::Findings;
+use crate::include::Loader;
 use crate::mapping::Mapping;
-use crate::read::{Field, Reader};
-use crate::tree::{self, Place};
+use crate::read::Field;
+use crate::surroundings::{Alone, Surroundings};
+use crate::tree::Place;
 
 /// What a document comes to.
 #[derive(Clone, Debug)]
@@ -85,16 +87,23 @@ impl Checked {
 }
 
 impl Mapping {
-    /// Checks the text of a document. `file` is how the findings name it. Never panics, and takes time and room in
-    /// proportion to the text, of which at most 4 MiB are read.
+    /// Checks the text of a document that stands alone: it includes no other, and no environment variable is set. `file`
+    /// is how the findings name it. Never panics, and takes time and room in proportion to the text, of which at most
+    /// 4 MiB are read.
     #[must_use]
     pub fn from_yaml(text: &str, file: &str) -> Checked {
+        Self::from_text(text, file, &Alone)
+    }
+
+    /// Checks the text of a document and of what it includes. `file` is how the findings name it, and paths within it are
+    /// taken from its folder.
+    #[must_use]
+    pub fn from_text(text: &str, file: &str, around: &dyn Surroundings) -> Checked {
         let mut findings = Findings::new(file);
-        let mapping = compile(text, &mut findings).filter(|_| !findings.has_errors());
-        let sources = vec![Source {
-            name: file.into(),
-            text: text.to_owned(),
-        }];
+        let (document, sources) = Loader::new(around, &mut findings).load(text, file);
+        let mapping = document
+            .map(|document| compile(document, &mut findings))
+            .filter(|_| !findings.has_errors());
         Checked {
             mapping,
             findings: findings.into_sorted(),
@@ -103,18 +112,7 @@ impl Mapping {
     }
 }
 
-fn compile(text: &str, findings: &mut Findings) -> Option<Mapping> {
-    let root = match tree::parse(text) {
-        Ok(root) => root,
-        Err(fault) => {
-            let note = findings.error(fault.code, fault.place, fault.message);
-            if let Some(help) = fault.help {
-                note.help(help);
-            }
-            return None;
-        }
-    };
-    let (document, _) = document::read(&root, &mut Reader::new(findings))?;
+fn compile(document: Document, findings: &mut Findings) -> Mapping {
     let spaces = cell::spaces(document.spaces.as_ref(), findings);
     let namespaces = cell::namespaces(document.namespaces.as_ref(), findings);
     let pubsub = network::pubsub(document.pubsub.as_ref(), findings);
@@ -134,7 +132,7 @@ fn compile(text: &str, findings: &mut Findings) -> Option<Mapping> {
         None => Vec::new(),
     };
     let mapping = Mapping::new(pubsub, spaces.known, namespaces.known, server, variables);
-    Some(mapping.with_patterns(patterns))
+    mapping.with_patterns(patterns)
 }
 
 /// What a document declares.

@@ -96,6 +96,10 @@ codes! {
     Conversion = "M083", "`scale` and `offset` go with a number, `invert` with a Boolean, all of them with one field; `out_of_range` says what becomes of values that a conversion makes too big.";
     LossyConversion = "M084", "The type the value becomes cannot hold all that the other type can, so a number would be rounded or not fit. With `out_of_range` it is rounded; one that does not fit then does not cross and is counted with `refuse`, and becomes the nearest that fits with `clamp`.";
     Publish = "M085", "`deadband` is a number above 0, of values that are numbers; `at_most` a rate as 10 Hz, from 0.001 Hz to 1000 Hz.";
+    Include = "M110", "`include` names files beside the file it stands in, one or a list; in the last part of a path `*` stands for any characters. Each of them can be read, and together they are as one document.";
+    IncludeTwice = "M111", "A file is included once, and not by itself. Includes nest no deeper than 8 and lead to no more than 256 files.";
+    EnvironmentVariable = "M112", "`${NAME}` is the value of an environment variable, `${NAME:-default}` has a default for one that is not set or empty, and `$${` stands for `${` itself.";
+    MergeKey = "M113", "`<<` brings the keys of other maps: of an alias, or of a list of aliases.";
 }
 
 impl fmt::Display for Code {
@@ -118,7 +122,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M085")]
+#[error("no finding has that code; codes are M001 to M113")]
 pub struct UnknownCode;
 
 #[cfg(test)]

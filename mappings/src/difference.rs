@@ -50,11 +50,8 @@ mod tests {
 
     #[test]
     fn variables_are_told_apart_by_their_topics() {
-        let difference = of(&[(1, "A"), (3, "X"), (4, "D")]).difference(&of(&[
-            (1, "A"),
-            (2, "B"),
-            (3, "C"),
-        ]));
+        let difference =
+            of(&[(1, "A"), (3, "X"), (4, "D")]).difference(&of(&[(1, "A"), (2, "B"), (3, "C")]));
         let topic = |id: u16| TopicId::new(1, 2, id).unwrap();
         assert_eq!(
             difference,

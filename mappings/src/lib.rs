@@ -6,13 +6,16 @@ mod diagnostic;
 mod difference;
 mod document;
 mod findings;
+mod include;
 mod mapping;
 mod nearest;
 mod node_id;
 mod pattern;
 mod read;
+mod surroundings;
 mod topic;
 mod tree;
+mod variables;
 
 pub use check::{Checked, Source};
 pub use code::{Code, UnknownCode};
@@ -25,4 +28,5 @@ pub use mapping::{
 };
 pub use node_id::{Identifier, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
+pub use surroundings::Surroundings;
 pub use topic::{Part, SpaceId, TopicError, TopicId};

@@ -101,7 +101,7 @@ impl<'f> Reader<'f> {
             self.wrong(node, wanted);
             return None;
         };
-        let mut first = std::collections::HashMap::new();
+        let mut first: std::collections::HashMap<&str, Place> = std::collections::HashMap::new();
         let mut found = Vec::with_capacity(pairs.len());
         for (key, value) in pairs {
             let Kind::Scalar(text) = &key.kind else {
@@ -109,12 +109,13 @@ impl<'f> Reader<'f> {
                 self.findings.error(Code::WrongValue, key.place, message);
                 continue;
             };
-            if let Some(line) = first.insert(text.as_str(), key.place.line) {
+            if let Some(before) = first.insert(text.as_str(), key.place) {
                 let message = format!("the key `{}` is repeated", short(text));
+                let line = self.findings.line(before, key.place);
                 self.findings
                     .error(Code::DuplicateKey, key.place, message)
-                    .label(format!("first at line {line}"));
-                first.insert(text, line);
+                    .label(format!("first at {line}"));
+                first.insert(text, before);
                 continue;
             }
             found.push(Pair {

@@ -77,7 +77,9 @@ impl Ros1Port {
         let Some(source) = self.sources.get_mut(index) else {
             return;
         };
-        let gone = source.values.extract_if(.., |value| !wanted.contains(value));
+        let gone = source
+            .values
+            .extract_if(.., |value| !wanted.contains(value));
         let gone = gone.map(|(topic, _)| PortEvent::Unbound { topic });
         self.events.extend(gone);
         source.found &= !named;
