@@ -429,7 +429,8 @@ impl Ros1Port {
 
     /// Subscribes a topic that was found in the graph, if somebody publishes it and it is not subscribed.
     fn resubscribe(&mut self, index: usize) {
-        let Some(source) = self.sources.get(index).filter(|s| s.subscription.is_none()) else {
+        let lost = |s: &&Source| s.subscription.is_none() && !s.values.is_empty();
+        let Some(source) = self.sources.get(index).filter(lost) else {
             return;
         };
         let publishers = self.graph.publishers.get(&source.ros_topic);

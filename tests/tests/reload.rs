@@ -16,8 +16,8 @@ use std::{
 use nix::sys::signal::Signal;
 use serde_json::Value;
 use system_tests::{
-    BareNode, Cell, MASTER, METRICS_ROS1, Peer, UadpSocket, eventually, http_get, metrics,
-    string_frame, xml_rpc,
+    BareNode, Cell, MASTER, METRICS_ROS1, Peer, SERVER_ENDPOINT, UadpSocket, eventually, http_get,
+    metrics, string_frame, xml_rpc,
 };
 use uadp::{NetworkMessage, Scalar, Variant};
 
@@ -163,12 +163,10 @@ fn of_500_routes_at_50_hz_only_the_edited_one_notices_the_edit() {
     assert_eq!(system_tests::drops(&status["topics"]), 0, "{status}");
     assert_eq!(status["mapping"]["stale"], Value::Null);
     // The bridge is no longer a subscriber of what it does not read.
-    let graph = xml_rpc(MASTER, "getSystemState", &["/test"]).unwrap();
-    assert_eq!(
-        graph.matches(">/r1<").count(),
-        1,
-        "published, and not subscribed"
-    );
+    eventually("/r1 is published, and not subscribed", SOON, || {
+        let graph = xml_rpc(MASTER, "getSystemState", &["/test"])?;
+        (graph.matches(">/r1<").count() == 1).then_some(())
+    });
 }
 
 #[test]
@@ -230,4 +228,97 @@ fn a_faulty_file_changes_nothing_and_says_why_and_a_mended_one_is_taken() {
     assert_eq!(about("restart_needed"), serde_json::json!(["pubsub.ttl"]));
     let _third = node.publish(&["/r3".to_owned()]);
     bridge.end();
+}
+
+#[test]
+fn bridge_ros2_leaves_the_routes_alone_that_an_edit_does_not_name() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mapping = |first: &str| {
+        mapping(2, first)
+            .replace("{id: 1}", "{id: 2}")
+            .replace("origin: 1", "origin: 2")
+    };
+    let file = cell.file("cell.yaml", &mapping("/r1"));
+    let mut bridge = cell.bridge_ros2(&[file.to_str().unwrap()]);
+    let (heard, ended) = (Arc::default(), Arc::new(AtomicBool::new(false)));
+    let listener = listen(&heard, &ended);
+    let sends = |topic: &str| {
+        let numbered = ["--domain", "2", "--numbered", "60000", "--rate", "50"];
+        cell.cyclone(
+            "ros2_pub.py",
+            &[&[topic, "std_msgs/String"][..], &numbered].concat(),
+        )
+    };
+    let heard_of = |route: u16| {
+        let heard: std::sync::MutexGuard<'_, Heard> = heard.lock().unwrap();
+        heard.get(&route).map_or(0, Vec::len)
+    };
+    let _sends = [sends("/r1"), sends("/r2"), sends("/moved")];
+    eventually("both are heard", SOON, || {
+        (heard_of(1) > 10 && heard_of(2) > 10).then_some(())
+    });
+    save(&file, &mapping("/moved"));
+    bridge.wait_for_line("was read again", SOON);
+    bridge.wait_for_line("unbound topic=ua_2_2_1", SOON);
+    let (one, two) = (heard_of(1), heard_of(2));
+    eventually("both are heard again", SOON, || {
+        (heard_of(1) > one + 10 && heard_of(2) > two + 10).then_some(())
+    });
+    ended.store(true, Ordering::Relaxed);
+    listener.join().unwrap();
+    let lines = bridge.lines();
+    assert!(
+        !lines
+            .iter()
+            .any(|line| line.contains("unbound topic=ua_2_2_2"))
+    );
+    let heard = heard.lock().unwrap();
+    let (first, number) = heard[&2][0];
+    for (sequence, said) in &heard[&2] {
+        let offset = first.wrapping_sub(number);
+        assert_eq!(sequence.wrapping_sub(*said), offset, "{:?}", heard[&2]);
+    }
+    let sequences: Vec<u16> = heard[&1].iter().map(|(sequence, _)| *sequence).collect();
+    assert!(sequences.is_sorted_by(|a, b| a < b), "{sequences:?}");
+}
+
+#[test]
+fn the_server_has_the_nodes_of_the_saved_mapping_and_its_clients_stay() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let part = cell.file("part.yaml", "variables: []\n");
+    let whole = mapping(2, "/r1").replacen("spaces", "include: part.yaml\nspaces", 1);
+    let file = cell.file("cell.yaml", &whole);
+    let mut server = cell.ua_server(&[file.to_str().unwrap()]);
+    let read = |nodes: &[&str]| {
+        let all = [&[SERVER_ENDPOINT], nodes].concat();
+        let answers = cell.asyncua_try("opcua_read.py", &all)?;
+        let status = |answer: &Value| answer["status"].as_str().unwrap().to_owned();
+        Some(answers.iter().map(status).collect::<Vec<String>>())
+    };
+    let (waiting, unknown) = ("BadWaitingForInitialData", "BadNodeIdUnknown");
+    let nodes = ["ns=2;i=1", "ns=2;i=2", "ns=2;i=3"];
+    let before = eventually("the server answers", SOON, || read(&nodes));
+    assert_eq!(before, [waiting, waiting, unknown]);
+
+    // The file that was started with does not change, only what it includes.
+    save(
+        &part,
+        "variables:\n  - {node: ns=2;i=3, name: New, type: Double, origin: 4}\n  - {node: ns=2;i=4, name: Far, \
+         type: Double, origin: 1}\n",
+    );
+    server.wait_for_line("error[M014]", SOON);
+    save(
+        &part,
+        "variables:\n  - {node: ns=2;i=3, name: New, type: Double, origin: 0}\n",
+    );
+    server.wait_for_line("was read again", SOON);
+    assert_eq!(read(&nodes), Some(vec![waiting.to_owned(); 3]));
+    save(&file, &whole.replace("node: ns=2;i=2,", "node: ns=2;i=7,"));
+    server.wait_for_line("unbound topic=ua_1_2_2", SOON);
+    let after = read(&nodes).unwrap();
+    assert_eq!(after, [waiting, unknown, waiting]);
 }

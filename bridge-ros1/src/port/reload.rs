@@ -84,8 +84,10 @@ impl Ros1Port {
         self.events.extend(gone);
         source.found &= !named;
         if source.values.is_empty() {
-            // Its index stays, by which the inbox names it.
-            *source = Source::new(source.ros_topic.clone(), None, Vec::new());
+            // Its index stays, by which the inbox names it; its name is free for another.
+            let ros_topic = source.ros_topic.clone();
+            self.source_of.remove(&ros_topic);
+            *source = Source::new(ros_topic, None, Vec::new());
         }
     }
 

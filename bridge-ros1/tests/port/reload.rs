@@ -178,3 +178,30 @@ variables:
     let later = at_once(&mut cell).await;
     assert_eq!((requests(&asked).len(), later), (before, Vec::new()));
 }
+
+#[tokio::test]
+async fn a_topic_named_in_the_space_crosses_again_when_the_mapping_has_another_use_for_it_no_more()
+{
+    let tied = "spaces: [{id: 1}]\nnamespaces: {2: 'urn:test'}\nvariables:\n  - {node: ns=2;i=7, name: A, origin: 1, \
+                ros: {topic: /a, type: std_msgs/Bool, field: data}}\n";
+    let mut cell = cell(tied);
+    let publishers = ["/a", "/ua_1_2_7"].map(|t| advertise(&cell.node, t, "std_msgs/Bool", true));
+    let [a, named] = &publishers;
+    let _sent = (
+        a.publish(Bytes::from_static(b"\x00")),
+        named.publish(Bytes::from_static(b"\x01")),
+    );
+    event(&mut cell, "ua_1_2_7", "= b\"\\0\"").await;
+    cell.port.reload(&parsed(crate::NOTHING));
+    event(&mut cell, "ua_1_2_7", "unbound").await;
+    event(&mut cell, "ua_1_2_7", "is std_msgs/Bool whole").await;
+    event(&mut cell, "ua_1_2_7", "= b\"\\x01\"").await;
+    cell.port.reload(&parsed(tied));
+    event(&mut cell, "ua_1_2_7", "unbound").await;
+    event(&mut cell, "ua_1_2_7", "= b\"\\0\"").await;
+    run_until(&mut cell.port, "the other is let go", || {
+        named.subscribers() == 0
+    })
+    .await;
+    assert_eq!(a.subscribers(), 1);
+}
