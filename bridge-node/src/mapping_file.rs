@@ -247,7 +247,7 @@ impl MappingFile {
         loop {
             let asked = tokio::select! {
                 Some(()) = hangup.recv() => true,
-                _ = looks.tick() => false,
+                _ = looks.tick(), if self.file.is_some() => false,
             };
             let Some(file) = self.file.clone() else {
                 if asked {
@@ -270,6 +270,8 @@ impl MappingFile {
             if !wanted {
                 continue;
             }
+            // One that cannot be read is told of once.
+            self.files.clone_from(&seen);
             // Elsewhere, since a large one takes longer than a sample should wait.
             let reading = tokio::task::spawn_blocking(move || read(&file)).await;
             let reading = reading.unwrap_or_else(|error| Err(error.to_string()));
@@ -282,15 +284,13 @@ impl MappingFile {
 
     /// Takes what was read, or refuses it; says whether anything is to be told on.
     fn take(&mut self, reading: Result<Reading, String>, asked: bool) -> bool {
-        let Some(file) = &self.file else { return false };
-        let mut about = About::clone(&self.running.about);
+        let Some(file) = self.file.clone() else {
+            return false;
+        };
         let mut reading = match reading {
             Ok(reading) => reading,
             Err(why) => {
-                error!("{why}; what runs stays as it is");
-                about.refused += 1;
-                about.stale = Some(why);
-                self.running.about = Arc::new(about);
+                self.refuse(why);
                 return true;
             }
         };
@@ -301,52 +301,61 @@ impl MappingFile {
         self.hash.clone_from(&reading.hash);
         if reading.checked.mapping.is_some() {
             // What is doubted was told at the start.
-            let _rendered_no_more = reading.leave_to_the_run(file);
+            let _rendered_no_more = reading.leave_to_the_run(&file);
         }
-        for finding in &reading.checked.findings {
-            let help = finding.help.as_ref().map(tracing::field::display);
-            match finding.severity {
-                Severity::Error => error!(help, "{finding}"),
-                Severity::Warning => warn!(help, "{finding}"),
-            }
-        }
-        match reading.checked.mapping {
-            Some(mapping) => {
-                let difference = mapping.difference(&self.running.mapping);
-                info!(
-                    hash = reading.hash,
-                    added = difference.added.len(),
-                    changed = difference.changed.len(),
-                    removed = difference.removed.len(),
-                    same = difference.same,
-                    "{} was read again",
-                    file.display()
-                );
-                about.hash = reading.hash;
-                about.loaded = seconds();
-                about.variables = mapping.variables().len();
-                about.reloads += 1;
-                about.stale = None;
-                self.running.mapping = Arc::new(mapping);
-            }
+        tell(&reading.checked.findings);
+        match &reading.checked.mapping {
+            Some(mapping) => self.adopt(&file, mapping, reading.hash),
             None => {
                 let errors = reading.checked.findings.iter();
                 let errors = errors.filter(|f| f.severity == Severity::Error).count();
-                let why = format!(
-                    "{} cannot run ({errors} error{})",
-                    file.display(),
-                    if errors == 1 { "" } else { "s" }
-                );
-                error!(
-                    running = about.hash,
-                    "{why}: nothing is changed, what runs stays as it is"
-                );
-                about.refused += 1;
-                about.stale = Some(why);
+                let s = if errors == 1 { "" } else { "s" };
+                self.refuse(format!("{} cannot run ({errors} error{s})", file.display()));
             }
         }
-        self.running.about = Arc::new(about);
         true
+    }
+
+    fn refuse(&mut self, why: String) {
+        let about = Arc::make_mut(&mut self.running.about);
+        error!(
+            running = about.hash,
+            "{why}: nothing is changed, what runs stays as it is"
+        );
+        about.refused += 1;
+        about.stale = Some(why);
+    }
+
+    fn adopt(&mut self, file: &Path, mapping: &Mapping, hash: String) {
+        let difference = mapping.difference(&self.running.mapping);
+        info!(
+            hash,
+            added = difference.added.len(),
+            changed = difference.changed.len(),
+            removed = difference.removed.len(),
+            same = difference.same,
+            "{} was read again",
+            file.display()
+        );
+        let about = Arc::make_mut(&mut self.running.about);
+        about.hash = hash;
+        about.loaded = seconds();
+        about.variables = mapping.variables().len();
+        about.reloads += 1;
+        about.stale = None;
+        // A copy, made by this thread: that of the thread that read lies among what it left, whose room would stay taken.
+        self.running.mapping = Arc::new(mapping.clone());
+    }
+}
+
+/// Logs findings, each with what to do about it.
+fn tell(findings: &[Diagnostic]) {
+    for finding in findings {
+        let help = finding.help.as_ref().map(tracing::field::display);
+        match finding.severity {
+            Severity::Error => error!(help, "{finding}"),
+            Severity::Warning => warn!(help, "{finding}"),
+        }
     }
 }
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use bridge_core::{Heard, Notice, Output, Reason, Router};
 use bytes::Bytes;
-use mappings::{Mapping, SpaceId};
+use mappings::{Mapping, SpaceId, TopicId};
 use tokio::sync::watch;
 use tokio::time::{Instant as TokioInstant, Sleep};
 use tracing::{debug, info, warn};
@@ -174,10 +174,7 @@ impl<P: Port> Shell<P> {
                 Ok(()) => info!(%topic, message_type = %message_type.name(), "bound"),
                 Err(error) => warn!(%topic, %error, "the topic cannot cross"),
             },
-            PortEvent::Unbound { topic } => {
-                info!(%topic, "unbound");
-                self.router.unbind(topic, now());
-            }
+            PortEvent::Unbound { topic } => self.unbound(topic),
             PortEvent::Left { topic, publisher } => self.router.left(topic, publisher, now()),
             PortEvent::Live { topic, live } => self.router.set_live(topic, live, now()),
             PortEvent::Lost { topic, why, count } => self.router.lost(topic, count, why),
@@ -187,6 +184,11 @@ impl<P: Port> Shell<P> {
             PortEvent::Ended(why) => return Err(Failure::new(FailureKind::Unavailable, why)),
         }
         Ok(())
+    }
+
+    fn unbound(&mut self, topic: TopicId) {
+        info!(%topic, "unbound");
+        self.router.unbind(topic, now());
     }
 
     /// Carries out what the Router wants done, a bounded number of things; says whether more may wait.

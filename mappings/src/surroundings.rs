@@ -39,7 +39,7 @@ impl Surroundings for Alone {
 
 /// The path of a file as another one names it, without `.` and without `..` where that can be.
 pub(crate) fn beside(file: &str, named: &str) -> String {
-    let folder = Path::new(file).parent().unwrap_or(Path::new(""));
+    let folder = Path::new(file).parent().unwrap_or_else(|| Path::new(""));
     let mut path = PathBuf::new();
     for part in folder.join(named).components() {
         match part {
@@ -49,7 +49,10 @@ pub(crate) fn beside(file: &str, named: &str) -> String {
             {
                 path.pop();
             }
-            part => path.push(part),
+            Component::Prefix(_)
+            | Component::RootDir
+            | Component::ParentDir
+            | Component::Normal(_) => path.push(part),
         }
     }
     path.to_string_lossy().into_owned()

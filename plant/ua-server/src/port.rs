@@ -138,12 +138,7 @@ impl ServerPort {
             runtime: Some(runtime),
             serving: Some(serving),
             writes,
-            live: layout
-                .topics
-                .iter()
-                .map(|node| node.topic)
-                .filter(|topic| topic.space == SpaceId::UA)
-                .collect(),
+            live: written(layout.topics.iter().map(|node| node.topic)).collect(),
             pki: setup.pki,
             look,
         })
@@ -219,8 +214,7 @@ impl Port for ServerPort {
                 self.newest.retain(|topic, _| !gone.contains(topic));
                 self.live.retain(|topic| !gone.contains(topic));
                 self.unbound.extend(gone);
-                let written = new.into_iter().filter(|topic| topic.space == SpaceId::UA);
-                self.live.extend(written);
+                self.live.extend(written(new.into_iter()));
             }
             Err(error) => restart.push(format!("variables ({error})")),
         }
@@ -247,6 +241,11 @@ impl Drop for ServerPort {
             runtime.shutdown_background();
         }
     }
+}
+
+/// Those topics that clients can write.
+fn written(topics: impl Iterator<Item = TopicId>) -> impl Iterator<Item = TopicId> {
+    topics.filter(|topic| topic.space == SpaceId::UA)
 }
 
 /// The server's own threads, and the listener as they take it.

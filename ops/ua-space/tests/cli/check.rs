@@ -130,7 +130,7 @@ fn the_files_a_mapping_includes_and_the_environment_are_looked_at() {
     let name = Path::new(&part).file_name().unwrap().to_str().unwrap();
     let whole = file(
         "whole.yaml",
-        &format!(
+        format!(
             "include: [\"{name}\"]\nspaces: [{{id: 1}}]\nnamespaces: {{2: \"${{NO_SUCH:-urn:x:y}}\"}}\n"
         ),
     );
