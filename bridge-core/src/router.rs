@@ -2,6 +2,7 @@
 
 mod chunks;
 mod receive;
+mod reload;
 
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, HashMap, VecDeque};

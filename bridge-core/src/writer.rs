@@ -207,6 +207,12 @@ impl Writer {
         gave_way
     }
 
+    /// No longer repeats anything.
+    pub(crate) fn keep_nothing(&mut self) {
+        self.kept.clear();
+        self.next = usize::MAX;
+    }
+
     /// No longer repeats the sample of a publisher that has gone.
     pub(crate) fn forget(&mut self, publisher: PublisherKey) {
         let found = self

@@ -8,6 +8,7 @@ mod clock;
 mod definitions;
 mod exit;
 mod logging;
+mod mapping_file;
 mod metrics;
 mod port;
 mod program;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use bridge_core::{Kept, PublisherKey, Reason};
 use bytes::Bytes;
-use mappings::TopicId;
+use mappings::{Mapping, TopicId};
 use messages::{MessageType, Selection};
 use uadp::{BuiltinType, Timestamp};
 
@@ -40,6 +40,11 @@ pub trait Port: Send + 'static {
         let _one_value = (topic, instance);
     }
 
+    /// Another mapping takes the place of the one there is. What both say alike goes on undisturbed; what only the old one
+    /// says is given up ([`PortEvent::Unbound`]), and what only the new one says taken up. Returns what is not changed
+    /// while the program runs, by its keys in the mapping and with the reason, for people.
+    fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<String>;
+
     /// Withdraws every registration and ends. Bounded by 2 s.
     fn shutdown(self) -> impl Future<Output = ()> + Send;
 }
@@ -72,6 +77,11 @@ pub enum PortEvent {
         message_type: Arc<MessageType>,
         /// The part of the message that is the value.
         selection: Selection,
+    },
+    /// The local side no longer has a topic, or will bind it to something else: the mapping has changed.
+    Unbound {
+        /// Which value.
+        topic: TopicId,
     },
     /// A message was received on a topic of our own space.
     Sample {

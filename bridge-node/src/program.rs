@@ -1,16 +1,14 @@
 //! From the command line to the run loop and back: what every program's `main` does.
 
-use std::io::Write as _;
 use std::net::SocketAddr;
-use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 
 use bridge_core::{Local, Router, Settings};
 use clap::Parser;
 use clap::error::ErrorKind;
-use mappings::{Code, Diagnostic, Mapping, PubSub, Severity, SpaceId};
-use tokio::signal::unix::{SignalKind, signal};
+use mappings::{Mapping, PubSub, SpaceId};
+use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::watch;
 use tokio::task::{JoinError, JoinSet};
 use tracing::{Instrument, Span, error, info, info_span};
@@ -19,9 +17,10 @@ use transport::{Options, Udp};
 use crate::arguments::Arguments;
 use crate::exit::{Failure, FailureKind};
 use crate::logging;
+use crate::mapping_file::{MappingFile, Running};
 use crate::metrics::{self, Requests};
 use crate::port::Port;
-use crate::run::Shell;
+use crate::run::{Fixed, Shell};
 
 /// What one program is, for [`run`].
 pub trait Program: Parser {
@@ -77,8 +76,9 @@ pub fn run<P: Program>() -> ExitCode {
         }
     };
     logging::start(program.arguments().log, P::QUIET);
-    let ended = match load(program.arguments()) {
-        Ok(Some(mapping)) => serve(program, Arc::new(mapping)),
+    let arguments = program.arguments();
+    let ended = match MappingFile::open(arguments.mapping.as_deref(), arguments.check) {
+        Ok(Some(mapping)) => serve(program, mapping),
         Ok(None) => Ok(()),
         Err(failure) => Err(failure),
     };
@@ -91,67 +91,7 @@ pub fn run<P: Program>() -> ExitCode {
     }
 }
 
-/// Reads the mapping and prints its findings. `None`: that was all that was asked for.
-fn load(arguments: &Arguments) -> Result<Option<Mapping>, Failure> {
-    let Some(file) = &arguments.mapping else {
-        return Ok((!arguments.check).then(Mapping::default));
-    };
-    let text = std::fs::read_to_string(file).map_err(|error| {
-        Failure::new(
-            FailureKind::Io,
-            format!("cannot read the mapping {}: {error}", file.display()),
-        )
-    })?;
-    let mut checked = type_files::check_mapping(&text, &file.display().to_string());
-    if !arguments.check && checked.mapping.is_some() {
-        leave_to_the_run(&mut checked.findings, file);
-    }
-    let findings = checked.render(&text);
-    // A closed stderr is no reason not to run.
-    let _printed = std::io::stderr().write_all(findings.as_bytes());
-    match checked.mapping {
-        Some(_) if arguments.check => {
-            info!("{} can run", file.display());
-            Ok(None)
-        }
-        Some(mapping) => Ok(Some(mapping)),
-        None => Err(refused(file)),
-    }
-}
-
-/// Types that are not built in are the rule with robots of a make, and what comes of them is told when they are met.
-fn leave_to_the_run(findings: &mut Vec<Diagnostic>, file: &Path) {
-    let before = findings.len();
-    findings.retain(|finding| {
-        let doubtful = finding
-            .help
-            .as_ref()
-            .is_some_and(|help| help.starts_with("did you mean"));
-        finding.severity == Severity::Error
-            || doubtful
-            || !matches!(
-                finding.code,
-                Code::UnknownMessageType | Code::UnknownServiceType
-            )
-    });
-    let left = before - findings.len();
-    if left > 0 {
-        info!(
-            "{left} bindings of {} are of types that are not built in; they are looked at when the definitions are \
-             there (--check names them)",
-            file.display()
-        );
-    }
-}
-
-fn refused(file: &Path) -> Failure {
-    Failure::new(
-        FailureKind::Configuration,
-        format!("{} cannot run, see the findings above", file.display()),
-    )
-}
-
-fn serve<P: Program>(program: P, mapping: Arc<Mapping>) -> Result<(), Failure> {
+fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
     // One thread: the way from the socket to ROS and back has no hand-over, and its state no lock.
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
@@ -159,8 +99,11 @@ fn serve<P: Program>(program: P, mapping: Arc<Mapping>) -> Result<(), Failure> {
         .map_err(|error| Failure::new(FailureKind::Io, format!("cannot start: {error}")))?;
     runtime.block_on(async move {
         let arguments = program.arguments();
-        let spaces = program.spaces(&mapping)?;
+        let running = file.running().clone();
+        let spaces = program.spaces(&running.mapping)?;
         let signal = stopped()?;
+        let hangup = listen(SignalKind::hangup())?;
+        let (changed, changes) = watch::channel(running);
         let mut requests = metrics::serve(arguments.metrics, spaces.len()).await?;
         let several = spaces.len() > 1;
         let (stopping, stop) = watch::channel(false);
@@ -173,8 +116,8 @@ fn serve<P: Program>(program: P, mapping: Arc<Mapping>) -> Result<(), Failure> {
                 Span::none()
             };
             let requests = requests.pop().unwrap_or_else(metrics::never);
-            let shell =
-                prepare(&program, &mapping, (own, several), requests).instrument(span.clone());
+            let shell = prepare(&program, &changes, (own, several), requests);
+            let shell = shell.instrument(span.clone());
             let ended = shell.await?.run(told(stop.clone()));
             // As tasks of their own: waking the future given to `block_on` costs a system call each time.
             shells.spawn(ended.instrument(span));
@@ -183,6 +126,7 @@ fn serve<P: Program>(program: P, mapping: Arc<Mapping>) -> Result<(), Failure> {
         tokio::select! {
             () = signal => {}
             first = shells.join_next() => ended = how(first),
+            () = file.follow(hangup, changed) => {}
         }
         stopping.send_replace(true);
         while let Some(next) = shells.join_next().await {
@@ -195,27 +139,29 @@ fn serve<P: Program>(program: P, mapping: Arc<Mapping>) -> Result<(), Failure> {
 /// What carries one space, ready to run.
 async fn prepare<P: Program>(
     program: &P,
-    mapping: &Arc<Mapping>,
+    changes: &watch::Receiver<Running>,
     (own, several): (SpaceId, bool),
     requests: Requests,
 ) -> Result<Shell<P::Port>, Failure> {
     let arguments = program.arguments();
+    let Running { mapping, about } = changes.borrow().clone();
     info!(
         version = env!("CARGO_PKG_VERSION"),
         space = %own,
         mapping = arguments.mapping.as_ref().map(|file| tracing::field::display(file.display())),
+        hash = about.hash(),
         "{} starts",
         P::NAME
     );
-    let udp = open(arguments, mapping, several)?;
+    let udp = open(arguments, &mapping, several)?;
     let settings = Settings {
         own,
         local: P::LOCAL,
         source: Some(udp.source()),
     };
-    let router = Router::new(settings, Arc::clone(mapping));
+    let router = Router::new(settings, Arc::clone(&mapping));
     let context = Context {
-        mapping: Arc::clone(mapping),
+        mapping: Arc::clone(&mapping),
         own,
     };
     Ok(Shell {
@@ -225,6 +171,13 @@ async fn prepare<P: Program>(
         port: program.start(context).await?,
         udp,
         requests,
+        changes: changes.clone(),
+        fixed: Fixed {
+            started: mapping,
+            address: arguments.address.is_none(),
+            interface: arguments.interface.is_none(),
+        },
+        restart: Vec::new(),
         dry_run: arguments.dry_run,
     })
 }
@@ -273,14 +226,6 @@ fn open(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Udp, 
 
 /// Ready at the first SIGINT or SIGTERM.
 fn stopped() -> Result<impl Future<Output = ()> + Send + 'static, Failure> {
-    let listen = |kind| {
-        signal(kind).map_err(|error| {
-            Failure::new(
-                FailureKind::Io,
-                format!("cannot listen for signals: {error}"),
-            )
-        })
-    };
     let (mut interrupt, mut terminate) = (
         listen(SignalKind::interrupt())?,
         listen(SignalKind::terminate())?,
@@ -290,5 +235,14 @@ fn stopped() -> Result<impl Future<Output = ()> + Send + 'static, Failure> {
             _ = interrupt.recv() => {}
             _ = terminate.recv() => {}
         }
+    })
+}
+
+fn listen(kind: SignalKind) -> Result<Signal, Failure> {
+    signal(kind).map_err(|error| {
+        Failure::new(
+            FailureKind::Io,
+            format!("cannot listen for signals: {error}"),
+        )
     })
 }

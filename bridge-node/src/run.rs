@@ -1,17 +1,20 @@
 //! The run loop: the only place where a bridge waits.
 
 use std::io;
+use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_core::{Heard, Notice, Output, Reason, Router};
 use bytes::Bytes;
-use mappings::SpaceId;
+use mappings::{Mapping, SpaceId, TopicId};
+use tokio::sync::watch;
 use tokio::time::{Instant as TokioInstant, Sleep};
 use tracing::{debug, info, warn};
 use transport::{SendError, Udp};
 
 use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
+use crate::mapping_file::Running;
 use crate::metrics::Requests;
 use crate::port::{Delivery, Port, PortEvent};
 use crate::status::Status;
@@ -24,7 +27,38 @@ pub(crate) struct Shell<P> {
     pub(crate) port: P,
     pub(crate) udp: Udp,
     pub(crate) requests: Requests,
+    pub(crate) changes: watch::Receiver<Running>,
+    pub(crate) fixed: Fixed,
+    /// What of the mapping waits for the next start.
+    pub(crate) restart: Vec<String>,
     pub(crate) dry_run: bool,
+}
+
+/// What of the mapping was decided when the program started.
+#[derive(Debug)]
+pub(crate) struct Fixed {
+    pub(crate) started: Arc<Mapping>,
+    /// Whether the mapping says the address; else the command line does.
+    pub(crate) address: bool,
+    /// Likewise the interface.
+    pub(crate) interface: bool,
+}
+
+impl Fixed {
+    /// The keys of `mapping` that say something else than what runs.
+    fn differing(&self, mapping: &Mapping) -> Vec<String> {
+        let (was, is) = (self.started.pubsub(), mapping.pubsub());
+        let keys = [
+            ("pubsub.address", self.address && was.address != is.address),
+            (
+                "pubsub.interface",
+                self.interface && was.interface != is.interface,
+            ),
+            ("pubsub.ttl", was.ttl != is.ttl),
+        ];
+        let differing = keys.into_iter().filter(|(_, differs)| *differs);
+        differing.map(|(key, _)| key.to_owned()).collect()
+    }
 }
 
 impl<P: Port> Shell<P> {
@@ -58,6 +92,7 @@ impl<P: Port> Shell<P> {
                 heard = self.udp.recv(&mut buffer) => self.heard(heard, &buffer),
                 event = self.port.recv() => self.port_event(event)?,
                 () = timer.as_mut() => self.router.handle_timeout(now()),
+                Ok(()) = self.changes.changed() => self.reload(),
                 // Who asked may have gone; there is nobody else to tell.
                 Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
             }
@@ -66,7 +101,29 @@ impl<P: Port> Shell<P> {
     }
 
     fn status(&self) -> Status {
-        Status::of(self.program, self.own, &self.router)
+        let about = Arc::clone(&self.changes.borrow().about);
+        Status::of(
+            (self.program, self.own),
+            &self.router,
+            (&about, &self.restart),
+        )
+    }
+
+    /// Goes over to another mapping, where it is another.
+    fn reload(&mut self) {
+        let mapping = Arc::clone(&self.changes.borrow_and_update().mapping);
+        if Arc::ptr_eq(&mapping, self.router.mapping()) {
+            return;
+        }
+        self.router.replace_mapping(Arc::clone(&mapping), now());
+        self.restart = self.fixed.differing(&mapping);
+        self.restart.extend(self.port.reload(&mapping));
+        if !self.restart.is_empty() {
+            warn!(
+                "restart needed: {} stay as they were; the rest of the mapping is taken",
+                self.restart.join(", ")
+            );
+        }
     }
 
     fn arm(&self, mut timer: std::pin::Pin<&mut Sleep>) {
@@ -117,6 +174,7 @@ impl<P: Port> Shell<P> {
                 Ok(()) => info!(%topic, message_type = %message_type.name(), "bound"),
                 Err(error) => warn!(%topic, %error, "the topic cannot cross"),
             },
+            PortEvent::Unbound { topic } => self.unbound(topic),
             PortEvent::Left { topic, publisher } => self.router.left(topic, publisher, now()),
             PortEvent::Live { topic, live } => self.router.set_live(topic, live, now()),
             PortEvent::Lost { topic, why, count } => self.router.lost(topic, count, why),
@@ -126,6 +184,11 @@ impl<P: Port> Shell<P> {
             PortEvent::Ended(why) => return Err(Failure::new(FailureKind::Unavailable, why)),
         }
         Ok(())
+    }
+
+    fn unbound(&mut self, topic: TopicId) {
+        info!(%topic, "unbound");
+        self.router.unbind(topic, now());
     }
 
     /// Carries out what the Router wants done, a bounded number of things; says whether more may wait.

@@ -16,7 +16,7 @@ use bytes::Bytes;
 use mappings::{Mapping, Overflow, ServiceRole, SpaceId, TopicId, Trigger, Variable};
 use messages::{Literal, MessageType, NoFields, Plan, Selection, ServiceType, TypeName, Wire};
 use tokio::sync::mpsc;
-use tokio::task::JoinSet;
+use tokio::task::{AbortHandle, JoinSet};
 use tracing::warn;
 use uadp::{BuiltinType, Timestamp};
 
@@ -72,6 +72,9 @@ pub struct Services {
     answering: HashSet<Source>,
     outcomes: mpsc::Receiver<Outcome>,
     report: mpsc::Sender<Outcome>,
+    polls: Vec<Polled>,
+    /// The number of the next poll.
+    next_poll: usize,
     tasks: JoinSet<()>,
 }
 
@@ -81,6 +84,7 @@ struct Callee {
     pending: Arc<Pending>,
     /// Where the request is the same each time: that request, and the value that calls, if not any does.
     constant: Option<(Bytes, Option<Vec<u8>>)>,
+    task: AbortHandle,
 }
 
 /// A service as a binding has it.
@@ -90,8 +94,38 @@ struct Target<'m> {
     timeout: Duration,
 }
 
-/// What makes two polls the same.
-type Polled<'m> = (&'m str, &'m TypeName, &'m Selection, Duration, Duration);
+/// A service that is asked regularly, for all values that are made of what it answers.
+#[derive(Debug)]
+struct Polled {
+    of: usize,
+    /// The binding that it was begun for, apart from what of the response is the value.
+    role: ServiceRole,
+    task: AbortHandle,
+}
+
+impl Polled {
+    /// Whether another binding is served by the same calls.
+    fn serves(&self, other: &ServiceRole) -> bool {
+        let calls = |role: &ServiceRole| match role {
+            ServiceRole::Poll {
+                service,
+                service_type,
+                request,
+                every,
+                timeout,
+                ..
+            } => Some((
+                service.clone(),
+                service_type.clone(),
+                request.clone(),
+                *every,
+                *timeout,
+            )),
+            ServiceRole::Call { .. } | ServiceRole::Answer { .. } => None,
+        };
+        calls(&self.role) == calls(other)
+    }
+}
 
 impl Services {
     /// Starts what the mapping ties to services. Reports the types of the values; a binding that cannot be served is
@@ -109,30 +143,97 @@ impl Services {
             answering: HashSet::new(),
             outcomes,
             report,
+            polls: Vec::new(),
+            next_poll: 0,
             tasks: JoinSet::new(),
         };
+        let events = services.reload(graph, own, (&Mapping::default(), mapping));
+        (services, events)
+    }
+
+    /// Ends what only `before` ties to services and starts what only `after` does; what both have alike goes on.
+    /// Reports the values that are given up, then the types of those taken up; a binding that cannot be served is told
+    /// of.
+    pub fn reload(
+        &mut self,
+        graph: &mut impl ServiceGraph,
+        own: SpaceId,
+        (before, after): (&Mapping, &Mapping),
+    ) -> Vec<PortEvent> {
+        // Those that were ended before.
+        while self.tasks.try_join_next().is_some() {}
+        let kept = |topic: TopicId| is_same(topic, (before, after));
         let mut events = Vec::new();
-        let mut polls: Vec<Polled<'_>> = Vec::new();
-        for (variable, binding) in mapping.services(own) {
-            let bound = match &binding.role {
-                ServiceRole::Call { .. } => services.open_call(graph, variable, &binding.role),
-                ServiceRole::Answer { of, selection } => {
-                    services.take_answers(graph, mapping, variable, (*of, selection))
-                }
-                ServiceRole::Poll { .. } => {
-                    services.open_poll(graph, variable, &binding.role, &mut polls)
-                }
-            };
-            match bound {
-                Ok(event) => events.push(event),
-                Err(error) => warn!(
-                    topic = %variable.topic,
-                    name = variable.name,
-                    "no service is called for this value: {error}"
-                ),
+        for (variable, binding) in before.services(own) {
+            if !kept(variable.topic) {
+                self.close(variable.topic, &binding.role);
+                let topic = variable.topic;
+                events.push(PortEvent::Unbound { topic });
             }
         }
-        (services, events)
+        for (variable, binding) in after.services(own) {
+            if !kept(variable.topic) {
+                events.extend(self.open(graph, after, variable, &binding.role));
+            }
+        }
+        events
+    }
+
+    fn open(
+        &mut self,
+        graph: &mut impl ServiceGraph,
+        mapping: &Mapping,
+        variable: &Variable,
+        role: &ServiceRole,
+    ) -> Vec<PortEvent> {
+        let bound = match role {
+            ServiceRole::Call { .. } => self.open_call(graph, variable, role),
+            ServiceRole::Answer { of, selection } => {
+                self.take_answers(graph, mapping, variable, (*of, selection))
+            }
+            ServiceRole::Poll { .. } => self.open_poll(graph, variable, role),
+        };
+        let topic = variable.topic;
+        match bound {
+            Ok(event) => {
+                let mut takers = self.takers.iter();
+                let answered = takers
+                    .any(|(of, takers)| takers.contains(&topic) && self.answering.contains(of));
+                let live = answered.then_some(PortEvent::Live { topic, live: true });
+                std::iter::once(event).chain(live).collect()
+            }
+            Err(error) => {
+                warn!(%topic, name = variable.name, "no service is called for this value: {error}");
+                Vec::new()
+            }
+        }
+    }
+
+    /// Ends what a value has to do with its service. A call under way is broken off.
+    fn close(&mut self, topic: TopicId, role: &ServiceRole) {
+        match role {
+            ServiceRole::Call { .. } => {
+                if let Some(callee) = self.callers.remove(&topic) {
+                    callee.task.abort();
+                }
+                self.takers.remove(&Source::Value(topic));
+                self.answering.remove(&Source::Value(topic));
+            }
+            ServiceRole::Answer { .. } | ServiceRole::Poll { .. } => {
+                self.takers.retain(|_, takers| {
+                    takers.retain(|taker| *taker != topic);
+                    !takers.is_empty()
+                });
+                let takers = &self.takers;
+                for poll in self
+                    .polls
+                    .extract_if(.., |poll| !takers.contains_key(&Source::Poll(poll.of)))
+                {
+                    poll.task.abort();
+                    self.answering.remove(&Source::Poll(poll.of));
+                }
+            }
+        }
     }
 
     fn open_call<G: ServiceGraph>(
@@ -190,9 +291,13 @@ impl Services {
         let caller = self.caller(graph, &target, of)?;
         let pending = Arc::new(Pending::new(variable.overflow));
         let insist = variable.overflow == Overflow::KeepLatest;
-        self.tasks.spawn(caller.serve(Arc::clone(&pending), insist));
-        self.callers
-            .insert(variable.topic, Callee { pending, constant });
+        let task = self.tasks.spawn(caller.serve(Arc::clone(&pending), insist));
+        let callee = Callee {
+            pending,
+            constant,
+            task,
+        };
+        self.callers.insert(variable.topic, callee);
         Ok(bound)
     }
 
@@ -216,12 +321,11 @@ impl Services {
         Ok(bound(variable.topic, &service_type, selection))
     }
 
-    fn open_poll<'m, G: ServiceGraph>(
+    fn open_poll<G: ServiceGraph>(
         &mut self,
         graph: &mut G,
         variable: &Variable,
-        role: &'m ServiceRole,
-        polls: &mut Vec<Polled<'m>>,
+        role: &ServiceRole,
     ) -> Result<PortEvent, String> {
         let ServiceRole::Poll {
             service,
@@ -235,9 +339,9 @@ impl Services {
             return Err("it has no poll".to_owned());
         };
         let service_type = graph.service_type(name)?;
-        let poll = (service.as_str(), name, request, *every, *timeout);
-        let known = polls.iter().position(|known| *known == poll);
-        let of = Source::Poll(known.unwrap_or(polls.len()));
+        let known = self.polls.iter().find(|known| known.serves(role));
+        let number = known.map_or(self.next_poll, |known| known.of);
+        let of = Source::Poll(number);
         if known.is_none() {
             let request = constant::<G>(service_type.request(), request)?;
             let target = Target {
@@ -246,8 +350,13 @@ impl Services {
                 timeout: *timeout,
             };
             let caller = self.caller(graph, &target, of)?;
-            self.tasks.spawn(caller.poll(request, *every));
-            polls.push(poll);
+            self.next_poll += 1;
+            let polled = Polled {
+                of: number,
+                role: role.clone(),
+                task: self.tasks.spawn(caller.poll(request, *every)),
+            };
+            self.polls.push(polled);
         }
         self.takers.entry(of).or_default().push(variable.topic);
         Ok(bound(variable.topic, &service_type, selection))
@@ -343,6 +452,21 @@ impl Services {
         }
         events
     }
+}
+
+/// Whether a value has the same to do with the same service in both mappings.
+fn is_same(topic: TopicId, (before, after): (&Mapping, &Mapping)) -> bool {
+    let tie = |mapping: &Mapping| {
+        let variable = mapping.variable(topic)?;
+        let service = variable.service.clone()?;
+        Some((service, variable.value_type, variable.overflow))
+    };
+    let (was, is) = (tie(before), tie(after));
+    let of = match is.as_ref().map(|(service, ..)| &service.role) {
+        Some(ServiceRole::Answer { of, .. }) => Some(*of),
+        Some(ServiceRole::Call { .. } | ServiceRole::Poll { .. }) | None => None,
+    };
+    was.is_some() && was == is && of.is_none_or(|of| is_same(of, (before, after)))
 }
 
 fn bound(topic: TopicId, service_type: &ServiceType, selection: &Selection) -> PortEvent {

@@ -7,15 +7,26 @@ use bridge_core::{Counters, Delays, Hop, Router};
 use mappings::SpaceId;
 use serde::Serialize;
 
+use crate::mapping_file::About;
+
 /// A program's counters and delays at one moment.
 #[derive(Debug, Clone, Serialize)]
 pub(crate) struct Status {
     program: &'static str,
     space: u8,
+    mapping: MappingStatus,
     topics: BTreeMap<String, TopicStatus>,
     /// Datagrams and messages that belong to no topic.
     others: TopicStatus,
     hops: BTreeMap<&'static str, HopStatus>,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct MappingStatus {
+    #[serde(flatten)]
+    about: About,
+    /// Its keys that count only after a restart.
+    restart_needed: Vec<String>,
 }
 
 #[derive(Debug, Clone, Serialize)]
@@ -38,7 +49,11 @@ struct HopStatus {
 }
 
 impl Status {
-    pub(crate) fn of(program: &'static str, space: SpaceId, router: &Router) -> Self {
+    pub(crate) fn of(
+        (program, space): (&'static str, SpaceId),
+        router: &Router,
+        (about, restart): (&About, &[String]),
+    ) -> Self {
         let topics = router
             .topics()
             .map(|(topic, counters)| (topic.to_string(), counters.into()))
@@ -50,6 +65,10 @@ impl Status {
         Self {
             program,
             space: space.get(),
+            mapping: MappingStatus {
+                about: about.clone(),
+                restart_needed: restart.to_vec(),
+            },
             topics,
             others: router.others().into(),
             hops,
@@ -81,6 +100,11 @@ impl Status {
             let _written = writeln!(text, "ua_{name}{{{labels}}} {value}");
         };
         let own = format!("program=\"{}\",space=\"{}\"", self.program, self.space);
+        for (name, value) in self.mapping.about.figures() {
+            line(name, &own, &value);
+        }
+        let restart = u8::from(!self.mapping.restart_needed.is_empty());
+        line("mapping_restart_needed", &own, &restart);
         let none = [("none".to_owned(), &self.others)];
         let all = self
             .topics

@@ -2,6 +2,8 @@
 //!
 //! One task owns everything; [`Ros1Port::recv`](Port::recv) is its only wait.
 
+mod reload;
+
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -195,7 +197,7 @@ impl Ros1Port {
         let Some(source) = self.sources.get_mut(index) else {
             return;
         };
-        let latched_by = source.latched_by(&peer);
+        let latched_by = source.latched_by(&peer, &bytes);
         for (topic, _) in &source.values {
             let payload = bytes.clone();
             self.events.push_back(PortEvent::Sample {
@@ -427,7 +429,8 @@ impl Ros1Port {
 
     /// Subscribes a topic that was found in the graph, if somebody publishes it and it is not subscribed.
     fn resubscribe(&mut self, index: usize) {
-        let Some(source) = self.sources.get(index).filter(|s| s.subscription.is_none()) else {
+        let lost = |s: &&Source| s.subscription.is_none() && !s.values.is_empty();
+        let Some(source) = self.sources.get(index).filter(lost) else {
             return;
         };
         let publishers = self.graph.publishers.get(&source.ros_topic);
@@ -642,6 +645,11 @@ impl Port for Ros1Port {
         {
             open.publisher.forget_latched(latch_key(instance));
         }
+    }
+
+    fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<String> {
+        self.go_over_to(mapping);
+        Vec::new()
     }
 
     async fn shutdown(self) {

@@ -81,6 +81,13 @@ impl Sink {
         }
     }
 
+    /// Whether the mapping says the same of both.
+    pub(crate) fn is_like(&self, other: &Self) -> bool {
+        self.ros_topic == other.ros_topic
+            && self.mapped == other.mapped
+            && self.latch == other.latch
+    }
+
     /// The types it could have, best first: the mapping's; what subscribers ask for; the standard type of the value.
     pub(crate) fn candidates(&self, asked_for: Option<&str>) -> Vec<TypeName> {
         if let Some((message_type, _)) = &self.mapped {

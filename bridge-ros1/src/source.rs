@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use bridge_node::PublisherKey;
+use bytes::Bytes;
 use mappings::TopicId;
 use messages::{MessageType, Selection, TypeName};
 use tcpros::{Peer, Subscription};
@@ -36,6 +37,8 @@ pub(crate) struct Source {
 struct LatchedPeer {
     caller_id: String,
     key: PublisherKey,
+    /// What it sent last, for values that come to be made of it.
+    last: Bytes,
     /// How often the graph was looked at since its connection ended.
     looks: u32,
 }
@@ -60,13 +63,14 @@ impl Source {
         }
     }
 
-    /// What a publisher is called to the Router, if it latches. It keeps that name over a lost connection.
-    pub(crate) fn latched_by(&mut self, peer: &Peer) -> Option<PublisherKey> {
+    /// What the publisher of a message is called to the Router, if it latches. It keeps that name over a lost connection.
+    pub(crate) fn latched_by(&mut self, peer: &Peer, message: &Bytes) -> Option<PublisherKey> {
         if !peer.header.latching() {
             return None;
         }
-        let known = self.latched.iter().find(|l| l.caller_id == peer.caller_id);
-        if let Some(known) = known {
+        let mut latched = self.latched.iter_mut();
+        if let Some(known) = latched.find(|l| l.caller_id == peer.caller_id) {
+            known.last.clone_from(message);
             return Some(known.key);
         }
         let key = PublisherKey(self.next_key);
@@ -74,9 +78,15 @@ impl Source {
         self.latched.push(LatchedPeer {
             caller_id: peer.caller_id.clone(),
             key,
+            last: message.clone(),
             looks: 0,
         });
         Some(key)
+    }
+
+    /// The last message of each latched publisher.
+    pub(crate) fn latched(&self) -> impl Iterator<Item = (PublisherKey, &Bytes)> {
+        self.latched.iter().map(|known| (known.key, &known.last))
     }
 
     /// The latched publishers that are not connected and will not be again: the master no longer names them, or their
@@ -237,11 +247,15 @@ mod tests {
     #[test]
     fn a_latched_publisher_is_gone_when_neither_connected_nor_named() {
         let mut source = source(None);
-        assert_eq!(source.latched_by(&peer()), None, "it does not latch");
+        assert_eq!(
+            source.latched_by(&peer(), &Bytes::new()),
+            None,
+            "it does not latch"
+        );
         let (a, b) = (latching("/a"), latching("/b"));
         source.meet(&a, of("std_msgs/Bool"));
         source.meet(&b, of("std_msgs/Bool"));
-        let keys = [&a, &b].map(|peer| source.latched_by(peer).unwrap());
+        let keys = [&a, &b].map(|peer| source.latched_by(peer, &Bytes::new()).unwrap());
         assert_ne!(keys[0], keys[1]);
         assert_eq!(source.gone_for_good(&[]), [], "both are connected");
         source.part(&a, 1);
@@ -249,7 +263,7 @@ mod tests {
         assert_eq!(source.gone_for_good(&named), [], "it may come back");
         let back = latching("/a");
         source.meet(&back, of("std_msgs/Bool"));
-        assert_eq!(source.latched_by(&back), Some(keys[0]));
+        assert_eq!(source.latched_by(&back, &Bytes::new()), Some(keys[0]));
         source.part(&back, 1);
         assert_eq!(source.gone_for_good(&named[1..]), [keys[0]]);
         source.part(&b, 0);

@@ -7,6 +7,7 @@
 mod descriptions;
 mod drops;
 mod reconcile;
+mod reload;
 mod schedule;
 mod services;
 mod strangers;
@@ -68,6 +69,7 @@ pub struct Ros2Port {
     discovery: DomainParticipantStatusListener,
     strangers: Strangers,
     own: SpaceId,
+    domain_id: u16,
     mapping: Arc<Mapping>,
     definitions: Definitions,
     descriptions: Descriptions,
@@ -80,6 +82,8 @@ pub struct Ros2Port {
     inbox: Inbox<usize>,
     /// Services that are called for values.
     services: Services,
+    /// Whose services they are, and who is there.
+    peers: ServicePeers,
     parameters: ParameterServer,
     /// Topics we write.
     sinks: HashMap<TopicId, Sink>,
@@ -140,11 +144,13 @@ impl Ros2Port {
             domain,
             presence,
             own,
+            domain_id: domain_options.domain,
             mapping: Arc::clone(&mapping),
             definitions,
             descriptions: Descriptions::new(peers),
             told_types,
             services,
+            peers,
             parameters,
             graph: Graph::default(),
             sources: Vec::new(),
@@ -179,6 +185,19 @@ impl Ros2Port {
                 self.sinks.insert(variable.topic, sink);
             }
         }
+    }
+
+    /// What a mapping says otherwise that only a start can change.
+    fn fixed(&self, mapping: &Mapping) -> Vec<String> {
+        let declared = mapping.space(self.own).and_then(|space| space.domain);
+        let other = declared.filter(|domain| *domain != self.domain_id);
+        let fixed = other.map(|domain| {
+            format!(
+                "spaces (space {} in domain {domain}, not {})",
+                self.own, self.domain_id
+            )
+        });
+        fixed.into_iter().collect()
     }
 
     /// The index of the source of that topic, made when there is none.
@@ -265,12 +284,12 @@ impl Ros2Port {
                 }
                 let received = now().utc;
                 let stranger = source.strangers.contains(&writer);
+                let payload = payload.into_bytes();
                 let latched_by = if stranger {
                     None
                 } else {
-                    source.latched_by(writer)
+                    source.latched_by(writer, &payload)
                 };
-                let payload = payload.into_bytes();
                 for (topic, _) in &source.values {
                     let topic = *topic;
                     if missing > 0 {
@@ -436,6 +455,12 @@ impl Port for Ros2Port {
         debug!(%topic, silent, "the writer in the space");
     }
 
+    fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<String> {
+        let restart = self.fixed(mapping);
+        self.go_over_to(mapping);
+        restart
+    }
+
     async fn shutdown(self) {
         let Self {
             domain,
@@ -445,13 +470,21 @@ impl Port for Ros2Port {
             sinks,
             retired,
             services,
+            peers,
             parameters,
             descriptions,
             told_types,
             ..
         } = self;
         // They hold the participant.
-        drop((discovery, services, parameters, descriptions, told_types));
+        drop((
+            discovery,
+            services,
+            peers,
+            parameters,
+            descriptions,
+            told_types,
+        ));
         if !domain.leave((inbox, sinks, retired, presence)).await {
             warn!("the DDS endpoints were not disposed in time; peers notice when the lease ends");
         }

@@ -104,6 +104,13 @@ impl Sink {
         }
     }
 
+    /// Whether the mapping says the same of both.
+    pub(crate) fn is_like(&self, other: &Self) -> bool {
+        self.dds_topic == other.dds_topic
+            && self.mapped == other.mapped
+            && self.offered == other.offered
+    }
+
     /// The types it could have, best first: the mapping's; what a subscriber asks for; the standard type of the value.
     pub(crate) fn candidates(&self, readers: &[Endpoint]) -> Vec<TypeName> {
         if let Some((message_type, _)) = &self.mapped {

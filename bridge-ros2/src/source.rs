@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use bridge_node::PublisherKey;
+use bytes::Bytes;
 use mappings::TopicId;
 use messages::{Selection, TypeName};
 use rustdds::{GUID, RTPSEntity};
@@ -23,8 +24,8 @@ pub(crate) struct Source {
     pub(crate) live: bool,
     /// Writers of this topic with another type. RustDDS matches by topic name alone, so their samples come too.
     pub(crate) strangers: BTreeSet<GUID>,
-    /// Transient-local writers that have sent something.
-    latched: BTreeMap<GUID, PublisherKey>,
+    /// Transient-local writers that have sent something, with what they sent last.
+    latched: BTreeMap<GUID, Latched>,
     /// The key for the next of them.
     next_key: u32,
     /// The writers there are that are transient-local.
@@ -32,6 +33,13 @@ pub(crate) struct Source {
     /// Transient-local writers that have sent something and gone. One that comes back, as after the network was out for
     /// longer than its lease, is to be read again.
     lapsed: BTreeSet<GUID>,
+}
+
+/// A transient-local writer that has sent something.
+#[derive(Debug)]
+struct Latched {
+    key: PublisherKey,
+    last: Bytes,
 }
 
 /// What there is of a reader.
@@ -59,8 +67,8 @@ impl Source {
         }
     }
 
-    /// What a writer is called to the Router, if it is transient-local.
-    pub(crate) fn latched_by(&mut self, writer: GUID) -> Option<PublisherKey> {
+    /// What the writer of a sample is called to the Router, if it is transient-local.
+    pub(crate) fn latched_by(&mut self, writer: GUID, sample: &Bytes) -> Option<PublisherKey> {
         let Reading::Open { requested, .. } = self.reading else {
             return None;
         };
@@ -69,22 +77,31 @@ impl Source {
             return None;
         }
         let next_key = &mut self.next_key;
-        let key = self.latched.entry(writer).or_insert_with(|| {
+        let latched = self.latched.entry(writer).or_insert_with(|| {
             let key = PublisherKey(*next_key);
             *next_key = next_key.wrapping_add(1);
-            key
+            Latched {
+                key,
+                last: Bytes::new(),
+            }
         });
-        Some(*key)
+        latched.last.clone_from(sample);
+        Some(latched.key)
+    }
+
+    /// The last sample of each transient-local writer, for values that come to be made of it.
+    pub(crate) fn latched(&self) -> impl Iterator<Item = (PublisherKey, &Bytes)> {
+        self.latched.values().map(|known| (known.key, &known.last))
     }
 
     /// The transient-local writers that have gone; `writers` are there.
     pub(crate) fn gone(&mut self, writers: &[Endpoint]) -> Vec<PublisherKey> {
         let mut gone = Vec::new();
         let lapsed = &mut self.lapsed;
-        self.latched.retain(|guid, key| {
+        self.latched.retain(|guid, latched| {
             let there = writers.iter().any(|writer| writer.guid == *guid);
             if !there {
-                gone.push(*key);
+                gone.push(latched.key);
                 lapsed.insert(*guid);
             }
             there

@@ -10,17 +10,20 @@ mod shaping;
 mod types;
 mod variables;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use std::sync::Arc;
 
 use messages::{DefinitionTexts, Dialect, NoTexts, TypeName};
 
 use crate::code::Code;
 use crate::diagnostic::{Diagnostic, Severity};
-use crate::document;
+use crate::document::Document;
 use crate::findings::Findings;
+use crate::include::Loader;
 use crate::mapping::Mapping;
-use crate::read::{At, Field, Reader};
-use crate::tree::{self, Place};
+use crate::read::{At, Field};
+use crate::surroundings::{Alone, Surroundings};
+use crate::tree::Place;
 
 use self::types::Types;
 
@@ -33,6 +36,8 @@ pub struct Checked {
     pub findings: Vec<Diagnostic>,
     /// The message types that were looked for, and what was found.
     pub types: Vec<TypeUse>,
+    /// What was read.
+    pub sources: Vec<Source>,
 }
 
 /// A message or service type that a mapping names.
@@ -57,7 +62,7 @@ pub enum TypeOrigin {
     Unknown,
 }
 
-/// Definition files, as [`Mapping::from_yaml_with`] needs them.
+/// Definition files, as [`Surroundings::types`] opens them.
 pub trait TypeFiles: DefinitionTexts {
     /// What is wrong with the `type_paths`; asked once.
     fn faults(&mut self) -> Vec<PathFault>;
@@ -87,15 +92,38 @@ pub enum PathFaultKind {
     File(String),
 }
 
+/// A text that was checked.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Source {
+    /// As findings name it.
+    pub name: Arc<str>,
+    /// As it is in the file.
+    pub text: String,
+}
+
 impl Checked {
     /// Every finding with its source line, then how many there are; empty when there is none. `source` is the text that
-    /// was checked.
+    /// was checked, of a document that includes no other.
     #[must_use]
-    pub fn render(&self, source: &str) -> String {
+    pub fn render<'s>(&'s self, source: &'s str) -> String {
+        self.render_with(|_| source)
+    }
+
+    /// As [`render`](Self::render), with the texts that were read.
+    #[must_use]
+    pub fn render_all(&self) -> String {
+        self.render_with(|found| {
+            let mut sources = self.sources.iter();
+            let source = sources.find(|source| source.name == found.at.file);
+            source.map_or("", |source| source.text.as_str())
+        })
+    }
+
+    fn render_with<'s>(&'s self, source: impl Fn(&Diagnostic) -> &'s str) -> String {
         let mut out: Vec<String> = self
             .findings
             .iter()
-            .map(|found| found.render(source))
+            .map(|found| found.render(source(found)))
             .collect();
         let count = |severity| {
             self.findings
@@ -119,34 +147,27 @@ impl Checked {
 }
 
 impl Mapping {
-    /// Checks the text of a document. `file` is how the findings name it. Never panics, and takes time and room in
-    /// proportion to the text, of which at most 4 MiB are read.
+    /// Checks the text of a document that stands alone: it includes no other, and no environment variable is set. `file`
+    /// is how the findings name it. Never panics, and takes time and room in proportion to the text, of which at most
+    /// 4 MiB are read.
     #[must_use]
     pub fn from_yaml(text: &str, file: &str) -> Checked {
-        Self::from_yaml_with(text, file, |_| Box::new(NoTexts))
+        Self::from_text(text, file, &Alone)
     }
 
-    /// As [`from_yaml`](Self::from_yaml), with the definitions of files besides those built in. `open` is given the
-    /// document's `type_paths`, those that are relative below the folder of `file`.
+    /// Checks the text of a document and of what it includes. `file` is how the findings name it, and paths within it are
+    /// taken from its folder.
     #[must_use]
-    pub fn from_yaml_with(
-        text: &str,
-        file: &str,
-        open: impl FnOnce(&[PathBuf]) -> Box<dyn TypeFiles>,
-    ) -> Checked {
+    pub fn from_text(text: &str, file: &str, around: &dyn Surroundings) -> Checked {
         let mut findings = Findings::new(file);
-        let folder = Path::new(file).parent().unwrap_or_else(|| Path::new(""));
+        let (document, sources) = Loader::new(around, &mut findings).load(text, file);
         let mut used = Vec::new();
-        let open = |paths: &[String]| {
-            let paths: Vec<PathBuf> = paths.iter().map(|path| folder.join(path)).collect();
-            let files = open(&paths);
-            (paths, files)
-        };
-        let mapping = compile(text, &mut findings, open, &mut used);
+        let mapping = document.map(|document| compile(document, around, &mut findings, &mut used));
         Checked {
             mapping: mapping.filter(|_| !findings.has_errors()),
             findings: findings.into_sorted(),
             types: used,
+            sources,
         }
     }
 }
@@ -155,7 +176,7 @@ impl Mapping {
 fn type_paths(
     entries: &Field<Vec<At<String>>>,
     findings: &mut Findings,
-) -> (Vec<String>, Vec<Place>) {
+) -> (Vec<PathBuf>, Vec<Place>) {
     let entries = entries.as_ref().and_then(|at| at.value.as_deref());
     let entries = entries.unwrap_or_default();
     if let Some(first) = entries.get(MAX_TYPE_PATHS) {
@@ -178,6 +199,7 @@ fn type_paths(
             }
             !path.is_empty()
         })
+        .map(|(path, place)| (PathBuf::from(path), place))
         .unzip()
 }
 
@@ -198,24 +220,13 @@ fn note_faults(faults: Vec<PathFault>, places: &[Place], findings: &mut Findings
 }
 
 fn compile(
-    text: &str,
+    document: Document,
+    around: &dyn Surroundings,
     findings: &mut Findings,
-    open: impl FnOnce(&[String]) -> (Vec<PathBuf>, Box<dyn TypeFiles>),
     used: &mut Vec<TypeUse>,
-) -> Option<Mapping> {
-    let root = match tree::parse(text) {
-        Ok(root) => root,
-        Err(fault) => {
-            let note = findings.error(fault.code, fault.place, fault.message);
-            if let Some(help) = fault.help {
-                note.help(help);
-            }
-            return None;
-        }
-    };
-    let (document, _) = document::read(&root, &mut Reader::new(findings))?;
+) -> Mapping {
     let (paths, places) = type_paths(&document.type_paths, findings);
-    let (type_paths, mut files) = open(&paths);
+    let mut files = around.types(&paths);
     note_faults(files.faults(), &places, findings);
     let mut types = Types::new(files);
     let spaces = cell::spaces(document.spaces.as_ref(), findings);
@@ -238,7 +249,7 @@ fn compile(
     };
     let mapping = Mapping::new(pubsub, spaces.known, namespaces.known, server, variables);
     *used = types.used();
-    Some(mapping.with_patterns(patterns).with_type_paths(type_paths))
+    mapping.with_patterns(patterns).with_type_paths(paths)
 }
 
 /// Most entries of `type_paths`.

@@ -100,6 +100,10 @@ codes! {
     DefinitionFile = "M101", "A definition file does not parse, in the ROS it is of. It counts as not there, and all others count.";
     DefinitionsDiffer = "M102", "A definition in a file differs from the one that is built in under its name. The file counts. Where peers have the other one, ROS 1 refuses the connection, and ROS 2 messages are misread unless type hashes are announced.";
     VersionsDiffer = "M103", "The message types of two bindings of one variable have different fields, beyond what ROS 2 renamed. Fields cross by their place in the message, so two of another name may be something else.";
+    Include = "M110", "`include` names files beside the file it stands in, one or a list; in the last part of a path `*` stands for any characters. Each of them can be read, and together they are as one document.";
+    IncludeTwice = "M111", "A file is included once, and not by itself. Includes nest no deeper than 8 and lead to no more than 256 files.";
+    EnvironmentVariable = "M112", "`${NAME}` is the value of an environment variable, `${NAME:-default}` has a default for one that is not set or empty, and `$${` stands for `${` itself.";
+    MergeKey = "M113", "`<<` brings the keys of other maps: of an alias, or of a list of aliases.";
 }
 
 impl fmt::Display for Code {
@@ -122,7 +126,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M103")]
+#[error("no finding has that code; codes are M001 to M113")]
 pub struct UnknownCode;
 
 #[cfg(test)]

@@ -13,6 +13,9 @@ document! {
     /// One cell: its ROS spaces, its OPC UA nodes, and which ROS topic is which node.
     #[schemars(title = "UA bridge mapping")]
     struct Document {
+        /// Files that belong to this one as if they stood here, one path or a list, from the folder of this file. `*` in the
+        /// last part stands for any characters, as in robots/*.yaml.
+        include: Includes,
         /// The ROS sides of the cell. The OPC UA side is space 0 and always there.
         spaces: Vec<At<SpaceEntry>>,
         /// Folders with ROS packages, or single files, whose definitions (.msg, .srv, .action, .idl) count before those built in;
@@ -336,6 +339,38 @@ impl JsonSchema for Request {
     }
 }
 
+/// One path or a list of them.
+#[derive(Clone, Debug)]
+pub(crate) struct Includes(pub(crate) Vec<At<String>>);
+
+impl Read for Includes {
+    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+        match &node.kind {
+            Kind::List(_) => Vec::read(node, reader).map(Self),
+            Kind::Scalar(_) => Some(Self(vec![reader.at(node)])),
+            Kind::Null | Kind::Map(_) => {
+                reader.wrong(node, "a path such as `robots.yaml`, or a list of them");
+                None
+            }
+        }
+    }
+}
+
+impl JsonSchema for Includes {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "Includes".into()
+    }
+
+    fn json_schema(generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        let one = generator.subschema_for::<String>();
+        schemars::json_schema!({ "anyOf": [one, { "type": "array", "items": one }] })
+    }
+}
+
 /// One binding or a list of them.
 #[derive(Clone, Debug)]
 pub(crate) struct Bindings(pub(crate) Vec<At<BindingEntry>>);
@@ -428,10 +463,11 @@ fn found(node: &Node) -> String {
     }
 }
 
-/// Reads the whole document; an empty one is one without any key.
-pub(crate) fn read(root: &Node, reader: &mut Reader<'_>) -> Option<(Document, Place)> {
-    if matches!(root.kind, Kind::Null) {
-        let document = Document {
+impl Default for Document {
+    /// Without any key.
+    fn default() -> Self {
+        Self {
+            include: None,
             spaces: None,
             type_paths: None,
             pubsub: None,
@@ -439,8 +475,14 @@ pub(crate) fn read(root: &Node, reader: &mut Reader<'_>) -> Option<(Document, Pl
             namespaces: None,
             variables: None,
             patterns: None,
-        };
-        return Some((document, root.place));
+        }
+    }
+}
+
+/// Reads the whole document; an empty one is one without any key.
+pub(crate) fn read(root: &Node, reader: &mut Reader<'_>) -> Option<(Document, Place)> {
+    if matches!(root.kind, Kind::Null) {
+        return Some((Document::default(), root.place));
     }
     Some((Document::read(root, reader)?, root.place))
 }

@@ -5,16 +5,22 @@ use std::sync::Arc;
 
 use crate::code::Code;
 use crate::diagnostic::{Diagnostic, Severity, Span};
+use crate::read::short;
 use crate::tree::Place;
 
 /// Most findings that are kept; the rest is counted.
 const MAX: usize = 200;
 
 pub(crate) struct Findings {
-    file: Arc<str>,
-    found: Vec<Diagnostic>,
+    /// By the numbers their places have.
+    files: Vec<Arc<str>>,
+    found: Vec<(u16, Diagnostic)>,
     /// An alias brings a node, and what is wrong with it, to several places.
     seen: HashSet<(Code, Place, String)>,
+    /// Values that are not there, so that nothing can be said of them.
+    unknown: HashSet<Place>,
+    /// Values out of the environment, which are nobody's to read, and what stands for them.
+    secrets: Vec<(String, String)>,
     errors: usize,
     left_out: usize,
 }
@@ -22,11 +28,48 @@ pub(crate) struct Findings {
 impl Findings {
     pub(crate) fn new(file: &str) -> Self {
         Self {
-            file: file.into(),
+            files: vec![file.into()],
             found: Vec::new(),
             seen: HashSet::new(),
+            unknown: HashSet::new(),
+            secrets: Vec::new(),
             errors: 0,
             left_out: 0,
+        }
+    }
+
+    /// Takes in another file and gives its number; `None` when there are too many.
+    pub(crate) fn file(&mut self, name: &str) -> Option<u16> {
+        let number = u16::try_from(self.files.len()).ok()?;
+        self.files.push(name.into());
+        Some(number)
+    }
+
+    pub(crate) fn name(&self, file: u16) -> Arc<str> {
+        self.files
+            .get(usize::from(file))
+            .cloned()
+            .unwrap_or_default()
+    }
+
+    /// Where something is, told at another place: `line 6`, and of which file if that is another.
+    pub(crate) fn line(&self, of: Place, at: Place) -> String {
+        if of.file == at.file {
+            format!("line {}", of.line)
+        } else {
+            format!("line {} of {}", of.line, self.name(of.file))
+        }
+    }
+
+    /// Nothing else is said of what stands there.
+    pub(crate) fn is_unknown(&mut self, place: Place) {
+        self.unknown.insert(place);
+    }
+
+    /// Does not let `value` be read in what is told: `written` stands for it.
+    pub(crate) fn hide(&mut self, value: String, written: String) {
+        if value != written && !value.is_empty() {
+            self.secrets.push((value, written));
         }
     }
 
@@ -53,6 +96,9 @@ impl Findings {
         if severity == Severity::Error {
             self.errors += 1;
         }
+        if self.unknown.contains(&place) {
+            return Note(None);
+        }
         if self.found.len() >= MAX {
             self.left_out += 1;
             return Note(None);
@@ -60,37 +106,56 @@ impl Findings {
         if !self.seen.insert((code, place, message.clone())) {
             return Note(None);
         }
-        let Place { line, column, len } = place;
+        let Place {
+            file,
+            line,
+            column,
+            len,
+        } = place;
         let at = Span {
-            file: Arc::clone(&self.file),
+            file: self.name(file),
             line,
             column,
             len,
         };
-        self.found.push(Diagnostic {
+        let found = Diagnostic {
             code,
             severity,
             at,
             message,
             label: None,
             help: None,
-        });
-        Note(self.found.last_mut())
+        };
+        self.found.push((file, found));
+        Note(self.found.last_mut().map(|(_, found)| found))
     }
 
     pub(crate) const fn has_errors(&self) -> bool {
         self.errors > 0
     }
 
-    /// In the order of the text.
+    /// In the order of the files and their texts.
     pub(crate) fn into_sorted(mut self) -> Vec<Diagnostic> {
         self.found
-            .sort_by_key(|found| (found.at.line, found.at.column, found.code));
+            .sort_by_key(|(file, found)| (*file, found.at.line, found.at.column, found.code));
+        let mut all: Vec<Diagnostic> = self.found.into_iter().map(|(_, found)| found).collect();
+        // The longest first, of which another may be a part.
+        self.secrets
+            .sort_by_key(|(value, _)| std::cmp::Reverse(value.len()));
+        for found in &mut all {
+            let texts = [&mut found.label, &mut found.help];
+            let texts = texts.into_iter().flatten().chain([&mut found.message]);
+            for text in texts {
+                *text = hidden(text, &self.secrets);
+            }
+        }
         if self.left_out > 0 {
             let message = format!("{} more findings are not shown", self.left_out);
-            let Place { line, column, len } = Place::START;
+            let Place {
+                line, column, len, ..
+            } = Place::START;
             let at = Span {
-                file: self.file,
+                file: self.files.into_iter().next().unwrap_or_default(),
                 line,
                 column,
                 len,
@@ -101,7 +166,7 @@ impl Findings {
                 Severity::Warning
             };
             let (label, help) = (None, Some("mend the first ones and check again".to_owned()));
-            self.found.push(Diagnostic {
+            all.push(Diagnostic {
                 code: Code::TooLarge,
                 severity,
                 at,
@@ -110,9 +175,27 @@ impl Findings {
                 help,
             });
         }
-        self.found
+        all
     }
 }
+
+/// A text without the values in it. A short one is only taken out where it stands by itself: elsewhere it is a word like
+/// another.
+fn hidden(text: &str, secrets: &[(String, String)]) -> String {
+    let mut text = text.to_owned();
+    for (value, written) in secrets {
+        let cut = short(value);
+        if value.len() >= TELLING {
+            text = text.replace(value.as_str(), written).replace(&cut, written);
+        } else {
+            text = text.replace(&format!("`{value}`"), &format!("`{written}`"));
+        }
+    }
+    text
+}
+
+/// From so many bytes on a value does not occur in a finding by chance.
+const TELLING: usize = 8;
 
 /// The finding just made; nothing when it was one too many or known already.
 pub(crate) struct Note<'f>(Option<&'f mut Diagnostic>);

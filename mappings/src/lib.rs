@@ -3,19 +3,24 @@
 mod check;
 mod code;
 mod diagnostic;
+mod difference;
 mod document;
 mod findings;
+mod include;
 mod mapping;
 mod nearest;
 mod node_id;
 mod pattern;
 mod read;
+mod surroundings;
 mod topic;
 mod tree;
+mod variables;
 
-pub use check::{Checked, PathFault, PathFaultKind, TypeFiles, TypeOrigin, TypeUse};
+pub use check::{Checked, PathFault, PathFaultKind, Source, TypeFiles, TypeOrigin, TypeUse};
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
+pub use difference::Difference;
 pub use document::schema;
 pub use mapping::{
     Binding, Endpoint, Mapping, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy, Server,
@@ -23,4 +28,5 @@ pub use mapping::{
 };
 pub use node_id::{Identifier, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
+pub use surroundings::Surroundings;
 pub use topic::{Part, SpaceId, TopicError, TopicId};

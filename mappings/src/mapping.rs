@@ -17,7 +17,7 @@ use crate::topic::{SpaceId, TopicId};
 ///
 /// `Mapping::default()` is zero configuration: the PubSub defaults, no space declared (each ROS 2 space is then the
 /// DDS domain of its number), no variable.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Mapping {
     pubsub: PubSub,
     spaces: Vec<Space>,

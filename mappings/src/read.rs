@@ -1,6 +1,7 @@
 //! Tree -> values. Every fault is noted and reading goes on beside it.
 
 use std::borrow::Cow;
+use std::collections::HashMap;
 use std::rc::Rc;
 
 use schemars::{JsonSchema, Schema, SchemaGenerator};
@@ -12,6 +13,9 @@ use crate::tree::{Kind, Node, Place};
 
 /// Most nodes that are read: an alias may lead to one node many times.
 const MAX_READ: usize = 2_000_000;
+
+/// Keys of a map that are told apart without a table.
+const FEW: usize = 16;
 
 /// A value and its place in the text.
 #[derive(Clone, Debug)]
@@ -97,24 +101,43 @@ impl<'f> Reader<'f> {
 
     /// The pairs of a map whose keys are texts, each key once.
     pub(crate) fn pairs<'n>(&mut self, node: &'n Node, wanted: &str) -> Option<Vec<Pair<'n>>> {
+        self.pairs_of(node, || wanted.to_owned())
+    }
+
+    /// As [`pairs`](Self::pairs), for what takes long to say.
+    fn pairs_of<'n>(
+        &mut self,
+        node: &'n Node,
+        wanted: impl FnOnce() -> String,
+    ) -> Option<Vec<Pair<'n>>> {
         let Kind::Map(pairs) = &node.kind else {
-            self.wrong(node, wanted);
+            self.wrong(node, &wanted());
             return None;
         };
-        let mut first = std::collections::HashMap::new();
-        let mut found = Vec::with_capacity(pairs.len());
+        let mut found: Vec<Pair<'n>> = Vec::with_capacity(pairs.len());
+        // Of a few keys a look at each is quicker.
+        let mut first: HashMap<&str, Place> = HashMap::new();
         for (key, value) in pairs {
             let Kind::Scalar(text) = &key.kind else {
                 let message = format!("expected a key, found {}", key.kind.name());
                 self.findings.error(Code::WrongValue, key.place, message);
                 continue;
             };
-            if let Some(line) = first.insert(text.as_str(), key.place.line) {
+            let before = if pairs.len() <= FEW {
+                let known = found.iter().find(|pair| pair.key == text);
+                known.map(|pair| pair.place)
+            } else {
+                first.insert(text, key.place)
+            };
+            if let Some(before) = before {
                 let message = format!("the key `{}` is repeated", short(text));
+                let line = self.findings.line(before, key.place);
                 self.findings
                     .error(Code::DuplicateKey, key.place, message)
-                    .label(format!("first at line {line}"));
-                first.insert(text, line);
+                    .label(format!("first at {line}"));
+                if pairs.len() > FEW {
+                    first.insert(text, before);
+                }
                 continue;
             }
             found.push(Pair {
@@ -133,9 +156,8 @@ impl<'f> Reader<'f> {
         keys: [&'static str; N],
     ) -> Option<[Option<&'n Node>; N]> {
         let mut values = [None; N];
-        for Pair { key, place, value } in
-            self.pairs(node, &format!("a map with {}", list(&keys)))?
-        {
+        let wanted = || format!("a map with {}", list(&keys));
+        for Pair { key, place, value } in self.pairs_of(node, wanted)? {
             if let Some((_, slot)) = keys
                 .iter()
                 .zip(&mut values)

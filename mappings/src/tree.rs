@@ -1,17 +1,19 @@
 //! YAML text -> a tree of nodes that know their place. Says nothing about what the nodes mean.
 //!
 //! Anchors and aliases are read: an alias shares the node it names, it is never copied, so a document of nested aliases
-//! takes no more room than its text. Merge keys (`<<`) are ordinary keys, and tags are refused.
+//! takes no more room than its text. The pairs of a merge key (`<<`) are shared likewise, and counted. `${NAME}` in a
+//! scalar is the value of an environment variable. Tags are refused.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::rc::Rc;
 
 use granit_parser::{Event, Parser, ScalarStyle, ScanError, Span as Marks};
 
 use crate::code::Code;
+use crate::variables;
 
 /// Largest text, in bytes.
-const MAX_BYTES: usize = 4 * 1024 * 1024;
+pub(crate) const MAX_BYTES: usize = 4 * 1024 * 1024;
 /// Most nodes a text may hold.
 const MAX_NODES: usize = 500_000;
 /// Deepest nesting, aliases followed.
@@ -20,6 +22,8 @@ const MAX_DEPTH: usize = 24;
 /// Where in the text, counted from 1 in lines and characters, within one line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(crate) struct Place {
+    /// In the order in which files are read; 0 is the document itself.
+    pub(crate) file: u16,
     pub(crate) line: usize,
     pub(crate) column: usize,
     pub(crate) len: usize,
@@ -28,6 +32,7 @@ pub(crate) struct Place {
 impl Place {
     /// The beginning of the text.
     pub(crate) const START: Self = Self {
+        file: 0,
         line: 1,
         column: 1,
         len: 1,
@@ -41,6 +46,9 @@ pub(crate) struct Node {
     depth: usize,
 }
 
+/// Keys and values.
+type Pairs = Vec<(Rc<Node>, Rc<Node>)>;
+
 #[derive(Debug)]
 pub(crate) enum Kind {
     /// Nothing, `~` or `null`.
@@ -48,7 +56,7 @@ pub(crate) enum Kind {
     Scalar(String),
     List(Vec<Rc<Node>>),
     /// In the order of the text, repeated keys included.
-    Map(Vec<(Rc<Node>, Rc<Node>)>),
+    Map(Pairs),
 }
 
 impl Kind {
@@ -72,8 +80,32 @@ pub(crate) struct Fault {
     pub(crate) help: Option<&'static str>,
 }
 
-/// The root node; null when the text holds comments only.
-pub(crate) fn parse(text: &str) -> Result<Rc<Node>, Fault> {
+/// A text as a tree.
+pub(crate) struct Tree {
+    /// Null when the text holds comments only.
+    pub(crate) root: Rc<Node>,
+    /// What is wrong with references to variables; the texts they stand in are as written.
+    pub(crate) faults: Vec<Fault>,
+    /// Values of variables, and what stands for them in the text.
+    pub(crate) values: Vec<(String, String)>,
+}
+
+/// Reads the text of a file, whose number all places have. `variable` looks up the environment.
+pub(crate) fn parse(
+    text: &str,
+    file: u16,
+    variable: &dyn Fn(&str) -> Option<String>,
+) -> Result<Tree, Fault> {
+    read(text, variable, file).map_err(|fault| Fault {
+        place: Place {
+            file,
+            ..fault.place
+        },
+        ..fault
+    })
+}
+
+fn read(text: &str, variable: &dyn Fn(&str) -> Option<String>, file: u16) -> Result<Tree, Fault> {
     if text.len() > MAX_BYTES {
         let message = format!(
             "the document has {} bytes; at most {MAX_BYTES} are read",
@@ -92,7 +124,16 @@ pub(crate) fn parse(text: &str) -> Result<Rc<Node>, Fault> {
         flow_nesting_limit: MAX_DEPTH,
         block_nesting_limit: MAX_DEPTH
     };
-    let mut builder = Builder::default();
+    let mut builder = Builder {
+        open: Vec::new(),
+        anchors: HashMap::new(),
+        root: None,
+        documents: 0,
+        nodes: 0,
+        faults: Vec::new(),
+        values: Vec::new(),
+        variable,
+    };
     for event in Parser::new_from_str_with_options(text, options) {
         let (event, marks) = event.map_err(|error| syntax(text, &error))?;
         if let Some(tag) = event.tag() {
@@ -104,24 +145,38 @@ pub(crate) fn parse(text: &str) -> Result<Rc<Node>, Fault> {
                 Some("leave the tag out; the key says what its value is"),
             ));
         }
-        builder.event(event, place(text, marks))?;
+        let place = Place {
+            file,
+            ..place(text, marks)
+        };
+        builder.event(event, place)?;
     }
-    Ok(builder.root.unwrap_or_else(|| {
+    let root = builder.root.unwrap_or_else(|| {
         Rc::new(Node {
-            place: Place::START,
+            place: Place {
+                file,
+                ..Place::START
+            },
             kind: Kind::Null,
             depth: 0,
         })
-    }))
+    });
+    Ok(Tree {
+        root,
+        faults: builder.faults,
+        values: builder.values,
+    })
 }
 
-#[derive(Default)]
-struct Builder {
+struct Builder<'v> {
     open: Vec<Open>,
     anchors: HashMap<usize, Rc<Node>>,
     root: Option<Rc<Node>>,
     documents: usize,
     nodes: usize,
+    faults: Vec<Fault>,
+    values: Vec<(String, String)>,
+    variable: &'v dyn Fn(&str) -> Option<String>,
 }
 
 /// A list or map whose end has not come.
@@ -132,7 +187,7 @@ struct Open {
     children: Vec<Rc<Node>>,
 }
 
-impl Builder {
+impl Builder<'_> {
     fn event(&mut self, event: Event<'_>, place: Place) -> Result<(), Fault> {
         match event {
             Event::DocumentStart(..) => {
@@ -148,13 +203,10 @@ impl Builder {
                 Ok(())
             }
             Event::Scalar(text, style, anchor, _) => {
+                let text = self.expand(text.into_owned(), place);
                 let null = style == ScalarStyle::Plain
                     && matches!(&*text, "" | "~" | "null" | "Null" | "NULL");
-                let kind = if null {
-                    Kind::Null
-                } else {
-                    Kind::Scalar(text.into_owned())
-                };
+                let kind = if null { Kind::Null } else { Kind::Scalar(text) };
                 self.close(anchor, place, kind, 0)
             }
             Event::SequenceStart(_, anchor, _) => {
@@ -216,11 +268,70 @@ impl Builder {
             while let (Some(key), Some(value)) = (children.next(), children.next()) {
                 pairs.push((key, value));
             }
-            Kind::Map(pairs)
+            Kind::Map(self.merge(pairs))
         } else {
             Kind::List(open.children)
         };
         self.close(open.anchor, open.place, kind, depth)
+    }
+
+    /// A scalar with the values of the variables it names.
+    fn expand(&mut self, text: String, place: Place) -> String {
+        if !text.contains("${") {
+            return text;
+        }
+        match variables::expand(&text, self.variable) {
+            Ok((expanded, values)) => {
+                self.values.extend(values);
+                expanded
+            }
+            Err((message, help)) => {
+                self.faults.push(Fault {
+                    code: Code::EnvironmentVariable,
+                    place,
+                    message,
+                    help: Some(help),
+                });
+                text
+            }
+        }
+    }
+
+    /// The pairs of a map with those its merge keys bring: of a key that stands in the map itself that value, else that of
+    /// the first map that has it.
+    fn merge(&mut self, pairs: Pairs) -> Pairs {
+        let is_merge = |(key, _): &(Rc<Node>, Rc<Node>)| matches!(&key.kind, Kind::Scalar(text) if text == "<<");
+        if !pairs.iter().any(is_merge) {
+            return pairs;
+        }
+        let (merges, mut own): (Pairs, Pairs) = pairs.into_iter().partition(is_merge);
+        let mut known: HashSet<String> = own.iter().filter_map(|(key, _)| name(key)).collect();
+        for (_, value) in merges {
+            let maps = match &value.kind {
+                Kind::List(maps) => maps.clone(),
+                Kind::Map(_) | Kind::Scalar(_) | Kind::Null => vec![Rc::clone(&value)],
+            };
+            for map in maps {
+                let Kind::Map(brought) = &map.kind else {
+                    self.faults.push(Fault {
+                        code: Code::MergeKey,
+                        place: map.place,
+                        message: format!("`<<` takes the keys of a map, found {}", map.kind.name()),
+                        help: Some(
+                            "<<: *name, or <<: [*one, *other], of maps with &name and so on",
+                        ),
+                    });
+                    continue;
+                };
+                for (key, value) in brought {
+                    if name(key).is_some_and(|name| known.insert(name)) {
+                        self.nodes += 1;
+                        own.push((Rc::clone(key), Rc::clone(value)));
+                    }
+                }
+            }
+        }
+        own
     }
 
     fn close(
@@ -257,6 +368,13 @@ impl Builder {
             message,
             help: None,
         })
+    }
+}
+
+fn name(key: &Node) -> Option<String> {
+    match &key.kind {
+        Kind::Scalar(text) => Some(text.clone()),
+        Kind::Null | Kind::List(_) | Kind::Map(_) => None,
     }
 }
 
@@ -298,6 +416,7 @@ fn place(text: &str, marks: Marks) -> Place {
             .count()
     };
     Place {
+        file: 0,
         line: start.line().max(1),
         column: start.col() + 1,
         len: len.max(1),
@@ -307,6 +426,10 @@ fn place(text: &str, marks: Marks) -> Place {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn parse(text: &str) -> Result<Rc<Node>, Fault> {
+        super::parse(text, 0, &|_| None).map(|tree| tree.root)
+    }
     use proptest::prelude::*;
 
     fn map(node: &Node) -> Vec<(&str, &Node)> {
@@ -323,7 +446,12 @@ mod tests {
     }
 
     fn at(line: usize, column: usize, len: usize) -> Place {
-        Place { line, column, len }
+        Place {
+            file: 0,
+            line,
+            column,
+            len,
+        }
     }
 
     #[test]

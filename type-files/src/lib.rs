@@ -12,7 +12,7 @@ use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use mappings::{Checked, Mapping, PathFault, PathFaultKind};
+use mappings::{PathFault, PathFaultKind, Surroundings};
 use messages::{
     DefinitionError, DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName,
     check_text,
@@ -58,11 +58,46 @@ impl Environment {
     }
 }
 
-/// Checks the text of a mapping with the definitions its `type_paths` and the environment have.
-#[must_use]
-pub fn check_mapping(text: &str, file: &str) -> Checked {
-    Mapping::from_yaml_with(text, file, |paths| {
+/// What is beside a mapping on this host: files, definitions, and the environment of this process.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Disk;
+
+impl Surroundings for Disk {
+    fn read(&self, file: &str) -> Result<String, String> {
+        read_mapping(file)
+    }
+
+    fn list(&self, folder: &str) -> Result<Vec<String>, String> {
+        let folder = if folder.is_empty() { "." } else { folder };
+        let entries = std::fs::read_dir(folder).map_err(|error| error.to_string())?;
+        let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+        Ok(names.collect())
+    }
+
+    fn variable(&self, name: &str) -> Option<String> {
+        std::env::var(name).ok()
+    }
+
+    fn types(&self, paths: &[PathBuf]) -> Box<dyn mappings::TypeFiles> {
         Box::new(TypeFiles::open(paths, Environment::from_env()))
+    }
+}
+
+/// A file that is no longer than a mapping may be, or its beginning, which has a finding (M002).
+fn read_mapping(file: &str) -> Result<String, String> {
+    let mut text = Vec::new();
+    let file = File::open(file).map_err(|error| error.to_string())?;
+    let length = file
+        .take(MOST_OF_A_MAPPING)
+        .read_to_end(&mut text)
+        .map_err(|error| error.to_string())?;
+    if u64::try_from(length).is_ok_and(|length| length == MOST_OF_A_MAPPING) {
+        // It may end within a character.
+        return Ok(String::from_utf8_lossy(&text).into_owned());
+    }
+    String::from_utf8(text).map_err(|error| {
+        let at = error.utf8_error().valid_up_to();
+        format!("it is not UTF-8 from byte {at} on; save it as UTF-8")
     })
 }
 
@@ -236,6 +271,8 @@ fn read(path: &Path) -> std::io::Result<String> {
 
 const ROS_PACKAGE_PATH: &str = "ROS_PACKAGE_PATH";
 const AMENT_PREFIX_PATH: &str = "AMENT_PREFIX_PATH";
+/// More than a mapping may have.
+const MOST_OF_A_MAPPING: u64 = 8 << 20;
 /// More than any definition has.
 const MOST_BYTES: u64 = 1 << 20;
 /// Faults that are told; more are of one cause.

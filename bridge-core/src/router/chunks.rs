@@ -44,6 +44,11 @@ impl Chunks {
         }
     }
 
+    /// Whether some message is not complete.
+    pub(super) const fn is_open(&self) -> bool {
+        self.reassembler.held() > 0
+    }
+
     /// When the oldest one has waited long enough.
     pub(super) fn due(&self) -> Option<Instant> {
         Some(self.start + self.reassembler.poll_timeout()?)

@@ -2,6 +2,7 @@
 
 #![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
 
+mod reload;
 mod services;
 
 use std::future::Future;
@@ -38,14 +39,10 @@ fn cell(mapping: &str) -> Cell {
         options.advertise_as("127.0.0.1");
         options
     };
-    let checked = Mapping::from_yaml(mapping, "test.yaml");
-    let mapping = checked
-        .mapping
-        .unwrap_or_else(|| panic!("{:?}", checked.findings));
     let port = Ros1Port::start(PortOptions {
         node: options("bridge"),
         own: SpaceId::ROS1,
-        mapping: Arc::new(mapping),
+        mapping: parsed(mapping),
         packages: Vec::new(),
     })
     .unwrap();
@@ -55,6 +52,14 @@ fn cell(mapping: &str) -> Cell {
         node,
         port,
     }
+}
+
+fn parsed(mapping: &str) -> Arc<Mapping> {
+    let checked = Mapping::from_yaml(mapping, "test.yaml");
+    let mapping = checked
+        .mapping
+        .unwrap_or_else(|| panic!("{:?}", checked.findings));
+    Arc::new(mapping)
 }
 
 const NOTHING: &str = "spaces:\n  - {id: 1}\n";
@@ -146,6 +151,7 @@ fn line(event: &PortEvent) -> String {
         }
         PortEvent::Sample { topic, payload, .. } => format!("{topic} = {payload:?}"),
         PortEvent::Live { topic, live } => format!("{topic} live {live}"),
+        PortEvent::Unbound { topic } => format!("{topic} unbound"),
         PortEvent::Left { topic, .. } => format!("{topic} left"),
         PortEvent::Unmatched { topic } => format!("{topic} unmatched"),
         PortEvent::Dropped { reason, why, count } => format!("{count} {} {why}", reason.label()),

@@ -30,7 +30,11 @@ const FINE: &[u8] = &[1, 2, 0, 0, 0, b'o', b'k'];
 const A_WHILE: Duration = Duration::from_millis(1500);
 
 /// A service of the robot, and the requests it has had.
-fn offer(node: &Node, service: &str, name: &str) -> (ServiceServer, Arc<Mutex<Vec<Bytes>>>) {
+pub(crate) fn offer(
+    node: &Node,
+    service: &str,
+    name: &str,
+) -> (ServiceServer, Arc<Mutex<Vec<Bytes>>>) {
     let found = Registry::bundle(Dialect::Ros1)
         .service(&name.parse().unwrap())
         .unwrap();
@@ -51,7 +55,7 @@ fn offer(node: &Node, service: &str, name: &str) -> (ServiceServer, Arc<Mutex<Ve
 }
 
 /// The next event whose line has both parts.
-async fn event(cell: &mut Cell, topic: &str, part: &str) -> String {
+pub(crate) async fn event(cell: &mut Cell, topic: &str, part: &str) -> String {
     within(&format!("{topic} {part}"), async {
         loop {
             let line = line(&cell.port.recv().await);

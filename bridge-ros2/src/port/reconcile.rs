@@ -180,7 +180,9 @@ impl Ros2Port {
     }
 
     fn reconcile_source(&mut self, index: usize, now: Instant) {
-        let Some(source) = self.sources.get_mut(index) else {
+        // Without a value it is one that the mapping no longer names.
+        let sources = self.sources.get_mut(index);
+        let Some(source) = sources.filter(|source| !source.values.is_empty()) else {
             return;
         };
         let writers = self.graph.writers(&source.dds_topic);

@@ -98,7 +98,7 @@ impl<'c> Bindings<'c> {
     ) -> Bound {
         let mut found: Vec<Found> = Vec::new();
         let mut service: Option<Service> = None;
-        let mut spaces: HashMap<SpaceId, usize> = HashMap::new();
+        let mut spaces: HashMap<SpaceId, Place> = HashMap::new();
         let entries = entries
             .and_then(|at| at.value.as_ref())
             .map_or(&[][..], |bindings| &bindings.0);
@@ -106,12 +106,13 @@ impl<'c> Bindings<'c> {
             let Some(entry) = &at.value else { continue };
             let (space, place) = self.space(entry, at.place, subject, findings);
             if let Some(space) = space
-                && let Some(line) = spaces.insert(space, place.line)
+                && let Some(first) = spaces.insert(space, place)
             {
+                let line = findings.line(first, place);
                 let message = format!("the variable is bound twice in space {space}");
                 let note = findings
                     .error(Code::BindingTwice, place, message)
-                    .label(format!("first at line {line}"));
+                    .label(format!("first at {line}"));
                 note.help("one topic per space: a second one is a second variable");
                 continue;
             }
@@ -441,7 +442,7 @@ fn selection(
 }
 
 fn conflict(first: &Use, other: &Use, topic: &str, findings: &mut Findings) {
-    let label = format!("first at line {}", first.place.line);
+    let label = format!("first at {}", findings.line(first.place, other.place));
     if first.reads != other.reads {
         let message = format!("{topic} is read for one variable and written for another");
         let note = findings
@@ -627,6 +628,7 @@ fn differences(found: &[Found], findings: &mut Findings) {
     let shape =
         |fields: &[Leaf]| -> Vec<ValueType> { fields.iter().map(types::value_type).collect() };
     for (other, others) in known {
+        let line = findings.line(first.place, other.place);
         if differ_as_bytes(&first.binding, &other.binding) {
             let (a, b) = (&first.binding, &other.binding);
             let message = format!(
@@ -634,7 +636,7 @@ fn differences(found: &[Found], findings: &mut Findings) {
                 a.message_type, a.space, b.message_type, b.space
             );
             let note = findings.error(Code::BindingsDiffer, other.place, message);
-            note.label(format!("differs from line {}", first.place.line))
+            note.label(format!("differs from {line}"))
                 .help("bytes cross as they are: only topics of one type and of one ROS can both have them");
         }
         if shape(fields) == shape(others) {
@@ -662,14 +664,13 @@ fn differences(found: &[Found], findings: &mut Findings) {
             ),
         };
         let note = findings.error(Code::BindingsDiffer, other.place, message);
-        let label = format!("differs from line {}", first.place.line);
         let several = fields.len() > 1 || others.len() > 1;
         let sides = several.then(|| sides((first, fields), (other, others)));
         let help = match sides.flatten() {
             Some(sides) => format!("{sides}; bind fields of one type on both sides"),
             None => "bind fields of one type on both sides".to_owned(),
         };
-        note.label(label).help(help);
+        note.label(format!("differs from {line}")).help(help);
     }
 }
 

@@ -37,22 +37,24 @@ pub(super) fn spaces(
             declared.partial = true;
             continue;
         };
-        if let Some(line) = ids.insert(id, place.line) {
+        if let Some(first) = ids.insert(id, place) {
+            let line = findings.line(first, place);
             let note = findings.error(
                 Code::SpaceTwice,
                 place,
                 format!("space {id} is declared twice"),
             );
-            note.label(format!("first at line {line}"));
+            note.label(format!("first at {line}"));
             continue;
         }
         let (domain, place) = domain(entry, id, place, findings);
         if let Some(domain) = domain
-            && let Some((other, line)) = domains.insert(domain, (id, place.line))
+            && let Some((other, first)) = domains.insert(domain, (id, place))
         {
+            let line = findings.line(first, place);
             let message = format!("spaces {other} and {id} are both in DDS domain {domain}");
             let note = findings.error(Code::DomainTwice, place, message);
-            note.label(format!("space {other} at line {line}"))
+            note.label(format!("space {other} at {line}"))
                 .help("give one of them a `domain` of its own");
         }
         declared.known.push(Space { id, domain });
@@ -130,7 +132,8 @@ pub(super) fn namespaces(
         return declared;
     };
     declared.partial = entries.value.is_none();
-    let mut uris: BTreeMap<&str, (u16, usize)> = BTreeMap::new();
+    let mut uris: BTreeMap<&str, (u16, Place)> = BTreeMap::new();
+    let mut places: BTreeMap<u16, Place> = BTreeMap::new();
     for (index, uri) in entries.value.iter().flatten() {
         let (Some(number), Some(text)) = (index.value, uri.value.as_deref()) else {
             declared.partial = true;
@@ -153,17 +156,22 @@ pub(super) fn namespaces(
                 .error(Code::Namespace, uri.place, message)
                 .help("for example urn:my-plant:line-1");
         }
-        if let Some((other, line)) = uris.insert(text, (number, index.place.line)) {
+        if let Some((other, first)) = uris.insert(text, (number, index.place)) {
+            let line = findings.line(first, uri.place);
             let message = format!("namespaces {other} and {number} have one URI");
             findings
                 .error(Code::Namespace, uri.place, message)
-                .label(format!("first at line {line}"));
+                .label(format!("first at {line}"));
         }
-        if declared.known.insert(number, text.to_owned()).is_some() {
+        let first = places.insert(number, index.place);
+        declared.known.insert(number, text.to_owned());
+        if let Some(first) = first {
+            let line = findings.line(first, index.place);
             let message = format!("namespace {number} is declared twice");
             findings
                 .error(Code::Namespace, index.place, message)
-                .help("01 and 1 are one index");
+                .label(format!("first at {line}"))
+                .help("each index once; 01 and 1 are one index");
         }
     }
     declared

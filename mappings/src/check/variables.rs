@@ -258,37 +258,40 @@ fn why_alias(node: &NodeIdText) -> &'static str {
 }
 
 fn unique(drafts: &[Draft<'_>], findings: &mut Findings) {
-    let mut nodes: HashMap<&NodeIdText, usize> = HashMap::new();
-    let mut topics: HashMap<TopicId, usize> = HashMap::new();
-    let mut names: HashMap<(u16, &str), usize> = HashMap::new();
+    let mut nodes: HashMap<&NodeIdText, Place> = HashMap::new();
+    let mut topics: HashMap<TopicId, Place> = HashMap::new();
+    let mut names: HashMap<(u16, &str), Place> = HashMap::new();
     for draft in drafts {
         let Some((node, place)) = &draft.node else {
             continue;
         };
         let text = node.to_string();
         if let Some((name, place)) = given(&draft.entry.name)
-            && let Some(line) = names.insert((node.namespace, name), place.line)
+            && let Some(first) = names.insert((node.namespace, name), place)
         {
             let message = format!(
                 "two variables of namespace {} are named `{}`",
                 node.namespace,
                 short(name)
             );
+            let line = findings.line(first, place);
             let note = findings.warning(Code::NameTwice, place, message);
-            note.label(format!("first at line {line}"));
+            note.label(format!("first at {line}"));
         }
         // Two variables of one node have one topic too, where the origin is the same: one finding is enough.
-        if let Some(line) = nodes.insert(node, place.line) {
+        if let Some(first) = nodes.insert(node, *place) {
+            let line = findings.line(first, *place);
             let note = findings.error(
                 Code::NodeTwice,
                 *place,
                 format!("node `{}` has two variables", short(&text)),
             );
-            note.label(format!("first at line {line}"))
+            note.label(format!("first at {line}"))
                 .help("one node, one origin: give one of them another node");
         } else if let Some(topic) = draft.topic()
-            && let Some(line) = topics.insert(topic, place.line)
+            && let Some(first) = topics.insert(topic, *place)
         {
+            let line = findings.line(first, *place);
             let place = draft
                 .entry
                 .alias
@@ -299,7 +302,7 @@ fn unique(drafts: &[Draft<'_>], findings: &mut Findings) {
                 place,
                 format!("`{topic}` is mapped twice"),
             );
-            note.label(format!("first at line {line}"))
+            note.label(format!("first at {line}"))
                 .help("give one of them another alias");
         }
     }

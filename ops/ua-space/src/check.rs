@@ -2,7 +2,7 @@
 
 use std::io::{self, BufWriter, Read as _, Write as _};
 
-use mappings::{Checked, Diagnostic, TypeOrigin, TypeUse};
+use mappings::{Checked, Diagnostic, Mapping, TypeOrigin, TypeUse};
 use messages::Dialect;
 use serde::Serialize;
 
@@ -15,14 +15,14 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
     for file in &arguments.files {
         let text = read(file)?;
         let name = if file == "-" { "<stdin>" } else { file };
-        let checked = type_files::check_mapping(&text, name);
+        let checked = Mapping::from_text(&text, name, &Disk);
         all_can_run &= checked.mapping.is_some();
         if arguments.json {
             let line = serde_json::to_string(&Told::of(name, &checked))
                 .map_err(|error| Failure::Data(format!("{name}: {error}")))?;
             writeln!(out, "{line}")?;
         } else {
-            out.write_all(checked.render(&text).as_bytes())?;
+            out.write_all(checked.render_all().as_bytes())?;
             writeln!(out, "{}", sum(name, &checked))?;
         }
     }
@@ -52,6 +52,26 @@ fn read(file: &str) -> Result<String, Failure> {
             "cannot read {file}: it is not UTF-8 from byte {at} on; save it as UTF-8"
         ))
     })
+}
+
+/// The files beside a mapping, and the environment of this process.
+struct Disk;
+
+impl Surroundings for Disk {
+    fn read(&self, file: &str) -> Result<String, String> {
+        read(file).map_err(|error| error.to_string())
+    }
+
+    fn list(&self, folder: &str) -> Result<Vec<String>, String> {
+        let folder = if folder.is_empty() { "." } else { folder };
+        let entries = std::fs::read_dir(folder).map_err(|error| error.to_string())?;
+        let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
+        Ok(names.collect())
+    }
+
+    fn variable(&self, name: &str) -> Option<String> {
+        std::env::var(name).ok()
+    }
 }
 
 /// What there is, in a line.
@@ -108,6 +128,9 @@ impl<'a> Type<'a> {
 
 #[derive(Serialize)]
 struct Finding<'a> {
+    /// Where it is not the file that was asked about, but one that it includes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    file: Option<&'a str>,
     code: &'static str,
     severity: String,
     line: usize,
@@ -125,15 +148,20 @@ impl<'a> Told<'a> {
         Self {
             file,
             can_run: checked.mapping.is_some(),
-            findings: checked.findings.iter().map(Finding::of).collect(),
+            findings: checked
+                .findings
+                .iter()
+                .map(|found| Finding::of(file, found))
+                .collect(),
             types: checked.types.iter().map(Type::of).collect(),
         }
     }
 }
 
 impl<'a> Finding<'a> {
-    fn of(found: &'a Diagnostic) -> Self {
+    fn of(file: &str, found: &'a Diagnostic) -> Self {
         Self {
+            file: Some(&*found.at.file).filter(|name| *name != file),
             code: found.code.as_str(),
             severity: found.severity.to_string(),
             line: found.at.line,

@@ -16,7 +16,7 @@ pub(crate) struct Layout {
 }
 
 /// The nodes of one topic.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) struct TopicNode {
     pub(crate) topic: TopicId,
     pub(crate) node: NodeId,
@@ -28,7 +28,7 @@ pub(crate) struct TopicNode {
 }
 
 /// The node of one field of a DataSet.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub(crate) struct FieldNode {
     pub(crate) node: NodeId,
     pub(crate) name: String,
@@ -83,6 +83,33 @@ impl Layout {
         )
     }
 
+    /// The nodes of another mapping in a server that runs with these namespaces; and what of it a server only takes when it
+    /// starts, for people.
+    ///
+    /// # Errors
+    /// A node that cannot be there with the others.
+    pub(crate) fn within(
+        running: &[String],
+        mapping: &Mapping,
+    ) -> Result<(Self, Vec<String>), LayoutError> {
+        let others = mapping
+            .namespaces()
+            .iter()
+            .filter(|(index, uri)| running.get(usize::from(**index)) != Some(*uri));
+        let others: Vec<u16> = others.map(|(index, _)| *index).collect();
+        let topics = mapping.variables().iter().map(TopicNode::of);
+        let is_here = |topic: &TopicNode| !others.contains(&topic.node.namespace);
+        let layout = Self {
+            namespaces: running.to_vec(),
+            topics: topics.filter(is_here).collect(),
+        };
+        layout.check()?;
+        let restart = others
+            .iter()
+            .map(|index| format!("namespaces ({index} and its nodes)"));
+        Ok((layout, restart.collect()))
+    }
+
     /// Gives every namespace its index and checks that the nodes can be there together.
     ///
     /// Indexes that the mapping skips are filled, since the NamespaceArray has no holes.
@@ -98,9 +125,15 @@ impl Layout {
             namespaces: namespace_array(application_uri, wanted)?,
             topics,
         };
+        layout.check()?;
+        Ok(layout)
+    }
+
+    /// Whether the nodes can be there together.
+    fn check(&self) -> Result<(), LayoutError> {
         let mut taken = HashSet::new();
-        for topic in &layout.topics {
-            let known = usize::from(topic.node.namespace) < layout.namespaces.len();
+        for topic in &self.topics {
+            let known = usize::from(topic.node.namespace) < self.namespaces.len();
             if topic.node.namespace == 0 || !known {
                 return Err(LayoutError::NoUri {
                     topic: topic.topic,
@@ -117,7 +150,7 @@ impl Layout {
                 }
             }
         }
-        Ok(layout)
+        Ok(())
     }
 }
 

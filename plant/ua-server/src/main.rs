@@ -85,6 +85,7 @@ impl Program for UaServer {
             url,
             pki,
             trust_any_client: self.trust_any_client_certificate,
+            mapped_url: self.endpoint.is_none(),
         };
         ServerPort::start(&context.mapping, setup)
     }

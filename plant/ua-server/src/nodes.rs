@@ -4,6 +4,7 @@
 //! while it is held but the subscriptions: a write leaves through a bounded channel.
 
 use std::collections::{HashMap, HashSet};
+use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
@@ -34,12 +35,13 @@ pub(crate) type SpaceManager = InMemoryNodeManager<SpaceNodes>;
 /// Serves the nodes of the space.
 pub(crate) struct SpaceNodes {
     namespaces: Vec<NamespaceMetadata>,
-    topics: Vec<TopicNode>,
-    /// Where the value of a node is: the topic's place in `topics`, and the field's, if it is a component.
-    places: HashMap<NodeId, (usize, Option<usize>)>,
+    /// Whose value a node has, and the place of the field, if it is a component.
+    places: RwLock<Places>,
     exits: Exits,
     unfiltered: Mutex<HashSet<MonitoredItemHandle>>,
 }
+
+type Places = HashMap<NodeId, (Arc<TopicNode>, Option<usize>)>;
 
 /// What leaves the node manager.
 #[derive(Clone)]
@@ -81,26 +83,53 @@ impl SpaceNodes {
             }
         }
         add_folders(layout, address_space);
-        let mut places = HashMap::new();
-        for (at, topic) in layout.topics.iter().enumerate() {
+        let mut places = Places::new();
+        for topic in &layout.topics {
             add_topic(address_space, topic, &origin_folder(topic.topic.space));
-            places.insert(topic.node.clone(), (at, None));
-            if topic.compound {
-                places.extend(
-                    topic
-                        .fields
-                        .iter()
-                        .enumerate()
-                        .map(|(f, field)| (field.node.clone(), (at, Some(f)))),
-                );
-            }
+            put(&mut places, topic);
         }
         Self {
             namespaces,
-            topics: layout.topics.clone(),
-            places,
+            places: RwLock::new(places),
             exits,
             unfiltered: Mutex::new(HashSet::new()),
+        }
+    }
+
+    /// Takes the nodes of some topics out and puts those of others in. Who watches a node that is gone is told.
+    pub(crate) fn exchange(
+        &self,
+        address_space: &RwLock<AddressSpace>,
+        subscriptions: &SubscriptionCache,
+        (gone, new): (&[TopicNode], &[TopicNode]),
+    ) {
+        let mut address_space = address_space.write();
+        let mut places = self.places.write();
+        for node in gone.iter().flat_map(TopicNode::nodes) {
+            drop(address_space.delete(node, true));
+            places.remove(node);
+        }
+        for topic in new {
+            let folder = origin_folder(topic.topic.space);
+            if !address_space.node_exists(&folder) {
+                add_folder(
+                    &folder,
+                    &origin_name(topic.topic.space),
+                    root(),
+                    &mut address_space,
+                );
+            }
+            add_topic(&mut address_space, topic, &folder);
+            put(&mut places, topic);
+        }
+        drop(places);
+        for node in gone.iter().flat_map(TopicNode::nodes) {
+            let value = current_data_value(&address_space, node).unwrap_or_else(|| DataValue {
+                status: Some(StatusCode::BadNodeIdUnknown),
+                server_timestamp: Some(DateTime::now()),
+                ..DataValue::default()
+            });
+            self.notify(subscriptions, node, value, false);
         }
     }
 
@@ -200,7 +229,8 @@ impl SpaceNodes {
             .value
             .as_ref()
             .ok_or(StatusCode::BadTypeMismatch)?;
-        let fields = new_fields(address_space, topic, field, (value, &write.index_range))?;
+        let field = field.and_then(|field| topic.fields.get(field));
+        let fields = new_fields(address_space, &topic, field, (value, &write.index_range))?;
         let now = DateTime::now();
         let (time, picoseconds) = match write.value.source_timestamp {
             Some(time) => (
@@ -231,7 +261,7 @@ impl SpaceNodes {
             source: Some(source),
             server: now,
         };
-        for (node, value) in topic_values(topic, fields, stamp) {
+        for (node, value) in topic_values(&topic, fields, stamp) {
             if let Some(NodeType::Variable(variable)) = address_space.find_mut(&node) {
                 variable.set_data_value(value.clone());
                 self.notify(subscriptions, &node, value, false);
@@ -240,10 +270,19 @@ impl SpaceNodes {
         Ok(())
     }
 
-    fn place(&self, node: &NodeId) -> Option<(&TopicNode, Option<&FieldNode>)> {
-        let (topic, field) = *self.places.get(node)?;
-        let topic = self.topics.get(topic)?;
-        Some((topic, field.and_then(|field| topic.fields.get(field))))
+    fn place(&self, node: &NodeId) -> Option<(Arc<TopicNode>, Option<usize>)> {
+        self.places.read().get(node).cloned()
+    }
+}
+
+/// Notes where the values of a topic's nodes are.
+fn put(places: &mut Places, topic: &TopicNode) {
+    let topic = Arc::new(topic.clone());
+    places.insert(topic.node.clone(), (Arc::clone(&topic), None));
+    if topic.compound {
+        let fields = topic.fields.iter().enumerate();
+        let fields = fields.map(|(at, field)| (field.node.clone(), (Arc::clone(&topic), Some(at))));
+        places.extend(fields);
     }
 }
 
@@ -468,8 +507,8 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
 
 /// Looks once more at monitored items some time after they were made, for values that came while they were.
 pub(crate) async fn look_again(
-    manager: std::sync::Arc<SpaceManager>,
-    subscriptions: std::sync::Arc<SubscriptionCache>,
+    manager: Arc<SpaceManager>,
+    subscriptions: Arc<SubscriptionCache>,
     mut created: mpsc::Receiver<(NodeId, MonitoredItemHandle)>,
 ) {
     let mut items = Vec::new();
@@ -564,36 +603,44 @@ fn access(writable: bool) -> AccessLevel {
 }
 
 fn add_folders(layout: &Layout, address_space: &mut AddressSpace) {
-    let folder = |node: &NodeId, name: &str, parent: NodeId, address_space: &mut AddressSpace| {
-        ObjectBuilder::new(
-            node,
-            QualifiedName::new(node.namespace, name),
-            LocalizedText::from(name),
-        )
-        .is_folder()
-        .organized_by(parent)
-        .insert(address_space);
-    };
-    let root = NodeId::new(APPLICATION, "UaSpace");
-    folder(
-        &root,
-        "UaSpace",
-        ObjectId::ObjectsFolder.into(),
-        address_space,
-    );
-    folder(&unmapped_folder(), "Unmapped", root.clone(), address_space);
+    let objects = ObjectId::ObjectsFolder.into();
+    add_folder(&root(), "UaSpace", objects, address_space);
+    add_folder(&unmapped_folder(), "Unmapped", root(), address_space);
     let spaces: HashSet<SpaceId> = layout
         .topics
         .iter()
         .map(|topic| topic.topic.space)
         .collect();
     for space in spaces {
-        let name = match space {
-            SpaceId::UA => "OPC UA".to_owned(),
-            SpaceId::ROS1 => "ROS 1".to_owned(),
-            other => format!("ROS 2 space {other}"),
-        };
-        folder(&origin_folder(space), &name, root.clone(), address_space);
+        add_folder(
+            &origin_folder(space),
+            &origin_name(space),
+            root(),
+            address_space,
+        );
+    }
+}
+
+fn add_folder(node: &NodeId, name: &str, parent: NodeId, address_space: &mut AddressSpace) {
+    ObjectBuilder::new(
+        node,
+        QualifiedName::new(node.namespace, name),
+        LocalizedText::from(name),
+    )
+    .is_folder()
+    .organized_by(parent)
+    .insert(address_space);
+}
+
+fn root() -> NodeId {
+    NodeId::new(APPLICATION, "UaSpace")
+}
+
+fn origin_name(space: SpaceId) -> String {
+    match space {
+        SpaceId::UA => "OPC UA".to_owned(),
+        SpaceId::ROS1 => "ROS 1".to_owned(),
+        other => format!("ROS 2 space {other}"),
     }
 }
 

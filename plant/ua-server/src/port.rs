@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::{Delivery, Failure, FailureKind, Kept, Port, PortEvent};
-use mappings::{Mapping, SpaceId, TopicId};
+use mappings::{Mapping, Server, SpaceId, TopicId};
 use opcua::server::ServerHandle;
 use opcua::server::address_space::AddressSpace;
 use opcua::server::node_manager::ServerContext;
@@ -30,6 +30,8 @@ pub(crate) struct Setup {
     pub(crate) url: EndpointUrl,
     pub(crate) pki: Pki,
     pub(crate) trust_any_client: bool,
+    /// Whether the mapping says the endpoint; else the command line does.
+    pub(crate) mapped_url: bool,
 }
 
 /// The OPC UA side of the space.
@@ -44,6 +46,12 @@ pub(crate) struct ServerPort {
     writes: mpsc::Receiver<ClientWrite>,
     /// The topics clients can write, not yet said to have a producer.
     live: VecDeque<TopicId>,
+    /// Topics that are gone, or others now.
+    unbound: VecDeque<TopicId>,
+    /// As the server was started.
+    namespaces: Vec<String>,
+    described: Server,
+    mapped_url: bool,
     pki: Pki,
     look: Interval,
 }
@@ -120,18 +128,17 @@ impl ServerPort {
         let mut look = tokio::time::interval(LOOK_AT_REJECTED);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         Ok(Self {
+            unbound: VecDeque::new(),
+            namespaces: layout.namespaces.clone(),
+            described: described.clone(),
+            mapped_url: setup.mapped_url,
             space: Space::new(&layout, manager, subscriptions),
             newest: HashMap::new(),
             handle,
             runtime: Some(runtime),
             serving: Some(serving),
             writes,
-            live: layout
-                .topics
-                .iter()
-                .map(|node| node.topic)
-                .filter(|topic| topic.space == SpaceId::UA)
-                .collect(),
+            live: written(layout.topics.iter().map(|node| node.topic)).collect(),
             pki: setup.pki,
             look,
         })
@@ -141,6 +148,9 @@ impl ServerPort {
 impl Port for ServerPort {
     async fn recv(&mut self) -> PortEvent {
         self.space.settle();
+        if let Some(topic) = self.unbound.pop_front() {
+            return PortEvent::Unbound { topic };
+        }
         if let Some(topic) = self.live.pop_front() {
             return PortEvent::Live { topic, live: true };
         }
@@ -182,6 +192,35 @@ impl Port for ServerPort {
         self.space.set_silent(topic, silent);
     }
 
+    fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<String> {
+        let (was, is) = (&self.described, mapping.server());
+        let endpoint = self.mapped_url && was.endpoint != is.endpoint;
+        let mut restart: Vec<String> = [
+            ("server.endpoint", endpoint),
+            (
+                "server.application_uri",
+                was.application_uri != is.application_uri,
+            ),
+            ("server.security", was.security != is.security),
+        ]
+        .into_iter()
+        .filter(|(_, differs)| *differs)
+        .map(|(key, _)| key.to_owned())
+        .collect();
+        match Layout::within(&self.namespaces, mapping) {
+            Ok((layout, namespaces)) => {
+                restart.extend(namespaces);
+                let (gone, new) = self.space.exchange(&layout);
+                self.newest.retain(|topic, _| !gone.contains(topic));
+                self.live.retain(|topic| !gone.contains(topic));
+                self.unbound.extend(gone);
+                self.live.extend(written(new.into_iter()));
+            }
+            Err(error) => restart.push(format!("variables ({error})")),
+        }
+        restart
+    }
+
     async fn shutdown(mut self) {
         self.handle.cancel();
         if let Some(serving) = &mut self.serving
@@ -202,6 +241,11 @@ impl Drop for ServerPort {
             runtime.shutdown_background();
         }
     }
+}
+
+/// Those topics that clients can write.
+fn written(topics: impl Iterator<Item = TopicId>) -> impl Iterator<Item = TopicId> {
+    topics.filter(|topic| topic.space == SpaceId::UA)
 }
 
 /// The server's own threads, and the listener as they take it.

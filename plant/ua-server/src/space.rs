@@ -53,6 +53,44 @@ impl Space {
         }
     }
 
+    /// Goes over to the nodes of another layout: those that are the same in both keep their values. Returns the topics
+    /// that are gone or other ones now, and those that are new or other ones.
+    pub(crate) fn exchange(&mut self, layout: &Layout) -> (Vec<TopicId>, Vec<TopicId>) {
+        let wanted: HashMap<TopicId, &TopicNode> = layout
+            .topics
+            .iter()
+            .map(|node| (node.topic, node))
+            .collect();
+        let is_gone = |topic: &TopicId, known: &mut Known| match wanted.get(topic) {
+            Some(node) => !known.mapped || known.node != **node,
+            // Those that nobody mapped are there as long as the server.
+            None => known.mapped,
+        };
+        let gone: Vec<Known> = self
+            .topics
+            .extract_if(is_gone)
+            .map(|(_, known)| known)
+            .collect();
+        self.unmapped -= gone.iter().filter(|known| !known.mapped).count();
+        let gone: Vec<TopicNode> = gone.into_iter().map(|known| known.node).collect();
+        let new = layout.topics.iter();
+        let new: Vec<TopicNode> = new
+            .filter(|node| !self.topics.contains_key(&node.topic))
+            .cloned()
+            .collect();
+        self.manager.inner().exchange(
+            self.manager.address_space(),
+            &self.subscriptions,
+            (&gone, &new),
+        );
+        for node in &new {
+            let known = Known::new(node.clone(), true);
+            self.topics.insert(node.topic, known);
+        }
+        let topics = |nodes: Vec<TopicNode>| nodes.into_iter().map(|node| node.topic).collect();
+        (topics(gone), topics(new))
+    }
+
     /// Takes in a sample: the fields of its DataSet as a key frame carries them.
     ///
     /// # Errors

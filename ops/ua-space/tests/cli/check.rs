@@ -160,3 +160,27 @@ fn the_schema_is_the_one_that_is_shipped() {
     let told = run(&["schema"]).quiet();
     assert_eq!(told, fs::read_to_string(shipped("schema.json")).unwrap());
 }
+
+#[test]
+fn the_files_a_mapping_includes_and_the_environment_are_looked_at() {
+    let part = file(
+        "part.yaml",
+        "variables:\n  - {node: ns=2;i=1, name: A, type: Duble, origin: 1}\n",
+    );
+    let name = Path::new(&part).file_name().unwrap().to_str().unwrap();
+    let whole = file(
+        "whole.yaml",
+        format!(
+            "include: [\"{name}\"]\nspaces: [{{id: 1}}]\nnamespaces: {{2: \"${{NO_SUCH:-urn:x:y}}\"}}\n"
+        ),
+    );
+    let ended = run(&["check", &whole]);
+    assert_eq!(ended.code, 78);
+    let place = format!("--> {part}:2:37");
+    assert!(ended.stdout.contains(&place), "{}", ended.stdout);
+    assert!(ended.stdout.contains("type: Duble"), "{}", ended.stdout);
+    let told: Value = run(&["check", "--json", &whole]).lines()[0].clone();
+    assert_eq!(told["findings"][0]["file"], json!(part));
+    fs::write(&part, "{}").unwrap();
+    assert_eq!(run(&["check", &whole]).code, 0);
+}

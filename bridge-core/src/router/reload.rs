@@ -1,0 +1,131 @@
+//! Another mapping for a Router that runs.
+
+use std::sync::Arc;
+
+use mappings::{Mapping, Overflow, PubSub, TopicId};
+
+use super::{About, Router};
+use crate::counters::Reason;
+use crate::gate::Gate;
+use crate::queue::Queue;
+use crate::settings::Now;
+use crate::topic::{Item, Role, Topic};
+
+impl Router {
+    /// The mapping that runs.
+    #[must_use]
+    pub const fn mapping(&self) -> &Arc<Mapping> {
+        &self.mapping
+    }
+
+    /// Puts another mapping in the place of the one there is. A topic whose variable is the same goes on as it is; where
+    /// its queue or what is published of it differs, that changes and its sequence numbers go on.
+    ///
+    /// What a variable is tied to is the port's affair: it [`unbind`](Self::unbind)s what it gives up and
+    /// [`bind`](Self::bind)s what it takes up.
+    pub fn replace_mapping(&mut self, mapping: Arc<Mapping>, now: Now) {
+        let before = std::mem::replace(&mut self.mapping, mapping);
+        self.renew_chunks(before.pubsub());
+        let topics: Vec<TopicId> = self.topics.keys().copied().collect();
+        for topic in topics {
+            let rules = |mapping: &Mapping| {
+                let variable = mapping.variable(topic);
+                variable
+                    .map(|variable| (variable.overflow, variable.publish))
+                    .unwrap_or_default()
+            };
+            let (was, is) = (rules(&before), rules(&self.mapping));
+            if was.0 != is.0 {
+                self.requeue(topic, is.0);
+            }
+            if was.1 != is.1 {
+                self.regate(topic, now);
+            }
+            // The periods may be shorter now.
+            self.schedule(topic);
+        }
+    }
+
+    /// The local side no longer has this topic, or will [`bind`](Self::bind) it to something else. A topic of our own space
+    /// falls silent until its next sample, which takes the next sequence number. Of another space, the next value asks
+    /// for a local type again. Its counters stay.
+    pub fn unbind(&mut self, topic: TopicId, now: Now) {
+        // What waits for its time is the last there is.
+        self.regate(topic, now);
+        let Some(entry) = self.topics.get_mut(&topic) else {
+            return;
+        };
+        entry.plan = None;
+        entry.transcoder = None;
+        match &mut entry.role {
+            Role::Ours(writer) => {
+                writer.keep_nothing();
+                writer.set_live(false);
+            }
+            Role::Theirs(reader) => {
+                reader.held = None;
+                reader.forget_all();
+                // They are in the type that was.
+                let waiting = std::iter::from_fn(|| entry.queue.pop()).count();
+                let count = waiting.try_into().unwrap_or(u64::MAX);
+                if count > 0 {
+                    self.count(About::topic(topic), Reason::NotPublished, count, || {
+                        "the mapping ties it to something else now".to_owned()
+                    });
+                }
+            }
+        }
+    }
+
+    /// Lets the samples that wait stand in a queue of another kind.
+    fn requeue(&mut self, topic: TopicId, overflow: Overflow) {
+        let Some(entry) = self.topics.get_mut(&topic) else {
+            return;
+        };
+        entry.overflow = overflow;
+        let mut before = std::mem::replace(&mut entry.queue, Queue::new(overflow));
+        if let Role::Ours(writer) = &mut entry.role
+            && overflow != Overflow::KeepLatest
+        {
+            writer.keep_nothing();
+        }
+        let waiting: Vec<Item> = std::iter::from_fn(|| before.pop()).collect();
+        for item in waiting {
+            // Whether another gave way for it is counted there.
+            let _gave_way = self.push(topic, item);
+        }
+    }
+
+    /// Puts the rule of the mapping in the place of the one there is; what that held back goes out.
+    fn regate(&mut self, topic: TopicId, now: Now) {
+        let Some(Topic {
+            role: Role::Ours(_),
+            gate,
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        let held = gate.as_mut().and_then(|gate| gate.hurry(now.monotonic));
+        let rule = self.mapping.variable(topic).map(|v| v.publish);
+        *gate = Gate::new(rule.unwrap_or_default());
+        self.let_go(topic, held, now);
+    }
+
+    /// What is put together of chunks obeys the new limits. What is not complete is given up where they differ.
+    fn renew_chunks(&mut self, before: &PubSub) {
+        let limits = |pubsub: &PubSub| (pubsub.max_message, pubsub.receive_timeout);
+        if limits(before) == limits(self.mapping.pubsub()) {
+            return;
+        }
+        if self.chunks.take().is_some_and(|chunks| chunks.is_open()) {
+            let about = About {
+                topic: None,
+                from: None,
+            };
+            self.count(about, Reason::Incomplete, 1, || {
+                "the mapping has other limits for large messages now".to_owned()
+            });
+        }
+    }
+}

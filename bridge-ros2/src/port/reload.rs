@@ -1,0 +1,169 @@
+//! Going over to another mapping: what both say alike is left as it is.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use bridge_node::{PortEvent, now};
+use mappings::{Mapping, SpaceId, TopicId, Variable};
+use messages::{Selection, TypeName};
+
+use super::Ros2Port;
+use super::services::Ros2Graph;
+use crate::graph::{dds_topic, ros_topic};
+use crate::sink::Sink;
+use crate::source::{Reading, Source};
+
+/// The topics the mapping reads: the type of each, and the values made of it.
+type Read = BTreeMap<String, (TypeName, Vec<(TopicId, Selection)>)>;
+
+impl Ros2Port {
+    /// Everything is given up before anything is taken up, as a value or a topic may only have changed hands. Endpoints
+    /// are made with the next look at the domain.
+    pub(super) fn go_over_to(&mut self, mapping: &Arc<Mapping>) {
+        let before = std::mem::replace(&mut self.mapping, Arc::clone(mapping));
+        // What is peculiar under the new mapping is told anew.
+        self.told.clear();
+        let mut read = Read::new();
+        for (variable, binding) in mapping.bindings(self.own) {
+            if variable.topic.space == self.own {
+                let (_, values) = read
+                    .entry(dds_topic(&binding.ros_topic))
+                    .or_insert_with(|| (binding.message_type.clone(), Vec::new()));
+                values.push((variable.topic, binding.selection.clone()));
+            }
+        }
+        for index in 0..self.sources.len() {
+            self.give_up_values(index, &read);
+        }
+        self.give_up_sinks();
+        let mut graph = Ros2Graph {
+            peers: &self.peers,
+            domain: &self.domain,
+            definitions: &mut self.definitions,
+        };
+        let services = &mut self.services;
+        let events = services.reload(&mut graph, self.own, (&before, mapping));
+        self.events.extend(events);
+        for (topic, (message_type, values)) in read {
+            self.take_up_values(topic, message_type, values);
+        }
+        for variable in mapping.variables() {
+            let topic = variable.topic;
+            if topic.space != self.own
+                && !self.sinks.contains_key(&topic)
+                && let Some(sink) = mapped(variable, self.own)
+            {
+                self.sinks.insert(topic, sink);
+            }
+        }
+        self.schedule.changed = true;
+    }
+
+    /// Lets go of the values of a topic that are no longer made of it, and of the topic where none is left.
+    fn give_up_values(&mut self, index: usize, read: &Read) {
+        let Some(source) = self.sources.get_mut(index) else {
+            return;
+        };
+        let is_wanted = |value: &(TopicId, Selection)| match read.get(&source.dds_topic) {
+            Some((message_type, values)) => {
+                source.message_type == *message_type && values.contains(value)
+            }
+            None => {
+                // A topic of the space that was found, and that the mapping does not tie to another.
+                let named = ros_topic(&source.dds_topic).and_then(|name| name.parse().ok());
+                let variable = self.mapping.variable(value.0);
+                named == Some(value.0)
+                    && value.1 == Selection::Whole
+                    && variable.is_none_or(|v| v.binding(self.own).is_none())
+            }
+        };
+        let gone = source.values.extract_if(.., |value| !is_wanted(value));
+        let gone: Vec<_> = gone.map(|(topic, _)| topic).collect();
+        let unbound = gone.into_iter().map(|topic| PortEvent::Unbound { topic });
+        self.events.extend(unbound);
+        if source.values.is_empty() {
+            if let Reading::Open { slot, .. } = source.reading {
+                // Whoever published to it sees the reader disposed.
+                drop(self.inbox.remove(slot));
+            }
+            // Its index stays, by which the inbox names it; its name is free for another.
+            let (topic, message_type) = (source.dds_topic.clone(), source.message_type.clone());
+            *source = Source::new(topic.clone(), message_type);
+            if self.source_of.get(&topic) == Some(&index) {
+                self.source_of.remove(&topic);
+            }
+        }
+    }
+
+    fn give_up_sinks(&mut self) {
+        let (mapping, own) = (&self.mapping, self.own);
+        let gone = self.sinks.extract_if(|topic, sink| {
+            let variable = mapping.variable(*topic);
+            let tied = variable.and_then(|variable| mapped(variable, own));
+            let called = variable
+                .and_then(|variable| variable.service.as_ref())
+                .is_some_and(|service| service.space == own);
+            // Values for a service have no topic.
+            called || !sink.is_like(&tied.unwrap_or_else(|| Sink::by_name(*topic, variable)))
+        });
+        // Their writers are disposed here.
+        let gone = gone.map(|(topic, _)| PortEvent::Unbound { topic });
+        self.events.extend(gone);
+    }
+
+    /// Makes values of a topic that the mapping reads, of which some may be made already.
+    fn take_up_values(
+        &mut self,
+        dds_topic: String,
+        message_type: TypeName,
+        values: Vec<(TopicId, Selection)>,
+    ) {
+        let index = self.source(dds_topic, message_type.clone());
+        let Some(source) = self.sources.get_mut(index) else {
+            return;
+        };
+        let known: Vec<TopicId> = source.values.iter().map(|(topic, _)| *topic).collect();
+        let new: Vec<_> = values
+            .into_iter()
+            .filter(|(topic, _)| !known.contains(topic))
+            .collect();
+        source.values.extend(new.iter().cloned());
+        // One that is not read yet tells of all its values when it is.
+        let Reading::Open { .. } = source.reading else {
+            return;
+        };
+        let Ok(message_type) = self.definitions.get(&message_type) else {
+            return;
+        };
+        let received = now().utc;
+        for (topic, selection) in new {
+            self.events.push_back(PortEvent::Bound {
+                topic,
+                message_type: Arc::clone(&message_type),
+                selection,
+            });
+            if source.live {
+                self.events.push_back(PortEvent::Live { topic, live: true });
+            }
+            // They were sent before and will not be again.
+            let latched = source.latched().map(|(key, payload)| PortEvent::Sample {
+                topic,
+                payload: payload.clone(),
+                received,
+                latched_by: Some(key),
+            });
+            self.events.extend(latched);
+        }
+    }
+}
+
+/// Where the values of a variable of another space are written, if the mapping says it.
+fn mapped(variable: &Variable, own: SpaceId) -> Option<Sink> {
+    let binding = variable.binding(own)?;
+    Some(Sink::mapped(
+        &binding.ros_topic,
+        binding.message_type.clone(),
+        binding.selection.clone(),
+        variable.overflow,
+    ))
+}

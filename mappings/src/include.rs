@@ -1,0 +1,251 @@
+//! A document and the files it includes, as one.
+
+use crate::check::Source;
+use crate::code::Code;
+use crate::document::{self, Document};
+use crate::findings::Findings;
+use crate::read::{At, Field, Reader};
+use crate::surroundings::{Surroundings, beside, fits};
+use crate::tree::{self, MAX_BYTES, Place};
+
+/// Reads files into one document.
+pub(crate) struct Loader<'a> {
+    pub(crate) around: &'a dyn Surroundings,
+    pub(crate) findings: &'a mut Findings,
+    pub(crate) sources: Vec<Source>,
+    /// The files that are being read, the outermost first.
+    open: Vec<String>,
+    /// Where each file was named.
+    read: Vec<(String, Place)>,
+    bytes: usize,
+    /// Some file is missing in the whole.
+    partial: bool,
+    whole: Document,
+}
+
+impl<'a> Loader<'a> {
+    pub(crate) fn new(around: &'a dyn Surroundings, findings: &'a mut Findings) -> Self {
+        Self {
+            around,
+            findings,
+            sources: Vec::new(),
+            open: Vec::new(),
+            read: Vec::new(),
+            bytes: 0,
+            partial: false,
+            whole: Document::default(),
+        }
+    }
+
+    /// The document of that text with all it includes, and what was read. `None` when the text itself is none.
+    pub(crate) fn load(mut self, text: &str, name: &str) -> (Option<Document>, Vec<Source>) {
+        // The file may be named as another names it.
+        let path = beside("", name);
+        self.read.push((path.clone(), Place::START));
+        let read = self.add(text, name, (path, 0));
+        if self.partial {
+            // What is not declared may be so in what could not be read.
+            self.whole.spaces = Some(missing());
+            self.whole.namespaces = Some(missing());
+        }
+        (read.map(|()| self.whole), self.sources)
+    }
+
+    fn add(&mut self, text: &str, name: &str, (path, file): (String, u16)) -> Option<()> {
+        self.sources.push(Source {
+            name: name.into(),
+            text: text.to_owned(),
+        });
+        let around = self.around;
+        let tree = match tree::parse(text, file, &|name| around.variable(name)) {
+            Ok(tree) => tree,
+            Err(fault) => {
+                self.note(fault);
+                return None;
+            }
+        };
+        for (value, written) in tree.values {
+            self.findings.hide(value, written);
+        }
+        for fault in tree.faults {
+            let place = fault.place;
+            self.note(fault);
+            self.findings.is_unknown(place);
+        }
+        let (mut document, _) = document::read(&tree.root, &mut Reader::new(self.findings))?;
+        let includes = document.include.take();
+        let type_paths = document.type_paths.as_mut();
+        for At { value, .. } in type_paths.and_then(|at| at.value.as_mut()).into_iter().flatten() {
+            // An empty one stays what it is, for a finding.
+            if let Some(named) = value.as_mut().filter(|named| !named.is_empty()) {
+                *named = beside(&path, named);
+                if named.is_empty() {
+                    named.push('.');
+                }
+            }
+        }
+        self.take(document);
+        self.open.push(path);
+        for At { place, value } in includes.and_then(|at| at.value).map_or(Vec::new(), |i| i.0) {
+            if let Some(named) = value {
+                self.include(&named, place);
+            }
+        }
+        self.open.pop();
+        Some(())
+    }
+
+    fn note(&mut self, fault: tree::Fault) {
+        let note = self.findings.error(fault.code, fault.place, fault.message);
+        if let Some(help) = fault.help {
+            note.help(help);
+        }
+    }
+
+    fn include(&mut self, named: &str, place: Place) {
+        let from = self.open.last().cloned().unwrap_or_default();
+        let (folder, last) = named.rsplit_once('/').unwrap_or(("", named));
+        if folder.contains('*') {
+            let message = format!("`*` stands in the folder of `{named}`");
+            let note = self.findings.error(Code::Include, place, message);
+            note.help("only the last part of a path has wildcards, as in robots/*.yaml");
+            return;
+        }
+        if !last.contains('*') {
+            self.file(beside(&from, named), place);
+            return;
+        }
+        let is_wanted = |name: &String| fits(last, name) && !name.starts_with('.');
+        let within = beside(
+            &from,
+            &format!("{folder}{}", if folder.is_empty() { "." } else { "" }),
+        );
+        let names = match self.around.list(&within) {
+            Ok(names) => names,
+            Err(why) => {
+                let message = format!("`{named}` names no files: {why}");
+                self.findings.error(Code::Include, place, message);
+                return;
+            }
+        };
+        let mut names: Vec<String> = names.into_iter().filter(is_wanted).collect();
+        if names.is_empty() {
+            let message = format!("no file is named as `{named}` says");
+            self.findings.warning(Code::Include, place, message);
+        }
+        names.sort();
+        for name in names {
+            let path = match folder {
+                "" => name,
+                folder => format!("{folder}/{name}"),
+            };
+            self.file(beside(&from, &path), place);
+        }
+    }
+
+    fn file(&mut self, path: String, place: Place) {
+        if self.open.contains(&path) {
+            let mut way: Vec<&str> = self.open.iter().map(String::as_str).collect();
+            way.push(&path);
+            let message = format!("`{path}` includes itself: {}", way.join(" -> "));
+            self.findings.error(Code::IncludeTwice, place, message);
+            return;
+        }
+        if let Some((_, first)) = self.read.iter().find(|(read, _)| *read == path) {
+            let label = format!("first at {}", self.findings.line(*first, place));
+            let message = format!("`{path}` is included twice");
+            let note = self.findings.error(Code::IncludeTwice, place, message);
+            note.label(label);
+            return;
+        }
+        if self.open.len() > MAX_NESTED || self.read.len() > MAX_FILES {
+            let message = format!(
+                "`{path}` is one file too many: includes nest {MAX_NESTED} deep at most and lead to {MAX_FILES} files"
+            );
+            self.findings.error(Code::IncludeTwice, place, message);
+            return;
+        }
+        let text = match self.around.read(&path) {
+            Ok(text) => text,
+            Err(why) => {
+                let message = format!("`{path}` cannot be read: {why}");
+                let note = self.findings.error(Code::Include, place, message);
+                note.help("the path is taken from the folder of the file it stands in");
+                self.partial = true;
+                return;
+            }
+        };
+        self.bytes = self.bytes.saturating_add(text.len());
+        if self.bytes > MAX_BYTES {
+            let message =
+                format!("with `{path}` the included files have more than {MAX_BYTES} bytes");
+            self.findings.error(Code::TooLarge, place, message);
+            return;
+        }
+        let Some(number) = self.findings.file(&path) else {
+            return;
+        };
+        self.read.push((path.clone(), place));
+        // What keeps it from being read has been noted.
+        let read = self.add(&text, &path.clone(), (path, number));
+        self.partial |= read.is_none();
+    }
+
+    /// Takes the parts of a file into the whole: lists one behind the other, all else once.
+    fn take(&mut self, other: Document) {
+        let Document {
+            include: _,
+            spaces,
+            type_paths,
+            pubsub,
+            server,
+            namespaces,
+            variables,
+            patterns,
+        } = other;
+        append(&mut self.whole.spaces, spaces);
+        append(&mut self.whole.type_paths, type_paths);
+        append(&mut self.whole.variables, variables);
+        append(&mut self.whole.patterns, patterns);
+        append(&mut self.whole.namespaces, namespaces);
+        once("pubsub", &mut self.whole.pubsub, pubsub, self.findings);
+        once("server", &mut self.whole.server, server, self.findings);
+    }
+}
+
+/// What a faulty entry comes to.
+const fn missing<T>() -> At<T> {
+    At {
+        place: Place::START,
+        value: None,
+    }
+}
+
+fn append<T>(whole: &mut Field<Vec<T>>, part: Field<Vec<T>>) {
+    match (whole, part) {
+        (_, None) => {}
+        (whole @ None, part) => *whole = part,
+        (Some(whole), Some(part)) => match (&mut whole.value, part.value) {
+            (Some(all), Some(more)) => all.extend(more),
+            // One of them is faulty, so something is missing in the whole.
+            (value, _) => *value = None,
+        },
+    }
+}
+
+fn once<T>(key: &str, whole: &mut Field<T>, part: Field<T>, findings: &mut Findings) {
+    match (&whole, part) {
+        (None, part) => *whole = part,
+        (Some(_), None) => {}
+        (Some(first), Some(part)) => {
+            let line = findings.line(first.place, part.place);
+            let message = format!("the key `{key}` is repeated");
+            let note = findings.error(Code::DuplicateKey, part.place, message);
+            note.label(format!("first at {line}"))
+                .help("all files together are one document, which has it once");
+        }
+    }
+}
+
+const MAX_NESTED: usize = 8;
+const MAX_FILES: usize = 256;

@@ -1,0 +1,119 @@
+//! What a document needs beside its text, handed in: this crate opens no file and looks at no environment.
+
+use std::path::{Component, Path, PathBuf};
+
+use messages::NoTexts;
+
+use crate::check::TypeFiles;
+use crate::environment::Environment;
+
+/// The files beside a document and the variables of its environment.
+pub trait Surroundings {
+    /// The text of a file, for `include`.
+    ///
+    /// # Errors
+    /// Why there is none, for people.
+    fn read(&self, file: &str) -> Result<String, String>;
+
+    /// The names in a folder, in no order, for an `include` with a wildcard.
+    ///
+    /// # Errors
+    /// Why there are none, for people.
+    fn list(&self, folder: &str) -> Result<Vec<String>, String>;
+
+    /// The value of an environment variable, for `${NAME}`; `None` when it is not set.
+    fn variable(&self, name: &str) -> Option<String>;
+
+    /// Definition files besides what is built in. `paths` are the `type_paths` of the document, those that are relative
+    /// below the folder of the file they stand in.
+    fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
+        let _ = paths;
+        Box::new(NoTexts)
+    }
+
+    /// What is there in the cell while the document is checked; `None` when nobody asked.
+    fn environment(&self) -> Option<&Environment> {
+        None
+    }
+}
+
+/// A document that stands alone.
+pub(crate) struct Alone;
+
+impl Surroundings for Alone {
+    fn read(&self, _: &str) -> Result<String, String> {
+        Err("only this text is read here".to_owned())
+    }
+
+    fn list(&self, _: &str) -> Result<Vec<String>, String> {
+        self.read("").map(|_| Vec::new())
+    }
+
+    fn variable(&self, _: &str) -> Option<String> {
+        None
+    }
+}
+
+/// The path of a file as another one names it, without `.` and without `..` where that can be.
+pub(crate) fn beside(file: &str, named: &str) -> String {
+    let folder = Path::new(file).parent().unwrap_or_else(|| Path::new(""));
+    let mut path = PathBuf::new();
+    for part in folder.join(named).components() {
+        match part {
+            Component::CurDir => {}
+            Component::ParentDir
+                if matches!(path.components().next_back(), Some(Component::Normal(_))) =>
+            {
+                path.pop();
+            }
+            Component::Prefix(_)
+            | Component::RootDir
+            | Component::ParentDir
+            | Component::Normal(_) => path.push(part),
+        }
+    }
+    path.to_string_lossy().into_owned()
+}
+
+/// Whether a name is what a pattern with `*` for any characters says.
+pub(crate) fn fits(pattern: &str, name: &str) -> bool {
+    let mut parts = pattern.split('*');
+    let Some(mut rest) = parts.next().and_then(|first| name.strip_prefix(first)) else {
+        return false;
+    };
+    let mut parts: Vec<&str> = parts.collect();
+    let Some(last) = parts.pop() else {
+        return rest.is_empty();
+    };
+    for part in parts {
+        match rest.split_once(part) {
+            Some((_, behind)) => rest = behind,
+            None => return false,
+        }
+    }
+    rest.ends_with(last)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_is_named_from_the_one_that_names_it() {
+        for (file, named, path) in [
+            ("cell.yaml", "robots.yaml", "robots.yaml"),
+            ("a/cell.yaml", "./robots.yaml", "a/robots.yaml"),
+            ("a/b/cell.yaml", "../robots.yaml", "a/robots.yaml"),
+            ("cell.yaml", "../robots.yaml", "../robots.yaml"),
+            ("a/cell.yaml", "/etc/robots.yaml", "/etc/robots.yaml"),
+        ] {
+            assert_eq!(beside(file, named), path);
+        }
+    }
+
+    #[test]
+    fn a_wildcard_stands_for_any_characters() {
+        assert!(fits("*.yaml", "a.yaml") && fits("r*b*.y", "rxbyb.y") && fits("a", "a"));
+        assert!(!fits("*.yaml", "a.yml") && !fits("a*a", "a") && !fits("a", "ab"));
+    }
+}

@@ -1,0 +1,257 @@
+//! Documents of several files, with variables of the environment and with what YAML shares within a text.
+#![expect(clippy::unwrap_used, reason = "test code")]
+
+use std::collections::BTreeMap;
+
+use mappings::{Checked, Code, Mapping, Surroundings};
+
+/// Files and variables by their names.
+#[derive(Default)]
+struct Beside {
+    files: BTreeMap<String, String>,
+    variables: BTreeMap<String, String>,
+}
+
+impl Beside {
+    fn file(mut self, name: &str, text: &str) -> Self {
+        self.files.insert(name.to_owned(), text.to_owned());
+        self
+    }
+
+    fn set(mut self, name: &str, value: &str) -> Self {
+        self.variables.insert(name.to_owned(), value.to_owned());
+        self
+    }
+
+    fn check(&self, text: &str) -> Checked {
+        Mapping::from_text(text, "plant/cell.yaml", self)
+    }
+}
+
+impl Surroundings for Beside {
+    fn read(&self, file: &str) -> Result<String, String> {
+        let text = self.files.get(file).cloned();
+        text.ok_or_else(|| "there is no such file".to_owned())
+    }
+
+    fn list(&self, folder: &str) -> Result<Vec<String>, String> {
+        let names = self.files.keys().filter_map(|file| file.rsplit_once('/'));
+        let within = names.filter(|(of, _)| *of == folder);
+        Ok(within.map(|(_, name)| name.to_owned()).rev().collect())
+    }
+
+    fn variable(&self, name: &str) -> Option<String> {
+        self.variables.get(name).cloned()
+    }
+}
+
+const HEAD: &str = "spaces: [{id: 1}]\nnamespaces: {2: urn:my-plant:line}\n";
+
+fn variable(id: u16, name: &str) -> String {
+    format!("  - {{node: ns=2;i={id}, name: {name}, type: Double, origin: 1}}\n")
+}
+
+fn names(checked: &Checked) -> Vec<&str> {
+    let mapping = checked.mapping.as_ref().unwrap();
+    let names = mapping.variables().iter().map(|v| v.name.as_str());
+    names.collect()
+}
+
+/// One line per finding: code, file and line, and the label.
+fn told(checked: &Checked) -> Vec<String> {
+    let findings = checked.findings.iter().map(|found| {
+        let label = found.label.clone().unwrap_or_default();
+        format!("{} {}:{} {label}", found.code, found.at.file, found.at.line)
+            .trim()
+            .to_owned()
+    });
+    findings.collect()
+}
+
+#[test]
+fn the_files_of_a_document_are_as_one() {
+    let beside = Beside::default()
+        .file(
+            "plant/robots/b.yaml",
+            &format!("variables:\n{}", variable(2, "B")),
+        )
+        .file(
+            "plant/robots/a.yaml",
+            &format!("variables:\n{}", variable(1, "A")),
+        )
+        .file("plant/robots/.b.yaml.swp", "not YAML: [")
+        .file("shared/net.yaml", "include: ports.yaml\npubsub: {ttl: 4}\n")
+        .file(
+            "shared/ports.yaml",
+            "server: {endpoint: 'opc.tcp://gateway:4841'}\n",
+        );
+    let text = format!(
+        "include: [robots/*.yaml, ../shared/net.yaml]\n{HEAD}variables:\n{}",
+        variable(9, "Own")
+    );
+    let checked = beside.check(&text);
+    assert_eq!(checked.render_all(), "");
+    assert_eq!(names(&checked), ["Own", "A", "B"]);
+    let mapping = checked.mapping.as_ref().unwrap();
+    assert_eq!(mapping.pubsub().ttl, 4);
+    assert_eq!(mapping.server().endpoint.host, "gateway");
+    let sources: Vec<&str> = checked.sources.iter().map(|source| &*source.name).collect();
+    let files = ["robots/a.yaml", "robots/b.yaml"].map(|name| format!("plant/{name}"));
+    assert_eq!(
+        sources,
+        [
+            "plant/cell.yaml",
+            &files[0],
+            &files[1],
+            "shared/net.yaml",
+            "shared/ports.yaml"
+        ]
+    );
+}
+
+#[test]
+fn a_finding_is_told_with_its_own_file_and_what_it_collides_with() {
+    let beside = Beside::default().file(
+        "plant/more.yaml",
+        &format!(
+            "{HEAD}pubsub: {{}}\nvariables:\n{}  - {{nod: 1}}\n",
+            variable(1, "B")
+        ),
+    );
+    let checked = beside.check(&format!(
+        "include: more.yaml\n{HEAD}pubsub: {{}}\nvariables:\n{}",
+        variable(1, "A")
+    ));
+    assert!(checked.mapping.is_none());
+    assert_eq!(
+        told(&checked),
+        [
+            "M011 plant/more.yaml:1 first at line 2 of plant/cell.yaml",
+            "M030 plant/more.yaml:2 first at line 3 of plant/cell.yaml",
+            "M030 plant/more.yaml:2 first at line 3 of plant/cell.yaml",
+            "M004 plant/more.yaml:3 first at line 4 of plant/cell.yaml",
+            "M053 plant/more.yaml:5 first at line 6 of plant/cell.yaml",
+            "M006 plant/more.yaml:6",
+            "M006 plant/more.yaml:6",
+            "M006 plant/more.yaml:6",
+            "M003 plant/more.yaml:6",
+        ]
+    );
+    let rendered = checked.render_all();
+    assert!(
+        rendered.contains("6 |   - {nod: 1}\n  |      ^^^"),
+        "{rendered}"
+    );
+}
+
+#[test]
+fn includes_that_lead_nowhere_or_in_circles_are_named() {
+    let beside = Beside::default()
+        .file("plant/a.yaml", "include: b.yaml\n")
+        .file("plant/b.yaml", "include: [a.yaml, cell.yaml]\n")
+        .file("plant/broken.yaml", "variables: [\n");
+    let checked = beside.check(
+        "include: [a.yaml, ./b.yaml, none.yaml, broken.yaml, no/*.yaml]\nvariables:\n  - \
+         {node: ns=2;i=1, name: A, type: Double, origin: 1}\n",
+    );
+    // Nothing is said of the space and the namespace, which may be declared in what is missing.
+    assert_eq!(
+        told(&checked),
+        [
+            "M111 plant/cell.yaml:1 first at line 1 of plant/a.yaml",
+            "M110 plant/cell.yaml:1",
+            "M110 plant/cell.yaml:1",
+            "M111 plant/b.yaml:1",
+            "M111 plant/b.yaml:1",
+            "M001 plant/broken.yaml:1",
+        ]
+    );
+    let circle = &checked.findings[3].message;
+    assert!(
+        circle.ends_with("plant/cell.yaml -> plant/a.yaml -> plant/b.yaml -> plant/a.yaml"),
+        "{circle}"
+    );
+    let deep = (0..20).fold(Beside::default(), |beside, n| {
+        beside.file(
+            &format!("plant/{n}.yaml"),
+            &format!("include: {}.yaml\n", n + 1),
+        )
+    });
+    let checked = deep.check("include: 0.yaml\n");
+    assert_eq!(told(&checked), ["M111 plant/7.yaml:1"]);
+}
+
+#[test]
+fn variables_of_the_environment_stand_for_their_values() {
+    let text = format!(
+        "{HEAD}pubsub: {{address: \"opc.udp://${{GROUP:-239.192.0.40}}:4840\", ttl: \"${{TTL}}\"}}\nvariables:\n  - node: ns=2;i=${{ID}}\n    \
+         name: \"$${{ID}}\"\n    type: Double\n    origin: 1\n"
+    );
+    let beside = Beside::default().set("TTL", "3").set("ID", "17");
+    let checked = beside.check(&text);
+    assert_eq!(checked.render_all(), "");
+    let mapping = checked.mapping.as_ref().unwrap();
+    assert_eq!(mapping.pubsub().ttl, 3);
+    assert_eq!(mapping.variables()[0].topic.to_string(), "ua_1_2_17");
+    assert_eq!(names(&checked), ["${ID}"]);
+
+    let checked = Beside::default().set("ID", "17").check(&text);
+    assert_eq!(told(&checked), ["M112 plant/cell.yaml:3"]);
+    assert!(checked.render_all().contains("`TTL` is not set"));
+}
+
+#[test]
+fn what_the_environment_says_is_not_told() {
+    let secret = "hunter2-hunter2";
+    let text = format!(
+        "{HEAD}pubsub: {{interface: \"${{KEY}}x y\"}}\nvariables:\n  - node: ns=2;i=${{KEY}}\n    name: A\n    type: ${{KEY}}\n    origin: ${{NUMBER}}\n"
+    );
+    let beside = Beside::default().set("KEY", secret).set("NUMBER", "300");
+    let checked = beside.check(&text);
+    let rendered = checked.render_all();
+    assert!(checked.findings.len() >= 4, "{rendered}");
+    assert!(
+        !rendered.contains("hunter2") && !rendered.contains("`300`"),
+        "{rendered}"
+    );
+    assert!(rendered.contains("`${KEY}`"), "{rendered}");
+}
+
+#[test]
+fn anchors_aliases_and_merge_keys_share_what_they_name() {
+    let text = format!(
+        "{HEAD}variables:\n  - &joint\n    node: ns=2;i=1\n    name: A\n    type: Double\n    origin: 1\n    queue: &events \
+         {{drop_oldest: 7}}\n  - <<: *joint\n    node: ns=2;i=2\n    name: B\n  - {{<<: [*joint], node: ns=2;i=3, \
+         name: C, type: Int16, queue: *events}}\n"
+    );
+    let checked = Beside::default().check(&text);
+    assert_eq!(checked.render_all(), "");
+    let variables = checked.mapping.as_ref().unwrap().variables();
+    assert_eq!(names(&checked), ["A", "B", "C"]);
+    assert_eq!(variables[1].value_type, variables[0].value_type);
+    assert_ne!(variables[2].value_type, variables[0].value_type);
+    assert_eq!(variables[1].overflow, variables[0].overflow);
+
+    // What is wrong with what is shared is told once, where it stands.
+    let faulty = text.replace("origin: 1\n", "origin: 3\n");
+    assert_eq!(
+        told(&Beside::default().check(&faulty)),
+        ["M014 plant/cell.yaml:8"]
+    );
+}
+
+#[test]
+fn merge_keys_upon_merge_keys_are_bounded() {
+    let mut text = "x0: &x0 {".to_owned();
+    for key in 0..2000 {
+        text += &format!("k{key}: 1, ");
+    }
+    text += "}\n";
+    for n in 1..400 {
+        let below = n - 1;
+        text += &format!("x{n}: &x{n} {{<<: *x{below}, own{n}: 1}}\n");
+    }
+    let checked = Beside::default().check(&text);
+    assert_eq!(checked.findings.len(), 1, "{}", checked.render_all());
+    assert_eq!(checked.findings[0].code, Code::TooLarge);
+}

@@ -1,0 +1,324 @@
+//! A mapping that is saved while the programs run.
+
+use std::{
+    collections::BTreeMap,
+    fs,
+    io::Write as _,
+    net::TcpStream,
+    path::Path,
+    sync::{
+        Arc, Mutex,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::{Duration, Instant},
+};
+
+use nix::sys::signal::Signal;
+use serde_json::Value;
+use system_tests::{
+    BareNode, Cell, MASTER, METRICS_ROS1, Peer, SERVER_ENDPOINT, UadpSocket, eventually, http_get,
+    metrics, string_frame, xml_rpc,
+};
+use uadp::{NetworkMessage, Scalar, Variant};
+
+const SOON: Duration = Duration::from_secs(30);
+const ROUTES: u16 = 500;
+/// Each route is sent at 50 Hz: so many of them are due each millisecond.
+const EACH_MS: usize = 25;
+
+/// A mapping of so many routes from ROS 1, of which the first is read from that topic.
+fn mapping(routes: u16, first: &str) -> String {
+    let mut text = "spaces:\n  - {id: 1}\nnamespaces:\n  2: urn:test\nvariables:\n".to_owned();
+    for route in 1..=routes {
+        let topic = if route == 1 {
+            first.to_owned()
+        } else {
+            format!("/r{route}")
+        };
+        text += &format!(
+            "  - {{node: ns=2;i={route}, name: R{route}, origin: 1, queue: {{drop_oldest: 100}}, \
+             ros: {{topic: {topic}, type: std_msgs/String, field: data}}}}\n"
+        );
+    }
+    text
+}
+
+/// Saves a file as editors do: under another name first.
+fn save(file: &Path, text: &str) {
+    let beside = file.with_extension("new");
+    fs::write(&beside, text).unwrap();
+    fs::rename(beside, file).unwrap();
+}
+
+fn about(key: &str) -> Value {
+    metrics(METRICS_ROS1).map_or(Value::Null, |status| status["mapping"][key].clone())
+}
+
+/// What was heard of the routes: of each, the sequence numbers with the number that was said.
+type Heard = BTreeMap<u16, Vec<(u16, u16)>>;
+
+/// Hears the group in a thread of its own until `ended`.
+fn listen(heard: &Arc<Mutex<Heard>>, ended: &Arc<AtomicBool>) -> std::thread::JoinHandle<()> {
+    let socket = UadpSocket::join();
+    let (heard, ended) = (Arc::clone(heard), Arc::clone(ended));
+    std::thread::spawn(move || {
+        while !ended.load(Ordering::Relaxed) {
+            let Some(datagram) = socket.receive(Duration::from_millis(100)) else {
+                continue;
+            };
+            let message = NetworkMessage::decode(&datagram).unwrap();
+            for message in message.messages().map(Result::unwrap) {
+                let sequence = message.header().sequence_number.unwrap();
+                let field = message.fields().ok().and_then(|mut fields| fields.next());
+                let Some(Ok(Variant::Scalar(Scalar::String(Some(text))))) = field else {
+                    continue;
+                };
+                let route = message.writer_id.unwrap();
+                let said = text.parse().unwrap();
+                let mut heard = heard.lock().unwrap();
+                heard.entry(route).or_default().push((sequence, said));
+            }
+        }
+    })
+}
+
+/// Sends each connection its next number, 50 times a second, spread over the time.
+fn send(to: &mut [TcpStream], said: &mut u16, until: impl Fn() -> bool) {
+    let mut due = Instant::now();
+    while !until() {
+        *said += 1;
+        let frame = string_frame(&said.to_string());
+        for some in to.chunks_mut(EACH_MS) {
+            for stream in some {
+                // The one that the mapping no longer names has ended.
+                drop(stream.write_all(&frame));
+            }
+            due += Duration::from_millis(1);
+            std::thread::sleep(due.saturating_duration_since(Instant::now()));
+        }
+    }
+}
+
+#[test]
+fn of_500_routes_at_50_hz_only_the_edited_one_notices_the_edit() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let file = cell.file("cell.yaml", &mapping(ROUTES, "/r1"));
+    let _bridge = cell.bridge_ros1(&[file.to_str().unwrap()]);
+    let node = BareNode::start("/robot");
+    let topics: Vec<String> = (1..=ROUTES).map(|route| format!("/r{route}")).collect();
+    let mut streams = node.publish(&topics);
+    let (heard, ended) = (Arc::default(), Arc::new(AtomicBool::new(false)));
+    let listener = listen(&heard, &ended);
+    let mut said = 0;
+    let reloads = |count: u64| {
+        let next = Mutex::new(Instant::now());
+        move || {
+            // Not at each turn: the answer has 500 topics in it.
+            let mut next = next.lock().unwrap();
+            if Instant::now() < *next {
+                return false;
+            }
+            *next = Instant::now() + Duration::from_millis(300);
+            about("reloads") == count
+        }
+    };
+
+    let before = said + 10;
+    let warm = Instant::now() + Duration::from_millis(500);
+    send(&mut streams, &mut said, || Instant::now() > warm);
+    save(&file, &mapping(ROUTES, "/moved"));
+    send(&mut streams, &mut said, reloads(1));
+    let mut moved = node.publish(&["/moved".to_owned()]);
+    std::mem::swap(&mut streams[0], &mut moved[0]);
+    let after = said + 10;
+    let cool = Instant::now() + Duration::from_millis(500);
+    send(&mut streams, &mut said, || Instant::now() > cool);
+    eventually("the last are heard", SOON, || {
+        let heard: std::sync::MutexGuard<'_, Heard> = heard.lock().unwrap();
+        let is_last = |of: &Vec<(u16, u16)>| of.last().is_some_and(|(_, last)| *last == said);
+        heard.values().all(is_last).then_some(())
+    });
+    ended.store(true, Ordering::Relaxed);
+    listener.join().unwrap();
+
+    let heard = heard.lock().unwrap();
+    assert_eq!(heard.len(), usize::from(ROUTES));
+    assert!(before < after && said > after);
+    for (route, all) in heard.iter().filter(|(route, _)| **route != 1) {
+        // A number more is said with each sequence number, from first to last: none was left out, said twice or renumbered
+        // by the bridge, whatever this socket missed.
+        let (first, number) = all[0];
+        let offset = first.wrapping_sub(number);
+        for (sequence, number) in all {
+            assert_eq!(sequence.wrapping_sub(*number), offset, "{route}: {all:?}");
+        }
+    }
+    // The edited one goes on with its numbers.
+    let sequences: Vec<u16> = heard[&1].iter().map(|(sequence, _)| *sequence).collect();
+    assert!(sequences.is_sorted_by(|a, b| a < b), "{sequences:?}");
+    let status = metrics(METRICS_ROS1).unwrap();
+    assert_eq!(system_tests::drops(&status["topics"]), 0, "{status}");
+    assert_eq!(status["mapping"]["stale"], Value::Null);
+    // The bridge is no longer a subscriber of what it does not read.
+    eventually("/r1 is published, and not subscribed", SOON, || {
+        let graph = xml_rpc(MASTER, "getSystemState", &["/test"])?;
+        (graph.matches(">/r1<").count() == 1).then_some(())
+    });
+}
+
+#[test]
+fn a_faulty_file_changes_nothing_and_says_why_and_a_mended_one_is_taken() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let file = cell.file("cell.yaml", &mapping(2, "/r1"));
+    let mut bridge = cell.bridge_ros1(&[file.to_str().unwrap()]);
+    let node = BareNode::start("/robot");
+    let mut streams = node.publish(&["/r1".to_owned(), "/r2".to_owned()]);
+    let socket = UadpSocket::join();
+    let first = about("hash");
+
+    save(&file, &mapping(2, "/r1").replace("origin: 1", "origin: 7"));
+    bridge.wait_for_line("nothing is changed", SOON);
+    let told = bridge.lines().join("\n");
+    assert_eq!(
+        told.matches("error[M014]").count(),
+        2,
+        "both places: {told}"
+    );
+    assert_eq!((about("hash"), about("refused")), (first.clone(), 1.into()));
+    assert!(about("stale").as_str().unwrap().contains("2 errors"));
+    let page = http_get(METRICS_ROS1, "/metrics").unwrap();
+    assert!(page.contains("ua_mapping_stale{program=\"bridge-ros1\",space=\"1\"} 1"));
+    streams[0].write_all(&string_frame("still")).unwrap();
+    let carries = |socket: &UadpSocket, text: &str| {
+        let datagram = socket.receive(Duration::from_millis(50));
+        datagram.filter(|datagram| datagram.windows(text.len()).any(|w| w == text.as_bytes()))
+    };
+    eventually("what ran still runs", SOON, || carries(&socket, "still"));
+
+    // Written in place, and asked for at once instead of waited for.
+    fs::write(&file, mapping(1, "/r1")).unwrap();
+    bridge.signal(Signal::SIGHUP);
+    eventually("it is taken", SOON, || {
+        (about("reloads") == 1).then_some(())
+    });
+    assert_eq!(
+        (about("stale"), about("variables")),
+        (Value::Null, 1.into())
+    );
+    assert_ne!(about("hash"), first);
+    bridge.wait_for_line("unbound", SOON);
+
+    // As a Kubernetes ConfigMap is changed: the file stays a link, and what it leads to is another.
+    let (folder, link) = (cell.folder(), file.with_extension("link"));
+    fs::write(
+        folder.join("other.yaml"),
+        mapping(3, "/r1") + "pubsub: {ttl: 4}\n",
+    )
+    .unwrap();
+    std::os::unix::fs::symlink("other.yaml", &link).unwrap();
+    fs::rename(&link, &file).unwrap();
+    bridge.wait_for_line("restart needed: pubsub.ttl", SOON);
+    assert_eq!(about("variables"), 3);
+    assert_eq!(about("restart_needed"), serde_json::json!(["pubsub.ttl"]));
+    let _third = node.publish(&["/r3".to_owned()]);
+    bridge.end();
+}
+
+#[test]
+fn bridge_ros2_leaves_the_routes_alone_that_an_edit_does_not_name() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mapping = |first: &str| {
+        mapping(2, first)
+            .replace("{id: 1}", "{id: 2}")
+            .replace("origin: 1", "origin: 2")
+    };
+    let file = cell.file("cell.yaml", &mapping("/r1"));
+    let mut bridge = cell.bridge_ros2(&[file.to_str().unwrap()]);
+    let (heard, ended) = (Arc::default(), Arc::new(AtomicBool::new(false)));
+    let listener = listen(&heard, &ended);
+    let sends = |topic: &str| {
+        let numbered = ["--domain", "2", "--numbered", "60000", "--rate", "50"];
+        cell.cyclone(
+            "ros2_pub.py",
+            &[&[topic, "std_msgs/String"][..], &numbered].concat(),
+        )
+    };
+    let heard_of = |route: u16| {
+        let heard: std::sync::MutexGuard<'_, Heard> = heard.lock().unwrap();
+        heard.get(&route).map_or(0, Vec::len)
+    };
+    let _sends = [sends("/r1"), sends("/r2"), sends("/moved")];
+    eventually("both are heard", SOON, || {
+        (heard_of(1) > 10 && heard_of(2) > 10).then_some(())
+    });
+    save(&file, &mapping("/moved"));
+    bridge.wait_for_line("was read again", SOON);
+    bridge.wait_for_line("unbound topic=ua_2_2_1", SOON);
+    let (one, two) = (heard_of(1), heard_of(2));
+    eventually("both are heard again", SOON, || {
+        (heard_of(1) > one + 10 && heard_of(2) > two + 10).then_some(())
+    });
+    ended.store(true, Ordering::Relaxed);
+    listener.join().unwrap();
+    let lines = bridge.lines();
+    assert!(
+        !lines
+            .iter()
+            .any(|line| line.contains("unbound topic=ua_2_2_2"))
+    );
+    let heard = heard.lock().unwrap();
+    let (first, number) = heard[&2][0];
+    for (sequence, said) in &heard[&2] {
+        let offset = first.wrapping_sub(number);
+        assert_eq!(sequence.wrapping_sub(*said), offset, "{:?}", heard[&2]);
+    }
+    let sequences: Vec<u16> = heard[&1].iter().map(|(sequence, _)| *sequence).collect();
+    assert!(sequences.is_sorted_by(|a, b| a < b), "{sequences:?}");
+}
+
+#[test]
+fn the_server_has_the_nodes_of_the_saved_mapping_and_its_clients_stay() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let part = cell.file("part.yaml", "variables: []\n");
+    let whole = mapping(2, "/r1").replacen("spaces", "include: part.yaml\nspaces", 1);
+    let file = cell.file("cell.yaml", &whole);
+    let mut server = cell.ua_server(&[file.to_str().unwrap()]);
+    let read = |nodes: &[&str]| {
+        let all = [&[SERVER_ENDPOINT], nodes].concat();
+        let answers = cell.asyncua_try("opcua_read.py", &all)?;
+        let status = |answer: &Value| answer["status"].as_str().unwrap().to_owned();
+        Some(answers.iter().map(status).collect::<Vec<String>>())
+    };
+    let (waiting, unknown) = ("BadWaitingForInitialData", "BadNodeIdUnknown");
+    let nodes = ["ns=2;i=1", "ns=2;i=2", "ns=2;i=3"];
+    let before = eventually("the server answers", SOON, || read(&nodes));
+    assert_eq!(before, [waiting, waiting, unknown]);
+
+    // The file that was started with does not change, only what it includes.
+    save(
+        &part,
+        "variables:\n  - {node: ns=2;i=3, name: New, type: Double, origin: 4}\n  - {node: ns=2;i=4, name: Far, \
+         type: Double, origin: 1}\n",
+    );
+    server.wait_for_line("error[M014]", SOON);
+    save(
+        &part,
+        "variables:\n  - {node: ns=2;i=3, name: New, type: Double, origin: 0}\n",
+    );
+    server.wait_for_line("was read again", SOON);
+    assert_eq!(read(&nodes), Some(vec![waiting.to_owned(); 3]));
+    save(&file, &whole.replace("node: ns=2;i=2,", "node: ns=2;i=7,"));
+    server.wait_for_line("unbound topic=ua_1_2_2", SOON);
+    let after = read(&nodes).unwrap();
+    assert_eq!(after, [waiting, unknown, waiting]);
+}
