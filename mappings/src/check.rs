@@ -2,6 +2,7 @@
 
 mod bindings;
 mod cell;
+mod environment;
 mod names;
 mod network;
 mod patterns;
@@ -12,6 +13,7 @@ mod variables;
 
 use crate::diagnostic::{Diagnostic, Severity};
 use crate::document;
+use crate::environment::Environment;
 use crate::findings::Findings;
 use crate::mapping::Mapping;
 use crate::read::{Field, Reader};
@@ -62,8 +64,19 @@ impl Mapping {
     /// proportion to the text, of which at most 4 MiB are read.
     #[must_use]
     pub fn from_yaml(text: &str, file: &str) -> Checked {
+        Self::checked(text, file, None)
+    }
+
+    /// As [`Mapping::from_yaml`], and whether what is named in the document is there as it says; what was not asked for
+    /// in the environment is not looked at. Findings about the environment are warnings.
+    #[must_use]
+    pub fn from_yaml_in(text: &str, file: &str, environment: &Environment) -> Checked {
+        Self::checked(text, file, Some(environment))
+    }
+
+    fn checked(text: &str, file: &str, environment: Option<&Environment>) -> Checked {
         let mut findings = Findings::new(file);
-        let mapping = compile(text, &mut findings).filter(|_| !findings.has_errors());
+        let mapping = compile(text, environment, &mut findings).filter(|_| !findings.has_errors());
         Checked {
             mapping,
             findings: findings.into_sorted(),
@@ -71,7 +84,11 @@ impl Mapping {
     }
 }
 
-fn compile(text: &str, findings: &mut Findings) -> Option<Mapping> {
+fn compile(
+    text: &str,
+    environment: Option<&Environment>,
+    findings: &mut Findings,
+) -> Option<Mapping> {
     let root = match tree::parse(text) {
         Ok(root) => root,
         Err(fault) => {
@@ -102,7 +119,13 @@ fn compile(text: &str, findings: &mut Findings) -> Option<Mapping> {
         None => Vec::new(),
     };
     let mapping = Mapping::new(pubsub, spaces.known, namespaces.known, server, variables);
-    Some(mapping.with_patterns(patterns))
+    let mapping = mapping.with_patterns(patterns);
+    if let Some(environment) = environment
+        && !findings.has_errors()
+    {
+        environment::check(&document, &mapping, environment, findings);
+    }
+    Some(mapping)
 }
 
 /// What a document declares.

@@ -96,6 +96,13 @@ codes! {
     Conversion = "M083", "`scale` and `offset` go with a number, `invert` with a Boolean, all of them with one field; `out_of_range` says what becomes of values that a conversion makes too big.";
     LossyConversion = "M084", "The type the value becomes cannot hold all that the other type can, so a number would be rounded or not fit. With `out_of_range` it is rounded; one that does not fit then does not cross and is counted with `refuse`, and becomes the nearest that fits with `clamp`.";
     Publish = "M085", "`deadband` is a number above 0, of values that are numbers; `at_most` a rate as 10 Hz, from 0.001 Hz to 1000 Hz.";
+    PatternUnmatched = "M120", "No topic that is there now fits the pattern and its type. Only `ua-space check --environment` asks for that; a robot that is switched off is no fault of the mapping.";
+    TopicAway = "M121", "Nobody publishes the topic that is read, or nobody subscribes to the one that is written, in the graph as it is now. Only `ua-space check --environment` asks for that.";
+    LiveTypeDiffers = "M122", "The topic is there with another message type, so not a single message would cross. Only `ua-space check --environment` asks for that.";
+    NamespaceIndex = "M123", "In the server that runs the namespace URI has another index, or none. The node ids of the mapping then mean other nodes, or none. Only `ua-space check --environment` asks for that.";
+    ServiceAway = "M124", "Nobody offers the service in the graph as it is now. Only `ua-space check --environment` asks for that.";
+    NodeAway = "M125", "The server that runs has no such variable. Only `ua-space check --environment` asks for that.";
+    LiveNodeDiffers = "M126", "The variable is there in the server with another data type. Only `ua-space check --environment` asks for that.";
 }
 
 impl fmt::Display for Code {
@@ -118,7 +125,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M085")]
+#[error("no finding has that code; codes are M001 to M126")]
 pub struct UnknownCode;
 
 #[cfg(test)]

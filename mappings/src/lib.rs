@@ -4,6 +4,7 @@ mod check;
 mod code;
 mod diagnostic;
 mod document;
+mod environment;
 mod findings;
 mod mapping;
 mod nearest;
@@ -17,6 +18,7 @@ pub use check::Checked;
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use document::schema;
+pub use environment::{Environment, LiveNode, LiveServer, LiveSpace, LiveTopic};
 pub use mapping::{
     Binding, Endpoint, Mapping, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy, Server,
     ServiceBinding, ServiceRole, Space, Trigger, Variable,

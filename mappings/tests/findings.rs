@@ -1,10 +1,14 @@
 //! One faulty document per code in tests/bad/, and beside it what people are told about it.
 #![expect(clippy::unwrap_used, reason = "test code")]
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use mappings::{Checked, Code, Mapping, Severity};
+use mappings::{
+    Checked, Code, Environment, LiveNode, LiveServer, LiveSpace, LiveTopic, Mapping, Severity,
+    SpaceId,
+};
+use uadp::BuiltinType;
 
 fn documents() -> Vec<PathBuf> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/bad");
@@ -21,8 +25,56 @@ fn documents() -> Vec<PathBuf> {
 fn check(path: &Path) -> (String, Checked) {
     let text = std::fs::read_to_string(path).unwrap();
     let name = path.file_name().unwrap().to_string_lossy();
-    let checked = Mapping::from_yaml(&text, &name);
+    let checked = if name.starts_with("M12") {
+        Mapping::from_yaml_in(&text, &name, &environment())
+    } else {
+        Mapping::from_yaml(&text, &name)
+    };
     (text, checked)
+}
+
+/// What is there for the documents that name what is not.
+fn environment() -> Environment {
+    let topic = |kind: &str, published| LiveTopic {
+        types: BTreeSet::from([kind.to_owned()]),
+        published,
+        subscribed: !published,
+    };
+    let ros1 = LiveSpace {
+        topics: BTreeMap::from([
+            ("/conveyor/running".to_owned(), topic("std_msgs/Bool", true)),
+            ("/conveyor/switch".to_owned(), topic("std_msgs/Bool", false)),
+            ("/robot1/pose".to_owned(), topic("std_msgs/String", true)),
+        ]),
+        services: Some(BTreeSet::from(["/conveyor/start".to_owned()])),
+    };
+    Environment {
+        spaces: BTreeMap::from([(SpaceId::ROS1, ros1)]),
+        server: Some(LiveServer {
+            namespaces: ["http://opcfoundation.org/UA/", "urn:server", "urn:line"]
+                .map(str::to_owned)
+                .to_vec(),
+            nodes: BTreeMap::from([
+                ("ns=2;i=98".to_owned(), LiveNode::Away),
+                (
+                    "ns=2;i=99".to_owned(),
+                    LiveNode::Variable(Some((BuiltinType::Double, false))),
+                ),
+            ]),
+        }),
+    }
+}
+
+#[test]
+fn what_was_not_asked_for_is_not_missed() {
+    for path in documents() {
+        let text = std::fs::read_to_string(&path).unwrap();
+        let name = path.file_name().unwrap().to_string_lossy();
+        if name.starts_with("M12") {
+            let checked = Mapping::from_yaml_in(&text, &name, &Environment::default());
+            assert!(checked.findings.is_empty(), "{}", checked.render(&text));
+        }
+    }
 }
 
 #[test]
