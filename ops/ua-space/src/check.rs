@@ -6,30 +6,50 @@ use mappings::{Checked, Diagnostic, Mapping};
 use serde::Serialize;
 
 use crate::arguments::Check;
+use crate::environment::{Asked, Seen};
 use crate::exit::Failure;
+use crate::report::warn;
 
 pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
     let mut out = BufWriter::new(io::stdout().lock());
-    let mut all_can_run = true;
+    let (mut all_can_run, mut all_there) = (true, true);
     for file in &arguments.files {
         let text = read(file)?;
         let name = if file == "-" { "<stdin>" } else { file };
-        let checked = Mapping::from_yaml(&text, name);
+        let mut checked = Mapping::from_yaml(&text, name);
         all_can_run &= checked.mapping.is_some();
+        let mut seen = None;
+        if !arguments.environment.is_empty()
+            && let Some(mapping) = &checked.mapping
+        {
+            let found = Seen::look(mapping, arguments)?;
+            checked = Mapping::from_yaml_in(&text, name, &found.environment);
+            all_there &= found.is_whole();
+            seen = Some(found);
+        }
+        let asked = seen.as_ref().map(|seen| seen.asked.as_slice());
         if arguments.json {
-            let line = serde_json::to_string(&Told::of(name, &checked))
+            let line = serde_json::to_string(&Told::of(name, &checked, asked))
                 .map_err(|error| Failure::Data(format!("{name}: {error}")))?;
             writeln!(out, "{line}")?;
         } else {
             out.write_all(checked.render(&text).as_bytes())?;
+            for asked in asked.unwrap_or_default() {
+                match &asked.why {
+                    None => writeln!(out, "{} is there", asked.whom)?,
+                    Some(why) => warn(&format!("error: {why}")),
+                }
+            }
             writeln!(out, "{}", sum(name, &checked))?;
         }
     }
     out.flush()?;
-    if all_can_run {
+    if !all_can_run {
+        Err(Failure::Configuration)
+    } else if all_there {
         Ok(())
     } else {
-        Err(Failure::Configuration)
+        Err(Failure::NotThere)
     }
 }
 
@@ -76,6 +96,8 @@ struct Told<'a> {
     file: &'a str,
     can_run: bool,
     findings: Vec<Finding<'a>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    environment: Option<&'a [Asked]>,
 }
 
 #[derive(Serialize)]
@@ -93,11 +115,12 @@ struct Finding<'a> {
 }
 
 impl<'a> Told<'a> {
-    fn of(file: &'a str, checked: &'a Checked) -> Self {
+    fn of(file: &'a str, checked: &'a Checked, environment: Option<&'a [Asked]>) -> Self {
         Self {
             file,
             can_run: checked.mapping.is_some(),
             findings: checked.findings.iter().map(Finding::of).collect(),
+            environment,
         }
     }
 }
