@@ -4,6 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use mappings::Mapping;
 use serde_json::Value;
 use system_tests::{Cell, Child, Peer, SERVER_ENDPOINT, Started, eventually, program};
 
@@ -167,8 +168,7 @@ fn what_is_new_is_put_behind_what_somebody_has_edited() {
     assert_eq!(ended.code, 0, "{}", ended.text());
     let nodes = |file: &Path| {
         let text = fs::read_to_string(file).unwrap();
-        let entries = text.split_once("variables:").unwrap().1.to_owned();
-        entries
+        text.split_once("variables:").unwrap().1.to_owned()
     };
     assert_eq!(nodes(&of_server), nodes(&of_set));
 
@@ -232,6 +232,45 @@ fn who_is_not_there_is_named_and_nothing_is_written() {
         (ended.code, &ended.object()["environment"]),
         (78, &Value::Null)
     );
+}
+
+#[test]
+fn values_named_alike_become_the_nodes_of_our_own_server() {
+    let Some(cell) = Cell::with(ALL) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let _robots = (
+        cell.rospy("assembly_line_ros1.py", &[]),
+        cell.cyclone("assembly_line_ros2.py", &[]),
+    );
+    let shipped = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../mappings/assembly-line.yaml"
+    );
+    let _server = cell.ua_server(&[shipped]);
+    let file = path(&cell, "cell.yaml");
+    let name = file.to_str().unwrap();
+    let looks = ["--ros1", "--ros2", "2", "--opcua", SERVER_ENDPOINT];
+    let ended = ua_space(&[&["init", "-o", name][..], &looks].concat());
+    assert_eq!(ended.code, 0, "{}", ended.text());
+    let read = |file: &str| {
+        let checked = Mapping::from_yaml(&fs::read_to_string(file).unwrap(), file);
+        assert!(checked.findings.is_empty());
+        checked.mapping.unwrap()
+    };
+    let (written, shipped) = (read(name), read(shipped));
+    // What is named alike is as somebody has written it by hand: node, origin, topics of both sides.
+    for topic in ["ua_0_2_1", "ua_1_2_10", "ua_2_2_20", "ua_2_2_21"] {
+        let topic = topic.parse().unwrap();
+        assert_eq!(written.variable(topic), shipped.variable(topic));
+    }
+    // /storage/covers and CoversInStorage are not, and are values each for itself.
+    let covers = written
+        .variables()
+        .iter()
+        .filter(|one| one.name.contains("Covers"));
+    assert_eq!(covers.count(), 6);
 }
 
 const ELSEWHERE: &str = r#"

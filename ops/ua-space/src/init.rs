@@ -261,9 +261,9 @@ type Rendered = Option<(String, usize, Vec<std::ops::Range<usize>>)>;
 fn settled(plan: &mut Plan, render: impl Fn(&Plan) -> Rendered) -> Result<String, Failure> {
     loop {
         let (text, start, entries) = render(plan).ok_or_else(unmergeable)?;
-        let findings = Mapping::from_yaml(&text, "").findings;
+        let Checked { mapping, findings } = Mapping::from_yaml(&text, "");
         let mut changed = false;
-        for finding in findings {
+        for finding in &findings {
             let at = finding.at.line.saturating_sub(1 + start);
             let faulty = entries.iter().position(|lines| lines.contains(&at));
             let entry = faulty.and_then(|at| plan.entries.get_mut(at));
@@ -281,9 +281,17 @@ fn settled(plan: &mut Plan, render: impl Fn(&Plan) -> Rendered) -> Result<String
             }
             entry.faulty = Some(why);
         }
-        if !changed {
-            return Ok(text);
+        if changed {
+            continue;
         }
+        // Such as that there is too much of it.
+        return match (mapping, findings.first()) {
+            (None, Some(first)) => Err(Failure::Unconfigured(format!(
+                "what would be written could not run: {}",
+                first.message
+            ))),
+            (Some(_), _) | (None, None) => Ok(text),
+        };
     }
 }
 

@@ -411,7 +411,7 @@ fn candidates(name: &str, bound: Vec<(Bound, bool)>) -> Vec<Candidate> {
     let first = bindings
         .iter()
         .find(|one| one.space == origin)
-        .or(bindings.first());
+        .or_else(|| bindings.first());
     let Some(kind) = first.map(|one| one.kind.clone()) else {
         return Vec::new();
     };
