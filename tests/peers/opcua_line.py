@@ -1,6 +1,6 @@
 """An assembly line's OPC UA server by asyncua: nodes with numbers, texts and GUIDs, in a namespace of its own.
 
-With --export it writes its nodes as a NodeSet instead of serving them.
+With --export it writes its nodes as a NodeSet, too.
 """
 
 import argparse
@@ -44,8 +44,6 @@ async def run(args):
         nodes = [server.get_node(ua.NodeId(one, space)) for one in identifiers]
         nodes.append(server.get_node(ua.NodeId(uuid.UUID("09087e75-8e5e-499b-954f-f2a9603db28a"), space)))
         await server.export_xml(nodes, args.export)
-        lifetime.say(ready=args.export)
-        return
     async with server:
         lifetime.say(ready=URI)
         await asyncio.Event().wait()
