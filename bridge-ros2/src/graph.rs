@@ -182,6 +182,11 @@ impl Graph {
         &self.participants
     }
 
+    /// The topics somebody reads.
+    pub fn read_topics(&self) -> impl Iterator<Item = &str> {
+        self.readers.keys().map(String::as_str)
+    }
+
     /// The topics somebody writes.
     pub fn written_topics(&self) -> impl Iterator<Item = &str> {
         self.writers.keys().map(String::as_str)

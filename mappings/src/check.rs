@@ -2,6 +2,7 @@
 
 mod bindings;
 mod cell;
+mod environment;
 mod names;
 mod network;
 mod patterns;
@@ -249,7 +250,13 @@ fn compile(
     };
     let mapping = Mapping::new(pubsub, spaces.known, namespaces.known, server, variables);
     *used = types.used();
-    mapping.with_patterns(patterns).with_type_paths(paths)
+    let mapping = mapping.with_patterns(patterns).with_type_paths(paths);
+    if let Some(environment) = around.environment()
+        && !findings.has_errors()
+    {
+        environment::check(&document, &mapping, environment, findings);
+    }
+    mapping
 }
 
 /// Most entries of `type_paths`.

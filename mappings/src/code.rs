@@ -104,6 +104,13 @@ codes! {
     IncludeTwice = "M111", "A file is included once, and not by itself. Includes nest no deeper than 8 and lead to no more than 256 files.";
     EnvironmentVariable = "M112", "`${NAME}` is the value of an environment variable, `${NAME:-default}` has a default for one that is not set or empty, and `$${` stands for `${` itself.";
     MergeKey = "M113", "`<<` brings the keys of other maps: of an alias, or of a list of aliases.";
+    PatternUnmatched = "M120", "No topic that is there now fits the pattern and its type. Only `ua-space check --environment` asks for that; a robot that is switched off is no fault of the mapping.";
+    TopicAway = "M121", "Nobody publishes the topic that is read, or nobody subscribes to the one that is written, in the graph as it is now. Only `ua-space check --environment` asks for that.";
+    LiveTypeDiffers = "M122", "The topic is there with another message type, so not a single message would cross. Only `ua-space check --environment` asks for that.";
+    NamespaceIndex = "M123", "In the server that runs the namespace URI has another index, or none. The node ids of the mapping then mean other nodes, or none. Only `ua-space check --environment` asks for that.";
+    ServiceAway = "M124", "Nobody offers the service in the graph as it is now. Only `ua-space check --environment` asks for that.";
+    NodeAway = "M125", "The server that runs has no such variable. Only `ua-space check --environment` asks for that.";
+    LiveNodeDiffers = "M126", "The variable is there in the server with another data type. Only `ua-space check --environment` asks for that.";
 }
 
 impl fmt::Display for Code {
@@ -126,7 +133,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M113")]
+#[error("no finding has that code; codes are M001 to M126")]
 pub struct UnknownCode;
 
 #[cfg(test)]

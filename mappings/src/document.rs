@@ -193,6 +193,7 @@ document! {
         /// {pose.x: 1.5}; the name of a constant of the request stands for its value. All others are zero or empty.
         request: Request,
         /// With `call` and without `field`: the value that calls the service. Default: true for a Boolean, any value else.
+        #[schemars(extend("type" = ["string", "boolean", "number", "null"]))]
         when: String,
         /// With `call` and `poll`: how long the service may take; default 5s.
         #[schemars(regex(pattern = DURATION))]

@@ -75,7 +75,11 @@ impl<'a> Loader<'a> {
         let (mut document, _) = document::read(&tree.root, &mut Reader::new(self.findings))?;
         let includes = document.include.take();
         let type_paths = document.type_paths.as_mut();
-        for At { value, .. } in type_paths.and_then(|at| at.value.as_mut()).into_iter().flatten() {
+        for At { value, .. } in type_paths
+            .and_then(|at| at.value.as_mut())
+            .into_iter()
+            .flatten()
+        {
             // An empty one stays what it is, for a finding.
             if let Some(named) = value.as_mut().filter(|named| !named.is_empty()) {
                 *named = beside(&path, named);

@@ -5,6 +5,7 @@ mod code;
 mod diagnostic;
 mod difference;
 mod document;
+mod environment;
 mod findings;
 mod include;
 mod mapping;
@@ -22,6 +23,7 @@ pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use difference::Difference;
 pub use document::schema;
+pub use environment::{Environment, LiveNode, LiveServer, LiveSpace, LiveTopic};
 pub use mapping::{
     Binding, Endpoint, Mapping, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy, Server,
     ServiceBinding, ServiceRole, Space, Trigger, Variable,

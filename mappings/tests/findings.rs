@@ -1,10 +1,13 @@
 //! One faulty document per code in tests/bad/, and beside it what people are told about it.
 #![expect(clippy::unwrap_used, reason = "test code")]
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use mappings::{Checked, Code, Mapping, PathFault, PathFaultKind, Severity, TypeFiles, TypeOrigin};
+use mappings::{
+    Checked, Code, Environment, LiveNode, LiveServer, LiveSpace, LiveTopic, Mapping, PathFault,
+    PathFaultKind, Severity, SpaceId, Surroundings, TypeFiles, TypeOrigin,
+};
 use messages::{DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName};
 use uadp::BuiltinType;
 
@@ -23,8 +26,38 @@ fn documents() -> Vec<PathBuf> {
 fn check(path: &Path) -> (String, Checked) {
     let text = std::fs::read_to_string(path).unwrap();
     let name = path.file_name().unwrap().to_string_lossy();
-    let checked = Mapping::from_yaml_with(&text, &name, |paths| Box::new(Folder(paths.to_vec())));
-    (text, checked)
+    let around = Around {
+        environment: name.starts_with("M12").then(environment),
+    };
+    (text.clone(), Mapping::from_text(&text, &name, &around))
+}
+
+/// Definitions in the folder `types`, and perhaps a cell that runs.
+#[derive(Default)]
+struct Around {
+    environment: Option<Environment>,
+}
+
+impl Surroundings for Around {
+    fn read(&self, file: &str) -> Result<String, String> {
+        Err(format!("{file} is not there"))
+    }
+
+    fn list(&self, folder: &str) -> Result<Vec<String>, String> {
+        self.read(folder).map(|_| Vec::new())
+    }
+
+    fn variable(&self, _: &str) -> Option<String> {
+        None
+    }
+
+    fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
+        Box::new(Folder(paths.to_vec()))
+    }
+
+    fn environment(&self) -> Option<&Environment> {
+        self.environment.as_ref()
+    }
 }
 
 /// The folder `types`, wherever a document names it; there is no other.
@@ -78,16 +111,44 @@ impl TypeFiles for Folder {
     }
 }
 
+/// What is there for the documents that name what is not.
+fn environment() -> Environment {
+    let topic = |kind: &str, published| LiveTopic {
+        types: BTreeSet::from([kind.to_owned()]),
+        published,
+        subscribed: !published,
+    };
+    let ros1 = LiveSpace {
+        topics: BTreeMap::from([
+            ("/conveyor/running".to_owned(), topic("std_msgs/Bool", true)),
+            ("/conveyor/switch".to_owned(), topic("std_msgs/Bool", false)),
+            ("/robot1/pose".to_owned(), topic("std_msgs/String", true)),
+        ]),
+        services: Some(BTreeSet::from(["/conveyor/start".to_owned()])),
+    };
+    Environment {
+        spaces: BTreeMap::from([(SpaceId::ROS1, ros1)]),
+        server: Some(LiveServer {
+            namespaces: ["http://opcfoundation.org/UA/", "urn:server", "urn:line"]
+                .map(str::to_owned)
+                .to_vec(),
+            nodes: BTreeMap::from([
+                ("ns=2;i=98".to_owned(), LiveNode::Away),
+                (
+                    "ns=2;i=99".to_owned(),
+                    LiveNode::Variable(Some((BuiltinType::Double, false))),
+                ),
+            ]),
+        }),
+    }
+}
+
 #[test]
 fn a_type_of_a_file_is_as_good_as_one_that_is_built_in() {
     let text = "spaces: [{id: 1}]\nnamespaces: {2: urn:x}\ntype_paths: [types]\nvariables:\n\
         - {node: ns=2;i=1, name: Arm, origin: 1, ros: {topic: /arm, type: robot_msgs/Arm, field: joints}}\n\
         - {node: ns=2;i=2, name: B, origin: 1, ros: {topic: /b, type: std_msgs/Int8}}\n";
-    let open = |paths: &[PathBuf]| -> Box<dyn TypeFiles> {
-        assert_eq!(paths, [PathBuf::from("cells/types")]);
-        Box::new(Folder(paths.to_vec()))
-    };
-    let checked = Mapping::from_yaml_with(text, "cells/one.yaml", open);
+    let checked = Mapping::from_text(text, "cells/one.yaml", &Around::default());
     let mapping = checked.mapping.unwrap();
     assert_eq!(mapping.type_paths(), [PathBuf::from("cells/types")]);
     let arm = mapping.variable("ua_1_2_1".parse().unwrap()).unwrap();
@@ -107,6 +168,21 @@ fn a_type_of_a_file_is_as_good_as_one_that_is_built_in() {
             ("std_msgs/Int8", TypeOrigin::BuiltIn)
         ]
     );
+}
+
+#[test]
+fn what_was_not_asked_for_is_not_missed() {
+    let nothing = Around {
+        environment: Some(Environment::default()),
+    };
+    for path in documents() {
+        let text = std::fs::read_to_string(&path).unwrap();
+        let name = path.file_name().unwrap().to_string_lossy();
+        if name.starts_with("M12") {
+            let checked = Mapping::from_text(&text, &name, &nothing);
+            assert!(checked.findings.is_empty(), "{}", checked.render(&text));
+        }
+    }
 }
 
 #[test]

@@ -23,6 +23,24 @@ pub struct Graph {
     pub types: BTreeMap<String, String>,
 }
 
+impl Graph {
+    /// Asks the master at `uri` (`http://host:port`) without becoming a node of its graph. Takes as long as two calls
+    /// may at most, 3 s each.
+    ///
+    /// # Errors
+    /// The URI is none, the master cannot be reached, or answers what no master does.
+    pub async fn of_master(uri: &str, caller_id: &str) -> Result<Self, MasterError> {
+        let endpoint = Endpoint::parse(uri).ok_or(RpcError::Uri)?;
+        let master = Master::new(
+            endpoint,
+            uri.to_owned(),
+            caller_id.to_owned(),
+            String::new(),
+        );
+        master.graph().await
+    }
+}
+
 /// One master, called in the name of one node.
 #[derive(Clone, Debug)]
 pub(crate) struct Master {

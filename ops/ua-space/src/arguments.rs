@@ -18,12 +18,24 @@ pub(crate) enum Verb {
     /// Tell everything that is wrong with a mapping
     ///
     /// Each finding has a code, its place with the line it is about, and what to do; `ua-space explain CODE` says more of
-    /// a code. Nothing is asked of the network: definitions of messages are those of its
-    /// type_paths, of ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, and those built in.
+    /// a code. Definitions of messages are those of its type_paths, of ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, and those
+    /// built in. Nothing is asked of the network without --environment.
     ///
-    /// Exit codes: 0 all can run, with or without warnings, 64 usage, 74 a file that cannot be read or an output that
-    /// cannot be written, 78 one of them cannot run.
+    /// Exit codes: 0 all can run, with or without warnings, 64 usage, 69 somebody of the environment is not there, 74 a
+    /// file that cannot be read or an output that cannot be written, 78 one of them cannot run.
     Check(Check),
+    /// Write a mapping of what is there
+    ///
+    /// Looks at live ROS graphs, a running OPC UA server and NodeSets, and writes a commented mapping that runs. Topics and
+    /// nodes of several are tied where name and type are the same, and marked as guesses. What runs ROS itself (logs,
+    /// actions, transforms) is left out, with a comment.
+    ///
+    /// A file that is there keeps every byte: with --merge what is new is put behind it, and topics or nodes that its
+    /// comments name are not proposed again.
+    ///
+    /// Exit codes: 0 done, 64 usage, 65 a NodeSet is malformed, 69 a master, domain or server is not there, 74 a file that
+    /// cannot be read or written, or is there and --merge was not said, 78 the file that is there cannot run.
+    Init(Init),
     /// Say what the code of a finding means, with an example
     ///
     /// Without a code: all of them, a line each.
@@ -62,6 +74,75 @@ pub(crate) struct Check {
     /// One JSON object a file, with its findings
     #[arg(long)]
     pub(crate) json: bool,
+    /// Ask whether the topics, services, types, namespaces and nodes are there: the ROS 1 master (ROS_MASTER_URI), the DDS
+    /// domains of the spaces and the OPC UA server, or some of them
+    #[arg(
+        long,
+        value_name = "WHOM",
+        value_enum,
+        num_args = 0..=1,
+        require_equals = true,
+        value_delimiter = ',',
+        default_missing_value = "ros1,ros2,opcua"
+    )]
+    pub(crate) environment: Vec<Part>,
+    /// How many seconds to listen in a DDS domain at most
+    #[arg(long, value_name = "SECONDS", default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..=600))]
+    pub(crate) wait: u16,
+}
+
+/// Whom of its environment to ask.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Part {
+    /// The ROS 1 master
+    Ros1,
+    /// The DDS domains
+    Ros2,
+    /// The OPC UA server
+    Opcua,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Init {
+    /// The ROS 1 graph of this master; without a URI that of ROS_MASTER_URI
+    #[arg(long, value_name = "URI", num_args = 0..=1)]
+    pub(crate) ros1: Option<Option<String>>,
+    /// A DDS domain, 0 to 232; without a number that of ROS_DOMAIN_ID. May be repeated
+    #[arg(long, value_name = "DOMAIN", num_args = 0..=1, default_missing_value = "", value_parser = domain)]
+    pub(crate) ros2: Vec<Option<u16>>,
+    /// A NodeSet, as modelling tools export it. May be repeated
+    #[arg(long, value_name = "FILE")]
+    pub(crate) nodeset: Vec<String>,
+    /// An OPC UA server that runs, as opc.tcp://127.0.0.1:4840. May be repeated
+    #[arg(long, value_name = "URL")]
+    pub(crate) opcua: Vec<String>,
+    /// Where to write; without it stdout
+    #[arg(short, long, value_name = "FILE")]
+    pub(crate) output: Option<String>,
+    /// Add what is new to the file where it is there already
+    #[arg(long, requires = "output")]
+    pub(crate) merge: bool,
+    /// The namespace URI of values that have no node yet
+    #[arg(long, value_name = "URI", default_value = "urn:ua-bridge:cell")]
+    pub(crate) namespace: String,
+    /// Take in /tf and /tf_static
+    #[arg(long)]
+    pub(crate) tf: bool,
+    /// How many seconds to listen in a DDS domain at most
+    #[arg(long, value_name = "SECONDS", default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..=600))]
+    pub(crate) wait: u16,
+    /// Tell what was written as a JSON object
+    #[arg(long, requires = "output")]
+    pub(crate) json: bool,
+}
+
+/// `None` for the one of the environment.
+fn domain(text: &str) -> Result<Option<u16>, &'static str> {
+    if text.is_empty() {
+        return Ok(None);
+    }
+    let number = text.parse().ok().filter(|number| *number <= 232);
+    number.map(Some).ok_or("a DDS domain is 0 to 232")
 }
 
 #[derive(Debug, Args)]

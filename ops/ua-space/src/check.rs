@@ -1,36 +1,63 @@
 //! What is wrong with a mapping, for people and for programs.
 
 use std::io::{self, BufWriter, Read as _, Write as _};
+use std::path::PathBuf;
 
-use mappings::{Checked, Diagnostic, Mapping, TypeOrigin, TypeUse};
+use mappings::{
+    Checked, Diagnostic, Environment, Mapping, Surroundings, TypeFiles, TypeOrigin, TypeUse,
+};
 use messages::Dialect;
 use serde::Serialize;
+use type_files::Disk;
 
 use crate::arguments::Check;
+use crate::environment::{Asked, Seen};
 use crate::exit::Failure;
+use crate::report::warn;
 
 pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
     let mut out = BufWriter::new(io::stdout().lock());
-    let mut all_can_run = true;
+    let (mut all_can_run, mut all_there) = (true, true);
     for file in &arguments.files {
         let text = read(file)?;
         let name = if file == "-" { "<stdin>" } else { file };
-        let checked = Mapping::from_text(&text, name, &Disk);
+        let mut checked = Mapping::from_text(&text, name, &Around::default());
         all_can_run &= checked.mapping.is_some();
+        let mut seen = None;
+        if !arguments.environment.is_empty()
+            && let Some(mapping) = &checked.mapping
+        {
+            let found = Seen::look(mapping, arguments)?;
+            let around = Around {
+                environment: Some(&found.environment),
+            };
+            checked = Mapping::from_text(&text, name, &around);
+            all_there &= found.is_whole();
+            seen = Some(found);
+        }
+        let asked = seen.as_ref().map(|seen| seen.asked.as_slice());
         if arguments.json {
-            let line = serde_json::to_string(&Told::of(name, &checked))
+            let line = serde_json::to_string(&Told::of(name, &checked, asked))
                 .map_err(|error| Failure::Data(format!("{name}: {error}")))?;
             writeln!(out, "{line}")?;
         } else {
             out.write_all(checked.render_all().as_bytes())?;
+            for asked in asked.unwrap_or_default() {
+                match &asked.why {
+                    None => writeln!(out, "{} is there", asked.whom)?,
+                    Some(why) => warn(&format!("error: {why}")),
+                }
+            }
             writeln!(out, "{}", sum(name, &checked))?;
         }
     }
     out.flush()?;
-    if all_can_run {
+    if !all_can_run {
+        Err(Failure::Configuration)
+    } else if all_there {
         Ok(())
     } else {
-        Err(Failure::Configuration)
+        Err(Failure::NotThere)
     }
 }
 
@@ -54,23 +81,31 @@ fn read(file: &str) -> Result<String, Failure> {
     })
 }
 
-/// The files beside a mapping, and the environment of this process.
-struct Disk;
+/// What is beside a mapping, and what was found in the cell.
+#[derive(Default)]
+struct Around<'a> {
+    environment: Option<&'a Environment>,
+}
 
-impl Surroundings for Disk {
+impl Surroundings for Around<'_> {
     fn read(&self, file: &str) -> Result<String, String> {
-        read(file).map_err(|error| error.to_string())
+        Disk.read(file)
     }
 
     fn list(&self, folder: &str) -> Result<Vec<String>, String> {
-        let folder = if folder.is_empty() { "." } else { folder };
-        let entries = std::fs::read_dir(folder).map_err(|error| error.to_string())?;
-        let names = entries.filter_map(|entry| entry.ok()?.file_name().into_string().ok());
-        Ok(names.collect())
+        Disk.list(folder)
     }
 
     fn variable(&self, name: &str) -> Option<String> {
-        std::env::var(name).ok()
+        Disk.variable(name)
+    }
+
+    fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
+        Disk.types(paths)
+    }
+
+    fn environment(&self) -> Option<&Environment> {
+        self.environment
     }
 }
 
@@ -99,6 +134,8 @@ struct Told<'a> {
     findings: Vec<Finding<'a>>,
     /// The message and service types it names.
     types: Vec<Type<'a>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    environment: Option<&'a [Asked]>,
 }
 
 #[derive(Serialize)]
@@ -144,7 +181,7 @@ struct Finding<'a> {
 }
 
 impl<'a> Told<'a> {
-    fn of(file: &'a str, checked: &'a Checked) -> Self {
+    fn of(file: &'a str, checked: &'a Checked, environment: Option<&'a [Asked]>) -> Self {
         Self {
             file,
             can_run: checked.mapping.is_some(),
@@ -154,6 +191,7 @@ impl<'a> Told<'a> {
                 .map(|found| Finding::of(file, found))
                 .collect(),
             types: checked.types.iter().map(Type::of).collect(),
+            environment,
         }
     }
 }

@@ -15,6 +15,18 @@ pub(crate) enum Failure {
     /// A mapping that cannot run; why was told.
     #[error("a mapping cannot run")]
     Configuration,
+    /// A configuration that cannot run, and why.
+    #[error("{0}")]
+    Unconfigured(String),
+    /// What was typed makes no sense together.
+    #[error("{0}")]
+    Usage(String),
+    /// A master, domain or server that is not there.
+    #[error("{0}")]
+    Unavailable(String),
+    /// Somebody of an environment is not there, which was told.
+    #[error("not all of the environment is there")]
+    NotThere,
     /// A file that cannot be read, or an output that cannot be written.
     #[error("{0}")]
     Io(String),
@@ -44,7 +56,9 @@ impl From<&Failure> for ExitCode {
     fn from(failure: &Failure) -> Self {
         match failure {
             Failure::Data(_) | Failure::Told => Self::from(65),
-            Failure::Configuration => Self::from(78),
+            Failure::Configuration | Failure::Unconfigured(_) => Self::from(78),
+            Failure::Usage(_) => Self::from(USAGE),
+            Failure::Unavailable(_) | Failure::NotThere => Self::from(69),
             Failure::Io(_) => Self::from(74),
             Failure::Closed => Self::SUCCESS,
         }

@@ -6,10 +6,12 @@ mod check;
 mod decode;
 mod discovery;
 mod encode;
+mod environment;
 mod exit;
 mod explain;
 mod fault;
 mod hex;
+mod init;
 mod input;
 mod iso_time;
 mod json_file;
@@ -26,6 +28,7 @@ mod session;
 mod shape;
 mod status;
 mod structures;
+mod survey;
 mod values;
 
 use std::process::ExitCode;
@@ -51,6 +54,7 @@ fn main() -> ExitCode {
     };
     let ended = match &arguments.verb {
         Verb::Check(arguments) => check::check(arguments),
+        Verb::Init(arguments) => init::init(arguments),
         Verb::Explain(arguments) => explain::explain(arguments),
         Verb::Schema => explain::schema(),
         Verb::Decode(arguments) => session::decode(arguments),
@@ -59,7 +63,12 @@ fn main() -> ExitCode {
     match ended {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            if let Failure::Data(what) | Failure::Io(what) = &failure {
+            if let Failure::Data(what)
+            | Failure::Io(what)
+            | Failure::Usage(what)
+            | Failure::Unavailable(what)
+            | Failure::Unconfigured(what) = &failure
+            {
                 report::warn(what);
             }
             (&failure).into()

@@ -4,6 +4,7 @@
 
 mod captures;
 mod check;
+mod init;
 mod malformed;
 mod normal;
 mod program;

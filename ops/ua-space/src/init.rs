@@ -1,0 +1,531 @@
+//! A mapping of what is there: from live graphs, from a server, from NodeSets.
+
+mod known;
+mod merge;
+mod plan;
+mod render;
+mod topics;
+mod yaml;
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, ErrorKind, Read as _, Write as _};
+use std::time::Duration;
+
+use mappings::{Checked, Code, Mapping, SpaceId};
+use serde::Serialize;
+
+use crate::arguments::Init;
+use crate::exit::Failure;
+use crate::report;
+use crate::survey::{self, Graph, Nodes, look};
+use known::Known;
+use plan::{Plan, Wishes};
+
+pub(crate) fn init(arguments: &Init) -> Result<(), Failure> {
+    let asked = [
+        arguments.ros1.is_none(),
+        arguments.ros2.is_empty(),
+        arguments.nodeset.is_empty(),
+        arguments.opcua.is_empty(),
+    ];
+    if asked.iter().all(|nothing| *nothing) {
+        return Err(Failure::Usage(
+            "nothing to look at: give one or several of --ros1, --ros2, --nodeset FILE, --opcua URL"
+                .to_owned(),
+        ));
+    }
+    let existing = match &arguments.output {
+        Some(file) => existing(file)?,
+        None => None,
+    };
+    let mut known = match &existing {
+        Some((mapping, text)) => Known::of(mapping.clone(), text),
+        None => Known::default(),
+    };
+    let found = Found::look(arguments, &known.mapping)?;
+    let wishes = Wishes {
+        namespace: &arguments.namespace,
+        transforms: arguments.tf,
+    };
+    let mut plan = Plan::new(&found.graphs, &found.nodes, &wishes, &mut known);
+    let text = match &existing {
+        Some((mapping, text)) => added(text, mapping, &mut plan)?,
+        None => written(&found.places, &mut plan)?,
+    };
+    put(
+        arguments,
+        existing.as_ref().map(|(_, text)| text.as_str()),
+        &text,
+        &plan,
+    )
+}
+
+/// What was looked at.
+struct Found {
+    graphs: Vec<Graph>,
+    nodes: Vec<Nodes>,
+    /// For people, in their order.
+    places: Vec<String>,
+}
+
+impl Found {
+    fn look(arguments: &Init, known: &Mapping) -> Result<Self, Failure> {
+        let mut found = Self {
+            graphs: Vec::new(),
+            nodes: Vec::new(),
+            places: Vec::new(),
+        };
+        if let Some(uri) = &arguments.ros1 {
+            let uri = uri.clone().unwrap_or_else(survey::ros1::master_uri);
+            let live = look(survey::ros1::survey(&uri))?;
+            found.places.push(format!("ROS 1 master {uri}"));
+            found.graphs.push(Graph {
+                space: SpaceId::ROS1,
+                domain: None,
+                live,
+            });
+        }
+        for domain in domains(arguments)? {
+            let space = space_of(domain, known, &found.graphs)?;
+            let wait = Duration::from_secs(arguments.wait.into());
+            let live = look(survey::ros2::survey(domain, wait))?;
+            found.places.push(format!("DDS domain {domain}"));
+            found.graphs.push(Graph {
+                space,
+                domain: Some(domain),
+                live,
+            });
+        }
+        for url in &arguments.opcua {
+            found.add(look(survey::opcua::survey(url))?);
+        }
+        for file in &arguments.nodeset {
+            found.add(survey::nodeset::survey(file)?);
+        }
+        Ok(found)
+    }
+
+    fn add(&mut self, nodes: Nodes) {
+        self.places.push(nodes.place.clone());
+        self.nodes.push(nodes);
+    }
+}
+
+/// Those asked for, each once, in their order.
+fn domains(arguments: &Init) -> Result<Vec<u16>, Failure> {
+    let mut domains = Vec::new();
+    for asked in &arguments.ros2 {
+        let variable = std::env::var("ROS_DOMAIN_ID").ok();
+        let domain = match (asked, variable.as_deref().map(str::trim)) {
+            (Some(domain), _) => *domain,
+            (None, None | Some("")) => 0,
+            (None, Some(text)) => text
+                .parse()
+                .ok()
+                .filter(|domain| *domain <= 232)
+                .ok_or_else(|| {
+                    Failure::Usage(format!("ROS_DOMAIN_ID is `{text}`: it is 0 to 232"))
+                })?,
+        };
+        if !domains.contains(&domain) {
+            domains.push(domain);
+        }
+    }
+    domains.sort_unstable();
+    Ok(domains)
+}
+
+/// The space of a domain: the one the mapping gives it, that of its number, or for domains 0 and 1 a free one.
+fn space_of(domain: u16, known: &Mapping, graphs: &[Graph]) -> Result<SpaceId, Failure> {
+    let taken = |space: &SpaceId| graphs.iter().any(|graph| graph.space == *space);
+    if let Some(space) = known.space_of_domain(domain).filter(|space| !taken(space)) {
+        return Ok(space);
+    }
+    let free = |space: &SpaceId| known.space(*space).is_none() && !taken(space);
+    let mut spaces = (FIRST_FREE..=232)
+        .chain(2..FIRST_FREE)
+        .filter_map(SpaceId::new);
+    spaces.find(free).ok_or_else(|| {
+        Failure::Unconfigured("no ROS 2 space is left for another domain".to_owned())
+    })
+}
+
+/// The mapping in the file; `None` where there is none.
+fn existing(file: &str) -> Result<Option<(Mapping, String)>, Failure> {
+    let mut bytes = Vec::new();
+    match File::open(file).and_then(|opened| opened.take(MOST).read_to_end(&mut bytes)) {
+        Ok(_) => {}
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(Failure::reading(file, &error)),
+    }
+    let text = String::from_utf8(bytes)
+        .map_err(|_| Failure::Io(format!("{file} is there and is no text; it stays as it is")))?;
+    let Checked { mapping, findings } = Mapping::from_yaml(&text, file);
+    match mapping {
+        Some(mapping) => Ok(Some((mapping, text))),
+        None => {
+            let told: Vec<String> = findings.iter().map(|one| one.render(&text)).collect();
+            Err(Failure::Unconfigured(format!(
+                "{}\n{file} is there and cannot run, so nothing is added to it; it stays as it is",
+                told.join("\n")
+            )))
+        }
+    }
+}
+
+/// A document of its own.
+fn written(places: &[String], plan: &mut Plan) -> Result<String, Failure> {
+    settled(plan, |plan| {
+        let mut lines = render::head(places);
+        let spaces = "The ROS sides. 1 is ROS 1, others are DDS domains; 0, the OPC UA side, is always there.";
+        section(&mut lines, spaces, "spaces", render::spaces(plan));
+        lines.extend(render::network(plan));
+        let namespaces = "What the indexes in node ids mean. The URI counts: check --environment compares it with the server's.";
+        section(
+            &mut lines,
+            namespaces,
+            "namespaces",
+            render::namespaces(plan),
+        );
+        let variables = render::variables(plan, "  ");
+        if !variables.lines.is_empty() {
+            lines.extend(
+                [
+                    "",
+                    "# `origin` is the space that produces the value: there its topic is read, on the other sides it is written.",
+                ]
+                .map(str::to_owned),
+            );
+            // A list of nothing but comments is none.
+            let any = plan.entries.iter().any(|entry| entry.faulty.is_none());
+            lines.push(if any { "variables:" } else { "variables: []" }.to_owned());
+        }
+        let start = lines.len();
+        lines.extend(variables.lines);
+        lines.push(String::new());
+        Some((lines.join("\n"), start, variables.entries))
+    })
+}
+
+fn section(lines: &mut Vec<String>, title: &str, key: &str, block: Vec<String>) {
+    if !block.is_empty() {
+        lines.extend([String::new(), format!("# {title}"), format!("{key}:")]);
+        lines.extend(block);
+    }
+}
+
+/// The document with what is new in it.
+fn added(text: &str, before: &Mapping, plan: &mut Plan) -> Result<String, Failure> {
+    let merged = settled(plan, |plan| {
+        let mut merged = text.to_owned();
+        for (key, block) in [
+            ("spaces", render::spaces(plan)),
+            ("namespaces", render::namespaces(plan)),
+        ] {
+            if !block.is_empty() {
+                (merged, _) = merge::append(&merged, key, &block)?;
+            }
+        }
+        let variables = render::variables(plan, &merge::indent(text, "variables"));
+        if variables.lines.is_empty() {
+            return Some((merged, 0, Vec::new()));
+        }
+        let (merged, start) = merge::append(&merged, "variables", &variables.lines)?;
+        Some((merged, start, variables.entries))
+    })?;
+    let active = plan.entries.iter().filter(|entry| entry.faulty.is_none());
+    let kept = Mapping::from_yaml(&merged, "")
+        .mapping
+        .is_some_and(|after| {
+            after.variables().len() == before.variables().len() + active.count()
+                && before
+                    .variables()
+                    .iter()
+                    .all(|one| after.variables().contains(one))
+        });
+    if kept { Ok(merged) } else { Err(unmergeable()) }
+}
+
+fn unmergeable() -> Failure {
+    Failure::Unconfigured(
+        "nothing can be put into the file as it is written: have each of `spaces`, `namespaces` and `variables` on lines \
+         of their own below the key, not in brackets or braces; it stays as it is"
+            .to_owned(),
+    )
+}
+
+/// A document, the line its variables begin at, and the lines of each among them.
+type Rendered = Option<(String, usize, Vec<std::ops::Range<usize>>)>;
+
+/// Renders until no entry has a finding: those that have one become comments with its text.
+fn settled(plan: &mut Plan, render: impl Fn(&Plan) -> Rendered) -> Result<String, Failure> {
+    loop {
+        let (text, start, entries) = render(plan).ok_or_else(unmergeable)?;
+        let Checked { mapping, findings } = Mapping::from_yaml(&text, "");
+        let mut changed = false;
+        for finding in &findings {
+            let at = finding.at.line.saturating_sub(1 + start);
+            let faulty = entries.iter().position(|lines| lines.contains(&at));
+            let entry = faulty.and_then(|at| plan.entries.get_mut(at));
+            let Some(entry) = entry.filter(|entry| entry.faulty.is_none()) else {
+                continue;
+            };
+            changed = true;
+            let mut why = format!("{}: {}", finding.code, finding.message);
+            if finding.code == Code::UnknownMessageType {
+                why.push_str(if entry.origin == SpaceId::ROS1 {
+                    "\nPublishers of ROS 1 bring it along: without the `#` it crosses, and check warns of it"
+                } else {
+                    "\nWhere the bridge finds its package by AMENT_PREFIX_PATH it crosses without the `#`"
+                });
+            }
+            entry.faulty = Some(why);
+        }
+        if changed {
+            continue;
+        }
+        // Such as that there is too much of it.
+        return match (mapping, findings.first()) {
+            (None, Some(first)) => Err(Failure::Unconfigured(format!(
+                "what would be written could not run: {}",
+                first.message
+            ))),
+            (Some(_), _) | (None, None) => Ok(text),
+        };
+    }
+}
+
+fn put(arguments: &Init, before: Option<&str>, text: &str, plan: &Plan) -> Result<(), Failure> {
+    let Some(file) = &arguments.output else {
+        let mut out = io::stdout().lock();
+        out.write_all(text.as_bytes())?;
+        out.flush()?;
+        report::warn(&Sum::of("the mapping", plan, true).to_string());
+        return Ok(());
+    };
+    let sum = Sum::of(file, plan, before != Some(text));
+    match before {
+        Some(before) if before == text => {}
+        Some(_) if arguments.merge => {
+            std::fs::write(file, text).map_err(|error| cannot_write(file, &error))?;
+        }
+        Some(_) => {
+            return Err(Failure::Io(format!(
+                "{file} is there and stays as it is: {} would be new in it. Say --merge to add them, or choose another \
+                 file",
+                sum.counts()
+            )));
+        }
+        None => {
+            let opened = OpenOptions::new().write(true).create_new(true).open(file);
+            opened
+                .and_then(|mut opened| opened.write_all(text.as_bytes()))
+                .map_err(|error| cannot_write(file, &error))?;
+        }
+    }
+    let mut out = io::stdout().lock();
+    if arguments.json {
+        let line = serde_json::to_string(&sum).map_err(|error| Failure::Data(error.to_string()))?;
+        writeln!(out, "{line}")?;
+    } else {
+        writeln!(out, "{sum}")?;
+    }
+    Ok(out.flush()?)
+}
+
+fn cannot_write(file: &str, error: &io::Error) -> Failure {
+    Failure::Io(format!("cannot write {file}: {error}"))
+}
+
+/// What came of it.
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+struct Sum<'a> {
+    file: &'a str,
+    changed: bool,
+    variables: usize,
+    guesses: usize,
+    commented_out: usize,
+    left_out: usize,
+}
+
+impl<'a> Sum<'a> {
+    fn of(file: &'a str, plan: &Plan, changed: bool) -> Self {
+        let active = || plan.entries.iter().filter(|entry| entry.faulty.is_none());
+        Self {
+            file,
+            changed,
+            variables: active().count(),
+            guesses: active().filter(|entry| entry.guessed).count(),
+            commented_out: plan.entries.len() - active().count(),
+            left_out: plan
+                .left_out
+                .values()
+                .map(std::collections::BTreeSet::len)
+                .sum(),
+        }
+    }
+
+    fn counts(&self) -> String {
+        let several = |count: usize, one: &str| match count {
+            1 => format!("1 {one}"),
+            _ => format!("{count} {one}s"),
+        };
+        format!(
+            "{} ({}), {} as comments, {} left out",
+            several(self.variables, "variable"),
+            several(self.guesses, "guess").replace("guesss", "guesses"),
+            several(self.commented_out, "other"),
+            several(self.left_out, "topic"),
+        )
+    }
+}
+
+impl std::fmt::Display for Sum<'_> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        if self.changed {
+            write!(f, "{}: {}", self.file, self.counts())
+        } else {
+            write!(f, "{}: nothing is new", self.file)
+        }
+    }
+}
+
+/// Spaces of domains 0 and 1 begin here: lower numbers are those of the domains people have.
+const FIRST_FREE: u16 = 40;
+/// More than a mapping may have (M002).
+const MOST: u64 = 5 << 20;
+
+#[cfg(test)]
+mod tests {
+    use std::collections::{BTreeMap, BTreeSet};
+
+    use mappings::{LiveSpace, LiveTopic};
+
+    use super::*;
+
+    const WISHES: Wishes<'static> = Wishes {
+        namespace: "urn:cell",
+        transforms: false,
+    };
+
+    /// A graph whose topics are (name, type, published).
+    fn graph(space: u16, topics: &[(&str, &str, bool)]) -> Graph {
+        let topic = |(name, kind, published): &(&str, &str, bool)| {
+            let live = LiveTopic {
+                types: BTreeSet::from([(*kind).to_owned()]),
+                published: *published,
+                subscribed: !published,
+            };
+            ((*name).to_owned(), live)
+        };
+        Graph {
+            space: SpaceId::new(space).unwrap(),
+            domain: (space > 1).then_some(space),
+            live: LiveSpace {
+                topics: topics.iter().map(topic).collect::<BTreeMap<_, _>>(),
+                services: None,
+            },
+        }
+    }
+
+    fn fresh(graphs: &[Graph]) -> String {
+        let mut plan = Plan::new(graphs, &[], &WISHES, &mut Known::default());
+        written(&[], &mut plan).unwrap()
+    }
+
+    fn merged(text: &str, graphs: &[Graph]) -> String {
+        let mapping = mapping(text);
+        let mut known = Known::of(mapping.clone(), text);
+        let mut plan = Plan::new(graphs, &[], &WISHES, &mut known);
+        added(text, &mapping, &mut plan).unwrap()
+    }
+
+    fn mapping(text: &str) -> Mapping {
+        let checked = Mapping::from_yaml(text, "cell.yaml");
+        assert!(checked.findings.is_empty(), "{}", checked.render(text));
+        checked.mapping.unwrap()
+    }
+
+    fn origins(text: &str) -> Vec<(String, String, usize)> {
+        let mapping = mapping(text);
+        let variables = mapping.variables().iter();
+        variables
+            .map(|one| (one.name.clone(), one.topic.to_string(), one.bindings.len()))
+            .collect()
+    }
+
+    #[test]
+    fn a_side_that_joins_later_is_proposed_once_and_changes_nothing() {
+        let ros1 = graph(1, &[("/a/b", "std_msgs/Bool", true)]);
+        let ros2 = graph(
+            2,
+            &[
+                ("/a/b", "std_msgs/Bool", false),
+                ("/c", "std_msgs/Int32", true),
+            ],
+        );
+        let first = fresh(std::slice::from_ref(&ros1));
+        let both = [ros1, ros2];
+        let second = merged(&first, &both);
+        assert!(
+            second
+                .contains("#   /a/b is in space 2 too, as std_msgs/Bool: AB could be bound to it"),
+            "{second}"
+        );
+        assert_eq!(
+            origins(&second),
+            [
+                ("AB".to_owned(), "ua_1_2_1".to_owned(), 1),
+                ("C".to_owned(), "ua_2_2_2".to_owned(), 1)
+            ]
+        );
+        assert_eq!(merged(&second, &both), second);
+        // Seen together, they are one value.
+        assert_eq!(
+            origins(&fresh(&both))[0],
+            ("AB".to_owned(), "ua_1_2_1".to_owned(), 2)
+        );
+    }
+
+    #[test]
+    fn what_both_sides_publish_is_two_values_and_what_differs_in_type_too() {
+        let text = fresh(&[
+            graph(
+                1,
+                &[("/x", "std_msgs/Bool", true), ("/y", "std_msgs/Bool", true)],
+            ),
+            graph(
+                2,
+                &[
+                    ("/x", "std_msgs/Bool", true),
+                    ("/y", "std_msgs/Int32", false),
+                ],
+            ),
+        ]);
+        let all = origins(&text);
+        let topics: Vec<&str> = all.iter().map(|(_, topic, _)| topic.as_str()).collect();
+        assert_eq!(topics, ["ua_1_2_1", "ua_2_2_2", "ua_1_2_3", "ua_0_2_4"]);
+        assert!(all.iter().all(|(.., bindings)| *bindings == 1) && !text.contains("guess:"));
+    }
+
+    #[test]
+    fn a_topic_that_a_comment_names_or_a_pattern_takes_stays_out() {
+        let text = "spaces:\n  - {id: 1}\nnamespaces:\n  2: urn:line\nvariables:\n  # not /a\n  - {node: ns=2;i=5, name: v, \
+                    origin: 1, ros: {topic: /v, type: std_msgs/Bool}}\npatterns:\n  - {topics: \"/r*/p\", origin: 1, node: \
+                    \"ns=2;i=10{1}\", name: \"P{1}\"}\n";
+        let seen = graph(
+            1,
+            &[
+                ("/a", "std_msgs/Bool", true),
+                ("/r1/p", "std_msgs/Bool", true),
+                ("/v", "std_msgs/Bool", true),
+            ],
+        );
+        assert_eq!(merged(text, &[seen]), text);
+        let more = merged(text, &[graph(1, &[("/next", "std_msgs/Bool", true)])]);
+        // In the namespace of the others, behind the highest number, and before the next key.
+        assert_eq!(origins(&more)[1].1, "ua_1_2_6");
+        assert!(more.find("name: Next").unwrap() < more.find("patterns:").unwrap());
+    }
+}

@@ -1,0 +1,150 @@
+//! What the file that is added to says already.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+
+use mappings::{Mapping, NodeIdText, SpaceId, TopicId};
+use messages::TypeName;
+
+use super::yaml;
+
+/// A mapping, and what its comments speak of: what somebody left out on purpose is not proposed again.
+#[derive(Default)]
+pub(super) struct Known {
+    pub(super) mapping: Mapping,
+    nodes: HashSet<NodeIdText>,
+    names: HashSet<(u16, String)>,
+    /// Identifiers in topic names, by the namespace in them.
+    numbers: HashMap<u16, BTreeSet<u16>>,
+    /// Words of comments that begin with a slash.
+    mentioned: HashSet<String>,
+    /// Node ids in comments, as they are written.
+    written: HashSet<String>,
+    /// The namespace of the last of them; a node of namespace 0 has this in its topic names.
+    hearing: u16,
+}
+
+impl Known {
+    /// `text` is what `mapping` was read from.
+    pub(super) fn of(mapping: Mapping, text: &str) -> Self {
+        let mut known = Self::default();
+        for variable in mapping.variables() {
+            known.nodes.insert(variable.node.clone());
+            let namespace = variable.node.namespace;
+            known.names.insert((namespace, variable.name.clone()));
+            let TopicId {
+                namespace,
+                identifier,
+                ..
+            } = variable.topic;
+            known.use_number(namespace.get(), identifier.get());
+        }
+        for line in text.lines() {
+            if let Some((_, comment)) = line.split_once('#') {
+                known.hear(comment);
+            }
+        }
+        known.mapping = mapping;
+        known
+    }
+
+    fn hear(&mut self, comment: &str) {
+        let is_name = |c: char| c.is_ascii_alphanumeric() || c == '/' || c == '_';
+        let words = comment.split(|c: char| !is_name(c));
+        let topics = words.filter(|word| word.starts_with('/') && word.len() > 1);
+        self.mentioned.extend(topics.map(str::to_owned));
+        if let Some((_, written)) = comment.split_once("node: ") {
+            let written = written.trim();
+            let index = written.trim_start_matches('"').strip_prefix("ns=");
+            let index = index.and_then(|rest| rest.split(';').next());
+            self.hearing = index
+                .and_then(|index| index.parse().ok())
+                .unwrap_or(u16::MAX);
+            let node = written.parse::<NodeIdText>().ok();
+            if let Some(number) = node.and_then(|node| node.writer_id()) {
+                self.use_number(self.hearing, number.get());
+            }
+            self.written.insert(written.to_owned());
+        } else if let Some((_, alias)) = comment.split_once("alias: ")
+            && let Ok(alias) = alias.trim().parse()
+        {
+            self.use_number(self.hearing, alias);
+        }
+    }
+
+    pub(super) fn use_number(&mut self, namespace: u16, number: u16) {
+        self.numbers.entry(namespace).or_default().insert(number);
+    }
+
+    /// The next number nobody has: above all there are, so that one that was given and taken back is not given again.
+    pub(super) fn next_number(&mut self, namespace: u16) -> Option<u16> {
+        let used = self.numbers.entry(namespace).or_default();
+        let above = used.last().map_or(Some(1), |last| last.checked_add(1));
+        let number = above.or_else(|| (1..=u16::MAX).find(|number| !used.contains(number)))?;
+        used.insert(number);
+        Some(number)
+    }
+
+    pub(super) fn has_node(&self, node: &NodeIdText) -> bool {
+        self.nodes.contains(node) || self.written.contains(&yaml::scalar(&node.to_string()))
+    }
+
+    /// `wanted`, or with a number behind it where that name is taken.
+    pub(super) fn free_name(&mut self, namespace: u16, wanted: &str) -> String {
+        let wanted = if wanted.trim().is_empty() {
+            "Value"
+        } else {
+            wanted
+        };
+        let wanted: String = wanted
+            .chars()
+            .filter(|c| !c.is_control())
+            .take(500)
+            .collect();
+        let mut name = wanted.clone();
+        for number in 2_u32.. {
+            if self.names.insert((namespace, name.clone())) {
+                break;
+            }
+            name = format!("{wanted}{number}");
+        }
+        name
+    }
+
+    /// Whether a comment speaks of the topic.
+    pub(super) fn mentions(&self, topic: &str) -> bool {
+        self.mentioned.contains(topic)
+    }
+
+    /// The name of a variable the topic is bound in, or of the pattern that takes it.
+    pub(super) fn bound(&self, space: SpaceId, topic: &str, kind: Option<&TypeName>) -> bool {
+        self.mapping
+            .bindings(space)
+            .any(|(_, binding)| binding.ros_topic == topic)
+            || self.mapping.matching(space, topic, kind).is_some()
+    }
+
+    /// The variable that the topic is bound in, in whatever space.
+    pub(super) fn variable_of(&self, topic: &str) -> Option<&str> {
+        let variables = self.mapping.variables().iter();
+        let mut bound = variables.filter(|variable| {
+            let bindings = &variable.bindings;
+            bindings.iter().any(|binding| binding.ros_topic == topic)
+        });
+        bound.next().map(|variable| variable.name.as_str())
+    }
+
+    /// The namespace that most variables with a ROS topic are in.
+    pub(super) fn ros_namespace(&self) -> Option<u16> {
+        let mut counts: BTreeMap<u16, usize> = BTreeMap::new();
+        for variable in self.mapping.variables() {
+            if !variable.bindings.is_empty() && variable.node.namespace != 0 {
+                *counts.entry(variable.node.namespace).or_default() += 1;
+            }
+        }
+        let most = counts.values().max()?;
+        counts
+            .iter()
+            .find(|(_, count)| *count == most)
+            .map(|(namespace, _)| *namespace)
+    }
+}

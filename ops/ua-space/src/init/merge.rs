@@ -1,0 +1,109 @@
+//! Putting lines into a document that somebody has written, without touching another byte of it.
+
+/// Puts `block`, entries of the top-level key `key`, behind those that are there; the key at the end of the document where
+/// there is none. Gives the text and the line, from 0, at which the block begins; `None` where the value of the key is
+/// written in braces or brackets, into which nothing is put.
+pub(super) fn append(text: &str, key: &str, block: &[String]) -> Option<(String, usize)> {
+    let newline = if text.contains("\r\n") { "\r\n" } else { "\n" };
+    let lines: Vec<&str> = text.split_inclusive('\n').collect();
+    let is_key = |line: &&str| {
+        let rest = line
+            .strip_prefix(key)
+            .and_then(|rest| rest.strip_prefix(':'));
+        rest.is_some_and(|rest| rest.starts_with([' ', '\t', '\r', '\n', '#']) || rest.is_empty())
+    };
+    let at = lines.iter().position(is_key);
+    let mut before: Vec<String> = Vec::new();
+    let place = match at {
+        None => {
+            before.extend([String::new(), format!("{key}:")]);
+            lines.len()
+        }
+        Some(at) => {
+            let (_, rest) = lines.get(at)?.split_once(':')?;
+            let rest = rest.trim();
+            if !rest.is_empty() && !rest.starts_with('#') {
+                return None;
+            }
+            let after = lines.iter().enumerate().skip(at + 1);
+            let mut last = at;
+            for (number, line) in after {
+                let inside = line.starts_with([' ', '\t', '-']);
+                if inside && !line.trim().is_empty() {
+                    last = number;
+                } else if !line.trim().is_empty() && !line.starts_with('#') {
+                    break;
+                }
+            }
+            last + 1
+        }
+    };
+    let mut merged: String = lines.iter().take(place).copied().collect();
+    if !merged.is_empty() && !merged.ends_with('\n') {
+        merged.push_str(newline);
+    }
+    let start = place + before.len();
+    for line in before.iter().chain(block) {
+        merged.push_str(line);
+        merged.push_str(newline);
+    }
+    merged.extend(lines.iter().skip(place).copied());
+    Some((merged, start))
+}
+
+/// How far the entries of that key are indented.
+pub(super) fn indent(text: &str, key: &str) -> String {
+    let key = format!("{key}:");
+    let mut inside = text
+        .lines()
+        .skip_while(|line| !line.starts_with(&key))
+        .skip(1);
+    let first = inside.find(|line| {
+        let line = line.trim_start();
+        !line.is_empty() && !line.starts_with('#')
+    });
+    let found = first.map(|line| line.chars().take_while(|c| *c == ' ').collect());
+    found
+        .filter(|_| first.is_some_and(|line| line.trim_start().starts_with('-')))
+        .unwrap_or_else(|| "  ".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn block() -> Vec<String> {
+        vec!["  - b".to_owned()]
+    }
+
+    #[test]
+    fn lines_go_behind_the_last_entry_of_their_key() {
+        let text = "a:\n  - a\n  # of a\n\n# of c\nc:\n  - c\n";
+        let (merged, at) = append(text, "a", &block()).unwrap();
+        assert_eq!(merged, "a:\n  - a\n  # of a\n  - b\n\n# of c\nc:\n  - c\n");
+        assert_eq!(at, 3);
+        let (merged, at) = append(text, "c", &block()).unwrap();
+        assert_eq!((merged.as_str(), at), (&*format!("{text}  - b\n"), 7));
+    }
+
+    #[test]
+    fn a_key_that_is_missing_is_put_at_the_end() {
+        let (merged, at) = append("a:\n  - a", "c", &block()).unwrap();
+        assert_eq!((merged.as_str(), at), ("a:\n  - a\n\nc:\n  - b\n", 4));
+    }
+
+    #[test]
+    fn line_ends_stay_and_nothing_is_put_into_brackets() {
+        let (merged, _) = append("a:\r\n- a\r\n", "a", &block()).unwrap();
+        assert_eq!(merged, "a:\r\n- a\r\n  - b\r\n");
+        assert_eq!(append("a: [1]\n", "a", &block()), None);
+        assert_eq!(append("a: # comment\n  - a\n", "a", &block()).unwrap().1, 2);
+    }
+
+    #[test]
+    fn entries_are_indented_as_those_before() {
+        assert_eq!(indent("a:\n\n  # c\n    - a\n", "a"), "    ");
+        assert_eq!(indent("a:\n- a\n", "a"), "");
+        assert_eq!(indent("b: 1\n", "a"), "  ");
+    }
+}

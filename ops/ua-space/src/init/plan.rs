@@ -1,0 +1,434 @@
+//! What a mapping says of what was found: which topic is which node, and what is left out.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+
+use mappings::{LiveTopic, NodeIdText, SpaceId};
+use messages::{Registry, TypeName};
+use uadp::BuiltinType;
+
+use super::known::Known;
+use super::topics::{Form, LeftOut, camel, normal, registry};
+use crate::survey::{Graph, Nodes, UaVariable};
+
+/// What is to be written, in its order.
+#[derive(Default)]
+pub(super) struct Plan {
+    pub(super) spaces: Vec<(SpaceId, Option<u16>)>,
+    pub(super) namespaces: BTreeMap<u16, String>,
+    pub(super) endpoint: Option<String>,
+    pub(super) entries: Vec<Entry>,
+    pub(super) left_out: BTreeMap<(SpaceId, LeftOut), BTreeSet<String>>,
+    /// Topics that a variable of the file could be bound to beside its own.
+    pub(super) proposals: Vec<String>,
+    pub(super) services: BTreeMap<SpaceId, BTreeSet<String>>,
+}
+
+/// A variable.
+#[derive(Clone, Debug)]
+pub(super) struct Entry {
+    /// Those of one group stand together under this heading.
+    pub(super) group: String,
+    pub(super) node: NodeIdText,
+    pub(super) alias: Option<u16>,
+    pub(super) name: String,
+    pub(super) value: Option<(BuiltinType, bool)>,
+    pub(super) origin: SpaceId,
+    pub(super) bindings: Vec<Bound>,
+    pub(super) notes: Vec<String>,
+    /// Nobody said that these belong together.
+    pub(super) guessed: bool,
+    /// Why it is a comment.
+    pub(super) faulty: Option<String>,
+}
+
+/// A topic it is tied to.
+#[derive(Clone, Debug)]
+pub(super) struct Bound {
+    pub(super) space: SpaceId,
+    pub(super) topic: String,
+    pub(super) kind: TypeName,
+    pub(super) form: Form,
+}
+
+/// What is asked for on the command line.
+pub(super) struct Wishes<'a> {
+    /// The URI of the namespace of values that have no node yet.
+    pub(super) namespace: &'a str,
+    pub(super) transforms: bool,
+}
+
+impl Plan {
+    /// What `graphs` and `nodes` have that is not `known`.
+    pub(super) fn new(
+        graphs: &[Graph],
+        nodes: &[Nodes],
+        wishes: &Wishes<'_>,
+        known: &mut Known,
+    ) -> Self {
+        let mut planner = Planner {
+            plan: Self::default(),
+            registries: [registry(false), registry(true)],
+            ua: Vec::new(),
+            known,
+        };
+        planner.spaces(graphs);
+        planner.nodes(nodes);
+        planner.topics(graphs, wishes);
+        planner.rest();
+        planner.services(graphs);
+        planner.plan
+    }
+}
+
+struct Planner<'k> {
+    plan: Plan,
+    /// Of ROS 1 and of ROS 2.
+    registries: [Registry; 2],
+    /// Nodes that are no variable yet, in the mapping's namespaces.
+    ua: Vec<UaVariable>,
+    known: &'k mut Known,
+}
+
+impl Planner<'_> {
+    fn spaces(&mut self, graphs: &[Graph]) {
+        for graph in graphs {
+            if self.known.mapping.space(graph.space).is_none() {
+                self.plan.spaces.push((graph.space, graph.domain));
+            }
+        }
+    }
+
+    /// Gives every namespace its index in the mapping: that of the server, from 2 on for those of files, since 1 is each
+    /// server's own.
+    fn nodes(&mut self, sources: &[Nodes]) {
+        let mut all = self.known.mapping.namespaces().clone();
+        let mut taken = BTreeSet::new();
+        for source in sources {
+            let mut indexes: HashMap<u16, u16> = HashMap::new();
+            for (index, uri) in (0_u16..).zip(&source.namespaces).skip(1) {
+                let used = source
+                    .variables
+                    .iter()
+                    .any(|one| one.node.namespace == index);
+                if !used {
+                    continue;
+                }
+                let there = all.iter().find(|(_, other)| *other == uri);
+                let there = there.map(|(index, _)| *index);
+                let given = there.unwrap_or_else(|| {
+                    let wanted = index + u16::from(source.endpoint.is_none());
+                    let free = |at: &u16| !all.contains_key(at);
+                    let found = (wanted..).chain(2..).find(free).unwrap_or(wanted);
+                    all.insert(found, uri.clone());
+                    self.plan.namespaces.insert(found, uri.clone());
+                    found
+                });
+                indexes.insert(index, given);
+            }
+            for one in &source.variables {
+                let Some(namespace) = indexes.get(&one.node.namespace) else {
+                    continue;
+                };
+                let node = NodeIdText {
+                    namespace: *namespace,
+                    identifier: one.node.identifier.clone(),
+                };
+                if let Some(number) = node.writer_id() {
+                    self.known.use_number(*namespace, number.get());
+                }
+                if !self.known.has_node(&node) && taken.insert(node.to_string()) {
+                    self.ua.push(UaVariable {
+                        node,
+                        ..one.clone()
+                    });
+                }
+            }
+            if self.plan.endpoint.is_none() {
+                self.plan.endpoint.clone_from(&source.endpoint);
+            }
+        }
+        let key = |one: &UaVariable| (one.within.clone(), one.name.clone(), one.node.to_string());
+        self.ua.sort_by_cached_key(key);
+    }
+
+    fn topics(&mut self, graphs: &[Graph], wishes: &Wishes<'_>) {
+        let mut names: BTreeMap<&str, Vec<(SpaceId, &LiveTopic)>> = BTreeMap::new();
+        for graph in graphs {
+            for (name, topic) in &graph.live.topics {
+                names.entry(name).or_default().push((graph.space, topic));
+            }
+        }
+        let mut found = Vec::new();
+        for (name, ends) in names {
+            if !self.known.mentions(name) {
+                let bound = self.bound(name, ends, wishes.transforms);
+                found.extend(candidates(name, bound));
+            }
+        }
+        found.sort_by_key(|one| (one.group.is_empty(), one.group.clone(), one.topic.clone()));
+        for one in found {
+            self.entry(one, wishes.namespace);
+        }
+    }
+
+    /// How the topic is bound in each space that has it, and whether it is published there.
+    fn bound(
+        &mut self,
+        name: &str,
+        ends: Vec<(SpaceId, &LiveTopic)>,
+        transforms: bool,
+    ) -> Vec<(Bound, bool)> {
+        let mut bound = Vec::new();
+        for (space, topic) in ends {
+            let kind = match topic.types.first() {
+                Some(kind) if topic.types.len() == 1 => kind.parse::<TypeName>().ok(),
+                Some(_) | None => None,
+            };
+            if let Some(why) = LeftOut::of(name, kind.as_ref(), transforms) {
+                self.leave_out(space, why, name);
+                continue;
+            }
+            let Some(kind) = kind else {
+                self.leave_out(space, LeftOut::Untyped, name);
+                continue;
+            };
+            if self.known.bound(space, name, Some(&kind)) {
+                continue;
+            }
+            if let Some(variable) = self.known.variable_of(name) {
+                self.plan.proposals.push(format!(
+                    "{name} is in space {space} too, as {kind}: {variable} could be bound to it"
+                ));
+                continue;
+            }
+            let [ros1, ros2] = &self.registries;
+            let form = Form::of(&kind, if space.is_ros2() { ros2 } else { ros1 });
+            let one = Bound {
+                space,
+                topic: name.to_owned(),
+                kind,
+                form,
+            };
+            bound.push((one, topic.published));
+        }
+        bound
+    }
+
+    fn leave_out(&mut self, space: SpaceId, why: LeftOut, name: &str) {
+        let topics = self.plan.left_out.entry((space, why)).or_default();
+        topics.insert(name.to_owned());
+    }
+
+    fn entry(&mut self, candidate: Candidate, namespace: &str) {
+        let Candidate {
+            group,
+            topic,
+            origin,
+            bindings,
+        } = candidate;
+        let value = match bindings.first().map(|one| &one.form) {
+            Some(Form::Field(_, value)) => Some(*value),
+            Some(Form::Whole | Form::Bytes) | None => None,
+        };
+        let mut notes = Vec::new();
+        let mut guessed = bindings.len() > 1;
+        if guessed {
+            notes.push("guess: one value on both sides".to_owned());
+        }
+        let wanted = normal(&topic);
+        let named = |one: &UaVariable| {
+            normal(&one.name) == wanted || normal(&format!("{}{}", one.within, one.name)) == wanted
+        };
+        let mut alike = self.ua.iter().enumerate().filter(|(_, one)| named(one));
+        let node = match (alike.next(), alike.next(), value) {
+            (Some((at, one)), None, Some(value)) if one.value == Some(value) => Some(at),
+            (Some((_, one)), None, _) => {
+                notes.push(format!(
+                    "the node {} is named alike, and is of another type",
+                    one.node
+                ));
+                None
+            }
+            (Some(_), Some(_), _) => {
+                notes.push("several nodes are named alike".to_owned());
+                None
+            }
+            (None, ..) => None,
+        };
+        let (node, name) = match node.map(|at| self.ua.remove(at)) {
+            Some(one) => {
+                guessed = true;
+                notes.push("guess: the node has the topic's name and type".to_owned());
+                (one.node, one.name)
+            }
+            None => {
+                let namespace = self.namespace(namespace);
+                let Some(number) = self.known.next_number(namespace) else {
+                    return;
+                };
+                let identifier = mappings::Identifier::Numeric(number.into());
+                (
+                    NodeIdText {
+                        namespace,
+                        identifier,
+                    },
+                    camel(&topic),
+                )
+            }
+        };
+        self.push(Entry {
+            group,
+            node,
+            alias: None,
+            name,
+            value,
+            origin,
+            bindings,
+            notes,
+            guessed,
+            faulty: None,
+        });
+    }
+
+    /// The namespace of values that have no node yet.
+    fn namespace(&mut self, uri: &str) -> u16 {
+        let all = self.known.mapping.namespaces().iter();
+        let all = all.chain(&self.plan.namespaces);
+        let there = all.clone().find(|(_, other)| *other == uri);
+        if let Some((index, _)) = there {
+            return *index;
+        }
+        if let Some(index) = self.known.ros_namespace() {
+            return index;
+        }
+        let highest = all.map(|(index, _)| *index).max();
+        let index = highest.map_or(2, |highest| highest.saturating_add(1).max(2));
+        self.plan.namespaces.insert(index, uri.to_owned());
+        index
+    }
+
+    /// The nodes no topic is tied to: the OPC UA side writes them.
+    fn rest(&mut self) {
+        for one in std::mem::take(&mut self.ua) {
+            let mut notes = Vec::new();
+            if one.value.is_none() {
+                notes.push(
+                    "its data type and rank are not those of one value or of an array of one dimension"
+                        .to_owned(),
+                );
+            }
+            let entry = Entry {
+                group: one.within.clone(),
+                name: one.name,
+                node: one.node,
+                alias: None,
+                value: one.value,
+                origin: SpaceId::UA,
+                bindings: Vec::new(),
+                notes,
+                guessed: false,
+                faulty: None,
+            };
+            self.push(entry);
+        }
+    }
+
+    fn push(&mut self, mut entry: Entry) {
+        let namespace = match entry.node.namespace {
+            0 => u16::MAX,
+            index => index,
+        };
+        if entry.node.writer_id().is_none() {
+            entry.alias = self.known.next_number(namespace);
+        }
+        let taken = self.known.free_name(entry.node.namespace, &entry.name);
+        entry.name = if taken == entry.name || entry.group.is_empty() {
+            taken
+        } else {
+            let longer = format!("{}.{}", entry.group, entry.name);
+            self.known.free_name(entry.node.namespace, &longer)
+        };
+        self.plan.entries.push(entry);
+    }
+
+    fn services(&mut self, graphs: &[Graph]) {
+        for graph in graphs {
+            let Some(services) = &graph.live.services else {
+                continue;
+            };
+            let of_mapping: BTreeSet<&str> = self
+                .known
+                .mapping
+                .services(graph.space)
+                .filter_map(|(_, bound)| match &bound.role {
+                    mappings::ServiceRole::Call { service, .. }
+                    | mappings::ServiceRole::Poll { service, .. } => Some(service.as_str()),
+                    mappings::ServiceRole::Answer { .. } => None,
+                })
+                .collect();
+            let wanted = services.iter().filter(|name| {
+                let last = name.rsplit('/').next().unwrap_or_default();
+                !EACH_NODE.contains(&last)
+                    && !of_mapping.contains(name.as_str())
+                    && !self.known.mentions(name)
+            });
+            let wanted: BTreeSet<String> = wanted.cloned().collect();
+            if !wanted.is_empty() {
+                self.plan.services.insert(graph.space, wanted);
+            }
+        }
+    }
+}
+
+/// A topic that becomes a variable.
+struct Candidate {
+    group: String,
+    topic: String,
+    origin: SpaceId,
+    bindings: Vec<Bound>,
+}
+
+/// The variables a topic becomes: one for all spaces where at most one publishes it, else one for each that does. Those
+/// of another type are values of their own.
+fn candidates(name: &str, bound: Vec<(Bound, bool)>) -> Vec<Candidate> {
+    let group = name.trim_start_matches('/').split_once('/');
+    let group = group.map_or("", |(first, _)| first);
+    let candidate = |origin: SpaceId, bindings: Vec<Bound>| Candidate {
+        group: group.to_owned(),
+        topic: name.to_owned(),
+        origin,
+        bindings,
+    };
+    let published = bound.iter().filter(|(_, published)| *published);
+    let producers: Vec<SpaceId> = published.map(|(one, _)| one.space).collect();
+    let bindings = bound.into_iter().map(|(one, _)| one);
+    if producers.len() > 1 {
+        let own = bindings.filter(|one| producers.contains(&one.space));
+        return own.map(|one| candidate(one.space, vec![one])).collect();
+    }
+    let bindings: Vec<Bound> = bindings.collect();
+    let origin = producers.first().copied().unwrap_or(SpaceId::UA);
+    let first = bindings
+        .iter()
+        .find(|one| one.space == origin)
+        .or_else(|| bindings.first());
+    let Some(kind) = first.map(|one| one.kind.clone()) else {
+        return Vec::new();
+    };
+    let (tied, alone): (Vec<Bound>, Vec<Bound>) =
+        bindings.into_iter().partition(|one| one.kind == kind);
+    let alone = alone
+        .into_iter()
+        .map(|one| candidate(SpaceId::UA, vec![one]));
+    std::iter::once(candidate(origin, tied))
+        .chain(alone)
+        .collect()
+}
+
+/// Services that nodes have for those who run them.
+const EACH_NODE: [&str; 4] = [
+    "get_loggers",
+    "set_logger_level",
+    "set_parameters",
+    "tf2_frames",
+];

@@ -1,0 +1,177 @@
+//! A plan as YAML.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+
+use mappings::SpaceId;
+
+use super::plan::{Bound, Entry, Plan};
+use super::topics::Form;
+use super::yaml::{comment, scalar, wrapped};
+
+/// The lines of a plan's variables, and which lines are which entry.
+pub(super) struct Variables {
+    pub(super) lines: Vec<String>,
+    pub(super) entries: Vec<Range<usize>>,
+}
+
+/// The head of a file of its own; `sources` are what was looked at.
+pub(super) fn head(sources: &[String]) -> Vec<String> {
+    let mut lines = vec![
+        "# yaml-language-server: $schema=schema.json".to_owned(),
+        "#".to_owned(),
+        "# Written by `ua-space init` after a look at".to_owned(),
+    ];
+    lines.extend(sources.iter().map(|one| format!("#   {}", comment(one))));
+    let rest = [
+        "# Every program of the cell reads this file and takes its part of it. Change what you like: `ua-space init --merge`",
+        "# adds what is new and leaves the rest as it is. What is marked as a guess wants to be looked at.",
+        "#   ua-space check FILE                  tells what is wrong with it",
+        "#   ua-space check --environment FILE    tells what is not there",
+        "#   ua-space schema > schema.json        has editors complete its keys",
+    ];
+    lines.extend(rest.map(str::to_owned));
+    lines
+}
+
+/// The ROS sides.
+pub(super) fn spaces(plan: &Plan) -> Vec<String> {
+    let space = |(id, domain): &(SpaceId, Option<u16>)| match domain {
+        Some(domain) => format!("  - {{id: {id}, domain: {domain}}}"),
+        None => format!("  - {{id: {id}}}"),
+    };
+    plan.spaces.iter().map(space).collect()
+}
+
+/// How values travel, as it is without being written.
+pub(super) fn network(plan: &Plan) -> Vec<String> {
+    let mut lines = [
+        "",
+        "# How values travel between the programs. For several machines name the network card that joins them.",
+        "pubsub:",
+        "  address: opc.udp://239.192.0.40:4840",
+        "  # interface: eth0",
+    ]
+    .map(str::to_owned)
+    .to_vec();
+    if let Some(endpoint) = &plan.endpoint {
+        lines.extend([
+            String::new(),
+            "server:".to_owned(),
+            format!("  endpoint: {}", scalar(endpoint)),
+        ]);
+    }
+    lines
+}
+
+/// What the indexes in node ids mean.
+pub(super) fn namespaces(plan: &Plan) -> Vec<String> {
+    let all = plan.namespaces.iter();
+    all.map(|(index, uri)| format!("  {index}: {}", scalar(uri)))
+        .collect()
+}
+
+/// The variables, those of a group below its name, and what is left out.
+pub(super) fn variables(plan: &Plan, indent: &str) -> Variables {
+    let mut lines = Vec::new();
+    let mut entries = Vec::new();
+    let mut group: Option<&str> = None;
+    for entry in &plan.entries {
+        if group != Some(&entry.group) {
+            lines.push(String::new());
+            match entry.group.as_str() {
+                "" if group.is_none() => {}
+                "" => lines.push(format!("{indent}# others")),
+                name => lines.push(format!("{indent}# {}", comment(name))),
+            }
+            group = Some(&entry.group);
+        }
+        let from = lines.len();
+        self::entry(entry, indent, &mut lines);
+        entries.push(from..lines.len());
+    }
+    let lead = format!("{indent}#   ");
+    if !plan.proposals.is_empty() {
+        lines.extend([
+            String::new(),
+            format!("{indent}# Could be bound to what is there:"),
+        ]);
+        let proposals = plan.proposals.iter();
+        lines.extend(proposals.map(|one| format!("{lead}{}", comment(one))));
+    }
+    let mut by_reason: BTreeMap<_, Vec<String>> = BTreeMap::new();
+    for ((space, why), topics) in &plan.left_out {
+        let topics = topics.iter().map(|topic| comment(topic));
+        let all = by_reason.entry((*why, *space)).or_default();
+        all.extend(topics);
+    }
+    for ((why, space), topics) in by_reason {
+        let heading = why.heading();
+        lines.extend([
+            String::new(),
+            format!("{indent}# Left out in space {space}: {heading}"),
+        ]);
+        lines.extend(wrapped(&lead, topics));
+    }
+    for (space, services) in &plan.services {
+        lines.extend([
+            String::new(),
+            format!("{indent}# Services of space {space}: `call` and `poll` in a binding make values of them"),
+        ]);
+        let services = services.iter().map(|name| comment(name));
+        lines.extend(wrapped(&lead, services));
+    }
+    Variables { lines, entries }
+}
+
+fn entry(entry: &Entry, indent: &str, lines: &mut Vec<String>) {
+    let mark = if entry.faulty.is_some() { "# " } else { "" };
+    let mut say = |text: String| lines.push(format!("{indent}{text}"));
+    let faulty = entry.faulty.iter().flat_map(|why| why.lines());
+    for note in faulty.chain(entry.notes.iter().map(String::as_str)) {
+        say(format!("# {}", comment(note)));
+    }
+    say(format!("{mark}- node: {}", scalar(&entry.node.to_string())));
+    if let Some(alias) = entry.alias {
+        say(format!("{mark}  alias: {alias}"));
+    }
+    say(format!("{mark}  name: {}", scalar(&entry.name)));
+    if let Some((builtin, array)) = entry.value {
+        let array = if array { "[]" } else { "" };
+        say(format!("{mark}  type: {}{array}", builtin.name()));
+    }
+    say(format!("{mark}  origin: {}", entry.origin));
+    match entry.bindings.as_slice() {
+        [] => {}
+        [one] => say(format!(
+            "{mark}  ros: {}",
+            binding(one, entry.origin, false)
+        )),
+        several => {
+            say(format!("{mark}  ros:"));
+            for one in several {
+                say(format!("{mark}    - {}", binding(one, entry.origin, true)));
+            }
+        }
+    }
+}
+
+fn binding(bound: &Bound, origin: SpaceId, named: bool) -> String {
+    let Bound {
+        space,
+        topic,
+        kind,
+        form,
+    } = bound;
+    let space = if named || *space != origin {
+        format!("space: {space}, ")
+    } else {
+        String::new()
+    };
+    let form = match form {
+        Form::Field(path, _) => format!(", field: {}", scalar(path)),
+        Form::Whole => String::new(),
+        Form::Bytes => ", as: bytes".to_owned(),
+    };
+    format!("{{{space}topic: {}, type: {kind}{form}}}", scalar(topic))
+}

@@ -1,0 +1,62 @@
+//! Data types of OPC UA's own namespace: which builtin type their values have (OPC 10000-3, 5.8.3; OPC 10000-6, 5.1.2).
+
+use uadp::BuiltinType;
+
+/// The builtin type of values of the DataType `i=number`, `None` for abstract ones and for types this table does not
+/// have, whose supertypes may tell.
+pub(crate) fn builtin(number: u32) -> Option<BuiltinType> {
+    // Numbers of DataTypes that are builtin types are those of the builtin types; 24 to 29 are abstract.
+    let id = match number {
+        1..=23 | 25 => number,
+        29 => 6,
+        30 | 311 | 521 | 16307 | 2000..=2003 => 15,
+        290 => 11,
+        293 | 294 => 13,
+        291 | 292 | 295 | 12877..=12881 | 23751 | 24263 | 31918 => 12,
+        288 | 289 | 17588 | 20998 => 7,
+        11737 => 9,
+        _ => return None,
+    };
+    BuiltinType::from_id(u8::try_from(id).ok()?)
+}
+
+/// Structures are ExtensionObjects, whose fields a subscriber finds in the server.
+pub(crate) const STRUCTURE: u32 = 22;
+
+/// A builtin type and whether the values are arrays; `None` for matrices and values of any rank.
+pub(crate) fn ranked(builtin: BuiltinType, rank: i64) -> Option<(BuiltinType, bool)> {
+    match rank {
+        -1 => Some((builtin, false)),
+        // 0 is one or more dimensions.
+        1 => Some((builtin, true)),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_abstract_has_no_builtin_type() {
+        assert_eq!(builtin(1), Some(BuiltinType::Boolean));
+        assert_eq!(builtin(11), Some(BuiltinType::Double));
+        assert_eq!(builtin(290), Some(BuiltinType::Double));
+        assert_eq!(builtin(294), Some(BuiltinType::DateTime));
+        assert_eq!(builtin(29), Some(BuiltinType::Int32));
+        for number in [0, 24, 26, 27, 28, 999_999] {
+            assert_eq!(builtin(number), None, "{number}");
+        }
+        assert_eq!(
+            ranked(BuiltinType::Byte, -1),
+            Some((BuiltinType::Byte, false))
+        );
+        assert_eq!(
+            ranked(BuiltinType::Byte, 1),
+            Some((BuiltinType::Byte, true))
+        );
+        for rank in [-3, -2, 0, 2] {
+            assert_eq!(ranked(BuiltinType::Byte, rank), None);
+        }
+    }
+}

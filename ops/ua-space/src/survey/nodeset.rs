@@ -1,0 +1,430 @@
+//! The variables of a NodeSet, an XML file by `UANodeSet.xsd` (OPC 10000-6, F).
+//!
+//! The file is not trusted: a document type is refused, so no entity is ever expanded, and sizes are bounded.
+
+use std::collections::{HashMap, HashSet};
+use std::fs::File;
+use std::io::Read as _;
+
+use mappings::{Identifier, NodeIdText};
+use quick_xml::XmlVersion;
+use quick_xml::events::{BytesStart, Event};
+use quick_xml::reader::Reader;
+use uadp::BuiltinType;
+
+use super::data_types::{self, STRUCTURE};
+use super::{MOST, Nodes, UaVariable};
+use crate::exit::Failure;
+
+/// Reads the file.
+pub(crate) fn survey(file: &str) -> Result<Nodes, Failure> {
+    let mut xml = String::new();
+    let read = File::open(file).and_then(|opened| opened.take(LARGEST).read_to_string(&mut xml));
+    let length = read.map_err(|error| Failure::reading(file, &error))?;
+    if u64::try_from(length).is_ok_and(|length| length == LARGEST) {
+        return Err(Failure::Data(format!(
+            "{file}: a NodeSet of more than {} MiB is not read",
+            LARGEST >> 20
+        )));
+    }
+    parse(&xml, file).map_err(|fault| {
+        let line = xml.get(..fault.at).unwrap_or(&xml).matches('\n').count() + 1;
+        Failure::Data(format!("{file}:{line}: {}", fault.what))
+    })
+}
+
+/// What is wrong with a NodeSet, and at which byte.
+#[derive(Debug)]
+struct Fault {
+    at: usize,
+    what: String,
+}
+
+fn parse(xml: &str, place: &str) -> Result<Nodes, Fault> {
+    let mut reader = Reader::from_str(xml.trim_start_matches('\u{feff}'));
+    reader.config_mut().expand_empty_elements = true;
+    reader.config_mut().trim_text(true);
+    let mut set = NodeSet::default();
+    loop {
+        let at = usize::try_from(reader.buffer_position()).unwrap_or(usize::MAX);
+        let fault = |what: String| Fault { at, what };
+        let event = reader.read_event();
+        match event.map_err(|error| fault(format!("this is not XML: {error}")))? {
+            Event::Start(element) => set.open(&element).map_err(fault)?,
+            Event::End(_) => set.close().map_err(fault)?,
+            Event::Text(text) => set.text.push_str(&text.xml10_content()),
+            Event::CData(text) => set.text.push_str(&text.xml10_content()),
+            Event::GeneralRef(entity) => {
+                let found = entity.resolve_char_ref().ok().flatten();
+                let known = quick_xml::escape::resolve_predefined_entity(&entity.xml10_content());
+                match (found, known) {
+                    (Some(char), _) => set.text.push(char),
+                    (None, Some(text)) => set.text.push_str(text),
+                    (None, None) => return Err(fault("an entity that XML does not have".into())),
+                }
+            }
+            Event::DocType(_) => {
+                return Err(fault(
+                    "a NodeSet has no document type; remove the `<!DOCTYPE ..>`".to_owned(),
+                ));
+            }
+            Event::Eof if !set.seen => {
+                return Err(fault("there is no <UANodeSet> in it".to_owned()));
+            }
+            Event::Eof if !set.path.is_empty() => {
+                return Err(fault("the file ends in the middle".to_owned()));
+            }
+            Event::Eof => break,
+            // An empty element is told as its start and its end.
+            Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
+        }
+    }
+    set.nodes(place).map_err(|what| Fault {
+        at: xml.len(),
+        what,
+    })
+}
+
+/// What was read so far.
+#[derive(Default)]
+struct NodeSet {
+    seen: bool,
+    /// Local names of the elements that are open.
+    path: Vec<String>,
+    text: String,
+    attributes: HashMap<String, String>,
+    uris: Vec<String>,
+    aliases: HashMap<String, String>,
+    node: Option<Node>,
+    variables: Vec<(NodeIdText, Node)>,
+    objects: HashMap<NodeIdText, Node>,
+    /// Types and methods: what is below them are declarations, no values.
+    types: HashSet<NodeIdText>,
+    /// Supertypes of data types.
+    supertypes: HashMap<NodeIdText, NodeIdText>,
+    properties: HashSet<NodeIdText>,
+}
+
+/// The node that is open, or was.
+#[derive(Clone, Debug, Default)]
+struct Node {
+    attributes: HashMap<String, String>,
+    parent: Option<String>,
+    references: Vec<(String, bool, String)>,
+}
+
+impl NodeSet {
+    fn open(&mut self, element: &BytesStart<'_>) -> Result<(), String> {
+        let name = element.local_name().into_inner().to_owned();
+        self.text.clear();
+        self.attributes.clear();
+        for attribute in element.attributes() {
+            let attribute = attribute.map_err(|error| format!("in <{name}>: {error}"))?;
+            let value = attribute
+                .normalized_value(XmlVersion::Implicit1_0)
+                .map_err(|error| format!("in <{name}>: {error}"))?;
+            let key = attribute.key.local_name().into_inner().to_owned();
+            self.attributes.insert(key, value.into_owned());
+        }
+        match self.path.len() {
+            0 if name != "UANodeSet" => {
+                return Err(format!("this is a <{name}>, no <UANodeSet>"));
+            }
+            0 => self.seen = true,
+            1 if name.starts_with("UA") => {
+                self.node = Some(Node {
+                    parent: self.attributes.get("ParentNodeId").cloned(),
+                    attributes: std::mem::take(&mut self.attributes),
+                    references: Vec::new(),
+                });
+            }
+            DEEPEST.. => return Err(format!("elements are nested deeper than {DEEPEST}")),
+            _ => {}
+        }
+        self.path.push(name);
+        Ok(())
+    }
+
+    fn close(&mut self) -> Result<(), String> {
+        let path: Vec<&str> = self.path.iter().map(String::as_str).collect();
+        let text = self.text.trim().to_owned();
+        match path.as_slice() {
+            [_, "NamespaceUris", "Uri"] => self.uris.push(text),
+            [_, "Aliases", "Alias"] => {
+                if let Some(alias) = self.attributes.remove("Alias") {
+                    self.aliases.insert(alias, text);
+                }
+            }
+            [_, _, "References", "Reference"] => {
+                let kind = self.attributes.remove("ReferenceType").unwrap_or_default();
+                let forward = self
+                    .attributes
+                    .get("IsForward")
+                    .is_none_or(|it| it != "false");
+                if let Some(node) = &mut self.node {
+                    node.references.push((kind, forward, text));
+                }
+            }
+            [_, kind] => {
+                let kind = (*kind).to_owned();
+                if let Some(node) = self.node.take() {
+                    self.keep(&kind, node)?;
+                }
+            }
+            _ => {}
+        }
+        self.text.clear();
+        self.path.pop();
+        Ok(())
+    }
+
+    fn keep(&mut self, kind: &str, mut node: Node) -> Result<(), String> {
+        let text = node.attributes.get("NodeId").map(String::as_str);
+        let id = self.resolve(text.unwrap_or_default())?;
+        let references = std::mem::take(&mut node.references);
+        let mut kept = Vec::new();
+        for (reference, forward, target) in references {
+            let reference = self.resolve(&reference)?;
+            let target = self.resolve(&target)?;
+            let Identifier::Numeric(number) = reference.identifier else {
+                continue;
+            };
+            match (reference.namespace, number, forward) {
+                (0, HAS_PROPERTY, true) => self.properties.extend([target]),
+                (0, HAS_PROPERTY, false) => self.properties.extend([id.clone()]),
+                (0, HAS_SUBTYPE, false) => self.supertypes.extend([(id.clone(), target)]),
+                (0, HAS_MODELLING_RULE, true) => self.types.extend([id.clone()]),
+                (0, ORGANIZES | HAS_COMPONENT, false) => kept.push(target),
+                _ => {}
+            }
+        }
+        if node.parent.is_none() {
+            node.parent = kept.first().map(ToString::to_string);
+        }
+        match kind {
+            "UAVariable" if self.variables.len() >= MOST => {
+                return Err(format!("more than {MOST} variables are not read"));
+            }
+            "UAVariable" => self.variables.push((id, node)),
+            "UAObject" => self.objects.extend([(id, node)]),
+            "UAObjectType" | "UAVariableType" | "UAMethod" => self.types.extend([id]),
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// A node id, or the alias of one.
+    fn resolve(&self, text: &str) -> Result<NodeIdText, String> {
+        let text = self.aliases.get(text).map_or(text, String::as_str);
+        text.parse().map_err(|_| {
+            let shown: String = text.chars().take(64).collect();
+            format!(
+                "`{}` is neither a node id nor an alias",
+                shown.escape_debug()
+            )
+        })
+    }
+
+    fn nodes(self, place: &str) -> Result<Nodes, String> {
+        let variables: HashSet<&NodeIdText> = self.variables.iter().map(|(id, _)| id).collect();
+        let mut found = Vec::new();
+        for (id, node) in &self.variables {
+            if id.namespace == 0 || self.properties.contains(id) || self.types.contains(id) {
+                continue;
+            }
+            if usize::from(id.namespace) > self.uris.len() {
+                let index = id.namespace;
+                return Err(format!("`{id}`: NamespaceUris has no entry {index}"));
+            }
+            let parent = match &node.parent {
+                Some(text) => Some(self.resolve(text)?),
+                None => None,
+            };
+            if parent.as_ref().is_some_and(|id| variables.contains(id))
+                || self.is_declaration(parent.clone())?
+            {
+                continue;
+            }
+            let within = parent.and_then(|parent| self.objects.get(&parent));
+            found.push(UaVariable {
+                node: id.clone(),
+                name: browse_name(node),
+                within: within.map(browse_name).unwrap_or_default(),
+                value: self.value(node)?,
+            });
+        }
+        let mut namespaces = vec!["http://opcfoundation.org/UA/".to_owned()];
+        namespaces.extend(self.uris);
+        Ok(Nodes {
+            place: format!("NodeSet {place}"),
+            endpoint: None,
+            namespaces,
+            variables: found,
+        })
+    }
+
+    /// Whether the objects it is in end at a type or method.
+    fn is_declaration(&self, mut parent: Option<NodeIdText>) -> Result<bool, String> {
+        for _ in 0..DEEPEST {
+            let Some(id) = parent else { return Ok(false) };
+            if self.types.contains(&id) {
+                return Ok(true);
+            }
+            let above = self
+                .objects
+                .get(&id)
+                .and_then(|node| node.parent.as_deref());
+            parent = above.map(|text| self.resolve(text)).transpose()?;
+        }
+        Ok(false)
+    }
+
+    fn value(&self, node: &Node) -> Result<Option<(BuiltinType, bool)>, String> {
+        // BaseDataType and a single value, unless it says so (UANodeSet.xsd).
+        let rank = node.attributes.get("ValueRank");
+        let rank = rank
+            .map_or(Ok(-1), |text| text.trim().parse())
+            .map_err(|_| {
+                let id = node.attributes.get("NodeId").map_or("", String::as_str);
+                format!("the ValueRank of `{id}` is no number")
+            })?;
+        let Some(text) = node.attributes.get("DataType") else {
+            return Ok(None);
+        };
+        let mut id = self.resolve(text)?;
+        for _ in 0..DEEPEST {
+            if id.namespace == 0
+                && let Identifier::Numeric(number) = id.identifier
+            {
+                let builtin = match number {
+                    STRUCTURE => Some(BuiltinType::ExtensionObject),
+                    _ => data_types::builtin(number),
+                };
+                if let Some(builtin) = builtin {
+                    return Ok(data_types::ranked(builtin, rank));
+                }
+            }
+            match self.supertypes.get(&id) {
+                Some(above) => id = above.clone(),
+                None => break,
+            }
+        }
+        Ok(None)
+    }
+}
+
+/// Without the index of its namespace.
+fn browse_name(node: &Node) -> String {
+    let text = node.attributes.get("BrowseName").map_or("", String::as_str);
+    let name = text
+        .split_once(':')
+        .filter(|(index, _)| index.bytes().all(|b| b.is_ascii_digit()))
+        .map_or(text, |(_, name)| name);
+    name.to_owned()
+}
+
+/// The standard's own NodeSet has a fifth of it.
+const LARGEST: u64 = 64 << 20;
+const DEEPEST: usize = 64;
+/// ReferenceTypes of OPC UA's namespace.
+const ORGANIZES: u32 = 35;
+const HAS_MODELLING_RULE: u32 = 37;
+const HAS_SUBTYPE: u32 = 45;
+const HAS_PROPERTY: u32 = 46;
+const HAS_COMPONENT: u32 = 47;
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const LINE: &str = r#"<?xml version="1.0" encoding="utf-8"?>
+<UANodeSet xmlns="http://opcfoundation.org/UA/2011/03/UANodeSet.xsd">
+  <NamespaceUris><Uri>urn:line</Uri></NamespaceUris>
+  <Aliases>
+    <Alias Alias="Boolean">i=1</Alias><Alias Alias="HasComponent">i=47</Alias><Alias Alias="HasProperty">i=46</Alias>
+    <Alias Alias="HasSubtype">i=45</Alias><Alias Alias="Organizes">i=35</Alias>
+  </Aliases>
+  <UADataType NodeId="ns=1;i=3001" BrowseName="1:Mode">
+    <References><Reference ReferenceType="HasSubtype" IsForward="false">i=29</Reference></References>
+  </UADataType>
+  <UAObjectType NodeId="ns=1;i=1001" BrowseName="1:ConveyorType"/>
+  <UAVariable NodeId="ns=1;i=1002" BrowseName="1:Running" ParentNodeId="ns=1;i=1001" DataType="Boolean"/>
+  <UAObject NodeId="ns=1;i=5001" BrowseName="1:Conveyor">
+    <References><Reference ReferenceType="Organizes" IsForward="false">i=85</Reference></References>
+  </UAObject>
+  <UAVariable NodeId="ns=1;i=6001" BrowseName="1:Running" ParentNodeId="ns=1;i=5001" DataType="Boolean"/>
+  <UAVariable NodeId="ns=1;s=Line.Mode" BrowseName="1:Mode" DataType="ns=1;i=3001" ValueRank="1">
+    <References><Reference ReferenceType="HasComponent" IsForward="false">ns=1;i=5001</Reference></References>
+  </UAVariable>
+  <UAVariable NodeId="ns=1;i=6003" BrowseName="1:Unit &amp; range" DataType="i=12" ParentNodeId="ns=1;i=6001">
+    <References><Reference ReferenceType="HasProperty" IsForward="false">ns=1;i=6001</Reference></References>
+  </UAVariable>
+</UANodeSet>"#;
+
+    #[test]
+    fn values_are_told_from_properties_declarations_and_types() {
+        let nodes = parse(LINE, "line.xml").unwrap();
+        assert_eq!(
+            nodes.namespaces,
+            ["http://opcfoundation.org/UA/", "urn:line"]
+        );
+        let told: Vec<(String, &str, &str, _)> = nodes
+            .variables
+            .iter()
+            .map(|one| {
+                (
+                    one.node.to_string(),
+                    one.name.as_str(),
+                    one.within.as_str(),
+                    one.value,
+                )
+            })
+            .collect();
+        assert_eq!(
+            told,
+            [
+                (
+                    "ns=1;i=6001".to_owned(),
+                    "Running",
+                    "Conveyor",
+                    Some((BuiltinType::Boolean, false))
+                ),
+                (
+                    "ns=1;s=Line.Mode".to_owned(),
+                    "Mode",
+                    "Conveyor",
+                    Some((BuiltinType::Int32, true))
+                ),
+            ]
+        );
+    }
+
+    #[test]
+    fn what_is_no_node_set_is_refused_with_the_reason() {
+        let refused = |xml: &str| parse(xml, "x").unwrap_err().what;
+        assert!(refused("").contains("no <UANodeSet>"));
+        assert!(refused("<html/>").contains("this is a <html>"));
+        assert!(refused("<UANodeSet>").contains("ends in the middle"));
+        assert!(refused("<!DOCTYPE x [<!ENTITY a \"aaaa\">]><UANodeSet/>").contains("DOCTYPE"));
+        assert!(refused("<UANodeSet>&a;</UANodeSet>").contains("entity"));
+        let odd = LINE.replace("ns=1;i=6001\" BrowseName", "ns=1;q=1\" BrowseName");
+        assert!(refused(&odd).contains("`ns=1;q=1` is neither"));
+        let odd = LINE.replace("<Uri>urn:line</Uri>", "");
+        assert!(refused(&odd).contains("has no entry 1"));
+        let deep = format!("<UANodeSet>{}", "<a>".repeat(100_000));
+        assert!(refused(&deep).contains("nested deeper"));
+        // A type that is its own supertype has no end, and no builtin type.
+        let round = LINE.replace("\"false\">i=29<", "\"false\">ns=1;i=3001<");
+        assert_eq!(parse(&round, "x").unwrap().variables[1].value, None);
+    }
+
+    proptest! {
+        #[test]
+        fn no_bytes_end_the_program(at in 0..LINE.len(), cut in 0..40_usize, put in "[<>&\"=a-z;/! ]{0,12}") {
+            let (start, end) = (LINE.get(..at).unwrap(), LINE.get(at + cut..).unwrap_or(""));
+            parse(&format!("{start}{put}{end}"), "x").ok();
+        }
+    }
+}

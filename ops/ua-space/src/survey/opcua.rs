@@ -1,0 +1,419 @@
+//! The namespaces and variables of an OPC UA server that runs.
+
+use std::collections::{BTreeMap, HashMap, HashSet, VecDeque};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use mappings::{LiveNode, LiveServer, Mapping, NodeIdText};
+use opcua::client::{ClientBuilder, IdentityToken, Session};
+use opcua::types::{
+    AttributeId, BrowseDescription, BrowseDirection, BrowseResultMask, DataValue,
+    EndpointDescription, Identifier, MessageSecurityMode, NodeClass, NodeClassMask, NodeId,
+    ObjectId, ReadValueId, ReferenceDescription, ReferenceTypeId, TimestampsToReturn, UAString,
+    UserTokenType, VariableId, Variant,
+};
+use tokio::time::timeout;
+use uadp::BuiltinType;
+
+use super::data_types::{self, STRUCTURE};
+use super::{MOST, Nodes, UaVariable, away};
+use crate::exit::Failure;
+
+/// Browses the server at `url` from its Objects folder on.
+pub(crate) async fn survey(url: &str) -> Result<Nodes, Failure> {
+    let server = Connected::to(url).await?;
+    let browsing = async {
+        let namespaces = server.namespaces().await?;
+        let variables = server.variables(namespaces.len()).await?;
+        Ok((namespaces, variables))
+    };
+    let (namespaces, variables) = server.within(browsing).await?;
+    server.leave().await;
+    Ok(Nodes {
+        place: format!("OPC UA server {url}"),
+        endpoint: Some(url.to_owned()),
+        namespaces,
+        variables,
+    })
+}
+
+/// Asks the server at `url` for its namespaces and for the nodes of `mapping`.
+pub(crate) async fn check(url: &str, mapping: &Mapping) -> Result<LiveServer, Failure> {
+    let server = Connected::to(url).await?;
+    let asking = async {
+        let mut live = LiveServer {
+            namespaces: server.namespaces().await?,
+            nodes: BTreeMap::new(),
+        };
+        let mut asked = Vec::new();
+        for variable in mapping.variables() {
+            let uri = mapping.namespaces().get(&variable.node.namespace);
+            let text = variable.node.to_string();
+            if live.agrees(&variable.node, uri.map(String::as_str))
+                && let Ok(node) = text.parse::<NodeId>()
+            {
+                asked.push((text, node));
+            }
+        }
+        let nodes: Vec<NodeId> = asked.iter().map(|(_, node)| node.clone()).collect();
+        let told = server.read(&nodes, &[AttributeId::NodeClass]).await?;
+        let types = server.value_types(&nodes).await?;
+        for (((text, _), class), value) in asked.into_iter().zip(told).zip(types) {
+            let class = class
+                .value
+                .and_then(|value| value.try_cast_to::<i32>().ok());
+            let node = match class {
+                Some(VARIABLE) => LiveNode::Variable(value),
+                Some(_) | None => LiveNode::Away,
+            };
+            live.nodes.insert(text, node);
+        }
+        Ok(live)
+    };
+    let live = server.within(asking).await?;
+    server.leave().await;
+    Ok(live)
+}
+
+/// A session without security, as an anonymous user.
+struct Connected {
+    url: String,
+    session: Arc<Session>,
+    events: tokio::task::JoinHandle<opcua::types::StatusCode>,
+    pki: PathBuf,
+}
+
+impl Connected {
+    async fn to(url: &str) -> Result<Self, Failure> {
+        if !url.starts_with("opc.tcp://") {
+            return Err(Failure::Usage(format!(
+                "`{url}` is no endpoint of an OPC UA server, such as opc.tcp://127.0.0.1:4840"
+            )));
+        }
+        let pki = std::env::temp_dir().join(format!("ua-space-{}", std::process::id()));
+        let connecting = Self::connect(url, pki.clone());
+        let found = match timeout(CONNECT, connecting).await {
+            Ok(found) => found,
+            Err(_over) => Err(absent(
+                url,
+                &format!("it did not answer within {CONNECT:?}"),
+            )),
+        };
+        if found.is_err() {
+            forget(&pki);
+        }
+        found
+    }
+
+    async fn connect(url: &str, pki: PathBuf) -> Result<Self, Failure> {
+        let mut client = ClientBuilder::new()
+            .application_name("ua-space")
+            .application_uri("urn:ua-bridge:ua-space")
+            .product_uri("urn:ua-bridge:ua-space")
+            .pki_dir(&pki)
+            .session_retry_limit(0)
+            .request_timeout(REQUEST)
+            .max_message_size(MESSAGE)
+            .max_chunk_count(CHUNKS)
+            .client()
+            .map_err(|wrong| Failure::Io(wrong.join("; ")))?;
+        let endpoints = client
+            .get_server_endpoints_from_url(url)
+            .await
+            .map_err(|error| absent(url, &error.to_string()))?;
+        let mut endpoint = open_endpoint(endpoints).ok_or_else(|| {
+            away(
+                format!("the OPC UA server at {url} takes secured sessions or known users only"),
+                "ua-space connects without security, as anonymous: allow that on this network, or export its NodeSet \
+                 and give it by --nodeset",
+            )
+        })?;
+        // Servers tell names of theirs that are not always to be resolved from here.
+        endpoint.endpoint_url = UAString::from(url);
+        let (session, events) = client
+            .connect_to_endpoint_directly(endpoint, IdentityToken::Anonymous)
+            .map_err(|error| absent(url, &error.to_string()))?;
+        let events = events.spawn();
+        if !session.wait_for_connection().await {
+            return Err(absent(url, "it refuses a session"));
+        }
+        Ok(Self {
+            url: url.to_owned(),
+            session,
+            events,
+            pki,
+        })
+    }
+
+    /// What `asking` finds, or why it does not in time.
+    async fn within<T>(
+        &self,
+        asking: impl Future<Output = Result<T, Failure>>,
+    ) -> Result<T, Failure> {
+        match timeout(BROWSE, asking).await {
+            Ok(found) => found,
+            Err(_over) => Err(absent(
+                &self.url,
+                &format!("not all was told within {BROWSE:?}"),
+            )),
+        }
+    }
+
+    async fn leave(&self) {
+        // A server that does not answer any more has nothing to be told.
+        let _answered = timeout(GOODBYE, self.session.disconnect()).await;
+    }
+
+    fn failed(&self, error: &opcua::types::Error) -> Failure {
+        absent(&self.url, &error.to_string())
+    }
+
+    async fn namespaces(&self) -> Result<Vec<String>, Failure> {
+        let node = NodeId::from(VariableId::Server_NamespaceArray);
+        let read = self.read(&[node], &[AttributeId::Value]).await?;
+        let value = read.into_iter().next().and_then(|value| value.value);
+        let Some(Variant::Array(array)) = value else {
+            return Err(absent(&self.url, "it has no NamespaceArray"));
+        };
+        let uris = array.values.iter().map(|value| {
+            if let Variant::String(uri) = value {
+                uri.as_ref().to_owned()
+            } else {
+                String::new()
+            }
+        });
+        Ok(uris.collect())
+    }
+
+    /// The variables below the Objects folder. Of variables nothing below is looked at, and no property.
+    async fn variables(&self, namespaces: usize) -> Result<Vec<UaVariable>, Failure> {
+        let objects = NodeId::from(ObjectId::ObjectsFolder);
+        let mut seen = HashSet::from([objects.clone()]);
+        let mut next = VecDeque::from([(objects, String::new())]);
+        let mut found: Vec<(NodeId, UaVariable)> = Vec::new();
+        while !next.is_empty() {
+            let batch: Vec<(NodeId, String)> = next.drain(..next.len().min(BATCH)).collect();
+            let nodes: Vec<NodeId> = batch.iter().map(|(node, _)| node.clone()).collect();
+            let below = self.below(&nodes).await?;
+            for ((_, within), references) in batch.into_iter().zip(below) {
+                for reference in references {
+                    let node = reference.node_id.node_id;
+                    if node.namespace == 0
+                        || usize::from(node.namespace) >= namespaces
+                        || reference.node_id.server_index != 0
+                        || reference.reference_type_id == ReferenceTypeId::HasProperty
+                        || !seen.insert(node.clone())
+                    {
+                        continue;
+                    }
+                    let name = reference.browse_name.name.as_ref().to_owned();
+                    if reference.node_class == NodeClass::Object {
+                        next.push_back((node, name));
+                    } else if let Ok(text) = node.to_string().parse::<NodeIdText>() {
+                        let within = within.clone();
+                        let variable = UaVariable {
+                            node: text,
+                            name,
+                            within,
+                            value: None,
+                        };
+                        found.push((node, variable));
+                    }
+                }
+            }
+            if seen.len() > MOST {
+                return Err(Failure::Unavailable(format!(
+                    "the OPC UA server at {} has more than {MOST} nodes, which are not looked through",
+                    self.url
+                )));
+            }
+        }
+        let nodes: Vec<NodeId> = found.iter().map(|(node, _)| node.clone()).collect();
+        let types = self.value_types(&nodes).await?;
+        let typed = found.into_iter().zip(types);
+        Ok(typed
+            .map(|((_, one), value)| UaVariable { value, ..one })
+            .collect())
+    }
+
+    /// What each node has below it.
+    async fn below(&self, nodes: &[NodeId]) -> Result<Vec<Vec<ReferenceDescription>>, Failure> {
+        let wanted: Vec<BrowseDescription> = nodes
+            .iter()
+            .map(|node| BrowseDescription {
+                node_id: node.clone(),
+                browse_direction: BrowseDirection::Forward,
+                reference_type_id: ReferenceTypeId::HierarchicalReferences.into(),
+                include_subtypes: true,
+                node_class_mask: (NodeClassMask::OBJECT | NodeClassMask::VARIABLE).bits(),
+                result_mask: BrowseResultMask::All as u32,
+            })
+            .collect();
+        let results = self.session.browse(&wanted, REFERENCES, None).await;
+        let results = results.map_err(|error| self.failed(&error))?;
+        let mut all = Vec::with_capacity(nodes.len());
+        for result in results {
+            let mut references = result.references.unwrap_or_default();
+            let mut point = result.continuation_point;
+            while !point.is_null_or_empty() && references.len() <= MOST {
+                let more = self.session.browse_next(false, &[point]).await;
+                let more = more.map_err(|error| self.failed(&error))?;
+                let Some(more) = more.into_iter().next() else {
+                    break;
+                };
+                references.extend(more.references.unwrap_or_default());
+                point = more.continuation_point;
+            }
+            all.push(references);
+        }
+        if all.len() == nodes.len() {
+            Ok(all)
+        } else {
+            Err(absent(
+                &self.url,
+                "its answer to Browse is short of results",
+            ))
+        }
+    }
+
+    /// The attributes of the nodes, those of one node side by side.
+    async fn read(
+        &self,
+        nodes: &[NodeId],
+        attributes: &[AttributeId],
+    ) -> Result<Vec<DataValue>, Failure> {
+        let mut values = Vec::new();
+        for nodes in nodes.chunks(BATCH) {
+            let wanted: Vec<ReadValueId> = nodes
+                .iter()
+                .flat_map(|node| {
+                    let of = |attribute: &AttributeId| ReadValueId::new(node.clone(), *attribute);
+                    attributes.iter().map(of)
+                })
+                .collect();
+            let read = self
+                .session
+                .read(&wanted, TimestampsToReturn::Neither, 0.0)
+                .await
+                .map_err(|error| self.failed(&error))?;
+            if read.len() != wanted.len() {
+                return Err(absent(&self.url, "its answer to Read is short of results"));
+            }
+            values.extend(read);
+        }
+        Ok(values)
+    }
+
+    /// The builtin type of each variable, and whether it is an array.
+    async fn value_types(
+        &self,
+        nodes: &[NodeId],
+    ) -> Result<Vec<Option<(BuiltinType, bool)>>, Failure> {
+        let attributes = [AttributeId::DataType, AttributeId::ValueRank];
+        let read = self.read(nodes, &attributes).await?;
+        let mut known: HashMap<NodeId, Option<BuiltinType>> = HashMap::new();
+        let mut types = Vec::with_capacity(nodes.len());
+        for told in read.chunks_exact(attributes.len()) {
+            let [kind, rank] = told else { continue };
+            let rank = if let Some(Variant::Int32(rank)) = &rank.value {
+                i64::from(*rank)
+            } else {
+                ANY_RANK
+            };
+            let Some(Variant::NodeId(kind)) = &kind.value else {
+                types.push(None);
+                continue;
+            };
+            let builtin = match known.get(&**kind) {
+                Some(builtin) => *builtin,
+                None => {
+                    let builtin = self.builtin(kind).await?;
+                    known.insert((**kind).clone(), builtin);
+                    builtin
+                }
+            };
+            types.push(builtin.and_then(|builtin| data_types::ranked(builtin, rank)));
+        }
+        Ok(types)
+    }
+
+    /// The builtin type a data type is of, by its supertypes.
+    async fn builtin(&self, data_type: &NodeId) -> Result<Option<BuiltinType>, Failure> {
+        let mut node = data_type.clone();
+        for _ in 0..DEEPEST {
+            if node.namespace == 0
+                && let Identifier::Numeric(number) = node.identifier
+            {
+                if number == STRUCTURE {
+                    return Ok(Some(BuiltinType::ExtensionObject));
+                }
+                if let Some(builtin) = data_types::builtin(number) {
+                    return Ok(Some(builtin));
+                }
+            }
+            let above = BrowseDescription {
+                node_id: node.clone(),
+                browse_direction: BrowseDirection::Inverse,
+                reference_type_id: ReferenceTypeId::HasSubtype.into(),
+                include_subtypes: true,
+                node_class_mask: NodeClassMask::DATA_TYPE.bits(),
+                result_mask: BrowseResultMask::All as u32,
+            };
+            let results = self.session.browse(&[above], 1, None).await;
+            let results = results.map_err(|error| self.failed(&error))?;
+            let references = results.into_iter().next().and_then(|one| one.references);
+            match references.and_then(|references| references.into_iter().next()) {
+                Some(above) => node = above.node_id.node_id,
+                None => return Ok(None),
+            }
+        }
+        Ok(None)
+    }
+}
+
+impl Drop for Connected {
+    fn drop(&mut self) {
+        self.events.abort();
+        forget(&self.pki);
+    }
+}
+
+/// The client makes a folder for certificates, of which it has none here.
+fn forget(pki: &PathBuf) {
+    // What stays is an empty folder among temporary files.
+    let _removed = std::fs::remove_dir_all(pki);
+}
+
+/// An endpoint without security for anonymous users.
+fn open_endpoint(endpoints: Vec<EndpointDescription>) -> Option<EndpointDescription> {
+    endpoints.into_iter().find(|endpoint| {
+        let anonymous = endpoint.user_identity_tokens.as_ref().is_none_or(|tokens| {
+            tokens.is_empty()
+                || tokens
+                    .iter()
+                    .any(|token| token.token_type == UserTokenType::Anonymous)
+        });
+        endpoint.security_mode == MessageSecurityMode::None && anonymous
+    })
+}
+
+fn absent(url: &str, why: &str) -> Failure {
+    away(
+        format!("no OPC UA server can be asked at {url}: {why}"),
+        "is it running, and is that its endpoint?",
+    )
+}
+
+/// NodeClass Variable (OPC 10000-3, 8.29).
+const VARIABLE: i32 = 2;
+const ANY_RANK: i64 = -2;
+const BATCH: usize = 100;
+const REFERENCES: u32 = 1000;
+const DEEPEST: usize = 32;
+const CONNECT: Duration = Duration::from_secs(10);
+const REQUEST: Duration = Duration::from_secs(5);
+const BROWSE: Duration = Duration::from_secs(60);
+const GOODBYE: Duration = Duration::from_secs(2);
+const MESSAGE: usize = 16 << 20;
+const CHUNKS: usize = 260;

@@ -1,0 +1,101 @@
+//! The topics of a DDS domain.
+
+use std::time::Duration;
+
+use bridge_ros2::domain::{DiscoveryRange, Domain, DomainOptions};
+use bridge_ros2::graph::{Endpoint, Graph, ros_topic};
+use bridge_ros2::node::NodeOptions;
+use bridge_ros2::security::Security;
+use mappings::{LiveSpace, LiveTopic};
+use messages::TypeName;
+use tokio::time::{Instant, sleep};
+
+use super::{MOST, away};
+use crate::exit::Failure;
+
+/// Joins `domain` as a node, listens until nothing new was discovered for a while, `wait` at most, and leaves.
+pub(crate) async fn survey(domain: u16, wait: Duration) -> Result<LiveSpace, Failure> {
+    let joined = join(domain)?;
+    let end = Instant::now() + wait;
+    let (mut graph, mut since) = (joined.graph(), Instant::now());
+    while Instant::now() < end {
+        if !graph.participants().is_empty() && since.elapsed() >= SETTLED {
+            break;
+        }
+        sleep(STEP).await;
+        let newer = joined.graph();
+        if newer != graph {
+            (graph, since) = (newer, Instant::now());
+        }
+    }
+    joined.leave(()).await;
+    if graph.participants().is_empty() {
+        let what = format!("nobody was discovered in DDS domain {domain} within {wait:?}");
+        return Err(away(what, HELP));
+    }
+    Ok(live(&graph))
+}
+
+fn join(domain: u16) -> Result<Domain, Failure> {
+    let variable = |name: &str| std::env::var(name).ok();
+    let security = Security::from_env(variable, None)
+        .map_err(|error| Failure::Unconfigured(error.to_string()))?;
+    let range = DiscoveryRange::from_env(
+        variable("ROS_AUTOMATIC_DISCOVERY_RANGE").as_deref(),
+        variable("ROS_LOCALHOST_ONLY").as_deref(),
+    )
+    .map_err(|error| Failure::Usage(error.to_string()))?;
+    let options = DomainOptions {
+        domain,
+        networks: range.networks(),
+        peers: Vec::new(),
+        node: NodeOptions::from(NODE),
+        enclave: security.enclave().cloned(),
+    };
+    Domain::join(&options).map_err(|error| away(error, HELP))
+}
+
+fn live(graph: &Graph) -> LiveSpace {
+    let mut live = LiveSpace::default();
+    for (name, published) in graph
+        .written_topics()
+        .map(|name| (name, true))
+        .chain(graph.read_topics().map(|name| (name, false)))
+    {
+        let all = if published {
+            graph.writers(name)
+        } else {
+            graph.readers(name)
+        };
+        let mut others = all
+            .iter()
+            .filter(|one| !graph.is_bridge(one.guid))
+            .peekable();
+        let Some(ros) = ros_topic(name) else { continue };
+        if others.peek().is_none() || live.topics.len() >= MOST {
+            continue;
+        }
+        let topic = live.topics.entry(format!("/{ros}")).or_default();
+        topic.published |= published;
+        topic.subscribed |= !published;
+        others.for_each(|one| learn(topic, one));
+    }
+    live
+}
+
+/// A name that is none of ROS is kept as it is, to be told.
+fn learn(topic: &mut LiveTopic, endpoint: &Endpoint) {
+    if topic.types.len() < MOST_TYPES {
+        let named = TypeName::from_dds(&endpoint.type_name);
+        topic
+            .types
+            .insert(named.map_or_else(|_| endpoint.type_name.clone(), |name| name.to_string()));
+    }
+}
+
+const NODE: &str = "ua_space";
+const HELP: &str = "are its nodes running, with the same ROS_DOMAIN_ID, and does multicast reach them? --wait N waits longer";
+/// Peers announce themselves within a fraction of this when somebody new comes.
+const SETTLED: Duration = Duration::from_millis(1500);
+const STEP: Duration = Duration::from_millis(50);
+const MOST_TYPES: usize = 16;

@@ -1,0 +1,95 @@
+//! `mappings/schema.json` judged by a JSON Schema validator and a YAML parser of other makers.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use serde_json::Value;
+use system_tests::{Cell, Peer};
+
+const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
+
+/// What the judge says of each file.
+fn judged(cell: &Cell, files: &[PathBuf]) -> Vec<Value> {
+    let schema = format!("{ROOT}/mappings/schema.json");
+    let names: Vec<&str> = files.iter().map(|file| file.to_str().unwrap()).collect();
+    let args = [&[schema.as_str()][..], &names].concat();
+    let told = cell.asyncua_once("schema_judge.py", &args);
+    assert_eq!(told.len(), files.len());
+    told
+}
+
+fn yaml_in(folder: &str) -> Vec<PathBuf> {
+    let entries = fs::read_dir(Path::new(ROOT).join(folder)).unwrap();
+    let mut files: Vec<PathBuf> = entries.map(|entry| entry.unwrap().path()).collect();
+    files.retain(|path| path.extension().is_some_and(|end| end == "yaml"));
+    files.sort();
+    files
+}
+
+/// The YAML blocks of a Markdown text that hold something.
+fn blocks(markdown: &str) -> Vec<&str> {
+    let blocks = markdown.split("```yaml\n").skip(1);
+    let blocks = blocks.map(|rest| rest.split("```").next().unwrap());
+    let says = |line: &str| !line.trim().is_empty() && !line.trim_start().starts_with('#');
+    blocks.filter(|block| block.lines().any(says)).collect()
+}
+
+#[test]
+fn what_is_shipped_and_what_the_guide_shows_is_valid() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut files = yaml_in("mappings");
+    files.extend(
+        yaml_in("tests/cells")
+            .into_iter()
+            .filter(|file| !file.ends_with("ten_faults.yaml")),
+    );
+    files.extend(yaml_in("tests/tests/init"));
+    let shipped = files.len();
+    for name in ["README.md", "docs/guide.md"] {
+        let text = fs::read_to_string(Path::new(ROOT).join(name)).unwrap();
+        for (number, block) in blocks(&text).into_iter().enumerate() {
+            let name = format!("{}-{number}.yaml", name.replace('/', "-"));
+            files.push(cell.file(&name, block));
+        }
+    }
+    assert!(shipped >= 7 && files.len() >= shipped + 5, "{files:?}");
+    for told in judged(&cell, &files) {
+        assert_eq!(told["faults"], serde_json::json!([]), "{told}");
+        assert_ne!(
+            told["keys"],
+            serde_json::json!([]),
+            "{told} holds nothing that was judged"
+        );
+    }
+}
+
+#[test]
+fn what_breaks_the_schema_is_refused_at_its_place() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    // Faults of shape and range. What shows only across keys the schema does not know.
+    let expected = [
+        ("M003", "$"),
+        ("M005", "$.variables[0]"),
+        ("M006", "$.spaces"),
+        ("M010", "$.spaces"),
+        ("M020", "$.pubsub"),
+        ("M040", "$.server"),
+        ("M050", "$.variables"),
+    ];
+    let files: Vec<PathBuf> = expected
+        .iter()
+        .map(|(name, _)| Path::new(ROOT).join(format!("mappings/tests/bad/{name}.yaml")))
+        .collect();
+    for (told, (name, place)) in judged(&cell, &files).iter().zip(expected) {
+        let faults = told["faults"].as_array().unwrap();
+        let there = |fault: &Value| fault.as_str().unwrap().starts_with(place);
+        assert!(
+            faults.iter().any(there),
+            "{name} is to be refused at {place}: {told}"
+        );
+    }
+}

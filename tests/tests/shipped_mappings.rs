@@ -1,0 +1,94 @@
+//! The mappings that no make of robot has a test for: each runs against what it is for.
+
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use system_tests::{Cell, Child, Peer, UaSide, eventually};
+use uadp::{Scalar, Variant};
+
+const SOON: Duration = Duration::from_secs(30);
+const FOLDER: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../mappings");
+
+fn shipped(name: &str) -> String {
+    format!("{FOLDER}/{name}")
+}
+
+/// Waits until the robot has heard the value on the topic.
+fn hears(robot: &mut Child, topic: &str, expected: Value) {
+    robot.wait_for_json(&format!("{topic} is {expected}"), SOON, |line| {
+        (line["heard"] == topic && line["value"] == expected).then_some(())
+    });
+}
+
+#[test]
+fn every_value_of_the_assembly_line_reaches_all_sides() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let mut side = UaSide::join();
+    let mut niryo = cell.rospy("assembly_line_ros1.py", &[]);
+    let mut turtlebot = cell.cyclone("assembly_line_ros2.py", &[]);
+    let mapping = shipped("assembly-line.yaml");
+    let _bridges = (
+        cell.bridge_ros1(&[&mapping]),
+        cell.bridge_ros2_alone(&[&mapping]).start(),
+    );
+    for (id, value) in [(11, 7), (12, 2), (13, 1)] {
+        side.hear_scalar((1, 2, id), Scalar::UInt32(value));
+    }
+    side.hear_scalar((1, 2, 10), Scalar::Boolean(true));
+    side.hear_scalar((2, 2, 20), Scalar::Boolean(true));
+    side.hear_scalar((2, 2, 21), Scalar::Boolean(false));
+    for (topic, value) in [
+        ("/conveyor/running", json!(true)),
+        ("/storage/covers", json!(7)),
+        ("/conveyor/covers", json!(2)),
+        ("/turtlebot3/covers", json!(1)),
+    ] {
+        hears(&mut turtlebot, topic, value);
+    }
+    hears(&mut niryo, "/park/busy", json!(true));
+    hears(&mut niryo, "/bucket/busy", json!(false));
+    // What an OPC UA client writes reaches both robots.
+    for robot in [&niryo, &turtlebot] {
+        eventually("the switch is heard", SOON, || {
+            side.write((0, 2, 1), Scalar::Boolean(true));
+            let told = robot.json_lines();
+            let switch = told.iter().find(|line| line["heard"] == "/conveyor/switch");
+            switch.map(|line| assert_eq!(line["value"], true))
+        });
+    }
+}
+
+#[test]
+fn the_button_of_the_first_mapping_is_a_value() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let side = UaSide::join();
+    let topic = ["/start_button", "std_msgs/Bool"];
+    let value = ["--repeat", "0", "--value", "true"];
+    let _robot = cell.rospy("ros1_pub.py", &[&topic[..], &value].concat());
+    let _bridge = cell.bridge_ros1(&[&shipped("minimal.yaml")]);
+    side.hear((1, 2, 10), "the button is pressed", |fields| {
+        (fields == [Variant::Scalar(Scalar::Boolean(true))]).then_some(())
+    });
+}
+
+#[test]
+fn every_shipped_mapping_has_a_test_that_runs_it() {
+    let sources = [
+        include_str!("shipped_mappings.rs"),
+        include_str!("niryo.rs"),
+        include_str!("turtlebot3.rs"),
+    ];
+    for entry in std::fs::read_dir(FOLDER).unwrap() {
+        let name = entry.unwrap().file_name().into_string().unwrap();
+        if name.ends_with(".yaml") {
+            let run = sources.iter().any(|source| source.contains(&name));
+            assert!(run, "no test runs {name} against a robot");
+        }
+    }
+}
