@@ -46,7 +46,11 @@ impl Bench {
             .get(&"std_msgs/Float64".parse().unwrap())
             .unwrap();
         router.bind(topic, &double, &Selection::Whole, now).unwrap();
-        Self { router, now, topic }
+        let mut bench = Self { router, now, topic };
+        // What it consists of is announced before.
+        bench.wait(Duration::from_secs(1));
+        assert_eq!(bench.sent(), []);
+        bench
     }
 
     fn say(&mut self, value: f64) -> Verdict {

@@ -64,6 +64,10 @@ document! {
         /// A writer silent for this long counts as gone; default 3s, and longer than `keep_alive_period`.
         #[schemars(regex(pattern = DURATION))]
         receive_timeout: String,
+        /// What a writer has in its messages (its DataSetMetaData) is announced this often, beside when it begins and when it
+        /// is asked for; default 30s.
+        #[schemars(regex(pattern = DURATION))]
+        metadata_period: String,
         /// Bytes of the largest datagram sent, 512 to 65507 (the default); larger NetworkMessages go in chunks of it. 1472 fits
         /// an Ethernet frame.
         #[schemars(range(min = 512, max = 65507))]

@@ -260,6 +260,9 @@ pub struct PubSub {
     pub keep_alive_period: Duration,
     /// A writer that is silent for this long counts as gone; longer than `keep_alive_period`.
     pub receive_timeout: Duration,
+    /// What a writer has in its messages is announced this often, beside when it begins and when it is asked for
+    /// (DataSetMetaData: OPC 10000-14, 7.2.4.6.4).
+    pub metadata_period: Duration,
     /// Bytes of the largest NetworkMessage that is sent as one datagram; a larger one goes in chunks of as much
     /// (OPC 10000-14, 7.2.4.4.4).
     pub max_datagram: u16,
@@ -307,6 +310,7 @@ impl Default for PubSub {
             key_frame_period: Duration::from_secs(1),
             keep_alive_period: Duration::from_secs(1),
             receive_timeout: Duration::from_secs(3),
+            metadata_period: Duration::from_secs(30),
             max_datagram: Self::LARGEST_DATAGRAM,
             max_message: 64 << 20,
         }

@@ -62,6 +62,7 @@ mod plan;
 mod registry;
 mod resolve;
 mod service;
+mod structure;
 mod type_hash;
 
 pub use convert::{date_time_to_time, duration_to_millis, millis_to_duration, time_to_date_time};
@@ -76,4 +77,5 @@ pub use name::{Dialect, TypeName};
 pub use plan::{Conversion, Literal, Part, Plan, Selection, Wire, is_lossless, is_number};
 pub use registry::Registry;
 pub use service::{ActionMessages, ActionType, ServiceType};
+pub use structure::{MemberKind, Structure, StructureMember};
 pub use type_hash::{ActionTypeHashes, ServiceTypeHashes, TypeHash};
