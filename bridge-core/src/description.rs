@@ -3,21 +3,22 @@
 //! The name of the DataSet is that of the topic (`ua_1_2_10`), since an announcement has no WriterGroupId: with the
 //! PublisherId and DataSetWriterId it has, the name tells which topic it is about. The description is the name of the ROS
 //! type that the fields make, with ` as bytes` behind it where they are one ByteString with the whole message. It is
-//! missing where they make none: one value out of a message.
+//! missing where they make none: one value out of a message, or values that were converted on the way.
 
 use std::collections::BTreeMap;
 use std::collections::hash_map::DefaultHasher;
 use std::hash::{Hash, Hasher};
 
-use mappings::TopicId;
-use messages::{Leaf, MemberKind, MessageType, Rank, Selection, TypeName};
+use mappings::{Meaning, TopicId, Unit};
+use messages::{Leaf, MemberKind, MessageType, Rank, Selected, Selection, TypeName};
 use uadp::discovery::{
     Announced, Announcement, ConfigurationVersion, DataSetMetaDataType, DataTypeSchemaHeader,
-    FieldMetaData, List, StructureDefinition, StructureDescription, StructureField,
+    EUInformation, EnumValueType, FieldMetaData, KeyValuePair, List, Range, Settings,
+    StructureDefinition, StructureDescription, StructureField, enum_strings,
 };
 use uadp::{
-    BuiltinType, EncodeError, Guid, LocalizedText, NodeId, PublisherId, QualifiedName,
-    SecurityHeader, StatusCode, Timestamp,
+    BuiltinType, EncodeError, Guid, LocalizedText, NodeId, PublisherId, QualifiedName, Scalar,
+    SecurityHeader, StatusCode, Timestamp, Variant,
 };
 
 /// What the DataSetMetaData of a writer of another space says of its topic.
@@ -38,10 +39,25 @@ impl Described {
         if self.bytes {
             return Some(Selection::Bytes);
         }
+        if let [one] = &self.fields[..]
+            && (one.builtin, one.rank) == (BuiltinType::ExtensionObject, Rank::Scalar)
+        {
+            return Some(Selection::Structure(None));
+        }
         let leaves = message_type.leaves();
         let whole = leaves.len() == self.fields.len()
             && leaves.iter().zip(&self.fields).all(|(a, b)| is_same(a, b));
-        whole.then_some(Selection::Whole)
+        if whole {
+            return Some(Selection::Whole);
+        }
+        // Some of them, in the order of the message.
+        let mut rest = leaves.iter();
+        let selected = self.fields.iter().map(|field| {
+            let found = rest.find(|leaf| is_same(leaf, field))?;
+            Some(Selected::whole(&found.path))
+        });
+        let selected: Vec<Selected> = selected.collect::<Option<_>>()?;
+        (!selected.is_empty()).then_some(Selection::Fields(selected))
     }
 
     /// Whether values of these types, and arrays or not, are what is described.
@@ -136,6 +152,8 @@ pub(crate) struct Source<'s> {
     pub(crate) selection: &'s Selection,
     /// The fields that cross.
     pub(crate) leaves: &'s [Leaf],
+    /// What the mapping says of the value.
+    pub(crate) meaning: Option<&'s Meaning>,
     /// Namespace index -> URI, as far as known.
     pub(crate) namespaces: &'s BTreeMap<u16, String>,
 }
@@ -199,66 +217,27 @@ impl Description {
 impl Source<'_> {
     /// The announcement, and where its body begins.
     fn encode(&self, version: ConfigurationVersion) -> Result<(Vec<u8>, usize), EncodeError> {
-        let (space, namespace, writer_id) = self.topic.triple();
-        let name = self.topic.to_string();
-        let within = match self.selection {
-            Selection::Field(path) => path.as_str(),
-            Selection::Whole
-            | Selection::Value { .. }
-            | Selection::Template { .. }
-            | Selection::Bytes => "",
+        let (_, namespace, _) = self.topic.triple();
+        let description = self.description();
+        let named: Vec<FieldText> = self.leaves.iter().map(|leaf| self.names(leaf)).collect();
+        let mut buffers = <[Vec<u8>; 3]>::default();
+        let properties = match (self.leaves, self.meaning) {
+            ([_], Some(meaning)) => properties(meaning, &mut buffers)?,
+            _ => Vec::new(),
         };
-        let whole = self.message_type.message_at(within);
-        let one_value = matches!(self.selection, Selection::Value { .. })
-            || (!within.is_empty() && whole.is_none());
-        let description = match whole {
-            _ if one_value => None,
-            Some(name) if *self.selection == Selection::Bytes => Some(format!("{name}{AS_BYTES}")),
-            Some(name) => Some(name.to_string()),
-            None => None,
-        };
-        let named: Vec<(String, String)> = self
-            .leaves
-            .iter()
-            .map(|leaf| self.names(leaf, within, one_value))
-            .collect();
-        let types: Vec<Option<&TypeName>> = self
-            .leaves
-            .iter()
-            .map(|leaf| match leaf.builtin {
-                BuiltinType::ExtensionObject => self.message_type.message_at(&leaf.path),
-                _ => None,
-            })
-            .collect();
-        let dimensions: Vec<Vec<u32>> = self.leaves.iter().map(|leaf| sizes(leaf.rank)).collect();
         let fields: Vec<FieldMetaData<'_>> = self
             .leaves
             .iter()
-            .zip(named.iter().zip(types.iter().zip(&dimensions)))
+            .zip(&named)
             .enumerate()
-            .map(
-                |(index, (leaf, ((name, told), (of, dimensions))))| FieldMetaData {
-                    name: Some(name),
-                    description: text(told),
-                    built_in_type: leaf.builtin.id(),
-                    data_type: data_type(leaf.builtin, *of, namespace),
-                    value_rank: value_rank(leaf.rank),
-                    array_dimensions: list(dimensions),
-                    data_set_field_id: field_id(self.topic, index, name),
-                    ..FieldMetaData::default()
-                },
-            )
+            .map(|(index, (leaf, text))| self.field(index, leaf, (text, &properties)))
             .collect();
         let structures = structures(self.message_type, self.leaves);
         let namespaces = match structures.is_empty() {
             true => Vec::new(),
             false => self.namespaces_up_to(namespace),
         };
-        let sizes_of = |structure: &messages::Structure<'_>| -> Vec<Vec<u32>> {
-            let ranks = structure.fields.iter().map(|field| field.rank);
-            ranks.map(sizes).collect()
-        };
-        let inner_sizes: Vec<Vec<Vec<u32>>> = structures.iter().map(sizes_of).collect();
+        let inner_sizes: Vec<Vec<Vec<u32>>> = structures.iter().map(member_sizes).collect();
         let inner: Vec<Vec<StructureField<'_>>> = structures
             .iter()
             .zip(&inner_sizes)
@@ -267,36 +246,32 @@ impl Source<'_> {
         let described: Vec<StructureDescription<'_>> = structures
             .iter()
             .zip(&inner)
-            .map(|(structure, fields)| StructureDescription {
-                data_type_id: NodeId::string(namespace, structure.name.as_str()),
-                name: QualifiedName {
-                    namespace,
-                    name: Some(structure.name.as_str()),
-                },
-                structure_definition: StructureDefinition {
-                    default_encoding_id: NodeId::string(namespace, structure.name.as_str()),
-                    base_data_type: STRUCTURE,
-                    fields: list(fields),
-                    ..StructureDefinition::default()
-                },
-            })
+            .map(|(structure, fields)| structure_description(structure.name, fields, namespace))
             .collect();
+        self.announcement(&DataSetMetaDataType {
+            schema: DataTypeSchemaHeader {
+                namespaces: list(&namespaces),
+                structure_data_types: list(&described),
+                ..DataTypeSchemaHeader::default()
+            },
+            name: Some(&self.topic.to_string()),
+            description: text(description.as_deref().unwrap_or_default()),
+            fields: List::new(&fields),
+            configuration_version: version,
+            ..DataSetMetaDataType::default()
+        })
+    }
+
+    fn announcement(
+        &self,
+        meta_data: &DataSetMetaDataType<'_>,
+    ) -> Result<(Vec<u8>, usize), EncodeError> {
+        let (space, _, writer_id) = self.topic.triple();
         let announcement = Announcement {
             sequence_number: 0,
             announced: Announced::DataSetMetaData {
                 writer_id,
-                meta_data: DataSetMetaDataType {
-                    schema: DataTypeSchemaHeader {
-                        namespaces: list(&namespaces),
-                        structure_data_types: list(&described),
-                        ..DataTypeSchemaHeader::default()
-                    },
-                    name: Some(&name),
-                    description: text(description.as_deref().unwrap_or_default()),
-                    fields: List::new(&fields),
-                    configuration_version: version,
-                    ..DataSetMetaDataType::default()
-                },
+                meta_data: *meta_data,
                 status: StatusCode::GOOD,
             },
         };
@@ -312,21 +287,91 @@ impl Source<'_> {
         Ok((datagram, body_at))
     }
 
-    /// Name and description of a field.
-    fn names(&self, leaf: &Leaf, within: &str, one_value: bool) -> (String, String) {
-        if leaf.path.is_empty() {
-            return (MESSAGE.to_owned(), String::new());
+    /// Path of the message of which the fields are; empty for the whole.
+    fn within(&self) -> &str {
+        match self.selection {
+            Selection::Field(path) | Selection::Structure(Some(path)) => path,
+            Selection::Whole
+            | Selection::Structure(None)
+            | Selection::Fields(_)
+            | Selection::Value { .. }
+            | Selection::Template { .. }
+            | Selection::Bytes => "",
         }
-        if one_value {
-            let told = format!("{} of {}", leaf.path, self.message_type.name());
-            return (leaf.path.clone(), told);
+    }
+
+    /// Whether the values make no message.
+    fn is_loose(&self) -> bool {
+        match self.selection {
+            Selection::Value { .. } => true,
+            Selection::Fields(selected) => selected.iter().any(|one| !one.is_plain()),
+            Selection::Whole
+            | Selection::Structure(_)
+            | Selection::Field(_)
+            | Selection::Template { .. }
+            | Selection::Bytes => self.message_type.message_at(self.within()).is_none(),
         }
+    }
+
+    fn description(&self) -> Option<String> {
+        if self.is_loose() {
+            return None;
+        }
+        let name = self.message_type.message_at(self.within())?;
+        let behind = match self.selection {
+            Selection::Bytes => AS_BYTES,
+            Selection::Whole
+            | Selection::Structure(_)
+            | Selection::Fields(_)
+            | Selection::Field(_)
+            | Selection::Value { .. }
+            | Selection::Template { .. } => "",
+        };
+        Some(format!("{name}{behind}"))
+    }
+
+    fn field<'f>(
+        &'f self,
+        index: usize,
+        leaf: &Leaf,
+        (said, properties): (&'f FieldText, &'f [KeyValuePair<'f>]),
+    ) -> FieldMetaData<'f> {
+        let (_, namespace, _) = self.topic.triple();
+        let structure = leaf.builtin == BuiltinType::ExtensionObject;
+        let of = self.message_type.message_at(&leaf.path);
+        FieldMetaData {
+            name: Some(&said.name),
+            description: text(&said.description),
+            built_in_type: leaf.builtin.id(),
+            data_type: data_type(leaf.builtin, of.filter(|_| structure), namespace),
+            value_rank: value_rank(leaf.rank),
+            array_dimensions: list(&said.sizes),
+            data_set_field_id: field_id(self.topic, index, &said.name),
+            // Only a single value has some.
+            properties: list(properties),
+            ..FieldMetaData::default()
+        }
+    }
+
+    fn names(&self, leaf: &Leaf) -> FieldText {
+        let within = self.within();
         let inner = leaf
             .path
             .strip_prefix(within)
             .and_then(|rest| rest.strip_prefix('.'));
-        let name = inner.unwrap_or(&leaf.path);
-        (name.to_owned(), String::new())
+        let (name, description) = if leaf.path.is_empty() {
+            (MESSAGE, String::new())
+        } else if self.is_loose() {
+            let told = format!("{} of {}", leaf.path, self.message_type.name());
+            (leaf.path.as_str(), told)
+        } else {
+            (inner.unwrap_or(&leaf.path), String::new())
+        };
+        FieldText {
+            name: name.to_owned(),
+            description,
+            sizes: sizes(leaf.rank),
+        }
     }
 
     /// The list of namespaces that has the index of the topic in it: ExtensionObjects have their TypeIds with that index.
@@ -338,6 +383,57 @@ impl Source<'_> {
             .map(|index| self.namespaces.get(&index).map(String::as_str))
             .collect()
     }
+}
+
+/// The Properties that say what a number means (OPC 10000-8, 5.3.2, and OPC 10000-3, 5.8.3).
+fn properties<'b>(
+    meaning: &'b Meaning,
+    [unit_buffer, range_buffer, texts_buffer]: &'b mut [Vec<u8>; 3],
+) -> Result<Vec<KeyValuePair<'b>>, EncodeError> {
+    let mut found = Vec::new();
+    let mut push = |name: &'static str, value: Variant<'b>| {
+        let key = QualifiedName {
+            namespace: 0,
+            name: Some(name),
+        };
+        found.push(KeyValuePair { key, value });
+    };
+    if let Some(unit) = meaning.unit {
+        let information = EUInformation {
+            namespace_uri: Some(Unit::NAMESPACE),
+            unit_id: unit.id(),
+            display_name: text(unit.symbol),
+            description: text(unit.name),
+        };
+        let object = information.write_object(unit_buffer)?;
+        push(
+            "EngineeringUnits",
+            Variant::Scalar(Scalar::ExtensionObject(object)),
+        );
+    }
+    if let Some((low, high)) = meaning.range() {
+        let object = Range { low, high }.write_object(range_buffer)?;
+        push("EURange", Variant::Scalar(Scalar::ExtensionObject(object)));
+    }
+    let counted = (0..)
+        .zip(meaning.texts.keys())
+        .all(|(at, number)| at == *number);
+    if counted && !meaning.texts.is_empty() {
+        let names: Vec<LocalizedText<'_>> = meaning.texts.values().map(|said| text(said)).collect();
+        push("EnumStrings", enum_strings(&names, texts_buffer)?);
+    } else if !meaning.texts.is_empty() {
+        let values: Vec<EnumValueType<'_>> = meaning
+            .texts
+            .iter()
+            .map(|(value, said)| EnumValueType {
+                value: *value,
+                display_name: text(said),
+                ..EnumValueType::default()
+            })
+            .collect();
+        push("EnumValues", EnumValueType::array(&values, texts_buffer)?);
+    }
+    Ok(found)
 }
 
 /// The types of the messages in arrays and of those nested in them, each once.
@@ -354,6 +450,38 @@ fn structures<'m>(message_type: &'m MessageType, leaves: &[Leaf]) -> Vec<message
         }
     }
     all
+}
+
+/// What a field is called, and how many elements it has.
+struct FieldText {
+    name: String,
+    description: String,
+    sizes: Vec<u32>,
+}
+
+fn member_sizes(structure: &messages::Structure<'_>) -> Vec<Vec<u32>> {
+    let ranks = structure.fields.iter().map(|field| field.rank);
+    ranks.map(sizes).collect()
+}
+
+fn structure_description<'s>(
+    name: &'s TypeName,
+    fields: &'s [StructureField<'s>],
+    namespace: u16,
+) -> StructureDescription<'s> {
+    StructureDescription {
+        data_type_id: NodeId::string(namespace, name.as_str()),
+        name: QualifiedName {
+            namespace,
+            name: Some(name.as_str()),
+        },
+        structure_definition: StructureDefinition {
+            default_encoding_id: NodeId::string(namespace, name.as_str()),
+            base_data_type: STRUCTURE,
+            fields: list(fields),
+            ..StructureDefinition::default()
+        },
+    }
 }
 
 fn structure_fields<'s>(

@@ -2,7 +2,6 @@
 
 #![expect(
     clippy::unwrap_used,
-    clippy::panic,
     clippy::wildcard_enum_match_arm,
     reason = "test code"
 )]
@@ -422,4 +421,84 @@ fn one_value_out_of_a_message_makes_no_type_and_a_message_in_it_does() {
             ),
         ]
     );
+}
+
+#[test]
+fn a_structure_crosses_with_its_definition_and_comes_back_as_the_message_it_was() {
+    let (mut writer, mut reader, mut now) = (Bridge::new(1, ""), Bridge::new(2, ""), clock());
+    let name_of = "geometry_msgs/Polygon";
+    let mut polygon = vec![2, 0, 0, 0];
+    for value in [1.0_f32, 2.0, 3.0, 4.0, 5.0, 6.0] {
+        polygon.extend(value.to_le_bytes());
+    }
+    writer.bind("ua_1_5_10", name_of, &Selection::Structure(None), now);
+    writer.say("ua_1_5_10", &polygon, now);
+    let sent = writer.sent_within(SECOND / 2, &mut now);
+    let mut names = Vec::new();
+    each_meta_data(&sent, |_, meta_data| {
+        assert_eq!(meta_data.fields.len(), 1);
+        let field = meta_data.field(0).unwrap();
+        assert_eq!(field.builtin_type(), Some(BuiltinType::ExtensionObject));
+        assert_eq!(field.data_type, uadp::NodeId::string(5, name_of));
+        assert_eq!(meta_data.schema.namespaces.len(), 5);
+        let structure = meta_data.schema.structure(field.data_type).unwrap();
+        let points = structure.structure_definition.fields.get(0).unwrap();
+        assert_eq!((points.name, points.value_rank), (Some("points"), 1));
+        let all = meta_data.schema.structure_data_types.iter();
+        names.extend(all.map(|one| one.name.name.unwrap().to_owned()));
+    });
+    assert_eq!(names, ["geometry_msgs/Polygon", "geometry_msgs/Point32"]);
+
+    reader.hear(&writer, &sent, now);
+    let told = reader.told(now);
+    let Some((_, Some(described))) = told.last() else {
+        panic!("{told:?}")
+    };
+    let polygon_type = reader.registry.get(&described.message_type).unwrap();
+    let selection = described.selection(&polygon_type).unwrap();
+    assert_eq!(selection, Selection::Structure(None));
+    reader.bind("ua_1_5_10", name_of, &selection, now);
+    let delivered = reader
+        .outputs(now)
+        .into_iter()
+        .find_map(|output| match output {
+            Output::Delivery(delivery) => Some(delivery.payload),
+            _ => None,
+        });
+    let cdr = [&[0, 1, 0, 0][..], &polygon].concat();
+    assert_eq!(delivered, Some(cdr));
+}
+
+#[test]
+fn several_fields_make_their_message_again_on_the_other_side() {
+    let (mut writer, mut reader, mut now) = (Bridge::new(1, ""), Bridge::new(2, ""), clock());
+    let twist = "geometry_msgs/Twist";
+    let fields = ["linear.x", "angular.z"].map(messages::Selected::whole);
+    writer.bind("ua_1_5_10", twist, &Selection::Fields(fields.to_vec()), now);
+    let mut speed = TWIST;
+    speed[..8].copy_from_slice(&1.5_f64.to_le_bytes());
+    speed[8..16].copy_from_slice(&9.0_f64.to_le_bytes());
+    speed[40..].copy_from_slice(&0.25_f64.to_le_bytes());
+    writer.say("ua_1_5_10", &speed, now);
+    let sent = writer.sent_within(SECOND / 2, &mut now);
+    reader.hear(&writer, &sent, now);
+    let told = reader.told(now);
+    let Some((_, Some(described))) = told.last() else {
+        panic!("{told:?}")
+    };
+    let twist_type = reader.registry.get(&described.message_type).unwrap();
+    let selection = described.selection(&twist_type).unwrap();
+    assert_eq!(selection, Selection::Fields(fields.to_vec()));
+    reader.bind("ua_1_5_10", twist, &selection, now);
+    let delivered = reader
+        .outputs(now)
+        .into_iter()
+        .find_map(|output| match output {
+            Output::Delivery(delivery) => Some(delivery.payload),
+            _ => None,
+        });
+    // What was not selected is zero.
+    speed[8..16].fill(0);
+    let cdr = [&[0, 1, 0, 0][..], &speed].concat();
+    assert_eq!(delivered, Some(cdr));
 }

@@ -82,8 +82,9 @@ impl Bench {
     /// Sequence number and value of each datagram.
     fn sent(&mut self) -> Vec<(u16, f64)> {
         std::iter::from_fn(|| self.router.poll_output(self.now))
-            .map(|output| match output {
-                Output::Datagram { bytes, .. } => value(&bytes),
+            .filter_map(|output| match output {
+                Output::Datagram { bytes, .. } => Some(value(&bytes)),
+                Output::Discovery { .. } => None,
                 other => panic!("{other:?}"),
             })
             .collect()

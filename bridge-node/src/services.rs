@@ -170,6 +170,8 @@ impl Services {
             }
             Selection::Whole
             | Selection::Field(_)
+            | Selection::Fields(_)
+            | Selection::Structure(_)
             | Selection::Value { .. }
             | Selection::Template { .. }
             | Selection::Bytes => {

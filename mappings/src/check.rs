@@ -2,10 +2,12 @@
 
 mod bindings;
 mod cell;
+mod meaning;
 mod names;
 mod network;
 mod patterns;
 mod services;
+mod several;
 mod shaping;
 mod types;
 mod variables;

@@ -12,15 +12,17 @@ mod pattern;
 mod read;
 mod topic;
 mod tree;
+mod unit;
 
 pub use check::Checked;
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use document::schema;
 pub use mapping::{
-    Binding, Endpoint, Mapping, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy, Server,
-    ServiceBinding, ServiceRole, Space, Trigger, Variable,
+    Binding, Endpoint, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule,
+    SecurityPolicy, Server, ServiceBinding, ServiceRole, Space, Trigger, Variable,
 };
 pub use node_id::{Identifier, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use topic::{Part, SpaceId, TopicError, TopicId};
+pub use unit::Unit;

@@ -11,6 +11,7 @@ use uadp::BuiltinType;
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 use crate::topic::{SpaceId, TopicId};
+use crate::unit::Unit;
 
 /// The checked mapping of one cell. Immutable: a changed file makes a new one.
 ///
@@ -431,6 +432,40 @@ pub struct Variable {
     pub overflow: Overflow,
     /// Which of its values its origin sends.
     pub publish: Publish,
+    /// What its numbers mean.
+    pub meaning: Meaning,
+}
+
+/// What the numbers of a variable mean, as far as it is said.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Meaning {
+    /// Their unit of measure.
+    pub unit: Option<&'static Unit>,
+    /// The lowest and the highest to be expected, by their bits.
+    range: Option<(u64, u64)>,
+    /// Texts of single values.
+    pub texts: BTreeMap<i64, String>,
+}
+
+impl Meaning {
+    pub(crate) fn new(
+        unit: Option<&'static Unit>,
+        range: Option<(f64, f64)>,
+        texts: BTreeMap<i64, String>,
+    ) -> Self {
+        Self {
+            unit,
+            range: range.map(|(low, high)| (low.to_bits(), high.to_bits())),
+            texts,
+        }
+    }
+
+    /// The lowest and the highest value to be expected.
+    #[must_use]
+    pub fn range(&self) -> Option<(f64, f64)> {
+        let (low, high) = self.range?;
+        Some((f64::from_bits(low), f64::from_bits(high)))
+    }
 }
 
 /// Which values of a variable are sent: by default each.

@@ -74,7 +74,9 @@ pub use error::{
 pub use fields::{NoFields, Sink, Source};
 pub use message::{Leaf, MessageType, Rank, standard_type};
 pub use name::{Dialect, TypeName};
-pub use plan::{Conversion, Literal, Part, Plan, Selection, Wire, is_lossless, is_number};
+pub use plan::{
+    Conversion, Literal, Part, Plan, Selected, Selection, Wire, is_lossless, is_number,
+};
 pub use registry::Registry;
 pub use service::{ActionMessages, ActionType, ServiceType};
 pub use structure::{MemberKind, Structure, StructureMember};

@@ -3,8 +3,8 @@
 use uadp::BuiltinType;
 
 use crate::definition::{Arity, Number, Primitive};
-use crate::resolve::{Shape, ShapeKind};
-use crate::{MessageType, Rank, TypeName};
+use crate::resolve::{Shape, ShapeKind, flatten};
+use crate::{Leaf, MessageType, Rank, TypeName};
 
 /// A message type as a structure: its fields in the order they are encoded in, one after the other (OPC 10000-6, 5.2.6).
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -53,10 +53,29 @@ impl MessageType {
         found
     }
 
+    /// The field at a path in each message of an array.
+    #[must_use]
+    pub fn leaf_inside(&self, array: &str, field: &str) -> Option<Leaf> {
+        let (_, leaves) = self.element_leaves(array)?;
+        leaves.into_iter().find(|leaf| leaf.path == field)
+    }
+
+    /// The fields of one message of the array at a path, flattened as those of a message are.
+    pub(crate) fn element_leaves(&self, path: &str) -> Option<(&TypeName, Vec<Leaf>)> {
+        let leaf = self.leaf(path)?;
+        if leaf.builtin != BuiltinType::ExtensionObject {
+            return None;
+        }
+        let shape = self.shape_at(path)?;
+        let mut leaves = Vec::new();
+        flatten(shape, "", &mut leaves);
+        Some((&shape.name, leaves))
+    }
+
     fn shape_at(&self, path: &str) -> Option<&Shape> {
-        let parts = path.split('.').filter(|part| !part.is_empty());
-        parts.fold(Some(self.shape.as_ref()), |shape, part| {
-            let field = shape?.fields.iter().find(|field| field.name == part)?;
+        let mut parts = path.split('.').filter(|part| !part.is_empty());
+        parts.try_fold(self.shape.as_ref(), |shape, part| {
+            let field = shape.fields.iter().find(|field| field.name == part)?;
             match &field.kind {
                 ShapeKind::Message(inner) => Some(inner.as_ref()),
                 ShapeKind::Primitive(_) | ShapeKind::Sequence => None,

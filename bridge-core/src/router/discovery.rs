@@ -131,6 +131,10 @@ impl Router {
             message_type,
             selection,
             leaves: plan.leaves(),
+            meaning: self
+                .mapping
+                .variable(topic)
+                .map(|variable| &variable.meaning),
             namespaces: self.mapping.namespaces(),
         };
         match Description::new(source, description.as_deref(), now.utc) {
@@ -325,7 +329,9 @@ impl Router {
     ) {
         if message.message_type() == NetworkMessageType::Probe {
             match Probe::decode(message) {
-                Ok(probe) => self.handle_probe(&probe, space, now),
+                Ok(Probe::DataSetMetaData(ids)) => self.handle_probe(ids, space, now),
+                // Of endpoints and configurations there is nothing to tell.
+                Ok(_) => self.drop_undecoded(None, from, &DISCOVERY),
                 Err(error) => self.drop_undecoded(None, from, &error),
             }
         } else if !may_cross(self.settings.own, Side::Ua, space) {
@@ -340,16 +346,13 @@ impl Router {
         }
     }
 
-    fn handle_probe(&mut self, probe: &Probe<'_>, asked: SpaceId, now: Now) {
-        let Probe::DataSetMetaData(ids) = probe else {
-            // Of endpoints and configurations there is nothing to tell.
-            return;
-        };
+    fn handle_probe(&mut self, ids: List<'_, u16>, asked: SpaceId, now: Now) {
         let own = self.settings.own;
         let discovery = self.discovery(now);
         let since = discovery.since_start(now);
         if asked == own {
-            discovery.announcer.handle_probe(probe, since);
+            let probe = Probe::DataSetMetaData(ids);
+            discovery.announcer.handle_probe(&probe, since);
         } else if let Some(probing) = discovery.probing.get_mut(&asked) {
             let named = |topic: &TopicId| ids.iter().any(|id| id == topic.triple().2);
             if probing.topics.iter().all(named) {

@@ -140,7 +140,9 @@ fn line(event: &PortEvent) -> String {
                 Selection::Field(field) => field,
                 Selection::Value { field, .. } => field,
                 Selection::Bytes => "bytes",
-                Selection::Template { .. } => "template",
+                Selection::Fields(_) | Selection::Structure(_) | Selection::Template { .. } => {
+                    "template"
+                }
             };
             format!("{topic} is {} {field}", message_type.name())
         }

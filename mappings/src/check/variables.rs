@@ -10,7 +10,7 @@ use messages::{Leaf, Rank};
 use super::bindings::{self, Bindings};
 use super::services::Calls;
 use super::types::{self, ValueType};
-use super::{Declared, required};
+use super::{Declared, meaning, required};
 use crate::code::Code;
 use crate::document::{PublishEntry, Queue, VariableEntry};
 use crate::findings::Findings;
@@ -334,6 +334,8 @@ fn variable(
         Some((Queue::KeepLatest, _)) | None => Overflow::KeepLatest,
     };
     let publish = publish(entry, value_type, findings);
+    let several = fields.len() > 1;
+    let meaning = meaning::check(entry, (value_type, several), findings);
     let service = bound
         .service
         .map(|service| service.settled(value_type, findings));
@@ -349,6 +351,7 @@ fn variable(
         service,
         overflow,
         publish: publish?,
+        meaning: meaning?,
     })
 }
 
