@@ -126,7 +126,6 @@ fn member(field: &crate::resolve::ShapeField) -> Option<StructureMember<'_>> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
     use crate::{Dialect, Registry};
 
     #[test]
