@@ -41,6 +41,8 @@ pub enum Reason {
     TooManyTopics,
     /// More latched publishers of one topic than are kept for late joiners.
     TooManyPublishers,
+    /// No sample, but what a topic is announced to consist of: nothing that is believed, or nothing that can be announced.
+    MetaData,
     /// The local side did not take it.
     NotPublished,
     /// The socket did not take it.
@@ -58,7 +60,7 @@ pub enum Reason {
 
 impl Reason {
     /// All of them, in the order of their counters.
-    pub const ALL: [Self; 24] = [
+    pub const ALL: [Self; 25] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -77,6 +79,7 @@ impl Reason {
         Self::NoRoom,
         Self::TooManyTopics,
         Self::TooManyPublishers,
+        Self::MetaData,
         Self::NotPublished,
         Self::NotSent,
         Self::CallFailed,
@@ -107,6 +110,7 @@ impl Reason {
             Self::NoRoom => "no_room",
             Self::TooManyTopics => "too_many_topics",
             Self::TooManyPublishers => "too_many_publishers",
+            Self::MetaData => "metadata",
             Self::NotPublished => "not_published",
             Self::NotSent => "not_sent",
             Self::CallFailed => "call_failed",
@@ -160,6 +164,10 @@ pub struct Counters {
     pub repeated: u64,
     /// DataSetMessages of other spaces that never came, by the gaps in their sequence numbers.
     pub missing: u64,
+    /// How often what the topic consists of was announced.
+    pub announced: u64,
+    /// What the writer of another space announced its topic to be, where that was new.
+    pub described: u64,
     /// Keep-alives sent.
     pub keep_alives: u64,
     dropped: [u64; Reason::ALL.len()],

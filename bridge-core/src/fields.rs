@@ -179,6 +179,23 @@ impl<'a> FieldSource<'a> {
             .map_err(malformed)
     }
 
+    fn open_structure(&mut self, value: Scalar<'a>) -> Result<(), SourceError> {
+        let Scalar::ExtensionObject(object) = value else {
+            return Err(unexpected(
+                BuiltinType::ExtensionObject,
+                false,
+                &Variant::Scalar(value),
+            ));
+        };
+        let ExtensionBody::Binary(body) = object.body else {
+            return Err(SourceError::Malformed(
+                "a structure without a binary body".to_owned(),
+            ));
+        };
+        self.structure = Some(StructureReader::new(body));
+        Ok(())
+    }
+
     /// The next field, or the next value of the structure being read, as an array.
     fn next_array(&mut self, expected: BuiltinType) -> Result<Array<'a>, SourceError> {
         if let Some(structure) = &mut self.structure {
@@ -273,26 +290,22 @@ impl<'a> Source<'a> for FieldSource<'a> {
         Ok(array.len())
     }
 
+    fn structure(&mut self) -> Result<(), SourceError> {
+        match self.field()? {
+            Variant::Scalar(one) => self.open_structure(one),
+            other @ (Variant::Null | Variant::Array(_) | Variant::Matrix(_)) => {
+                Err(unexpected(BuiltinType::ExtensionObject, false, &other))
+            }
+        }
+    }
+
     fn begin_structure(&mut self) -> Result<(), SourceError> {
         let next = self
             .structures
             .as_mut()
             .and_then(Iterator::next)
             .ok_or(SourceError::Missing)?;
-        let Scalar::ExtensionObject(object) = next else {
-            return Err(unexpected(
-                BuiltinType::ExtensionObject,
-                false,
-                &Variant::Scalar(next),
-            ));
-        };
-        let ExtensionBody::Binary(body) = object.body else {
-            return Err(SourceError::Malformed(
-                "a structure without a binary body".to_owned(),
-            ));
-        };
-        self.structure = Some(StructureReader::new(body));
-        Ok(())
+        self.open_structure(next)
     }
 
     fn end_structure(&mut self) -> Result<(), SourceError> {

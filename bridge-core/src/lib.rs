@@ -9,9 +9,11 @@
 //! and no allocation.
 
 mod counters;
+mod description;
 mod fields;
 mod gate;
 mod hops;
+mod learned;
 mod loop_rule;
 mod network;
 mod output;
@@ -25,6 +27,7 @@ mod transcoder;
 mod writer;
 
 pub use counters::{Counters, Reason, Verdict};
+pub use description::Described;
 pub use fields::{decode_fields, encode_fields};
 pub use hops::{Delays, Hop, Hops};
 pub use loop_rule::{Side, may_cross};

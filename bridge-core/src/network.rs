@@ -1,10 +1,11 @@
 //! The NetworkMessages a bridge sends: one DataSetMessage each, since common subscribers handle only the first of
 //! several.
 
-use mappings::TopicId;
+use mappings::{SpaceId, TopicId};
 use uadp::{
     ChunkBudget, ChunkError, Chunks, DataSetHeader, Extras, GroupHeader, NetworkHeader,
-    NetworkMessage, NetworkMessageEncoder, NetworkMessageType, PublisherId, Timestamp, Whole,
+    NetworkMessage, NetworkMessageEncoder, NetworkMessageType, PublisherId, SecurityHeader,
+    Timestamp, Whole,
 };
 
 use crate::counters::Reason;
@@ -76,6 +77,47 @@ pub(crate) fn chunk(
     Ok(chunks.offset())
 }
 
+/// The chunks of an announcement that is larger than a datagram.
+pub(crate) fn announcement_chunks(
+    space: SpaceId,
+    sequence_number: u16,
+    body: &[u8],
+    (max_datagram, utc): (u16, Timestamp),
+) -> Result<Vec<Vec<u8>>, ChunkError> {
+    let whole = Whole {
+        message_type: NetworkMessageType::Announcement,
+        writer_id: None,
+        message_sequence_number: sequence_number,
+        bytes: body,
+    };
+    let budget = ChunkBudget {
+        network_message: max_datagram.into(),
+        trailer: 0,
+    };
+    let header = NetworkHeader {
+        group: None,
+        timestamp: None,
+        picoseconds: None,
+        ..network_header(space.into(), 0, utc)
+    };
+    let extras = Extras {
+        security: Some(SecurityHeader::NONE),
+        ..Extras::default()
+    };
+    let mut chunks = Chunks::new(&header, &extras, whole, budget)?;
+    let mut datagrams = Vec::new();
+    loop {
+        let mut bytes = Vec::new();
+        match chunks.append(&mut bytes, &extras) {
+            Some(written) => {
+                written?;
+                datagrams.push(bytes);
+            }
+            None => return Ok(datagrams),
+        }
+    }
+}
+
 /// Writes a keep-alive; the stamp of sending is patched in when it is polled.
 pub(crate) fn keep_alive(
     mut bytes: Vec<u8>,
@@ -115,12 +157,17 @@ fn network_header(space: u16, namespace: u16, utc: Timestamp) -> NetworkHeader<'
 }
 
 /// The header of a sample taken from the local side at `taken`.
-pub(crate) fn data_set_header(sequence: u16, taken: Timestamp) -> DataSetHeader {
+pub(crate) fn data_set_header(
+    sequence: u16,
+    taken: Timestamp,
+    major_version: Option<u32>,
+) -> DataSetHeader {
     DataSetHeader {
         sequence_number: Some(sequence),
         timestamp: Some(taken.time),
         picoseconds: Some(taken.picoseconds),
         status: Some(0),
+        major_version,
         ..DataSetHeader::default()
     }
 }

@@ -1,11 +1,13 @@
 //! What comes out of a Router.
 
 use std::net::SocketAddr;
+use std::sync::Arc;
 
 use mappings::TopicId;
 use uadp::{BuiltinType, Timestamp};
 
 use crate::counters::Reason;
+use crate::description::Described;
 
 /// What the Router wants done.
 #[derive(Debug)]
@@ -18,15 +20,24 @@ pub enum Output {
         /// The whole UDP payload.
         bytes: Vec<u8>,
     },
+    /// A discovery NetworkMessage to send, as a [`Datagram`](Self::Datagram) is: what a topic consists of, or the question
+    /// for that.
+    Discovery {
+        /// The whole UDP payload.
+        bytes: Vec<u8>,
+    },
     /// A sample of another space to publish.
     Delivery(Delivery),
-    /// A value of another space came whose local type is not known: find one and [`bind`](crate::Router::bind) it.
+    /// A value of another space came whose local type is not known, or its writer says anew what it is: find a type and
+    /// [`bind`](crate::Router::bind) it.
     Unbound {
         /// Which value.
         topic: TopicId,
         /// Builtin type, and whether it is an array, of each of its fields. Null counts as a scalar
         /// [`BuiltinType::Variant`].
         shape: Vec<(BuiltinType, bool)>,
+        /// What its writer says it is, if that is what the values are.
+        described: Option<Arc<Described>>,
     },
     /// The writer of a topic of another space fell silent, or speaks again.
     Silent {

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
-use uadp::Timestamp;
+use uadp::{BuiltinType, Timestamp};
 
 use crate::counters::Reason;
 use crate::output::Kept;
@@ -33,6 +33,10 @@ pub(crate) struct Reader {
     pub(crate) held: Option<Held>,
     /// When the port was last asked for the local type.
     pub(crate) asked: Option<Instant>,
+    /// Builtin type of each field, and whether it is an array, of a sample of the present version.
+    pub(crate) shape: Option<Vec<(BuiltinType, bool)>>,
+    /// The major version its messages have (OPC 10000-14, 6.2.3.2.6).
+    major_version: Option<u32>,
 }
 
 /// A sample that was handed on.
@@ -84,6 +88,8 @@ impl Reader {
             several: None,
             held: None,
             asked: None,
+            shape: None,
+            major_version: None,
         }
     }
 
@@ -91,6 +97,21 @@ impl Reader {
     pub(crate) fn heard(&mut self, now: Instant) -> bool {
         self.heard = now;
         std::mem::take(&mut self.silent)
+    }
+
+    /// Whether what comes from there may be of the writer: of one that is silent nobody knows.
+    pub(crate) fn may_be(&self, from: SocketAddr) -> bool {
+        self.silent || self.from == from
+    }
+
+    /// Takes note of the version of a message, and says whether what was known of the content is no longer true.
+    pub(crate) fn is_changed(&mut self, major_version: Option<u32>) -> bool {
+        let before = std::mem::replace(&mut self.major_version, major_version);
+        let changed = before.is_some() && before != major_version;
+        if changed {
+            self.shape = None;
+        }
+        changed
     }
 
     /// Whether the writer has just been silent for `timeout`. True once per silence.

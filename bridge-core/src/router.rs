@@ -1,6 +1,7 @@
 //! The Router: verdicts on samples, queues per topic, repetitions and silences.
 
 mod chunks;
+mod discovery;
 mod receive;
 mod reload;
 
@@ -28,6 +29,7 @@ use crate::topic::{Item, Role, Sending, Topic};
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Idle, MAX_KEPT, Message, Writer};
 use chunks::Chunks;
+use discovery::Discovery;
 use receive::Sample;
 
 /// Decides what crosses between one space and UADP. See the crate's page for how it is driven.
@@ -43,6 +45,8 @@ pub struct Router {
     pace: Pace,
     /// Chunks of large messages of other spaces; `None` before the first one.
     chunks: Option<Box<Chunks>>,
+    /// What topics consist of, announced and learned; `None` before there is any.
+    discovery: Option<Box<Discovery>>,
     /// What is told besides samples. Bounded by the topics and by [`is_told`].
     told: VecDeque<Output>,
     timers: BinaryHeap<Reverse<(Instant, TopicId)>>,
@@ -65,6 +69,7 @@ impl Router {
             paced: VecDeque::new(),
             pace: Pace::default(),
             chunks: None,
+            discovery: None,
             told: VecDeque::new(),
             timers: BinaryHeap::new(),
             spare: Vec::new(),
@@ -114,7 +119,10 @@ impl Router {
                 reader.forget_all();
                 reader.held.take()
             }
-            Role::Ours(_) => None,
+            Role::Ours(_) => {
+                self.describe(topic, (message_type, selection), now);
+                None
+            }
         };
         if let Some(held) = held
             && let Ok(fields) = Fields::parse(&held.fields)
@@ -160,6 +168,7 @@ impl Router {
             role: Role::Ours(writer),
             plan,
             gate,
+            description,
             ..
         }) = self.entry(topic, None, now)
         else {
@@ -175,7 +184,8 @@ impl Router {
             }
         };
         let stamp = writer.stamp(received);
-        let header = data_set_header(writer.expected_sequence(), stamp);
+        let version = description.as_ref().map(|said| said.major_version());
+        let header = data_set_header(writer.expected_sequence(), stamp, version);
         let mut written = encode(&mut encoded, topic, &header, now.utc, &sample);
         let large = encoded.bytes.len() > usize::from(max_datagram);
         if written.is_ok() && large {
@@ -296,7 +306,11 @@ impl Router {
             ..
         }) = self.entry(topic, None, now)
         {
+            let revived = live && !writer.is_live();
             writer.set_live(live);
+            if revived && let Some(entry) = self.topics.get_mut(&topic) {
+                entry.announce_at = entry.announce_at.map(|_| now.monotonic);
+            }
             self.schedule(topic);
         }
     }
@@ -316,9 +330,11 @@ impl Router {
                 continue;
             }
             entry.timer = None;
+            self.announce_again(topic, now);
             self.handle_due(topic, now);
             self.schedule(topic);
         }
+        self.discover(now);
         self.expire_chunks(now);
     }
 
@@ -331,7 +347,8 @@ impl Router {
             false => self.pace.opens(),
         };
         let chunks = self.chunks.as_ref().and_then(|chunks| chunks.due());
-        [timer, pace, chunks].into_iter().flatten().min()
+        let discovery = self.discovery_due();
+        [timer, pace, chunks, discovery].into_iter().flatten().min()
     }
 
     /// The next thing to do, topic by topic in turn. `None`: nothing until the next `handle_*`.
@@ -582,7 +599,8 @@ impl Router {
             Role::Ours(writer) => {
                 let held = entry.gate.as_ref().and_then(|gate| gate.due());
                 let idle = writer.due(key_frames, keep_alives).map(|(at, _)| at);
-                held.into_iter().chain(idle).min()
+                let again = entry.announce_at;
+                held.into_iter().chain(idle).chain(again).min()
             }
             Role::Theirs(reader) => reader.due(silence),
         };

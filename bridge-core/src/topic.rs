@@ -7,6 +7,7 @@ use mappings::Overflow;
 use messages::Plan;
 
 use crate::counters::Counters;
+use crate::description::Description;
 use crate::gate::Gate;
 use crate::output::Delivery;
 use crate::queue::Queue;
@@ -29,6 +30,10 @@ pub(crate) struct Topic {
     pub(crate) overflow: Overflow,
     /// What holds samples of our own space back.
     pub(crate) gate: Option<Box<Gate>>,
+    /// What is announced of it, if it is of our own space and its type is known.
+    pub(crate) description: Option<Box<Description>>,
+    /// When it is to be announced again.
+    pub(crate) announce_at: Option<Instant>,
     pub(crate) counters: Counters,
     /// Whether it stands in the Router's list of topics with something to poll.
     pub(crate) ready: bool,
@@ -80,6 +85,8 @@ impl Topic {
             sending: None,
             overflow,
             gate: None,
+            description: None,
+            announce_at: None,
             counters: Counters::default(),
             ready: false,
             timer: None,

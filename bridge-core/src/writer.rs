@@ -279,6 +279,11 @@ impl Writer {
         }
     }
 
+    /// Whether the topic has a producer.
+    pub(crate) const fn is_live(&self) -> bool {
+        self.live
+    }
+
     /// When the writer has to speak again, and how. Large values are repeated so seldom that this takes up no more
     /// than a tenth of the pace of chunks.
     pub(crate) fn due(

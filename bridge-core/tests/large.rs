@@ -92,6 +92,7 @@ impl Pair {
             && due < self.now.monotonic + Duration::from_millis(100)
         {
             self.wait(due.saturating_duration_since(self.now.monotonic));
+            self.sender.handle_timeout(self.now);
             all.extend(self.burst());
         }
         (all, self.now.monotonic - start)

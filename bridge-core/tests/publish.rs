@@ -46,7 +46,11 @@ impl Bench {
             .get(&"std_msgs/Float64".parse().unwrap())
             .unwrap();
         router.bind(topic, &double, &Selection::Whole, now).unwrap();
-        Self { router, now, topic }
+        let mut bench = Self { router, now, topic };
+        // What it consists of is announced before.
+        bench.wait(Duration::from_secs(1));
+        assert_eq!(bench.sent(), []);
+        bench
     }
 
     fn say(&mut self, value: f64) -> Verdict {
@@ -78,8 +82,9 @@ impl Bench {
     /// Sequence number and value of each datagram.
     fn sent(&mut self) -> Vec<(u16, f64)> {
         std::iter::from_fn(|| self.router.poll_output(self.now))
-            .map(|output| match output {
-                Output::Datagram { bytes, .. } => value(&bytes),
+            .filter_map(|output| match output {
+                Output::Datagram { bytes, .. } => Some(value(&bytes)),
+                Output::Discovery { .. } => None,
                 other => panic!("{other:?}"),
             })
             .collect()

@@ -287,6 +287,7 @@ fn a_value_waits_for_its_type_and_then_goes_out() {
         Output::Unbound {
             topic: asked,
             shape,
+            ..
         },
     ] = &outputs[..]
     else {
@@ -495,6 +496,9 @@ fn a_state_is_repeated_with_its_time_and_its_readers_deliver_it_once() {
     let mut sender = Bench::new(1, Local::Ros1);
     let mut reader = Bench::new(2, Local::Fields);
     sender.bind(topic("ua_1_5_10"), "std_msgs/UInt32");
+    // What it consists of is announced meanwhile.
+    sender.wait(SECOND);
+    sender.router.handle_timeout(sender.now);
     assert_eq!(
         sender.say(topic("ua_1_5_10"), &[7, 0, 0, 0]),
         Verdict::Forward
@@ -546,7 +550,7 @@ fn a_topic_without_a_producer_is_not_repeated() {
     bench.outputs();
     bench.wait(SECOND * 2);
     bench.router.handle_timeout(bench.now);
-    assert!(bench.outputs().is_empty());
+    assert!(bench.datagrams().is_empty());
 }
 
 #[test]

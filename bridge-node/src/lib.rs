@@ -18,7 +18,7 @@ mod stamp;
 mod status;
 
 pub use arguments::Arguments;
-pub use bridge_core::{Kept, PublisherKey};
+pub use bridge_core::{Described, Kept, PublisherKey};
 pub use clock::{now, timestamp};
 pub use definitions::Definitions;
 pub use exit::{Failure, FailureKind};

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use bridge_core::{Kept, PublisherKey, Reason};
+use bridge_core::{Described, Kept, PublisherKey, Reason};
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
 use messages::{MessageType, Selection};
@@ -26,10 +26,15 @@ pub trait Port: Send + 'static {
     /// A short reason under which the sample is counted as dropped.
     fn publish(&mut self, sample: Delivery) -> Result<(), &'static str>;
 
-    /// The Router heard a value of another space whose local type is not known yet. The port finds one (mapping,
-    /// then a local subscriber's, then the standard type of the value) and answers with [`PortEvent::Bound`], now or
-    /// when a subscriber comes; it is asked again while values arrive.
-    fn wanted(&mut self, topic: TopicId, shape: &[(BuiltinType, bool)]);
+    /// The Router heard a value of another space whose local type is not known yet, or what its writer says it is. The
+    /// port finds a type (mapping, then a local subscriber's, then what is described, then the standard type of the value)
+    /// and answers with [`PortEvent::Bound`], now or when a subscriber comes; it is asked again while values arrive.
+    fn wanted(
+        &mut self,
+        topic: TopicId,
+        shape: &[(BuiltinType, bool)],
+        described: Option<&Described>,
+    );
 
     /// The writer of a topic of another space fell silent past its receive timeout, or speaks again.
     fn silent(&mut self, topic: TopicId, silent: bool);

@@ -210,8 +210,24 @@ impl<P: Port> Shell<P> {
                     }
                     self.router.recycle(bytes);
                 }
+                Output::Discovery { bytes } => {
+                    let sent = if self.dry_run {
+                        Ok(())
+                    } else {
+                        self.udp.try_send(&bytes)
+                    };
+                    if let Err(error) = sent {
+                        self.router
+                            .not_announced(not_sent(error), &error.to_string());
+                    }
+                    self.router.recycle(bytes);
+                }
                 Output::Delivery(delivery) => self.deliver(delivery),
-                Output::Unbound { topic, shape } => self.port.wanted(topic, &shape),
+                Output::Unbound {
+                    topic,
+                    shape,
+                    described,
+                } => self.port.wanted(topic, &shape, described.as_deref()),
                 Output::Silent { topic, silent } => self.port.silent(topic, silent),
                 Output::Retired { topic, instance } => self.port.retired(topic, instance),
                 Output::Notice(notice) => tell(&notice),

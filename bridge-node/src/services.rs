@@ -271,6 +271,8 @@ impl Services {
             }
             Selection::Whole
             | Selection::Field(_)
+            | Selection::Fields(_)
+            | Selection::Structure(_)
             | Selection::Value { .. }
             | Selection::Template { .. }
             | Selection::Bytes => {

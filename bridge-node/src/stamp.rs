@@ -10,11 +10,19 @@ pub fn wants_stamp(message_type: &MessageType, selection: Option<&Selection>) ->
     let Some(stamp) = message_type.leaves().first().filter(|leaf| is_stamp(leaf)) else {
         return false;
     };
-    matches!(
-        selection,
+    let leaves_it = |path: &String| path != STAMP && !stamp.is_inside(path);
+    match selection {
         Some(Selection::Field(path) | Selection::Value { field: path, .. })
-            if path != STAMP && !stamp.is_inside(path)
-    )
+        | Some(Selection::Structure(Some(path))) => leaves_it(path),
+        Some(Selection::Fields(selected)) => selected.iter().all(|one| leaves_it(&one.field)),
+        Some(
+            Selection::Whole
+            | Selection::Structure(None)
+            | Selection::Template { .. }
+            | Selection::Bytes,
+        )
+        | None => false,
+    }
 }
 
 /// The first field of a message that begins with a header.

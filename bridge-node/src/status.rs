@@ -34,6 +34,8 @@ struct TopicStatus {
     sent: u64,
     delivered: u64,
     repeated: u64,
+    announced: u64,
+    described: u64,
     keep_alives: u64,
     missing: u64,
     dropped: BTreeMap<&'static str, u64>,
@@ -116,6 +118,8 @@ impl Status {
             line("samples_sent_total", &labels, &status.sent);
             line("samples_delivered_total", &labels, &status.delivered);
             line("key_frames_repeated_total", &labels, &status.repeated);
+            line("metadata_announced_total", &labels, &status.announced);
+            line("metadata_learned_total", &labels, &status.described);
             line("keep_alives_total", &labels, &status.keep_alives);
             line("messages_missing_total", &labels, &status.missing);
             for (reason, count) in &status.dropped {
@@ -144,6 +148,8 @@ impl From<&Counters> for TopicStatus {
             sent: counters.sent,
             delivered: counters.delivered,
             repeated: counters.repeated,
+            announced: counters.announced,
+            described: counters.described,
             keep_alives: counters.keep_alives,
             missing: counters.missing,
             dropped: counters

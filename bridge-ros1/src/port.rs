@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use bridge_node::{Delivery, Kept, Port, PortEvent, Services, timestamp};
+use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, timestamp};
 use mappings::{Mapping, SpaceId, TopicId, Variable};
 use messages::{MessageType, Selection, TypeName};
 use tcpros::{
@@ -518,7 +518,7 @@ impl Ros1Port {
                     stamps: sink.stamps(&message_type),
                 };
                 sink.open = Some(open);
-                let selection = sink.selection();
+                let selection = sink.selection(message_type.name());
                 self.events.push_back(PortEvent::Bound {
                     topic,
                     message_type,
@@ -527,6 +527,28 @@ impl Ros1Port {
             }
             Err(error) => {
                 self.tell_once(&ros_topic, "not published", || error.to_string());
+            }
+        }
+    }
+
+    /// The local type a writer says its value is of, if it is known and has the fields that are said.
+    fn learned(&mut self, topic: TopicId, described: &Described) -> Option<(TypeName, Selection)> {
+        let name = &described.message_type;
+        match self.definitions.get(name) {
+            Ok(message_type) => {
+                let selection = described.selection(&message_type);
+                if selection.is_none() {
+                    self.tell_once(&topic.to_string(), "other fields", || {
+                        format!("its writer says it is {name}, which has other fields here")
+                    });
+                }
+                Some((name.clone(), selection?))
+            }
+            Err(error) => {
+                self.tell_once(&topic.to_string(), "unknown type", || {
+                    format!("its writer says what it is, but {error}")
+                });
+                None
             }
         }
     }
@@ -604,7 +626,12 @@ impl Port for Ros1Port {
         Ok(())
     }
 
-    fn wanted(&mut self, topic: TopicId, shape: &[(BuiltinType, bool)]) {
+    fn wanted(
+        &mut self,
+        topic: TopicId,
+        shape: &[(BuiltinType, bool)],
+        described: Option<&Described>,
+    ) {
         let for_service = |variable: &Variable| variable.service.is_some();
         if topic.space == self.own || self.mapping.variable(topic).is_some_and(for_service) {
             return;
@@ -623,13 +650,34 @@ impl Port for Ros1Port {
             [(builtin, array)] => self.definitions.standard_type(*builtin, *array),
             _ => None,
         };
-        if let Some(sink) = self
-            .sinks
-            .get_mut(&topic)
-            .filter(|sink| sink.open.is_none())
-        {
+        let learned = described.and_then(|described| self.learned(topic, described));
+        let Some(sink) = self.sinks.get_mut(&topic) else {
+            return;
+        };
+        let Some(open) = &sink.open else {
             sink.standard = standard;
+            sink.learned = learned;
             self.open_sink(topic);
+            return;
+        };
+        // What somebody subscribed to stays as it is; without a word nothing changes.
+        if sink.mapped.is_some() || open.publisher.subscribers() > 0 || learned.is_none() {
+            return;
+        }
+        let message_type = Arc::clone(&open.message_type);
+        let before = sink.selection(message_type.name());
+        let same = |name: &TypeName| name == message_type.name();
+        let other_type = learned.as_ref().is_some_and(|(name, _)| !same(name));
+        sink.learned = learned;
+        let selection = sink.selection(message_type.name());
+        if other_type {
+            self.open_sink(topic);
+        } else if selection != before {
+            self.events.push_back(PortEvent::Bound {
+                topic,
+                message_type,
+                selection,
+            });
         }
     }
 

@@ -13,6 +13,8 @@ pub(crate) struct Sink {
     pub(crate) ros_topic: String,
     /// What the mapping ties it to; it decides alone.
     pub(crate) mapped: Option<(TypeName, Selection)>,
+    /// What the writer of the value says it is, and what of the message it makes.
+    pub(crate) learned: Option<(TypeName, Selection)>,
     /// The std_msgs type of the value the Router holds, if it is one value and there is such a type.
     pub(crate) standard: Option<TypeName>,
     /// The topic as it is written.
@@ -75,6 +77,7 @@ impl Sink {
         Self {
             ros_topic,
             mapped,
+            learned: None,
             standard: None,
             open: None,
             latch,
@@ -88,7 +91,8 @@ impl Sink {
             && self.latch == other.latch
     }
 
-    /// The types it could have, best first: the mapping's; what subscribers ask for; the standard type of the value.
+    /// The types it could have, best first: the mapping's; what subscribers ask for; what its writer
+    /// says; the standard type of the value.
     pub(crate) fn candidates(&self, asked_for: Option<&str>) -> Vec<TypeName> {
         if let Some((message_type, _)) = &self.mapped {
             return vec![message_type.clone()];
@@ -101,6 +105,7 @@ impl Sink {
         let mut candidates: Vec<TypeName> = Vec::new();
         for name in asked_for
             .filter_map(|name| name.parse().ok())
+            .chain(self.learned.as_ref().map(|(name, _)| name.clone()))
             .chain(self.standard.clone())
         {
             if !candidates.contains(&name) {
@@ -117,16 +122,18 @@ impl Sink {
         })
     }
 
-    pub(crate) fn selection(&self) -> Selection {
+    /// What of a message of that type the value is.
+    pub(crate) fn selection(&self, name: &TypeName) -> Selection {
+        let learned = self.learned.as_ref().filter(|(learned, _)| learned == name);
         self.mapped
             .as_ref()
+            .or(learned)
             .map_or(Selection::Whole, |(_, selection)| selection.clone())
     }
 
     /// Whether the stamp at the beginning of such messages is no part of the value.
     pub(crate) fn stamps(&self, message_type: &MessageType) -> bool {
-        let selected = self.mapped.as_ref().map(|(_, selection)| selection);
-        bridge_node::wants_stamp(message_type, selected)
+        bridge_node::wants_stamp(message_type, Some(&self.selection(message_type.name())))
     }
 
     /// The Router's queue says what waits; behind it, as much is held for a slow subscriber as for any.

@@ -18,10 +18,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use bridge_node::{Delivery, Kept, Port, PortEvent, Services, now};
+use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, now};
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::TypeName;
+use messages::{Selection, TypeName};
 use rustdds::{DomainParticipantStatusEvent, DomainParticipantStatusListener, GUID, StatusEvented};
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
@@ -347,6 +347,28 @@ impl Ros2Port {
         self.schedule.waiting = waiting;
     }
 
+    /// The local type a writer says its value is of, if it is known and has the fields that are said.
+    fn learned(&mut self, topic: TopicId, described: &Described) -> Option<(TypeName, Selection)> {
+        let name = &described.message_type;
+        match self.definitions.get(name) {
+            Ok(message_type) => {
+                let selection = described.selection(&message_type);
+                if selection.is_none() {
+                    self.tell_once(&topic.to_string(), "other fields", || {
+                        format!("its writer says it is {name}, which has other fields here")
+                    });
+                }
+                Some((name.clone(), selection?))
+            }
+            Err(error) => {
+                self.tell_once(&topic.to_string(), "unknown type", || {
+                    format!("its writer says what it is, but {error}")
+                });
+                None
+            }
+        }
+    }
+
     /// Logs something about a topic the first time it happens; says whether it was.
     fn tell_once(
         &mut self,
@@ -422,7 +444,12 @@ impl Port for Ros2Port {
         offered.map_err(Refusal::label)
     }
 
-    fn wanted(&mut self, topic: TopicId, shape: &[(BuiltinType, bool)]) {
+    fn wanted(
+        &mut self,
+        topic: TopicId,
+        shape: &[(BuiltinType, bool)],
+        described: Option<&Described>,
+    ) {
         let at_home = topic.space == self.own || self.graph.is_at_home(topic.space.into());
         if at_home || self.services.takes(topic) {
             return;
@@ -441,12 +468,35 @@ impl Port for Ros2Port {
             [(builtin, array)] => self.definitions.standard_type(*builtin, *array),
             _ => None,
         };
+        let learned = described.and_then(|described| self.learned(topic, described));
         let Some(sink) = self.sinks.get_mut(&topic) else {
             return;
         };
-        if sink.open.is_none() {
+        let Some(open) = &sink.open else {
             sink.standard = standard;
+            sink.learned = learned;
             self.open_sink(topic);
+            return;
+        };
+        // What somebody subscribed to stays as it is; without a word nothing changes.
+        let readers = self.graph.readers(&sink.dds_topic);
+        if sink.mapped.is_some() || !readers.is_empty() || learned.is_none() {
+            return;
+        }
+        let message_type = Arc::clone(&open.message_type);
+        let before = sink.selection(message_type.name());
+        let same = |name: &TypeName| name == message_type.name();
+        let other_type = learned.as_ref().is_some_and(|(name, _)| !same(name));
+        sink.learned = learned;
+        let selection = sink.selection(message_type.name());
+        if other_type {
+            self.open_sink(topic);
+        } else if selection != before {
+            self.events.push_back(PortEvent::Bound {
+                topic,
+                message_type,
+                selection,
+            });
         }
     }
 

@@ -20,6 +20,8 @@ pub(crate) struct Sink {
     pub(crate) offered: Offered,
     /// What the mapping ties it to; it decides alone.
     pub(crate) mapped: Option<(TypeName, Selection)>,
+    /// What the writer of the value says it is, and what of the message it makes.
+    pub(crate) learned: Option<(TypeName, Selection)>,
     /// The std_msgs type of the value the Router holds, if it is one value and there is such a type.
     pub(crate) standard: Option<TypeName>,
     /// The topic as it is written.
@@ -83,6 +85,7 @@ impl Sink {
                     .unwrap_or_default(),
             ),
             mapped: None,
+            learned: None,
             standard: None,
             open: None,
         }
@@ -99,6 +102,7 @@ impl Sink {
             dds_topic: dds_topic(ros_topic),
             offered: offered(overflow),
             mapped: Some((message_type, selection)),
+            learned: None,
             standard: None,
             open: None,
         }
@@ -111,7 +115,8 @@ impl Sink {
             && self.offered == other.offered
     }
 
-    /// The types it could have, best first: the mapping's; what a subscriber asks for; the standard type of the value.
+    /// The types it could have, best first: the mapping's; what a subscriber asks for; what its writer
+    /// says; the standard type of the value.
     pub(crate) fn candidates(&self, readers: &[Endpoint]) -> Vec<TypeName> {
         if let Some((message_type, _)) = &self.mapped {
             return vec![message_type.clone()];
@@ -120,7 +125,8 @@ impl Sink {
         let asked_for = readers
             .iter()
             .filter_map(|reader| TypeName::from_dds(&reader.type_name).ok());
-        for name in asked_for.chain(self.standard.clone()) {
+        let learned = self.learned.as_ref().map(|(name, _)| name.clone());
+        for name in asked_for.chain(learned).chain(self.standard.clone()) {
             if !candidates.contains(&name) {
                 candidates.push(name);
             }
@@ -138,13 +144,15 @@ impl Sink {
 
     /// Whether the stamp at the beginning of such messages is no part of the value.
     pub(crate) fn stamps(&self, message_type: &MessageType) -> bool {
-        let selected = self.mapped.as_ref().map(|(_, selection)| selection);
-        bridge_node::wants_stamp(message_type, selected)
+        bridge_node::wants_stamp(message_type, Some(&self.selection(message_type.name())))
     }
 
-    pub(crate) fn selection(&self) -> Selection {
+    /// What of a message of that type the value is.
+    pub(crate) fn selection(&self, name: &TypeName) -> Selection {
+        let learned = self.learned.as_ref().filter(|(learned, _)| learned == name);
         self.mapped
             .as_ref()
+            .or(learned)
             .map_or(Selection::Whole, |(_, selection)| selection.clone())
     }
 }

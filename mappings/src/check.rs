@@ -3,10 +3,12 @@
 mod bindings;
 mod cell;
 mod environment;
+mod meaning;
 mod names;
 mod network;
 mod patterns;
 mod services;
+mod several;
 mod shaping;
 mod types;
 mod variables;

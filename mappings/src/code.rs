@@ -96,6 +96,12 @@ codes! {
     Conversion = "M083", "`scale` and `offset` go with a number, `invert` with a Boolean, all of them with one field; `out_of_range` says what becomes of values that a conversion makes too big.";
     LossyConversion = "M084", "The type the value becomes cannot hold all that the other type can, so a number would be rounded or not fit. With `out_of_range` it is rounded; one that does not fit then does not cross and is counted with `refuse`, and becomes the nearest that fits with `clamp`.";
     Publish = "M085", "`deadband` is a number above 0, of values that are numbers; `at_most` a rate as 10 Hz, from 0.001 Hz to 1000 Hz.";
+    Fields = "M090", "`fields` names at least one field, each once, and stands in place of `field`. What converts a value stands with its field, as {field: linear.x, scale: 1000}.";
+    FieldOrder = "M091", "Fields that are written to ROS stand in the order the message has them, and none of them is in another.";
+    StructureOf = "M092", "A structure is a message: the whole one, or a message in it that `field` names. A structure on both sides is of one message type.";
+    UnitUnknown = "M093", "A `unit` is one of those known by symbol (m/s), UNECE code (MTS) or name (metre per second), and goes with a value that is a number.";
+    ValueRange = "M094", "A `range` is the lowest and the highest value, as [0, 1.5], of a value that is a number.";
+    EnumTexts = "M095", "An `enum` says what the numbers of an integer value mean, as {0: idle, 1: moving}: at most 1000 texts that are not empty.";
     TypePath = "M100", "An entry of `type_paths` is a folder with ROS packages or a definition file (.msg, .srv, .action, .idl), relative to the mapping. One that is not there, or holds none, brings no types; on the host of another program of the cell that may be as it should.";
     DefinitionFile = "M101", "A definition file does not parse, in the ROS it is of. It counts as not there, and all others count.";
     DefinitionsDiffer = "M102", "A definition in a file differs from the one that is built in under its name. The file counts. Where peers have the other one, ROS 1 refuses the connection, and ROS 2 messages are misread unless type hashes are announced.";

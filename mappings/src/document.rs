@@ -70,6 +70,10 @@ document! {
         /// A writer silent for this long counts as gone; default 3s, and longer than `keep_alive_period`.
         #[schemars(regex(pattern = DURATION))]
         receive_timeout: String,
+        /// What a writer has in its messages (its DataSetMetaData) is announced this often, beside when it begins and when it
+        /// is asked for; default 30s.
+        #[schemars(regex(pattern = DURATION))]
+        metadata_period: String,
         /// Bytes of the largest datagram sent, 512 to 65507 (the default); larger NetworkMessages go in chunks of it. 1472 fits
         /// an Ethernet frame.
         #[schemars(range(min = 512, max = 65507))]
@@ -100,6 +104,13 @@ document! {
         name: String,
         /// OPC UA builtin type, as Boolean or Double[]. May be left out where a ROS type says it.
         r#type: String,
+        /// Unit of the value in OPC UA, by its symbol as m/s, its UNECE code as MTS, or its name.
+        unit: String,
+        /// Lowest and highest value to be expected in OPC UA, as [0, 1.5].
+        range: Vec<At<f64>>,
+        /// What the numbers of the value mean, as {0: idle, 1: moving}.
+        #[schemars(with = "Option<BTreeMap<String, String>>")]
+        r#enum: EnumTexts,
         /// The space that produces the value: 0 the OPC UA side, else one of `spaces`.
         #[schemars(required, range(max = 232))]
         origin: u16,
@@ -180,6 +191,10 @@ document! {
         /// array that is read a part: an element as position[2], by the text at its place in another array of the message as
         /// position[name=joint_3], several as ranges[0:90].
         field: String,
+        /// Several fields of the message in place of `field`, in this order, as [linear.x, angular.z]; one that is converted
+        /// as {field: linear.x, scale: 1000}. Where the message is written, they stand in the order it has them, and all others
+        /// are zero or empty.
+        fields: FieldList,
         /// The value in OPC UA is the field's times this, and `offset`; written to ROS the other way round.
         scale: f64,
         /// Added to the field's value for OPC UA, after `scale`; written to ROS it is taken off again.
@@ -203,8 +218,24 @@ document! {
         every: String,
         /// How the message crosses: `fields` (the default) as OPC UA values, `bytes` as it is, one ByteString that only a
         /// reader who knows the message type can read. For messages too big or too deep to be of use as values, as
-        /// images; not together with `field`.
+        /// images; not together with `field`. `structure`: as one OPC UA structure, which is described in the DataSetMetaData;
+        /// `field` may name a message in the message.
         r#as: AsEntry,
+    }
+
+    /// One of several fields, with what converts it.
+    struct FieldEntry {
+        /// The field, as in a binding with one.
+        #[schemars(required)]
+        field: String,
+        /// As in a binding with one field.
+        scale: f64,
+        /// As in a binding with one field.
+        offset: f64,
+        /// As in a binding with one field.
+        invert: bool,
+        /// As in a binding with one field.
+        out_of_range: OutOfRangeEntry,
     }
 }
 
@@ -228,6 +259,8 @@ choice! {
         Fields = "fields",
         /// The message as it is, one ByteString.
         Bytes = "bytes",
+        /// The message as one structure.
+        Structure = "structure",
     }
 
     enum OutOfRangeEntry {
@@ -273,6 +306,25 @@ impl Read for Namespaces {
                 },
                 reader.at(pair.value),
             )
+        });
+        Some(read.collect())
+    }
+}
+
+/// Value and its text, each at its place.
+pub(crate) type EnumTexts = Vec<(At<i64>, At<String>)>;
+
+impl Read for EnumTexts {
+    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+        let pairs = reader.pairs(node, "a map of value and text, as {0: idle, 1: moving}")?;
+        let read = pairs.into_iter().map(|pair| {
+            let value = pair.key.parse().ok();
+            if value.is_none() {
+                let message = format!("expected a whole number, found `{}`", short(pair.key));
+                reader.findings.error(Code::WrongValue, pair.place, message);
+            }
+            let place = pair.place;
+            (At { place, value }, reader.at(pair.value))
         });
         Some(read.collect())
     }
@@ -369,6 +421,51 @@ impl JsonSchema for Includes {
     fn json_schema(generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
         let one = generator.subschema_for::<String>();
         schemars::json_schema!({ "anyOf": [one, { "type": "array", "items": one }] })
+    }
+}
+
+/// Several fields of a message.
+#[derive(Clone, Debug)]
+pub(crate) struct FieldList(pub(crate) Vec<At<FieldEntry>>);
+
+impl Read for FieldList {
+    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+        let Kind::List(items) = &node.kind else {
+            reader.wrong(node, "a list of fields such as `[linear.x, angular.z]`");
+            return None;
+        };
+        let read = items.iter().map(|item| match &item.kind {
+            Kind::Scalar(text) => At {
+                place: item.place,
+                value: Some(FieldEntry {
+                    field: Some(At {
+                        place: item.place,
+                        value: Some(text.clone()),
+                    }),
+                    scale: None,
+                    offset: None,
+                    invert: None,
+                    out_of_range: None,
+                }),
+            },
+            Kind::Null | Kind::List(_) | Kind::Map(_) => reader.at(item),
+        });
+        Some(Self(read.collect()))
+    }
+}
+
+impl JsonSchema for FieldList {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "FieldList".into()
+    }
+
+    fn json_schema(generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        let one = generator.subschema_for::<FieldEntry>();
+        schemars::json_schema!({ "type": "array", "items": { "anyOf": [{ "type": "string" }, one] } })
     }
 }
 

@@ -16,6 +16,7 @@ mod read;
 mod surroundings;
 mod topic;
 mod tree;
+mod unit;
 mod variables;
 
 pub use check::{Checked, PathFault, PathFaultKind, Source, TypeFiles, TypeOrigin, TypeUse};
@@ -25,10 +26,11 @@ pub use difference::Difference;
 pub use document::schema;
 pub use environment::{Environment, LiveNode, LiveServer, LiveSpace, LiveTopic};
 pub use mapping::{
-    Binding, Endpoint, Mapping, Overflow, PubSub, Publish, PublisherIdRule, SecurityPolicy, Server,
-    ServiceBinding, ServiceRole, Space, Trigger, Variable,
+    Binding, Endpoint, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule,
+    SecurityPolicy, Server, ServiceBinding, ServiceRole, Space, Trigger, Variable,
 };
 pub use node_id::{Identifier, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use surroundings::Surroundings;
 pub use topic::{Part, SpaceId, TopicError, TopicId};
+pub use unit::Unit;

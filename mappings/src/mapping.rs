@@ -12,6 +12,7 @@ use uadp::BuiltinType;
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 use crate::topic::{SpaceId, TopicId};
+use crate::unit::Unit;
 
 /// The checked mapping of one cell. Immutable: a changed file makes a new one.
 ///
@@ -275,6 +276,9 @@ pub struct PubSub {
     pub keep_alive_period: Duration,
     /// A writer that is silent for this long counts as gone; longer than `keep_alive_period`.
     pub receive_timeout: Duration,
+    /// What a writer has in its messages is announced this often, beside when it begins and when it is asked for
+    /// (DataSetMetaData: OPC 10000-14, 7.2.4.6.4).
+    pub metadata_period: Duration,
     /// Bytes of the largest NetworkMessage that is sent as one datagram; a larger one goes in chunks of as much
     /// (OPC 10000-14, 7.2.4.4.4).
     pub max_datagram: u16,
@@ -322,6 +326,7 @@ impl Default for PubSub {
             key_frame_period: Duration::from_secs(1),
             keep_alive_period: Duration::from_secs(1),
             receive_timeout: Duration::from_secs(3),
+            metadata_period: Duration::from_secs(30),
             max_datagram: Self::LARGEST_DATAGRAM,
             max_message: 64 << 20,
         }
@@ -442,6 +447,40 @@ pub struct Variable {
     pub overflow: Overflow,
     /// Which of its values its origin sends.
     pub publish: Publish,
+    /// What its numbers mean.
+    pub meaning: Meaning,
+}
+
+/// What the numbers of a variable mean, as far as it is said.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Meaning {
+    /// Their unit of measure.
+    pub unit: Option<&'static Unit>,
+    /// The lowest and the highest to be expected, by their bits.
+    range: Option<(u64, u64)>,
+    /// Texts of single values.
+    pub texts: BTreeMap<i64, String>,
+}
+
+impl Meaning {
+    pub(crate) fn new(
+        unit: Option<&'static Unit>,
+        range: Option<(f64, f64)>,
+        texts: BTreeMap<i64, String>,
+    ) -> Self {
+        Self {
+            unit,
+            range: range.map(|(low, high)| (low.to_bits(), high.to_bits())),
+            texts,
+        }
+    }
+
+    /// The lowest and the highest value to be expected.
+    #[must_use]
+    pub fn range(&self) -> Option<(f64, f64)> {
+        let (low, high) = self.range?;
+        Some((f64::from_bits(low), f64::from_bits(high)))
+    }
 }
 
 /// Which values of a variable are sent: by default each.

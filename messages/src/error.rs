@@ -283,6 +283,9 @@ pub enum WriteFault {
     /// Part of an array: what stands in the rest of it, nobody says.
     #[error("a part of an array is read and cannot be written")]
     Part,
+    /// Several fields that do not follow each other as in the message, or of which one is in another.
+    #[error("fields in another order than that of the message are read and cannot be written")]
+    Order,
     /// A text with a NUL, which CDR cannot carry.
     #[error("a NUL inside a text")]
     Nul,

@@ -5,7 +5,7 @@ use crate::{SourceError, TypeName};
 /// Takes the fields of a message, in the order of [`Plan::leaves`](crate::Plan::leaves).
 ///
 /// A field is one call of `scalar`; or one of `packed_array`; or `array` and then as many calls of `element` as it said;
-/// or `structures` and then as many begun and ended structures as it said.
+/// or one begun and ended structure; or `structures` and then as many of those as it said.
 pub trait Sink {
     /// Why a value is refused.
     type Error;
@@ -46,7 +46,7 @@ pub trait Sink {
     /// messages in it as [`Sink::array`] says.
     fn structures(&mut self, of: &TypeName, count: usize) -> Result<(), Self::Error>;
 
-    /// Begins the next of the structures.
+    /// Begins the next of the structures, or a field that is one.
     fn begin_structure(&mut self, of: &TypeName) -> Result<(), Self::Error>;
 
     /// Ends it.
@@ -83,6 +83,11 @@ pub trait Source<'a> {
 
     /// Opens the next field as an array of structures and tells its length.
     fn structures(&mut self) -> Result<usize, SourceError>;
+
+    /// Begins the next field, which is one structure. A source that has none leaves this out.
+    fn structure(&mut self) -> Result<(), SourceError> {
+        Err(SourceError::Missing)
+    }
 
     /// Begins the next of the structures.
     fn begin_structure(&mut self) -> Result<(), SourceError>;

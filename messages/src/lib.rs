@@ -65,6 +65,7 @@ mod plan;
 mod registry;
 mod resolve;
 mod service;
+mod structure;
 mod type_hash;
 
 pub use convert::{date_time_to_time, duration_to_millis, millis_to_duration, time_to_date_time};
@@ -80,7 +81,10 @@ pub use library::{
 };
 pub use message::{Leaf, MessageType, Rank, standard_type};
 pub use name::{Dialect, TypeName};
-pub use plan::{Conversion, Literal, Part, Plan, Selection, Wire, is_lossless, is_number};
+pub use plan::{
+    Conversion, Literal, Part, Plan, Selected, Selection, Wire, is_lossless, is_number,
+};
 pub use registry::Registry;
 pub use service::{ActionMessages, ActionType, ServiceType};
+pub use structure::{MemberKind, Structure, StructureMember};
 pub use type_hash::{ActionTypeHashes, NoTypeHash, ServiceTypeHashes, TypeHash};

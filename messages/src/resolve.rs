@@ -383,7 +383,7 @@ impl Shape {
     }
 }
 
-fn flatten(shape: &Shape, prefix: &str, leaves: &mut Vec<Leaf>) {
+pub(crate) fn flatten(shape: &Shape, prefix: &str, leaves: &mut Vec<Leaf>) {
     for field in &shape.fields {
         let path = format!("{prefix}{}", field.name);
         match (&field.kind, field.arity) {

@@ -4,8 +4,8 @@
 mod support;
 
 use messages::{
-    Conversion, Dialect, MessageType, Part, Plan, PlanError, ReadError, Registry, Selection,
-    ValueFault, Wire, WriteFault,
+    Conversion, Dialect, MessageType, Part, Plan, PlanError, ReadError, Registry, Selected,
+    Selection, ValueFault, Wire, WriteFault,
 };
 use proptest::prelude::*;
 use std::sync::Arc;
@@ -312,5 +312,201 @@ proptest! {
             let expected = [vec![format!("packed Int32 {}", picked.len())], picked].concat().join(" ");
             prop_assert_eq!(read(&slice, &bytes).unwrap(), [expected]);
         }
+    }
+}
+
+fn selected(text: &str, conversion: Conversion) -> Selected {
+    let (field, part) = Part::split(text).unwrap();
+    Selected {
+        field: field.to_owned(),
+        part,
+        conversion,
+    }
+}
+
+#[test]
+fn several_fields_cross_in_the_order_given_with_their_parts_and_conversions() {
+    for (dialect, wire) in WIRES {
+        let (of, bytes) = joints(dialect, wire);
+        let none = Conversion::default();
+        let fields = vec![
+            selected("late", none),
+            selected("position[name=joint_3]", none.scaled(1000.0, 1.0)),
+            selected("gap", none),
+        ];
+        let plan = Plan::compile(&of, &Selection::Fields(fields), wire).unwrap();
+        let paths: Vec<&str> = plan
+            .leaves()
+            .iter()
+            .map(|leaf| leaf.path.as_str())
+            .collect();
+        assert_eq!(paths, ["late", "position[name=joint_3]", "gap"]);
+        assert_eq!(
+            read(&plan, &bytes).unwrap(),
+            [
+                "array Double 2",
+                "element Double 1500.0",
+                "element Double 2500.0",
+                "scalar Double 751.0",
+                "scalar Byte 9"
+            ]
+        );
+        let refused = plan.write(&mut Player::new(&[]), &mut Vec::new());
+        assert_eq!(refused.unwrap_err().fault, WriteFault::Part);
+    }
+}
+
+#[test]
+fn several_fields_are_written_between_zeros_and_each_is_converted_by_its_own() {
+    let text_of = "float64 a\nint32[] b\nstring c\ngeometry_msgs/Point d\nint16 e";
+    for (dialect, wire) in WIRES {
+        let of = message(dialect, text_of);
+        let none = Conversion::default();
+        let plan = |fields: Vec<Selected>| Plan::compile(&of, &Selection::Fields(fields), wire);
+        let fields = vec![
+            selected("b", none.scaled(10.0, 0.0)),
+            selected("d", none),
+            selected("e", none.to(BuiltinType::Double)),
+        ];
+        let whole = Plan::compile(&of, &Selection::Whole, wire).unwrap();
+        let some = plan(fields).unwrap();
+        let real = |value| Event::Scalar(Value::of(Scalar::Double(value)));
+        let whole_number = |value| Event::Element(Value::of(Scalar::Int32(value)));
+        let events = [
+            Event::Array(BuiltinType::Int32, 2),
+            whole_number(20),
+            whole_number(-30),
+            real(1.0),
+            real(2.0),
+            real(3.0),
+            real(7.0),
+        ];
+        let bytes = written(&some, &events);
+        assert_eq!(
+            read(&whole, &bytes).unwrap(),
+            [
+                "scalar Double 0.0",
+                "packed Int32 2 2 -3",
+                "scalar String ",
+                "scalar Double 1.0",
+                "scalar Double 2.0",
+                "scalar Double 3.0",
+                "scalar Int16 7"
+            ]
+        );
+        let back = read(&some, &bytes).unwrap();
+        assert_eq!(back.len(), events.len());
+        assert_eq!(
+            back[0..3],
+            ["array Int32 2", "element Int32 20", "element Int32 -30"]
+        );
+
+        let turned = plan(vec![selected("d", none), selected("a", none)]).unwrap();
+        let refused = turned.write(&mut Player::new(&[]), &mut Vec::new());
+        assert_eq!(refused.unwrap_err().fault, WriteFault::Order);
+        assert!(plan(vec![selected("x", none)]).is_err());
+    }
+}
+
+#[test]
+fn a_message_is_one_structure_with_the_messages_in_it_inline() {
+    for (dialect, wire) in WIRES {
+        let name = "geometry_msgs/Polygon".parse().unwrap();
+        let of = Registry::bundle(dialect).get(&name).unwrap();
+        let plan = Plan::compile(&of, &Selection::Structure(None), wire).unwrap();
+        let point = |values: [f32; 3]| values.map(|value| scalar(Scalar::Float(value)));
+        let mut events = vec![
+            Event::Begin("geometry_msgs/Polygon".to_owned()),
+            Event::Array(BuiltinType::ExtensionObject, 2),
+        ];
+        events.extend(point([1.0, 2.0, 3.0]));
+        events.extend(point([4.0, 5.0, 6.0]));
+        events.push(Event::End);
+        let bytes = written(&plan, &events);
+        let expected: Vec<String> = events.iter().map(ToString::to_string).collect();
+        assert_eq!(read(&plan, &bytes).unwrap(), expected);
+        let leaf = &plan.leaves()[0];
+        assert_eq!(leaf.builtin, BuiltinType::ExtensionObject);
+    }
+    let stamped = "geometry_msgs/PointStamped".parse().unwrap();
+    let of = Registry::bundle(Dialect::Ros2).get(&stamped).unwrap();
+    let compile = |path: &str| {
+        let selection = Selection::Structure(Some(path.to_owned()));
+        Plan::compile(&of, &selection, Wire::Cdr)
+    };
+    assert_eq!(compile("point").unwrap().leaves()[0].path, "point");
+    assert!(matches!(
+        compile("header.frame_id"),
+        Err(PlanError::Shape { .. })
+    ));
+    assert!(matches!(
+        compile("nothing"),
+        Err(PlanError::UnknownField { .. })
+    ));
+}
+
+#[test]
+fn a_field_of_one_message_of_an_array_is_found_by_place_and_by_name() {
+    let text_of = "int32 before\ndiagnostic_msgs/DiagnosticStatus[] status\nint32 after";
+    let level = |dialect| match dialect {
+        Dialect::Ros1 => Scalar::SByte(2),
+        Dialect::Ros2 => Scalar::Byte(2),
+    };
+    let zero = |dialect| match dialect {
+        Dialect::Ros1 => Scalar::SByte(0),
+        Dialect::Ros2 => Scalar::Byte(0),
+    };
+    for (dialect, wire) in WIRES {
+        let of = message(dialect, text_of);
+        let whole = Plan::compile(&of, &Selection::Whole, wire).unwrap();
+        let string = |text: &str| Event::Scalar(Value::Text(text.to_owned()));
+        let status = |name: &str, level| {
+            let begin = Event::Begin("diagnostic_msgs/DiagnosticStatus".to_owned());
+            let values = Event::Array(BuiltinType::ExtensionObject, 0);
+            let texts = [name, "said", "id"].map(string);
+            let [name, said, id] = texts;
+            vec![begin, scalar(level), name, said, id, values, Event::End]
+        };
+        let mut events = vec![
+            scalar(Scalar::Int32(1)),
+            Event::Structures("diagnostic_msgs/DiagnosticStatus".to_owned(), 2),
+        ];
+        events.extend(status("imu", zero(dialect)));
+        events.extend(status("lidar", level(dialect)));
+        events.push(scalar(Scalar::Int32(2)));
+        let bytes = written(&whole, &events);
+        let part = |text: &str| Plan::compile(&of, &select(text, Conversion::default()), wire);
+        let expected = scalar(level(dialect)).to_string();
+        for text in ["status[name=lidar].level", "status[1].level"] {
+            let plan = part(text).unwrap();
+            assert_eq!(plan.leaves()[0].path, text);
+            assert_eq!(read(&plan, &bytes).unwrap(), [expected.as_str()]);
+        }
+        let said = part("status[0].name").unwrap();
+        assert_eq!(read(&said, &bytes).unwrap(), ["scalar String imu"]);
+        let absent = read(&part("status[2].level").unwrap(), &bytes).unwrap_err();
+        let fault = ValueFault::Absent { at: 2, found: 2 };
+        assert!(matches!(&absent, ReadError::Value { fault: found, .. } if *found == fault));
+        let missing = read(&part("status[name=gps].level").unwrap(), &bytes).unwrap_err();
+        assert!(matches!(
+            missing,
+            ReadError::Value {
+                fault: ValueFault::NoName(_),
+                ..
+            }
+        ));
+        assert!(matches!(
+            part("status[0].nothing"),
+            Err(PlanError::UnknownField { .. })
+        ));
+        for text in ["before[0].x", "status[0].values"] {
+            assert!(matches!(part(text), Err(PlanError::Shape { .. })), "{text}");
+        }
+        let scaled = select("status[1].level", Conversion::default().scaled(10.0, 0.0));
+        let scaled = Plan::compile(&of, &scaled, wire).unwrap();
+        assert!(read(&scaled, &bytes).unwrap()[0].ends_with("20"));
+    }
+    for text in ["a[0:2].x", "a[0]x", "a[0].", "a[0].b[1]"] {
+        assert_eq!(Part::split(text), None, "{text}");
     }
 }

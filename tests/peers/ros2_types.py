@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from cyclonedds.core import Policy, Qos
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.annotations import final
-from cyclonedds.idl.types import float64, int32, sequence, uint8, uint32
+from cyclonedds.idl.types import float32, float64, int32, sequence, uint8, uint32
 from cyclonedds.util import duration
 
 
@@ -60,6 +60,42 @@ class JointState(IdlStruct, typename="sensor_msgs.msg.dds_.JointState_"):
 
 @dataclass
 @final
+class Vector3(IdlStruct, typename="geometry_msgs.msg.dds_.Vector3_"):
+    x: float64 = 0.0
+    y: float64 = 0.0
+    z: float64 = 0.0
+
+
+@dataclass
+@final
+class Twist(IdlStruct, typename="geometry_msgs.msg.dds_.Twist_"):
+    linear: Vector3 = field(default_factory=Vector3)
+    angular: Vector3 = field(default_factory=Vector3)
+
+
+@dataclass
+@final
+class Point32(IdlStruct, typename="geometry_msgs.msg.dds_.Point32_"):
+    x: float32 = 0.0
+    y: float32 = 0.0
+    z: float32 = 0.0
+
+
+@dataclass
+@final
+class Polygon(IdlStruct, typename="geometry_msgs.msg.dds_.Polygon_"):
+    points: sequence[Point32] = field(default_factory=list)
+
+
+@dataclass
+@final
+class PolygonStamped(IdlStruct, typename="geometry_msgs.msg.dds_.PolygonStamped_"):
+    header: Header = field(default_factory=Header)
+    polygon: Polygon = field(default_factory=Polygon)
+
+
+@dataclass
+@final
 class Clock(IdlStruct, typename="rosgraph_msgs.msg.dds_.Clock_"):
     clock: Time = field(default_factory=Time)
 
@@ -90,6 +126,8 @@ TYPES = {
     "std_msgs/Float64": Float64,
     "std_msgs/String": String,
     "sensor_msgs/JointState": JointState,
+    "geometry_msgs/Twist": Twist,
+    "geometry_msgs/PolygonStamped": PolygonStamped,
     "rosgraph_msgs/Clock": Clock,
     "rcl_interfaces/Log": Log,
     "nobody_msgs/Unheard": Unheard,

@@ -79,6 +79,7 @@ mod list;
 mod meta_data;
 mod probe;
 mod probe_timer;
+mod property;
 mod settings;
 mod wire;
 
@@ -107,6 +108,7 @@ pub use meta_data::{
 };
 pub use probe::Probe;
 pub use probe_timer::{ProbeLimits, ProbeStep, ProbeTimer};
+pub use property::{EUInformation, EnumValueType, Range, enum_strings};
 pub use settings::{
     DataSetOrderingType, DatagramConnectionTransport2DataType, DatagramConnectionTransportDataType,
     DatagramWriterGroupTransport2DataType, DatagramWriterGroupTransportDataType,

@@ -4,9 +4,10 @@ use std::net::SocketAddr;
 use std::time::{Duration, Instant};
 
 use mappings::{PubSub, SpaceId, TopicId};
+use uadp::discovery::Announcement;
 use uadp::{
-    ChunkRefusal, DecodeError, GiveUp, GivenUp, NetworkMessage, OwnedPublisherId, Reassembler,
-    ReassemblyLimits,
+    ChunkRefusal, DecodeError, GiveUp, GivenUp, NetworkMessage, NetworkMessageType,
+    OwnedPublisherId, Reassembler, ReassemblyLimits,
 };
 
 use super::receive::{number_of, sent};
@@ -85,6 +86,12 @@ impl Router {
         let since = chunks.since_start(now);
         match chunks.reassembler.receive(message, since) {
             Ok(None) => {}
+            Ok(Some(whole)) if whole.message_type == NetworkMessageType::Announcement => {
+                match Announcement::decode_body(whole.bytes) {
+                    Ok(announcement) => self.learn(&announcement, (space, from), now),
+                    Err(error) => self.drop_undecoded(None, from, &error),
+                }
+            }
             Ok(Some(whole)) => match topic {
                 Some(topic) => match whole.data_set_message() {
                     Ok(message) => {

@@ -38,12 +38,12 @@ impl Router {
         let Some(space) = self.space_of(&header, from) else {
             return;
         };
-        if !may_cross(self.settings.own, Side::Ua, space) {
-            self.drop_own(from);
+        if message.message_type() != NetworkMessageType::DataSet {
+            self.handle_discovery(message, (space, from), now);
             return;
         }
-        if message.message_type() != NetworkMessageType::DataSet {
-            self.drop_undecoded(None, from, &DISCOVERY);
+        if !may_cross(self.settings.own, Side::Ua, space) {
+            self.drop_own(from);
             return;
         }
         let Some(namespace) = header.group.and_then(|group| group.writer_group_id) else {
@@ -90,7 +90,7 @@ impl Router {
     }
 
     /// Counts a datagram with our own PublisherId: our own, or that of a rival.
-    fn drop_own(&mut self, from: SocketAddr) {
+    pub(super) fn drop_own(&mut self, from: SocketAddr) {
         let own = self.settings.own;
         let ours = self.settings.source.is_none_or(|source| {
             source.port() == from.port()
@@ -141,6 +141,9 @@ impl Router {
             return;
         };
         let was_silent = reader.heard(now.monotonic);
+        // A keep-alive says nothing of the content.
+        let changed = message.kind != MessageKind::KeepAlive
+            && reader.is_changed(message.header().major_version);
         let admitted = match message.kind {
             MessageKind::KeyFrame => Some(reader.admit(place, now.monotonic)),
             // It says that the writer lives, and that is all.
@@ -157,6 +160,9 @@ impl Router {
                 silent: false,
             });
             self.schedule(topic);
+        }
+        if changed {
+            self.ask(topic, now);
         }
         self.retire(topic, now);
         match admitted {
@@ -199,22 +205,21 @@ impl Router {
         else {
             return;
         };
+        if !typed && reader.shape.is_none() {
+            let fields = sample.fields.clone().filter_map(Result::ok);
+            reader.shape = Some(fields.map(|field| fields::shape(&field)).collect());
+        }
         if typed || plan.is_some() {
             self.deliver(topic, sample, now);
             return;
         }
-        if reader
+        let asks = reader
             .asked
-            .is_none_or(|asked| now.monotonic >= asked + ASK_AGAIN)
-        {
+            .is_none_or(|asked| now.monotonic >= asked + ASK_AGAIN);
+        if asks {
             reader.asked = Some(now.monotonic);
-            let fields = sample.fields.clone();
-            let shape = fields
-                .filter_map(Result::ok)
-                .map(|field| fields::shape(&field))
-                .collect();
-            self.told.push_back(Output::Unbound { topic, shape });
         }
+        let shape = reader.shape.clone().filter(|_| asks);
         let fields = sample.fields.bytes();
         reader.held = (fields.len() <= MAX_HELD).then(|| Held {
             fields: fields.to_vec(),
@@ -223,6 +228,9 @@ impl Router {
             status: sample.status,
             arrived: sample.arrived,
         });
+        if let Some(shape) = shape {
+            self.tell_unbound(topic, shape, now);
+        }
         // Not yet a loss: the newest one waits. It is not told, since the port names topics without a type.
         self.count(About::topic(topic), Reason::Untyped, 1, String::new);
     }
@@ -381,7 +389,7 @@ fn fields_of<'a>(message: &DataSetMessage<'a>) -> Result<Fields<'a>, DecodeError
     }
 }
 
-const DISCOVERY: DecodeError = DecodeError::Misread("a discovery message");
+pub(super) const DISCOVERY: DecodeError = DecodeError::Misread("a discovery message");
 
 const fn reason_of(error: &DecodeError) -> Reason {
     if matches!(error, DecodeError::Unsupported(_) | DecodeError::Misread(_)) {

@@ -145,7 +145,9 @@ fn line(event: &PortEvent) -> String {
                 Selection::Field(field) => field,
                 Selection::Value { field, .. } => field,
                 Selection::Bytes => "bytes",
-                Selection::Template { .. } => "template",
+                Selection::Fields(_) | Selection::Structure(_) | Selection::Template { .. } => {
+                    "template"
+                }
             };
             format!("{topic} is {} {field}", message_type.name())
         }
@@ -310,7 +312,7 @@ async fn a_value_nobody_mapped_gets_the_standard_type_or_the_one_a_subscriber_as
         port.publish(delivery("ua_2_1_1", b"\x01")),
         Err("no publisher yet")
     );
-    port.wanted(id("ua_2_1_1"), &[(BuiltinType::Boolean, false)]);
+    port.wanted(id("ua_2_1_1"), &[(BuiltinType::Boolean, false)], None);
     assert_eq!(
         events(&mut port, 1).await,
         ["ua_2_1_1 is std_msgs/Bool whole"]
@@ -336,7 +338,7 @@ async fn a_value_nobody_mapped_gets_the_standard_type_or_the_one_a_subscriber_as
     .await;
     // Three values have no standard type: the topic waits for somebody who says.
     let shape = [(BuiltinType::Double, false); 3];
-    port.wanted(id("ua_2_1_2"), &shape);
+    port.wanted(id("ua_2_1_2"), &shape, None);
     assert_eq!(
         events(&mut port, 1).await,
         ["ua_2_1_2 is geometry_msgs/Point whole"]
@@ -352,7 +354,7 @@ async fn a_subscriber_of_another_type_gets_its_way_while_nobody_else_listens() {
         mut port,
         _core,
     } = cell(NOTHING);
-    port.wanted(id("ua_2_1_1"), &[(BuiltinType::Double, false)]);
+    port.wanted(id("ua_2_1_1"), &[(BuiltinType::Double, false)], None);
     assert_eq!(
         events(&mut port, 1).await,
         ["ua_2_1_1 is std_msgs/Float64 whole"]
@@ -409,7 +411,7 @@ async fn the_port_ends_when_another_node_takes_its_name() {
         mut port,
         node,
     } = cell(NOTHING);
-    port.wanted(id("ua_2_1_1"), &[(BuiltinType::Boolean, false)]);
+    port.wanted(id("ua_2_1_1"), &[(BuiltinType::Boolean, false)], None);
     let graph = node.graph_reader();
     within("the registration", async {
         while !graph

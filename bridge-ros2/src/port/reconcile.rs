@@ -468,8 +468,7 @@ impl Ros2Port {
         let Some(sink) = self.sinks.get(&topic) else {
             return;
         };
-        let (dds_topic, offered, selection) =
-            (sink.dds_topic.clone(), sink.offered, sink.selection());
+        let (dds_topic, offered) = (sink.dds_topic.clone(), sink.offered);
         let mut found = None;
         for name in sink.candidates(self.graph.readers(&sink.dds_topic)) {
             match self.definitions.get(&name) {
@@ -505,7 +504,9 @@ impl Ros2Port {
         if let Err(refusal) = outlet.set_readers(self.graph.readers(&dds_topic), Instant::now()) {
             self.events.push_back(lost(topic, refusal.label(), 1));
         }
+        let mut selection = Selection::Whole;
         if let Some(sink) = self.sinks.get_mut(&topic) {
+            selection = sink.selection(message_type.name());
             sink.open = Some(Open {
                 message_type: Arc::clone(&message_type),
                 outlet,

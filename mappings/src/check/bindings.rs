@@ -8,6 +8,7 @@ use messages::{DefinitionError, Dialect, Leaf, MessageType, Selection, TextKind,
 
 use super::names::{mended, topic_fault};
 use super::services::{self, Calls, Kind, Known, Service};
+use super::several;
 use super::shaping::{self, Way};
 use super::types::{self, Types, ValueType, dialect};
 use super::{Declared, required, variables};
@@ -201,10 +202,11 @@ impl<'c> Bindings<'c> {
         let (name, place) = named?;
         let space = site.space?;
         let message_type = self.message_type(&name, place, site, findings);
-        let chosen = match (&entry.field, &entry.r#as) {
-            (Some(at), _) => at.place,
-            (None, Some(at)) => at.place,
-            (None, None) => place,
+        let chosen = match (&entry.field, &entry.fields, &entry.r#as) {
+            (Some(at), _, _) => at.place,
+            (None, Some(at), _) => at.place,
+            (None, None, Some(at)) => at.place,
+            (None, None, None) => place,
         };
         let way = Way {
             // Where no origin is known, that is the finding.
@@ -215,6 +217,16 @@ impl<'c> Bindings<'c> {
         let selection = selection(entry, known, (chosen, way), findings)?;
         let fields = match (&selection, message_type) {
             (Selection::Bytes, _) => Some(vec![Leaf::bytes()]),
+            (Selection::Fields(selected), Some(message_type)) => Some(several::leaves(
+                &message_type,
+                selected,
+                (chosen, way),
+                findings,
+            )?),
+            (Selection::Structure(path), Some(message_type)) => {
+                let path = path.as_deref().unwrap_or_default();
+                Some(several::structure(&message_type, path, chosen, findings)?)
+            }
             (Selection::Value { .. }, Some(message_type)) => Some(shaping::leaves(
                 &message_type,
                 &selection,
@@ -400,8 +412,21 @@ fn selection(
     findings: &mut Findings,
 ) -> Option<Selection> {
     let bytes = matches!(given(&entry.r#as), Some((AsEntry::Bytes, _)));
-    let shaping = shaping::shaping(entry, findings)?;
+    let structure = matches!(given(&entry.r#as), Some((AsEntry::Structure, _)));
+    let shaping = shaping::shaping(entry.into(), findings)?;
+    if let Some(at) = &entry.fields {
+        shaping.of_fields(findings)?;
+        return several::selection(entry, at, message_type, way, findings);
+    }
     match &entry.field {
+        None if structure => {
+            shaping.of_several(findings)?;
+            Some(Selection::Structure(None))
+        }
+        Some(at) if structure => {
+            shaping.of_several(findings)?;
+            Some(Selection::Structure(Some(at.value.clone()?)))
+        }
         None => {
             // Of a type with one field that one is meant.
             let only = message_type.and_then(|message| match message.leaves() {
@@ -641,6 +666,7 @@ fn differences(found: &[Found], findings: &mut Findings) {
         }
         if shape(fields) == shape(others) {
             versions((first, fields), (other, others), findings);
+            several::compare(&first.binding, &other.binding, other.place, findings);
             continue;
         }
         let told = |fields: &[Leaf]| match fields {

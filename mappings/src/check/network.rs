@@ -40,6 +40,7 @@ pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -
     let key_frame_period = duration(&entry.key_frame_period, findings);
     let keep_alive_period = duration(&entry.keep_alive_period, findings);
     let receive_timeout = duration(&entry.receive_timeout, findings);
+    let metadata_period = duration(&entry.metadata_period, findings);
     let largest = PubSub::SMALLEST_DATAGRAM..=PubSub::LARGEST_DATAGRAM;
     let max_datagram = within(&entry.max_datagram, largest, "bytes", findings);
     let max_message = within(&entry.max_message, 1..=1024, "MiB", findings);
@@ -51,6 +52,7 @@ pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -
         key_frame_period: key_frame_period.unwrap_or(default.key_frame_period),
         keep_alive_period: keep_alive_period.unwrap_or(default.keep_alive_period),
         receive_timeout: receive_timeout.unwrap_or(default.receive_timeout),
+        metadata_period: metadata_period.unwrap_or(default.metadata_period),
         max_datagram: max_datagram.unwrap_or(default.max_datagram),
         max_message: max_message
             .map_or(default.max_message, |mebibytes| u32::from(mebibytes) << 20),

@@ -233,7 +233,10 @@ fn kind(
     findings: &mut Findings,
 ) -> Option<(Option<TypeName>, Selection)> {
     let bytes = matches!(given(&entry.r#as), Some((AsEntry::Bytes, _)));
+    let structure = matches!(given(&entry.r#as), Some((AsEntry::Structure, _)));
     let selection = match &entry.field {
+        Some(at) if structure => Selection::Structure(Some(at.value.clone()?)),
+        None if structure => Selection::Structure(None),
         Some(at) if bytes => {
             let message = "a message that crosses as bytes has no fields";
             findings
@@ -270,6 +273,8 @@ fn kind(
             Selection::Value { .. } => shaping::leaves(&known, &selection, field.place, findings)?,
             Selection::Whole
             | Selection::Field(_)
+            | Selection::Fields(_)
+            | Selection::Structure(_)
             | Selection::Template { .. }
             | Selection::Bytes => select(&known, &selection, field.place, findings)?,
         };

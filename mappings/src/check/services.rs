@@ -206,6 +206,7 @@ pub(super) fn kind(entry: &BindingEntry, owner: Place, findings: &mut Findings) 
     let strange = [
         ("type", place(&entry.r#type), kind == Kind::Answer),
         ("as", r#as, !topic),
+        ("fields", entry.fields.as_ref().map(|at| at.place), !topic),
         ("scale", entry.scale.as_ref().map(|at| at.place), !topic),
         ("offset", entry.offset.as_ref().map(|at| at.place), !topic),
         ("invert", entry.invert.as_ref().map(|at| at.place), !topic),

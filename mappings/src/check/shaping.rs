@@ -7,9 +7,9 @@ use uadp::BuiltinType;
 
 use super::types::ValueType;
 use crate::code::Code;
-use crate::document::{BindingEntry, OutOfRangeEntry};
+use crate::document::{BindingEntry, FieldEntry, OutOfRangeEntry};
 use crate::findings::Findings;
-use crate::read::{given, short};
+use crate::read::{Field, given, short};
 use crate::tree::Place;
 
 /// What a binding says about its one value beside its field.
@@ -20,6 +20,37 @@ pub(super) struct Shaping {
     scaled: bool,
     /// What becomes of values that do not fit is said.
     said: bool,
+}
+
+/// The keys that convert a value.
+#[derive(Clone, Copy)]
+pub(super) struct Keys<'k> {
+    scale: &'k Field<f64>,
+    offset: &'k Field<f64>,
+    invert: &'k Field<bool>,
+    out_of_range: &'k Field<OutOfRangeEntry>,
+}
+
+impl<'k> From<&'k BindingEntry> for Keys<'k> {
+    fn from(entry: &'k BindingEntry) -> Self {
+        Self {
+            scale: &entry.scale,
+            offset: &entry.offset,
+            invert: &entry.invert,
+            out_of_range: &entry.out_of_range,
+        }
+    }
+}
+
+impl<'k> From<&'k FieldEntry> for Keys<'k> {
+    fn from(entry: &'k FieldEntry) -> Self {
+        Self {
+            scale: &entry.scale,
+            offset: &entry.offset,
+            invert: &entry.invert,
+            out_of_range: &entry.out_of_range,
+        }
+    }
 }
 
 /// Which way the value goes, and what it is in OPC UA.
@@ -46,11 +77,11 @@ pub(super) fn part(
 }
 
 /// `None` when something is faulty, which is noted.
-pub(super) fn shaping(entry: &BindingEntry, findings: &mut Findings) -> Option<Shaping> {
+pub(super) fn shaping(keys: Keys<'_>, findings: &mut Findings) -> Option<Shaping> {
     let mut sound = Some(());
     let mut conversion = Conversion::default();
-    let (scale, offset) = (given(&entry.scale), given(&entry.offset));
-    let scaled = entry.scale.is_some() || entry.offset.is_some();
+    let (scale, offset) = (given(keys.scale), given(keys.offset));
+    let scaled = keys.scale.is_some() || keys.offset.is_some();
     if let Some((scale, place)) = scale
         && (*scale == 0.0 || !scale.is_normal())
     {
@@ -77,23 +108,23 @@ pub(super) fn shaping(entry: &BindingEntry, findings: &mut Findings) -> Option<S
         let scale = scale.map_or(1.0, |(scale, _)| *scale);
         conversion = conversion.scaled(scale, offset.map_or(0.0, |(offset, _)| *offset));
     }
-    if let Some((true, _)) = given(&entry.invert) {
+    if let Some((true, _)) = given(keys.invert) {
         conversion = conversion.inverted();
     }
-    if let Some((OutOfRangeEntry::Clamp, _)) = given(&entry.out_of_range) {
+    if let Some((OutOfRangeEntry::Clamp, _)) = given(keys.out_of_range) {
         conversion = conversion.clamped();
     }
     let places = [
-        entry.scale.as_ref().map(|at| at.place),
-        entry.offset.as_ref().map(|at| at.place),
-        entry.invert.as_ref().map(|at| at.place),
-        entry.out_of_range.as_ref().map(|at| at.place),
+        keys.scale.as_ref().map(|at| at.place),
+        keys.offset.as_ref().map(|at| at.place),
+        keys.invert.as_ref().map(|at| at.place),
+        keys.out_of_range.as_ref().map(|at| at.place),
     ];
     sound.map(|()| Shaping {
         conversion,
         place: places.into_iter().flatten().next(),
         scaled,
-        said: entry.out_of_range.is_some(),
+        said: keys.out_of_range.is_some(),
     })
 }
 
@@ -117,7 +148,13 @@ impl Shaping {
             return None;
         }
         let leaf = message_type.and_then(|message| message.leaf(&field));
-        let element = leaf.map(|leaf| element(leaf, part.as_ref()));
+        let element = match &part {
+            // The type of a field inside is known by the type of the messages.
+            Some(inside @ Part::Inside { .. }) => message_type
+                .and_then(|message| inner(message, &field, inside))
+                .map(|leaf| leaf.builtin),
+            Some(_) | None => leaf.map(|leaf| element(leaf, part.as_ref())),
+        };
         let conversion = self.conversion(element, (place, way), findings)?;
         if part.is_none() && conversion.is_none() {
             return Some(Selection::Field(field));
@@ -127,6 +164,17 @@ impl Shaping {
             part,
             conversion,
         })
+    }
+
+    /// What converts stands with one of several fields.
+    pub(super) fn of_fields(&self, findings: &mut Findings) -> Option<()> {
+        let Some(place) = self.place else {
+            return Some(());
+        };
+        findings
+            .error(Code::Fields, place, "`fields` are converted one by one")
+            .help("write it to the field: `fields: [{field: linear.x, scale: 1000}]`");
+        None
     }
 
     /// Of a whole message nothing is converted.
@@ -200,6 +248,14 @@ impl Shaping {
     }
 }
 
+/// The field of one message of an array.
+fn inner(message_type: &MessageType, array: &str, part: &Part) -> Option<Leaf> {
+    let Part::Inside { field, .. } = part else {
+        return None;
+    };
+    message_type.leaf_inside(array, field)
+}
+
 /// The builtin type of one value of that.
 fn element(leaf: &Leaf, part: Option<&Part>) -> BuiltinType {
     match (leaf.builtin, part) {
@@ -216,7 +272,7 @@ pub(super) fn leaves(
     findings: &mut Findings,
 ) -> Option<Vec<Leaf>> {
     let Selection::Value { field, part, .. } = selection else {
-        return None;
+        return super::bindings::select(message_type, selection, place, findings);
     };
     let wire = match message_type.dialect() {
         messages::Dialect::Ros1 => Wire::Ros1,
@@ -238,7 +294,7 @@ pub(super) fn leaves(
         });
     let (code, error) = match found {
         Ok(plan) => return Some(plan.leaves().to_vec()),
-        Err((_, PlanError::UnknownField { path, .. })) => {
+        Err((_, PlanError::UnknownField { name, path, .. })) if name == *message_type.name() => {
             let missing = Selection::Field(path);
             super::bindings::select(message_type, &missing, place, findings);
             return None;

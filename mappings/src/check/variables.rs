@@ -10,7 +10,7 @@ use messages::{Leaf, Rank};
 use super::bindings::{self, Bindings};
 use super::services::Calls;
 use super::types::{self, Types, ValueType};
-use super::{Declared, required};
+use super::{Declared, meaning, required};
 use crate::code::Code;
 use crate::document::{PublishEntry, Queue, VariableEntry};
 use crate::findings::Findings;
@@ -337,6 +337,8 @@ fn variable(
         Some((Queue::KeepLatest, _)) | None => Overflow::KeepLatest,
     };
     let publish = publish(entry, value_type, findings);
+    let several = fields.len() > 1;
+    let meaning = meaning::check(entry, (value_type, several), findings);
     let service = bound
         .service
         .map(|service| service.settled(value_type, findings));
@@ -352,6 +354,7 @@ fn variable(
         service,
         overflow,
         publish: publish?,
+        meaning: meaning?,
     })
 }
 

@@ -1,8 +1,10 @@
 //! A message type compiled for one wire and selection.
 
 mod conversion;
+mod inside;
 mod literal;
 mod read;
+mod several;
 mod shaped;
 mod write;
 
@@ -10,17 +12,21 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 
-use uadp::Scalar;
+use uadp::{BuiltinType, Scalar};
 
 pub use conversion::{Conversion, is_lossless, is_number};
 pub use literal::Literal;
 use literal::{Given, Typed};
+pub use several::Selected;
+use several::Several;
 pub use shaped::Part;
 use shaped::Shaped;
 
 use crate::definition::{Arity, Number, Primitive};
 use crate::resolve::{Shape, ShapeKind};
-use crate::{Dialect, Leaf, MessageType, PlanError, ReadError, Sink, Source, TypeName, WriteError};
+use crate::{
+    Dialect, Leaf, MessageType, PlanError, Rank, ReadError, Sink, Source, TypeName, WriteError,
+};
 
 /// What the bytes of a message are.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -48,6 +54,10 @@ pub enum Selection {
         /// What each value goes through.
         conversion: Conversion,
     },
+    /// Several fields, in that order; where a message is written all others are zero or empty.
+    Fields(Vec<Selected>),
+    /// The message, or the one at that path, as one structure.
+    Structure(Option<String>),
     /// A message of constants, to be written: `field` takes the value, or without it no value crosses; the fields of
     /// `rest` have what stands there, all others are zero or empty. Read, it is as [`Selection::Field`].
     Template {
@@ -76,6 +86,10 @@ pub struct Plan {
 #[derive(Clone, Debug)]
 enum Body {
     Steps(Vec<Op>),
+    /// Fields that do not all cross as they are, or not in their order.
+    Several(Box<Several>),
+    /// A message as one structure.
+    Structure(TypeName, Vec<Op>),
     /// One field, of which a part crosses or which is converted.
     Shaped(Box<Shaped>),
     /// The message crosses as it is.
@@ -158,6 +172,29 @@ impl Plan {
                 let (shaped, leaf) = Shaped::compile(message, (field, part, conversion), steps)?;
                 (Body::Shaped(Box::new(shaped)), vec![leaf])
             }
+            Selection::Fields(selected) => several::compile(message, selected, wire)?,
+            Selection::Structure(path) => {
+                let at = path.as_deref().unwrap_or_default();
+                let Some(of) = message.message_at(at) else {
+                    range(message, at)?;
+                    return Err(PlanError::Shape {
+                        name: message.name().clone(),
+                        path: at.to_owned(),
+                        what: "is no message, and only a message is a structure",
+                    });
+                };
+                let inner = match path {
+                    Some(path) => Selection::Field(path.clone()),
+                    None => Selection::Whole,
+                };
+                let (ops, _) = steps(message, &inner, wire)?;
+                let leaf = Leaf {
+                    path: at.to_owned(),
+                    builtin: BuiltinType::ExtensionObject,
+                    rank: Rank::Scalar,
+                };
+                (Body::Structure(of.clone(), ops), vec![leaf])
+            }
             Selection::Whole | Selection::Field(_) | Selection::Template { .. } => {
                 let (ops, leaves) = steps(message, selection, wire)?;
                 (Body::Steps(ops), leaves)
@@ -192,6 +229,8 @@ impl Plan {
     pub fn read<S: Sink>(&self, payload: &[u8], sink: &mut S) -> Result<(), ReadError<S::Error>> {
         match &self.body {
             Body::Steps(ops) => read::read(self, ops, payload, sink),
+            Body::Several(several) => several.read(payload, sink),
+            Body::Structure(of, ops) => read::structure(self, (of, ops), payload, sink),
             Body::Shaped(shaped) => shaped.read(self, payload, sink),
             Body::Bytes => sink
                 .scalar(Scalar::ByteString(Some(payload)))
@@ -210,6 +249,8 @@ impl Plan {
     ) -> Result<(), WriteError> {
         match &self.body {
             Body::Steps(ops) => write::write(self, ops, source, out),
+            Body::Several(several) => several.write(self, source, out),
+            Body::Structure(_, ops) => write::structure(self, ops, source, out),
             Body::Shaped(shaped) => shaped.write(self, source, out),
             Body::Bytes => write::bytes(source, out),
         }
@@ -232,22 +273,19 @@ fn steps(
     let (field, rest) = match selection {
         Selection::Field(path) => (Some(path), &none),
         Selection::Template { field, rest } => (field.as_ref(), rest),
-        Selection::Whole | Selection::Value { .. } | Selection::Bytes => (None, &none),
+        Selection::Whole
+        | Selection::Value { .. }
+        | Selection::Fields(_)
+        | Selection::Structure(_)
+        | Selection::Bytes => (None, &none),
     };
     let carried = match field {
         Some(path) => range(message, path)?,
         None if *selection == Selection::Whole => 0..message.leaves().len(),
         None => 0..0,
     };
-    let mut compiler = Compiler {
-        wire,
-        carried: carried.clone(),
-        given: given(message, field, rest)?,
-        leaf: 0,
-        ops: Vec::new(),
-        body: 0,
-        fault: None,
-    };
+    let mut compiler = Compiler::new(wire, vec![carried.clone()]);
+    compiler.given = given(message, field, rest)?;
     compiler.message(&message.shape, false);
     if let Some(fault) = compiler.fault {
         return Err(fault);
@@ -364,7 +402,7 @@ fn coalesced(mut ops: &[Op]) -> Vec<Op> {
 struct Compiler<'m> {
     wire: Wire,
     /// Which fields cross.
-    carried: Range<usize>,
+    carried: Vec<Range<usize>>,
     given: BTreeMap<usize, Given<'m>>,
     leaf: usize,
     ops: Vec<Op>,
@@ -375,6 +413,18 @@ struct Compiler<'m> {
 }
 
 impl Compiler<'_> {
+    const fn new(wire: Wire, carried: Vec<Range<usize>>) -> Self {
+        Self {
+            wire,
+            carried,
+            given: BTreeMap::new(),
+            leaf: 0,
+            ops: Vec::new(),
+            body: 0,
+            fault: None,
+        }
+    }
+
     /// Returns the least number of bytes the message takes. `element`: it is one of an array.
     fn message(&mut self, shape: &Shape, element: bool) -> usize {
         if shape.fields.is_empty() && self.wire == Wire::Cdr {
@@ -465,7 +515,7 @@ impl Compiler<'_> {
     }
 
     fn push(&mut self, what: What) {
-        let carry = self.carried.contains(&self.leaf);
+        let carry = self.carried.iter().any(|range| range.contains(&self.leaf));
         let skip = matches!(what, What::Skip { .. });
         let constant = match self.given.get(&self.leaf).filter(|_| !skip) {
             Some(given) => match given.typed(&what) {

@@ -58,8 +58,34 @@ pub(super) fn read<S: Sink>(
     payload: &[u8],
     sink: &mut S,
 ) -> Result<(), ReadError<S::Error>> {
+    as_wire(plan, (ops, false), payload, sink)
+}
+
+/// Reads a message as one structure.
+pub(super) fn structure<S: Sink>(
+    plan: &Plan,
+    (of, ops): (&TypeName, &[Op]),
+    payload: &[u8],
+    sink: &mut S,
+) -> Result<(), ReadError<S::Error>> {
+    let refused = |source| ReadError::Sink {
+        field: String::new(),
+        source,
+    };
+    sink.begin_structure(of).map_err(refused)?;
+    as_wire(plan, (ops, true), payload, sink)?;
+    sink.end_structure().map_err(refused)
+}
+
+/// `inside`: the fields are those of a structure.
+fn as_wire<S: Sink>(
+    plan: &Plan,
+    (ops, inside): (&[Op], bool),
+    payload: &[u8],
+    sink: &mut S,
+) -> Result<(), ReadError<S::Error>> {
     if plan.wire == Wire::Ros1 {
-        return run::<Packed, S>(plan, ops, (payload, 0), sink);
+        return run::<Packed, S>(plan, (ops, inside), (payload, 0), sink);
     }
     let malformed = |at, fault| ReadError::Malformed {
         field: String::new(),
@@ -70,8 +96,8 @@ pub(super) fn read<S: Sink>(
         return Err(malformed(payload.len(), Fault::Truncated));
     };
     match u16::from_be_bytes([*high, *low]) {
-        0 => run::<BigCdr, S>(plan, ops, (data, 4), sink),
-        1 => run::<LittleCdr, S>(plan, ops, (data, 4), sink),
+        0 => run::<BigCdr, S>(plan, (ops, inside), (data, 4), sink),
+        1 => run::<LittleCdr, S>(plan, (ops, inside), (data, 4), sink),
         other => Err(malformed(0, Fault::Encapsulation(other))),
     }
 }
@@ -79,7 +105,7 @@ pub(super) fn read<S: Sink>(
 /// `offset`: where in the payload `data` begins.
 fn run<L: Layout, S: Sink>(
     plan: &Plan,
-    ops: &[Op],
+    (ops, inside): (&[Op], bool),
     (data, offset): (&[u8], usize),
     sink: &mut S,
 ) -> Result<(), ReadError<S::Error>> {
@@ -91,7 +117,7 @@ fn run<L: Layout, S: Sink>(
         scratch: Vec::new(),
         layout: PhantomData,
     };
-    let mut done = reader.steps(ops, false);
+    let mut done = reader.steps(ops, inside);
     let left = data.len().saturating_sub(reader.at);
     if done.is_ok() && !L::ALIGNED && left > 0 {
         reader.leaf = None;

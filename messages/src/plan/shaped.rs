@@ -4,6 +4,7 @@ use std::convert::Infallible;
 
 use uadp::{BuiltinType, Scalar};
 
+use super::inside::Inside;
 use super::{Conversion, Op, Plan, Selection, What, index, range, read, write};
 use crate::definition::Primitive;
 use crate::{
@@ -30,6 +31,14 @@ pub enum Part {
         /// The one after the last; greater than `from`.
         to: u32,
     },
+    /// A field of one message of an array: `points[2].x`, or `status[name=lidar].level`, where the name stands in the
+    /// message itself.
+    Inside {
+        /// Which message: [`Part::Element`] or [`Part::Named`].
+        of: Box<Self>,
+        /// The path of the field in it.
+        field: String,
+    },
 }
 
 impl Part {
@@ -40,7 +49,7 @@ impl Part {
         let Some((field, rest)) = text.split_once('[') else {
             return (!text.contains(']')).then_some((text, None));
         };
-        let inside = rest.strip_suffix(']')?;
+        let (inside, behind) = rest.split_once(']')?;
         let part = if let Some((by, name)) = inside.split_once('=') {
             let (by, name) = (by.trim(), name.trim());
             let sound = !by.is_empty() && !name.is_empty() && !name.contains([']', '[']);
@@ -55,6 +64,18 @@ impl Part {
         } else {
             Self::Element(number(inside)?)
         };
+        if behind.is_empty() {
+            return Some((field, Some(part)));
+        }
+        let inner = behind.strip_prefix('.')?;
+        let sound = !inner.is_empty() && !inner.contains(['[', ']']);
+        if !sound || matches!(part, Self::Slice { .. }) {
+            return None;
+        }
+        let part = Self::Inside {
+            of: Box::new(part),
+            field: inner.to_owned(),
+        };
         Some((field, Some(part)))
     }
 }
@@ -66,6 +87,7 @@ impl std::fmt::Display for Part {
             Self::Named { by, name } => write!(f, "[{by}={name}]"),
             Self::Slice { from, to: u32::MAX } => write!(f, "[{from}:]"),
             Self::Slice { from, to } => write!(f, "[{from}:{to}]"),
+            Self::Inside { of, field } => write!(f, "{of}.{field}"),
         }
     }
 }
@@ -82,6 +104,8 @@ pub(super) struct Shaped {
     /// The steps that read the names, where a name says which element.
     names: Option<Vec<Op>>,
     part: Option<Part>,
+    /// Where in the messages of an array the value is.
+    inside: Option<Inside>,
     conversion: Conversion,
     /// Path of the field, for errors.
     field: String,
@@ -108,7 +132,16 @@ impl Shaped {
             range(message, field)?;
             return Err(fault("is a message, and only one value is converted"));
         };
-        let inner = shape(leaf, part.as_ref()).map_err(&fault)?;
+        let inside = match part {
+            Some(Part::Inside { of, field: inner }) => {
+                Some(Inside::compile(message, field, (of, inner))?)
+            }
+            Some(_) | None => None,
+        };
+        let inner = match &inside {
+            Some(inside) => inside.leaf.clone(),
+            None => shape(leaf, part.as_ref()).map_err(&fault)?,
+        };
         let outside = conversion.outside(inner.builtin).map_err(&fault)?;
         let mut names = None;
         if let Some(Part::Named { by, .. }) = part {
@@ -134,7 +167,9 @@ impl Shaped {
                     op.what = What::Many(Primitive::Number(number), len);
                 }
             }
-            ops.retain(|op| !matches!(op.what, What::Run(..)));
+            if inside.is_none() {
+                ops.retain(|op| !matches!(op.what, What::Run(..)));
+            }
         }
         let told = part.as_ref().map(ToString::to_string).unwrap_or_default();
         let outer = Leaf {
@@ -146,6 +181,7 @@ impl Shaped {
             ops,
             names,
             part: part.clone(),
+            inside,
             conversion: *conversion,
             field: field.to_owned(),
             outside,
@@ -164,6 +200,7 @@ impl Shaped {
             Some(Part::Element(at)) => Pick::One(wide(*at)),
             Some(Part::Slice { from, to }) => Pick::Some(wide(*from), wide(*to)),
             Some(Part::Named { name, .. }) => Pick::One(self.find(plan, payload, name)?),
+            Some(Part::Inside { .. }) => Pick::All,
         };
         let mut shaping = ShapingSink {
             sink,
@@ -172,7 +209,19 @@ impl Shaped {
             pick,
             at: 0,
         };
-        read::read(plan, &self.ops, payload, &mut shaping).map_err(|error| match error {
+        let done = match &self.inside {
+            Some(inside) => {
+                let at = inside.find(plan, &self.ops, payload)?;
+                read::read(
+                    plan,
+                    &self.ops,
+                    payload,
+                    &mut inside.picking(at, &mut shaping),
+                )
+            }
+            None => read::read(plan, &self.ops, payload, &mut shaping),
+        };
+        done.map_err(|error| match error {
             ReadError::Malformed { field, at, fault } => ReadError::Malformed { field, at, fault },
             ReadError::Value { field, fault } => ReadError::Value { field, fault },
             ReadError::Sink { field, source } => match source {
@@ -257,12 +306,14 @@ fn shape(leaf: &Leaf, part: Option<&Part>) -> Result<Leaf, &'static str> {
     let first = match part {
         Part::Element(at) => *at,
         Part::Slice { from, .. } => *from,
-        Part::Named { .. } => 0,
+        Part::Named { .. } | Part::Inside { .. } => 0,
     };
     if fixed.is_some_and(|fixed| first >= fixed) {
         return Err("has fewer elements, always");
     }
     let (builtin, rank) = match (part, leaf.rank) {
+        // Told apart before.
+        (Part::Inside { .. }, rank) => (element, rank),
         (Part::Element(_) | Part::Named { .. }, _) => (element, Rank::Scalar),
         (Part::Slice { .. }, Rank::Scalar) => (leaf.builtin, Rank::Scalar),
         (Part::Slice { .. }, Rank::Array { .. }) => (element, Rank::Array { fixed: None }),
@@ -274,7 +325,7 @@ fn shape(leaf: &Leaf, part: Option<&Part>) -> Result<Leaf, &'static str> {
     })
 }
 
-fn wide(number: u32) -> usize {
+pub(super) fn wide(number: u32) -> usize {
     usize::try_from(number).unwrap_or(usize::MAX)
 }
 
@@ -287,12 +338,12 @@ enum Pick {
 }
 
 /// Why a value goes no further.
-enum Stop<E> {
+pub(super) enum Stop<E> {
     Sink(E),
     Value(ValueFault),
 }
 
-struct ShapingSink<'s, S> {
+pub(super) struct ShapingSink<'s, S> {
     sink: &'s mut S,
     conversion: Conversion,
     outside: BuiltinType,
@@ -514,6 +565,10 @@ impl<'a, S: Source<'a>> Source<'a> for ShapingSource<'_, S> {
 
     fn structures(&mut self) -> Result<usize, SourceError> {
         self.source.structures()
+    }
+
+    fn structure(&mut self) -> Result<(), SourceError> {
+        self.source.structure()
     }
 
     fn begin_structure(&mut self) -> Result<(), SourceError> {

@@ -21,6 +21,26 @@ pub(super) fn write<'a, S: Source<'a>>(
     source: &mut S,
     out: &mut Vec<u8>,
 ) -> Result<(), WriteError> {
+    message(plan, (ops, false), source, out)
+}
+
+/// Writes a message that is one structure.
+pub(super) fn structure<'a, S: Source<'a>>(
+    plan: &Plan,
+    ops: &[Op],
+    source: &mut S,
+    out: &mut Vec<u8>,
+) -> Result<(), WriteError> {
+    message(plan, (ops, true), source, out)
+}
+
+/// `structure`: the fields are those of one structure.
+fn message<'a, S: Source<'a>>(
+    plan: &Plan,
+    (ops, structure): (&[Op], bool),
+    source: &mut S,
+    out: &mut Vec<u8>,
+) -> Result<(), WriteError> {
     let start = out.len();
     if plan.wire == Wire::Cdr {
         out.extend_from_slice(&[0, 1, 0, 0]);
@@ -32,7 +52,7 @@ pub(super) fn write<'a, S: Source<'a>>(
         leaf: None,
         source,
     };
-    let done = writer.steps(ops, false).and_then(|()| {
+    let done = writer.body(ops, structure).and_then(|()| {
         writer.leaf = None;
         writer.source.finish().map_err(WriteFault::Source)
     });
@@ -101,6 +121,16 @@ pub(super) fn bytes<'a, S: Source<'a>>(
 }
 
 impl<'a, S: Source<'a>> Writer<'_, '_, S> {
+    fn body(&mut self, ops: &[Op], structure: bool) -> Result<(), WriteFault> {
+        if !structure {
+            return self.steps(ops, false);
+        }
+        self.source.structure()?;
+        self.steps(ops, true)?;
+        self.source.end_structure()?;
+        Ok(())
+    }
+
     /// `inside`: the steps are those of an element.
     fn steps(&mut self, mut ops: &[Op], inside: bool) -> Result<(), WriteFault> {
         while let Some((op, after)) = ops.split_first() {

@@ -236,6 +236,9 @@ impl<'e> Source<'e> for Player<'e> {
             other => Err(Self::wrong(other)),
         }
     }
+    fn structure(&mut self) -> Result<(), SourceError> {
+        self.begin_structure()
+    }
     fn begin_structure(&mut self) -> Result<(), SourceError> {
         match self.0.next() {
             Some(Event::Begin(_)) => Ok(()),

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use mappings::{Mapping, NodeIdText, SpaceId, TopicId, Variable};
+use mappings::{Mapping, Meaning, NodeIdText, SpaceId, TopicId, Variable};
 use messages::Rank;
 use opcua::types::{ByteString, DataTypeId, Identifier, NodeId, Variant, VariantTypeId};
 use uadp::BuiltinType;
@@ -25,6 +25,8 @@ pub(crate) struct TopicNode {
     pub(crate) fields: Vec<FieldNode>,
     /// The fields are component variables of the topic's variable, which has them all as a Variant array.
     pub(crate) compound: bool,
+    /// What its numbers mean.
+    pub(crate) meaning: Meaning,
 }
 
 /// The node of one field of a DataSet.
@@ -208,12 +210,16 @@ impl TopicNode {
             Some(shape) => vec![(variable.name.clone(), Shape(Some(shape)))],
             None => leaves.collect(),
         };
-        Self::new(
+        let node = Self::new(
             variable.topic,
             node_id(&variable.node),
             variable.name.clone(),
             fields,
-        )
+        );
+        Self {
+            meaning: variable.meaning.clone(),
+            ..node
+        }
     }
 
     /// A topic whose DataSet has `fields`, in order: the path of each in the message, and its shape. None or one is
@@ -248,6 +254,7 @@ impl TopicNode {
             name,
             fields,
             compound,
+            meaning: Meaning::default(),
         }
     }
 
@@ -283,7 +290,7 @@ fn node_id(text: &NodeIdText) -> NodeId {
     }
 }
 
-fn component(parent: &NodeId, path: &str) -> NodeId {
+pub(crate) fn component(parent: &NodeId, path: &str) -> NodeId {
     let identifier = match &parent.identifier {
         Identifier::Numeric(number) => number.to_string(),
         Identifier::String(text) => text.to_string(),

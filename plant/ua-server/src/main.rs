@@ -11,6 +11,7 @@ mod layout;
 mod nodes;
 mod pki;
 mod port;
+mod properties;
 mod space;
 mod value;
 

@@ -27,6 +27,7 @@ use tokio::sync::mpsc;
 use uadp::Timestamp;
 
 use crate::layout::{FieldNode, Layout, Shape, TopicNode};
+use crate::properties;
 use crate::value;
 
 /// The node manager as the server has it.
@@ -555,6 +556,7 @@ pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, fol
     .insert(address_space);
     wait_for_data(address_space, &topic.node);
     if !topic.compound {
+        properties::add(address_space, topic);
         return;
     }
     for field in &topic.fields {

@@ -4,7 +4,7 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Delivery, Failure, FailureKind, Kept, Port, PortEvent};
+use bridge_node::{Delivery, Described, Failure, FailureKind, Kept, Port, PortEvent};
 use mappings::{Mapping, Server, SpaceId, TopicId};
 use opcua::server::ServerHandle;
 use opcua::server::address_space::AddressSpace;
@@ -184,7 +184,12 @@ impl Port for ServerPort {
         )
     }
 
-    fn wanted(&mut self, _topic: TopicId, _shape: &[(BuiltinType, bool)]) {
+    fn wanted(
+        &mut self,
+        _topic: TopicId,
+        _shape: &[(BuiltinType, bool)],
+        _described: Option<&Described>,
+    ) {
         // Values of every type have a node.
     }
 

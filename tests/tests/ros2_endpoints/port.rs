@@ -148,7 +148,7 @@ async fn a_value_nobody_asks_for_gets_the_standard_type_and_waits_for_late_joine
     };
     let mut port = port();
     let topic = topic("ua_1_2_3");
-    port.wanted(topic, &[(BuiltinType::String, false)]);
+    port.wanted(topic, &[(BuiltinType::String, false)], None);
     assert_eq!(bound(&mut port, topic).await, "std_msgs/String");
     port.publish(delivery(topic, "earlier")).unwrap();
     port.publish(delivery(topic, "latched")).unwrap();
@@ -170,10 +170,10 @@ async fn a_subscriber_decides_the_type() {
     // after the other one.
     let _later = reads(&cell, "/ua_0_2_4", "std_msgs/Bool", &[]);
     let two = [(BuiltinType::Double, false); 2];
-    port.wanted(topic("ua_0_2_4"), &two);
+    port.wanted(topic("ua_0_2_4"), &two, None);
     assert_eq!(bound(&mut port, topic("ua_0_2_4")).await, "std_msgs/Bool");
 
-    port.wanted(topic("ua_0_2_3"), &[(BuiltinType::Double, false)]);
+    port.wanted(topic("ua_0_2_3"), &[(BuiltinType::Double, false)], None);
     assert_eq!(bound(&mut port, topic("ua_0_2_3")).await, "std_msgs/UInt32");
 }
 
@@ -184,7 +184,7 @@ async fn a_subscriber_that_comes_later_changes_the_standard_type() {
     };
     let mut port = port();
     let topic = topic("ua_0_2_3");
-    port.wanted(topic, &[(BuiltinType::Double, false)]);
+    port.wanted(topic, &[(BuiltinType::Double, false)], None);
     assert_eq!(bound(&mut port, topic).await, "std_msgs/Float64");
     let _peer = reads(&cell, "/ua_0_2_3", "std_msgs/UInt32", &[]);
     assert_eq!(bound(&mut port, topic).await, "std_msgs/UInt32");
@@ -239,7 +239,7 @@ async fn a_bad_value_is_not_published() {
     };
     let mut port = port();
     let topic = topic("ua_1_2_3");
-    port.wanted(topic, &[(BuiltinType::String, false)]);
+    port.wanted(topic, &[(BuiltinType::String, false)], None);
     assert_eq!(bound(&mut port, topic).await, "std_msgs/String");
     let bad = Delivery {
         status: 0x8032,
@@ -259,7 +259,7 @@ async fn a_thousand_topics_are_advertised_in_batches_and_disposed_within_two_sec
     let mut port = port();
     for n in 1..=1000 {
         let topic = TopicId::new(1, 1, n).unwrap();
-        port.wanted(topic, &[(BuiltinType::Boolean, false)]);
+        port.wanted(topic, &[(BuiltinType::Boolean, false)], None);
     }
     for _ in 0..1000 {
         event(&mut port, |event| {
@@ -285,7 +285,7 @@ async fn a_subscriber_that_is_killed_does_not_keep_the_newest_value_from_the_oth
     let topic = topic("ua_1_2_3");
     let mut killed = reads(&cell, "/ua_1_2_3", "std_msgs/String", &LATCHED[..2]);
     let other = reads(&cell, "/ua_1_2_3", "std_msgs/String", &LATCHED[..2]);
-    port.wanted(topic, &[(BuiltinType::String, false)]);
+    port.wanted(topic, &[(BuiltinType::String, false)], None);
     assert_eq!(bound(&mut port, topic).await, "std_msgs/String");
     port.publish(delivery(topic, "before")).unwrap();
     run_until(&mut port, "both hear", || {

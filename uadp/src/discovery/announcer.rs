@@ -160,6 +160,12 @@ impl Announcer {
         }
     }
 
+    /// Adds a DataSetWriter; what is planned of others stays so.
+    pub fn add_writer(&mut self, group: u16, writer: u16) {
+        self.writers.insert(writer, group);
+        self.groups.insert(group);
+    }
+
     /// Plans the answers to a probe, which the caller found to be for this Publisher: by the PublisherId in its
     /// header, and for connections by the TransportProfileUris. The [`counters`](Self::counters) say what was refused.
     pub fn handle_probe(&mut self, probe: &Probe<'_>, now: Duration) {

@@ -1,0 +1,495 @@
+//! What topics consist of: announced for those of our own space, learned and asked for of the others.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use mappings::{SpaceId, TopicId};
+use messages::{MessageType, Selection};
+use uadp::discovery::{
+    AnnounceLimits, Announced, Announcement, Announcer, Included, List, Probe, ProbeLimits,
+    ProbeStep, ProbeTimer, Subject,
+};
+use uadp::{NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader};
+
+use super::receive::DISCOVERY;
+use super::{About, Router};
+use crate::counters::Reason;
+use crate::description::{Described, Description, Source};
+use crate::learned::{Learned, News};
+use crate::loop_rule::{Side, may_cross};
+use crate::network::announcement_chunks;
+use crate::output::Output;
+use crate::settings::{Local, Now};
+use crate::topic::{Role, Topic};
+
+/// What is planned to be announced and asked, and what was learned.
+#[derive(Debug)]
+pub(super) struct Discovery {
+    /// What its times count from.
+    start: Instant,
+    announcer: Announcer,
+    /// Topics of our own space by their DataSetWriterId: all that a probe names.
+    writers: BTreeMap<u16, Vec<TopicId>>,
+    /// Publishers that are asked.
+    probing: BTreeMap<SpaceId, Probing>,
+    learned: Learned,
+    /// When there is something to do: looked up at every turn, and computed when something changes.
+    due: Option<Instant>,
+}
+
+/// What one Publisher is asked for.
+#[derive(Debug)]
+struct Probing {
+    timer: ProbeTimer,
+    topics: BTreeSet<TopicId>,
+}
+
+impl Discovery {
+    fn new(own: SpaceId, start: Instant) -> Self {
+        let limits = AnnounceLimits {
+            // Those who are asked at once do not answer at once.
+            gather: Duration::from_millis(50 + u64::from(own.get() % 50)),
+            ..AnnounceLimits::default()
+        };
+        Self {
+            start,
+            announcer: Announcer::new([], limits),
+            writers: BTreeMap::new(),
+            probing: BTreeMap::new(),
+            learned: Learned::default(),
+            due: None,
+        }
+    }
+
+    fn since_start(&self, now: Now) -> Duration {
+        now.monotonic.saturating_duration_since(self.start)
+    }
+
+    fn reckon(&mut self) {
+        let probes = self.probing.values();
+        let probes = probes.filter_map(|probing| probing.timer.poll_timeout());
+        let next = probes.chain(self.announcer.poll_timeout()).min();
+        self.due = next.map(|due| self.start + due);
+    }
+
+    fn plan(&mut self, topic: TopicId, now: Now) {
+        let since = self.since_start(now);
+        let (_, _, writer_id) = topic.triple();
+        let subject = Subject::DataSetMetaData(writer_id);
+        // One that is planned already says it all.
+        let _planned = self
+            .announcer
+            .announce(subject, Included::default(), since)
+            .is_ok();
+        self.reckon();
+    }
+
+    /// A topic of a Publisher is no longer to be asked for.
+    fn answered(&mut self, space: SpaceId, is_it: impl Fn(TopicId) -> bool) {
+        if let Some(probing) = self.probing.get_mut(&space) {
+            probing.topics.retain(|topic| !is_it(*topic));
+            if probing.topics.is_empty() {
+                self.probing.remove(&space);
+            }
+            self.reckon();
+        }
+    }
+}
+
+impl Router {
+    fn discovery(&mut self, now: Now) -> &mut Discovery {
+        let own = self.settings.own;
+        self.discovery
+            .get_or_insert_with(|| Box::new(Discovery::new(own, now.monotonic)))
+    }
+
+    /// When [`discover`](Self::discover) is wanted.
+    pub(super) fn discovery_due(&self) -> Option<Instant> {
+        self.discovery.as_ref()?.due
+    }
+
+    /// The type of a topic of our own space is known: it is announced, and again whenever it changes.
+    pub(super) fn describe(
+        &mut self,
+        topic: TopicId,
+        (message_type, selection): (&MessageType, &Selection),
+        now: Now,
+    ) {
+        let period = self.mapping.pubsub().metadata_period;
+        let Some(Topic {
+            plan: Some(plan),
+            description,
+            announce_at,
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        let source = Source {
+            topic,
+            message_type,
+            selection,
+            leaves: plan.leaves(),
+            meaning: self
+                .mapping
+                .variable(topic)
+                .map(|variable| &variable.meaning),
+            namespaces: self.mapping.namespaces(),
+        };
+        match Description::new(source, description.as_deref(), now.utc) {
+            Ok(new) if new.differs(description.as_deref()) => {
+                *description = Some(Box::new(new));
+                *announce_at = Some(now.monotonic + period);
+            }
+            Ok(_) => return,
+            Err(error) => {
+                *description = None;
+                self.count(About::topic(topic), Reason::MetaData, 1, || {
+                    format!("what it consists of cannot be announced: {error}")
+                });
+                return;
+            }
+        }
+        let (_, namespace, writer_id) = topic.triple();
+        let discovery = self.discovery(now);
+        let topics = discovery.writers.entry(writer_id).or_default();
+        if !topics.contains(&topic) {
+            topics.push(topic);
+        }
+        discovery.announcer.add_writer(namespace, writer_id);
+        discovery.plan(topic, now);
+        self.schedule(topic);
+    }
+
+    /// Plans to announce a topic again, where that is due and it has a producer.
+    pub(super) fn announce_again(&mut self, topic: TopicId, now: Now) {
+        let period = self.mapping.pubsub().metadata_period;
+        let Some(Topic {
+            role: Role::Ours(writer),
+            announce_at: Some(at),
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        if *at > now.monotonic {
+            return;
+        }
+        *at = now.monotonic + period;
+        if writer.is_live() {
+            self.discovery(now).plan(topic, now);
+        }
+    }
+
+    /// Announces and asks what is due.
+    pub(super) fn discover(&mut self, now: Now) {
+        if self.discovery_due().is_none_or(|due| due > now.monotonic) {
+            return;
+        }
+        let Some(mut discovery) = self.discovery.take() else {
+            return;
+        };
+        let since = discovery.since_start(now);
+        while let Some(due) = discovery.announcer.poll(since) {
+            let Subject::DataSetMetaData(writer_id) = due.subject else {
+                continue;
+            };
+            match discovery.writers.get(&writer_id).map(Vec::as_slice) {
+                Some(topics) => {
+                    for topic in topics {
+                        self.announce(*topic, due.sequence_number, now);
+                    }
+                }
+                None => self.deny(writer_id, due.sequence_number),
+            }
+        }
+        // Anything is random enough to ask at another time than others do.
+        let random = u32::try_from(now.utc.unix_nanos() & 0xFFFF_FFFF).unwrap_or_default();
+        let spaces: Vec<SpaceId> = discovery.probing.keys().copied().collect();
+        for space in spaces {
+            let Some(probing) = discovery.probing.get_mut(&space) else {
+                continue;
+            };
+            match probing
+                .timer
+                .poll(since, random.rotate_left(space.get().into()))
+            {
+                ProbeStep::Wait => {}
+                ProbeStep::Send => self.probe(space, &probing.topics),
+                ProbeStep::Answered | ProbeStep::GivenUp => {
+                    discovery.probing.remove(&space);
+                }
+            }
+        }
+        discovery.reckon();
+        self.discovery = Some(discovery);
+    }
+
+    fn announce(&mut self, topic: TopicId, sequence_number: u16, now: Now) {
+        let (max_datagram, _) = self.sizes();
+        let mut bytes = self.buffer();
+        let Some(Topic {
+            description: Some(description),
+            counters,
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        let body_at = description.write(sequence_number, &mut bytes);
+        counters.announced += 1;
+        if bytes.len() <= usize::from(max_datagram) {
+            self.told.push_back(Output::Discovery { bytes });
+            return;
+        }
+        let body = bytes.get(body_at..).unwrap_or_default();
+        match announcement_chunks(topic.space, sequence_number, body, (max_datagram, now.utc)) {
+            Ok(chunks) => {
+                let chunks = chunks.into_iter().map(|bytes| Output::Discovery { bytes });
+                self.told.extend(chunks);
+            }
+            Err(error) => self.count(About::topic(topic), Reason::TooBig, 1, || error.to_string()),
+        }
+        self.recycle(bytes);
+    }
+
+    /// Answers for a DataSetWriter that we do not have.
+    fn deny(&mut self, writer_id: u16, sequence_number: u16) {
+        let announcement = Announcement {
+            sequence_number,
+            announced: Announced::DataSetMetaData {
+                writer_id,
+                meta_data: uadp::discovery::DataSetMetaDataType::default(),
+                status: BAD_NOT_FOUND,
+            },
+        };
+        let mut bytes = self.buffer();
+        let publisher = PublisherId::UInt16(self.settings.own.into());
+        if announcement
+            .encode(publisher, SecurityHeader::NONE, &mut bytes)
+            .is_ok()
+        {
+            self.told.push_back(Output::Discovery { bytes });
+        }
+    }
+
+    /// Asks a Publisher what some of its topics consist of.
+    fn probe(&mut self, space: SpaceId, topics: &BTreeSet<TopicId>) {
+        let ids: BTreeSet<u16> = topics.iter().map(|topic| topic.triple().2).collect();
+        let ids: Vec<u16> = ids.into_iter().take(MAX_ASKED).collect();
+        let mut bytes = self.buffer();
+        let publisher = Some(PublisherId::UInt16(space.into()));
+        if Probe::DataSetMetaData(List::new(&ids))
+            .encode(publisher, SecurityHeader::NONE, &mut bytes)
+            .is_ok()
+        {
+            self.told.push_back(Output::Discovery { bytes });
+        }
+    }
+
+    /// Plans to ask what a topic of another space consists of.
+    pub(super) fn ask(&mut self, topic: TopicId, now: Now) {
+        if !self.is_learned(topic) {
+            return;
+        }
+        let random = u32::try_from(now.utc.unix_nanos() & 0xFFFF_FFFF).unwrap_or_default();
+        let discovery = self.discovery(now);
+        let since = discovery.since_start(now);
+        let probing = discovery
+            .probing
+            .entry(topic.space)
+            .or_insert_with(|| Probing {
+                timer: ProbeTimer::new(since, random, ProbeLimits::default()),
+                topics: BTreeSet::new(),
+            });
+        // The others are announced from time to time.
+        if probing.topics.len() < MAX_ASKED {
+            probing.topics.insert(topic);
+        }
+        discovery.reckon();
+    }
+
+    /// Whether what a topic is locally may come from its writer: the mapping does not say it.
+    fn is_learned(&self, topic: TopicId) -> bool {
+        let own = self.settings.own;
+        let bound = self.mapping.variable(topic).is_some_and(|variable| {
+            let service = variable.service.as_ref();
+            variable.binding(own).is_some() || service.is_some_and(|service| service.space == own)
+        });
+        self.settings.local != Local::Fields && !bound
+    }
+
+    /// A probe or an announcement of that Publisher, or for it.
+    pub(super) fn handle_discovery(
+        &mut self,
+        message: &NetworkMessage<'_>,
+        (space, from): (SpaceId, SocketAddr),
+        now: Now,
+    ) {
+        if message.message_type() == NetworkMessageType::Probe {
+            match Probe::decode(message) {
+                Ok(Probe::DataSetMetaData(ids)) => self.handle_probe(ids, space, now),
+                // Of endpoints and configurations there is nothing to tell.
+                Ok(_) => self.drop_undecoded(None, from, &DISCOVERY),
+                Err(error) => self.drop_undecoded(None, from, &error),
+            }
+        } else if !may_cross(self.settings.own, Side::Ua, space) {
+            self.drop_own(from);
+        } else if message.is_chunk() && !message.is_sealed() {
+            self.handle_chunk(message, (space, 0), from, now);
+        } else {
+            match Announcement::decode(message) {
+                Ok(announcement) => self.learn(&announcement, (space, from), now),
+                Err(error) => self.drop_undecoded(None, from, &error),
+            }
+        }
+    }
+
+    fn handle_probe(&mut self, ids: List<'_, u16>, asked: SpaceId, now: Now) {
+        let own = self.settings.own;
+        let discovery = self.discovery(now);
+        let since = discovery.since_start(now);
+        if asked == own {
+            let probe = Probe::DataSetMetaData(ids);
+            discovery.announcer.handle_probe(&probe, since);
+        } else if let Some(probing) = discovery.probing.get_mut(&asked) {
+            let named = |topic: &TopicId| ids.iter().any(|id| id == topic.triple().2);
+            if probing.topics.iter().all(named) {
+                probing.timer.handle_probe(since);
+            }
+        }
+        discovery.reckon();
+    }
+
+    /// Takes in what a writer of another space says of its topic.
+    pub(super) fn learn(
+        &mut self,
+        announcement: &Announcement<'_>,
+        (space, from): (SpaceId, SocketAddr),
+        now: Now,
+    ) {
+        let Announced::DataSetMetaData {
+            writer_id,
+            meta_data,
+            status,
+        } = &announcement.announced
+        else {
+            self.drop_undecoded(None, from, &DISCOVERY);
+            return;
+        };
+        if status.0 & STATUS_BAD != 0 {
+            let is_it = |topic: TopicId| topic.triple().2 == *writer_id;
+            self.discovery(now).answered(space, is_it);
+            return;
+        }
+        let named = meta_data.name.and_then(|name| name.parse().ok());
+        let topic =
+            named.filter(|topic: &TopicId| topic.space == space && topic.triple().2 == *writer_id);
+        let Some(topic) = topic else {
+            self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
+            return;
+        };
+        if !self.is_learned(topic) {
+            return;
+        }
+        let about = About {
+            topic: Some(topic),
+            from: Some(from),
+        };
+        let mut shape = None;
+        if let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get(&topic)
+        {
+            if !reader.may_be(from) {
+                self.count(about, Reason::MetaData, 1, || {
+                    "another program than the one that sends its values says what they are"
+                        .to_owned()
+                });
+                return;
+            }
+            shape = reader.shape.clone();
+        }
+        let described = match Described::read(meta_data) {
+            Ok(described) => described,
+            Err(why) => {
+                self.count(about, Reason::MetaData, 1, || why);
+                return;
+            }
+        };
+        let period = self.mapping.pubsub().metadata_period;
+        let discovery = self.discovery(now);
+        discovery.answered(space, |other| other == topic);
+        let news = match described {
+            Some(described) => discovery
+                .learned
+                .learn(topic, described, now.monotonic, period),
+            None => {
+                discovery.learned.forget(topic);
+                News::Same
+            }
+        };
+        match news {
+            News::Same => {}
+            News::Full => self.count(about, Reason::MetaData, 1, || {
+                "there is no room for what more topics consist of".to_owned()
+            }),
+            News::Other => {
+                let counters = self.topics.get_mut(&topic);
+                let counters = counters.map_or(&mut self.others, |entry| &mut entry.counters);
+                counters.described += 1;
+                if let Some(shape) = shape {
+                    self.tell_unbound(topic, shape, now);
+                }
+            }
+        }
+    }
+
+    /// Has the port find the local type of a topic, with what is known of it.
+    pub(super) fn tell_unbound(
+        &mut self,
+        topic: TopicId,
+        shape: Vec<(uadp::BuiltinType, bool)>,
+        now: Now,
+    ) {
+        let described = self
+            .discovery
+            .as_ref()
+            .and_then(|discovery| discovery.learned.get(topic, now.monotonic))
+            .cloned();
+        if described.is_none() {
+            self.ask(topic, now);
+        }
+        let fits = described
+            .as_ref()
+            .is_none_or(|described| described.fits(&shape));
+        if !fits {
+            self.count(About::topic(topic), Reason::MetaData, 1, || {
+                "its values are not what its writer says they are".to_owned()
+            });
+        }
+        self.told.push_back(Output::Unbound {
+            topic,
+            shape,
+            described: described.filter(|_| fits),
+        });
+    }
+
+    /// An announcement or probe could not be sent.
+    pub fn not_announced(&mut self, reason: Reason, detail: &str) {
+        let about = About {
+            topic: None,
+            from: None,
+        };
+        self.count(about, reason, 1, || detail.to_owned());
+    }
+}
+
+/// The severity of a Bad StatusCode (OPC 10000-4, 7.39.1).
+const STATUS_BAD: u32 = 0x8000_0000;
+/// Bad_NotFound (OPC 10000-6, A.2).
+const BAD_NOT_FOUND: uadp::StatusCode = uadp::StatusCode(0x803E_0000);
+/// Topics of one Publisher that are asked for at a time: those fit any datagram.
+const MAX_ASKED: usize = 200;

@@ -1,0 +1,126 @@
+//! What the numbers of a variable mean: their unit, range, and texts.
+
+use std::collections::BTreeMap;
+
+use uadp::BuiltinType;
+
+use super::types::{self, ValueType};
+use crate::code::Code;
+use crate::document::VariableEntry;
+use crate::findings::Findings;
+use crate::mapping::Meaning;
+use crate::read::{At, given, short};
+use crate::tree::Place;
+use crate::unit::Unit;
+
+/// Most texts of one variable.
+const MAX_TEXTS: usize = 1000;
+
+/// `None` when something is faulty, which is noted. The value type is that in OPC UA, where the value is one.
+pub(super) fn check(
+    entry: &VariableEntry,
+    value: (Option<ValueType>, bool),
+    findings: &mut Findings,
+) -> Option<Meaning> {
+    let mut sound = Some(());
+    let mut unit = None;
+    if let Some((text, place)) = given(&entry.unit) {
+        unit = Unit::find(text);
+        if unit.is_none() {
+            let message = format!("unit `{}` unknown", short(text));
+            let note = findings.error(Code::UnitUnknown, place, message);
+            note.help_with(|| match Unit::suggest(text) {
+                Some(near) => {
+                    format!(
+                        "did you mean `{}` ({}, {})?",
+                        near.symbol, near.name, near.code
+                    )
+                }
+                None => "a symbol as m/s, a UNECE code as MTS, or a name".to_owned(),
+            });
+            sound = None;
+        }
+        let fits = numbers(value, ("unit", Code::UnitUnknown, place), findings);
+        sound = sound.and(fits);
+    }
+    let mut range = None;
+    if let Some((bounds, place)) = given(&entry.range) {
+        range = limits(bounds, place, findings);
+        let fits = numbers(value, ("range", Code::ValueRange, place), findings);
+        let is_range = range.map(|_| ());
+        sound = sound.and(fits).and(is_range);
+    }
+    let mut texts = BTreeMap::new();
+    if let Some((pairs, place)) = given(&entry.r#enum) {
+        let whole = value.0.is_none_or(|(builtin, _)| {
+            messages::is_number(builtin)
+                && !matches!(builtin, BuiltinType::Float | BuiltinType::Double)
+        });
+        if value.1 || !whole {
+            let told = told(value);
+            let message = format!("an `enum` goes with integers, and this is {told}");
+            findings.error(Code::EnumTexts, place, message);
+            sound = None;
+        }
+        if pairs.is_empty() || pairs.len() > MAX_TEXTS {
+            let message = format!("an `enum` of {} values", pairs.len());
+            findings
+                .error(Code::EnumTexts, place, message)
+                .help("1 to 1000, as {0: idle, 1: moving}");
+            sound = None;
+        }
+        for (number, text) in pairs {
+            let (Some(number), Some(said)) = (number.value, &text.value) else {
+                sound = None;
+                continue;
+            };
+            if said.trim().is_empty() || said.chars().count() > 512 {
+                let message =
+                    format!("the text of {number} is empty or longer than 512 characters");
+                findings.error(Code::EnumTexts, text.place, message);
+                sound = None;
+            }
+            texts.insert(number, said.clone());
+        }
+    }
+    sound.map(|()| Meaning::new(unit, range, texts))
+}
+
+/// Notes that a value is none that such a key goes with.
+fn numbers(
+    value: (Option<ValueType>, bool),
+    (key, code, place): (&str, Code, Place),
+    findings: &mut Findings,
+) -> Option<()> {
+    let number = value
+        .0
+        .is_none_or(|(builtin, _)| messages::is_number(builtin));
+    if number && !value.1 {
+        return Some(());
+    }
+    let message = format!("a `{key}` goes with a number, and this is {}", told(value));
+    findings
+        .error(code, place, message)
+        .help("bind the one field it is of");
+    None
+}
+
+fn told((value_type, several): (Option<ValueType>, bool)) -> String {
+    match value_type {
+        Some(value_type) if !several => types::print(value_type),
+        _ => "a message of several fields".to_owned(),
+    }
+}
+
+fn limits(bounds: &[At<f64>], place: Place, findings: &mut Findings) -> Option<(f64, f64)> {
+    let bounds: Vec<f64> = bounds.iter().map(|at| at.value).collect::<Option<_>>()?;
+    match bounds[..] {
+        [low, high] if low.is_finite() && high.is_finite() && low < high => Some((low, high)),
+        _ => {
+            findings
+                .error(Code::ValueRange, place, "this is no range")
+                .help("the lowest and the highest value, as [0, 1.5]");
+            None
+        }
+    }
+}

@@ -1,0 +1,176 @@
+//! Several fields of a message, and messages that are structures.
+
+use std::sync::Arc;
+
+use messages::{Leaf, MessageType, Rank, Selected, Selection};
+use uadp::BuiltinType;
+
+use super::shaping::{self, Way};
+use crate::code::Code;
+use crate::document::{BindingEntry, FieldList};
+use crate::findings::Findings;
+use crate::mapping::Binding;
+use crate::read::{At, given, short};
+use crate::tree::Place;
+
+/// The fields of a binding; `None` when something is faulty, which is noted.
+pub(super) fn selection(
+    entry: &BindingEntry,
+    at: &At<FieldList>,
+    message_type: Option<&MessageType>,
+    way: Way,
+    findings: &mut Findings,
+) -> Option<Selection> {
+    let list = at.value.as_ref()?;
+    let beside = [
+        ("field", entry.field.as_ref().map(|at| at.place)),
+        ("as", entry.r#as.as_ref().map(|at| at.place)),
+    ];
+    for (key, place) in beside {
+        if let Some(place) = place {
+            let message = format!("`{key}` does not go with `fields`");
+            findings
+                .error(Code::Fields, place, message)
+                .help("leave one of them out");
+            return None;
+        }
+    }
+    if list.0.is_empty() {
+        findings
+            .error(Code::Fields, at.place, "`fields` names no field")
+            .help("leave it out for the whole message");
+        return None;
+    }
+    let mut selected: Vec<Selected> = Vec::new();
+    for at in &list.0 {
+        let entry = at.value.as_ref()?;
+        let Some((text, place)) = given(&entry.field) else {
+            findings
+                .error(Code::MissingKey, at.place, "one of `fields` has no `field`")
+                .help("as {field: linear.x, scale: 1000}");
+            return None;
+        };
+        let field = shaping::part(text, place, findings)?;
+        let shaping = shaping::shaping(entry.into(), findings)?;
+        // The variable has no one type that all would be converted to.
+        let way = Way {
+            declared: None,
+            ..way
+        };
+        let one = match shaping.select(field, message_type, (place, way), findings)? {
+            Selection::Field(field) => Selected::whole(&field),
+            Selection::Value {
+                field,
+                part,
+                conversion,
+            } => Selected {
+                field,
+                part,
+                conversion,
+            },
+            Selection::Whole
+            | Selection::Fields(_)
+            | Selection::Structure(_)
+            | Selection::Template { .. }
+            | Selection::Bytes => return None,
+        };
+        let same = |known: &&Selected| known.field == one.field && known.part == one.part;
+        if selected.iter().find(same).is_some() {
+            let message = format!("`{}` is named twice", short(text));
+            findings.error(Code::Fields, place, message);
+            return None;
+        }
+        selected.push(one);
+    }
+    Some(Selection::Fields(selected))
+}
+
+/// The values of several fields; `None` when the type has one of them not, which is noted.
+pub(super) fn leaves(
+    message_type: &Arc<MessageType>,
+    selected: &[Selected],
+    (place, way): (Place, Way),
+    findings: &mut Findings,
+) -> Option<Vec<Leaf>> {
+    let mut all = Vec::new();
+    let mut places = Vec::new();
+    for one in selected {
+        let selection = match one.is_plain() {
+            true => Selection::Field(one.field.clone()),
+            false => Selection::Value {
+                field: one.field.clone(),
+                part: one.part.clone(),
+                conversion: one.conversion,
+            },
+        };
+        all.extend(shaping::leaves(message_type, &selection, place, findings)?);
+        let inside = |leaf: &Leaf| leaf.path == one.field || leaf.is_inside(&one.field);
+        let at = message_type
+            .leaves()
+            .iter()
+            .enumerate()
+            .filter(|(_, leaf)| inside(leaf))
+            .map(|(at, _)| at);
+        places.extend(at);
+    }
+    if !way.reads && !places.is_sorted_by(|a, b| a < b) {
+        let message = format!(
+            "the fields do not stand in the order that `{}` has them",
+            message_type.name()
+        );
+        let paths: Vec<&str> = message_type
+            .leaves()
+            .iter()
+            .map(|leaf| leaf.path.as_str())
+            .filter(|path| {
+                let under = |one: &Selected| {
+                    path.strip_prefix(one.field.as_str())
+                        .is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+                };
+                selected.iter().any(under)
+            })
+            .collect();
+        let help = format!("here they are {}", super::bindings::told(&paths));
+        findings.error(Code::FieldOrder, place, message).help(help);
+        return None;
+    }
+    Some(all)
+}
+
+/// The one value of a structure; `None` where no message is, which is noted.
+pub(super) fn structure(
+    message_type: &MessageType,
+    path: &str,
+    place: Place,
+    findings: &mut Findings,
+) -> Option<Vec<Leaf>> {
+    if message_type.message_at(path).is_some() {
+        return Some(vec![Leaf {
+            path: path.to_owned(),
+            builtin: BuiltinType::ExtensionObject,
+            rank: Rank::Scalar,
+        }]);
+    }
+    let missing = Selection::Field(path.to_owned());
+    super::bindings::select(message_type, &missing, place, findings)?;
+    let message = format!("`{}` is no message, so it is no structure", short(path));
+    findings
+        .error(Code::StructureOf, place, message)
+        .help("leave `field` out for the whole message, or `as: structure`");
+    None
+}
+
+/// Structures are of one type on both sides.
+pub(super) fn compare(a: &Binding, b: &Binding, place: Place, findings: &mut Findings) {
+    if let (Selection::Structure(None), Selection::Structure(None)) = (&a.selection, &b.selection)
+        && a.message_type != b.message_type
+    {
+        let message = format!(
+            "a structure of `{}` in space {} is no `{}` in space {}",
+            a.message_type, a.space, b.message_type, b.space
+        );
+        findings
+            .error(Code::StructureOf, place, message)
+            .help("bind the same type on both sides, or leave `as: structure` out");
+    }
+}

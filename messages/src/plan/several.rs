@@ -1,0 +1,255 @@
+//! Several fields of one message, each perhaps with a part and a conversion of its own.
+
+use std::sync::Arc;
+
+use uadp::{BuiltinType, Scalar};
+
+use super::{Compiler, Conversion, Op, Part, Plan, Selection, What, Wire, coalesced, range, write};
+use crate::definition::Primitive;
+use crate::{
+    Leaf, MessageType, PlanError, ReadError, Sink, Source, SourceError, WriteError, WriteFault,
+};
+
+/// One of several fields.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub struct Selected {
+    /// The path of a field, or of a message in the message.
+    pub field: String,
+    /// What of an array crosses; `None`: all of it.
+    pub part: Option<Part>,
+    /// What each value goes through.
+    pub conversion: Conversion,
+}
+
+impl Selected {
+    /// The field as it is.
+    #[must_use]
+    pub fn whole(field: &str) -> Self {
+        Self {
+            field: field.to_owned(),
+            part: None,
+            conversion: Conversion::default(),
+        }
+    }
+
+    /// Whether it crosses as it is.
+    #[must_use]
+    pub fn is_plain(&self) -> bool {
+        self.part.is_none() && self.conversion.is_none()
+    }
+
+    fn selection(&self) -> Selection {
+        if self.is_plain() {
+            return Selection::Field(self.field.clone());
+        }
+        Selection::Value {
+            field: self.field.clone(),
+            part: self.part.clone(),
+            conversion: self.conversion,
+        }
+    }
+}
+
+/// Fields that are read one after the other, in whatever order they stand in the message.
+#[derive(Clone, Debug)]
+pub(super) struct Several {
+    plans: Vec<Plan>,
+    /// The fields that are written, and what becomes of each; or why none is.
+    write: Result<(Vec<Op>, Vec<Shaping>), WriteFault>,
+}
+
+/// What becomes of one field, and its builtin type in OPC UA where it is converted.
+type Shaping = Option<(Conversion, BuiltinType)>;
+
+/// The body of a plan, and the fields that cross, in the order given.
+pub(super) fn compile(
+    message: &Arc<MessageType>,
+    selected: &[Selected],
+    wire: Wire,
+) -> Result<(super::Body, Vec<Leaf>), PlanError> {
+    let mut plans = Vec::new();
+    let mut leaves = Vec::new();
+    let mut shapings = Vec::new();
+    let mut ranges: Vec<std::ops::Range<usize>> = Vec::new();
+    for one in selected {
+        let plan = Plan::compile(message, &one.selection(), wire)?;
+        let converted = !one.conversion.is_none();
+        shapings.extend(
+            plan.leaves()
+                .iter()
+                .map(|leaf| converted.then_some((one.conversion, leaf.builtin))),
+        );
+        leaves.extend_from_slice(plan.leaves());
+        ranges.push(range(message, &one.field)?);
+        plans.push(plan);
+    }
+    let in_order = ranges.is_sorted_by(|a, b| a.end <= b.start);
+    let write = if selected.iter().any(|one| one.part.is_some()) {
+        Err(WriteFault::Part)
+    } else if !in_order {
+        Err(WriteFault::Order)
+    } else {
+        let mut compiler = Compiler::new(wire, ranges);
+        compiler.message(&message.shape, false);
+        if let Some(fault) = compiler.fault {
+            return Err(fault);
+        }
+        Ok((coalesced(&compiler.ops), shapings))
+    };
+    let plain = selected.iter().all(Selected::is_plain);
+    let body = match write {
+        Ok((ops, _)) if plain => super::Body::Steps(ops),
+        Ok((mut ops, shapings)) => {
+            convert(&mut ops, message, &leaves, &shapings);
+            let write = Ok((ops, shapings));
+            super::Body::Several(Box::new(Several { plans, write }))
+        }
+        write => super::Body::Several(Box::new(Several { plans, write })),
+    };
+    Ok((body, leaves))
+}
+
+/// Has what is converted come one by one, as what is not the same on the wire.
+fn convert(ops: &mut [Op], message: &MessageType, leaves: &[Leaf], shapings: &[Shaping]) {
+    let converted: Vec<&str> = leaves
+        .iter()
+        .zip(shapings)
+        .filter(|(_, shaping)| shaping.is_some())
+        .map(|(leaf, _)| leaf.path.as_str())
+        .collect();
+    let is_converted = |leaf: usize| {
+        let leaf = message.leaves().get(leaf);
+        leaf.is_some_and(|leaf| converted.contains(&leaf.path.as_str()))
+    };
+    for op in ops {
+        if let What::Packed(number, len) = op.what
+            && op.carry
+            && is_converted(op.leaf)
+        {
+            op.what = What::Many(Primitive::Number(number), len);
+        }
+    }
+}
+
+impl Several {
+    pub(super) fn read<S: Sink>(
+        &self,
+        payload: &[u8],
+        sink: &mut S,
+    ) -> Result<(), ReadError<S::Error>> {
+        self.plans
+            .iter()
+            .try_for_each(|plan| plan.read(payload, sink))
+    }
+
+    pub(super) fn write<'a, S: Source<'a>>(
+        &self,
+        plan: &Plan,
+        source: &mut S,
+        out: &mut Vec<u8>,
+    ) -> Result<(), WriteError> {
+        match &self.write {
+            Ok((ops, shapings)) => {
+                let mut converting = ConvertingSource {
+                    source,
+                    shapings: shapings.iter(),
+                    now: None,
+                    inside: false,
+                };
+                write::write(plan, ops, &mut converting, out)
+            }
+            Err(fault) => Err(WriteError {
+                field: plan
+                    .leaves()
+                    .first()
+                    .map(|leaf| leaf.path.clone())
+                    .unwrap_or_default(),
+                fault: fault.clone(),
+            }),
+        }
+    }
+}
+
+/// A source of which each field goes through a conversion of its own.
+struct ConvertingSource<'s, S> {
+    source: &'s mut S,
+    /// Of the fields that are still to come.
+    shapings: std::slice::Iter<'s, Shaping>,
+    /// That of the field being read.
+    now: Shaping,
+    /// Whether within a structure, of which nothing is converted.
+    inside: bool,
+}
+
+impl<S> ConvertingSource<'_, S> {
+    /// The next field, if it is one.
+    fn step(&mut self) {
+        if !self.inside {
+            self.now = self.shapings.next().copied().flatten();
+        }
+    }
+
+    fn outside(&self, expected: BuiltinType) -> BuiltinType {
+        match self.now {
+            Some((_, outside)) if !self.inside => outside,
+            Some(_) | None => expected,
+        }
+    }
+
+    fn back<'a>(&self, value: Scalar<'a>, field: BuiltinType) -> Result<Scalar<'a>, SourceError> {
+        match self.now {
+            Some((conversion, _)) if !self.inside => {
+                conversion.back(value, field).map_err(SourceError::Value)
+            }
+            Some(_) | None => Ok(value),
+        }
+    }
+}
+
+impl<'a, S: Source<'a>> Source<'a> for ConvertingSource<'_, S> {
+    fn scalar(&mut self, expected: BuiltinType) -> Result<Scalar<'a>, SourceError> {
+        self.step();
+        let value = self.source.scalar(self.outside(expected))?;
+        self.back(value, expected)
+    }
+
+    fn packed_array(&mut self, expected: BuiltinType) -> Result<(usize, &'a [u8]), SourceError> {
+        self.step();
+        self.source.packed_array(expected)
+    }
+
+    fn array(&mut self, expected: BuiltinType) -> Result<usize, SourceError> {
+        self.step();
+        self.source.array(self.outside(expected))
+    }
+
+    fn element(&mut self, expected: BuiltinType) -> Result<Scalar<'a>, SourceError> {
+        let value = self.source.element(self.outside(expected))?;
+        self.back(value, expected)
+    }
+
+    fn structures(&mut self) -> Result<usize, SourceError> {
+        self.step();
+        self.source.structures()
+    }
+
+    fn structure(&mut self) -> Result<(), SourceError> {
+        self.step();
+        self.inside = true;
+        self.source.structure()
+    }
+
+    fn begin_structure(&mut self) -> Result<(), SourceError> {
+        self.inside = true;
+        self.source.begin_structure()
+    }
+
+    fn end_structure(&mut self) -> Result<(), SourceError> {
+        self.inside = false;
+        self.source.end_structure()
+    }
+
+    fn finish(&mut self) -> Result<(), SourceError> {
+        self.source.finish()
+    }
+}
