@@ -84,28 +84,34 @@ impl Definitions {
 
     fn tell(&mut self) {
         for noted in self.library.take_noted() {
-            match noted {
-                Noted::Read { name, file } => {
-                    info!(definition = %name, %file, "definition read");
-                }
-                Noted::Refused { name, file, error } => {
-                    warn!(definition = %name, %file, "definition file does not count: {error}");
-                }
-                Noted::Differs {
-                    name,
-                    file,
-                    only_file,
-                    only_built_in,
-                } => warn!(
-                    definition = %name,
-                    %file,
-                    ?only_file,
-                    ?only_built_in,
-                    "the file counts, and differs from the definition that is built in"
-                ),
-            }
+            tell(noted);
         }
     }
+}
+
+fn tell(noted: Noted) {
+    match noted {
+        Noted::Read { name, file } => info!(definition = %name, %file, "definition read"),
+        Noted::Refused { name, file, error } => {
+            warn!(definition = %name, %file, "definition file does not count: {error}");
+        }
+        Noted::Differs {
+            name,
+            file,
+            only_file,
+            only_built_in,
+        } => tell_differing(&name, &file, &only_file, &only_built_in),
+    }
+}
+
+fn tell_differing(name: &TypeName, file: &str, only_file: &[String], only_built_in: &[String]) {
+    warn!(
+        definition = %name,
+        file,
+        ?only_file,
+        ?only_built_in,
+        "the file counts, and differs from the definition that is built in"
+    );
 }
 
 /// Types of peers whose origin is kept in mind.

@@ -84,7 +84,7 @@ fn a_path_wins_over_the_installation_and_both_over_what_is_built_in() {
                 only_built_in,
                 ..
             } => Some((name.to_string(), only_file, only_built_in)),
-            _ => None,
+            messages::Noted::Read { .. } | messages::Noted::Refused { .. } => None,
         })
         .collect();
     let quality = vec!["uint8 quality".to_owned()];

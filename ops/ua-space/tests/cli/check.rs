@@ -78,17 +78,17 @@ fn a_program_gets_the_same_as_json() {
 fn each_type_is_told_with_where_it_is_from() {
     let folder = std::env::temp_dir().join(format!("ua-space-types-{}", std::process::id()));
     let package = folder.join("types/robot_msgs/msg");
-    std::fs::create_dir_all(&package).unwrap();
-    std::fs::write(package.join("Arm.msg"), "float64[] joints\n").unwrap();
-    std::fs::write(package.join("Leg.msg"), "float64 knee\nfloat64 9th\n").unwrap();
+    fs::create_dir_all(&package).unwrap();
+    fs::write(package.join("Arm.msg"), "float64[] joints\n").unwrap();
+    fs::write(package.join("Leg.msg"), "float64 knee\nfloat64 9th\n").unwrap();
     let mapping = folder.join("cell.yaml");
     let text = "spaces: [{id: 2}]\nnamespaces: {2: urn:x}\ntype_paths: [types]\nvariables:\n\
         - {node: ns=2;i=1, name: Arm, origin: 0, ros: {space: 2, topic: /arm, type: robot_msgs/Arm, field: joints}}\n\
         - {node: ns=2;i=2, name: Hip, origin: 2, ros: {topic: /hip, type: robot_msgs/Hip}}\n\
         - {node: ns=2;i=3, name: On, origin: 2, ros: {topic: /on, type: std_msgs/Bool}}\n";
-    std::fs::write(&mapping, text).unwrap();
+    fs::write(&mapping, text).unwrap();
     let ended = run(&["check", "--json", mapping.to_str().unwrap()]);
-    std::fs::remove_dir_all(&folder).unwrap();
+    fs::remove_dir_all(&folder).unwrap();
     let told: Value = serde_json::from_str(&ended.stdout).unwrap();
     assert_eq!((ended.code, &told["canRun"]), (0, &json!(true)), "{told}");
     let arm = package.join("Arm.msg");
