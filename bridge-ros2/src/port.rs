@@ -147,7 +147,7 @@ impl Ros2Port {
             domain_id: domain_options.domain,
             mapping: Arc::clone(&mapping),
             definitions,
-            descriptions: Descriptions::new(peers),
+            descriptions: Descriptions::new(peers.clone()),
             told_types,
             services,
             peers,

@@ -11,7 +11,7 @@ use std::{
 
 use socket2::{Domain, Protocol, Socket, Type};
 
-use crate::{Cell, GROUP, Started, peers::cyclone_uri};
+use crate::{Cell, GROUP, Host, Started, WIRE, peers::cyclone_uri};
 
 /// A keystore with one certificate authority for everything, and the enclaves `/bridge` and `/peer`, in which all may
 /// read and write all topics of all domains.
@@ -125,6 +125,19 @@ impl Cell {
     /// The Cyclone DDS peer in C as the enclave `/peer`, not started yet.
     #[must_use]
     pub fn secured_cyclone(&self, keystore: &Keystore, args: &[&str]) -> Started {
+        let started = self.cyclone_c_started(args);
+        Self::as_peer(started, keystore, &cyclone_uri("lo", ""))
+    }
+
+    /// The same on another host.
+    #[must_use]
+    pub fn secured_cyclone_on(&self, host: &Host, keystore: &Keystore, args: &[&str]) -> Started {
+        let started = host.cyclone_c_started(self, args);
+        Self::as_peer(started, keystore, &cyclone_uri(WIRE, ""))
+    }
+
+    /// With the enclave in the configuration.
+    fn as_peer(started: Started, keystore: &Keystore, configuration: &str) -> Started {
         let folder = keystore.enclave("peer");
         let file = |name: &str| format!("file:{}", folder.join(name).display());
         let library = |kind: &str, call: &str| {
@@ -148,9 +161,9 @@ impl Cell {
             file("governance.p7s"),
             file("permissions.p7s"),
         );
-        self.cyclone_c_started(args).env(
+        started.env(
             "CYCLONEDDS_URI",
-            cyclone_uri("lo", "").replace("</Domain>", &security),
+            configuration.replace("</Domain>", &security),
         )
     }
 

@@ -11,8 +11,8 @@ use std::{
 };
 
 use system_tests::{
-    Cell, Child, Keystore, METRICS_ROS2, Peer, Started, Triple, UaSide, Wiretap, drops, eventually,
-    metrics, program,
+    Cell, Child, HERE, Keystore, METRICS_ROS2, Peer, Started, Triple, UaSide, Wire, Wiretap, drops,
+    eventually, metrics, program,
 };
 use uadp::Scalar;
 
@@ -109,6 +109,28 @@ fn values_cross_both_ways_with_secured_peers_and_nothing_of_them_is_readable_on_
                 "{secret} can be read"
             );
         }
+    }
+}
+
+#[test]
+fn secured_peers_get_each_others_keys_although_datagrams_are_lost() {
+    let Some(cell) = secured_cell(&[Peer::CycloneC]) else {
+        return;
+    };
+    let host = cell.host(Wire {
+        loss: 0.1,
+        delay: Duration::from_millis(5),
+    });
+    let keystore = Keystore::make(&cell, "keystore");
+    let mut ua = UaSide::join();
+    let _bridge = answering(cell.secured_bridge(&keystore, &["--ros-interface", HERE]));
+    for number in 0..3 {
+        let (there, back) = (format!("there {number}"), format!("back {number}"));
+        let on_host = |args: &[&str]| cell.secured_cyclone_on(&host, &keystore, args);
+        let reader = on_host(&["sub", THERE.1, STRING]).start().ready(SOON);
+        reaches(&mut ua, &there, &reader);
+        let _writer = on_host(&sends(BACK.1, &back)).start();
+        ua.hear_scalar(BACK.0, Scalar::String(Some(&back)));
     }
 }
 
