@@ -13,6 +13,7 @@ use std::time::Duration;
 
 use mappings::{Checked, Code, Mapping, SpaceId};
 use serde::Serialize;
+use type_files::Disk;
 
 use crate::arguments::Init;
 use crate::exit::Failure;
@@ -48,9 +49,10 @@ pub(crate) fn init(arguments: &Init) -> Result<(), Failure> {
         transforms: arguments.tf,
     };
     let mut plan = Plan::new(&found.graphs, &found.nodes, &wishes, &mut known);
+    let file = arguments.output.as_deref().unwrap_or_default();
     let text = match &existing {
-        Some((mapping, text)) => added(text, mapping, &mut plan)?,
-        None => written(&found.places, &mut plan)?,
+        Some((mapping, text)) => added(file, (text, mapping), &mut plan)?,
+        None => written(file, &found.places, &mut plan)?,
     };
     put(
         arguments,
@@ -160,7 +162,9 @@ fn existing(file: &str) -> Result<Option<(Mapping, String)>, Failure> {
     }
     let text = String::from_utf8(bytes)
         .map_err(|_| Failure::Io(format!("{file} is there and is no text; it stays as it is")))?;
-    let Checked { mapping, findings } = Mapping::from_yaml(&text, file);
+    let Checked {
+        mapping, findings, ..
+    } = Mapping::from_text(&text, file, &Disk);
     match mapping {
         Some(mapping) => Ok(Some((mapping, text))),
         None => {
@@ -174,8 +178,8 @@ fn existing(file: &str) -> Result<Option<(Mapping, String)>, Failure> {
 }
 
 /// A document of its own.
-fn written(places: &[String], plan: &mut Plan) -> Result<String, Failure> {
-    settled(plan, |plan| {
+fn written(file: &str, places: &[String], plan: &mut Plan) -> Result<String, Failure> {
+    settled(file, plan, |plan| {
         let mut lines = render::head(places);
         let spaces = "The ROS sides. 1 is ROS 1, others are DDS domains; 0, the OPC UA side, is always there.";
         section(&mut lines, spaces, "spaces", render::spaces(plan));
@@ -215,8 +219,8 @@ fn section(lines: &mut Vec<String>, title: &str, key: &str, block: Vec<String>) 
 }
 
 /// The document with what is new in it.
-fn added(text: &str, before: &Mapping, plan: &mut Plan) -> Result<String, Failure> {
-    let merged = settled(plan, |plan| {
+fn added(file: &str, (text, before): (&str, &Mapping), plan: &mut Plan) -> Result<String, Failure> {
+    let merged = settled(file, plan, |plan| {
         let mut merged = text.to_owned();
         for (key, block) in [
             ("spaces", render::spaces(plan)),
@@ -234,7 +238,7 @@ fn added(text: &str, before: &Mapping, plan: &mut Plan) -> Result<String, Failur
         Some((merged, start, variables.entries))
     })?;
     let active = plan.entries.iter().filter(|entry| entry.faulty.is_none());
-    let kept = Mapping::from_yaml(&merged, "")
+    let kept = Mapping::from_text(&merged, file, &Disk)
         .mapping
         .is_some_and(|after| {
             after.variables().len() == before.variables().len() + active.count()
@@ -258,12 +262,19 @@ fn unmergeable() -> Failure {
 type Rendered = Option<(String, usize, Vec<std::ops::Range<usize>>)>;
 
 /// Renders until no entry has a finding: those that have one become comments with its text.
-fn settled(plan: &mut Plan, render: impl Fn(&Plan) -> Rendered) -> Result<String, Failure> {
+fn settled(
+    file: &str,
+    plan: &mut Plan,
+    render: impl Fn(&Plan) -> Rendered,
+) -> Result<String, Failure> {
     loop {
         let (text, start, entries) = render(plan).ok_or_else(unmergeable)?;
-        let Checked { mapping, findings } = Mapping::from_yaml(&text, "");
+        let Checked {
+            mapping, findings, ..
+        } = Mapping::from_text(&text, file, &Disk);
         let mut changed = false;
-        for finding in &findings {
+        let here = findings.iter().filter(|finding| *finding.at.file == *file);
+        for finding in here {
             let at = finding.at.line.saturating_sub(1 + start);
             let faulty = entries.iter().position(|lines| lines.contains(&at));
             let entry = faulty.and_then(|at| plan.entries.get_mut(at));
@@ -431,14 +442,14 @@ mod tests {
 
     fn fresh(graphs: &[Graph]) -> String {
         let mut plan = Plan::new(graphs, &[], &WISHES, &mut Known::default());
-        written(&[], &mut plan).unwrap()
+        written("", &[], &mut plan).unwrap()
     }
 
     fn merged(text: &str, graphs: &[Graph]) -> String {
         let mapping = mapping(text);
         let mut known = Known::of(mapping.clone(), text);
         let mut plan = Plan::new(graphs, &[], &WISHES, &mut known);
-        added(text, &mapping, &mut plan).unwrap()
+        added("", (text, &mapping), &mut plan).unwrap()
     }
 
     fn mapping(text: &str) -> Mapping {
