@@ -34,13 +34,14 @@ pub(crate) enum News {
 }
 
 impl Learned {
-    /// Takes note of what a topic is, for some time.
+    /// Takes note of what a topic is, for some time. Where there is no room, one that is read has precedence over all
+    /// that are not.
     pub(crate) fn learn(
         &mut self,
         topic: TopicId,
         described: Described,
-        now: Instant,
-        period: Duration,
+        (now, period): (Instant, Duration),
+        is_read: impl Fn(TopicId) -> bool,
     ) -> News {
         let until = now + period.saturating_mul(MISSED).max(LEAST);
         if let Some(known) = self.known.get_mut(&topic)
@@ -52,7 +53,10 @@ impl Learned {
         let weight = described.weight();
         self.forget(topic);
         if !self.has_room(weight) {
-            self.expire(now);
+            self.retain(|_, known| known.until > now);
+        }
+        if !self.has_room(weight) && is_read(topic) {
+            self.retain(|topic, _| is_read(topic));
         }
         if !self.has_room(weight) {
             return News::Full;
@@ -69,6 +73,11 @@ impl Learned {
         (known.until > now).then_some(&known.described)
     }
 
+    /// What was said of a topic last, be it long ago.
+    pub(crate) fn last(&self, topic: TopicId) -> Option<&Arc<Described>> {
+        self.known.get(&topic).map(|known| &known.described)
+    }
+
     pub(crate) fn forget(&mut self, topic: TopicId) {
         if let Some(known) = self.known.remove(&topic) {
             self.weight -= known.described.weight();
@@ -79,10 +88,10 @@ impl Learned {
         self.known.len() < MAX_TOPICS && self.weight.saturating_add(weight) <= MAX_WEIGHT
     }
 
-    fn expire(&mut self, now: Instant) {
+    fn retain(&mut self, is_kept: impl Fn(TopicId, &Known) -> bool) {
         let weight = &mut self.weight;
-        self.known.retain(|_, known| {
-            let keep = known.until > now;
+        self.known.retain(|topic, known| {
+            let keep = is_kept(*topic, known);
             if !keep {
                 *weight -= known.described.weight();
             }
@@ -127,7 +136,7 @@ mod tests {
         let mut learned = Learned::default();
         let mut learn = |number: usize, at: Instant| {
             let what = described("std_msgs/Bool");
-            learned.learn(topic(number), what, at, Duration::from_secs(30))
+            learned.learn(topic(number), what, (at, Duration::from_secs(30)), |_| true)
         };
         for number in 0..MAX_TOPICS {
             assert_eq!(learn(number, start), News::Other);
@@ -143,5 +152,27 @@ mod tests {
             .map(|one| one.described.weight())
             .sum();
         assert_eq!((learned.known.len(), learned.weight), (2, weight));
+    }
+
+    #[test]
+    #[expect(
+        clippy::disallowed_methods,
+        reason = "a test needs some instant to count from"
+    )]
+    fn what_is_read_has_precedence_over_what_is_not() {
+        let at = (Instant::now(), Duration::from_secs(30));
+        let mut learned = Learned::default();
+        let read = [topic(0), topic(MAX_TOPICS)];
+        let mut learn = |number: usize| {
+            let what = described("std_msgs/Bool");
+            learned.learn(topic(number), what, at, |topic| read.contains(&topic))
+        };
+        for number in 0..MAX_TOPICS {
+            assert_eq!(learn(number), News::Other);
+        }
+        assert_eq!(learn(MAX_TOPICS + 1), News::Full);
+        assert_eq!(learn(MAX_TOPICS), News::Other);
+        assert_eq!(learn(0), News::Same);
+        assert_eq!(learned.known.len(), 2);
     }
 }

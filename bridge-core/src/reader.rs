@@ -37,6 +37,8 @@ pub(crate) struct Reader {
     pub(crate) shape: Option<Vec<(BuiltinType, bool)>>,
     /// The major version its messages have (OPC 10000-14, 6.2.3.2.6).
     major_version: Option<u32>,
+    /// When what it is said to be was last taken, and how often it was another by then.
+    renamed: Option<(Instant, u32)>,
 }
 
 /// A sample that was handed on.
@@ -90,6 +92,7 @@ impl Reader {
             asked: None,
             shape: None,
             major_version: None,
+            renamed: None,
         }
     }
 
@@ -114,10 +117,40 @@ impl Reader {
         changed
     }
 
+    /// Whether the topic may be said to be something now, and something else if anything is `known` of it: the port opens
+    /// it anew for that, and whoever can send under the writer's address could have it do nothing else. The first word is
+    /// taken, and the first other one; from then on each is waited for twice as long as the one before.
+    pub(crate) fn may_be_renamed(&mut self, known: bool, now: Instant) -> bool {
+        let (since, times) = match self.renamed {
+            Some(renamed) => renamed,
+            None if known => (now, 0),
+            None => {
+                self.renamed = Some((now, 0));
+                return true;
+            }
+        };
+        let passed = now.saturating_duration_since(since);
+        let wait = match times.checked_sub(1) {
+            Some(again) => RENAME_AFTER * (1_u32 << again.min(MOST_DOUBLINGS)),
+            None => Duration::ZERO,
+        };
+        if passed < wait {
+            return false;
+        }
+        let forgiven = passed >= RENAME_AFTER * (1_u32 << MOST_DOUBLINGS);
+        let times = if forgiven { 1 } else { times.saturating_add(1) };
+        self.renamed = Some((now, times));
+        true
+    }
+
     /// Whether the writer has just been silent for `timeout`. True once per silence.
     pub(crate) fn fell_silent(&mut self, now: Instant, timeout: Duration) -> bool {
         let fell = !self.silent && now.saturating_duration_since(self.heard) >= timeout;
         self.silent |= fell;
+        if fell {
+            // Who comes back may send something else.
+            self.shape = None;
+        }
         fell
     }
 
@@ -274,6 +307,9 @@ impl Reader {
 
 /// Samples whose repetitions are known: as many as a writer keeps.
 const MAX_KNOWN: usize = MAX_KEPT;
+/// How long the second other word on what a topic is has to wait for, and how often that is doubled.
+const RENAME_AFTER: Duration = Duration::from_secs(10);
+const MOST_DOUBLINGS: u32 = 8;
 /// A quarter of the sequence numbers' range.
 const QUARTER: u16 = 0x4000;
 /// From here on a number counts as behind the last one.

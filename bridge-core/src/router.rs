@@ -117,9 +117,12 @@ impl Router {
         let held = match &mut entry.role {
             Role::Theirs(reader) => {
                 reader.forget_all();
-                reader.held.take()
+                let held = reader.held.take();
+                self.drop_deliveries(topic, "its local type is another now");
+                held
             }
             Role::Ours(_) => {
+                entry.bound = Some((Arc::clone(message_type), selection.clone()));
                 self.describe(topic, (message_type, selection), now);
                 None
             }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use mappings::Overflow;
-use messages::Plan;
+use messages::{MessageType, Plan, Selection};
 
 use crate::counters::Counters;
 use crate::description::Description;
@@ -22,6 +22,8 @@ pub(crate) struct Topic {
     /// How its bytes become fields or the other way. `None` until the local type is known, and for a local side
     /// that speaks in fields.
     pub(crate) plan: Option<Plan>,
+    /// What the plan of a topic of our own space was made of.
+    pub(crate) bound: Option<(Arc<MessageType>, Selection)>,
     /// For bytes of the other ROS, what makes them ours, or why nothing does.
     pub(crate) transcoder: Option<Box<Result<Transcoder, String>>>,
     pub(crate) queue: Queue<Item>,
@@ -80,6 +82,7 @@ impl Topic {
         Self {
             role,
             plan: None,
+            bound: None,
             transcoder: None,
             queue: Queue::new(overflow),
             sending: None,

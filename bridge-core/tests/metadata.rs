@@ -336,6 +336,46 @@ fn who_does_not_send_the_values_does_not_say_what_they_are() {
 }
 
 #[test]
+fn a_topic_that_is_said_to_be_now_this_and_now_that_is_told_of_ever_more_rarely() {
+    let (mut writer, mut reader, mut now) = (Bridge::new(1, ""), Bridge::new(2, ""), clock());
+    let [vector, point] = ["geometry_msgs/Vector3", "geometry_msgs/Point"];
+    writer.bind("ua_1_5_10", vector, &Selection::Whole, now);
+    writer.say("ua_1_5_10", &[0; 24], now);
+    let sent = writer.sent_within(SECOND / 2, &mut now);
+    reader.hear(&writer, &sent, now);
+    let mut is_told = |kind: &str, now: &mut Now| {
+        // Anybody who sends under the writer's address.
+        let mut spoofed = Bridge::new(1, "");
+        spoofed.bind("ua_1_5_10", kind, &Selection::Whole, *now);
+        let said = spoofed.sent_within(SECOND / 2, now);
+        assert_eq!(announced(&said), 1);
+        let refused = reader.refused();
+        reader.hear(&spoofed, &said, *now);
+        let told = reader.told(*now).into_iter();
+        let told: Vec<_> = told.filter_map(|(_, what)| what).collect();
+        let names: Vec<String> = told.iter().map(|d| d.message_type.to_string()).collect();
+        (names, reader.refused() - refused)
+    };
+    let taken = |kind: &str| (vec![kind.to_owned()], 0);
+    let nothing = Vec::<String>::new();
+    // The first word came with the value, and the next is taken at once.
+    let first = is_told(vector, &mut now);
+    assert_eq!(first, taken(vector));
+    assert_eq!(is_told(point, &mut now), taken(point));
+    assert_eq!(is_told(vector, &mut now), (nothing.clone(), 1));
+    assert_eq!(is_told(point, &mut now), (nothing.clone(), 0), "as it is");
+    let later = now.monotonic + SECOND * 10;
+    advance(&mut now, later);
+    assert_eq!(is_told(vector, &mut now), taken(vector));
+    let later = now.monotonic + SECOND * 10;
+    advance(&mut now, later);
+    assert_eq!(is_told(point, &mut now), (nothing, 1), "twice as long");
+    let later = now.monotonic + SECOND * 10;
+    advance(&mut now, later);
+    assert_eq!(is_told(point, &mut now), taken(point));
+}
+
+#[test]
 fn what_does_not_fit_the_values_is_not_believed() {
     let (mut writer, mut reader, mut now) = (Bridge::new(1, ""), Bridge::new(2, ""), clock());
     writer.bind("ua_1_5_10", "std_msgs/UInt32", &Selection::Whole, now);

@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use bridge_core::{Heard, Local, Now, Output, Reason, Router, Settings};
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{Dialect, Registry, Selection};
+use uadp::discovery::{Announced, Announcement};
 use uadp::{NetworkMessage, Scalar, Timestamp, Variant};
 
 struct Bench {
@@ -77,6 +78,26 @@ impl Bench {
             latched_by: None,
         };
         let _verdict = self.router.handle_local(heard, self.now);
+    }
+
+    /// Writers whose DataSetMetaData goes out within two seconds.
+    fn announced(&mut self) -> Vec<u16> {
+        let mut announced = Vec::new();
+        for _ in 0..20 {
+            self.wait(Duration::from_millis(100));
+            while let Some(output) = self.router.poll_output(self.now) {
+                let Output::Discovery { bytes } = output else {
+                    continue;
+                };
+                let message = NetworkMessage::decode(&bytes).unwrap();
+                let announcement = Announcement::decode(&message).unwrap();
+                if let Announced::DataSetMetaData { writer_id, .. } = announcement.announced {
+                    announced.push(writer_id);
+                }
+            }
+        }
+        announced.sort_unstable();
+        announced
     }
 
     /// Writer, sequence number and value of what goes out; a keep-alive has none.
@@ -159,6 +180,20 @@ fn a_queue_a_rule_and_a_period_change_without_a_new_binding() {
         .replace_mapping(mapping(once, quick), bench.now);
     bench.wait(Duration::from_millis(100));
     assert_eq!(bench.sent(), [(1, 5, Some(3))]);
+}
+
+#[test]
+fn what_is_said_of_a_value_is_announced_anew_where_the_mapping_says_something_else() {
+    let unit = |unit: &str| mapping(&format!(", unit: {unit}"), "metadata_period: 30min");
+    let mut bench = Bench::new(unit("m"));
+    assert_eq!(bench.announced(), [1, 2]);
+    bench.router.replace_mapping(unit("m"), bench.now);
+    assert_eq!(bench.announced(), [0; 0]);
+    bench.router.replace_mapping(unit("mm"), bench.now);
+    assert_eq!(bench.announced(), [1]);
+    bench.router.unbind(topic(1), bench.now);
+    bench.router.replace_mapping(unit("m"), bench.now);
+    assert_eq!(bench.announced(), [0; 0], "it is tied to nothing");
 }
 
 #[test]

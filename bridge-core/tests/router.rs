@@ -143,11 +143,15 @@ impl Frame {
     }
 
     fn bytes(&self) -> Vec<u8> {
+        self.bytes_with(&Variant::Scalar(Scalar::UInt32(self.value)))
+    }
+
+    fn bytes_with(&self, value: &Variant<'_>) -> Vec<u8> {
         let mut bytes = Vec::new();
         let mut message =
             NetworkMessageEncoder::new(&mut bytes, &self.network(), Some(&[self.writer])).unwrap();
         let mut frame = message.key_frame(&self.header).unwrap();
-        frame.scalar(Scalar::UInt32(self.value)).unwrap();
+        frame.variant(value).unwrap();
         frame.finish().unwrap();
         message.finish().unwrap();
         bytes
@@ -304,6 +308,42 @@ fn a_value_waits_for_its_type_and_then_goes_out() {
         [42],
         "the newest one"
     );
+}
+
+#[test]
+fn a_topic_whose_first_value_is_null_gets_the_type_of_the_first_that_is_not() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    let double = Variant::Scalar(Scalar::Double(1.5));
+    let mut asked = Vec::new();
+    for (sequence, value) in [(1, Variant::Null), (2, double)] {
+        bench.hear(&Frame::new(10, sequence, 0).bytes_with(&value));
+        for output in bench.outputs() {
+            if let Output::Unbound { shape, .. } = output {
+                asked.push(shape);
+            }
+        }
+        bench.wait(SECOND);
+    }
+    assert_eq!(
+        asked,
+        [
+            [(BuiltinType::Variant, false)],
+            [(BuiltinType::Double, false)]
+        ]
+    );
+    bench.bind(topic("ua_2_5_10"), "std_msgs/Float64");
+    let deliveries = bench.deliveries();
+    assert_eq!(deliveries[0].payload[..], 1.5_f64.to_le_bytes());
+}
+
+#[test]
+fn what_waits_in_the_type_that_was_is_not_delivered_and_is_counted() {
+    let mut bench = Bench::new(1, Local::Ros1);
+    bench.bind(topic("ua_2_5_10"), "std_msgs/UInt32");
+    bench.hear(&Frame::new(10, 1, 42).bytes());
+    bench.bind(topic("ua_2_5_10"), "std_msgs/String");
+    assert!(bench.deliveries().is_empty());
+    assert_eq!(bench.dropped(Reason::NotPublished), 1);
 }
 
 #[test]

@@ -292,6 +292,8 @@ impl MappingFile {
             Ok(reading) => reading,
             Err(why) => {
                 self.refuse(why);
+                // The same text, once it can be read again, is no longer stale.
+                self.hash.clear();
                 return true;
             }
         };

@@ -405,7 +405,9 @@ impl Ros1Port {
         ros_topic: String,
         (topic, expected, selection): (TopicId, Option<TypeName>, Selection),
     ) {
-        if self.sources.len() >= MAX_TOPICS {
+        // Those that were given up leave their place behind.
+        let read = self.sources.iter().filter(|s| !s.values.is_empty());
+        if read.count() >= MAX_TOPICS {
             self.tell_once("", "too many topics", || {
                 format!("more than {MAX_TOPICS} topics of this space: the rest is left alone")
             });
@@ -553,6 +555,17 @@ impl Ros1Port {
         }
     }
 
+    /// Whether the type of a topic is another than the Router knows by now: what it wrote is still in the old one.
+    fn type_changes(&self, topic: TopicId) -> bool {
+        self.events.iter().any(|event| {
+            matches!(
+                event,
+                PortEvent::Bound { topic: other, .. } | PortEvent::Unbound { topic: other }
+                    if *other == topic
+            )
+        })
+    }
+
     /// Logs something about a topic the first time it happens.
     fn tell_once(&mut self, topic: &str, what: &'static str, message: impl FnOnce() -> String) {
         if self.told.len() < MAX_TOLD && self.told.insert((topic.to_owned(), what)) {
@@ -587,6 +600,9 @@ impl Port for Ros1Port {
     }
 
     fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
+        if self.type_changes(sample.topic) {
+            return Err(TYPE_CHANGES);
+        }
         if sample.status & STATUS_BAD != 0 {
             return Err("bad status");
         }
@@ -729,6 +745,8 @@ fn latch_key(instance: Timestamp) -> u64 {
     u64::try_from(instance.unix_nanos()).unwrap_or_default()
 }
 
+/// Why a value is not written while its topic goes over to another type.
+const TYPE_CHANGES: &str = "type changes";
 /// The severity bit of a Bad StatusCode (OPC 10000-4, 7.39.1) in its upper 16 bits.
 const STATUS_BAD: u16 = 0x8000;
 /// Topics of the space that are read, and likewise written: anybody in the graph can invent names.

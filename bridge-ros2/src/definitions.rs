@@ -68,7 +68,10 @@ impl Definitions {
         let described = Described {
             hash,
             message_type,
-            types: types.to_vec(),
+            types: DescribedType::needed(name, types)
+                .into_iter()
+                .cloned()
+                .collect(),
         };
         self.described.insert(name.clone(), described);
         self.known.learned(name, from);

@@ -203,14 +203,6 @@ impl Program for BridgeRos2 {
 
     const NAME: &'static str = "bridge-ros2";
     const LOCAL: Local = Local::Cdr;
-    // On leaving a domain RustDDS reports errors that mean nothing, and at all times much that only its authors need.
-    // Of security it reports what a stranger sends, each time; the port tells of strangers, once.
-    const QUIET: &'static str = if cfg!(feature = "security") {
-        "rustdds=error,rustdds::dds::pubsub=off,rustdds::network=off,rustdds::rtps=off,rustdds::security=off,\
-         rustdds::discovery::secure_discovery=off"
-    } else {
-        "rustdds=error,rustdds::dds::pubsub=off,rustdds::network=off,rustdds::rtps::dp_event_loop=off"
-    };
 
     fn arguments(&self) -> &Arguments {
         &self.arguments

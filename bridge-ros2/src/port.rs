@@ -369,6 +369,17 @@ impl Ros2Port {
         }
     }
 
+    /// Whether the type of a topic is another than the Router knows by now: what it wrote is still in the old one.
+    fn type_changes(&self, topic: TopicId) -> bool {
+        self.events.iter().any(|event| {
+            matches!(
+                event,
+                PortEvent::Bound { topic: other, .. } | PortEvent::Unbound { topic: other }
+                    if *other == topic
+            )
+        })
+    }
+
     /// Logs something about a topic the first time it happens; says whether it was.
     fn tell_once(
         &mut self,
@@ -398,6 +409,9 @@ impl Port for Ros2Port {
             kept,
             ..
         } = sample;
+        if self.type_changes(topic) {
+            return Err(TYPE_CHANGES);
+        }
         if kept == Kept::Again {
             // A writer of depth 1 has no place for more than the last value.
             return Ok(());
@@ -581,6 +595,8 @@ fn dds_time(time: uadp::Timestamp) -> rustdds::Timestamp {
 }
 
 const NANOS: u64 = 1_000_000_000;
+/// Why a value is not written while its topic goes over to another type.
+const TYPE_CHANGES: &str = "type changes";
 /// The severity bit of a Bad StatusCode (OPC 10000-4, 7.39.1) in its upper 16 bits.
 const STATUS_BAD: u16 = 0x8000;
 /// Topics of the space that are read, and likewise written: anybody in the domain can invent names.

@@ -1,6 +1,6 @@
 //! What has been found so far.
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 use std::sync::Arc;
 
 use crate::code::Code;
@@ -20,7 +20,7 @@ pub(crate) struct Findings {
     /// Values that are not there, so that nothing can be said of them.
     unknown: HashSet<Place>,
     /// Values out of the environment, which are nobody's to read, and what stands for them.
-    secrets: Vec<(String, String)>,
+    secrets: BTreeMap<String, String>,
     errors: usize,
     left_out: usize,
 }
@@ -32,7 +32,7 @@ impl Findings {
             found: Vec::new(),
             seen: HashSet::new(),
             unknown: HashSet::new(),
-            secrets: Vec::new(),
+            secrets: BTreeMap::new(),
             errors: 0,
             left_out: 0,
         }
@@ -69,7 +69,7 @@ impl Findings {
     /// Does not let `value` be read in what is told: `written` stands for it.
     pub(crate) fn hide(&mut self, value: String, written: String) {
         if value != written && !value.is_empty() {
-            self.secrets.push((value, written));
+            self.secrets.entry(value).or_insert(written);
         }
     }
 
@@ -140,13 +140,13 @@ impl Findings {
             .sort_by_key(|(file, found)| (*file, found.at.line, found.at.column, found.code));
         let mut all: Vec<Diagnostic> = self.found.into_iter().map(|(_, found)| found).collect();
         // The longest first, of which another may be a part.
-        self.secrets
-            .sort_by_key(|(value, _)| std::cmp::Reverse(value.len()));
+        let mut secrets: Vec<(String, String)> = self.secrets.into_iter().collect();
+        secrets.sort_by_key(|(value, _)| std::cmp::Reverse(value.len()));
         for found in &mut all {
             let texts = [&mut found.label, &mut found.help];
             let texts = texts.into_iter().flatten().chain([&mut found.message]);
             for text in texts {
-                *text = hidden(text, &self.secrets);
+                *text = hidden(text, &secrets);
             }
         }
         if self.left_out > 0 {
@@ -184,9 +184,10 @@ impl Findings {
 fn hidden(text: &str, secrets: &[(String, String)]) -> String {
     let mut text = text.to_owned();
     for (value, written) in secrets {
-        let cut = short(value);
         if value.len() >= TELLING {
+            let cut = short(value);
             text = text.replace(value.as_str(), written).replace(&cut, written);
+            text = without_beginnings(&text, value, written);
         } else {
             text = text.replace(&format!("`{value}`"), &format!("`{written}`"));
         }
@@ -194,6 +195,36 @@ fn hidden(text: &str, secrets: &[(String, String)]) -> String {
     text
 }
 
+/// A text without beginnings of a value that end where the text around them was cut.
+fn without_beginnings(text: &str, value: &str, written: &str) -> String {
+    let beginnings = || {
+        let ends = value.char_indices().map(|(at, _)| at);
+        ends.skip_while(|at| *at < TELLING)
+            .take(MOST_CUT)
+            .filter_map(move |at| value.get(..at))
+    };
+    let mut out = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some((before, behind)) = rest.split_once(CUT) {
+        let kept = beginnings().filter_map(|beginning| before.strip_suffix(beginning));
+        match kept.last() {
+            Some(kept) => {
+                out.push_str(kept);
+                out.push_str(written);
+            }
+            None => out.push_str(before),
+        }
+        out.push_str(CUT);
+        rest = behind;
+    }
+    out.push_str(rest);
+    out
+}
+
+/// What stands where a text was cut.
+const CUT: &str = "...";
+/// More characters than are left of a text that was cut.
+const MOST_CUT: usize = 256;
 /// From so many bytes on a value does not occur in a finding by chance.
 const TELLING: usize = 8;
 

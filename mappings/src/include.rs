@@ -18,6 +18,8 @@ pub(crate) struct Loader<'a> {
     /// Where each file was named.
     read: Vec<(String, Place)>,
     bytes: usize,
+    /// Of the values of variables in all files.
+    expanded: usize,
     /// Some file is missing in the whole.
     partial: bool,
     whole: Document,
@@ -32,6 +34,7 @@ impl<'a> Loader<'a> {
             open: Vec::new(),
             read: Vec::new(),
             bytes: 0,
+            expanded: 0,
             partial: false,
             whole: Document::default(),
         }
@@ -66,6 +69,15 @@ impl<'a> Loader<'a> {
         };
         for (value, written) in tree.values {
             self.findings.hide(value, written);
+        }
+        self.expanded = self.expanded.saturating_add(tree.expanded);
+        if self.expanded > MAX_BYTES {
+            let place = Place {
+                file,
+                ..Place::START
+            };
+            self.note(tree::too_expanded(place));
+            return None;
         }
         for fault in tree.faults {
             let place = fault.place;

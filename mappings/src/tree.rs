@@ -4,7 +4,8 @@
 //! takes no more room than its text. The pairs of a merge key (`<<`) are shared likewise, and counted. `${NAME}` in a
 //! scalar is the value of an environment variable. Tags are refused.
 
-use std::collections::{HashMap, HashSet};
+use std::cell::Cell;
+use std::collections::{BTreeMap, HashMap, HashSet};
 use std::rc::Rc;
 
 use granit_parser::{Event, Parser, ScalarStyle, ScanError, Span as Marks};
@@ -14,10 +15,12 @@ use crate::variables;
 
 /// Largest text, in bytes.
 pub(crate) const MAX_BYTES: usize = 4 * 1024 * 1024;
-/// Most nodes a text may hold.
+/// Most nodes a text may hold, with what its merge keys bring.
 const MAX_NODES: usize = 500_000;
 /// Deepest nesting, aliases followed.
 const MAX_DEPTH: usize = 24;
+/// So many bytes of a key that a merge key brings count as one node more.
+const LONG_KEY: usize = 64;
 
 /// Where in the text, counted from 1 in lines and characters, within one line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -87,7 +90,9 @@ pub(crate) struct Tree {
     /// What is wrong with references to variables; the texts they stand in are as written.
     pub(crate) faults: Vec<Fault>,
     /// Values of variables, and what stands for them in the text.
-    pub(crate) values: Vec<(String, String)>,
+    pub(crate) values: BTreeMap<String, String>,
+    /// How many bytes the values of variables come to, each time that one is named.
+    pub(crate) expanded: usize,
 }
 
 /// Reads the text of a file, whose number all places have. `variable` looks up the environment.
@@ -111,12 +116,7 @@ fn read(text: &str, variable: &dyn Fn(&str) -> Option<String>, file: u16) -> Res
             "the document has {} bytes; at most {MAX_BYTES} are read",
             text.len()
         );
-        return Err(Fault {
-            code: Code::TooLarge,
-            place: Place::START,
-            message,
-            help: None,
-        });
+        return Err(too_large(Place::START, message));
     }
     let options = granit_parser::options! {
         emit_comments: false,
@@ -131,7 +131,8 @@ fn read(text: &str, variable: &dyn Fn(&str) -> Option<String>, file: u16) -> Res
         documents: 0,
         nodes: 0,
         faults: Vec::new(),
-        values: Vec::new(),
+        values: BTreeMap::new(),
+        expanded: 0,
         variable,
     };
     for event in Parser::new_from_str_with_options(text, options) {
@@ -165,6 +166,7 @@ fn read(text: &str, variable: &dyn Fn(&str) -> Option<String>, file: u16) -> Res
         root,
         faults: builder.faults,
         values: builder.values,
+        expanded: builder.expanded,
     })
 }
 
@@ -175,7 +177,8 @@ struct Builder<'v> {
     documents: usize,
     nodes: usize,
     faults: Vec<Fault>,
-    values: Vec<(String, String)>,
+    values: BTreeMap<String, String>,
+    expanded: usize,
     variable: &'v dyn Fn(&str) -> Option<String>,
 }
 
@@ -203,7 +206,7 @@ impl Builder<'_> {
                 Ok(())
             }
             Event::Scalar(text, style, anchor, _) => {
-                let text = self.expand(text.into_owned(), place);
+                let text = self.expand(text.into_owned(), place)?;
                 let null = style == ScalarStyle::Plain
                     && matches!(&*text, "" | "~" | "null" | "Null" | "NULL");
                 let kind = if null { Kind::Null } else { Kind::Scalar(text) };
@@ -268,7 +271,7 @@ impl Builder<'_> {
             while let (Some(key), Some(value)) = (children.next(), children.next()) {
                 pairs.push((key, value));
             }
-            Kind::Map(self.merge(pairs))
+            Kind::Map(self.merge(pairs)?)
         } else {
             Kind::List(open.children)
         };
@@ -276,13 +279,26 @@ impl Builder<'_> {
     }
 
     /// A scalar with the values of the variables it names.
-    fn expand(&mut self, text: String, place: Place) -> String {
+    fn expand(&mut self, text: String, place: Place) -> Result<String, Fault> {
         if !text.contains("${") {
-            return text;
+            return Ok(text);
         }
-        match variables::expand(&text, self.variable) {
+        let taken = Cell::new(0_usize);
+        let variable = |name: &str| {
+            let value = (self.variable)(name)?;
+            taken.set(taken.get().saturating_add(value.len()));
+            Some(value)
+        };
+        let expanded = variables::expand(&text, &variable);
+        self.expanded = self.expanded.saturating_add(taken.get());
+        if self.expanded > MAX_BYTES {
+            return Err(too_expanded(place));
+        }
+        Ok(match expanded {
             Ok((expanded, values)) => {
-                self.values.extend(values);
+                for (value, written) in values {
+                    self.values.entry(value).or_insert(written);
+                }
                 expanded
             }
             Err((message, help)) => {
@@ -294,24 +310,25 @@ impl Builder<'_> {
                 });
                 text
             }
-        }
+        })
     }
 
     /// The pairs of a map with those its merge keys bring: of a key that stands in the map itself that value, else that of
     /// the first map that has it.
-    fn merge(&mut self, pairs: Pairs) -> Pairs {
+    fn merge(&mut self, pairs: Pairs) -> Result<Pairs, Fault> {
         let is_merge = |(key, _): &(Rc<Node>, Rc<Node>)| matches!(&key.kind, Kind::Scalar(text) if text == "<<");
         if !pairs.iter().any(is_merge) {
-            return pairs;
+            return Ok(pairs);
         }
         let (merges, mut own): (Pairs, Pairs) = pairs.into_iter().partition(is_merge);
         let mut known: HashSet<String> = own.iter().filter_map(|(key, _)| name(key)).collect();
-        for (_, value) in merges {
+        for (merge, value) in &merges {
             let maps = match &value.kind {
-                Kind::List(maps) => maps.clone(),
-                Kind::Map(_) | Kind::Scalar(_) | Kind::Null => vec![Rc::clone(&value)],
+                Kind::List(maps) => maps.as_slice(),
+                Kind::Map(_) | Kind::Scalar(_) | Kind::Null => std::slice::from_ref(value),
             };
             for map in maps {
+                self.count(1, merge.place)?;
                 let Kind::Map(brought) = &map.kind else {
                     self.faults.push(Fault {
                         code: Code::MergeKey,
@@ -324,14 +341,29 @@ impl Builder<'_> {
                     continue;
                 };
                 for (key, value) in brought {
-                    if name(key).is_some_and(|name| known.insert(name)) {
-                        self.nodes += 1;
+                    let Kind::Scalar(text) = &key.kind else {
+                        self.count(1, merge.place)?;
+                        continue;
+                    };
+                    // Also those that are there already: looking for them is the work.
+                    self.count(1 + text.len() / LONG_KEY, merge.place)?;
+                    if !known.contains(text) {
+                        known.insert(text.clone());
                         own.push((Rc::clone(key), Rc::clone(value)));
                     }
                 }
             }
         }
-        own
+        Ok(own)
+    }
+
+    /// Takes so many more nodes in, if there is room for them.
+    fn count(&mut self, nodes: usize, place: Place) -> Result<(), Fault> {
+        self.nodes = self.nodes.saturating_add(nodes);
+        if self.nodes > MAX_NODES {
+            return Err(too_large(place, format!("more than {MAX_NODES} values")));
+        }
+        Ok(())
     }
 
     fn close(
@@ -350,24 +382,32 @@ impl Builder<'_> {
 
     /// Puts a finished node where it belongs.
     fn place(&mut self, node: Rc<Node>, place: Place) -> Result<(), Fault> {
-        self.nodes += 1;
-        let message = if self.nodes > MAX_NODES {
-            format!("more than {MAX_NODES} values")
-        } else if self.open.len() + node.depth > MAX_DEPTH {
-            format!("values nest deeper than {MAX_DEPTH} levels")
-        } else {
-            match self.open.last_mut() {
-                Some(open) => open.children.push(node),
-                None => self.root = Some(node),
-            }
-            return Ok(());
-        };
-        Err(Fault {
-            code: Code::TooLarge,
-            place,
-            message,
-            help: None,
-        })
+        self.count(1, place)?;
+        if self.open.len() + node.depth > MAX_DEPTH {
+            let message = format!("values nest deeper than {MAX_DEPTH} levels");
+            return Err(too_large(place, message));
+        }
+        match self.open.last_mut() {
+            Some(open) => open.children.push(node),
+            None => self.root = Some(node),
+        }
+        Ok(())
+    }
+}
+
+/// That values of variables come to more than a document may have.
+pub(crate) fn too_expanded(place: Place) -> Fault {
+    let message =
+        format!("the values of its environment variables have more than {MAX_BYTES} bytes");
+    too_large(place, message)
+}
+
+fn too_large(place: Place, message: String) -> Fault {
+    Fault {
+        code: Code::TooLarge,
+        place,
+        message,
+        help: None,
     }
 }
 

@@ -218,6 +218,40 @@ fn what_the_environment_says_is_not_told() {
 }
 
 #[test]
+fn the_beginning_of_a_value_that_is_cut_is_not_told() {
+    let secret = "hunter2-".repeat(6);
+    let text = format!(
+        "{HEAD}variables:\n  - node: \"a node whose id is written in many words: ${{KEY}}\"\n    name: A\n    type: Double\n    origin: 1\n"
+    );
+    let checked = Beside::default().set("KEY", &secret).check(&text);
+    let rendered = checked.render_all();
+    assert!(rendered.contains("${KEY}..."), "{rendered}");
+    assert!(!rendered.contains("hunter2"), "{rendered}");
+}
+
+#[test]
+fn values_of_the_environment_have_no_more_bytes_than_a_document() {
+    let value = "x".repeat(60_000);
+    let beside = Beside::default().set("LONG", &value);
+    let many = |times: usize| format!("a: [{}]\n", "\"${LONG}\", ".repeat(times));
+    let checked = beside.check(&many(100));
+    let codes: Vec<Code> = checked.findings.iter().map(|one| one.code).collect();
+    assert_eq!(codes, [Code::TooLarge], "{}", checked.render_all());
+    let checked = beside.check(&many(10));
+    let mut codes = checked.findings.iter().map(|one| one.code);
+    assert!(!codes.any(|code| code == Code::TooLarge));
+    // Those of all files count together.
+    let halves = ["a", "b"].into_iter().fold(Beside::default(), |all, name| {
+        all.file(&format!("plant/{name}.yaml"), &many(40))
+    });
+    let checked = halves
+        .set("LONG", &value)
+        .check("include: [a.yaml, b.yaml]\n");
+    let codes: Vec<Code> = checked.findings.iter().map(|one| one.code).collect();
+    assert!(codes.contains(&Code::TooLarge), "{}", checked.render_all());
+}
+
+#[test]
 fn anchors_aliases_and_merge_keys_share_what_they_name() {
     let text = format!(
         "{HEAD}variables:\n  - &joint\n    node: ns=2;i=1\n    name: A\n    type: Double\n    origin: 1\n    queue: &events \
@@ -254,4 +288,14 @@ fn merge_keys_upon_merge_keys_are_bounded() {
     let checked = Beside::default().check(&text);
     assert_eq!(checked.findings.len(), 1, "{}", checked.render_all());
     assert_eq!(checked.findings[0].code, Code::TooLarge);
+}
+
+#[test]
+fn a_map_that_is_merged_again_and_again_counts_each_time() {
+    let keys: String = (0..1000).map(|key| format!("k{key}: 1, ")).collect();
+    let again = "*x, ".repeat(1000);
+    let checked = Beside::default().check(&format!("x: &x {{{keys}}}\ny: {{<<: [{again}]}}\n"));
+    assert_eq!(checked.findings.len(), 1, "{}", checked.render_all());
+    assert_eq!(checked.findings[0].code, Code::TooLarge);
+    assert_eq!(checked.findings[0].at.line, 2);
 }

@@ -646,3 +646,21 @@ fn the_sizes_of_datagrams_and_messages_are_held_to_what_udp_and_chunks_carry() {
         assert!(checked(text).is_none(), "{text}");
     }
 }
+
+#[test]
+fn a_binding_has_a_thousand_fields_at_most() {
+    let with = |count: usize| {
+        let fields = "linear.x, ".repeat(count);
+        let text = format!(
+            "{HEAD}  - {{node: ns=2;i=1, name: A, origin: 1, ros: {{topic: /a, type: geometry_msgs/Twist, fields: [{fields}]}}}}\n"
+        );
+        let checked = Mapping::from_yaml(&text, "cell.yaml");
+        let found = checked.findings.iter();
+        found
+            .map(|one| (one.code, one.message.clone()))
+            .collect::<Vec<_>>()
+    };
+    let told = |message: &str| vec![(Code::Fields, message.to_owned())];
+    assert_eq!(with(1001), told("`fields` names 1001 fields"));
+    assert_eq!(with(1000), told("`linear.x` is named twice"));
+}

@@ -35,20 +35,59 @@ pub struct DescribedField {
     pub nested: String,
 }
 
+impl DescribedType {
+    /// Of what somebody tells, the type `name` and what it needs: itself first, then the others in the order of their
+    /// names. What is not told is left out.
+    #[must_use]
+    pub fn needed<'t>(name: &TypeName, types: &'t [Self]) -> Vec<&'t Self> {
+        let mut told: BTreeMap<TypeName, &'t Self> = types
+            .iter()
+            .filter_map(|one| Some((one.name.parse::<TypeName>().ok()?, one)))
+            .collect();
+        let mut needed = BTreeMap::new();
+        let Some(first) = told.remove(name) else {
+            return Vec::new();
+        };
+        let mut open = vec![first];
+        while let Some(one) = open.pop() {
+            let nested = one.fields.iter().filter(|field| !field.nested.is_empty());
+            for inner in nested.filter_map(|field| field.nested.parse::<TypeName>().ok()) {
+                if let Some(found) = told.remove(&inner) {
+                    needed.insert(inner, found);
+                    open.push(found);
+                }
+            }
+        }
+        std::iter::once(first).chain(needed.into_values()).collect()
+    }
+}
+
 impl Registry {
     /// The type `name` as a description has it, with all it needs. Its type hash tells whether it is the one somebody
-    /// announced; the registry keeps the definitions of names new to it when it is `expected`.
+    /// announced; the registry keeps the definitions of names new to it when it is `expected`. What the type does not need
+    /// is not looked at.
     ///
     /// # Errors
-    /// [`DefinitionError`]; a hash that is not `expected` is [`DefinitionError::OtherHash`], and nothing is kept.
+    /// [`DefinitionError`], also for more than 512 types or 4096 fields in all; a hash that is not `expected` is
+    /// [`DefinitionError::OtherHash`], and nothing is kept.
     pub fn add_described(
         &mut self,
         name: &TypeName,
         types: &[DescribedType],
         expected: TypeHash,
     ) -> Result<Arc<MessageType>, DefinitionError> {
+        let fields = types.iter().map(|one| one.fields.len());
+        let fields = fields.fold(0, usize::saturating_add);
+        if types.len() > MOST_TYPES || fields > MOST_FIELDS {
+            return Err(DefinitionError::Syntax {
+                name: name.clone(),
+                line: 1,
+                reason: "a description of more types or fields than any message needs",
+                text: format!("{} types with {fields} fields", types.len()),
+            });
+        }
         let mut described = Self::empty(Dialect::Ros2);
-        for one in types.iter().take(MOST_TYPES) {
+        for one in DescribedType::needed(name, types) {
             let made = definition(name, one)?;
             described
                 .definitions
@@ -159,6 +198,8 @@ fn written(field: &DescribedField) -> Option<String> {
 
 /// More types than any message needs.
 const MOST_TYPES: usize = 512;
+/// More fields than they have together.
+const MOST_FIELDS: usize = 4096;
 
 #[cfg(test)]
 mod tests {
@@ -214,6 +255,42 @@ mod tests {
         described.fields[0].nested = "robot_msgs/msg/Arm".to_owned();
         let cyclic = registry.add_described(&name, &[described], bool_hash);
         assert!(matches!(cyclic, Err(DefinitionError::Cyclic { .. })));
+    }
+
+    #[test]
+    fn nothing_is_kept_that_the_type_does_not_need_and_no_more_is_read_than_a_message_has() {
+        let registry = Registry::bundle(Dialect::Ros2);
+        let [twist, stray, other]: [TypeName; 3] =
+            ["geometry_msgs/Twist", "robot_msgs/Stray", "std_msgs/Bool"]
+                .map(|name| name.parse().unwrap());
+        let hash = registry.type_hash(&twist).unwrap();
+        let mut described = registry.describe(&twist).unwrap();
+        let alone = described.clone();
+        described.extend(registry.describe(&other).unwrap());
+        described.push(DescribedType {
+            name: "robot_msgs/msg/Stray".to_owned(),
+            fields: Vec::new(),
+        });
+        let needed = DescribedType::needed(&twist, &described);
+        assert!(needed.into_iter().eq(&alone));
+        let mut empty = Registry::empty(Dialect::Ros2);
+        empty.add_described(&twist, &described, hash).unwrap();
+        for name in [&stray, &other] {
+            assert!(empty.get(name).is_err(), "{name}");
+        }
+        assert!(empty.get(&"geometry_msgs/Vector3".parse().unwrap()).is_ok());
+
+        let field = alone[0].fields[0].clone();
+        let many_fields = DescribedType {
+            name: "robot_msgs/msg/Stray".to_owned(),
+            fields: vec![field; MOST_FIELDS],
+        };
+        let many_types = vec![described.pop().unwrap(); MOST_TYPES];
+        for too_many in [vec![many_fields], many_types] {
+            let all = [alone.clone(), too_many].concat();
+            let refused = Registry::empty(Dialect::Ros2).add_described(&twist, &all, hash);
+            assert!(matches!(refused, Err(DefinitionError::Syntax { .. })));
+        }
     }
 
     #[test]

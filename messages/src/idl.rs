@@ -465,6 +465,15 @@ fn tokens(text: &str) -> Parsed<Vec<Token<'_>>> {
             _ if first.is_ascii_digit() || first == '.' => Some(TokenKind::Number),
             _ => Some(TokenKind::Mark),
         };
+        if let Some(TokenKind::Word | TokenKind::Number) = kind
+            && taken.len() > LONGEST
+        {
+            return Err(Fault {
+                line,
+                reason: "a name or number of at most 255 bytes expected",
+                text: taken.to_owned(),
+            });
+        }
         if let Some(kind) = kind {
             found.push(Token {
                 kind,
@@ -513,6 +522,8 @@ fn length(rest: &str, first: char) -> Option<usize> {
 
 /// Modules in modules; those of ROS are two deep, and three for constants.
 const DEEPEST: usize = 16;
+/// Bytes of a name or number; file systems give the files of types no more.
+const LONGEST: usize = 255;
 
 #[cfg(test)]
 mod tests {
@@ -622,6 +633,14 @@ module robot_msgs {
             ),
             ("double x; double x;", "the field is defined twice"),
             ("\"x", "a quote or comment that does not end"),
+            (
+                format!("double {};", "x".repeat(256)).as_str(),
+                "a name or number of at most 255 bytes expected",
+            ),
+            (
+                format!("double x[{}];", "1".repeat(256)).as_str(),
+                "a name or number of at most 255 bytes expected",
+            ),
         ] {
             let text = format!("module p {{ module msg {{\nstruct T {{\n{member} }};\n}}; }};");
             let error = Registry::empty(Dialect::Ros2)

@@ -119,7 +119,7 @@ impl Walk {
                 let package = Package::of(&around.canonicalize()?);
                 self.folder_of(&package, (path, Some(kind)), &mut found);
             }
-            _ => self.walk(path, crate::DEEPEST, true, &mut found),
+            _ => self.walk(path, (crate::DEEPEST, true), None, &mut found),
         }
         Ok(found)
     }
@@ -127,18 +127,32 @@ impl Walk {
     /// The definitions of the packages at or below a folder. Packages hold no packages.
     pub(crate) fn packages(&mut self, root: &Path, depth: usize) -> Vec<DefinitionFile> {
         let mut found = Vec::new();
-        self.walk(root, depth, false, &mut found);
+        self.walk(root, (depth, false), None, &mut found);
         found
     }
 
-    fn walk(&mut self, folder: &Path, depth: usize, loose: bool, found: &mut Vec<DefinitionFile>) {
+    /// `only` is the only ROS that looks at the folder.
+    fn walk(
+        &mut self,
+        folder: &Path,
+        (depth, loose): (usize, bool),
+        only: Option<Dialect>,
+        found: &mut Vec<DefinitionFile>,
+    ) {
         let Some(entries) = self.entries(folder) else {
             return;
         };
         let holds = |name: &str| entries.iter().any(|entry| entry.ends_with(name));
-        if IGNORED.into_iter().any(holds) {
-            return;
-        }
+        let hides = |dialect: Dialect| {
+            let other = only.is_some_and(|only| only != dialect);
+            other || ignored(dialect).iter().any(|name| holds(name))
+        };
+        let only = match (hides(Dialect::Ros1), hides(Dialect::Ros2)) {
+            (true, true) => return,
+            (true, false) => Some(Dialect::Ros2),
+            (false, true) => Some(Dialect::Ros1),
+            (false, false) => None,
+        };
         let folders: Vec<&PathBuf> = entries
             .iter()
             .filter(|entry| is_real_folder(entry))
@@ -148,16 +162,24 @@ impl Walk {
             .filter_map(|path| Some((path.as_path(), kind_of(path)?)))
             .collect();
         let is_package = holds(MANIFEST);
+        let mut here = Vec::new();
         if loose || is_package || !kinds.is_empty() {
             let named = folder.canonicalize();
             let package = Package::of(named.as_deref().unwrap_or(folder));
             for (path, kind) in &kinds {
-                self.folder_of(&package, (path, Some(*kind)), found);
+                self.folder_of(&package, (path, Some(*kind)), &mut here);
             }
             if loose {
-                self.files_of(&package, &entries, None, found);
+                self.files_of(&package, &entries, None, &mut here);
             }
         }
+        if let Some(only) = only {
+            here.retain(|file| file.of(only));
+            for file in &mut here {
+                file.only = Some(only);
+            }
+        }
+        found.append(&mut here);
         if is_package && !loose {
             return;
         }
@@ -166,7 +188,7 @@ impl Walk {
         };
         for below in folders {
             if kind_of(below).is_none() && !is_hidden(below) {
-                self.walk(below, depth, loose, found);
+                self.walk(below, (depth, loose), only, found);
             }
         }
     }
@@ -226,8 +248,14 @@ fn kind_of(folder: &Path) -> Option<TextKind> {
     TextKind::ALL.into_iter().find(|kind| kind.word() == name)
 }
 
-/// Files that say that a folder is not to be looked at, and nothing below it.
-const IGNORED: [&str; 3] = ["CATKIN_IGNORE", "AMENT_IGNORE", "COLCON_IGNORE"];
+/// Files that say to the tools of one ROS that a folder is not to be looked at, and nothing below it.
+const fn ignored(dialect: Dialect) -> &'static [&'static str] {
+    match dialect {
+        Dialect::Ros1 => &["CATKIN_IGNORE"],
+        Dialect::Ros2 => &["AMENT_IGNORE", "COLCON_IGNORE"],
+    }
+}
+
 /// Folders looked at; a large installation has some thousands.
 const MOST_FOLDERS: usize = 20_000;
 /// Definitions; a large installation has some thousands.

@@ -86,7 +86,7 @@ impl Surroundings for Disk {
 /// A file that is no longer than a mapping may be, or its beginning, which has a finding (M002).
 fn read_mapping(file: &str) -> Result<String, String> {
     let mut text = Vec::new();
-    let file = File::open(file).map_err(|error| error.to_string())?;
+    let file = open(Path::new(file)).map_err(|error| error.to_string())?;
     let length = file
         .take(MOST_OF_A_MAPPING)
         .read_to_end(&mut text)
@@ -262,9 +262,20 @@ fn definition(text: String, path: &Path) -> DefinitionText {
     }
 }
 
+/// A regular file, or a link to one: opening a pipe would wait for whoever writes into it.
+pub(crate) fn open(path: &Path) -> std::io::Result<File> {
+    if path.metadata()?.is_file() {
+        File::open(path)
+    } else {
+        Err(std::io::Error::other(
+            "it is no regular file, or link to one; nothing else is read",
+        ))
+    }
+}
+
 fn read(path: &Path) -> std::io::Result<String> {
     let mut bytes = Vec::new();
-    File::open(path)?.take(MOST_BYTES).read_to_end(&mut bytes)?;
+    open(path)?.take(MOST_BYTES).read_to_end(&mut bytes)?;
     // Comments are in any encoding; what counts is ASCII.
     Ok(String::from_utf8_lossy(&bytes).into_owned())
 }

@@ -1,6 +1,5 @@
 //! What `package.xml` says of a package.
 
-use std::fs::File;
 use std::io::Read as _;
 use std::path::Path;
 
@@ -23,7 +22,7 @@ impl Package {
             dialect: None,
         };
         let mut text = String::new();
-        let file = File::open(folder.join(MANIFEST));
+        let file = crate::open(&folder.join(MANIFEST));
         if file
             .and_then(|file| file.take(MOST_BYTES).read_to_string(&mut text))
             .is_err()

@@ -135,7 +135,15 @@ fn an_installation_of_ros_2_is_read_below_share_and_prefers_the_msg_to_the_idl_m
 }
 
 #[test]
-fn what_is_to_be_ignored_is_not_looked_into() {
+fn what_is_no_regular_file_is_not_opened() {
+    for file in ["/dev/null", "/"] {
+        let refused = Disk.read(file).unwrap_err();
+        assert!(refused.contains("no regular file"), "{refused}");
+    }
+}
+
+#[test]
+fn what_one_ros_is_to_ignore_is_only_looked_into_for_the_other() {
     let package =
         "<package><name>robot_msgs</name><buildtool_depend>catkin</buildtool_depend></package>";
     let folder = Folder::new(
@@ -144,9 +152,11 @@ fn what_is_to_be_ignored_is_not_looked_into() {
             ("a/CATKIN_IGNORE", ""),
             ("a/old_msgs/msg/Arm.msg", "bool x\n"),
             ("b/AMENT_IGNORE", ""),
-            ("b/msg/Arm.msg", "bool x\n"),
+            ("b/ament_msgs/msg/Arm.msg", "bool x\n"),
             ("c/COLCON_IGNORE", ""),
-            ("c/old_msgs/msg/Arm.msg", "bool x\n"),
+            ("c/colcon_msgs/msg/Arm.msg", "bool x\n"),
+            ("c/both_msgs/CATKIN_IGNORE", ""),
+            ("c/both_msgs/msg/Arm.msg", "bool x\n"),
             ("d/.git/old_msgs/msg/Arm.msg", "bool x\n"),
             ("d/folder/package.xml", package),
             ("d/folder/msg/Arm.msg", "bool x\n"),
@@ -157,16 +167,20 @@ fn what_is_to_be_ignored_is_not_looked_into() {
         ros1: vec![folder.0.clone()],
         ros2: vec![],
     };
+    let names = |files: &mut TypeFiles, dialect| -> Vec<String> {
+        let names = files.names(dialect, TextKind::Message);
+        names.iter().map(ToString::to_string).collect()
+    };
     let mut files = TypeFiles::open(&[], environment);
-    let names: Vec<String> = files
-        .names(Dialect::Ros1, TextKind::Message)
-        .iter()
-        .map(ToString::to_string)
-        .collect();
     assert_eq!(
-        names,
-        ["robot_msgs/Arm"],
-        "by its package.xml, and none within it"
+        names(&mut files, Dialect::Ros1),
+        ["ament_msgs/Arm", "colcon_msgs/Arm", "robot_msgs/Arm"],
+        "the last by its package.xml, and none within it"
+    );
+    let mut files = TypeFiles::open(std::slice::from_ref(&folder.0), Environment::default());
+    assert_eq!(
+        names(&mut files, Dialect::Ros2),
+        ["inner_msgs/Arm", "old_msgs/Arm"]
     );
 }
 

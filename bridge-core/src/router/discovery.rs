@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use mappings::{SpaceId, TopicId};
@@ -419,19 +420,17 @@ impl Router {
                 return;
             }
         };
-        let period = self.mapping.pubsub().metadata_period;
-        let discovery = self.discovery(now);
-        discovery.answered(space, |other| other == topic);
-        let news = match described {
-            Some(described) => discovery
-                .learned
-                .learn(topic, described, now.monotonic, period),
-            None => {
-                discovery.learned.forget(topic);
-                News::Same
-            }
-        };
-        match news {
+        self.discovery(now).answered(space, |other| other == topic);
+        if let Some(described) = &described
+            && shape.is_some()
+            && !self.may_be_renamed(topic, described, now)
+        {
+            self.count(about, Reason::MetaData, 1, || {
+                "its writer says too often that it is something else".to_owned()
+            });
+            return;
+        }
+        match self.take_note(topic, described, now) {
             News::Same => {}
             News::Full => self.count(about, Reason::MetaData, 1, || {
                 "there is no room for what more topics consist of".to_owned()
@@ -444,6 +443,57 @@ impl Router {
                     self.tell_unbound(topic, shape, now);
                 }
             }
+        }
+    }
+
+    /// Keeps what a topic is said to be; what is no type is not kept, and nothing else is.
+    fn take_note(&mut self, topic: TopicId, described: Option<Described>, now: Now) -> News {
+        let until = (now.monotonic, self.mapping.pubsub().metadata_period);
+        let topics = &self.topics;
+        let Some(discovery) = &mut self.discovery else {
+            return News::Same;
+        };
+        let Some(described) = described else {
+            discovery.learned.forget(topic);
+            return News::Same;
+        };
+        let is_read = |topic: TopicId| topics.contains_key(&topic);
+        discovery.learned.learn(topic, described, until, is_read)
+    }
+
+    /// Whether a topic that has values may be what it is said to be from now on: always what it is known as.
+    fn may_be_renamed(&mut self, topic: TopicId, described: &Described, now: Now) -> bool {
+        let learned = self.discovery.as_ref().map(|discovery| &discovery.learned);
+        let known = learned.and_then(|learned| learned.last(topic));
+        if known.is_some_and(|known| **known == *described) {
+            return true;
+        }
+        let known = known.is_some();
+        match self.topics.get_mut(&topic) {
+            Some(Topic {
+                role: Role::Theirs(reader),
+                ..
+            }) => reader.may_be_renamed(known, now.monotonic),
+            Some(_) | None => true,
+        }
+    }
+
+    /// A topic that is open may have other values than before: has the port look at what its writer said of them.
+    pub(super) fn tell_described(
+        &mut self,
+        topic: TopicId,
+        shape: Vec<(uadp::BuiltinType, bool)>,
+        now: Now,
+    ) {
+        let learned = self.discovery.as_ref().map(|discovery| &discovery.learned);
+        let described = learned.and_then(|learned| learned.get(topic, now.monotonic));
+        if let Some(described) = described.filter(|described| described.fits(&shape)) {
+            let described = Some(Arc::clone(described));
+            self.told.push_back(Output::Unbound {
+                topic,
+                shape,
+                described,
+            });
         }
     }
 

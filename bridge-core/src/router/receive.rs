@@ -205,11 +205,18 @@ impl Router {
         else {
             return;
         };
-        if !typed && reader.shape.is_none() {
+        let anew = !typed && reader.shape.is_none();
+        // Until there is a type, the next sample may say more: a value that is null says nothing.
+        if anew || (!typed && plan.is_none()) {
             let fields = sample.fields.clone().filter_map(Result::ok);
             reader.shape = Some(fields.map(|field| fields::shape(&field)).collect());
         }
         if typed || plan.is_some() {
+            // Looked up once for each shape, and not for each sample.
+            let shape = if anew { reader.shape.clone() } else { None };
+            if let Some(shape) = shape {
+                self.tell_described(topic, shape, now);
+            }
             self.deliver(topic, sample, now);
             return;
         }

@@ -19,13 +19,15 @@ impl Router {
     }
 
     /// Puts another mapping in the place of the one there is. A topic whose variable is the same goes on as it is; where
-    /// its queue or what is published of it differs, that changes and its sequence numbers go on.
+    /// its queue or what is published of it differs, that changes and its sequence numbers go on; where what is said of it
+    /// differs, it is announced anew.
     ///
     /// What a variable is tied to is the port's affair: it [`unbind`](Self::unbind)s what it gives up and
     /// [`bind`](Self::bind)s what it takes up.
     pub fn replace_mapping(&mut self, mapping: Arc<Mapping>, now: Now) {
         let before = std::mem::replace(&mut self.mapping, mapping);
         self.renew_chunks(before.pubsub());
+        let renamed = before.namespaces() != self.mapping.namespaces();
         let topics: Vec<TopicId> = self.topics.keys().copied().collect();
         for topic in topics {
             let rules = |mapping: &Mapping| {
@@ -40,6 +42,10 @@ impl Router {
             }
             if was.1 != is.1 {
                 self.regate(topic, now);
+            }
+            let (was, is) = (before.variable(topic), self.mapping.variable(topic));
+            if renamed || was.map(|v| &v.meaning) != is.map(|v| &v.meaning) {
+                self.describe_again(topic, now);
             }
             // The periods may be shorter now.
             self.schedule(topic);
@@ -56,6 +62,7 @@ impl Router {
             return;
         };
         entry.plan = None;
+        entry.bound = None;
         entry.transcoder = None;
         match &mut entry.role {
             Role::Ours(writer) => {
@@ -64,16 +71,35 @@ impl Router {
             }
             Role::Theirs(reader) => {
                 reader.held = None;
+                reader.shape = None;
                 reader.forget_all();
-                // They are in the type that was.
-                let waiting = std::iter::from_fn(|| entry.queue.pop()).count();
-                let count = waiting.try_into().unwrap_or(u64::MAX);
-                if count > 0 {
-                    self.count(About::topic(topic), Reason::NotPublished, count, || {
-                        "the mapping ties it to something else now".to_owned()
-                    });
-                }
+                self.drop_deliveries(topic, "the mapping ties it to something else now");
             }
+        }
+    }
+
+    /// Drops what waits for the local side: it is in the type that was.
+    pub(super) fn drop_deliveries(&mut self, topic: TopicId, why: &str) {
+        let Some(entry) = self.topics.get_mut(&topic) else {
+            return;
+        };
+        let waiting = std::iter::from_fn(|| entry.queue.pop()).count();
+        let count = waiting.try_into().unwrap_or(u64::MAX);
+        if count > 0 {
+            self.count(About::topic(topic), Reason::NotPublished, count, || {
+                why.to_owned()
+            });
+        }
+    }
+
+    /// Describes a topic of our own space by the mapping there is now.
+    fn describe_again(&mut self, topic: TopicId, now: Now) {
+        let bound = self
+            .topics
+            .get(&topic)
+            .and_then(|entry| entry.bound.clone());
+        if let Some((message_type, selection)) = bound {
+            self.describe(topic, (&message_type, &selection), now);
         }
     }
 

@@ -86,8 +86,11 @@ impl Ros1Port {
         if source.values.is_empty() {
             // Its index stays, by which the inbox names it; its name is free for another.
             let ros_topic = source.ros_topic.clone();
-            self.source_of.remove(&ros_topic);
-            *source = Source::new(ros_topic, None, Vec::new());
+            *source = Source::new(ros_topic.clone(), None, Vec::new());
+            // That of one given up before may be taken by now.
+            if self.source_of.get(&ros_topic) == Some(&index) {
+                self.source_of.remove(&ros_topic);
+            }
         }
     }
 

@@ -93,6 +93,29 @@ async fn a_topic_without_values_is_let_go_and_one_that_gets_some_is_read() {
 }
 
 #[tokio::test]
+async fn a_topic_that_went_and_came_back_is_read_once_whatever_is_edited_next() {
+    let mut cell = cell(BEFORE);
+    let publisher = advertise(&cell.node, "/target", "geometry_msgs/Point", false);
+    events(&mut cell.port, 5).await;
+    cell.port
+        .reload(&parsed(&BEFORE.replace("/target", "/goal")));
+    events(&mut cell.port, 2).await;
+    cell.port.reload(&parsed(BEFORE));
+    // Bound and live again, both of them.
+    event(&mut cell, "ua_1_2_1", "live true").await;
+    event(&mut cell, "ua_1_2_2", "live true").await;
+    for name in ["Stop", "Halt"] {
+        cell.port
+            .reload(&edited("name: Park", &format!("name: {name}")));
+        assert_eq!(at_once(&mut cell).await, [""; 0]);
+    }
+    let _sent = publisher.publish(Bytes::from_static(b"q"));
+    let expected = ["ua_1_2_1 = b\"q\"", "ua_1_2_2 = b\"q\""];
+    assert_eq!(events(&mut cell.port, 2).await, expected);
+    assert_eq!(at_once(&mut cell).await, [""; 0]);
+}
+
+#[tokio::test]
 async fn a_topic_that_is_written_may_change_its_type_and_may_come_under_its_own_name() {
     let mut cell = cell(BEFORE);
     assert_eq!(
@@ -113,6 +136,8 @@ async fn a_topic_that_is_written_may_change_its_type_and_may_come_under_its_own_
     let other = BEFORE.replace("type: Boolean", "type: Int16");
     let other = parsed(&other.replace("type: std_msgs/Bool", "type: std_msgs/Int16"));
     cell.port.reload(&other);
+    let stale = cell.port.publish(delivery("ua_2_2_3", b"\x01"));
+    assert_eq!(stale, Err("type changes"), "it is still in the old one");
     let lines = at_once(&mut cell).await;
     assert_eq!(
         lines,
@@ -153,6 +178,7 @@ variables:
     let (_light, old) = offer(&cell.node, "/light", "std_srvs/SetBool");
     let (_lamp, new) = offer(&cell.node, "/lamp", "std_srvs/SetBool");
     let (_ask, asked) = offer(&cell.node, "/ask", "std_srvs/Trigger");
+    event(&mut cell, "ua_0_2_1", " is ").await;
     cell.port.publish(delivery("ua_0_2_1", &[1])).unwrap();
     event(&mut cell, "ua_1_2_2", "=").await;
     event(&mut cell, "ua_1_2_5", "=").await;

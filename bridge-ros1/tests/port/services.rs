@@ -80,6 +80,7 @@ async fn for_a_while(cell: &mut Cell) {
 #[tokio::test]
 async fn a_state_is_tried_until_its_service_comes_and_the_answer_is_a_value() {
     let mut cell = cell(SERVICES);
+    event(&mut cell, "ua_0_2_1", " is ").await;
     cell.port.publish(delivery("ua_0_2_1", &[1])).unwrap();
     let told = event(&mut cell, "ua_0_2_1", "call failed").await;
     assert!(
@@ -97,6 +98,7 @@ async fn a_state_is_tried_until_its_service_comes_and_the_answer_is_a_value() {
 #[tokio::test]
 async fn a_value_that_calls_nothing_ends_what_is_tried_for_one_before_it() {
     let mut cell = cell(SERVICES);
+    event(&mut cell, "ua_0_2_3", " is ").await;
     cell.port.publish(delivery("ua_0_2_3", &[1])).unwrap();
     event(&mut cell, "ua_0_2_3", "trying again").await;
     cell.port.publish(delivery("ua_0_2_3", &[0])).unwrap();
@@ -115,6 +117,7 @@ async fn a_value_that_calls_nothing_ends_what_is_tried_for_one_before_it() {
 #[tokio::test]
 async fn an_event_is_called_for_once() {
     let mut cell = cell(SERVICES);
+    event(&mut cell, "ua_0_2_4", " is ").await;
     cell.port.publish(delivery("ua_0_2_4", &[1])).unwrap();
     let told = event(&mut cell, "ua_0_2_4", "call failed").await;
     assert!(!told.contains("trying again"), "{told}");

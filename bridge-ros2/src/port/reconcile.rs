@@ -107,7 +107,9 @@ impl Ros2Port {
                 });
                 continue;
             }
-            if self.sources.len() >= MAX_TOPICS {
+            // Those that were given up leave their place behind.
+            let read = self.sources.iter().filter(|s| !s.values.is_empty());
+            if read.count() >= MAX_TOPICS {
                 self.tell_once("", "too many topics", || {
                     format!("more than {MAX_TOPICS} topics of the space: the rest is left alone")
                 });

@@ -1,5 +1,6 @@
 //! Several fields of a message, and messages that are structures.
 
+use std::collections::HashSet;
 use std::sync::Arc;
 
 use messages::{Leaf, MessageType, Rank, Selected, Selection};
@@ -41,7 +42,15 @@ pub(super) fn selection(
             .help("leave it out for the whole message");
         return None;
     }
+    if list.0.len() > MOST_FIELDS {
+        let message = format!("`fields` names {} fields", list.0.len());
+        findings
+            .error(Code::Fields, at.place, message)
+            .help(format!("a variable has at most {MOST_FIELDS} of them"));
+        return None;
+    }
     let mut selected: Vec<Selected> = Vec::new();
+    let mut known = HashSet::new();
     for at in &list.0 {
         let entry = at.value.as_ref()?;
         let Some((text, place)) = given(&entry.field) else {
@@ -74,8 +83,7 @@ pub(super) fn selection(
             | Selection::Template { .. }
             | Selection::Bytes => return None,
         };
-        let same = |known: &&Selected| known.field == one.field && known.part == one.part;
-        if selected.iter().find(same).is_some() {
+        if !known.insert((one.field.clone(), one.part.clone())) {
             let message = format!("`{}` is named twice", short(text));
             findings.error(Code::Fields, place, message);
             return None;
@@ -174,3 +182,6 @@ pub(super) fn compare(a: &Binding, b: &Binding, place: Place, findings: &mut Fin
             .help("bind the same type on both sides, or leave `as: structure` out");
     }
 }
+
+/// As many as a DataSet with a component for each can reasonably have.
+const MOST_FIELDS: usize = 1_000;

@@ -9,6 +9,8 @@ mod yaml;
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read as _, Write as _};
+use std::os::unix::fs::{MetadataExt as _, fchown};
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use mappings::{Checked, Code, Mapping, SpaceId};
@@ -154,27 +156,27 @@ fn space_of(domain: u16, known: &Mapping, graphs: &[Graph]) -> Result<SpaceId, F
 
 /// The mapping in the file; `None` where there is none.
 fn existing(file: &str) -> Result<Option<(Mapping, String)>, Failure> {
-    let mut bytes = Vec::new();
-    match File::open(file).and_then(|opened| opened.take(MOST).read_to_end(&mut bytes)) {
-        Ok(_) => {}
+    let bytes = match bytes_of(file) {
+        Ok(bytes) => bytes,
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(Failure::reading(file, &error)),
-    }
+    };
     let text = String::from_utf8(bytes)
         .map_err(|_| Failure::Io(format!("{file} is there and is no text; it stays as it is")))?;
-    let Checked {
-        mapping, findings, ..
-    } = Mapping::from_text(&text, file, &Disk);
-    match mapping {
+    let mut checked = Mapping::from_text(&text, file, &Disk);
+    match checked.mapping.take() {
         Some(mapping) => Ok(Some((mapping, text))),
-        None => {
-            let told: Vec<String> = findings.iter().map(|one| one.render(&text)).collect();
-            Err(Failure::Unconfigured(format!(
-                "{}\n{file} is there and cannot run, so nothing is added to it; it stays as it is",
-                told.join("\n")
-            )))
-        }
+        None => Err(Failure::Unconfigured(format!(
+            "{}\n{file} is there and cannot run, so nothing is added to it; it stays as it is",
+            checked.render_all().trim_end()
+        ))),
     }
+}
+
+fn bytes_of(file: &str) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    File::open(file)?.take(MOST).read_to_end(&mut bytes)?;
+    Ok(bytes)
 }
 
 /// A document of its own.
@@ -182,14 +184,14 @@ fn written(file: &str, places: &[String], plan: &mut Plan) -> Result<String, Fai
     settled(file, plan, |plan| {
         let mut lines = render::head(places);
         let spaces = "The ROS sides. 1 is ROS 1, others are DDS domains; 0, the OPC UA side, is always there.";
-        section(&mut lines, spaces, "spaces", render::spaces(plan));
+        section(&mut lines, spaces, "spaces", render::spaces(plan, "  "));
         lines.extend(render::network(plan));
         let namespaces = "What the indexes in node ids mean. The URI counts: check --environment compares it with the server's.";
         section(
             &mut lines,
             namespaces,
             "namespaces",
-            render::namespaces(plan),
+            render::namespaces(plan, "  "),
         );
         let variables = render::variables(plan, "  ");
         if !variables.lines.is_empty() {
@@ -222,15 +224,19 @@ fn section(lines: &mut Vec<String>, title: &str, key: &str, block: Vec<String>) 
 fn added(file: &str, (text, before): (&str, &Mapping), plan: &mut Plan) -> Result<String, Failure> {
     let merged = settled(file, plan, |plan| {
         let mut merged = text.to_owned();
+        let indent = |key: &str| merge::indent(text, key);
         for (key, block) in [
-            ("spaces", render::spaces(plan)),
-            ("namespaces", render::namespaces(plan)),
+            ("spaces", render::spaces(plan, &indent("spaces"))),
+            (
+                "namespaces",
+                render::namespaces(plan, &indent("namespaces")),
+            ),
         ] {
             if !block.is_empty() {
                 (merged, _) = merge::append(&merged, key, &block)?;
             }
         }
-        let variables = render::variables(plan, &merge::indent(text, "variables"));
+        let variables = render::variables(plan, &indent("variables"));
         if variables.lines.is_empty() {
             return Some((merged, 0, Vec::new()));
         }
@@ -317,9 +323,7 @@ fn put(arguments: &Init, before: Option<&str>, text: &str, plan: &Plan) -> Resul
     let sum = Sum::of(file, plan, before != Some(text));
     match before {
         Some(before) if before == text => {}
-        Some(_) if arguments.merge => {
-            std::fs::write(file, text).map_err(|error| cannot_write(file, &error))?;
-        }
+        Some(before) if arguments.merge => replace(file, before, text)?,
         Some(_) => {
             return Err(Failure::Io(format!(
                 "{file} is there and stays as it is: {} would be new in it. Say --merge to add them, or choose another \
@@ -342,6 +346,55 @@ fn put(arguments: &Init, before: Option<&str>, text: &str, plan: &Plan) -> Resul
         writeln!(out, "{sum}")?;
     }
     Ok(out.flush()?)
+}
+
+/// Puts another text in the place of that which was read, at once and with its permissions. The survey takes some time, in
+/// which somebody may have saved the file.
+fn replace(file: &str, before: &str, text: &str) -> Result<(), Failure> {
+    let now = bytes_of(file).map_err(|error| Failure::reading(file, &error))?;
+    if now != before.as_bytes() {
+        return Err(Failure::Io(format!(
+            "{file} was changed while this looked around; it stays as it is now: say the same again"
+        )));
+    }
+    exchanged(file, text).map_err(|error| cannot_write(file, &error))
+}
+
+/// Writes beside the file and renames: who reads it meanwhile has the one text or the other.
+fn exchanged(file: &str, text: &str) -> io::Result<()> {
+    // What a link names is exchanged, not the link.
+    let target = std::fs::canonicalize(file)?;
+    let found = target.metadata()?;
+    if !found.is_file() {
+        return Err(io::Error::other("it is no regular file"));
+    }
+    // Who may write into the folder may not yet write the file.
+    drop(OpenOptions::new().write(true).open(&target)?);
+    let beside = beside(&target);
+    let mut opened = OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .open(&beside)?;
+    // Root leaves the file to whom it belongs; who is not root can give nothing away.
+    drop(fchown(&opened, Some(found.uid()), Some(found.gid())));
+    let written = opened
+        .set_permissions(found.permissions())
+        .and_then(|()| opened.write_all(text.as_bytes()))
+        .and_then(|()| opened.sync_all())
+        .and_then(|()| std::fs::rename(&beside, &target));
+    if written.is_err() {
+        // The cause counts.
+        drop(std::fs::remove_file(&beside));
+    }
+    written
+}
+
+/// A name in the same folder, hidden, so that no `include` takes it.
+fn beside(target: &Path) -> PathBuf {
+    let mut name = std::ffi::OsString::from(".");
+    name.push(target.file_name().unwrap_or_default());
+    name.push(format!(".{}", std::process::id()));
+    target.with_file_name(name)
 }
 
 fn cannot_write(file: &str, error: &io::Error) -> Failure {
@@ -497,6 +550,30 @@ mod tests {
             origins(&fresh(&both))[0],
             ("AB".to_owned(), "ua_1_2_1".to_owned(), 2)
         );
+    }
+
+    #[test]
+    fn a_block_is_indented_as_the_entries_before_it() {
+        let text = "spaces:\n- {id: 1}\nnamespaces:\n    2: urn:line\nvariables:\n- {node: ns=2;i=5, name: v, origin: 1, \
+                    type: Double}\n";
+        let more = merged(text, &[graph(2, &[("/a", "std_msgs/Bool", true)])]);
+        assert!(more.contains("\n- {id: 2, domain: 2}\n"), "{more}");
+        assert!(more.contains("\n    3: urn:cell\n"), "{more}");
+        assert_eq!(origins(&more).len(), 2);
+    }
+
+    #[test]
+    fn a_file_that_was_saved_meanwhile_stays_as_it_is() {
+        let file = std::env::temp_dir().join(format!("ua-space-init-{}.yaml", std::process::id()));
+        let name = file.to_str().unwrap();
+        std::fs::write(&file, "theirs\n").unwrap();
+        let refused = replace(name, "before\n", "mine\n").unwrap_err();
+        assert!(refused.to_string().contains("was changed"), "{refused}");
+        assert_eq!(std::fs::read_to_string(&file).unwrap(), "theirs\n");
+        replace(name, "theirs\n", "mine\n").unwrap();
+        assert_eq!(std::fs::read_to_string(&file).unwrap(), "mine\n");
+        assert!(!beside(&file.canonicalize().unwrap()).exists());
+        std::fs::remove_file(&file).unwrap();
     }
 
     #[test]

@@ -110,6 +110,12 @@ impl SpaceNodes {
             drop(address_space.delete(node, true));
             places.remove(node);
         }
+        // Nodes of their own: what stays behind would keep the new ones out. One that is the node of a variable is that.
+        for node in gone.iter().flat_map(properties::nodes) {
+            if !places.contains_key(&node) {
+                drop(address_space.delete(&node, true));
+            }
+        }
         for topic in new {
             let folder = origin_folder(topic.topic.space);
             if !address_space.node_exists(&folder) {

@@ -4,11 +4,18 @@ use mappings::Unit;
 use opcua::nodes::VariableBuilder;
 use opcua::server::address_space::AddressSpace;
 use opcua::types::{
-    DataTypeId, EUInformation, EnumValueType, ExtensionObject, LocalizedText, QualifiedName, Range,
-    VariableTypeId, Variant,
+    DataTypeId, EUInformation, EnumValueType, ExtensionObject, LocalizedText, NodeId,
+    QualifiedName, Range, VariableTypeId, Variant,
 };
 
 use crate::layout::{TopicNode, component};
+
+/// The nodes that a topic may have of them.
+pub(crate) fn nodes(topic: &TopicNode) -> impl Iterator<Item = NodeId> {
+    // Below a compound these are the names of fields.
+    let names: &'static [&'static str] = if topic.compound { &[] } else { &NAMES };
+    names.iter().map(move |name| component(&topic.node, name))
+}
 
 /// Adds those that the mapping has of the one value of a topic.
 pub(crate) fn add(address_space: &mut AddressSpace, topic: &TopicNode) {
@@ -35,7 +42,7 @@ pub(crate) fn add(address_space: &mut AddressSpace, topic: &TopicNode) {
         };
         let value = ExtensionObject::from_message(information);
         add(
-            "EngineeringUnits",
+            ENGINEERING_UNITS,
             DataTypeId::EUInformation,
             -1,
             value.into(),
@@ -43,7 +50,7 @@ pub(crate) fn add(address_space: &mut AddressSpace, topic: &TopicNode) {
     }
     if let Some((low, high)) = meaning.range() {
         let value = ExtensionObject::from_message(Range { low, high });
-        add("EURange", DataTypeId::Range, -1, value.into());
+        add(EU_RANGE, DataTypeId::Range, -1, value.into());
     }
     let texts = &meaning.texts;
     if texts.is_empty() {
@@ -54,7 +61,7 @@ pub(crate) fn add(address_space: &mut AddressSpace, topic: &TopicNode) {
             .values()
             .map(|text| LocalizedText::from(text.as_str()))
             .collect();
-        add("EnumStrings", DataTypeId::LocalizedText, 1, names.into());
+        add(ENUM_STRINGS, DataTypeId::LocalizedText, 1, names.into());
     } else {
         let values: Vec<ExtensionObject> = texts
             .iter()
@@ -66,6 +73,61 @@ pub(crate) fn add(address_space: &mut AddressSpace, topic: &TopicNode) {
                 })
             })
             .collect();
-        add("EnumValues", DataTypeId::EnumValueType, 1, values.into());
+        add(ENUM_VALUES, DataTypeId::EnumValueType, 1, values.into());
+    }
+}
+
+const ENGINEERING_UNITS: &str = "EngineeringUnits";
+const EU_RANGE: &str = "EURange";
+const ENUM_STRINGS: &str = "EnumStrings";
+const ENUM_VALUES: &str = "EnumValues";
+const NAMES: [&str; 4] = [ENGINEERING_UNITS, EU_RANGE, ENUM_STRINGS, ENUM_VALUES];
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use mappings::TopicId;
+    use opcua::types::ReferenceTypeId;
+    use uadp::BuiltinType;
+
+    use super::*;
+    use crate::layout::Shape;
+    use crate::nodes::current;
+
+    fn topic(number: i64, text: &str) -> TopicNode {
+        let mut topic = TopicNode::new(
+            TopicId::new(1, 2, 10).unwrap(),
+            NodeId::new(2, 10),
+            "x".to_owned(),
+            vec![("data".to_owned(), Shape(Some((BuiltinType::Int32, false))))],
+        );
+        topic.meaning.texts = BTreeMap::from([(number, text.to_owned())]);
+        topic
+    }
+
+    #[test]
+    fn what_is_added_can_be_taken_out_by_its_nodes() {
+        let mut space = AddressSpace::new();
+        space.add_namespace("urn:cell", 2);
+        let mut before = None;
+        for (number, text, name) in [
+            (0, "off", ENUM_STRINGS),
+            (0, "idle", ENUM_STRINGS),
+            (5, "on", ENUM_VALUES),
+        ] {
+            let topic = topic(number, text);
+            add(&mut space, &topic);
+            let there: Vec<NodeId> = nodes(&topic).filter(|id| space.node_exists(id)).collect();
+            let [property] = there.as_slice() else {
+                unreachable!("{there:?}");
+            };
+            assert_eq!(*property, component(&topic.node, name));
+            assert!(space.has_reference(&topic.node, property, ReferenceTypeId::HasProperty));
+            let value = current(&space, property);
+            assert!(value.is_some() && value != before, "{value:?}");
+            before = value;
+            drop(space.delete(property, true));
+        }
     }
 }

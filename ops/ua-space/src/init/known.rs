@@ -13,6 +13,8 @@ pub(super) struct Known {
     pub(super) mapping: Mapping,
     nodes: HashSet<NodeIdText>,
     names: HashSet<(u16, String)>,
+    /// The last number that was tried behind a name.
+    numbered: HashMap<(u16, String), u32>,
     /// Identifiers in topic names, by the namespace in them.
     numbers: HashMap<u16, BTreeSet<u16>>,
     /// Words of comments that begin with a slash.
@@ -100,14 +102,20 @@ impl Known {
             .filter(|c| !c.is_control())
             .take(500)
             .collect();
-        let mut name = wanted.clone();
-        for number in 2_u32.. {
-            if self.names.insert((namespace, name.clone())) {
-                break;
-            }
-            name = format!("{wanted}{number}");
+        if self.names.insert((namespace, wanted.clone())) {
+            return wanted;
         }
-        name
+        let last = self
+            .numbered
+            .entry((namespace, wanted.clone()))
+            .or_insert(1);
+        loop {
+            *last = last.saturating_add(1);
+            let name = format!("{wanted}{last}");
+            if self.names.insert((namespace, name.clone())) || *last == u32::MAX {
+                return name;
+            }
+        }
     }
 
     /// Whether a comment speaks of the topic.

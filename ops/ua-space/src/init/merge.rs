@@ -64,7 +64,7 @@ pub(super) fn indent(text: &str, key: &str) -> String {
     });
     let found = first.map(|line| line.chars().take_while(|c| *c == ' ').collect());
     found
-        .filter(|_| first.is_some_and(|line| line.trim_start().starts_with('-')))
+        .filter(|_| first.is_some_and(|line| line.starts_with([' ', '-'])))
         .unwrap_or_else(|| "  ".to_owned())
 }
 
@@ -105,5 +105,7 @@ mod tests {
         assert_eq!(indent("a:\n\n  # c\n    - a\n", "a"), "    ");
         assert_eq!(indent("a:\n- a\n", "a"), "");
         assert_eq!(indent("b: 1\n", "a"), "  ");
+        assert_eq!(indent("a:\n    2: urn:x\n", "a"), "    ");
+        assert_eq!(indent("a:\nb: 1\n", "a"), "  ");
     }
 }

@@ -69,6 +69,7 @@ impl Plan {
             plan: Self::default(),
             registries: [registry(false), registry(true)],
             ua: Vec::new(),
+            alike: HashMap::new(),
             known,
         };
         planner.spaces(graphs);
@@ -84,8 +85,10 @@ struct Planner<'k> {
     plan: Plan,
     /// Of ROS 1 and of ROS 2.
     registries: [Registry; 2],
-    /// Nodes that are no variable yet, in the mapping's namespaces.
-    ua: Vec<UaVariable>,
+    /// Nodes that are no variable yet, in the mapping's namespaces; `None` where one has become one.
+    ua: Vec<Option<UaVariable>>,
+    /// Which of them have a name, as [`normal`] has it.
+    alike: HashMap<String, Vec<usize>>,
     known: &'k mut Known,
 }
 
@@ -103,9 +106,10 @@ impl Planner<'_> {
     fn nodes(&mut self, sources: &[Nodes]) {
         let mut all = self.known.mapping.namespaces().clone();
         let mut taken = BTreeSet::new();
+        let mut ua = Vec::new();
         for source in sources {
             let mut indexes: HashMap<u16, u16> = HashMap::new();
-            for (index, uri) in (0_u16..).zip(&source.namespaces).skip(1) {
+            for (index, uri) in (0..=u16::MAX).zip(&source.namespaces).skip(1) {
                 let used = source
                     .variables
                     .iter()
@@ -115,15 +119,18 @@ impl Planner<'_> {
                 }
                 let there = all.iter().find(|(_, other)| *other == uri);
                 let there = there.map(|(index, _)| *index);
-                let given = there.unwrap_or_else(|| {
-                    let wanted = index + u16::from(source.endpoint.is_none());
+                let given = there.or_else(|| {
+                    let wanted = index.saturating_add(u16::from(source.endpoint.is_none()));
                     let free = |at: &u16| !all.contains_key(at);
-                    let found = (wanted..).chain(2..).find(free).unwrap_or(wanted);
+                    let found = (wanted..=u16::MAX).chain(2..=u16::MAX).find(free)?;
                     all.insert(found, uri.clone());
                     self.plan.namespaces.insert(found, uri.clone());
-                    found
+                    Some(found)
                 });
-                indexes.insert(index, given);
+                // Without an index its nodes stay out.
+                if let Some(given) = given {
+                    indexes.insert(index, given);
+                }
             }
             for one in &source.variables {
                 let Some(namespace) = indexes.get(&one.node.namespace) else {
@@ -137,7 +144,7 @@ impl Planner<'_> {
                     self.known.use_number(*namespace, number.get());
                 }
                 if !self.known.has_node(&node) && taken.insert(node.to_string()) {
-                    self.ua.push(UaVariable {
+                    ua.push(UaVariable {
                         node,
                         ..one.clone()
                     });
@@ -148,7 +155,16 @@ impl Planner<'_> {
             }
         }
         let key = |one: &UaVariable| (one.within.clone(), one.name.clone(), one.node.to_string());
-        self.ua.sort_by_cached_key(key);
+        ua.sort_by_cached_key(key);
+        for (at, one) in ua.iter().enumerate() {
+            let alone = normal(&one.name);
+            let within = normal(&format!("{}{}", one.within, one.name));
+            if within != alone {
+                self.alike.entry(within).or_default().push(at);
+            }
+            self.alike.entry(alone).or_default().push(at);
+        }
+        self.ua = ua.into_iter().map(Some).collect();
     }
 
     fn topics(&mut self, graphs: &[Graph], wishes: &Wishes<'_>) {
@@ -235,11 +251,8 @@ impl Planner<'_> {
         if guessed {
             notes.push("guess: one value on both sides".to_owned());
         }
-        let wanted = normal(&topic);
-        let named = |one: &UaVariable| {
-            normal(&one.name) == wanted || normal(&format!("{}{}", one.within, one.name)) == wanted
-        };
-        let mut alike = self.ua.iter().enumerate().filter(|(_, one)| named(one));
+        let alike = self.alike.get(&normal(&topic)).into_iter().flatten();
+        let mut alike = alike.filter_map(|at| Some((*at, self.ua.get(*at)?.as_ref()?)));
         let node = match (alike.next(), alike.next(), value) {
             (Some((at, one)), None, Some(value)) if one.value == Some(value) => Some(at),
             (Some((_, one)), None, _) => {
@@ -255,14 +268,16 @@ impl Planner<'_> {
             }
             (None, ..) => None,
         };
-        let (node, name) = match node.map(|at| self.ua.remove(at)) {
+        let (node, name) = match node.and_then(|at| self.ua.get_mut(at)?.take()) {
             Some(one) => {
                 guessed = true;
                 notes.push("guess: the node has the topic's name and type".to_owned());
                 (one.node, one.name)
             }
             None => {
-                let namespace = self.namespace(namespace);
+                let Some(namespace) = self.namespace(namespace) else {
+                    return;
+                };
                 let Some(number) = self.known.next_number(namespace) else {
                     return;
                 };
@@ -290,26 +305,28 @@ impl Planner<'_> {
         });
     }
 
-    /// The namespace of values that have no node yet.
-    fn namespace(&mut self, uri: &str) -> u16 {
+    /// The namespace of values that have no node yet; `None` when no index is left for it.
+    fn namespace(&mut self, uri: &str) -> Option<u16> {
         let all = self.known.mapping.namespaces().iter();
         let all = all.chain(&self.plan.namespaces);
         let there = all.clone().find(|(_, other)| *other == uri);
         if let Some((index, _)) = there {
-            return *index;
+            return Some(*index);
         }
         if let Some(index) = self.known.ros_namespace() {
-            return index;
+            return Some(index);
         }
-        let highest = all.map(|(index, _)| *index).max();
-        let index = highest.map_or(2, |highest| highest.saturating_add(1).max(2));
+        let used: BTreeSet<u16> = all.map(|(index, _)| *index).collect();
+        let above = used.last().map_or(Some(2), |last| last.checked_add(1));
+        let free = || (2..=u16::MAX).find(|index| !used.contains(index));
+        let index = above.map(|index| index.max(2)).or_else(free)?;
         self.plan.namespaces.insert(index, uri.to_owned());
-        index
+        Some(index)
     }
 
     /// The nodes no topic is tied to: the OPC UA side writes them.
     fn rest(&mut self) {
-        for one in std::mem::take(&mut self.ua) {
+        for one in std::mem::take(&mut self.ua).into_iter().flatten() {
             let mut notes = Vec::new();
             if one.value.is_none() {
                 notes.push(

@@ -35,10 +35,10 @@ pub(super) fn head(sources: &[String]) -> Vec<String> {
 }
 
 /// The ROS sides.
-pub(super) fn spaces(plan: &Plan) -> Vec<String> {
+pub(super) fn spaces(plan: &Plan, indent: &str) -> Vec<String> {
     let space = |(id, domain): &(SpaceId, Option<u16>)| match domain {
-        Some(domain) => format!("  - {{id: {id}, domain: {domain}}}"),
-        None => format!("  - {{id: {id}}}"),
+        Some(domain) => format!("{indent}- {{id: {id}, domain: {domain}}}"),
+        None => format!("{indent}- {{id: {id}}}"),
     };
     plan.spaces.iter().map(space).collect()
 }
@@ -65,9 +65,9 @@ pub(super) fn network(plan: &Plan) -> Vec<String> {
 }
 
 /// What the indexes in node ids mean.
-pub(super) fn namespaces(plan: &Plan) -> Vec<String> {
+pub(super) fn namespaces(plan: &Plan, indent: &str) -> Vec<String> {
     let all = plan.namespaces.iter();
-    all.map(|(index, uri)| format!("  {index}: {}", scalar(uri)))
+    all.map(|(index, uri)| format!("{indent}{index}: {}", scalar(uri)))
         .collect()
 }
 
