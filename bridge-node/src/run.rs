@@ -1,7 +1,10 @@
 //! The run loop: the only place where a bridge waits.
 
+use std::future::poll_fn;
 use std::io;
+use std::pin::pin;
 use std::sync::Arc;
+use std::task::Poll;
 use std::time::Duration;
 
 use bridge_core::{Heard, Notice, Output, Reason, Router};
@@ -82,26 +85,72 @@ impl<P: Port> Shell<P> {
 
     /// All branches of the `select!` are cancel-safe: a socket and bounded channels that hold what was not taken.
     async fn carry(&mut self, stop: impl Future<Output = ()> + Send) -> Result<(), Failure> {
-        let mut stop = std::pin::pin!(stop);
-        let mut timer = std::pin::pin!(tokio::time::sleep(FAR));
+        let mut stop = pin!(stop);
+        let mut timer = pin!(tokio::time::sleep(FAR));
         // Any UDP datagram fits.
         let mut buffer = vec![0; 65_536];
         let mut more = false;
         loop {
             self.arm(timer.as_mut());
+            let yields = std::mem::take(&mut more);
             tokio::select! {
                 // What is left of a long drain goes on after one more look at everything else.
-                () = tokio::task::yield_now(), if more => {}
+                () = tokio::task::yield_now(), if yields => {}
                 () = &mut stop => return Ok(()),
-                heard = self.udp.recv(&mut buffer) => self.heard(heard, &buffer),
-                event = self.port.recv() => self.port_event(event)?,
+                heard = self.udp.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
+                event = self.port.recv() => more = self.port_events(event).await?,
                 () = timer.as_mut() => self.router.handle_timeout(now()),
                 Ok(()) = self.changes.changed() => self.reload(),
                 // Who asked may have gone; there is nobody else to tell.
                 Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
             }
-            more = self.drain();
+            more |= self.drain();
         }
+    }
+
+    /// A datagram and those that wait behind it, a bounded number, each carried on before the next is looked at: asking
+    /// everybody else between two of them costs as much as half the work itself. Says whether more may wait.
+    fn heard_all(
+        &mut self,
+        first: io::Result<(usize, std::net::SocketAddr)>,
+        buffer: &mut [u8],
+    ) -> bool {
+        let mut heard = first;
+        for _ in 0..TAKEN_AT_ONCE {
+            self.heard(heard, buffer);
+            if self.drain() {
+                return true;
+            }
+            match self.udp.try_recv(buffer) {
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => return false,
+                next => heard = next,
+            }
+        }
+        // The last one was taken and is not to be lost.
+        self.heard(heard, buffer);
+        true
+    }
+
+    /// As [`heard_all`](Self::heard_all), of what the port reports.
+    async fn port_events(&mut self, first: PortEvent) -> Result<bool, Failure> {
+        let mut event = first;
+        for _ in 0..TAKEN_AT_ONCE {
+            self.port_event(event)?;
+            if self.drain() {
+                return Ok(true);
+            }
+            let next = poll_fn(|cx| {
+                let next = pin!(self.port.recv()).poll(cx);
+                Poll::Ready(next)
+            });
+            match next.await {
+                Poll::Ready(next) => event = next,
+                Poll::Pending => return Ok(false),
+            }
+        }
+        // Likewise.
+        self.port_event(event)?;
+        Ok(true)
     }
 
     fn status(&self) -> Status {
@@ -294,5 +343,7 @@ fn tell(notice: &Notice) {
 /// Outputs carried out before everybody else has a turn: where sending is slower than the Router's pace for large
 /// messages, there is always one more.
 const DRAINED_AT_ONCE: usize = 64;
+/// Datagrams, or events of the port, that are carried on one behind the other.
+const TAKEN_AT_ONCE: usize = 32;
 /// A deadline for when there is nothing to wait for.
 const FAR: Duration = Duration::from_secs(3600);
