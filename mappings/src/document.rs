@@ -143,7 +143,7 @@ document! {
         topics: String,
         /// Topics left out, patterns too, as [/robot9/**].
         exclude: Vec<At<String>>,
-        /// The ROS space of the topics: 1, since topics of ROS 2 are not taken in by patterns yet.
+        /// The ROS space of the topics.
         #[schemars(required, range(min = 1, max = 1))]
         origin: u16,
         /// The OPC UA node of each, as ns=2;i=10{1}: {1} is what the first wildcard stands for, {2} the second. A topic whose

@@ -60,12 +60,14 @@ class Simple:
             text = self.client.get_goal_status_text()
             lifetime.say(count=count, end=status_name(status), text=text, result=result.result)
 
-        self.client.send_goal(
-            TestGoal(goal=number),
-            done,
-            lambda: lifetime.say(count=count, state="ACTIVE"),
-            lambda feedback: lifetime.say(count=count, feedback=feedback.feedback),
-        )
+        # The client knows the goal as its own only once it is sent, and loses what is answered before.
+        with self.client.action_client.manager.list_mutex:
+            self.client.send_goal(
+                TestGoal(goal=number),
+                done,
+                lambda: lifetime.say(count=count, state="ACTIVE"),
+                lambda feedback: lifetime.say(count=count, feedback=feedback.feedback),
+            )
 
     def cancel(self, _count):
         self.client.cancel_goal()

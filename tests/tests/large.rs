@@ -84,6 +84,9 @@ fn images_of_ten_megabytes_leave_ros_1_as_they_were_and_a_button_beside_them_los
             continue;
         };
         let message = NetworkMessage::decode(&datagram).unwrap();
+        if message.message_type() != NetworkMessageType::DataSet {
+            continue;
+        }
         if message.is_chunk() {
             let whole = reassembler.receive(&message, start.elapsed()).unwrap();
             if let Some(whole) = whole {

@@ -19,7 +19,7 @@ use system_tests::{
     BareNode, Cell, MASTER, METRICS_ROS1, Peer, SERVER_ENDPOINT, UadpSocket, eventually, http_get,
     metrics, string_frame, xml_rpc,
 };
-use uadp::{NetworkMessage, Scalar, Variant};
+use uadp::{NetworkMessage, NetworkMessageType, Scalar, Variant};
 
 const SOON: Duration = Duration::from_secs(30);
 const ROUTES: u16 = 500;
@@ -67,6 +67,9 @@ fn listen(heard: &Arc<Mutex<Heard>>, ended: &Arc<AtomicBool>) -> std::thread::Jo
                 continue;
             };
             let message = NetworkMessage::decode(&datagram).unwrap();
+            if message.message_type() != NetworkMessageType::DataSet {
+                continue;
+            }
             for message in message.messages().map(Result::unwrap) {
                 let sequence = message.header().sequence_number.unwrap();
                 let field = message.fields().ok().and_then(|mut fields| fields.next());

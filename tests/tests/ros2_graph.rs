@@ -9,7 +9,8 @@ use bridge_ros2::domain::{Domain, DomainOptions, can_announce_type_hashes};
 use bridge_ros2::node::NodeOptions;
 use bridge_ros2::qos::{Offered, Requested};
 use serde_json::Value;
-use system_tests::{Cell, Child, METRICS_ROS2, Peer, eventually, metrics};
+use system_tests::{Cell, Child, METRICS_ROS2, Peer, UaSide, eventually, metrics};
+use uadp::Scalar;
 
 const DOMAIN: u16 = 2;
 const SOON: Duration = Duration::from_secs(20);
@@ -437,3 +438,45 @@ fn each_of_a_burst_of_endpoints_is_announced_or_known_not_to_be() {
 
 /// The type hash of `std_msgs/msg/String`, as ROS 2 publishes it.
 const STRING_HASH: &str = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18";
+
+#[test]
+fn topics_of_a_pattern_become_values_as_they_appear() {
+    const PATTERNS: &str = r#"
+spaces: [{id: 2}]
+namespaces: {2: "urn:cell"}
+patterns:
+  - {topics: "/robot*/status", exclude: ["/robot9/**"], origin: 2, node: "ns=2;i=10{1}", name: "Robot{1}Status", type: std_msgs/String, field: data}
+"#;
+    let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
+        return;
+    };
+    let side = UaSide::join();
+    let mapping = cell.file("patterns.yaml", PATTERNS);
+    let bridge = cell.bridge_ros2(&[&mapping.to_string_lossy()]);
+    let says = |topic: &str, text: &str| {
+        let args = ["pub", topic, "std_msgs/String", "--text", text];
+        cell.cyclone_c(&[&args[..], &["--count", "0", "--rate", "10"]].concat())
+    };
+    let _excluded = says("/robot9/status", "not this");
+    let _first = says("/robot1/status", "one");
+    side.hear_scalar((2, 2, 101), Scalar::String(Some("one")));
+    let _second = says("/robot2/status", "two");
+    side.hear_scalar((2, 2, 102), Scalar::String(Some("two")));
+    // A name the pattern makes no number of is told of, and costs the others nothing.
+    let _odd = says("/robot_b/status", "odd");
+    let odd = || {
+        let lines = bridge.lines();
+        let told = lines.iter().filter(|line| line.contains("/robot_b/status"));
+        told.count()
+    };
+    eventually("the odd name is told of", SOON, || {
+        (odd() > 0).then_some(())
+    });
+    let heard = side.triples_for(Duration::from_secs(1));
+    assert!(heard.contains(&(2, 2, 101)) && heard.contains(&(2, 2, 102)));
+    assert!(
+        heard.iter().all(|(_, _, id)| [101, 102].contains(id)),
+        "{heard:?}"
+    );
+    assert_eq!(odd(), 1, "told once");
+}

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::PortEvent;
-use mappings::TopicId;
+use mappings::{PatternFault, PatternVariable, TopicId};
 use messages::{MessageType, Selection, TypeName};
 use rustdds::GUID;
 use tokio::time::Instant;
@@ -17,7 +17,7 @@ use crate::graph::{Endpoint, ros_topic};
 use crate::outlet::Outlet;
 use crate::qos::Requested;
 use crate::sink::{Open, Sink, shortest_deadline};
-use crate::source::Reading;
+use crate::source::{Reading, Source};
 
 impl Ros2Port {
     /// Makes what is open fit what the domain holds, at most [`MAX_BATCH`] endpoints at a time: RustDDS' discovery
@@ -36,7 +36,7 @@ impl Ros2Port {
         self.report_drops();
         self.announce_anew(now);
         self.take_descriptions(now);
-        self.find_topics_of_the_space(now);
+        self.find_topics(now);
         for index in 0..self.sources.len() {
             self.reconcile_source(index, now);
         }
@@ -91,22 +91,20 @@ impl Ros2Port {
         }
     }
 
-    /// Zero configuration: a topic named in our part of the space crosses as soon as somebody writes it.
-    fn find_topics_of_the_space(&mut self, now: Instant) {
-        let found: Vec<(String, TopicId)> = self
+    /// Zero configuration, and patterns: a topic named in our part of the space, or that a pattern is about, crosses as
+    /// soon as somebody writes it.
+    fn find_topics(&mut self, now: Instant) {
+        let unknown = |topic: &&str| !self.source_of.contains_key(*topic);
+        let found: Vec<(String, TopicId, Selection)> = self
             .graph
             .written_topics()
-            .filter(|topic| !self.source_of.contains_key(*topic))
-            .filter_map(|topic| Some((topic.to_owned(), ros_topic(topic)?.parse().ok()?)))
-            .filter(|(_, topic): &(_, TopicId)| topic.space == self.own)
+            .filter(unknown)
+            .map(str::to_owned)
+            .collect::<Vec<_>>()
+            .into_iter()
+            .filter_map(|topic| self.value_of(topic))
             .collect();
-        for (dds_topic, topic) in found {
-            if self.is_tied(topic) {
-                self.tell_once(&dds_topic, "tied elsewhere", || {
-                    format!("{topic} comes from another ROS topic, as the mapping says; this one is left alone")
-                });
-                continue;
-            }
+        for (dds_topic, topic, selection) in found {
             // Those that were given up leave their place behind.
             let read = self.sources.iter().filter(|s| !s.values.is_empty());
             if read.count() >= MAX_TOPICS {
@@ -114,6 +112,14 @@ impl Ros2Port {
                     format!("more than {MAX_TOPICS} topics of the space: the rest is left alone")
                 });
                 return;
+            }
+            let same = |source: &&Source| source.values.iter().any(|(other, _)| *other == topic);
+            if let Some(other) = self.sources.iter().find(same) {
+                let other = other.dds_topic.clone();
+                self.tell_once(&dds_topic, "pattern", || {
+                    format!("it would be {topic}, which {other} is already: it does not cross")
+                });
+                continue;
             }
             let writers = self.graph.writers(&dds_topic).to_vec();
             let types: Vec<String> = writers
@@ -132,14 +138,65 @@ impl Ros2Port {
             }
             let known = types
                 .iter()
+                .filter(|name| self.may_be(&dds_topic, name))
+                .cloned()
+                .collect::<Vec<_>>()
+                .iter()
                 .find_map(|name| self.message_type(topic, &dds_topic, name));
             if let Some(message_type) = known {
                 let index = self.source(dds_topic, message_type.name().clone());
                 if let Some(source) = self.sources.get_mut(index) {
-                    source.values.push((topic, Selection::Whole));
+                    source.values.push((topic, selection));
                 }
             }
         }
+    }
+
+    /// The value a topic is that the mapping does not name: by its own name, or by a pattern.
+    fn value_of(&mut self, dds_topic: String) -> Option<(String, TopicId, Selection)> {
+        let name = ros_topic(&dds_topic)?;
+        if let Ok(topic) = name.parse::<TopicId>() {
+            if topic.space != self.own {
+                return None;
+            }
+            if self.is_tied(topic) {
+                self.tell_once(&dds_topic, "tied elsewhere", || {
+                    format!("{topic} comes from another ROS topic, as the mapping says; this one is left alone")
+                });
+                return None;
+            }
+            return Some((dds_topic, topic, Selection::Whole));
+        }
+        // Others who write where values of other spaces go are not a value of ours.
+        if self.sinks.values().any(|sink| sink.dds_topic == dds_topic) {
+            return None;
+        }
+        let made = self
+            .graph
+            .writers(&dds_topic)
+            .iter()
+            .find_map(|writer| self.made_of(name, &writer.type_name))?;
+        match made {
+            Ok(made) => Some((dds_topic, made.topic, made.selection)),
+            Err(fault) => {
+                self.tell_once(&dds_topic, "pattern", || fault.to_string());
+                None
+            }
+        }
+    }
+
+    /// What a pattern makes of a topic that is written in that type.
+    fn made_of(&self, name: &str, dds_type: &str) -> Option<Result<PatternVariable, PatternFault>> {
+        let message_type = TypeName::from_dds(dds_type).ok()?;
+        let name = format!("/{name}");
+        self.mapping.matching(self.own, &name, Some(&message_type))
+    }
+
+    /// Whether a topic that the mapping does not name is a value in that type: a pattern may be about one type.
+    fn may_be(&self, dds_topic: &str, dds_type: &str) -> bool {
+        ros_topic(dds_topic).is_some_and(|name| {
+            name.parse::<TopicId>().is_ok() || self.made_of(name, dds_type).is_some()
+        })
     }
 
     /// Whether the mapping gives this value to another ROS topic of our domain.

@@ -69,12 +69,24 @@ impl Ros2Port {
                 source.message_type == *message_type && values.contains(value)
             }
             None => {
-                // A topic of the space that was found, and that the mapping does not tie to another.
-                let named = ros_topic(&source.dds_topic).and_then(|name| name.parse().ok());
-                let variable = self.mapping.variable(value.0);
-                named == Some(value.0)
-                    && value.1 == Selection::Whole
-                    && variable.is_none_or(|v| v.binding(self.own).is_none())
+                // A topic that was found: of the space, and that the mapping does not tie to another; or by a pattern.
+                let Some(name) = ros_topic(&source.dds_topic) else {
+                    return false;
+                };
+                match name.parse::<TopicId>() {
+                    Ok(named) => {
+                        let variable = self.mapping.variable(value.0);
+                        named == value.0
+                            && value.1 == Selection::Whole
+                            && variable.is_none_or(|v| v.binding(self.own).is_none())
+                    }
+                    Err(_) => {
+                        let kind = Some(&source.message_type);
+                        let made = self.mapping.matching(self.own, &format!("/{name}"), kind);
+                        made.and_then(Result::ok)
+                            .is_some_and(|made| (made.topic, made.selection) == *value)
+                    }
+                }
             }
         };
         let gone = source.values.extract_if(.., |value| !is_wanted(value));

@@ -74,13 +74,6 @@ fn origin_of(
             .help("a pattern is about the topics of one ROS space");
         return None;
     }
-    if origin.is_ros2() {
-        let message = "topics of ROS 2 are not taken in by patterns yet";
-        findings
-            .error(Code::TopicPattern, place, message)
-            .help("name each topic under `variables`, or after the space: /ua_2_2_10");
-        return None;
-    }
     Some(origin)
 }
 
