@@ -15,7 +15,8 @@ pub(super) fn scalar(text: &str) -> String {
         return text.to_owned();
     }
     let mut quoted = String::from('"');
-    for c in text.chars() {
+    // What would stand for a variable of the environment.
+    for c in text.replace("${", "$${").chars() {
         match c {
             '"' | '\\' => quoted.extend(['\\', c]),
             c if c.is_ascii() && !c.is_control() => quoted.push(c),
