@@ -108,8 +108,8 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    /// A datagram and those that wait behind it, a bounded number, each carried on before the next is looked at: asking
-    /// everybody else between two of them costs as much as half the work itself. Says whether more may wait.
+    /// A datagram and those that wait behind it, a bounded number, each carried on before the next is looked at. Under a
+    /// flood everybody else is then asked once for many of them. Says whether more may wait.
     fn heard_all(
         &mut self,
         first: io::Result<(usize, std::net::SocketAddr)>,
@@ -252,24 +252,14 @@ impl<P: Port> Shell<P> {
             };
             match output {
                 Output::Datagram { topic, bytes } => {
-                    let sent = if self.dry_run {
-                        Ok(())
-                    } else {
-                        self.udp.try_send(&bytes)
-                    };
-                    if let Err(error) = sent {
+                    if let Err(error) = self.send(&bytes) {
                         self.router
                             .not_sent(topic, not_sent(error), &error.to_string());
                     }
                     self.router.recycle(bytes);
                 }
                 Output::Discovery { bytes } => {
-                    let sent = if self.dry_run {
-                        Ok(())
-                    } else {
-                        self.udp.try_send(&bytes)
-                    };
-                    if let Err(error) = sent {
+                    if let Err(error) = self.send(&bytes) {
                         self.router
                             .not_announced(not_sent(error), &error.to_string());
                     }
@@ -288,6 +278,13 @@ impl<P: Port> Shell<P> {
             }
         }
         true
+    }
+
+    fn send(&self, datagram: &[u8]) -> Result<(), SendError> {
+        if self.dry_run {
+            return Ok(());
+        }
+        self.udp.try_send(datagram)
     }
 
     fn deliver(&mut self, delivery: bridge_core::Delivery) {
