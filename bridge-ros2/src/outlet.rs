@@ -3,8 +3,8 @@
 //! RustDDS stops a reliable writer while its send window is full ([`Offered::policies`]): samples it does not take
 //! then wait here, in a queue as long as the topic's overflow policy says, and go out when the window opens.
 //!
-//! Samples wait, too, for a moment after the first reader was seen: it is known here before our writer is known there,
-//! and what is written in between is history, which a volatile reader does not get.
+//! Samples wait, too, from the time the first reader was seen until it has answered: it is known here before our writer
+//! is known there, and what is written in between is history, which a volatile reader does not get.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -45,8 +45,20 @@ enum Audience {
     /// Nobody. A state topic holds its last value back: written to a writer without readers it would stay in RustDDS'
     /// history, whose pruning spares what nobody acknowledged, and a late joiner would be given a trail of old values.
     Nobody { held: Option<Sample> },
-    /// Somebody, from this moment on, whom a sample of at most that size reaches.
-    Present { since: Instant, sample_size: usize },
+    /// Somebody, whom a sample of at most that size reaches.
+    Present {
+        /// Until what is written reaches them; none when it does.
+        settling: Option<Settling>,
+        sample_size: usize,
+    },
+}
+
+/// Waiting for readers to learn of the writer.
+#[derive(Debug, Clone, Copy)]
+struct Settling {
+    since: Instant,
+    /// How long to wait for one that says nothing.
+    patience: Duration,
 }
 
 /// Why a sample was not delivered.
@@ -106,8 +118,12 @@ impl Outlet {
         if self.waiting.is_empty() {
             self.waiting.extend(self.last.clone());
         }
-        if let Audience::Present { since, .. } = &mut self.audience {
-            *since = now + SETTLE;
+        if let Audience::Present { settling, .. } = &mut self.audience {
+            // Not for the reader because of which it is replaced.
+            *settling = Some(Settling {
+                since: now,
+                patience: SETTLE,
+            });
         }
     }
 
@@ -146,10 +162,10 @@ impl Outlet {
             Audience::Present { sample_size, .. } if sample.payload.len() > *sample_size => {
                 return Err(Refusal::TooLarge(*sample_size));
             }
-            Audience::Present { since, .. } if now < *since => {
-                return self.queue(sample, self.offered.waiting_room().max(SETTLING_ROOM));
-            }
             Audience::Present { .. } => {}
+        }
+        if !self.is_settled(now) {
+            return self.queue(sample, self.offered.waiting_room().max(SETTLING_ROOM));
         }
         self.flush(now)?;
         if !self.waiting.is_empty() {
@@ -166,7 +182,7 @@ impl Outlet {
     /// # Errors
     /// [`Refusal::Failed`], with the sample lost.
     pub fn flush(&mut self, now: Instant) -> Result<(), Refusal> {
-        if matches!(self.audience, Audience::Present { since, .. } if now < since) {
+        if self.waiting.is_empty() || !self.is_settled(now) {
             return Ok(());
         }
         while let Some(sample) = self.waiting.pop_front() {
@@ -198,6 +214,16 @@ impl Outlet {
         }
     }
 
+    /// Whether what is written now reaches the readers there are. Asked for the first time when there is something to
+    /// write; readers that come later join a stream that waits for nobody.
+    fn is_settled(&mut self, now: Instant) -> bool {
+        let Audience::Present { settling, .. } = &mut self.audience else {
+            return true;
+        };
+        settling.take_if(|settling| settling.is_over(&self.writer, now));
+        settling.is_none()
+    }
+
     /// A reader may match between two snapshots; what comes after the match is for it.
     fn notice_matches(&mut self, now: Instant) {
         while let Some(status) = self.writer.try_recv_status() {
@@ -220,7 +246,10 @@ impl Outlet {
             Audience::Nobody { held } => {
                 let held = held.take();
                 self.audience = Audience::Present {
-                    since: now + SETTLE,
+                    settling: Some(Settling {
+                        since: now,
+                        patience: PATIENCE,
+                    }),
                     sample_size: size,
                 };
                 held
@@ -298,8 +327,30 @@ impl std::fmt::Debug for Outlet {
     }
 }
 
+impl Settling {
+    /// Whether the readers get what is written now: those that acknowledge say so.
+    #[cfg(feature = "patched-dds")]
+    fn is_over(&self, writer: &Writer, now: Instant) -> bool {
+        let readers = writer.matched_readers();
+        let age = now.saturating_duration_since(self.since);
+        let told = readers.silent + readers.greeting == 0 && readers.in_step > 0;
+        // Where nobody has matched, the policies of those there are do not go with ours.
+        told && readers.best_effort == 0
+            || readers.silent == 0 && age >= SETTLE
+            || age >= self.patience
+    }
+
+    /// Whether the readers most likely get what is written now.
+    #[cfg(not(feature = "patched-dds"))]
+    fn is_over(&self, _writer: &Writer, now: Instant) -> bool {
+        now.saturating_duration_since(self.since) >= SETTLE.min(self.patience)
+    }
+}
+
 /// How long peers take to learn of our writer after we learned of their reader: 30 to 190 ms measured.
 const SETTLE: Duration = Duration::from_millis(250);
+/// How long to wait for a first reader that has not said anything: what tells it of us may have been lost, and said again.
+const PATIENCE: Duration = Duration::from_secs(3);
 /// Samples that may wait for that, at least.
 const SETTLING_ROOM: usize = 512;
 /// How long a state topic may lag behind for the sake of one reader. A reader that was killed, or lost its radio link,
