@@ -32,7 +32,10 @@ async fn main() -> ExitCode {
         }
     };
     let result = match domain {
-        Ok(domain) => relay(from, to, domain).await,
+        // A task of its own, as the bridge is: waking the main one costs a system call each time.
+        Ok(domain) => tokio::spawn(relay(from.clone(), to.clone(), domain))
+            .await
+            .unwrap_or_else(|panic| Err(panic.into())),
         Err(error) => Err(format!("no domain: {error}").into()),
     };
     match result {
@@ -44,7 +47,7 @@ async fn main() -> ExitCode {
     }
 }
 
-async fn relay(from: &str, to: &str, domain: u16) -> Result<(), Box<dyn std::error::Error>> {
+async fn relay(from: String, to: String, domain: u16) -> Result<(), Failure> {
     let domain = Domain::join(&DomainOptions {
         domain,
         networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
@@ -83,6 +86,8 @@ async fn relay(from: &str, to: &str, domain: u16) -> Result<(), Box<dyn std::err
         }
     }
 }
+
+type Failure = Box<dyn std::error::Error + Send + Sync>;
 
 const TYPE: &str = "std_msgs::msg::dds_::String_";
 const ROOM: NonZeroU16 = NonZeroU16::new(1000).unwrap();

@@ -6,9 +6,12 @@
 use std::future::poll_fn;
 use std::os::fd::OwnedFd;
 use std::pin::Pin;
-use std::task::{Context, Poll};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::{Context, Poll, Wake, Waker};
 use std::time::Duration;
 
+use futures_util::task::AtomicWaker;
 use rustdds::{EventLoop, Turned};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
@@ -20,13 +23,18 @@ use tracing::debug;
 /// # Errors
 /// When the runtime cannot watch the sockets.
 pub(crate) fn spawn(event_loop: EventLoop) -> std::io::Result<()> {
-    let sockets: Result<Vec<_>, _> = event_loop
+    let task = Arc::new(AtomicWaker::new());
+    let sockets: Result<Vec<_>, std::io::Error> = event_loop
         .descriptors()
         .into_iter()
-        .map(|descriptor| watched(descriptor.try_clone_to_owned()?))
+        .map(|descriptor| {
+            let socket = watched(descriptor.try_clone_to_owned()?)?;
+            Ok(Watched::new(socket, Arc::clone(&task)))
+        })
         .collect();
     let driver = Driver {
         sockets: sockets?,
+        task,
         event_loop,
     };
     tokio::spawn(driver.run());
@@ -44,7 +52,48 @@ fn watched(socket: OwnedFd) -> std::io::Result<AsyncFd<OwnedFd>> {
 struct Driver {
     event_loop: EventLoop,
     /// Its descriptors, each watched by the runtime itself: what is behind a second poll wakes a thread late.
-    sockets: Vec<AsyncFd<OwnedFd>>,
+    sockets: Vec<Watched>,
+    /// What their bells wake.
+    task: Arc<AtomicWaker>,
+}
+
+/// A descriptor that says whether it is worth a look: asking the runtime for each of them at each wake was a tenth of
+/// what a sample costs.
+struct Watched {
+    socket: AsyncFd<OwnedFd>,
+    bell: Arc<Bell>,
+    waker: Waker,
+}
+
+impl Watched {
+    fn new(socket: AsyncFd<OwnedFd>, task: Arc<AtomicWaker>) -> Self {
+        let bell = Arc::new(Bell {
+            // The first look has the runtime watch it.
+            rung: AtomicBool::new(true),
+            task,
+        });
+        Self {
+            socket,
+            waker: Waker::from(Arc::clone(&bell)),
+            bell,
+        }
+    }
+}
+
+struct Bell {
+    rung: AtomicBool,
+    task: Arc<AtomicWaker>,
+}
+
+impl Wake for Bell {
+    fn wake(self: Arc<Self>) {
+        self.wake_by_ref();
+    }
+
+    fn wake_by_ref(self: &Arc<Self>) {
+        self.rung.store(true, Ordering::Release);
+        self.task.wake();
+    }
 }
 
 impl Driver {
@@ -86,13 +135,21 @@ impl Driver {
 
     /// Tells the loop which sockets have become readable; the task is woken when one of the others does.
     fn poll_sockets(&mut self, cx: &mut Context<'_>) -> Sockets {
+        // Before the bells are looked at, so that none rings unheard.
+        self.task.register(cx.waker());
         let mut found = Sockets::Quiet;
-        for (index, socket) in self.sockets.iter().enumerate() {
-            match socket.poll_read_ready(cx) {
+        for (index, watched) in self.sockets.iter().enumerate() {
+            if !watched.bell.rung.swap(false, Ordering::Acquire) {
+                continue;
+            }
+            let mut cx = Context::from_waker(&watched.waker);
+            match watched.socket.poll_read_ready(&mut cx) {
                 Poll::Ready(Ok(mut ready)) => {
                     // Before the turn, so that what comes during it is noticed.
                     ready.clear_ready();
                     self.event_loop.readable(index);
+                    // For the next look, which has it watched again.
+                    watched.bell.rung.store(true, Ordering::Release);
                     found = Sockets::Readable;
                 }
                 Poll::Ready(Err(_shutting_down)) => return Sockets::Gone,

@@ -135,7 +135,8 @@ fn pass(paths: &mut [Path], pinger: &mut Pinger, load: Load) -> Vec<Option<Passe
             let Some(all) = all else { continue };
             let before = processor_time(path.relay.id());
             let passed = path.pass(pinger, Load { samples, ..load });
-            all.used += processor_time(path.relay.id()) - before;
+            // Less than before when a thread has ended.
+            all.used += processor_time(path.relay.id()).saturating_sub(before);
             all.times.extend(passed.times);
             all.lost += passed.lost;
             all.took += passed.took;
