@@ -157,9 +157,20 @@ document! {
         alias: String,
         /// Message type, as sensor_msgs/JointState: topics of another type are left out. Left out: any.
         r#type: String,
-        /// The field that holds the value. Left out: the whole message, a field per leaf.
+        /// The field that holds the value, or a part of it, as in a binding. Left out: the whole message, a field per leaf.
         field: String,
-        /// How the messages cross: `fields` (the default) as OPC UA values, `bytes` as they are, one ByteString each.
+        /// Several fields of the message in place of `field`, as in a binding.
+        fields: FieldList,
+        /// As in a binding.
+        scale: f64,
+        /// As in a binding.
+        offset: f64,
+        /// As in a binding.
+        invert: bool,
+        /// As in a binding.
+        out_of_range: OutOfRangeEntry,
+        /// How the messages cross: `fields` (the default) as OPC UA values, `bytes` as they are, one ByteString each,
+        /// `structure` as one OPC UA structure each, as in a binding.
         r#as: AsEntry,
     }
 
@@ -172,16 +183,16 @@ document! {
         #[schemars(regex(pattern = "^/"))]
         topic: String,
         /// Absolute name of a ROS 1 service that is called with each value that arrives from another space: the value
-        /// stands in `field` of the request. Without `field` the request is the same each time, and `when` says which
-        /// values call.
+        /// stands in `field` of the request, or its fields in `fields`. Without either the request is the same each time,
+        /// and `when` says which values call.
         #[schemars(regex(pattern = "^/"))]
         call: String,
         /// Node of the variable with a `call`, as ns=2;i=20: the value is what that service answers to its calls, one field
-        /// of the response or all.
+        /// of the response, several or all.
         #[schemars(regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
         answer: String,
         /// Absolute name of a ROS 1 service that is called `every` so often with `request`: the value is what it answers,
-        /// one field of the response or all.
+        /// one field of the response, several or all.
         #[schemars(regex(pattern = "^/"))]
         poll: String,
         /// Message type, as std_msgs/Bool. Left out: the std_msgs type of the variable's `type`. With `call` and `poll` the
@@ -207,7 +218,7 @@ document! {
         /// With `call` and `poll`: fields of the request that stay the same, as {id: 12, pose: {x: 1.5}} or
         /// {pose.x: 1.5}; the name of a constant of the request stands for its value. All others are zero or empty.
         request: Request,
-        /// With `call` and without `field`: the value that calls the service. Default: true for a Boolean, any value else.
+        /// With `call` and without `field` and `fields`: the value that calls the service. Default: true for a Boolean, any value else.
         #[schemars(extend("type" = ["string", "boolean", "number", "null"]))]
         when: String,
         /// With `call` and `poll`: how long the service may take; default 5s.
@@ -583,14 +594,4 @@ pub(crate) fn read(root: &Node, reader: &mut Reader<'_>) -> Option<(Document, Pl
         return Some((Document::default(), root.place));
     }
     Some((Document::read(root, reader)?, root.place))
-}
-
-/// The JSON Schema of the document, for editors: shapes and ranges, without what only checking across keys finds.
-#[must_use]
-pub fn schema() -> String {
-    let schema = schemars::schema_for!(Document);
-    // Every key is a string, which is all that could fail.
-    let mut text = serde_json::to_string_pretty(&schema).unwrap_or_default();
-    text.push('\n');
-    text
 }
