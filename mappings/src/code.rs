@@ -110,6 +110,7 @@ codes! {
     IncludeTwice = "M111", "A file is included once, and not by itself. Includes nest no deeper than 8 and lead to no more than 256 files.";
     EnvironmentVariable = "M112", "`${NAME}` is the value of an environment variable, `${NAME:-default}` has a default for one that is not set or empty, and `$${` stands for `${` itself.";
     MergeKey = "M113", "`<<` brings the keys of other maps: of an alias, or of a list of aliases.";
+    Secret = "M114", "A password stands in a URL of the file, as in rtsp://user:password@camera. It is not shown here, but whoever can read the file, or a copy of it, has it. Write it as ${NAME}, which the environment of the program gives, and keep the file to its owner (chmod 600). What everybody gets to read, such as the URI of a namespace, and the addresses of the mapping take none at all.";
     PatternUnmatched = "M120", "No topic that is there now fits the pattern and its type. Only `ua-space check --environment` asks for that; a robot that is switched off is no fault of the mapping.";
     TopicAway = "M121", "Nobody publishes the topic that is read, or nobody subscribes to the one that is written, in the graph as it is now. Only `ua-space check --environment` asks for that.";
     LiveTypeDiffers = "M122", "The topic is there with another message type, so not a single message would cross. Only `ua-space check --environment` asks for that.";

@@ -14,6 +14,7 @@ mod node_id;
 mod pattern;
 mod read;
 mod schema;
+mod secret;
 mod surroundings;
 mod topic;
 mod tree;
@@ -32,6 +33,6 @@ pub use mapping::{
 pub use node_id::{Identifier, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use schema::schema;
-pub use surroundings::Surroundings;
+pub use surroundings::{Readers, Surroundings};
 pub use topic::{Part, SpaceId, TopicError, TopicId};
 pub use unit::Unit;

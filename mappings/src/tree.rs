@@ -11,7 +11,7 @@ use std::rc::Rc;
 use granit_parser::{Event, Parser, ScalarStyle, ScanError, Span as Marks};
 
 use crate::code::Code;
-use crate::variables;
+use crate::{secret, variables};
 
 /// Largest text, in bytes.
 pub(crate) const MAX_BYTES: usize = 4 * 1024 * 1024;
@@ -93,6 +93,8 @@ pub(crate) struct Tree {
     pub(crate) values: BTreeMap<String, String>,
     /// How many bytes the values of variables come to, each time that one is named.
     pub(crate) expanded: usize,
+    /// The values with a password in them, which stands in the text.
+    pub(crate) secrets: Vec<(Place, String)>,
 }
 
 /// Reads the text of a file, whose number all places have. `variable` looks up the environment.
@@ -133,6 +135,7 @@ fn read(text: &str, variable: &dyn Fn(&str) -> Option<String>, file: u16) -> Res
         faults: Vec::new(),
         values: BTreeMap::new(),
         expanded: 0,
+        secrets: Vec::new(),
         variable,
     };
     for event in Parser::new_from_str_with_options(text, options) {
@@ -167,6 +170,7 @@ fn read(text: &str, variable: &dyn Fn(&str) -> Option<String>, file: u16) -> Res
         faults: builder.faults,
         values: builder.values,
         expanded: builder.expanded,
+        secrets: builder.secrets,
     })
 }
 
@@ -179,6 +183,7 @@ struct Builder<'v> {
     faults: Vec<Fault>,
     values: BTreeMap<String, String>,
     expanded: usize,
+    secrets: Vec<(Place, String)>,
     variable: &'v dyn Fn(&str) -> Option<String>,
 }
 
@@ -206,7 +211,11 @@ impl Builder<'_> {
                 Ok(())
             }
             Event::Scalar(text, style, anchor, _) => {
+                let written = secret::is_written(&text);
                 let text = self.expand(text.into_owned(), place)?;
+                if written {
+                    self.secrets.push((place, text.clone()));
+                }
                 let null = style == ScalarStyle::Plain
                     && matches!(&*text, "" | "~" | "null" | "Null" | "NULL");
                 let kind = if null { Kind::Null } else { Kind::Scalar(text) };

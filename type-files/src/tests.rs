@@ -250,3 +250,23 @@ fn a_single_file_is_of_the_package_around_its_folder() {
         assert!(file(&mut files, dialect, TextKind::Message, "robot_msgs/Arm").is_some());
     }
 }
+
+#[cfg(unix)]
+#[test]
+fn who_may_read_a_file_is_told_by_its_mode() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let folder = Folder::new("readers", &[("cell.yaml", "{}")]);
+    let path = folder.path("cell.yaml");
+    for (mode, readers) in [
+        (0o600, None),
+        (0o622, None),
+        (0o640, Some(Readers::Group)),
+        (0o604, Some(Readers::Everybody)),
+        (0o644, Some(Readers::Everybody)),
+    ] {
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(mode)).unwrap();
+        let told = Disk.readers(path.to_str().unwrap());
+        assert_eq!(told, readers, "{mode:o}");
+    }
+    assert_eq!(Disk.readers("/nowhere/cell.yaml"), None);
+}
