@@ -268,6 +268,17 @@ pub(crate) fn short(text: &str) -> String {
     short
 }
 
+/// The name of a field that is a word of Rust too.
+pub(crate) const fn plain(name: &'static str) -> &'static str {
+    match name.as_bytes() {
+        [b'r', b'#', plain @ ..] => match std::str::from_utf8(plain) {
+            Ok(plain) => plain,
+            Err(_) => name,
+        },
+        _ => name,
+    }
+}
+
 /// A map of known keys, each of which may be left out; the names of the fields are the keys.
 macro_rules! document {
     ($($(#[$meta:meta])* struct $name:ident { $($(#[$field_meta:meta])* $field:ident: $type:ty,)* })*) => {$(
@@ -278,8 +289,9 @@ macro_rules! document {
 
         impl $crate::read::Read for $name {
             fn read(node: &$crate::tree::Node, reader: &mut $crate::read::Reader<'_>) -> Option<Self> {
-                let keys = [$(stringify!($field).trim_start_matches("r#")),*];
-                let [$($field),*] = reader.keys(node, keys)?;
+                const KEYS: [&str; [$(stringify!($field)),*].len()] =
+                    [$($crate::read::plain(stringify!($field))),*];
+                let [$($field),*] = reader.keys(node, KEYS)?;
                 Some(Self { $($field: reader.field($field),)* })
             }
         }
