@@ -1,6 +1,5 @@
 //! Parts of arrays and converted values, from a mapping through the bridges of two spaces.
 #![expect(
-    clippy::panic,
     clippy::unwrap_used,
     clippy::wildcard_enum_match_arm,
     reason = "test code"
