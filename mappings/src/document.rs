@@ -295,7 +295,7 @@ const DURATION: &str = r"^[0-9]+(\.[0-9]+)?(ms|s|min|h)$";
 pub(crate) type Namespaces = Vec<(At<u16>, At<String>)>;
 
 impl Read for Namespaces {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let pairs = reader.pairs(node, "a map of namespace index and URI")?;
         let read = pairs.into_iter().map(|pair| {
             let key = pair
@@ -326,7 +326,7 @@ impl Read for Namespaces {
 pub(crate) type EnumTexts = Vec<(At<i64>, At<String>)>;
 
 impl Read for EnumTexts {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let pairs = reader.pairs(node, "a map of value and text, as {0: idle, 1: moving}")?;
         let read = pairs.into_iter().map(|pair| {
             let value = pair.key.parse().ok();
@@ -346,7 +346,7 @@ impl Read for EnumTexts {
 pub(crate) struct Request(pub(crate) Vec<(String, Place, Literal)>);
 
 impl Read for Request {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let mut found = Vec::new();
         constants(node, "", reader, &mut found)?;
         Some(Self(found))
@@ -355,7 +355,7 @@ impl Read for Request {
 
 /// `None` after noting what is faulty. Maps nest no deeper than documents do.
 fn constants(
-    node: &Node,
+    node: &Node<'_>,
     prefix: &str,
     reader: &mut Reader<'_>,
     found: &mut Vec<(String, Place, Literal)>,
@@ -369,7 +369,7 @@ fn constants(
                 sound = sound.and(inner);
                 continue;
             }
-            Kind::Scalar(text) => Some(Literal::One(text.clone())),
+            Kind::Scalar(text) => Some(Literal::One(text.clone().into_owned())),
             Kind::List(items) => {
                 let texts = items
                     .iter()
@@ -408,7 +408,7 @@ impl JsonSchema for Request {
 pub(crate) struct Includes(pub(crate) Vec<At<String>>);
 
 impl Read for Includes {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         match &node.kind {
             Kind::List(_) => Vec::read(node, reader).map(Self),
             Kind::Scalar(_) => Some(Self(vec![reader.at(node)])),
@@ -440,7 +440,7 @@ impl JsonSchema for Includes {
 pub(crate) struct FieldList(pub(crate) Vec<At<FieldEntry>>);
 
 impl Read for FieldList {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let Kind::List(items) = &node.kind else {
             reader.wrong(node, "a list of fields such as `[linear.x, angular.z]`");
             return None;
@@ -451,7 +451,7 @@ impl Read for FieldList {
                 value: Some(FieldEntry {
                     field: Some(At {
                         place: item.place,
-                        value: Some(text.clone()),
+                        value: Some(text.clone().into_owned()),
                     }),
                     scale: None,
                     offset: None,
@@ -485,7 +485,7 @@ impl JsonSchema for FieldList {
 pub(crate) struct Bindings(pub(crate) Vec<At<BindingEntry>>);
 
 impl Read for Bindings {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         match &node.kind {
             Kind::List(_) => Vec::read(node, reader).map(Self),
             Kind::Map(_) => Some(Self(vec![reader.at(node)])),
@@ -523,7 +523,7 @@ pub(crate) enum Queue {
 }
 
 impl Read for Queue {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         match &node.kind {
             Kind::Scalar(text) if text == "keep_latest" => Some(Self::KeepLatest),
             Kind::Map(_) => {
@@ -565,7 +565,7 @@ impl Read for Queue {
     }
 }
 
-fn found(node: &Node) -> String {
+fn found(node: &Node<'_>) -> String {
     match &node.kind {
         Kind::Scalar(text) => format!("`{}`", short(text)),
         Kind::Null | Kind::List(_) | Kind::Map(_) => node.kind.name().to_owned(),
@@ -589,7 +589,7 @@ impl Default for Document {
 }
 
 /// Reads the whole document; an empty one is one without any key.
-pub(crate) fn read(root: &Node, reader: &mut Reader<'_>) -> Option<(Document, Place)> {
+pub(crate) fn read(root: &Node<'_>, reader: &mut Reader<'_>) -> Option<(Document, Place)> {
     if matches!(root.kind, Kind::Null) {
         return Some((Document::default(), root.place));
     }
