@@ -39,7 +39,7 @@ fn messages_move_both_ways_without_an_allocation() {
                 .unwrap();
             let plan = Plan::compile(&message, &Selection::Whole, wire).unwrap();
             let nothing = Selection::Template {
-                field: None,
+                fields: Vec::new(),
                 rest: [].into(),
             };
             let mut bytes = Vec::new();

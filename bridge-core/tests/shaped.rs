@@ -10,8 +10,8 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use bridge_core::{Heard, Local, Now, Output, Reason, Router, Settings, Verdict};
-use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Dialect, NoFields, Plan, Registry, Selection, Wire};
+use mappings::{Mapping, ServiceRole, SpaceId, TopicId};
+use messages::{Dialect, NoFields, Plan, Registry, Selected, Selection, Wire};
 use uadp::Timestamp;
 
 const CELL: &str = r#"
@@ -41,24 +41,37 @@ fn now() -> Now {
     }
 }
 
-/// The bridge of a space, its topics bound as the cell says.
-fn bridge(space: u16, now: Now) -> Router {
-    let checked = Mapping::from_yaml(CELL, "cell.yaml");
-    assert!(checked.findings.is_empty(), "{}", checked.render(CELL));
-    let mapping = Arc::new(checked.mapping.unwrap());
-    let own = SpaceId::new(space).unwrap();
-    let (local, dialect) = match space {
-        1 => (Local::Ros1, Dialect::Ros1),
-        _ => (Local::Cdr, Dialect::Ros2),
-    };
+fn mapping(text: &str) -> Arc<Mapping> {
+    let checked = Mapping::from_yaml(text, "cell.yaml");
+    assert!(checked.findings.is_empty(), "{}", checked.render(text));
+    Arc::new(checked.mapping.unwrap())
+}
+
+fn router(space: u16, mapping: &Arc<Mapping>) -> Router {
     let settings = Settings {
-        own,
-        local,
+        own: SpaceId::new(space).unwrap(),
+        local: match space {
+            1 => Local::Ros1,
+            _ => Local::Cdr,
+        },
         source: None,
     };
-    let mut router = Router::new(settings, Arc::clone(&mapping));
-    let registry = Registry::bundle(dialect);
-    for (variable, binding) in mapping.bindings(own) {
+    Router::new(settings, Arc::clone(mapping))
+}
+
+fn registry(space: u16) -> Registry {
+    Registry::bundle(match space {
+        1 => Dialect::Ros1,
+        _ => Dialect::Ros2,
+    })
+}
+
+/// The bridge of a space, its topics bound as the cell says.
+fn bridge(space: u16, now: Now) -> Router {
+    let mapping = mapping(CELL);
+    let mut router = router(space, &mapping);
+    let registry = registry(space);
+    for (variable, binding) in mapping.bindings(SpaceId::new(space).unwrap()) {
         let message_type = registry.get(&binding.message_type).unwrap();
         router
             .bind(variable.topic, &message_type, &binding.selection, now)
@@ -70,8 +83,24 @@ fn bridge(space: u16, now: Now) -> Router {
 /// What is published in space 2 when space 1 hears `payload`.
 fn cross(topic: &str, payload: &[u8]) -> Result<Vec<u8>, String> {
     let now = now();
+    carried(
+        &mut bridge(1, now),
+        &mut bridge(2, now),
+        topic,
+        payload,
+        now,
+    )
+}
+
+/// What `reader` publishes when `sender` hears `payload`, or why the sender drops it.
+fn carried(
+    sender: &mut Router,
+    reader: &mut Router,
+    topic: &str,
+    payload: &[u8],
+    now: Now,
+) -> Result<Vec<u8>, String> {
     let topic: TopicId = topic.parse().unwrap();
-    let (mut sender, mut reader) = (bridge(1, now), bridge(2, now));
     let heard = Heard {
         topic,
         payload,
@@ -137,6 +166,122 @@ fn an_inverted_boolean_crosses_as_the_other() {
     assert_eq!(cross("ua_1_2_11", &[0]).unwrap(), [0, 1, 0, 0, 1, 0, 0, 0]);
 }
 
+/// What space 2 makes of the Twist of a topic that a pattern makes a value of, with `chosen` of it, when it reads the
+/// values as `taken`.
+fn by_pattern(chosen: &str, taken: &Selection) -> Vec<u8> {
+    let mapping = mapping(&format!(
+        "spaces: [{{id: 1}}, {{id: 2}}]\nnamespaces: {{2: urn:my-plant:line}}\npatterns:\n  \
+         - {{topics: \"/robot*/cmd_vel\", origin: 1, node: \"ns=2;i=10{{1}}\", name: \"Robot{{1}}\", {chosen}}}\n"
+    ));
+    let now = now();
+    let name = "geometry_msgs/Twist".parse().unwrap();
+    let made = mapping.matching(SpaceId::ROS1, "/robot2/cmd_vel", Some(&name));
+    let made = made.unwrap().unwrap();
+    assert_eq!(made.topic.to_string(), "ua_1_2_102");
+    let (mut sender, mut reader) = (router(1, &mapping), router(2, &mapping));
+    let twist = |space| registry(space).get(&name).unwrap();
+    let bound = sender.bind(made.topic, &twist(1), &made.selection, now);
+    bound.unwrap();
+    reader.bind(made.topic, &twist(2), taken, now).unwrap();
+    let payload: Vec<u8> = TWIST.iter().flat_map(|value| value.to_le_bytes()).collect();
+    carried(&mut sender, &mut reader, "ua_1_2_102", &payload, now).unwrap()
+}
+
+const TWIST: [f64; 6] = [1.0, 2.0, 3.0, 4.0, 5.0, 0.25];
+
+fn cdr(values: [f64; 6]) -> Vec<u8> {
+    let values = values.iter().flat_map(|value| value.to_le_bytes());
+    [0, 1, 0, 0].into_iter().chain(values).collect()
+}
+
+#[test]
+fn fields_of_topics_of_a_pattern_cross_each_converted_by_its_own() {
+    let chosen = "type: geometry_msgs/Twist, fields: [linear.x, {field: angular.z, scale: 1000}]";
+    let fields = ["linear.x", "angular.z"].map(Selected::whole).to_vec();
+    let delivered = by_pattern(chosen, &Selection::Fields(fields));
+    assert_eq!(delivered, cdr([1.0, 0.0, 0.0, 0.0, 0.0, 250.0]));
+}
+
+#[test]
+fn topics_of_a_pattern_cross_as_structures() {
+    let whole = by_pattern("as: structure", &Selection::Structure(None));
+    assert_eq!(whole, cdr(TWIST));
+    let within = Selection::Structure(Some("linear".to_owned()));
+    let linear = by_pattern(
+        "type: geometry_msgs/Twist, field: linear, as: structure",
+        &within,
+    );
+    assert_eq!(linear, cdr([1.0, 2.0, 3.0, 0.0, 0.0, 0.0]));
+}
+
+#[test]
+fn requests_and_answers_of_services_are_converted() {
+    let mapping = mapping(
+        r#"
+spaces: [{id: 1}, {id: 2}]
+namespaces: {2: urn:my-plant:line}
+variables:
+  - node: ns=2;i=20
+    name: Tolerance
+    origin: 2
+    ros:
+      - {topic: /millimetres, type: std_msgs/Float64}
+      - {space: 1, call: /plan, type: nav_msgs/GetPlan, field: tolerance, scale: 1000, out_of_range: refuse, request: {start.header.frame_id: map}}
+    type: Double
+  - node: ns=2;i=21
+    name: Failed
+    origin: 1
+    ros:
+      - {poll: /ready, type: std_srvs/Trigger, field: success, invert: true}
+      - {space: 2, topic: /failed, type: std_msgs/Bool}
+"#,
+    );
+    let now = now();
+    let (mut ros1, mut ros2) = (router(1, &mapping), router(2, &mapping));
+    for (variable, binding) in mapping.bindings(SpaceId::new(2).unwrap()) {
+        let message_type = registry(2).get(&binding.message_type).unwrap();
+        let bound = ros2.bind(variable.topic, &message_type, &binding.selection, now);
+        bound.unwrap();
+    }
+    for (variable, service) in mapping.services(SpaceId::ROS1) {
+        let (message_type, selection) = match &service.role {
+            ServiceRole::Call {
+                service_type,
+                request,
+                ..
+            } => {
+                let service_type = registry(1).service(service_type).unwrap();
+                (Arc::clone(service_type.request()), request)
+            }
+            ServiceRole::Poll {
+                service_type,
+                selection,
+                ..
+            } => {
+                let service_type = registry(1).service(service_type).unwrap();
+                (Arc::clone(service_type.response()), selection)
+            }
+            ServiceRole::Answer { .. } => panic!("the mapping has none"),
+        };
+        let bound = ros1.bind(variable.topic, &message_type, selection, now);
+        bound.unwrap();
+    }
+    let value = [&[0, 1, 0, 0][..], &250f64.to_le_bytes()].concat();
+    let request = carried(&mut ros2, &mut ros1, "ua_2_2_20", &value, now).unwrap();
+    assert!(
+        request.ends_with(&0.25f32.to_le_bytes()),
+        "250 mm are {request:?}"
+    );
+    let map = request.windows(3).position(|bytes| bytes == b"map");
+    assert_eq!(map, Some(16), "behind sequence number, time and length");
+    let ready = [1, 0, 0, 0, 0];
+    let delivered = carried(&mut ros1, &mut ros2, "ua_1_2_21", &ready, now).unwrap();
+    assert_eq!(delivered, [0, 1, 0, 0, 0, 0, 0, 0]);
+    let failed = [0, 0, 0, 0, 0];
+    let delivered = carried(&mut ros1, &mut ros2, "ua_1_2_21", &failed, now).unwrap();
+    assert_eq!(delivered, [0, 1, 0, 0, 1, 0, 0, 0]);
+}
+
 #[test]
 fn a_message_of_zeros_is_what_the_test_takes_it_for() {
     let registry = Registry::bundle(Dialect::Ros1);
@@ -144,7 +289,7 @@ fn a_message_of_zeros_is_what_the_test_takes_it_for() {
         .get(&"sensor_msgs/JointState".parse().unwrap())
         .unwrap();
     let nothing = Selection::Template {
-        field: None,
+        fields: Vec::new(),
         rest: [].into(),
     };
     let plan = Plan::compile(&message, &nothing, Wire::Ros1).unwrap();

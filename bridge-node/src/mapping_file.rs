@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use mappings::{Checked, Code, Diagnostic, Mapping, Severity, Surroundings, TypeFiles};
+use mappings::{Checked, Code, Diagnostic, Mapping, Readers, Severity, Surroundings, TypeFiles};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use tokio::signal::unix::Signal;
@@ -157,6 +157,10 @@ impl Surroundings for Disk {
 
     fn variable(&self, name: &str) -> Option<String> {
         type_files::Disk.variable(name)
+    }
+
+    fn readers(&self, file: &str) -> Option<Readers> {
+        type_files::Disk.readers(file)
     }
 
     fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {

@@ -255,7 +255,7 @@ impl Services {
         let service_type = graph.service_type(service_type)?;
         let message_type = service_type.request();
         let (bound, constant) = match request {
-            Selection::Template { field: None, .. } => {
+            Selection::Template { fields, .. } if fields.is_empty() => {
                 let request = constant::<G>(message_type, request)?;
                 let carrier = carrier(graph, variable)?;
                 let value = match when {
@@ -504,7 +504,7 @@ fn constant<G: ServiceGraph>(
 /// A std_msgs type with that text as its `data`.
 fn only(text: &str) -> Selection {
     Selection::Template {
-        field: None,
+        fields: Vec::new(),
         rest: BTreeMap::from([("data".to_owned(), Literal::One(text.to_owned()))]),
     }
 }

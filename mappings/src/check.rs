@@ -7,6 +7,7 @@ mod meaning;
 mod names;
 mod network;
 mod patterns;
+mod selection;
 mod services;
 mod several;
 mod shaping;

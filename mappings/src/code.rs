@@ -88,14 +88,14 @@ codes! {
     UnknownServiceType = "M075", "No definition of the service type is built in. The connection to a service does not carry it, so a package with the .srv file must be below one of the folders of ROS_PACKAGE_PATH when the bridge runs.";
     RequestConstant = "M076", "A constant of a request is a value of its field: the field exists, is given once, does not take the value too, and the value is of its type and range.";
     Answer = "M077", "`answer` names the node of a variable that has a `call`; its value is what that service answers.";
-    When = "M078", "`when` is a value of the variable's type, and goes with a `call` that has no `field`: with one, each value is sent.";
+    When = "M078", "`when` is a value of the variable's type, and goes with a `call` that has no `field` or `fields`: with one, each value is sent.";
     TopicPattern = "M079", "A pattern of topics is a topic name in which `*` stands for one or more characters of a part, and at most one part `**` for any number of parts.";
     PatternCapture = "M080", "`{1}` in the `node`, `alias` or `name` of a pattern stands for what its first wildcard does, and so on. Node and alias have one, or all topics would be one node.";
     FieldPart = "M081", "In brackets behind a field that is an array of values stands the part of it: `[2]` the third element, `[name=joint_3]` the one whose place has joint_3 in the array `name` beside it, `[0:90]` the first ninety.";
     PartWritten = "M082", "A part of an array is read from ROS. It cannot be written, since nothing says what stands in the rest of the array.";
-    Conversion = "M083", "`scale` and `offset` go with a number, `invert` with a Boolean, all of them with one field; `out_of_range` says what becomes of values that a conversion makes too big.";
-    LossyConversion = "M084", "The type the value becomes cannot hold all that the other type can, so a number would be rounded or not fit. With `out_of_range` it is rounded; one that does not fit then does not cross and is counted with `refuse`, and becomes the nearest that fits with `clamp`.";
-    Publish = "M085", "`deadband` is a number above 0, of values that are numbers; `at_most` a rate as 10 Hz, from 0.001 Hz to 1000 Hz.";
+    Conversion = "M083", "`scale` and `offset` go with a number, `invert` with a Boolean, all of them with one field; `out_of_range` says what becomes of numbers that a conversion makes too big. Of several `fields` each has its own; of a service those of the request, or of what it answers, convert likewise.";
+    LossyConversion = "M084", "The type the value becomes cannot hold all that the other type can, so a number would be rounded or not fit. With `out_of_range` it is rounded; one that does not fit then does not cross and is counted with `refuse`, and becomes the nearest that fits with `clamp`. So write one of them beside the `field`; or give the variable a `type` that holds all values, such as Double, and nothing has to be said.";
+    Publish = "M085", "`deadband` is a number above 0, of values that are numbers, or of which one at least is; `at_most` a rate as 10 Hz, from 0.001 Hz to 1000 Hz.";
     Fields = "M090", "`fields` names at least one field, each once, and stands in place of `field`. What converts a value stands with its field, as {field: linear.x, scale: 1000}.";
     FieldOrder = "M091", "Fields that are written to ROS stand in the order the message has them, and none of them is in another.";
     StructureOf = "M092", "A structure is a message: the whole one, or a message in it that `field` names. A structure on both sides is of one message type.";
@@ -110,6 +110,7 @@ codes! {
     IncludeTwice = "M111", "A file is included once, and not by itself. Includes nest no deeper than 8 and lead to no more than 256 files.";
     EnvironmentVariable = "M112", "`${NAME}` is the value of an environment variable, `${NAME:-default}` has a default for one that is not set or empty, and `$${` stands for `${` itself.";
     MergeKey = "M113", "`<<` brings the keys of other maps: of an alias, or of a list of aliases.";
+    Secret = "M114", "A password stands in a URL of the file, as in rtsp://user:password@camera. It is not shown here, but whoever can read the file, or a copy of it, has it. Write it as ${NAME}, which the environment of the program gives, and keep the file to its owner (chmod 600). What everybody gets to read, such as the URI of a namespace, and the addresses of the mapping take none at all.";
     PatternUnmatched = "M120", "No topic that is there now fits the pattern and its type. Only `ua-space check --environment` asks for that; a robot that is switched off is no fault of the mapping.";
     TopicAway = "M121", "Nobody publishes the topic that is read, or nobody subscribes to the one that is written, in the graph as it is now. Only `ua-space check --environment` asks for that.";
     LiveTypeDiffers = "M122", "The topic is there with another message type, so not a single message would cross. Only `ua-space check --environment` asks for that.";

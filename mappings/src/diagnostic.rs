@@ -4,6 +4,7 @@ use std::fmt::{self, Write as _};
 use std::sync::Arc;
 
 use crate::code::Code;
+use crate::secret::masked;
 
 /// One finding. Its `Display` is one line without the source: `error[M003]: <message> (cell.yaml:14:3)`.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -56,7 +57,7 @@ pub struct Span {
 impl Diagnostic {
     /// The finding with its source line, several lines of text that end in a newline. `source` is the text that was
     /// checked; without that line the finding is told without it. Control characters of the source are replaced, so
-    /// that a document cannot steer the terminal.
+    /// that a document cannot steer the terminal, and passwords in URLs are not shown.
     #[must_use]
     pub fn render(&self, source: &str) -> String {
         let Span {
@@ -75,7 +76,7 @@ impl Diagnostic {
         let place = format!("{:width$}--> {}:{line}:{column}\n", "", printable(file));
         out.push_str(&place);
         if let Some(text) = line.checked_sub(1).and_then(|n| source.lines().nth(n)) {
-            let (shown, caret, carets) = window(text, column.saturating_sub(1), *len);
+            let (shown, caret, carets) = window(&masked(text), column.saturating_sub(1), *len);
             let label = self.label.as_deref().map(printable).unwrap_or_default();
             let pointer = format!("{:caret$}{:^<carets$} {label}", "", "");
             // A write to a String cannot fail.

@@ -157,9 +157,20 @@ document! {
         alias: String,
         /// Message type, as sensor_msgs/JointState: topics of another type are left out. Left out: any.
         r#type: String,
-        /// The field that holds the value. Left out: the whole message, a field per leaf.
+        /// The field that holds the value, or a part of it, as in a binding. Left out: the whole message, a field per leaf.
         field: String,
-        /// How the messages cross: `fields` (the default) as OPC UA values, `bytes` as they are, one ByteString each.
+        /// Several fields of the message in place of `field`, as in a binding.
+        fields: FieldList,
+        /// As in a binding.
+        scale: f64,
+        /// As in a binding.
+        offset: f64,
+        /// As in a binding.
+        invert: bool,
+        /// As in a binding.
+        out_of_range: OutOfRangeEntry,
+        /// How the messages cross: `fields` (the default) as OPC UA values, `bytes` as they are, one ByteString each,
+        /// `structure` as one OPC UA structure each, as in a binding.
         r#as: AsEntry,
     }
 
@@ -172,16 +183,16 @@ document! {
         #[schemars(regex(pattern = "^/"))]
         topic: String,
         /// Absolute name of a ROS 1 service that is called with each value that arrives from another space: the value
-        /// stands in `field` of the request. Without `field` the request is the same each time, and `when` says which
-        /// values call.
+        /// stands in `field` of the request, or its fields in `fields`. Without either the request is the same each time,
+        /// and `when` says which values call.
         #[schemars(regex(pattern = "^/"))]
         call: String,
         /// Node of the variable with a `call`, as ns=2;i=20: the value is what that service answers to its calls, one field
-        /// of the response or all.
+        /// of the response, several or all.
         #[schemars(regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
         answer: String,
         /// Absolute name of a ROS 1 service that is called `every` so often with `request`: the value is what it answers,
-        /// one field of the response or all.
+        /// one field of the response, several or all.
         #[schemars(regex(pattern = "^/"))]
         poll: String,
         /// Message type, as std_msgs/Bool. Left out: the std_msgs type of the variable's `type`. With `call` and `poll` the
@@ -207,7 +218,7 @@ document! {
         /// With `call` and `poll`: fields of the request that stay the same, as {id: 12, pose: {x: 1.5}} or
         /// {pose.x: 1.5}; the name of a constant of the request stands for its value. All others are zero or empty.
         request: Request,
-        /// With `call` and without `field`: the value that calls the service. Default: true for a Boolean, any value else.
+        /// With `call` and without `field` and `fields`: the value that calls the service. Default: true for a Boolean, any value else.
         #[schemars(extend("type" = ["string", "boolean", "number", "null"]))]
         when: String,
         /// With `call` and `poll`: how long the service may take; default 5s.
@@ -284,7 +295,7 @@ const DURATION: &str = r"^[0-9]+(\.[0-9]+)?(ms|s|min|h)$";
 pub(crate) type Namespaces = Vec<(At<u16>, At<String>)>;
 
 impl Read for Namespaces {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let pairs = reader.pairs(node, "a map of namespace index and URI")?;
         let read = pairs.into_iter().map(|pair| {
             let key = pair
@@ -315,7 +326,7 @@ impl Read for Namespaces {
 pub(crate) type EnumTexts = Vec<(At<i64>, At<String>)>;
 
 impl Read for EnumTexts {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let pairs = reader.pairs(node, "a map of value and text, as {0: idle, 1: moving}")?;
         let read = pairs.into_iter().map(|pair| {
             let value = pair.key.parse().ok();
@@ -335,7 +346,7 @@ impl Read for EnumTexts {
 pub(crate) struct Request(pub(crate) Vec<(String, Place, Literal)>);
 
 impl Read for Request {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let mut found = Vec::new();
         constants(node, "", reader, &mut found)?;
         Some(Self(found))
@@ -344,7 +355,7 @@ impl Read for Request {
 
 /// `None` after noting what is faulty. Maps nest no deeper than documents do.
 fn constants(
-    node: &Node,
+    node: &Node<'_>,
     prefix: &str,
     reader: &mut Reader<'_>,
     found: &mut Vec<(String, Place, Literal)>,
@@ -358,7 +369,7 @@ fn constants(
                 sound = sound.and(inner);
                 continue;
             }
-            Kind::Scalar(text) => Some(Literal::One(text.clone())),
+            Kind::Scalar(text) => Some(Literal::One(text.clone().into_owned())),
             Kind::List(items) => {
                 let texts = items
                     .iter()
@@ -397,7 +408,7 @@ impl JsonSchema for Request {
 pub(crate) struct Includes(pub(crate) Vec<At<String>>);
 
 impl Read for Includes {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         match &node.kind {
             Kind::List(_) => Vec::read(node, reader).map(Self),
             Kind::Scalar(_) => Some(Self(vec![reader.at(node)])),
@@ -429,7 +440,7 @@ impl JsonSchema for Includes {
 pub(crate) struct FieldList(pub(crate) Vec<At<FieldEntry>>);
 
 impl Read for FieldList {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let Kind::List(items) = &node.kind else {
             reader.wrong(node, "a list of fields such as `[linear.x, angular.z]`");
             return None;
@@ -440,7 +451,7 @@ impl Read for FieldList {
                 value: Some(FieldEntry {
                     field: Some(At {
                         place: item.place,
-                        value: Some(text.clone()),
+                        value: Some(text.clone().into_owned()),
                     }),
                     scale: None,
                     offset: None,
@@ -474,7 +485,7 @@ impl JsonSchema for FieldList {
 pub(crate) struct Bindings(pub(crate) Vec<At<BindingEntry>>);
 
 impl Read for Bindings {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         match &node.kind {
             Kind::List(_) => Vec::read(node, reader).map(Self),
             Kind::Map(_) => Some(Self(vec![reader.at(node)])),
@@ -512,7 +523,7 @@ pub(crate) enum Queue {
 }
 
 impl Read for Queue {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         match &node.kind {
             Kind::Scalar(text) if text == "keep_latest" => Some(Self::KeepLatest),
             Kind::Map(_) => {
@@ -554,7 +565,7 @@ impl Read for Queue {
     }
 }
 
-fn found(node: &Node) -> String {
+fn found(node: &Node<'_>) -> String {
     match &node.kind {
         Kind::Scalar(text) => format!("`{}`", short(text)),
         Kind::Null | Kind::List(_) | Kind::Map(_) => node.kind.name().to_owned(),
@@ -578,19 +589,9 @@ impl Default for Document {
 }
 
 /// Reads the whole document; an empty one is one without any key.
-pub(crate) fn read(root: &Node, reader: &mut Reader<'_>) -> Option<(Document, Place)> {
+pub(crate) fn read(root: &Node<'_>, reader: &mut Reader<'_>) -> Option<(Document, Place)> {
     if matches!(root.kind, Kind::Null) {
         return Some((Document::default(), root.place));
     }
     Some((Document::read(root, reader)?, root.place))
-}
-
-/// The JSON Schema of the document, for editors: shapes and ranges, without what only checking across keys finds.
-#[must_use]
-pub fn schema() -> String {
-    let schema = schemars::schema_for!(Document);
-    // Every key is a string, which is all that could fail.
-    let mut text = serde_json::to_string_pretty(&schema).unwrap_or_default();
-    text.push('\n');
-    text
 }

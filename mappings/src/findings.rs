@@ -6,6 +6,7 @@ use std::sync::Arc;
 use crate::code::Code;
 use crate::diagnostic::{Diagnostic, Severity, Span};
 use crate::read::short;
+use crate::secret;
 use crate::tree::Place;
 
 /// Most findings that are kept; the rest is counted.
@@ -146,7 +147,7 @@ impl Findings {
             let texts = [&mut found.label, &mut found.help];
             let texts = texts.into_iter().flatten().chain([&mut found.message]);
             for text in texts {
-                *text = hidden(text, &secrets);
+                *text = secret::masked(&hidden(text, &secrets)).into_owned();
             }
         }
         if self.left_out > 0 {

@@ -5,7 +5,8 @@ use crate::code::Code;
 use crate::document::{self, Document};
 use crate::findings::Findings;
 use crate::read::{At, Field, Reader};
-use crate::surroundings::{Surroundings, beside, fits};
+use crate::secret;
+use crate::surroundings::{Readers, Surroundings, beside, fits};
 use crate::tree::{self, MAX_BYTES, Place};
 
 /// Reads files into one document.
@@ -70,6 +71,7 @@ impl<'a> Loader<'a> {
         for (value, written) in tree.values {
             self.findings.hide(value, written);
         }
+        self.secrets(tree.secrets, &path);
         self.expanded = self.expanded.saturating_add(tree.expanded);
         if self.expanded > MAX_BYTES {
             let place = Place {
@@ -109,6 +111,31 @@ impl<'a> Loader<'a> {
         }
         self.open.pop();
         Some(())
+    }
+
+    /// Notes the passwords that stand in a file, and has them hidden.
+    fn secrets(&mut self, found: Vec<(Place, String)>, path: &str) {
+        if found.is_empty() {
+            return;
+        }
+        let readers = self.around.readers(path);
+        for (place, text) in found {
+            let masked = secret::masked(&text).into_owned();
+            self.findings.hide(text, masked);
+            let message = "a password stands here in plain text";
+            let note = self.findings.warning(Code::Secret, place, message);
+            let apart = "write it as ${NAME}, which the environment of the program gives";
+            let Some(readers) = readers else {
+                note.help(apart);
+                continue;
+            };
+            let (who, mode) = match readers {
+                Readers::Group => ("the group of the file", "g-r"),
+                Readers::Everybody => ("everybody on this host", "go-r"),
+            };
+            let help = format!("{apart}, or keep the file to its owner: chmod {mode} {path}");
+            note.label(format!("{who} can read it")).help(help);
+        }
     }
 
     fn note(&mut self, fault: tree::Fault) {

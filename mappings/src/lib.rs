@@ -13,6 +13,8 @@ mod nearest;
 mod node_id;
 mod pattern;
 mod read;
+mod schema;
+mod secret;
 mod surroundings;
 mod topic;
 mod tree;
@@ -23,7 +25,6 @@ pub use check::{Checked, PathFault, PathFaultKind, Source, TypeFiles, TypeOrigin
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use difference::Difference;
-pub use document::schema;
 pub use environment::{Environment, LiveNode, LiveServer, LiveSpace, LiveTopic};
 pub use mapping::{
     Binding, Endpoint, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule,
@@ -31,6 +32,7 @@ pub use mapping::{
 };
 pub use node_id::{Identifier, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
-pub use surroundings::Surroundings;
+pub use schema::schema;
+pub use surroundings::{Readers, Surroundings};
 pub use topic::{Part, SpaceId, TopicError, TopicId};
 pub use unit::Unit;

@@ -55,7 +55,7 @@ impl<T: JsonSchema> JsonSchema for At<T> {
 /// What can be made of a node.
 pub(crate) trait Read: Sized {
     /// `None` after noting why.
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self>;
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self>;
 }
 
 pub(crate) struct Reader<'f> {
@@ -68,7 +68,7 @@ impl<'f> Reader<'f> {
         Self { findings, read: 0 }
     }
 
-    pub(crate) fn at<T: Read>(&mut self, node: &Node) -> At<T> {
+    pub(crate) fn at<T: Read>(&mut self, node: &Node<'_>) -> At<T> {
         self.read += 1;
         let value = if self.read <= MAX_READ {
             T::read(node, self)
@@ -86,12 +86,12 @@ impl<'f> Reader<'f> {
     }
 
     /// Notes that `wanted` (with its article) should stand there.
-    pub(crate) fn wrong(&mut self, node: &Node, wanted: &str) {
+    pub(crate) fn wrong(&mut self, node: &Node<'_>, wanted: &str) {
         let message = format!("expected {wanted}, found {}", node.kind.name());
         self.findings.error(Code::WrongValue, node.place, message);
     }
 
-    pub(crate) fn text<'n>(&mut self, node: &'n Node, wanted: &str) -> Option<&'n str> {
+    pub(crate) fn text<'n>(&mut self, node: &'n Node<'n>, wanted: &str) -> Option<&'n str> {
         if let Kind::Scalar(text) = &node.kind {
             return Some(text);
         }
@@ -100,14 +100,14 @@ impl<'f> Reader<'f> {
     }
 
     /// The pairs of a map whose keys are texts, each key once.
-    pub(crate) fn pairs<'n>(&mut self, node: &'n Node, wanted: &str) -> Option<Vec<Pair<'n>>> {
+    pub(crate) fn pairs<'n>(&mut self, node: &'n Node<'n>, wanted: &str) -> Option<Vec<Pair<'n>>> {
         self.pairs_of(node, || wanted.to_owned())
     }
 
     /// As [`pairs`](Self::pairs), for what takes long to say.
     fn pairs_of<'n>(
         &mut self,
-        node: &'n Node,
+        node: &'n Node<'n>,
         wanted: impl FnOnce() -> String,
     ) -> Option<Vec<Pair<'n>>> {
         let Kind::Map(pairs) = &node.kind else {
@@ -152,9 +152,9 @@ impl<'f> Reader<'f> {
     /// The values of a map in the order of `keys`. Keys that are none of them are noted.
     pub(crate) fn keys<'n, const N: usize>(
         &mut self,
-        node: &'n Node,
+        node: &'n Node<'n>,
         keys: [&'static str; N],
-    ) -> Option<[Option<&'n Node>; N]> {
+    ) -> Option<[Option<&'n Node<'n>>; N]> {
         let mut values = [None; N];
         let wanted = || format!("a map with {}", list(&keys));
         for Pair { key, place, value } in self.pairs_of(node, wanted)? {
@@ -177,7 +177,7 @@ impl<'f> Reader<'f> {
     }
 
     /// A key without a value counts as left out.
-    pub(crate) fn field<T: Read>(&mut self, node: Option<&Node>) -> Field<T> {
+    pub(crate) fn field<T: Read>(&mut self, node: Option<&Node<'_>>) -> Field<T> {
         let node = node.filter(|node| !matches!(node.kind, Kind::Null))?;
         Some(self.at(node))
     }
@@ -186,7 +186,7 @@ impl<'f> Reader<'f> {
 pub(crate) struct Pair<'n> {
     pub(crate) key: &'n str,
     pub(crate) place: Place,
-    pub(crate) value: &'n Rc<Node>,
+    pub(crate) value: &'n Rc<Node<'n>>,
 }
 
 /// `a`, `b`, `c`
@@ -199,13 +199,13 @@ pub(crate) fn list(names: &[impl AsRef<str>]) -> String {
 }
 
 impl Read for String {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         reader.text(node, "a text").map(str::to_owned)
     }
 }
 
 impl Read for u16 {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let text = reader.text(node, "a number")?;
         let number = text
             .parse()
@@ -220,7 +220,7 @@ impl Read for u16 {
 }
 
 impl Read for f64 {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let text = reader.text(node, "a number")?;
         // `inf` and `nan` are numbers to Rust, and to YAML with a dot before them.
         let number = text
@@ -236,7 +236,7 @@ impl Read for f64 {
 }
 
 impl Read for bool {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         match reader.text(node, "true or false")? {
             "true" => Some(true),
             "false" => Some(false),
@@ -250,7 +250,7 @@ impl Read for bool {
 }
 
 impl<T: Read> Read for Vec<At<T>> {
-    fn read(node: &Node, reader: &mut Reader<'_>) -> Option<Self> {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
         let Kind::List(items) = &node.kind else {
             reader.wrong(node, "a list (each entry begins with `- `)");
             return None;
@@ -268,6 +268,17 @@ pub(crate) fn short(text: &str) -> String {
     short
 }
 
+/// The name of a field that is a word of Rust too.
+pub(crate) const fn plain(name: &'static str) -> &'static str {
+    match name.as_bytes() {
+        [b'r', b'#', plain @ ..] => match std::str::from_utf8(plain) {
+            Ok(plain) => plain,
+            Err(_) => name,
+        },
+        _ => name,
+    }
+}
+
 /// A map of known keys, each of which may be left out; the names of the fields are the keys.
 macro_rules! document {
     ($($(#[$meta:meta])* struct $name:ident { $($(#[$field_meta:meta])* $field:ident: $type:ty,)* })*) => {$(
@@ -277,9 +288,10 @@ macro_rules! document {
         pub(crate) struct $name { $($(#[$field_meta])* pub(crate) $field: $crate::read::Field<$type>,)* }
 
         impl $crate::read::Read for $name {
-            fn read(node: &$crate::tree::Node, reader: &mut $crate::read::Reader<'_>) -> Option<Self> {
-                let keys = [$(stringify!($field).trim_start_matches("r#")),*];
-                let [$($field),*] = reader.keys(node, keys)?;
+            fn read(node: &$crate::tree::Node<'_>, reader: &mut $crate::read::Reader<'_>) -> Option<Self> {
+                const KEYS: [&str; [$(stringify!($field)),*].len()] =
+                    [$($crate::read::plain(stringify!($field))),*];
+                let [$($field),*] = reader.keys(node, KEYS)?;
                 Some(Self { $($field: reader.field($field),)* })
             }
         }
@@ -294,7 +306,7 @@ macro_rules! choice {
         pub(crate) enum $name { $($(#[$variant_meta])* #[schemars(rename = $word)] $variant,)* }
 
         impl $crate::read::Read for $name {
-            fn read(node: &$crate::tree::Node, reader: &mut $crate::read::Reader<'_>) -> Option<Self> {
+            fn read(node: &$crate::tree::Node<'_>, reader: &mut $crate::read::Reader<'_>) -> Option<Self> {
                 let words = [$($word),*];
                 let wanted = format!("one of {}", $crate::read::list(&words));
                 let text = reader.text(node, &wanted)?;

@@ -24,6 +24,12 @@ pub trait Surroundings {
     /// The value of an environment variable, for `${NAME}`; `None` when it is not set.
     fn variable(&self, name: &str) -> Option<String>;
 
+    /// Who may read a file beside its owner; `None` where that is nobody, or not known.
+    fn readers(&self, file: &str) -> Option<Readers> {
+        let _ = file;
+        None
+    }
+
     /// Definition files besides what is built in. `paths` are the `type_paths` of the document, those that are relative
     /// below the folder of the file they stand in.
     fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
@@ -35,6 +41,15 @@ pub trait Surroundings {
     fn environment(&self) -> Option<&Environment> {
         None
     }
+}
+
+/// Who may read a file beside its owner.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Readers {
+    /// Those of its group.
+    Group,
+    /// Everybody on the host.
+    Everybody,
 }
 
 /// A document that stands alone.

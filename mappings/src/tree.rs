@@ -4,6 +4,7 @@
 //! takes no more room than its text. The pairs of a merge key (`<<`) are shared likewise, and counted. `${NAME}` in a
 //! scalar is the value of an environment variable. Tags are refused.
 
+use std::borrow::Cow;
 use std::cell::Cell;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::rc::Rc;
@@ -11,7 +12,7 @@ use std::rc::Rc;
 use granit_parser::{Event, Parser, ScalarStyle, ScanError, Span as Marks};
 
 use crate::code::Code;
-use crate::variables;
+use crate::{secret, variables};
 
 /// Largest text, in bytes.
 pub(crate) const MAX_BYTES: usize = 4 * 1024 * 1024;
@@ -42,27 +43,28 @@ impl Place {
     };
 }
 
+/// Scalars without variables are borrowed from the text.
 #[derive(Debug)]
-pub(crate) struct Node {
+pub(crate) struct Node<'t> {
     pub(crate) place: Place,
-    pub(crate) kind: Kind,
+    pub(crate) kind: Kind<'t>,
     depth: usize,
 }
 
 /// Keys and values.
-type Pairs = Vec<(Rc<Node>, Rc<Node>)>;
+type Pairs<'t> = Vec<(Rc<Node<'t>>, Rc<Node<'t>>)>;
 
 #[derive(Debug)]
-pub(crate) enum Kind {
+pub(crate) enum Kind<'t> {
     /// Nothing, `~` or `null`.
     Null,
-    Scalar(String),
-    List(Vec<Rc<Node>>),
+    Scalar(Cow<'t, str>),
+    List(Vec<Rc<Node<'t>>>),
     /// In the order of the text, repeated keys included.
-    Map(Pairs),
+    Map(Pairs<'t>),
 }
 
-impl Kind {
+impl Kind<'_> {
     /// With its article.
     pub(crate) const fn name(&self) -> &'static str {
         match self {
@@ -84,23 +86,25 @@ pub(crate) struct Fault {
 }
 
 /// A text as a tree.
-pub(crate) struct Tree {
+pub(crate) struct Tree<'t> {
     /// Null when the text holds comments only.
-    pub(crate) root: Rc<Node>,
+    pub(crate) root: Rc<Node<'t>>,
     /// What is wrong with references to variables; the texts they stand in are as written.
     pub(crate) faults: Vec<Fault>,
     /// Values of variables, and what stands for them in the text.
     pub(crate) values: BTreeMap<String, String>,
     /// How many bytes the values of variables come to, each time that one is named.
     pub(crate) expanded: usize,
+    /// The values with a password in them, which stands in the text.
+    pub(crate) secrets: Vec<(Place, String)>,
 }
 
 /// Reads the text of a file, whose number all places have. `variable` looks up the environment.
-pub(crate) fn parse(
-    text: &str,
+pub(crate) fn parse<'t>(
+    text: &'t str,
     file: u16,
     variable: &dyn Fn(&str) -> Option<String>,
-) -> Result<Tree, Fault> {
+) -> Result<Tree<'t>, Fault> {
     read(text, variable, file).map_err(|fault| Fault {
         place: Place {
             file,
@@ -110,7 +114,11 @@ pub(crate) fn parse(
     })
 }
 
-fn read(text: &str, variable: &dyn Fn(&str) -> Option<String>, file: u16) -> Result<Tree, Fault> {
+fn read<'t>(
+    text: &'t str,
+    variable: &dyn Fn(&str) -> Option<String>,
+    file: u16,
+) -> Result<Tree<'t>, Fault> {
     if text.len() > MAX_BYTES {
         let message = format!(
             "the document has {} bytes; at most {MAX_BYTES} are read",
@@ -133,6 +141,7 @@ fn read(text: &str, variable: &dyn Fn(&str) -> Option<String>, file: u16) -> Res
         faults: Vec::new(),
         values: BTreeMap::new(),
         expanded: 0,
+        secrets: Vec::new(),
         variable,
     };
     for event in Parser::new_from_str_with_options(text, options) {
@@ -167,31 +176,33 @@ fn read(text: &str, variable: &dyn Fn(&str) -> Option<String>, file: u16) -> Res
         faults: builder.faults,
         values: builder.values,
         expanded: builder.expanded,
+        secrets: builder.secrets,
     })
 }
 
-struct Builder<'v> {
-    open: Vec<Open>,
-    anchors: HashMap<usize, Rc<Node>>,
-    root: Option<Rc<Node>>,
+struct Builder<'v, 't> {
+    open: Vec<Open<'t>>,
+    anchors: HashMap<usize, Rc<Node<'t>>>,
+    root: Option<Rc<Node<'t>>>,
     documents: usize,
     nodes: usize,
     faults: Vec<Fault>,
     values: BTreeMap<String, String>,
     expanded: usize,
+    secrets: Vec<(Place, String)>,
     variable: &'v dyn Fn(&str) -> Option<String>,
 }
 
 /// A list or map whose end has not come.
-struct Open {
+struct Open<'t> {
     anchor: usize,
     place: Place,
     map: bool,
-    children: Vec<Rc<Node>>,
+    children: Vec<Rc<Node<'t>>>,
 }
 
-impl Builder<'_> {
-    fn event(&mut self, event: Event<'_>, place: Place) -> Result<(), Fault> {
+impl<'t> Builder<'_, 't> {
+    fn event(&mut self, event: Event<'t>, place: Place) -> Result<(), Fault> {
         match event {
             Event::DocumentStart(..) => {
                 self.documents += 1;
@@ -206,7 +217,11 @@ impl Builder<'_> {
                 Ok(())
             }
             Event::Scalar(text, style, anchor, _) => {
-                let text = self.expand(text.into_owned(), place)?;
+                let written = secret::is_written(&text);
+                let text = self.expand(text, place)?;
+                if written {
+                    self.secrets.push((place, text.clone().into_owned()));
+                }
                 let null = style == ScalarStyle::Plain
                     && matches!(&*text, "" | "~" | "null" | "Null" | "NULL");
                 let kind = if null { Kind::Null } else { Kind::Scalar(text) };
@@ -258,7 +273,7 @@ impl Builder<'_> {
         }
     }
 
-    fn end(&mut self, open: Open) -> Result<(), Fault> {
+    fn end(&mut self, open: Open<'t>) -> Result<(), Fault> {
         let depth = open
             .children
             .iter()
@@ -279,8 +294,9 @@ impl Builder<'_> {
     }
 
     /// A scalar with the values of the variables it names.
-    fn expand(&mut self, text: String, place: Place) -> Result<String, Fault> {
-        if !text.contains("${") {
+    fn expand(&mut self, text: Cow<'t, str>, place: Place) -> Result<Cow<'t, str>, Fault> {
+        // Of most there is none, which is quicker to see by bytes.
+        if !text.as_bytes().contains(&b'$') || !text.contains("${") {
             return Ok(text);
         }
         let taken = Cell::new(0_usize);
@@ -299,7 +315,7 @@ impl Builder<'_> {
                 for (value, written) in values {
                     self.values.entry(value).or_insert(written);
                 }
-                expanded
+                Cow::Owned(expanded)
             }
             Err((message, help)) => {
                 self.faults.push(Fault {
@@ -315,12 +331,12 @@ impl Builder<'_> {
 
     /// The pairs of a map with those its merge keys bring: of a key that stands in the map itself that value, else that of
     /// the first map that has it.
-    fn merge(&mut self, pairs: Pairs) -> Result<Pairs, Fault> {
-        let is_merge = |(key, _): &(Rc<Node>, Rc<Node>)| matches!(&key.kind, Kind::Scalar(text) if text == "<<");
+    fn merge(&mut self, pairs: Pairs<'t>) -> Result<Pairs<'t>, Fault> {
+        let is_merge = |(key, _): &(Rc<Node<'_>>, Rc<Node<'_>>)| matches!(&key.kind, Kind::Scalar(text) if text == "<<");
         if !pairs.iter().any(is_merge) {
             return Ok(pairs);
         }
-        let (merges, mut own): (Pairs, Pairs) = pairs.into_iter().partition(is_merge);
+        let (merges, mut own): (Pairs<'t>, Pairs<'t>) = pairs.into_iter().partition(is_merge);
         let mut known: HashSet<String> = own.iter().filter_map(|(key, _)| name(key)).collect();
         for (merge, value) in &merges {
             let maps = match &value.kind {
@@ -347,8 +363,8 @@ impl Builder<'_> {
                     };
                     // Also those that are there already: looking for them is the work.
                     self.count(1 + text.len() / LONG_KEY, merge.place)?;
-                    if !known.contains(text) {
-                        known.insert(text.clone());
+                    if !known.contains(&**text) {
+                        known.insert(text.clone().into_owned());
                         own.push((Rc::clone(key), Rc::clone(value)));
                     }
                 }
@@ -370,7 +386,7 @@ impl Builder<'_> {
         &mut self,
         anchor: usize,
         place: Place,
-        kind: Kind,
+        kind: Kind<'t>,
         depth: usize,
     ) -> Result<(), Fault> {
         let node = Rc::new(Node { place, kind, depth });
@@ -381,7 +397,7 @@ impl Builder<'_> {
     }
 
     /// Puts a finished node where it belongs.
-    fn place(&mut self, node: Rc<Node>, place: Place) -> Result<(), Fault> {
+    fn place(&mut self, node: Rc<Node<'t>>, place: Place) -> Result<(), Fault> {
         self.count(1, place)?;
         if self.open.len() + node.depth > MAX_DEPTH {
             let message = format!("values nest deeper than {MAX_DEPTH} levels");
@@ -411,9 +427,9 @@ fn too_large(place: Place, message: String) -> Fault {
     }
 }
 
-fn name(key: &Node) -> Option<String> {
+fn name(key: &Node<'_>) -> Option<String> {
     match &key.kind {
-        Kind::Scalar(text) => Some(text.clone()),
+        Kind::Scalar(text) => Some(text.clone().into_owned()),
         Kind::Null | Kind::List(_) | Kind::Map(_) => None,
     }
 }
@@ -467,19 +483,19 @@ fn place(text: &str, marks: Marks) -> Place {
 mod tests {
     use super::*;
 
-    fn parse(text: &str) -> Result<Rc<Node>, Fault> {
+    fn parse(text: &str) -> Result<Rc<Node<'_>>, Fault> {
         super::parse(text, 0, &|_| None).map(|tree| tree.root)
     }
     use proptest::prelude::*;
 
-    fn map(node: &Node) -> Vec<(&str, &Node)> {
+    fn map<'n>(node: &'n Node<'n>) -> Vec<(&'n str, &'n Node<'n>)> {
         let Kind::Map(pairs) = &node.kind else {
             panic!("{node:?}")
         };
         pairs
             .iter()
             .map(|(key, value)| match &key.kind {
-                Kind::Scalar(text) => (text.as_str(), &**value),
+                Kind::Scalar(text) => (&**text, &**value),
                 Kind::Null | Kind::List(_) | Kind::Map(_) => panic!("{key:?}"),
             })
             .collect()

@@ -3,13 +3,14 @@
 
 use std::collections::BTreeMap;
 
-use mappings::{Checked, Code, Mapping, Surroundings};
+use mappings::{Checked, Code, Mapping, Readers, Surroundings};
 
 /// Files and variables by their names.
 #[derive(Default)]
 struct Beside {
     files: BTreeMap<String, String>,
     variables: BTreeMap<String, String>,
+    readers: Option<Readers>,
 }
 
 impl Beside {
@@ -42,6 +43,10 @@ impl Surroundings for Beside {
 
     fn variable(&self, name: &str) -> Option<String> {
         self.variables.get(name).cloned()
+    }
+
+    fn readers(&self, file: &str) -> Option<Readers> {
+        self.readers.filter(|_| file == "plant/cameras.yaml")
     }
 }
 
@@ -298,4 +303,71 @@ fn a_map_that_is_merged_again_and_again_counts_each_time() {
     assert_eq!(checked.findings.len(), 1, "{}", checked.render_all());
     assert_eq!(checked.findings[0].code, Code::TooLarge);
     assert_eq!(checked.findings[0].at.line, 2);
+}
+
+#[test]
+fn a_password_in_a_file_is_told_with_who_can_read_it_and_never_shown() {
+    let url = "rtsp://robot:open-sesame@camera/hall";
+    let cameras = |url: &str| {
+        format!(
+            "variables:\n  - {{node: ns=2;i=1, name: A, origin: 0, ros: {{space: 1, call: /look, type: nav_msgs/LoadMap, \
+             request: {{map_url: \"{url}\"}}}}}}\n"
+        )
+    };
+    let mut beside = Beside::default()
+        .set("SECRET", "open-sesame")
+        .file("plant/cameras.yaml", &cameras(url));
+    let text = format!("include: cameras.yaml\n{HEAD}");
+    for (readers, label, help) in [
+        (
+            None,
+            "",
+            "write it as ${NAME}, which the environment of the program gives",
+        ),
+        (
+            Some(Readers::Group),
+            " the group of the file can read it",
+            "chmod g-r plant/cameras.yaml",
+        ),
+        (
+            Some(Readers::Everybody),
+            " everybody on this host can read it",
+            "chmod go-r plant/cameras.yaml",
+        ),
+    ] {
+        beside.readers = readers;
+        let checked = beside.check(&text);
+        assert!(checked.mapping.is_some(), "it can run");
+        assert_eq!(
+            told(&checked),
+            [format!("M114 plant/cameras.yaml:2{label}")]
+        );
+        let said = checked.findings[0].help.as_deref().unwrap();
+        assert!(said.ends_with(help), "{said}");
+        let shown = checked.render_all();
+        assert!(!shown.contains("sesame"), "{shown}");
+        assert!(
+            shown.contains("rtsp://robot:***********@camera/hall"),
+            "{shown}"
+        );
+    }
+    let apart = "rtsp://robot:${SECRET}@camera/hall";
+    let beside = beside.file("plant/cameras.yaml", &cameras(apart));
+    assert_eq!(told(&beside.check(&text)), [""; 0]);
+    // Also not where a long text is cut, and where another finding tells of it.
+    let long = format!("opc.tcp://robot:{}@gateway", "open-sesame".repeat(8));
+    let text = format!("{HEAD}server: {{endpoint: \"{long}\"}}\n");
+    let checked = beside.check(&text);
+    let shown = checked.render(&text);
+    assert!(
+        shown.contains("M040") && !shown.contains("sesame"),
+        "{shown}"
+    );
+    let text = format!("{HEAD}server: {{endpoint: [\"{long}\"]}}\nbroken: [\"{url}\"");
+    let checked = beside.check(&text);
+    let shown = checked.render(&text);
+    assert!(
+        !shown.contains("sesame") && !checked.findings.is_empty(),
+        "{shown}"
+    );
 }

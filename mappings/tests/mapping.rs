@@ -14,7 +14,7 @@ use mappings::{
     Checked, Code, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, ServiceRole,
     SpaceId, TopicId, Trigger,
 };
-use messages::{Conversion, Leaf, Literal, Part, Rank, Selection};
+use messages::{Conversion, Leaf, Literal, Part, Rank, Selected, Selection};
 use proptest::prelude::*;
 use uadp::BuiltinType;
 
@@ -350,7 +350,7 @@ fn a_value_calls_a_service_and_its_answer_is_a_value() {
         service: "/pump".to_owned(),
         service_type: "std_srvs/SetBool".parse().unwrap(),
         request: Selection::Template {
-            field: Some("data".to_owned()),
+            fields: vec![Selected::whole("data")],
             rest: BTreeMap::new(),
         },
         when: Trigger::Any,
@@ -404,7 +404,7 @@ fn a_topic_of_the_space_is_fed_by_polling_a_service() {
         service: "/plan".to_owned(),
         service_type: "nav_msgs/GetPlan".parse().unwrap(),
         request: Selection::Template {
-            field: None,
+            fields: Vec::new(),
             rest: BTreeMap::from([
                 one("goal.header.frame_id", "map"),
                 one("start.pose.position.x", "1.5"),
@@ -491,6 +491,106 @@ fn topics_become_variables_by_the_first_pattern_about_them() {
     assert!(
         told("/robot99999/joint_states").ends_with("`ns=2;i=1099999` is no number from 1 to 65535")
     );
+}
+
+#[test]
+fn a_pattern_chooses_fields_as_a_binding_does() {
+    let of = |keys: &str| {
+        let text = format!(
+            "spaces: [{{id: 1}}]\nnamespaces: {{2: urn:my-plant:line}}\npatterns:\n  \
+             - {{topics: \"/robot*\", origin: 1, node: \"ns=2;i=10{{1}}\", name: R, {keys}}}\n"
+        );
+        let made = sound(&text).matching(SpaceId::ROS1, "/robot1", None);
+        made.unwrap().unwrap().selection
+    };
+    let thousandths = Conversion::default().scaled(1000.0, 0.0);
+    let fields = "fields: [linear.x, {field: angular.z, scale: 1000}]";
+    let wanted = Selection::Fields(vec![
+        Selected::whole("linear.x"),
+        Selected {
+            conversion: thousandths,
+            ..Selected::whole("angular.z")
+        },
+    ]);
+    assert_eq!(of(&format!("type: geometry_msgs/Twist, {fields}")), wanted);
+    assert_eq!(of(fields), wanted, "also of any type");
+    assert_eq!(of("as: structure"), Selection::Structure(None));
+    let pose = of("type: geometry_msgs/PoseStamped, field: pose, as: structure");
+    assert_eq!(pose, Selection::Structure(Some("pose".to_owned())));
+    let converted = Selection::Value {
+        field: "data".to_owned(),
+        part: None,
+        conversion: thousandths.clamped(),
+    };
+    let keys = "scale: 1000, out_of_range: clamp";
+    assert_eq!(of(&format!("field: data, {keys}")), converted);
+    let of_one_field = of(&format!("type: std_msgs/Float64, {keys}"));
+    assert_eq!(of_one_field, converted, "the one field is meant");
+    let inverted = of("type: std_msgs/Bool, invert: true");
+    let Selection::Value { conversion, .. } = inverted else {
+        panic!("{inverted:?}")
+    };
+    assert_eq!(conversion, Conversion::default().inverted());
+}
+
+#[test]
+fn values_of_services_convert_as_those_of_topics() {
+    let text = format!(
+        "{HEAD}  - {{node: ns=2;i=20, name: Open, origin: 0, ros: {{space: 1, call: /close, type: std_srvs/SetBool, field: data, \
+         invert: true}}}}\n  \
+         - {{node: ns=2;i=21, name: Shut, origin: 1, ros: {{answer: ns=2;i=20, field: success, invert: true}}}}\n  \
+         - {{node: ns=2;i=22, name: Millimetres, origin: 0, ros: {{space: 1, call: /plan, type: nav_msgs/GetPlan, \
+         fields: [start.header.frame_id, {{field: tolerance, scale: 1000, out_of_range: clamp}}], \
+         request: {{goal.header.frame_id: map}}}}}}\n  \
+         - {{node: ns=2;i=23, name: Resolution, type: Int32, origin: 1, ros: {{poll: /map, type: nav_msgs/GetMap, \
+         field: map.info.resolution, scale: 1000, offset: -5, out_of_range: refuse}}}}\n"
+    );
+    let mapping = sound(&text);
+    let role = |at: usize| mapping.variables()[at].service.clone().unwrap().role;
+    let inverted = Conversion::default().inverted();
+    let ServiceRole::Call { request, .. } = role(0) else {
+        panic!("{:?}", role(0))
+    };
+    let wanted = Selection::Template {
+        fields: vec![Selected {
+            conversion: inverted,
+            ..Selected::whole("data")
+        }],
+        rest: BTreeMap::new(),
+    };
+    assert_eq!(request, wanted);
+    let ServiceRole::Answer { selection, .. } = role(1) else {
+        panic!("{:?}", role(1))
+    };
+    let wanted = Selection::Value {
+        field: "success".to_owned(),
+        part: None,
+        conversion: inverted,
+    };
+    assert_eq!(selection, wanted);
+    let ServiceRole::Call { request, when, .. } = role(2) else {
+        panic!("{:?}", role(2))
+    };
+    let Selection::Template { fields, rest } = request else {
+        panic!("{request:?}")
+    };
+    assert_eq!((fields.len(), rest.len(), when), (2, 1, Trigger::Any));
+    let scaled = Conversion::default().scaled(1000.0, 0.0).clamped();
+    assert_eq!(fields[1].conversion, scaled);
+    assert_eq!(mapping.variables()[2].fields.len(), 2);
+    let ServiceRole::Poll { selection, .. } = role(3) else {
+        panic!("{:?}", role(3))
+    };
+    let wanted = Selection::Value {
+        field: "map.info.resolution".to_owned(),
+        part: None,
+        conversion: Conversion::default()
+            .scaled(1000.0, -5.0)
+            .to(BuiltinType::Int32),
+    };
+    assert_eq!(selection, wanted);
+    let declared = Some((BuiltinType::Int32, false));
+    assert_eq!(mapping.variables()[3].value_type, declared);
 }
 
 #[test]

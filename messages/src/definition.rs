@@ -1,5 +1,7 @@
 //! The parser of `.msg` texts: genmsg's rules for ROS 1, rosidl's for ROS 2.
 
+use std::collections::HashSet;
+
 use uadp::BuiltinType;
 
 use crate::name::is_identifier;
@@ -149,6 +151,7 @@ impl Definition {
         constants: Vec<Line>,
         fields: Vec<Line>,
     ) -> Result<Self, DefinitionError> {
+        let mut named = HashSet::new();
         let mut made = Self {
             name: name.clone(),
             text: String::new(),
@@ -163,7 +166,7 @@ impl Definition {
                 value,
             } = &line;
             let added = match value {
-                None => made.field(dialect, written, of),
+                None => made.field(dialect, (written, of), &mut named),
                 Some(value) => made.constant(dialect, value, (written, of, value)),
             };
             let text = line.text();
@@ -184,6 +187,7 @@ impl Definition {
         name: &TypeName,
         text: &str,
     ) -> Result<Self, DefinitionError> {
+        let mut named = HashSet::new();
         let mut parsed = Self {
             name: name.clone(),
             text: text.to_owned(),
@@ -192,7 +196,7 @@ impl Definition {
         };
         for (number, line) in text.lines().enumerate() {
             parsed
-                .line(dialect, line)
+                .line(dialect, line, &mut named)
                 .map_err(|reason| DefinitionError::Syntax {
                     name: name.clone(),
                     line: number + 1,
@@ -203,7 +207,13 @@ impl Definition {
         Ok(parsed)
     }
 
-    fn line(&mut self, dialect: Dialect, line: &str) -> Result<(), &'static str> {
+    /// `named`: the names of the fields so far.
+    fn line(
+        &mut self,
+        dialect: Dialect,
+        line: &str,
+        named: &mut HashSet<String>,
+    ) -> Result<(), &'static str> {
         let clean = without_comment(dialect, line);
         if clean.is_empty() {
             return Ok(());
@@ -216,7 +226,7 @@ impl Definition {
             Some((name, value)) if is_identifier(name.trim_end()) => {
                 self.constant(dialect, line, (written, name.trim_end(), value.trim()))
             }
-            _ => self.field(dialect, written, rest),
+            _ => self.field(dialect, (written, rest), named),
         }
     }
 
@@ -256,7 +266,12 @@ impl Definition {
         Ok(())
     }
 
-    fn field(&mut self, dialect: Dialect, written: &str, rest: &str) -> Result<(), &'static str> {
+    fn field(
+        &mut self,
+        dialect: Dialect,
+        (written, rest): (&str, &str),
+        named: &mut HashSet<String>,
+    ) -> Result<(), &'static str> {
         let (name, default) = rest.split_once(char::is_whitespace).unwrap_or((rest, ""));
         if !is_identifier(name) {
             return Err("a field name expected: letters, digits and `_`, a letter first");
@@ -267,7 +282,7 @@ impl Definition {
         if self.fields.len() >= MOST_FIELDS {
             return Err("more than 4096 fields");
         }
-        if self.fields.iter().any(|field| field.name == name) {
+        if !named.insert(name.to_owned()) {
             return Err("the field is defined twice");
         }
         let (kind, arity) = parse_type(dialect, &self.name, written)?;

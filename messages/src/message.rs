@@ -2,7 +2,8 @@ use std::sync::Arc;
 
 use uadp::BuiltinType;
 
-use crate::resolve::Shape;
+use crate::definition::{Arity, Number, Primitive};
+use crate::resolve::{Shape, ShapeKind};
 use crate::{Constant, Dialect, TypeName};
 
 /// A message type with all it needs resolved.
@@ -95,6 +96,28 @@ impl MessageType {
         self.constants()
             .iter()
             .find(|constant| constant.name == name)
+    }
+
+    /// How many bytes the array of bytes at that path has in every message; `None` where it may have another number, or
+    /// is none.
+    pub(crate) fn fixed_bytes(&self, path: &str) -> Option<u32> {
+        let mut shape = &self.shape;
+        let mut parts = path.split('.').peekable();
+        loop {
+            let part = parts.next()?;
+            let field = shape.fields.iter().find(|field| field.name == part)?;
+            match (&field.kind, field.arity, parts.peek()) {
+                (ShapeKind::Message(inner), Arity::One, Some(_)) => shape = inner,
+                (
+                    ShapeKind::Primitive(Primitive::Number(Number::UInt8)),
+                    Arity::Fixed(count),
+                    None,
+                ) => {
+                    return Some(count);
+                }
+                _ => return None,
+            }
+        }
     }
 
     /// The field of that path.

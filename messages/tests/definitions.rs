@@ -419,7 +419,7 @@ fn an_action_of_ros_2_has_its_status_before_its_result() {
     let plan = Plan::compile(result, &field, Wire::Cdr).unwrap();
     assert_eq!(plan.leaves().len(), 1);
     let nothing = Selection::Template {
-        field: None,
+        fields: Vec::new(),
         rest: BTreeMap::new(),
     };
     let plan = Plan::compile(result, &nothing, Wire::Cdr).unwrap();

@@ -4,8 +4,8 @@
 mod support;
 
 use messages::{
-    Conversion, Dialect, MessageType, Part, Plan, PlanError, ReadError, Registry, Selected,
-    Selection, ValueFault, Wire, WriteFault,
+    Conversion, Dialect, Literal, MessageType, Part, Plan, PlanError, ReadError, Registry,
+    Selected, Selection, ValueFault, Wire, WriteFault,
 };
 use proptest::prelude::*;
 use std::sync::Arc;
@@ -405,6 +405,106 @@ fn several_fields_are_written_between_zeros_and_each_is_converted_by_its_own() {
         let refused = turned.write(&mut Player::new(&[]), &mut Vec::new());
         assert_eq!(refused.unwrap_err().fault, WriteFault::Order);
         assert!(plan(vec![selected("x", none)]).is_err());
+    }
+}
+
+#[test]
+fn values_of_a_template_are_converted_between_its_constants() {
+    let text = "uint8 id\nbool open\nint16 speed\nstring note\nfloat32[] levels";
+    for (dialect, wire) in WIRES {
+        let message = message(dialect, text);
+        let one = |text: &str| Literal::One(text.to_owned());
+        let rest = [("id", one("12")), ("note", one("by hand"))];
+        let template = |fields: Vec<Selected>| Selection::Template {
+            fields,
+            rest: rest
+                .clone()
+                .map(|(path, value)| (path.to_owned(), value))
+                .into(),
+        };
+        let tenths = Conversion::default()
+            .scaled(0.1, 0.0)
+            .to(BuiltinType::Double);
+        let fields = vec![
+            selected("open", Conversion::default().inverted()),
+            selected("speed", tenths),
+            selected("levels", Conversion::default().scaled(2.0, 0.0)),
+        ];
+        let plan = Plan::compile(&message, &template(fields.clone()), wire).unwrap();
+        let outside: Vec<BuiltinType> = plan.leaves().iter().map(|leaf| leaf.builtin).collect();
+        assert_eq!(
+            outside,
+            [
+                BuiltinType::Boolean,
+                BuiltinType::Double,
+                BuiltinType::Float
+            ]
+        );
+        let events = [
+            scalar(Scalar::Boolean(false)),
+            scalar(Scalar::Double(-20.04)),
+            Event::Array(BuiltinType::Float, 1),
+            Event::Element(Value::of(Scalar::Float(3.0))),
+        ];
+        let bytes = written(&plan, &events);
+        let whole = Plan::compile(&message, &Selection::Whole, wire).unwrap();
+        assert_eq!(
+            read(&whole, &bytes).unwrap()[..4],
+            [
+                "scalar Byte 12",
+                "scalar Boolean true",
+                "scalar Int16 -200",
+                "scalar String by hand"
+            ]
+        );
+        assert_eq!(read(&plan, &bytes).unwrap()[0], "scalar Boolean false");
+        let big = [
+            scalar(Scalar::Boolean(false)),
+            scalar(Scalar::Double(4000.0)),
+        ];
+        let error = plan
+            .write(&mut Player::new(&big), &mut Vec::new())
+            .unwrap_err();
+        assert_eq!(error.to_string(), "field `speed`: 40000 does not fit Int16");
+        let twice = template(vec![selected("id", Conversion::default())]);
+        let error = Plan::compile(&message, &twice, wire).unwrap_err();
+        assert!(
+            matches!(error, PlanError::ConstantOfField { .. }),
+            "{error}"
+        );
+        let part = vec![selected("levels[0]", Conversion::default())];
+        let plan = Plan::compile(&message, &template(part), wire).unwrap();
+        let one = [scalar(Scalar::Float(1.0))];
+        let error = plan
+            .write(&mut Player::new(&one), &mut Vec::new())
+            .unwrap_err();
+        assert_eq!(error.fault, WriteFault::Part);
+    }
+}
+
+#[test]
+fn a_part_behind_the_end_of_an_array_of_bytes_of_one_length_is_refused() {
+    let text = "uint8[16] uuid\nunique_identifier_msgs/UUID goal\nuint8[] any";
+    let message = message(Dialect::Ros2, text);
+    let compiled = |field: &str| {
+        let selection = select(field, Conversion::default());
+        Plan::compile(&message, &selection, Wire::Cdr).map(|_| ())
+    };
+    for field in [
+        "uuid[15]",
+        "uuid[15:]",
+        "uuid[0:20]",
+        "goal.uuid[15]",
+        "any[20]",
+    ] {
+        assert_eq!(compiled(field), Ok(()), "{field}");
+    }
+    for field in ["uuid[16]", "uuid[16:]", "goal.uuid[16]", "goal.uuid[20:30]"] {
+        let error = compiled(field).unwrap_err().to_string();
+        assert!(
+            error.ends_with("has fewer elements, always"),
+            "{field}: {error}"
+        );
     }
 }
 

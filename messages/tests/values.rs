@@ -7,8 +7,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use messages::{
-    Dialect, Fault, Leaf, Literal, MessageType, Plan, PlanError, ReadError, Registry, Selection,
-    SourceError, TypeName, Wire, WriteError, WriteFault,
+    Dialect, Fault, Leaf, Literal, MessageType, Plan, PlanError, ReadError, Registry, Selected,
+    Selection, SourceError, TypeName, Wire, WriteError, WriteFault,
 };
 use support::{Event, Player, Recorder, Value};
 use uadp::{BuiltinType, DateTime, Scalar};
@@ -367,7 +367,7 @@ fn a_message_may_cross_as_it_is() {
 fn template(field: Option<&str>, rest: &[(&str, Literal)]) -> Selection {
     let rest = rest.iter().cloned();
     Selection::Template {
-        field: field.map(str::to_owned),
+        fields: field.map(Selected::whole).into_iter().collect(),
         rest: rest
             .map(|(path, literal)| (path.to_owned(), literal))
             .collect::<BTreeMap<_, _>>(),

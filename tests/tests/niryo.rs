@@ -269,7 +269,10 @@ fn move_goal(path: &str, value: &str) -> (TopicType, Vec<u8>) {
     let name = "niryo_robot_arm_commander/RobotMove".parse().unwrap();
     let action = registry.action(&name).unwrap();
     let rest = [(path.to_owned(), Literal::One(value.to_owned()))].into();
-    let template = Selection::Template { field: None, rest };
+    let template = Selection::Template {
+        fields: Vec::new(),
+        rest,
+    };
     let plan = Plan::compile(action.goal(), &template, Wire::Ros1).unwrap();
     let mut goal = Vec::new();
     plan.write(&mut NoFields, &mut goal).unwrap();

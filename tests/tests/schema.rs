@@ -93,3 +93,78 @@ fn what_breaks_the_schema_is_refused_at_its_place() {
         );
     }
 }
+
+/// Keys of each kind that takes no text of any form, with a value that is in order.
+const LIMITED: [(&str, &str); 12] = [
+    ("spaces: [{id: 2, domain: @}]", "7"),
+    ("pubsub: {ttl: @}", "1"),
+    ("pubsub: {publisher_id: @}", "any_width"),
+    ("pubsub: {keep_alive_period: @}", "1s"),
+    ("pubsub: {address: @}", "opc.udp://239.192.0.40:4840"),
+    ("server: {security: [@]}", "Basic256Sha256"),
+    ("variables: [{node: @, name: A, origin: 1}]", "ns=2;i=1"),
+    (
+        "variables: [{node: ns=2;i=1, name: A, origin: 1, queue: @}]",
+        "keep_latest",
+    ),
+    (
+        "variables: [{node: ns=2;i=1, name: A, origin: 1, queue: {drop_oldest: @}}]",
+        "100",
+    ),
+    (
+        "variables: [{node: ns=2;i=1, name: A, origin: 1, range: [@, 100]}]",
+        "0.5",
+    ),
+    (
+        "variables: [{node: ns=2;i=1, name: A, origin: 1, ros: {topic: /a, scale: 2, invert: @}}]",
+        "true",
+    ),
+    (
+        "patterns: [{topics: \"/a/*\", node: \"ns=2;i={1}\", name: A, origin: 1, fields: [{field: x, out_of_range: @}]}]",
+        "clamp",
+    ),
+];
+
+#[test]
+fn an_environment_variable_may_stand_wherever_the_program_takes_one_and_nothing_else_may() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut files = Vec::new();
+    for (number, (document, value)) in LIMITED.into_iter().enumerate() {
+        let values = [
+            value.to_owned(),
+            "\"${CELL_VALUE}\"".to_owned(),
+            format!("\"${{CELL_VALUE:-{value}}}\""),
+            "\"$CELL_VALUE\"".to_owned(),
+            "\"$${CELL_VALUE}\"".to_owned(),
+            "\"${CELL VALUE}\"".to_owned(),
+        ];
+        for (form, value) in values.iter().enumerate() {
+            let text = document.replace('@', value);
+            files.push(cell.file(&format!("limited-{number}-{form}.yaml"), &text));
+        }
+    }
+    let told = judged(&cell, &files);
+    for (told, (document, _)) in told.chunks(6).zip(LIMITED) {
+        let sound: Vec<bool> = told
+            .iter()
+            .map(|one| one["faults"] == serde_json::json!([]))
+            .collect();
+        let expected = [true, true, true, false, false, false];
+        assert_eq!(sound, expected, "{document}: {told:?}");
+    }
+    // The program reads what the schema lets pass.
+    for (document, value) in LIMITED {
+        let text = document.replace('@', &format!("\"${{NO_SUCH_VARIABLE:-{value}}}\""));
+        let checked = mappings::Mapping::from_yaml(&text, "cell.yaml");
+        let refused = checked.findings.iter().find(|found| {
+            let codes = [
+                mappings::Code::WrongValue,
+                mappings::Code::EnvironmentVariable,
+            ];
+            codes.contains(&found.code)
+        });
+        assert_eq!(refused, None, "{text}");
+    }
+}

@@ -8,11 +8,11 @@ mod index;
 mod package;
 
 use std::fs::File;
-use std::io::Read as _;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use mappings::{PathFault, PathFaultKind, Surroundings};
+use mappings::{PathFault, PathFaultKind, Readers, Surroundings};
 use messages::{
     DefinitionError, DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName,
     check_text,
@@ -78,16 +78,44 @@ impl Surroundings for Disk {
         std::env::var(name).ok()
     }
 
+    fn readers(&self, file: &str) -> Option<Readers> {
+        readers(Path::new(file))
+    }
+
     fn types(&self, paths: &[PathBuf]) -> Box<dyn mappings::TypeFiles> {
         Box::new(TypeFiles::open(paths, Environment::from_env()))
     }
 }
 
-/// A file that is no longer than a mapping may be, or its beginning, which has a finding (M002).
+/// As the mode of the file says.
+#[cfg(unix)]
+fn readers(file: &Path) -> Option<Readers> {
+    use std::os::unix::fs::PermissionsExt as _;
+    let mode = file.metadata().ok()?.permissions().mode();
+    match (mode & 0o040, mode & 0o004) {
+        (0, 0) => None,
+        (_, 0) => Some(Readers::Group),
+        (_, _) => Some(Readers::Everybody),
+    }
+}
+
+#[cfg(not(unix))]
+const fn readers(_: &Path) -> Option<Readers> {
+    None
+}
+
 fn read_mapping(file: &str) -> Result<String, String> {
-    let mut text = Vec::new();
     let file = open(Path::new(file)).map_err(|error| error.to_string())?;
-    let length = file
+    read_text(file)
+}
+
+/// A text that is no longer than a mapping may be, or its beginning, which has a finding (M002).
+///
+/// # Errors
+/// Why it cannot be read, for people.
+pub fn read_text(from: impl Read) -> Result<String, String> {
+    let mut text = Vec::new();
+    let length = from
         .take(MOST_OF_A_MAPPING)
         .read_to_end(&mut text)
         .map_err(|error| error.to_string())?;

@@ -1,3 +1,5 @@
+use std::collections::BTreeMap;
+
 use mappings::TypeFiles as _;
 use messages::{Library, Registry};
 
@@ -249,4 +251,131 @@ fn a_single_file_is_of_the_package_around_its_folder() {
     for dialect in [Dialect::Ros1, Dialect::Ros2] {
         assert!(file(&mut files, dialect, TextKind::Message, "robot_msgs/Arm").is_some());
     }
+}
+
+/// A robot's definitions in two folders, and two of the tutorials whose checksums everybody knows.
+const ROBOT: [(&str, &str); 8] = [
+    (
+        "a/robot_msgs/msg/Joint.msg",
+        "uint8 OFF=0  # no power\nstring name\nfloat64 angle\n",
+    ),
+    (
+        "a/robot_msgs/msg/Arm.msg",
+        "Header header\nJoint[] joints\nother_msgs/Tool tool\n",
+    ),
+    (
+        "a/robot_msgs/srv/Move.srv",
+        "uint8 FAST=1\nArm target\nduration within\n---\nuint8 LATE=2\nbool success\nother_msgs/Tool[2] tools\n",
+    ),
+    ("a/robot_msgs/srv/Stop.srv", "---\n"),
+    (
+        "a/robot_msgs/action/Pick.action",
+        "Arm arm\n---\nother_msgs/Tool held\n---\nfloat32 progress\n",
+    ),
+    ("b/other_msgs/msg/Tool.msg", "int32 id\ntime since\n"),
+    (
+        "b/rospy_tutorials/srv/AddTwoInts.srv",
+        "int64 a\nint64 b\n---\nint64 sum\n",
+    ),
+    (
+        "b/actionlib_tutorials/action/Fibonacci.action",
+        "#goal definition\nint32 order\n---\n#result definition\nint32[] sequence\n---\n#feedback\nint32[] sequence\n",
+    ),
+];
+
+/// Name and md5 of each service of the folders, and of each message of each action.
+fn md5s(paths: &[PathBuf]) -> BTreeMap<String, String> {
+    let mut files = TypeFiles::open(paths, Environment::default());
+    assert_eq!(files.faults(), []);
+    let mut library = Library::new(Registry::bundle(Dialect::Ros1));
+    let mut found = BTreeMap::new();
+    for service in [
+        "robot_msgs/Move",
+        "robot_msgs/Stop",
+        "rospy_tutorials/AddTwoInts",
+    ] {
+        let service_type = library.service(&name(service), &mut files).unwrap();
+        found.insert(service.to_owned(), service_type.md5().to_owned());
+    }
+    for action in ["robot_msgs/Pick", "actionlib_tutorials/Fibonacci"] {
+        let action = library.action(&name(action), &mut files).unwrap();
+        for part in [
+            action.action(),
+            action.action_goal(),
+            action.action_result(),
+            action.action_feedback(),
+            action.goal(),
+            action.result(),
+            action.feedback(),
+        ] {
+            found.insert(part.name().to_string(), part.md5().to_owned());
+        }
+    }
+    found
+}
+
+#[test]
+fn services_and_actions_of_type_paths_have_the_md5s_that_genmsg_computes() {
+    let folder = Folder::new("md5", &ROBOT);
+    let found = md5s(&[folder.path("a"), folder.path("b")]);
+    assert_eq!(found.len(), 3 + 2 * 7);
+    for (known, md5) in [
+        (
+            "rospy_tutorials/AddTwoInts",
+            "6a2e34150c00229791cc89ff309fff21",
+        ),
+        (
+            "actionlib_tutorials/FibonacciAction",
+            "f59df5767bf7634684781c92598b2406",
+        ),
+        (
+            "actionlib_tutorials/FibonacciGoal",
+            "6889063349a00b249bd1661df429d822",
+        ),
+        (
+            "actionlib_tutorials/FibonacciResult",
+            "b81e37d2a31925a0e8ae261a8699cb79",
+        ),
+    ] {
+        assert_eq!(found[known], md5, "{known}");
+    }
+    let script = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../messages/tests/data/genmsg_md5.py"
+    );
+    let genmsg = std::process::Command::new("/usr/bin/python3")
+        .arg(script)
+        .arg(&folder.0)
+        .output();
+    let Some(told) = genmsg.ok().filter(|done| done.status.success()) else {
+        eprintln!("skipped: Debian's python3-genmsg is missing");
+        return;
+    };
+    let told = String::from_utf8(told.stdout).unwrap();
+    let judged: BTreeMap<String, String> = told
+        .lines()
+        .filter_map(|line| line.split_once(' '))
+        .map(|(name, md5)| (name.to_owned(), md5.to_owned()))
+        .collect();
+    assert_eq!(found, judged);
+}
+
+#[cfg(unix)]
+#[test]
+fn who_may_read_a_file_is_told_by_its_mode() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let folder = Folder::new("readers", &[("cell.yaml", "{}")]);
+    let path = folder.path("cell.yaml");
+    for (mode, readers) in [
+        (0o600, None),
+        (0o622, None),
+        (0o640, Some(Readers::Group)),
+        (0o604, Some(Readers::Everybody)),
+        (0o644, Some(Readers::Everybody)),
+    ] {
+        std::fs::set_permissions(&path, std::fs::Permissions::from_mode(mode)).unwrap();
+        let told = Disk.readers(path.to_str().unwrap());
+        assert_eq!(told, readers, "{mode:o}");
+    }
+    assert_eq!(Disk.readers("/nowhere/cell.yaml"), None);
 }

@@ -7,17 +7,17 @@ use std::sync::Arc;
 use messages::{DefinitionError, Dialect, Leaf, MessageType, Selection, TextKind, TypeName};
 
 use super::names::{mended, topic_fault};
+use super::selection::{self, Chosen};
 use super::services::{self, Calls, Kind, Known, Service};
 use super::several;
-use super::shaping::{self, Way};
+use super::shaping::Way;
 use super::types::{self, Types, ValueType, dialect};
 use super::{Declared, required, variables};
 use crate::code::Code;
-use crate::document::{self, AsEntry, BindingEntry};
+use crate::document::{self, BindingEntry};
 use crate::findings::Findings;
 use crate::mapping::{Binding, Space};
-use crate::nearest::nearest;
-use crate::read::{At, given, list, short};
+use crate::read::{At, list, short};
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::Place;
 
@@ -202,42 +202,25 @@ impl<'c> Bindings<'c> {
         let (name, place) = named?;
         let space = site.space?;
         let message_type = self.message_type(&name, place, site, findings);
-        let chosen = match (&entry.field, &entry.fields, &entry.r#as) {
-            (Some(at), _, _) => at.place,
-            (None, Some(at), _) => at.place,
-            (None, None, Some(at)) => at.place,
-            (None, None, None) => place,
-        };
+        let chosen = Chosen::from(entry);
+        let place = chosen.place().unwrap_or(place);
         let way = Way {
             // Where no origin is known, that is the finding.
             reads: site.subject.origin.is_none_or(|origin| origin == space),
             declared: site.subject.declared,
         };
-        let known = message_type.as_deref();
-        let selection = selection(entry, known, (chosen, way), findings)?;
-        let fields = match (&selection, message_type) {
-            (Selection::Bytes, _) => Some(vec![Leaf::bytes()]),
-            (Selection::Fields(selected), Some(message_type)) => Some(several::leaves(
-                &message_type,
-                selected,
-                (chosen, way),
-                findings,
-            )?),
-            (Selection::Structure(path), Some(message_type)) => {
-                let path = path.as_deref().unwrap_or_default();
-                Some(several::structure(&message_type, path, chosen, findings)?)
-            }
-            (Selection::Value { .. }, Some(message_type)) => Some(shaping::leaves(
-                &message_type,
+        let selection = chosen.selection(message_type.as_deref(), (place, way), findings)?;
+        let fields = match message_type {
+            Some(known) => Some(selection::leaves(
+                &known,
                 &selection,
-                chosen,
+                (place, way),
                 findings,
             )?),
-            (_, Some(message_type)) => Some(select(&message_type, &selection, chosen, findings)?),
-            (_, None) => None,
+            None => (selection == Selection::Bytes).then(|| vec![Leaf::bytes()]),
         };
         if let Some(fields) = &fields {
-            compare(fields, &name, site.subject, chosen, findings);
+            compare(fields, &name, site.subject, place, findings);
         }
         let (ros_topic, place) = topic?;
         let binding = Binding {
@@ -404,68 +387,6 @@ impl<'c> Bindings<'c> {
     }
 }
 
-/// `None` when it is faulty, which is noted.
-fn selection(
-    entry: &BindingEntry,
-    message_type: Option<&MessageType>,
-    (place, way): (Place, Way),
-    findings: &mut Findings,
-) -> Option<Selection> {
-    let bytes = matches!(given(&entry.r#as), Some((AsEntry::Bytes, _)));
-    let structure = matches!(given(&entry.r#as), Some((AsEntry::Structure, _)));
-    let shaping = shaping::shaping(entry.into(), findings)?;
-    if let Some(at) = &entry.fields {
-        shaping.of_fields(findings)?;
-        return several::selection(entry, at, message_type, way, findings);
-    }
-    match &entry.field {
-        None if structure => {
-            shaping.of_several(findings)?;
-            Some(Selection::Structure(None))
-        }
-        Some(at) if structure => {
-            shaping.of_several(findings)?;
-            Some(Selection::Structure(Some(at.value.clone()?)))
-        }
-        None => {
-            // Of a type with one field that one is meant.
-            let only = message_type.and_then(|message| match message.leaves() {
-                [only] if !bytes => Some(only.path.clone()),
-                _ => None,
-            });
-            match only {
-                Some(only) => {
-                    let shaped =
-                        shaping.select((only, None), message_type, (place, way), findings)?;
-                    let alone = matches!(shaped, Selection::Field(_));
-                    Some(if alone { Selection::Whole } else { shaped })
-                }
-                None => {
-                    shaping.of_several(findings)?;
-                    Some(if bytes {
-                        Selection::Bytes
-                    } else {
-                        Selection::Whole
-                    })
-                }
-            }
-        }
-        Some(at) if bytes => {
-            let note = findings.error(
-                Code::FieldOfBytes,
-                at.place,
-                "a message that crosses as bytes has no fields",
-            );
-            note.help("leave `field` out, or `as: bytes`");
-            None
-        }
-        Some(at) => {
-            let field = shaping::part(at.value.as_ref()?, at.place, findings)?;
-            shaping.select(field, message_type, (place, way), findings)
-        }
-    }
-}
-
 fn conflict(first: &Use, other: &Use, topic: &str, findings: &mut Findings) {
     let label = format!("first at {}", findings.line(first.place, other.place));
     if first.reads != other.reads {
@@ -543,44 +464,6 @@ const fn ros(dialect: Dialect) -> &'static str {
         Dialect::Ros1 => "ROS 1",
         Dialect::Ros2 => "ROS 2",
     }
-}
-
-pub(super) fn select(
-    message_type: &MessageType,
-    selection: &Selection,
-    place: Place,
-    findings: &mut Findings,
-) -> Option<Vec<Leaf>> {
-    let Selection::Field(path) = selection else {
-        return Some(message_type.leaves().to_vec());
-    };
-    if let Some(leaf) = message_type.leaf(path) {
-        return Some(vec![leaf.clone()]);
-    }
-    let inside: Vec<Leaf> = message_type
-        .leaves()
-        .iter()
-        .filter(|leaf| leaf.is_inside(path))
-        .cloned()
-        .collect();
-    if !inside.is_empty() {
-        return Some(inside);
-    }
-    let paths: Vec<&str> = message_type
-        .leaves()
-        .iter()
-        .map(|leaf| leaf.path.as_str())
-        .collect();
-    let name = message_type.name();
-    let message = format!("`{name}` has no field `{}`", short(path));
-    let note = findings.error(Code::UnknownField, place, message);
-    let near = nearest(path, paths.iter().copied()).map(|near| format!("did you mean `{near}`? "));
-    note.help(format!(
-        "{}its fields are {}",
-        near.unwrap_or_default(),
-        told(&paths)
-    ));
-    None
 }
 
 pub(super) fn told(paths: &[&str]) -> String {

@@ -8,6 +8,7 @@ use crate::document::{Namespaces, SpaceEntry};
 use crate::findings::Findings;
 use crate::mapping::Space;
 use crate::read::{At, given};
+use crate::secret::has_user;
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
@@ -152,9 +153,11 @@ pub(super) fn namespaces(
         }
         if !is_uri(text) {
             let message = format!("`{}` is no namespace URI", crate::read::short(text));
-            findings
-                .error(Code::Namespace, uri.place, message)
-                .help("for example urn:my-plant:line-1");
+            let mut note = findings.error(Code::Namespace, uri.place, message);
+            if has_user(text) {
+                note = note.label("whoever connects can read it: it has no user name or password");
+            }
+            note.help("for example urn:my-plant:line-1");
         }
         if let Some((other, first)) = uris.insert(text, (number, index.place)) {
             let line = findings.line(first, uri.place);
@@ -177,7 +180,8 @@ pub(super) fn namespaces(
     declared
 }
 
-/// As much of RFC 3986 as tells a URI from a slip: a scheme, a colon, and something without spaces.
+/// As much of RFC 3986 as tells a URI from a slip: a scheme, a colon, and something without spaces. What everybody gets to
+/// read has no user name or password.
 pub(super) fn is_uri(text: &str) -> bool {
     let Some((scheme, rest)) = text.split_once(':') else {
         return false;
@@ -188,5 +192,6 @@ pub(super) fn is_uri(text: &str) -> bool {
             .all(|b| b.is_ascii_alphanumeric() || b"+-.".contains(&b))
         && !rest.is_empty()
         && text.len() <= 4096
+        && !has_user(text)
         && !rest.contains(|c: char| c.is_whitespace() || c.is_control())
 }

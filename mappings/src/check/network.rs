@@ -10,6 +10,7 @@ use crate::document::{PubSubEntry, PublisherIdEntry, SecurityEntry, ServerEntry}
 use crate::findings::Findings;
 use crate::mapping::{Endpoint, PubSub, PublisherIdRule, SecurityPolicy, Server};
 use crate::read::{At, Field, given, short};
+use crate::secret::has_user;
 use crate::tree::Place;
 
 /// The port registered for OPC UA, TCP and UDP.
@@ -113,7 +114,10 @@ fn timing(entry: &PubSubEntry, pubsub: &PubSub, findings: &mut Findings) {
 fn address(text: &str, place: Place, findings: &mut Findings) -> Option<SocketAddr> {
     let Some(address) = PubSub::parse_address(text) else {
         let message = format!("`{}` is no PubSub address", short(text));
-        let note = findings.error(Code::Address, place, message);
+        let mut note = findings.error(Code::Address, place, message);
+        if has_user(text) {
+            note = note.label("it has no user name or password");
+        }
         note.help(format!(
             "a group or host by number: opc.udp://{}",
             PubSub::ADDRESS
@@ -224,9 +228,11 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
         let endpoint = parse_endpoint(text);
         if endpoint.is_none() {
             let message = format!("`{}` is no endpoint", short(text));
-            findings
-                .error(Code::Endpoint, place, message)
-                .help(format!("for example {}", default.endpoint));
+            let mut note = findings.error(Code::Endpoint, place, message);
+            if has_user(text) {
+                note = note.label("it has no user name or password");
+            }
+            note.help(format!("for example {}", default.endpoint));
         }
         endpoint
     });
@@ -235,9 +241,11 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
             return Some(text.clone());
         }
         let message = format!("`{}` is no ApplicationUri", short(text));
-        findings
-            .error(Code::ApplicationUri, place, message)
-            .help(format!("for example {}", default.application_uri));
+        let mut note = findings.error(Code::ApplicationUri, place, message);
+        if has_user(text) {
+            note = note.label("whoever connects can read it: it has no user name or password");
+        }
+        note.help(format!("for example {}", default.application_uri));
         None
     });
     let security =

@@ -2,14 +2,14 @@
 
 use std::collections::BTreeMap;
 
-use messages::{Conversion, Selection, TypeName};
+use messages::{Selection, TypeName};
 
-use super::bindings::select;
-use super::shaping;
+use super::selection::{self, Chosen};
+use super::shaping::Way;
 use super::types::{Types, dialect};
 use super::{Declared, required, variables};
 use crate::code::Code;
-use crate::document::{AsEntry, PatternEntry};
+use crate::document::PatternEntry;
 use crate::findings::Findings;
 use crate::mapping::Space;
 use crate::node_id::NodeIdText;
@@ -41,7 +41,7 @@ pub(super) fn check(
         let origin = required(&entry.origin, "origin", "the pattern", at.place, findings);
         let origin = origin.and_then(|(number, place)| origin_of(*number, place, spaces, findings));
         let texts = texts(entry, at.place, namespaces, findings);
-        let kind = kind(entry, origin, types, findings);
+        let kind = kind((entry, at.place), origin, types, findings);
         let (Some(origin), Some(texts), Some((message_type, selection))) = (origin, texts, kind)
         else {
             continue;
@@ -220,35 +220,20 @@ fn node(
 
 /// Type and selection.
 fn kind(
-    entry: &PatternEntry,
+    (entry, owner): (&PatternEntry, Place),
     origin: Option<SpaceId>,
     types: &mut Types,
     findings: &mut Findings,
 ) -> Option<(Option<TypeName>, Selection)> {
-    let bytes = matches!(given(&entry.r#as), Some((AsEntry::Bytes, _)));
-    let structure = matches!(given(&entry.r#as), Some((AsEntry::Structure, _)));
-    let selection = match &entry.field {
-        Some(at) if structure => Selection::Structure(Some(at.value.clone()?)),
-        None if structure => Selection::Structure(None),
-        Some(at) if bytes => {
-            let message = "a message that crosses as bytes has no fields";
-            findings
-                .error(Code::FieldOfBytes, at.place, message)
-                .help("leave `field` out, or `as: bytes`");
-            return None;
-        }
-        Some(at) => match shaping::part(at.value.as_ref()?, at.place, findings)? {
-            (field, None) => Selection::Field(field),
-            (field, part) => Selection::Value {
-                field,
-                part,
-                conversion: Conversion::default(),
-            },
-        },
-        None if bytes => Selection::Bytes,
-        None => Selection::Whole,
+    let chosen = Chosen::from(entry);
+    let chosen_at = |or: Place| chosen.place().unwrap_or(or);
+    // What a pattern makes are values of its space, of no declared type.
+    let way = Way {
+        reads: true,
+        declared: None,
     };
     let Some(at) = &entry.r#type else {
+        let selection = chosen.selection(None, (chosen_at(owner), way), findings)?;
         return Some((None, selection));
     };
     let text = at.value.as_ref()?;
@@ -261,16 +246,10 @@ fn kind(
     };
     let known =
         origin.and_then(|origin| types.get((dialect(origin), at.place), &name, findings).ok());
-    if let (Some(known), Some(field)) = (known, &entry.field) {
-        match &selection {
-            Selection::Value { .. } => shaping::leaves(&known, &selection, field.place, findings)?,
-            Selection::Whole
-            | Selection::Field(_)
-            | Selection::Fields(_)
-            | Selection::Structure(_)
-            | Selection::Template { .. }
-            | Selection::Bytes => select(&known, &selection, field.place, findings)?,
-        };
+    let place = chosen_at(at.place);
+    let selection = chosen.selection(known.as_deref(), (place, way), findings)?;
+    if let Some(known) = known {
+        selection::leaves(&known, &selection, (place, way), findings)?;
     }
     Some((Some(name), selection))
 }

@@ -5,13 +5,16 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use messages::{
-    Dialect, Leaf, Literal, MessageType, Plan, PlanError, Selection, ServiceType, TextKind,
-    TypeName, Wire,
+    Dialect, Leaf, Literal, MessageType, Plan, PlanError, Selected, Selection, ServiceType,
+    TextKind, TypeName, Wire,
 };
 use uadp::BuiltinType;
 
-use super::bindings::{Site, compare, ros_name, select, told};
+use super::bindings::{Site, compare, ros_name, told};
 use super::network::duration;
+use super::selection::{self, Chosen};
+use super::several;
+use super::shaping::Way;
 use super::types::{self, Types, ValueType};
 use crate::code::Code;
 use crate::document::{self, BindingEntry, Request};
@@ -85,10 +88,11 @@ impl Service {
         findings: &mut Findings,
     ) -> ServiceBinding {
         if let ServiceRole::Call {
-            request: Selection::Template { field: None, .. },
+            request: Selection::Template { fields, .. },
             when,
             ..
         } = &mut self.binding.role
+            && fields.is_empty()
         {
             *when = match (self.when, value_type) {
                 (Some((text, place)), value_type) => {
@@ -118,7 +122,7 @@ fn check_when(
     let carrier = carrier.and_then(|name| registry.get(&name).ok());
     let data = ("data".to_owned(), Literal::One(text.to_owned()));
     let template = Selection::Template {
-        field: None,
+        fields: Vec::new(),
         rest: BTreeMap::from([data]),
     };
     let fits = |carrier| Plan::compile(&carrier, &template, wire(dialect)).is_ok();
@@ -206,15 +210,6 @@ pub(super) fn kind(entry: &BindingEntry, owner: Place, findings: &mut Findings) 
     let strange = [
         ("type", place(&entry.r#type), kind == Kind::Answer),
         ("as", r#as, !topic),
-        ("fields", entry.fields.as_ref().map(|at| at.place), !topic),
-        ("scale", entry.scale.as_ref().map(|at| at.place), !topic),
-        ("offset", entry.offset.as_ref().map(|at| at.place), !topic),
-        ("invert", entry.invert.as_ref().map(|at| at.place), !topic),
-        (
-            "out_of_range",
-            entry.out_of_range.as_ref().map(|at| at.place),
-            !topic,
-        ),
         ("request", request, !call && !poll),
         ("when", place(&entry.when), !call),
         ("timeout", place(&entry.timeout), !call && !poll),
@@ -336,23 +331,31 @@ fn asked(
     let known = built_in(&service_type, (dialect, place), types, findings);
     let request_type = known.as_ref().map(|service| service.request());
     if kind == Kind::Call {
-        let taken = given(&entry.field);
-        let fields = match (taken, request_type) {
-            (Some((path, place)), Some(request)) => {
-                let fields = select(request, &Selection::Field(path.clone()), place, findings)?;
-                compare(&fields, request.name(), site.subject, place, findings);
-                Some(fields)
-            }
-            (Some(_), None) | (None, _) => None,
+        let chosen = Chosen::from(entry);
+        let way = Way {
+            reads: false,
+            declared: site.subject.declared,
         };
-        if let (Some(_), Some(at)) = (taken, &entry.when) {
-            let message = "`when` does not go with `field`: each value is sent";
-            findings
-                .error(Code::When, at.place, message)
-                .help("leave `field` out to send the same request each time");
+        let (mut taken, mut fields) = (Vec::new(), None);
+        if chosen.names_fields() {
+            let at = (chosen.place().unwrap_or(place), way);
+            let known = request_type.map(|request| &**request);
+            taken = several::selected(chosen.selection(known, at, findings)?)?;
+            if let Some(request) = request_type {
+                let found = several::leaves(request, &taken, at, findings)?;
+                compare(&found, request.name(), site.subject, at.0, findings);
+                fields = Some(found);
+            }
+            if let Some(at) = &entry.when {
+                let message = "`when` does not go with `field`: each value is sent";
+                findings
+                    .error(Code::When, at.place, message)
+                    .help("leave `field` out to send the same request each time");
+            }
+        } else {
+            chosen.converts_nothing(findings)?;
         }
         let when = given(&entry.when).map(|(text, place)| (text.clone(), place));
-        let taken = taken.map(|(path, _)| path);
         let request = template(entry, taken, (dialect, request_type), findings)?;
         let role = ServiceRole::Call {
             service: service?,
@@ -363,7 +366,7 @@ fn asked(
         };
         return Some((role, fields, when));
     }
-    let request = template(entry, None, (dialect, request_type), findings);
+    let request = template(entry, Vec::new(), (dialect, request_type), findings);
     let response = known.as_ref().map(|service| service.response());
     let (selection, fields) = response_field(entry, response, place, site, findings)?;
     let role = ServiceRole::Poll {
@@ -451,20 +454,24 @@ fn response_field(
     site: &Site<'_>,
     findings: &mut Findings,
 ) -> Option<(Selection, Option<Vec<Leaf>>)> {
-    let (selection, place) = match &entry.field {
-        None => (Selection::Whole, place),
-        Some(at) => (Selection::Field(at.value.clone()?), at.place),
+    let chosen = Chosen::from(entry);
+    let way = Way {
+        reads: true,
+        declared: site.subject.declared,
     };
+    let at = (chosen.place().unwrap_or(place), way);
     let Some(response) = response else {
+        let selection = chosen.selection(None, at, findings)?;
         return Some((selection, None));
     };
     if response.leaves().is_empty() {
         let message = format!("`{}` has no field, so there is no value", response.name());
-        findings.error(Code::UnknownField, place, message);
+        findings.error(Code::UnknownField, at.0, message);
         return None;
     }
-    let fields = select(response, &selection, place, findings)?;
-    compare(&fields, response.name(), site.subject, place, findings);
+    let selection = chosen.selection(Some(&**response), at, findings)?;
+    let fields = selection::leaves(response, &selection, at, findings)?;
+    compare(&fields, response.name(), site.subject, at.0, findings);
     Some((selection, Some(fields)))
 }
 
@@ -477,7 +484,7 @@ fn takes(field: &str, path: &str) -> bool {
 /// The request with its constants, each checked where its type is known.
 fn template(
     entry: &BindingEntry,
-    field: Option<&String>,
+    fields: Vec<Selected>,
     (dialect, request): (Dialect, Option<&Arc<MessageType>>),
     findings: &mut Findings,
 ) -> Option<Selection> {
@@ -490,13 +497,13 @@ fn template(
     for (path, place, literal) in constants {
         let fault = if rest.insert(path.clone(), literal.clone()).is_some() {
             Some((format!("field `{}` is given twice", short(path)), None))
-        } else if field.is_some_and(|field| takes(field, path)) {
+        } else if fields.iter().any(|one| takes(&one.field, path)) {
             let message = format!("field `{}` takes the value already", short(path));
             Some((message, Some("leave it out of `request`".to_owned())))
         } else {
             request.and_then(|request| {
                 let one = Selection::Template {
-                    field: None,
+                    fields: Vec::new(),
                     rest: BTreeMap::from([(path.clone(), literal.clone())]),
                 };
                 let error = Plan::compile(request, &one, wire(dialect)).err()?;
@@ -511,10 +518,7 @@ fn template(
             }
         }
     }
-    sound.then(|| Selection::Template {
-        field: field.cloned(),
-        rest,
-    })
+    sound.then_some(Selection::Template { fields, rest })
 }
 
 /// Message and help.

@@ -6,17 +6,18 @@ use std::sync::Arc;
 use messages::{Leaf, MessageType, Rank, Selected, Selection};
 use uadp::BuiltinType;
 
+use super::selection::{self, Chosen};
 use super::shaping::{self, Way};
 use crate::code::Code;
-use crate::document::{BindingEntry, FieldList};
+use crate::document::FieldList;
 use crate::findings::Findings;
 use crate::mapping::Binding;
 use crate::read::{At, given, short};
 use crate::tree::Place;
 
 /// The fields of a binding; `None` when something is faulty, which is noted.
-pub(super) fn selection(
-    entry: &BindingEntry,
+pub(super) fn fields(
+    chosen: Chosen<'_>,
     at: &At<FieldList>,
     message_type: Option<&MessageType>,
     way: Way,
@@ -24,8 +25,8 @@ pub(super) fn selection(
 ) -> Option<Selection> {
     let list = at.value.as_ref()?;
     let beside = [
-        ("field", entry.field.as_ref().map(|at| at.place)),
-        ("as", entry.r#as.as_ref().map(|at| at.place)),
+        ("field", chosen.field.as_ref().map(|at| at.place)),
+        ("as", chosen.r#as.as_ref().map(|at| at.place)),
     ];
     for (key, place) in beside {
         if let Some(place) = place {
@@ -49,7 +50,7 @@ pub(super) fn selection(
             .help(format!("a variable has at most {MOST_FIELDS} of them"));
         return None;
     }
-    let mut selected: Vec<Selected> = Vec::new();
+    let mut all: Vec<Selected> = Vec::new();
     let mut known = HashSet::new();
     for at in &list.0 {
         let entry = at.value.as_ref()?;
@@ -66,31 +67,37 @@ pub(super) fn selection(
             declared: None,
             ..way
         };
-        let one = match shaping.select(field, message_type, (place, way), findings)? {
-            Selection::Field(field) => Selected::whole(&field),
-            Selection::Value {
-                field,
-                part,
-                conversion,
-            } => Selected {
-                field,
-                part,
-                conversion,
-            },
-            Selection::Whole
-            | Selection::Fields(_)
-            | Selection::Structure(_)
-            | Selection::Template { .. }
-            | Selection::Bytes => return None,
-        };
+        let one = shaping.select(field, message_type, (place, way), findings)?;
+        let one = selected(one)?.pop()?;
         if !known.insert((one.field.clone(), one.part.clone())) {
             let message = format!("`{}` is named twice", short(text));
             findings.error(Code::Fields, place, message);
             return None;
         }
-        selected.push(one);
+        all.push(one);
     }
-    Some(Selection::Fields(selected))
+    Some(Selection::Fields(all))
+}
+
+/// The fields of a selection that names them; `None` of one that names none.
+pub(super) fn selected(selection: Selection) -> Option<Vec<Selected>> {
+    match selection {
+        Selection::Field(field) => Some(vec![Selected::whole(&field)]),
+        Selection::Value {
+            field,
+            part,
+            conversion,
+        } => Some(vec![Selected {
+            field,
+            part,
+            conversion,
+        }]),
+        Selection::Fields(selected) => Some(selected),
+        Selection::Whole
+        | Selection::Structure(_)
+        | Selection::Template { .. }
+        | Selection::Bytes => None,
+    }
 }
 
 /// The values of several fields; `None` when the type has one of them not, which is noted.
@@ -159,8 +166,7 @@ pub(super) fn structure(
             rank: Rank::Scalar,
         }]);
     }
-    let missing = Selection::Field(path.to_owned());
-    super::bindings::select(message_type, &missing, place, findings)?;
+    selection::field(message_type, path, place, findings)?;
     let message = format!("`{}` is no message, so it is no structure", short(path));
     findings
         .error(Code::StructureOf, place, message)

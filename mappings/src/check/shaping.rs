@@ -7,7 +7,7 @@ use uadp::BuiltinType;
 
 use super::types::ValueType;
 use crate::code::Code;
-use crate::document::{BindingEntry, FieldEntry, OutOfRangeEntry};
+use crate::document::{BindingEntry, FieldEntry, OutOfRangeEntry, PatternEntry};
 use crate::findings::Findings;
 use crate::read::{Field, given, short};
 use crate::tree::Place;
@@ -33,6 +33,17 @@ pub(super) struct Keys<'k> {
 
 impl<'k> From<&'k BindingEntry> for Keys<'k> {
     fn from(entry: &'k BindingEntry) -> Self {
+        Self {
+            scale: &entry.scale,
+            offset: &entry.offset,
+            invert: &entry.invert,
+            out_of_range: &entry.out_of_range,
+        }
+    }
+}
+
+impl<'k> From<&'k PatternEntry> for Keys<'k> {
+    fn from(entry: &'k PatternEntry) -> Self {
         Self {
             scale: &entry.scale,
             offset: &entry.offset,
@@ -108,8 +119,28 @@ pub(super) fn shaping(keys: Keys<'_>, findings: &mut Findings) -> Option<Shaping
         let scale = scale.map_or(1.0, |(scale, _)| *scale);
         conversion = conversion.scaled(scale, offset.map_or(0.0, |(offset, _)| *offset));
     }
-    if let Some((true, _)) = given(keys.invert) {
+    if let Some((true, place)) = given(keys.invert) {
         conversion = conversion.inverted();
+        let beside = [
+            ("scale", keys.scale.as_ref().map(|at| at.place)),
+            ("offset", keys.offset.as_ref().map(|at| at.place)),
+            (
+                "out_of_range",
+                keys.out_of_range.as_ref().map(|at| at.place),
+            ),
+        ];
+        let mut beside = beside
+            .into_iter()
+            .filter_map(|(key, place)| Some((key, place?)));
+        if let Some((key, other)) = beside.next() {
+            let message = format!("`{key}` is about numbers, and `invert` about a Boolean");
+            let line = findings.line(place, other);
+            findings
+                .error(Code::Conversion, other, message)
+                .label(format!("`invert` at {line}"))
+                .help("leave one of them out");
+            sound = None;
+        }
     }
     if let Some((OutOfRangeEntry::Clamp, _)) = given(keys.out_of_range) {
         conversion = conversion.clamped();
@@ -174,6 +205,21 @@ impl Shaping {
         findings
             .error(Code::Fields, place, "`fields` are converted one by one")
             .help("write it to the field: `fields: [{field: linear.x, scale: 1000}]`");
+        None
+    }
+
+    /// Where no value crosses none is converted.
+    pub(super) fn of_nothing(&self, findings: &mut Findings) -> Option<()> {
+        let Some(place) = self.place else {
+            return Some(());
+        };
+        findings
+            .error(
+                Code::Conversion,
+                place,
+                "no value goes into the request, so none is converted",
+            )
+            .help("name the field of the request that takes the value: `field: data`");
         None
     }
 
@@ -271,8 +317,16 @@ pub(super) fn leaves(
     place: Place,
     findings: &mut Findings,
 ) -> Option<Vec<Leaf>> {
-    let Selection::Value { field, part, .. } = selection else {
-        return super::bindings::select(message_type, selection, place, findings);
+    let (field, part) = match selection {
+        Selection::Value { field, part, .. } => (field, part),
+        Selection::Field(path) => {
+            return super::selection::field(message_type, path, place, findings);
+        }
+        Selection::Whole
+        | Selection::Fields(_)
+        | Selection::Structure(_)
+        | Selection::Template { .. }
+        | Selection::Bytes => return None,
     };
     let wire = match message_type.dialect() {
         messages::Dialect::Ros1 => Wire::Ros1,
@@ -295,8 +349,7 @@ pub(super) fn leaves(
     let (code, error) = match found {
         Ok(plan) => return Some(plan.leaves().to_vec()),
         Err((_, PlanError::UnknownField { name, path, .. })) if name == *message_type.name() => {
-            let missing = Selection::Field(path);
-            super::bindings::select(message_type, &missing, place, findings);
+            super::selection::field(message_type, &path, place, findings);
             return None;
         }
         Err(fault) => fault,

@@ -336,7 +336,7 @@ fn variable(
         Some((Queue::DropOldest(size), _)) => Overflow::DropOldest(NonZeroU16::new(*size)?),
         Some((Queue::KeepLatest, _)) | None => Overflow::KeepLatest,
     };
-    let publish = publish(entry, value_type, findings);
+    let publish = publish(entry, (value_type, &fields), findings);
     let several = fields.len() > 1;
     let meaning = meaning::check(entry, (value_type, several), findings);
     let service = bound
@@ -361,7 +361,7 @@ fn variable(
 /// `None` when it is faulty, which is noted.
 fn publish(
     entry: &VariableEntry,
-    value_type: Option<ValueType>,
+    (value_type, fields): (Option<ValueType>, &[Leaf]),
     findings: &mut Findings,
 ) -> Option<Publish> {
     let mut on_change = matches!(given(&entry.publish), Some((PublishEntry::OnChange, _)));
@@ -377,6 +377,11 @@ fn publish(
             let told = value_type.map(types::print).unwrap_or_default();
             Some((
                 format!("a deadband goes with numbers, and this is {told}"),
+                "`publish: on_change` goes with all values",
+            ))
+        } else if fields.len() > 1 && !fields.iter().any(|leaf| messages::is_number(leaf.builtin)) {
+            Some((
+                "a deadband goes with numbers, and none of the fields is one".to_owned(),
                 "`publish: on_change` goes with all values",
             ))
         } else if matches!(given(&entry.publish), Some((PublishEntry::Always, _))) {

@@ -114,7 +114,15 @@ impl Conversion {
         let number = number_of(value).ok_or(ValueFault::NoNumber)?;
         let number = match self.linear {
             None => number,
-            Some((scale, offset)) => Number::Real(linear(number.real(), scale.get(), offset.get())),
+            Some((scale, offset)) => {
+                let moved = linear(number.real(), scale.get(), offset.get());
+                // Infinity comes of infinity; else it is more than even a Double holds.
+                match moved.is_infinite() && number.real().is_finite() {
+                    true if self.clamp => Number::Real(f64::MAX.copysign(moved)),
+                    true => return Err(Number::Real(moved).out_of(to)),
+                    false => Number::Real(moved),
+                }
+            }
         };
         number.fit(to, self.clamp)
     }
@@ -303,6 +311,43 @@ mod tests {
         assert_eq!(float.there(Scalar::Double(-1e300)).map_err(|_| ()), Err(()));
         let clamped = float.clamped().there(Scalar::Double(-1e300));
         assert_eq!(clamped, Ok(Scalar::Float(f32::MIN)));
+    }
+
+    #[test]
+    fn what_scaling_makes_too_big_for_a_double_is_out_of_range_and_infinity_is_a_value() {
+        let scaled = Conversion::default().scaled(1e10, 0.0);
+        let double = scaled.there(Scalar::Double(-1e300));
+        assert_eq!(double, out_of("-inf", BuiltinType::Double));
+        let clamped = scaled.clamped().there(Scalar::Double(-1e300));
+        assert_eq!(clamped, Ok(Scalar::Double(f64::MIN)));
+        let back = Conversion::default().scaled(1e-10, 0.0);
+        let value = Scalar::Double(1e300);
+        assert_eq!(
+            back.back(value, BuiltinType::Double),
+            out_of("inf", BuiltinType::Double)
+        );
+        assert_eq!(
+            back.clamped().back(value, BuiltinType::Double),
+            Ok(Scalar::Double(f64::MAX))
+        );
+        // Through a Double to a Float, and to an integer.
+        let float = scaled.to(BuiltinType::Float);
+        assert_eq!(
+            float.there(Scalar::Double(1e300)),
+            out_of("inf", BuiltinType::Float)
+        );
+        let clamped = float.clamped().there(Scalar::Double(1e300));
+        assert_eq!(clamped, Ok(Scalar::Float(f32::MAX)));
+        let whole = scaled.to(BuiltinType::Int16).clamped();
+        assert_eq!(
+            whole.there(Scalar::Double(1e300)),
+            Ok(Scalar::Int16(i16::MAX))
+        );
+        for infinite in [f64::INFINITY, f64::NEG_INFINITY] {
+            let value = Scalar::Double(infinite);
+            assert_eq!(scaled.there(value), Ok(value));
+            assert_eq!(scaled.clamped().there(value), Ok(value));
+        }
     }
 
     #[test]

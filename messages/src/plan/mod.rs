@@ -58,11 +58,11 @@ pub enum Selection {
     Fields(Vec<Selected>),
     /// The message, or the one at that path, as one structure.
     Structure(Option<String>),
-    /// A message of constants, to be written: `field` takes the value, or without it no value crosses; the fields of
-    /// `rest` have what stands there, all others are zero or empty. Read, it is as [`Selection::Field`].
+    /// A message of constants, to be written: `fields` take the value, or without any no value crosses; the fields of
+    /// `rest` have what stands there, all others are zero or empty. Read, it is as [`Selection::Fields`].
     Template {
-        /// The path of the field that holds the value; `None` where the message is the same each time.
-        field: Option<String>,
+        /// The fields that hold the value; none where the message is the same each time.
+        fields: Vec<Selected>,
         /// Path of a field -> its value.
         rest: BTreeMap<String, Literal>,
     },
@@ -172,7 +172,12 @@ impl Plan {
                 let (shaped, leaf) = Shaped::compile(message, (field, part, conversion), steps)?;
                 (Body::Shaped(Box::new(shaped)), vec![leaf])
             }
-            Selection::Fields(selected) => several::compile(message, selected, wire)?,
+            Selection::Fields(selected) => {
+                several::compile(message, (selected, &BTreeMap::new()), wire)?
+            }
+            Selection::Template { fields, rest } => {
+                several::compile(message, (fields, rest), wire)?
+            }
             Selection::Structure(path) => {
                 let at = path.as_deref().unwrap_or_default();
                 let Some(of) = message.message_at(at) else {
@@ -195,7 +200,7 @@ impl Plan {
                 };
                 (Body::Structure(of.clone(), ops), vec![leaf])
             }
-            Selection::Whole | Selection::Field(_) | Selection::Template { .. } => {
+            Selection::Whole | Selection::Field(_) => {
                 let (ops, leaves) = steps(message, selection, wire)?;
                 (Body::Steps(ops), leaves)
             }
@@ -263,29 +268,34 @@ impl Plan {
     }
 }
 
-/// The steps of a selection that is no part of a field and not the bytes, and the fields that cross.
+/// The steps of the whole message or one field, and the fields that cross.
 fn steps(
     message: &Arc<MessageType>,
     selection: &Selection,
     wire: Wire,
 ) -> Result<(Vec<Op>, Vec<Leaf>), PlanError> {
-    let none = BTreeMap::new();
-    let (field, rest) = match selection {
-        Selection::Field(path) => (Some(path), &none),
-        Selection::Template { field, rest } => (field.as_ref(), rest),
-        Selection::Whole
-        | Selection::Value { .. }
+    let carried = match selection {
+        Selection::Field(path) => range(message, path)?,
+        Selection::Whole => 0..message.leaves().len(),
+        Selection::Value { .. }
         | Selection::Fields(_)
         | Selection::Structure(_)
-        | Selection::Bytes => (None, &none),
+        | Selection::Template { .. }
+        | Selection::Bytes => 0..0,
     };
-    let carried = match field {
-        Some(path) => range(message, path)?,
-        None if *selection == Selection::Whole => 0..message.leaves().len(),
-        None => 0..0,
-    };
-    let mut compiler = Compiler::new(wire, vec![carried.clone()]);
-    compiler.given = given(message, field, rest)?;
+    let ops = ops(message, (vec![carried.clone()], BTreeMap::new()), wire)?;
+    let leaves = message.leaves().get(carried).unwrap_or_default().to_vec();
+    Ok((ops, leaves))
+}
+
+/// The steps of a message of which some fields cross, and others are constants.
+fn ops(
+    message: &MessageType,
+    (carried, given): (Vec<Range<usize>>, BTreeMap<usize, Given<'_>>),
+    wire: Wire,
+) -> Result<Vec<Op>, PlanError> {
+    let mut compiler = Compiler::new(wire, carried);
+    compiler.given = given;
     compiler.message(&message.shape, false);
     if let Some(fault) = compiler.fault {
         return Err(fault);
@@ -300,8 +310,7 @@ fn steps(
             .unwrap_or_default(),
         fault,
     })?;
-    let leaves = message.leaves().get(carried).unwrap_or_default().to_vec();
-    Ok((ops, leaves))
+    Ok(ops)
 }
 
 /// The fields of a path: one, or those of a message, which follow each other.
@@ -336,14 +345,15 @@ fn index(message: &MessageType, path: &str) -> Result<usize, PlanError> {
 /// The constants by the index of their field.
 fn given<'m>(
     message: &'m MessageType,
-    field: Option<&String>,
-    rest: &'m BTreeMap<String, Literal>,
+    (fields, rest): (&[Selected], &'m BTreeMap<String, Literal>),
 ) -> Result<BTreeMap<usize, Given<'m>>, PlanError> {
     let each = rest.iter().map(|(path, literal)| {
         let at = index(message, path)?;
         let leaf = message.leaves().get(at);
-        let inside = |field: &String| leaf.is_some_and(|leaf| leaf.is_inside(field));
-        if field == Some(path) || field.is_some_and(inside) {
+        let takes = |one: &Selected| {
+            one.field == *path || leaf.is_some_and(|leaf| leaf.is_inside(&one.field))
+        };
+        if fields.iter().any(takes) {
             return Err(PlanError::ConstantOfField {
                 name: message.name().clone(),
                 path: path.clone(),

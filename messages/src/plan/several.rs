@@ -1,10 +1,11 @@
 //! Several fields of one message, each perhaps with a part and a conversion of its own.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use uadp::{BuiltinType, Scalar};
 
-use super::{Compiler, Conversion, Op, Part, Plan, Selection, What, Wire, coalesced, range, write};
+use super::{Conversion, Literal, Op, Part, Plan, Selection, What, Wire, given, ops, range, write};
 use crate::definition::Primitive;
 use crate::{
     Leaf, MessageType, PlanError, ReadError, Sink, Source, SourceError, WriteError, WriteFault,
@@ -61,10 +62,11 @@ pub(super) struct Several {
 /// What becomes of one field, and its builtin type in OPC UA where it is converted.
 type Shaping = Option<(Conversion, BuiltinType)>;
 
-/// The body of a plan, and the fields that cross, in the order given.
+/// The body of a plan, and the fields that cross, in the order given. Where the message is written, the fields of `rest`
+/// are what stands there.
 pub(super) fn compile(
     message: &Arc<MessageType>,
-    selected: &[Selected],
+    (selected, rest): (&[Selected], &BTreeMap<String, Literal>),
     wire: Wire,
 ) -> Result<(super::Body, Vec<Leaf>), PlanError> {
     let mut plans = Vec::new();
@@ -83,18 +85,14 @@ pub(super) fn compile(
         ranges.push(range(message, &one.field)?);
         plans.push(plan);
     }
+    let constants = given(message, (selected, rest))?;
     let in_order = ranges.is_sorted_by(|a, b| a.end <= b.start);
     let write = if selected.iter().any(|one| one.part.is_some()) {
         Err(WriteFault::Part)
     } else if !in_order {
         Err(WriteFault::Order)
     } else {
-        let mut compiler = Compiler::new(wire, ranges);
-        compiler.message(&message.shape, false);
-        if let Some(fault) = compiler.fault {
-            return Err(fault);
-        }
-        Ok((coalesced(&compiler.ops), shapings))
+        Ok((ops(message, (ranges, constants), wire)?, shapings))
     };
     let plain = selected.iter().all(Selected::is_plain);
     let body = match write {

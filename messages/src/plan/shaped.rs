@@ -140,7 +140,10 @@ impl Shaped {
         };
         let inner = match &inside {
             Some(inside) => inside.leaf.clone(),
-            None => shape(leaf, part.as_ref()).map_err(&fault)?,
+            None => {
+                let bytes = message.fixed_bytes(field);
+                shape((leaf, bytes), part.as_ref()).map_err(&fault)?
+            }
         };
         let outside = conversion.outside(inner.builtin).map_err(&fault)?;
         let mut names = None;
@@ -279,8 +282,8 @@ fn beside(field: &str, name: &str) -> String {
     }
 }
 
-/// What the part of a field is, before it is converted.
-fn shape(leaf: &Leaf, part: Option<&Part>) -> Result<Leaf, &'static str> {
+/// What the part of a field is, before it is converted. `bytes`: how many an array of bytes always has.
+fn shape((leaf, bytes): (&Leaf, Option<u32>), part: Option<&Part>) -> Result<Leaf, &'static str> {
     let Some(part) = part else {
         return Ok(leaf.clone());
     };
@@ -293,7 +296,7 @@ fn shape(leaf: &Leaf, part: Option<&Part>) -> Result<Leaf, &'static str> {
         Leaf {
             builtin: BuiltinType::ByteString,
             ..
-        } => (BuiltinType::Byte, None),
+        } => (BuiltinType::Byte, bytes),
         Leaf {
             rank: Rank::Scalar, ..
         } => return Err("is no array"),

@@ -1,10 +1,11 @@
 //! What is wrong with a mapping, for people and for programs.
 
-use std::io::{self, BufWriter, Read as _, Write as _};
+use std::io::{self, BufWriter, Write as _};
 use std::path::PathBuf;
 
 use mappings::{
-    Checked, Diagnostic, Environment, Mapping, Surroundings, TypeFiles, TypeOrigin, TypeUse,
+    Checked, Diagnostic, Environment, Mapping, Readers, Surroundings, TypeFiles, TypeOrigin,
+    TypeUse,
 };
 use messages::Dialect;
 use serde::Serialize;
@@ -62,23 +63,11 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
 }
 
 fn read(file: &str) -> Result<String, Failure> {
-    let mut text = Vec::new();
-    let read = if file == "-" {
-        io::stdin().lock().take(MOST).read_to_end(&mut text)
-    } else {
-        std::fs::File::open(file).and_then(|file| file.take(MOST).read_to_end(&mut text))
+    let read = match file {
+        "-" => type_files::read_text(io::stdin().lock()),
+        file => Disk.read(file),
     };
-    let length = read.map_err(|error| Failure::reading(file, &error))?;
-    if u64::try_from(length).is_ok_and(|length| length == MOST) {
-        // It has a finding by its size alone (M002), and may end within a character.
-        return Ok(String::from_utf8_lossy(&text).into_owned());
-    }
-    String::from_utf8(text).map_err(|error| {
-        let at = error.utf8_error().valid_up_to();
-        Failure::Io(format!(
-            "cannot read {file}: it is not UTF-8 from byte {at} on; save it as UTF-8"
-        ))
-    })
+    read.map_err(|why| Failure::Io(format!("cannot read {file}: {why}")))
 }
 
 /// What is beside a mapping, and what was found in the cell.
@@ -98,6 +87,10 @@ impl Surroundings for Around<'_> {
 
     fn variable(&self, name: &str) -> Option<String> {
         Disk.variable(name)
+    }
+
+    fn readers(&self, file: &str) -> Option<Readers> {
+        Disk.readers(file)
     }
 
     fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
@@ -211,6 +204,3 @@ impl<'a> Finding<'a> {
         }
     }
 }
-
-/// More than a mapping may have (M002): a device that never ends is not read for ever.
-const MOST: u64 = 5 << 20;

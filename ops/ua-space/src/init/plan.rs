@@ -1,6 +1,6 @@
 //! What a mapping says of what was found: which topic is which node, and what is left out.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 
 use mappings::{LiveTopic, NodeIdText, SpaceId};
 use messages::{Registry, TypeName};
@@ -105,25 +105,42 @@ impl Planner<'_> {
     /// server's own.
     fn nodes(&mut self, sources: &[Nodes]) {
         let mut all = self.known.mapping.namespaces().clone();
+        let mut by_uri: HashMap<String, u16> = HashMap::new();
+        for (index, uri) in &all {
+            by_uri.entry(uri.clone()).or_insert(*index);
+        }
         let mut taken = BTreeSet::new();
         let mut ua = Vec::new();
         for source in sources {
             let mut indexes: HashMap<u16, u16> = HashMap::new();
+            let used: HashSet<u16> = source
+                .variables
+                .iter()
+                .map(|one| one.node.namespace)
+                .collect();
+            // From the index that is wanted on, then below it; none is given back, so nothing is free before them.
+            let (mut above, mut below) = (0, 2);
             for (index, uri) in (0..=u16::MAX).zip(&source.namespaces).skip(1) {
-                let used = source
-                    .variables
-                    .iter()
-                    .any(|one| one.node.namespace == index);
-                if !used {
+                if !used.contains(&index) {
                     continue;
                 }
-                let there = all.iter().find(|(_, other)| *other == uri);
-                let there = there.map(|(index, _)| *index);
-                let given = there.or_else(|| {
+                let given = by_uri.get(uri).copied().or_else(|| {
                     let wanted = index.saturating_add(u16::from(source.endpoint.is_none()));
                     let free = |at: &u16| !all.contains_key(at);
-                    let found = (wanted..=u16::MAX).chain(2..=u16::MAX).find(free)?;
+                    above = wanted.max(above);
+                    let found = match (above..=u16::MAX).find(free) {
+                        Some(found) => {
+                            above = found;
+                            found
+                        }
+                        None => {
+                            above = u16::MAX;
+                            below = (below..=u16::MAX).find(free)?;
+                            below
+                        }
+                    };
                     all.insert(found, uri.clone());
+                    by_uri.insert(uri.clone(), found);
                     self.plan.namespaces.insert(found, uri.clone());
                     Some(found)
                 });

@@ -184,3 +184,31 @@ fn the_files_a_mapping_includes_and_the_environment_are_looked_at() {
     fs::write(&part, "{}").unwrap();
     assert_eq!(run(&["check", &whole]).code, 0);
 }
+
+#[cfg(unix)]
+#[test]
+fn a_password_in_a_file_others_can_read_is_told_and_not_shown() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let text = "server: {endpoint: \"opc.tcp://robot:sesame@gateway\"}\n";
+    let path = file("secret.yaml", text);
+    let told = |mode| {
+        fs::set_permissions(&path, fs::Permissions::from_mode(mode)).unwrap();
+        let ended = run(&["check", &path]);
+        assert_eq!(ended.code, 78, "an endpoint has no password");
+        let json = run(&["check", "--json", &path]);
+        for output in [&ended.stdout, &ended.stderr, &json.stdout] {
+            assert!(!output.contains("sesame"), "{output}");
+        }
+        assert!(ended.stdout.contains("warning[M114]"), "{}", ended.stdout);
+        ended.stdout
+    };
+    assert!(told(0o644).contains("everybody on this host can read it"));
+    assert!(told(0o640).contains("the group of the file can read it"));
+    assert!(!told(0o600).contains("can read it"));
+    let ended = run_on(&["check", "-"], text.as_bytes());
+    assert!(
+        ended.stdout.contains("opc.tcp://robot:******@gateway"),
+        "{}",
+        ended.stdout
+    );
+}

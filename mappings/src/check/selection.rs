@@ -1,0 +1,176 @@
+//! Which fields of a message cross: what `field`, `fields`, `as` and the keys that convert say together.
+
+use std::sync::Arc;
+
+use messages::{Leaf, MessageType, Selection};
+
+use super::bindings::told;
+use super::several;
+use super::shaping::{self, Keys, Way};
+use crate::code::Code;
+use crate::document::{AsEntry, BindingEntry, FieldList, PatternEntry};
+use crate::findings::Findings;
+use crate::nearest::nearest;
+use crate::read::{Field, given, short};
+use crate::tree::Place;
+
+/// What a binding or a pattern says of the fields.
+#[derive(Clone, Copy)]
+pub(super) struct Chosen<'e> {
+    pub(super) field: &'e Field<String>,
+    pub(super) fields: &'e Field<FieldList>,
+    pub(super) r#as: &'e Field<AsEntry>,
+    keys: Keys<'e>,
+}
+
+impl<'e> From<&'e BindingEntry> for Chosen<'e> {
+    fn from(entry: &'e BindingEntry) -> Self {
+        Self {
+            field: &entry.field,
+            fields: &entry.fields,
+            r#as: &entry.r#as,
+            keys: entry.into(),
+        }
+    }
+}
+
+impl<'e> From<&'e PatternEntry> for Chosen<'e> {
+    fn from(entry: &'e PatternEntry) -> Self {
+        Self {
+            field: &entry.field,
+            fields: &entry.fields,
+            r#as: &entry.r#as,
+            keys: entry.into(),
+        }
+    }
+}
+
+impl Chosen<'_> {
+    /// Where the fields are named, or else how they cross.
+    pub(super) fn place(&self) -> Option<Place> {
+        let field = self.field.as_ref().map(|at| at.place);
+        let fields = self.fields.as_ref().map(|at| at.place);
+        let r#as = self.r#as.as_ref().map(|at| at.place);
+        field.or(fields).or(r#as)
+    }
+
+    /// Whether fields are named.
+    pub(super) const fn names_fields(&self) -> bool {
+        self.field.is_some() || self.fields.is_some()
+    }
+
+    /// Notes that something converts where no value is.
+    pub(super) fn converts_nothing(&self, findings: &mut Findings) -> Option<()> {
+        shaping::shaping(self.keys, findings)?.of_nothing(findings)
+    }
+
+    /// `None` when it is faulty, which is noted.
+    pub(super) fn selection(
+        self,
+        message_type: Option<&MessageType>,
+        (place, way): (Place, Way),
+        findings: &mut Findings,
+    ) -> Option<Selection> {
+        let shaping = shaping::shaping(self.keys, findings)?;
+        if let Some(at) = self.fields {
+            shaping.of_fields(findings)?;
+            return several::fields(self, at, message_type, way, findings);
+        }
+        let r#as = given(self.r#as).map_or(AsEntry::Fields, |(r#as, _)| *r#as);
+        match (self.field, r#as) {
+            (Some(at), AsEntry::Fields) => {
+                let field = shaping::part(at.value.as_ref()?, at.place, findings)?;
+                shaping.select(field, message_type, (place, way), findings)
+            }
+            (Some(at), AsEntry::Bytes) => {
+                let message = "a message that crosses as bytes has no fields";
+                findings
+                    .error(Code::FieldOfBytes, at.place, message)
+                    .help("leave `field` out, or `as: bytes`");
+                None
+            }
+            (Some(at), AsEntry::Structure) => {
+                shaping.of_several(findings)?;
+                Some(Selection::Structure(Some(at.value.clone()?)))
+            }
+            (None, AsEntry::Structure) => {
+                shaping.of_several(findings)?;
+                Some(Selection::Structure(None))
+            }
+            (None, AsEntry::Bytes) => {
+                shaping.of_several(findings)?;
+                Some(Selection::Bytes)
+            }
+            (None, AsEntry::Fields) => {
+                // Of a type with one field that one is meant.
+                let Some([only]) = message_type.map(MessageType::leaves) else {
+                    shaping.of_several(findings)?;
+                    return Some(Selection::Whole);
+                };
+                let only = (only.path.clone(), None);
+                let shaped = shaping.select(only, message_type, (place, way), findings)?;
+                let alone = matches!(shaped, Selection::Field(_));
+                Some(if alone { Selection::Whole } else { shaped })
+            }
+        }
+    }
+}
+
+/// The values of a selection; `None` when the type has it not, which is noted.
+pub(super) fn leaves(
+    message_type: &Arc<MessageType>,
+    selection: &Selection,
+    (place, way): (Place, Way),
+    findings: &mut Findings,
+) -> Option<Vec<Leaf>> {
+    match selection {
+        Selection::Bytes => Some(vec![Leaf::bytes()]),
+        Selection::Fields(selected)
+        | Selection::Template {
+            fields: selected, ..
+        } => several::leaves(message_type, selected, (place, way), findings),
+        Selection::Structure(path) => {
+            let path = path.as_deref().unwrap_or_default();
+            several::structure(message_type, path, place, findings)
+        }
+        Selection::Value { .. } => shaping::leaves(message_type, selection, place, findings),
+        Selection::Whole => Some(message_type.leaves().to_vec()),
+        Selection::Field(path) => field(message_type, path, place, findings),
+    }
+}
+
+/// A field, or those of a message in the message; `None` when the type has it not, which is noted.
+pub(super) fn field(
+    message_type: &MessageType,
+    path: &str,
+    place: Place,
+    findings: &mut Findings,
+) -> Option<Vec<Leaf>> {
+    if let Some(leaf) = message_type.leaf(path) {
+        return Some(vec![leaf.clone()]);
+    }
+    let inside: Vec<Leaf> = message_type
+        .leaves()
+        .iter()
+        .filter(|leaf| leaf.is_inside(path))
+        .cloned()
+        .collect();
+    if !inside.is_empty() {
+        return Some(inside);
+    }
+    let paths: Vec<&str> = message_type
+        .leaves()
+        .iter()
+        .map(|leaf| leaf.path.as_str())
+        .collect();
+    let name = message_type.name();
+    let message = format!("`{name}` has no field `{}`", short(path));
+    let note = findings.error(Code::UnknownField, place, message);
+    let near = nearest(path, paths.iter().copied()).map(|near| format!("did you mean `{near}`? "));
+    note.help(format!(
+        "{}its fields are {}",
+        near.unwrap_or_default(),
+        told(&paths)
+    ));
+    None
+}
