@@ -130,7 +130,7 @@ impl Ros2Port {
         message_type: TypeName,
         values: Vec<(TopicId, Selection)>,
     ) {
-        let index = self.source(dds_topic, message_type.clone());
+        let index = self.source(dds_topic, message_type);
         let Some(source) = self.sources.get_mut(index) else {
             return;
         };
@@ -144,7 +144,11 @@ impl Ros2Port {
         let Reading::Open { .. } = source.reading else {
             return;
         };
-        let Ok(message_type) = self.definitions.get(&message_type) else {
+        let Some(message_type) = source
+            .definition
+            .as_ref()
+            .map(|d| Arc::clone(&d.message_type))
+        else {
             return;
         };
         let received = now().utc;
