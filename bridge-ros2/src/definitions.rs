@@ -53,6 +53,22 @@ impl Definitions {
         }
     }
 
+    /// Reads the files again, by the mapping's `type_paths`. What nodes told stays.
+    pub(crate) fn read_again(&mut self, type_paths: &[PathBuf]) {
+        self.known.read_again(type_paths);
+        self.found.clear();
+    }
+
+    /// Whether it is still what endpoints mean that announce this hash.
+    pub(crate) fn is_current(
+        &mut self,
+        definition: &Definition,
+        announced: Option<TypeHash>,
+    ) -> bool {
+        let now = self.announced(definition.name(), announced);
+        now.is_ok_and(|now| now.hash == definition.hash)
+    }
+
     /// The type of that name with all it needs, as endpoints mean it that announce no hash: built in, or read from files;
     /// else what a node told, if nodes told the same.
     ///

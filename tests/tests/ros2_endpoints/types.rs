@@ -1,13 +1,14 @@
 //! Types that nodes tell one another.
 
 use bridge_node::{Delivery, Kept, Port, PortEvent};
+use mappings::Mapping;
 use messages::{Dialect, Registry};
 use serde_json::json;
 use system_tests::{Cell, Peer};
 use uadp::BuiltinType;
 
 use crate::peer::{SOON, writes};
-use crate::port::{bound, event, port, run_until, topic};
+use crate::port::{bound, event, port, port_of, run_until, topic};
 
 const UNKNOWN: &str = "type_description_interfaces/FieldType";
 
@@ -226,4 +227,52 @@ async fn a_value_is_written_to_a_subscriber_whose_type_only_its_node_knows() {
     })
     .await;
     assert_eq!(lost, (Some(of), "subscriber of another definition"));
+}
+
+/// The next topic that is bound or unbound, with how many fields its type has, if it is bound.
+async fn next_bound(port: &mut bridge_ros2::Ros2Port) -> (mappings::TopicId, Option<usize>) {
+    event(port, |event| match event {
+        PortEvent::Bound {
+            topic,
+            message_type,
+            ..
+        } => Some((topic, Some(message_type.leaves().len()))),
+        PortEvent::Unbound { topic } => Some((topic, None)),
+        _ => None,
+    })
+    .await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_saved_definition_file_counts_from_the_next_reload_on() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let file = cell.folder().join("types/geometry_msgs/msg/Point.msg");
+    std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+    std::fs::write(&file, "float64 x\nfloat64 y\nfloat64 z\n").unwrap();
+    let text = format!(
+        "spaces: [{{id: 1}}, {{id: 2}}]\nnamespaces: {{2: urn:test}}\ntype_paths: [{}]\nvariables:\n  - {{node: ns=2;i=1, \
+         name: Read, origin: 2, ros: {{topic: /arm, type: geometry_msgs/Point}}}}\n  - {{node: ns=2;i=2, name: Written, \
+         origin: 1, ros: {{space: 2, topic: /to_arm, type: geometry_msgs/Point}}}}\n",
+        cell.folder().join("types").display()
+    );
+    let mapping = std::sync::Arc::new(Mapping::from_yaml(&text, "cell.yaml").mapping.unwrap());
+    let mut port = port_of(std::sync::Arc::clone(&mapping));
+    let (read, written) = (topic("ua_2_2_1"), topic("ua_1_2_2"));
+    let first = [next_bound(&mut port).await, next_bound(&mut port).await];
+    assert_eq!(first, [(read, Some(3)), (written, Some(3))]);
+    std::fs::write(&file, "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n").unwrap();
+    port.reload(&mapping);
+    let mut changed = Vec::new();
+    for _ in 0..4 {
+        changed.push(next_bound(&mut port).await);
+    }
+    let expected = [
+        (read, None),
+        (written, None),
+        (read, Some(4)),
+        (written, Some(4)),
+    ];
+    assert_eq!(changed, expected);
 }
