@@ -9,7 +9,7 @@ use std::collections::BTreeMap;
 use std::collections::hash_map::DefaultHasher;
 use std::hash::{Hash, Hasher};
 
-use mappings::{Meaning, TopicId, Unit};
+use mappings::{Binding, Meaning, TopicId, Unit, Variable};
 use messages::{Leaf, MemberKind, MessageType, Rank, Selected, Selection, TypeName};
 use uadp::discovery::{
     Announced, Announcement, ConfigurationVersion, DataSetMetaDataType, DataTypeSchemaHeader,
@@ -148,12 +148,13 @@ pub(crate) struct Description {
 #[derive(Clone, Copy)]
 pub(crate) struct Source<'s> {
     pub(crate) topic: TopicId,
-    pub(crate) message_type: &'s MessageType,
-    pub(crate) selection: &'s Selection,
+    /// The message they are of, and what of it they are. Of values that no message is made of here, only the mapping says
+    /// what they are.
+    pub(crate) message: Option<(&'s MessageType, &'s Selection)>,
     /// The fields that cross.
     pub(crate) leaves: &'s [Leaf],
     /// What the mapping says of the value.
-    pub(crate) meaning: Option<&'s Meaning>,
+    pub(crate) variable: Option<&'s Variable>,
     /// Namespace index -> URI, as far as known.
     pub(crate) namespaces: &'s BTreeMap<u16, String>,
 }
@@ -221,8 +222,8 @@ impl Source<'_> {
         let description = self.description();
         let named: Vec<FieldText> = self.leaves.iter().map(|leaf| self.names(leaf)).collect();
         let mut buffers = <[Vec<u8>; 3]>::default();
-        let properties = match (self.leaves, self.meaning) {
-            ([_], Some(meaning)) => properties(meaning, &mut buffers)?,
+        let properties = match (self.leaves, self.variable) {
+            ([_], Some(variable)) => properties(&variable.meaning, &mut buffers)?,
             _ => Vec::new(),
         };
         let fields: Vec<FieldMetaData<'_>> = self
@@ -232,7 +233,8 @@ impl Source<'_> {
             .enumerate()
             .map(|(index, (leaf, text))| self.field(index, leaf, (text, &properties)))
             .collect();
-        let structures = structures(self.message_type, self.leaves);
+        let structures = self.message.map(|(of, _)| structures(of, self.leaves));
+        let structures = structures.unwrap_or_default();
         let namespaces = match structures.is_empty() {
             true => Vec::new(),
             false => self.namespaces_up_to(namespace),
@@ -289,43 +291,52 @@ impl Source<'_> {
 
     /// Path of the message of which the fields are; empty for the whole.
     fn within(&self) -> &str {
-        match self.selection {
-            Selection::Field(path) | Selection::Structure(Some(path)) => path,
-            Selection::Whole
-            | Selection::Structure(None)
-            | Selection::Fields(_)
-            | Selection::Value { .. }
-            | Selection::Template { .. }
-            | Selection::Bytes => "",
+        match self.message {
+            Some((_, Selection::Field(path) | Selection::Structure(Some(path)))) => path,
+            Some((
+                _,
+                Selection::Whole
+                | Selection::Structure(None)
+                | Selection::Fields(_)
+                | Selection::Value { .. }
+                | Selection::Template { .. }
+                | Selection::Bytes,
+            ))
+            | None => "",
         }
     }
 
-    /// Whether the values make no message.
-    fn is_loose(&self) -> bool {
-        match self.selection {
-            Selection::Value { .. } => true,
-            Selection::Fields(selected) => selected.iter().any(|one| !one.is_plain()),
-            Selection::Whole
+    /// The message that the values make, if they make one.
+    fn made(&self) -> Option<&TypeName> {
+        let Some((message_type, selection)) = self.message else {
+            return self.variable.and_then(whole_message);
+        };
+        match selection {
+            Selection::Value { .. } => None,
+            Selection::Fields(selected) if selected.iter().any(|one| !one.is_plain()) => None,
+            Selection::Fields(_)
+            | Selection::Whole
             | Selection::Structure(_)
             | Selection::Field(_)
             | Selection::Template { .. }
-            | Selection::Bytes => self.message_type.message_at(self.within()).is_none(),
+            | Selection::Bytes => message_type.message_at(self.within()),
         }
     }
 
     fn description(&self) -> Option<String> {
-        if self.is_loose() {
-            return None;
-        }
-        let name = self.message_type.message_at(self.within())?;
-        let behind = match self.selection {
-            Selection::Bytes => AS_BYTES,
-            Selection::Whole
-            | Selection::Structure(_)
-            | Selection::Fields(_)
-            | Selection::Field(_)
-            | Selection::Value { .. }
-            | Selection::Template { .. } => "",
+        let name = self.made()?;
+        let behind = match self.message {
+            Some((_, Selection::Bytes)) => AS_BYTES,
+            Some((
+                _,
+                Selection::Whole
+                | Selection::Structure(_)
+                | Selection::Fields(_)
+                | Selection::Field(_)
+                | Selection::Value { .. }
+                | Selection::Template { .. },
+            ))
+            | None => "",
         };
         Some(format!("{name}{behind}"))
     }
@@ -338,7 +349,7 @@ impl Source<'_> {
     ) -> FieldMetaData<'f> {
         let (_, namespace, _) = self.topic.triple();
         let structure = leaf.builtin == BuiltinType::ExtensionObject;
-        let of = self.message_type.message_at(&leaf.path);
+        let of = self.message.and_then(|(of, _)| of.message_at(&leaf.path));
         FieldMetaData {
             name: Some(&said.name),
             description: text(&said.description),
@@ -361,9 +372,11 @@ impl Source<'_> {
             .and_then(|rest| rest.strip_prefix('.'));
         let (name, description) = if leaf.path.is_empty() {
             (MESSAGE, String::new())
-        } else if self.is_loose() {
-            let told = format!("{} of {}", leaf.path, self.message_type.name());
-            (leaf.path.as_str(), told)
+        } else if self.made().is_none() {
+            let told = self
+                .message
+                .map(|(of, _)| format!("{} of {}", leaf.path, of.name()));
+            (leaf.path.as_str(), told.unwrap_or_default())
         } else {
             (inner.unwrap_or(&leaf.path), String::new())
         };
@@ -382,6 +395,34 @@ impl Source<'_> {
         (1..=namespace)
             .map(|index| self.namespaces.get(&index).map(String::as_str))
             .collect()
+    }
+}
+
+/// The message type that all who read or write the value in ROS take as a whole, and the same.
+fn whole_message(variable: &Variable) -> Option<&TypeName> {
+    let (first, rest) = variable.bindings.split_first()?;
+    let whole = |one: &Binding| one.selection == Selection::Whole;
+    let same = |one: &Binding| whole(one) && one.message_type == first.message_type;
+    let known = whole(first) && !variable.fields.is_empty();
+    (known && rest.iter().all(same)).then_some(&first.message_type)
+}
+
+/// The fields of a value as the mapping says them; none where it leaves them open.
+pub(crate) fn mapped_leaves(variable: &Variable) -> Vec<Leaf> {
+    if whole_message(variable).is_some() {
+        return variable.fields.clone();
+    }
+    let rank = |array| match array {
+        true => Rank::Array { fixed: None },
+        false => Rank::Scalar,
+    };
+    match variable.value_type {
+        Some((builtin, array)) => vec![Leaf {
+            path: variable.name.clone(),
+            builtin,
+            rank: rank(array),
+        }],
+        None => variable.fields.clone(),
     }
 }
 

@@ -123,7 +123,7 @@ impl Router {
             }
             Role::Ours(_) => {
                 entry.bound = Some((Arc::clone(message_type), selection.clone()));
-                self.describe(topic, (message_type, selection), now);
+                self.describe(topic, Some((message_type, selection)), now);
                 None
             }
         };
@@ -313,6 +313,10 @@ impl Router {
             writer.set_live(live);
             if revived && let Some(entry) = self.topics.get_mut(&topic) {
                 entry.announce_at = entry.announce_at.map(|_| now.monotonic);
+            }
+            if live && self.settings.local == Local::Fields {
+                // No local type will say what it is.
+                self.describe(topic, None, now);
             }
             self.schedule(topic);
         }

@@ -37,9 +37,10 @@ impl Bridge {
         };
         let settings = Settings {
             own: SpaceId::new(space).unwrap(),
-            local: match dialect {
-                Dialect::Ros1 => Local::Ros1,
-                Dialect::Ros2 => Local::Cdr,
+            local: match (space, dialect) {
+                (0, _) => Local::Fields,
+                (_, Dialect::Ros1) => Local::Ros1,
+                (_, Dialect::Ros2) => Local::Cdr,
             },
             source: Some(address),
         };
@@ -421,6 +422,61 @@ fn two_topics_with_one_number_in_two_namespaces_are_told_apart() {
             pair("ua_1_6_10", "std_msgs/Bool")
         ]
     );
+}
+
+#[test]
+fn what_is_written_in_opc_ua_is_announced_as_the_mapping_says_it() {
+    let mut now = clock();
+    let text = |unit: &str| {
+        format!(
+            "spaces: [{{id: 2}}]\nnamespaces: {{2: urn:test}}\nvariables:\n  - {{node: ns=2;i=1, name: Command, origin: 0, \
+             ros: {{space: 2, topic: /cmd_vel, type: geometry_msgs/Twist}}}}\n  - {{node: ns=2;i=2, name: Level, type: Double, \
+             origin: 0, unit: {unit}, ros: {{space: 2, topic: /level, type: std_msgs/Int32, scale: 0.5, out_of_range: clamp}}}}\n  \
+             - {{node: ns=2;i=3, name: Names, type: \"String[]\", origin: 0}}\n"
+        )
+    };
+    let mut server = Bridge::new(0, &text("m"));
+    let topics = ["ua_0_2_1", "ua_0_2_2", "ua_0_2_3"].map(|name| name.parse::<TopicId>().unwrap());
+    for topic in topics {
+        server.router.set_live(topic, true, now);
+    }
+    let sent = server.sent_within(Duration::from_secs(1), &mut now);
+    let mut said = Vec::new();
+    each_meta_data(&sent, |writer, meta| {
+        let fields = meta.fields.iter();
+        let fields: Vec<_> = fields
+            .map(|field| {
+                let name = field.name.unwrap().to_owned();
+                let properties = field.properties.iter().count();
+                (name, field.built_in_type, field.value_rank, properties)
+            })
+            .collect();
+        said.push((writer, meta.description.text.map(str::to_owned), fields));
+    });
+    assert_eq!(said.len(), 3, "each once: {said:?}");
+    assert_eq!(said[0].1.as_deref(), Some("geometry_msgs/Twist"));
+    assert_eq!(said[0].2.len(), 6);
+    assert_eq!(said[0].2[5], ("angular.z".to_owned(), 11, -1, 0));
+    assert_eq!(said[1], (2, None, vec![("Level".to_owned(), 11, -1, 1)]));
+    assert_eq!(said[2], (3, None, vec![("Names".to_owned(), 12, 1, 0)]));
+
+    // A bridge without a mapping knows what it is before the first value came.
+    let mut bridge = Bridge::new(2, "");
+    bridge.hear(&server, &sent, now);
+    assert_eq!(bridge.refused(), 0);
+
+    // Again each period, and at once where the mapping says something else of it.
+    let period = Mapping::default().pubsub().metadata_period;
+    let again = server.sent_within(period + Duration::from_secs(1), &mut now);
+    assert_eq!(announced(&again), 3);
+    let mapping = Mapping::from_yaml(&text("mm"), "cell.yaml")
+        .mapping
+        .unwrap();
+    server.router.replace_mapping(Arc::new(mapping), now);
+    let changed = server.sent_within(Duration::from_secs(1), &mut now);
+    let mut writers = Vec::new();
+    each_meta_data(&changed, |writer, _| writers.push(writer));
+    assert_eq!(writers, [2]);
 }
 
 #[test]

@@ -11,7 +11,7 @@ use messages::{
 use tracing::{info, warn};
 use type_files::{Environment, TypeFiles};
 
-/// Finds types by name; a definition once read stays.
+/// Finds types by name; a definition once read stays until all are read again.
 #[derive(Debug)]
 pub struct Definitions {
     library: Library,
@@ -29,6 +29,14 @@ impl Definitions {
             // What is wrong with them was told when the mapping was checked.
             files: TypeFiles::open(type_paths, environment),
             peers: BTreeMap::new(),
+        }
+    }
+
+    /// Reads the definition files again, those of these `type_paths`. What peers brought stays.
+    pub fn read_again(&mut self, type_paths: &[PathBuf]) {
+        if self.files.has_paths() || !type_paths.is_empty() {
+            self.library.forget_texts();
+            self.files.open_again(type_paths);
         }
     }
 

@@ -58,10 +58,6 @@ impl Fixed {
                 self.interface && was.interface != is.interface,
             ),
             ("pubsub.ttl", was.ttl != is.ttl),
-            (
-                "type_paths",
-                self.started.type_paths() != mapping.type_paths(),
-            ),
         ];
         let differing = keys.into_iter().filter(|(_, differs)| *differs);
         differing.map(|(key, _)| key.to_owned()).collect()

@@ -76,6 +76,8 @@ pub struct Services {
     /// The number of the next poll.
     next_poll: usize,
     tasks: JoinSet<()>,
+    /// The checksums of the types that are called: definitions may be others when a mapping is read again.
+    checksums: HashMap<TypeName, String>,
 }
 
 /// What the values of one variable call.
@@ -146,6 +148,7 @@ impl Services {
             polls: Vec::new(),
             next_poll: 0,
             tasks: JoinSet::new(),
+            checksums: HashMap::new(),
         };
         let events = services.reload(graph, own, (&Mapping::default(), mapping));
         (services, events)
@@ -162,7 +165,16 @@ impl Services {
     ) -> Vec<PortEvent> {
         // Those that were ended before.
         while self.tasks.try_join_next().is_some() {}
-        let kept = |topic: TopicId| is_same(topic, (before, after));
+        let checksums = checksums(graph, own, after);
+        let alike = |name: &TypeName| self.checksums.get(name) == checksums.get(name);
+        let defined = |topic: TopicId| called_type(after, topic).is_none_or(alike);
+        let kept: HashSet<TopicId> = after
+            .services(own)
+            .map(|(variable, _)| variable.topic)
+            .filter(|topic| is_same(*topic, (before, after)) && defined(*topic))
+            .collect();
+        let kept = |topic: TopicId| kept.contains(&topic);
+        self.checksums = checksums;
         let mut events = Vec::new();
         for (variable, binding) in before.services(own) {
             if !kept(variable.topic) {
@@ -469,6 +481,38 @@ fn is_same(topic: TopicId, (before, after): (&Mapping, &Mapping)) -> bool {
         Some(ServiceRole::Call { .. } | ServiceRole::Poll { .. }) | None => None,
     };
     was.is_some() && was == is && of.is_none_or(|of| is_same(of, (before, after)))
+}
+
+/// The type of the service that a variable is tied to.
+fn called_type(mapping: &Mapping, topic: TopicId) -> Option<&TypeName> {
+    match &mapping.variable(topic)?.service.as_ref()?.role {
+        ServiceRole::Call { service_type, .. } | ServiceRole::Poll { service_type, .. } => {
+            Some(service_type)
+        }
+        // That of a call, which has an answer of none.
+        ServiceRole::Answer { of, .. } => match &mapping.variable(*of)?.service.as_ref()?.role {
+            ServiceRole::Call { service_type, .. } => Some(service_type),
+            ServiceRole::Poll { .. } | ServiceRole::Answer { .. } => None,
+        },
+    }
+}
+
+/// Of the types of the services that are called, as far as they are known.
+fn checksums(
+    graph: &mut impl ServiceGraph,
+    own: SpaceId,
+    mapping: &Mapping,
+) -> HashMap<TypeName, String> {
+    let mut checksums = HashMap::new();
+    for (variable, _) in mapping.services(own) {
+        if let Some(name) = called_type(mapping, variable.topic)
+            && !checksums.contains_key(name)
+            && let Ok(found) = graph.service_type(name)
+        {
+            checksums.insert(name.clone(), found.md5().to_owned());
+        }
+    }
+    checksums
 }
 
 fn bound(topic: TopicId, service_type: &ServiceType, selection: &Selection) -> PortEvent {

@@ -27,6 +27,11 @@ impl Definitions {
         }
     }
 
+    /// Reads the files again, by the mapping's `type_paths`.
+    pub(crate) fn read_again(&mut self, type_paths: &[PathBuf]) {
+        self.known.read_again(type_paths);
+    }
+
     /// The type a publisher has: by the text in its header, else the known type of that name and checksum.
     pub(crate) fn of_publisher(
         &mut self,

@@ -6,18 +6,36 @@ use std::sync::Arc;
 
 use bridge_node::Environment;
 use messages::{
-    DefinitionError, DescribedType, Dialect, MessageType, ServiceType, ServiceTypeHashes, TypeHash,
-    TypeName,
+    DefinitionError, DescribedType, Dialect, MessageType, Registry, ServiceType, ServiceTypeHashes,
+    TypeHash, TypeName,
 };
 use uadp::BuiltinType;
 
 /// Finds message types by name; a type once found stays.
+///
+/// A name may have several definitions: the one known here, and those that nodes told. Their hashes keep them apart.
 #[derive(Debug)]
 pub(crate) struct Definitions {
     known: bridge_node::Definitions,
-    /// What nodes told of their types, with the hash they announce.
-    described: BTreeMap<TypeName, Described>,
-    hashes: BTreeMap<TypeName, TypeHash>,
+    /// Those of `known` that were asked for.
+    found: BTreeMap<TypeName, Definition>,
+    told: BTreeMap<(TypeName, TypeHash), Told>,
+}
+
+/// One definition of a type.
+#[derive(Debug, Clone)]
+pub(crate) struct Definition {
+    pub(crate) message_type: Arc<MessageType>,
+    /// `None` where it has none, as with a type that ROS 2 cannot express.
+    pub(crate) hash: Option<TypeHash>,
+    /// Where it is from, for people.
+    pub(crate) from: Arc<str>,
+}
+
+impl Definition {
+    pub(crate) fn name(&self) -> &TypeName {
+        self.message_type.name()
+    }
 }
 
 impl Definitions {
@@ -30,29 +48,90 @@ impl Definitions {
         };
         Self {
             known: bridge_node::Definitions::new(Dialect::Ros2, type_paths, environment),
-            described: BTreeMap::new(),
-            hashes: BTreeMap::new(),
+            found: BTreeMap::new(),
+            told: BTreeMap::new(),
         }
     }
 
-    /// The type of that name with all it needs. One that is not built in is read from the prefixes.
+    /// Reads the files again, by the mapping's `type_paths`. What nodes told stays.
+    pub(crate) fn read_again(&mut self, type_paths: &[PathBuf]) {
+        self.known.read_again(type_paths);
+        self.found.clear();
+    }
+
+    /// Whether it is still what endpoints mean that announce this hash.
+    pub(crate) fn is_current(
+        &mut self,
+        definition: &Definition,
+        announced: Option<TypeHash>,
+    ) -> bool {
+        let now = self.announced(definition.name(), announced);
+        now.is_ok_and(|now| now.hash == definition.hash)
+    }
+
+    /// The type of that name with all it needs, as endpoints mean it that announce no hash: built in, or read from files;
+    /// else what a node told, if nodes told the same.
     ///
     /// # Errors
     /// [`DefinitionError`].
-    pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
-        if let Some(described) = self.described.get(name) {
-            return Ok(Arc::clone(&described.message_type));
+    pub(crate) fn get(&mut self, name: &TypeName) -> Result<Definition, DefinitionError> {
+        let error = match self.here(name) {
+            Ok(found) => return Ok(found),
+            Err(error) => error,
+        };
+        let mut told = self.told.iter().filter(|((of, _), _)| of == name);
+        match (told.next(), told.next()) {
+            (Some((_, only)), None) => Ok(only.definition.clone()),
+            (None, _) | (Some(_), Some(_)) => Err(error),
         }
-        let found = self.known.find(name)?;
-        if !self.hashes.contains_key(name)
-            && let Ok(hash) = self.known.registry().type_hash(name)
-        {
-            self.hashes.insert(name.clone(), hash);
+    }
+
+    /// The type as endpoints mean it that announce this hash, or none. Of a hash that is not known it is what is known
+    /// here under the name.
+    ///
+    /// # Errors
+    /// [`DefinitionError`].
+    pub(crate) fn announced(
+        &mut self,
+        name: &TypeName,
+        hash: Option<TypeHash>,
+    ) -> Result<Definition, DefinitionError> {
+        match hash {
+            Some(hash) => match self.of_hash(name, hash) {
+                Some(found) => Ok(found),
+                None => self.here(name),
+            },
+            None => self.get(name),
         }
+    }
+
+    /// The definition of that hash.
+    pub(crate) fn of_hash(&mut self, name: &TypeName, hash: TypeHash) -> Option<Definition> {
+        let here = self.here(name).ok();
+        here.filter(|found| found.hash == Some(hash)).or_else(|| {
+            let told = self.told.get(&(name.clone(), hash));
+            told.map(|told| told.definition.clone())
+        })
+    }
+
+    /// What is known here, whatever nodes tell.
+    ///
+    /// # Errors
+    /// [`DefinitionError`].
+    pub(crate) fn here(&mut self, name: &TypeName) -> Result<Definition, DefinitionError> {
+        if let Some(found) = self.found.get(name) {
+            return Ok(found.clone());
+        }
+        let found = Definition {
+            message_type: self.known.find(name)?,
+            hash: self.known.registry().type_hash(name).ok(),
+            from: self.known.source(name).into(),
+        };
+        self.found.insert(name.clone(), found.clone());
         Ok(found)
     }
 
-    /// Takes what a node told of a type in place of what is known under its name, if it is the type of that hash.
+    /// Takes what a node told of a type, if it is the type of that hash.
     ///
     /// # Errors
     /// [`DefinitionError`].
@@ -61,36 +140,36 @@ impl Definitions {
         name: &TypeName,
         types: &[DescribedType],
         hash: TypeHash,
-        from: impl FnOnce() -> String,
+        from: &str,
     ) -> Result<(), DefinitionError> {
-        let registry = self.known.registry_mut();
-        let message_type = registry.add_described(name, types, hash)?;
-        let described = Described {
-            hash,
-            message_type,
+        // Of its own: the types in it may be others than those of that name here.
+        let message_type = Registry::empty(Dialect::Ros2).add_described(name, types, hash)?;
+        let told = Told {
+            definition: Definition {
+                message_type,
+                hash: Some(hash),
+                from: from.into(),
+            },
             types: DescribedType::needed(name, types)
                 .into_iter()
                 .cloned()
                 .collect(),
         };
-        self.described.insert(name.clone(), described);
-        self.known.learned(name, from);
+        self.told.insert((name.clone(), hash), told);
         Ok(())
-    }
-
-    /// The hash of a type that was asked for, or that a node told.
-    pub(crate) fn hash_of(&self, name: &TypeName) -> Option<TypeHash> {
-        let described = self.described.get(name).map(|described| described.hash);
-        described.or_else(|| self.hashes.get(name).copied())
     }
 
     /// The description of a type and what it needs.
     ///
     /// # Errors
     /// [`DefinitionError`].
-    pub(crate) fn described(&self, name: &TypeName) -> Result<Vec<DescribedType>, DefinitionError> {
-        match self.described.get(name) {
-            Some(described) => Ok(described.types.clone()),
+    pub(crate) fn described(
+        &self,
+        name: &TypeName,
+        hash: TypeHash,
+    ) -> Result<Vec<DescribedType>, DefinitionError> {
+        match self.told.get(&(name.clone(), hash)) {
+            Some(told) => Ok(told.types.clone()),
             None => self.known.registry().describe(name),
         }
     }
@@ -101,11 +180,6 @@ impl Definitions {
     /// [`DefinitionError`].
     pub(crate) fn service(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
         self.known.find_service(name)
-    }
-
-    /// Where the definition of a type is from, for people.
-    pub(crate) fn source(&self, name: &TypeName) -> &str {
-        self.known.source(name)
     }
 
     /// The type hashes of a service that was found.
@@ -121,9 +195,8 @@ impl Definitions {
 
 /// What a node told of a type.
 #[derive(Debug)]
-struct Described {
-    hash: TypeHash,
-    message_type: Arc<MessageType>,
+struct Told {
+    definition: Definition,
     types: Vec<DescribedType>,
 }
 
@@ -142,7 +215,7 @@ mod tests {
         let found =
             Definitions::new(&[], vec![prefix.clone()]).get(&"robot_msgs/Arm".parse().unwrap());
         std::fs::remove_dir_all(&prefix).unwrap();
-        assert_eq!(found.unwrap().leaves()[0].path, "joints");
+        assert_eq!(found.unwrap().message_type.leaves()[0].path, "joints");
     }
 
     #[test]
@@ -151,5 +224,53 @@ mod tests {
             .get(&"robot_msgs/Arm".parse().unwrap())
             .unwrap_err();
         assert!(error.to_string().contains("robot_msgs/Arm"), "{error}");
+    }
+
+    /// Description and hash of a type, as a node would tell it.
+    fn told(name: &TypeName, text: &str) -> (Vec<DescribedType>, TypeHash) {
+        let mut registry = Registry::empty(Dialect::Ros2);
+        registry.add(name, text).unwrap();
+        let hash = registry.type_hash(name).unwrap();
+        (registry.describe(name).unwrap(), hash)
+    }
+
+    #[test]
+    fn definitions_of_one_name_are_kept_apart_by_their_hashes() {
+        let name: TypeName = "robot_msgs/Arm".parse().unwrap();
+        let mut definitions = Definitions::new(&[], vec![]);
+        let (old, old_hash) = told(&name, "float64 angle\n");
+        let (new, new_hash) = told(&name, "float32 speed\nfloat64 angle\n");
+        definitions
+            .add_described(&name, &old, old_hash, "/old")
+            .unwrap();
+        assert_eq!(definitions.get(&name).unwrap().hash, Some(old_hash));
+        definitions
+            .add_described(&name, &new, new_hash, "/new")
+            .unwrap();
+        for (hash, first, types) in [(old_hash, "angle", &old), (new_hash, "speed", &new)] {
+            let found = definitions.announced(&name, Some(hash)).unwrap();
+            assert_eq!(found.message_type.leaves()[0].path, first);
+            assert_eq!(definitions.described(&name, hash).unwrap(), *types);
+        }
+        // Nobody says which.
+        definitions.get(&name).unwrap_err();
+        definitions.announced(&name, None).unwrap_err();
+    }
+
+    #[test]
+    fn what_is_told_leaves_what_is_known_here_as_it_was() {
+        let name: TypeName = "std_msgs/Bool".parse().unwrap();
+        let mut definitions = Definitions::new(&[], vec![]);
+        let here = definitions.get(&name).unwrap();
+        let (other, hash) = told(&name, "string data\n");
+        definitions
+            .add_described(&name, &other, hash, "/other")
+            .unwrap();
+        assert_eq!(definitions.get(&name).unwrap().hash, here.hash);
+        let of = |hash| definitions.announced(&name, hash).unwrap().hash;
+        assert_eq!(
+            [hash, here.hash.unwrap()].map(Some).map(of),
+            [Some(hash), here.hash]
+        );
     }
 }

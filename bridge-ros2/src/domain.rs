@@ -27,6 +27,7 @@ use crate::qos::{Offered, Requested};
 use crate::raw::{Opaque, Payload, RawReader, RawWriter, Reader, Writer};
 use crate::rosout;
 use crate::security::{Enclave, SecurityError};
+use crate::service::offered;
 
 /// Which domain to join and how.
 #[derive(Debug, Clone)]
@@ -252,6 +253,13 @@ impl Domain {
         self.node
             .retain(|prefix| graph.participants().contains(prefix));
         graph
+    }
+
+    /// The services others offer, by their names, with the types they have, as `std_srvs/SetBool`; a name that is none of
+    /// ROS as it is. Those that actions are made of are left out.
+    #[must_use]
+    pub fn services(&self) -> BTreeMap<String, BTreeSet<String>> {
+        offered(&self.participant)
     }
 
     /// The readers and writers made here that were not announced to the domain: RustDDS' discovery drops what does not

@@ -62,6 +62,12 @@ impl Endpoint {
         (data.topic_name().clone(), endpoint)
     }
 
+    /// Whether it is of that type, and of the definition with that hash as far as either is known to have one.
+    pub(crate) fn is_of(&self, dds_type: &str, hash: Option<TypeHash>) -> bool {
+        let differ = self.type_hash.zip(hash).is_some_and(|(a, b)| a != b);
+        self.type_name == dds_type && !differ
+    }
+
     /// Whether the endpoint is of Fast DDS, by the vendor in its GUID (eProsima is 01.0f in the OMG's list).
     #[must_use]
     pub fn is_fast_dds(&self) -> bool {

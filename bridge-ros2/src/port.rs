@@ -11,6 +11,7 @@ mod reload;
 mod schedule;
 mod services;
 mod strangers;
+mod writing;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::future::poll_fn;
@@ -283,12 +284,11 @@ impl Ros2Port {
                     return;
                 }
                 let received = now().utc;
-                let stranger = source.strangers.contains(&writer);
+                let stranger = source.strangers.get(&writer).copied();
                 let payload = payload.into_bytes();
-                let latched_by = if stranger {
-                    None
-                } else {
-                    source.latched_by(writer, &payload)
+                let latched_by = match stranger {
+                    Some(_) => None,
+                    None => source.latched_by(writer, &payload),
                 };
                 for (topic, _) in &source.values {
                     let topic = *topic;
@@ -296,15 +296,14 @@ impl Ros2Port {
                         self.events
                             .push_back(lost(topic, "lost before they were read", missing));
                     }
-                    self.events.push_back(if stranger {
-                        lost(topic, "publisher of another type", 1)
-                    } else {
-                        PortEvent::Sample {
+                    self.events.push_back(match stranger {
+                        Some(why) => lost(topic, why, 1),
+                        None => PortEvent::Sample {
                             topic,
                             payload: payload.clone(),
                             received,
                             latched_by,
-                        }
+                        },
                     });
                 }
             }
@@ -351,8 +350,8 @@ impl Ros2Port {
     fn learned(&mut self, topic: TopicId, described: &Described) -> Option<(TypeName, Selection)> {
         let name = &described.message_type;
         match self.definitions.get(name) {
-            Ok(message_type) => {
-                let selection = described.selection(&message_type);
+            Ok(found) => {
+                let selection = described.selection(&found.message_type);
                 if selection.is_none() {
                     self.tell_once(&topic.to_string(), "other fields", || {
                         format!("its writer says it is {name}, which has other fields here")
@@ -361,9 +360,18 @@ impl Ros2Port {
                 Some((name.clone(), selection?))
             }
             Err(error) => {
-                self.tell_once(&topic.to_string(), "unknown type", || {
-                    format!("its writer says what it is, but {error}")
-                });
+                let dds_topic = self.sinks.get(&topic).map(|sink| sink.dds_topic.as_str());
+                let readers = self.graph.readers(dds_topic.unwrap_or_default());
+                let dds_type = name.dds();
+                // Nodes that can tell are asked when it is opened.
+                if !readers
+                    .iter()
+                    .any(|r| r.type_name == dds_type && r.type_hash.is_some())
+                {
+                    self.tell_once(&topic.to_string(), "unknown type", || {
+                        format!("its writer says what it is, but {error}")
+                    });
+                }
                 None
             }
         }
@@ -486,10 +494,11 @@ impl Port for Ros2Port {
         let Some(sink) = self.sinks.get_mut(&topic) else {
             return;
         };
+        sink.described = described.cloned();
         let Some(open) = &sink.open else {
             sink.standard = standard;
             sink.learned = learned;
-            self.open_sink(topic);
+            self.open_sink(topic, Instant::now());
             return;
         };
         // What somebody subscribed to stays as it is; without a word nothing changes.
@@ -497,14 +506,14 @@ impl Port for Ros2Port {
         if sink.mapped.is_some() || !readers.is_empty() || learned.is_none() {
             return;
         }
-        let message_type = Arc::clone(&open.message_type);
+        let message_type = Arc::clone(&open.definition.message_type);
         let before = sink.selection(message_type.name());
         let same = |name: &TypeName| name == message_type.name();
         let other_type = learned.as_ref().is_some_and(|(name, _)| !same(name));
         sink.learned = learned;
         let selection = sink.selection(message_type.name());
         if other_type {
-            self.open_sink(topic);
+            self.open_sink(topic, Instant::now());
         } else if selection != before {
             self.events.push_back(PortEvent::Bound {
                 topic,

@@ -1,14 +1,14 @@
 //! A topic of the domain that we write values of other spaces to.
 
-use std::sync::Arc;
-
+use bridge_node::Described;
 use bytes::{Bytes, BytesMut};
 use mappings::{Overflow, TopicId, Variable};
-use messages::{MessageType, Selection, TypeName};
+use messages::{MessageType, Selection, TypeHash, TypeName};
 use rustdds::Duration;
 
 use crate::clock::RosTime;
 use crate::compatibility::finite_deadline;
+use crate::definitions::Definition;
 use crate::graph::{Endpoint, dds_topic};
 use crate::outlet::Outlet;
 use crate::qos::Offered;
@@ -20,7 +20,9 @@ pub(crate) struct Sink {
     pub(crate) offered: Offered,
     /// What the mapping ties it to; it decides alone.
     pub(crate) mapped: Option<(TypeName, Selection)>,
-    /// What the writer of the value says it is, and what of the message it makes.
+    /// What the writer of the value says of it.
+    pub(crate) described: Option<Described>,
+    /// The type it says, where it is known here and has those fields, and what of the message they are.
     pub(crate) learned: Option<(TypeName, Selection)>,
     /// The std_msgs type of the value the Router holds, if it is one value and there is such a type.
     pub(crate) standard: Option<TypeName>,
@@ -31,7 +33,9 @@ pub(crate) struct Sink {
 /// A writer and its type.
 #[derive(Debug)]
 pub(crate) struct Open {
-    pub(crate) message_type: Arc<MessageType>,
+    pub(crate) definition: Definition,
+    /// The hash of the type that counts among those readers announce; others of it are strangers.
+    pub(crate) announced: Option<TypeHash>,
     pub(crate) outlet: Outlet,
     /// The shortest deadline readers asked for, which the writer offers.
     pub(crate) deadline: Option<Duration>,
@@ -85,6 +89,7 @@ impl Sink {
                     .unwrap_or_default(),
             ),
             mapped: None,
+            described: None,
             learned: None,
             standard: None,
             open: None,
@@ -102,6 +107,7 @@ impl Sink {
             dds_topic: dds_topic(ros_topic),
             offered: offered(overflow),
             mapped: Some((message_type, selection)),
+            described: None,
             learned: None,
             standard: None,
             open: None,
@@ -137,9 +143,20 @@ impl Sink {
     /// Whether what is open serves somebody, so that it is not to be given up for another type.
     pub(crate) fn serves(&self, readers: &[Endpoint]) -> bool {
         self.open.as_ref().is_some_and(|open| {
-            let dds_type = open.message_type.name().dds();
-            readers.is_empty() || readers.iter().any(|reader| reader.type_name == dds_type)
+            let dds_type = open.definition.name().dds();
+            let served = |reader: &Endpoint| reader.is_of(&dds_type, open.announced);
+            readers.is_empty() || readers.iter().any(served)
         })
+    }
+
+    /// Looks at what the writer of the value says again, with the definition that is written.
+    pub(crate) fn learn_from(&mut self, message_type: &MessageType) {
+        let name = message_type.name();
+        let described = self.described.as_ref();
+        if let Some(described) = described.filter(|described| described.message_type == *name) {
+            let selection = described.selection(message_type);
+            self.learned = selection.map(|selection| (name.clone(), selection));
+        }
     }
 
     /// Whether the stamp at the beginning of such messages is no part of the value.

@@ -5,9 +5,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use bridge_node::PublisherKey;
 use bytes::Bytes;
 use mappings::TopicId;
-use messages::{Selection, TypeName};
+use messages::{Selection, TypeHash, TypeName};
 use rustdds::{GUID, RTPSEntity};
 
+use crate::definitions::Definition;
 use crate::graph::Endpoint;
 use crate::inbox::SlotId;
 use crate::qos::Requested;
@@ -17,13 +18,18 @@ use crate::qos::Requested;
 pub(crate) struct Source {
     pub(crate) dds_topic: String,
     pub(crate) message_type: TypeName,
+    /// The hash of the type that counts among those its writers announce; others of it are strangers.
+    pub(crate) announced: Option<TypeHash>,
+    /// What it is read as.
+    pub(crate) definition: Option<Definition>,
     /// Which values are made of a message; one unless a mapping ties several variables to one topic.
     pub(crate) values: Vec<(TopicId, Selection)>,
     pub(crate) reading: Reading,
     /// Whether somebody writes it, in our type.
     pub(crate) live: bool,
-    /// Writers of this topic with another type. RustDDS matches by topic name alone, so their samples come too.
-    pub(crate) strangers: BTreeSet<GUID>,
+    /// Writers of this topic with another type, or another definition of it. RustDDS matches by topic name alone, so their
+    /// samples come too. With what they are dropped for.
+    pub(crate) strangers: BTreeMap<GUID, &'static str>,
     /// Transient-local writers that have sent something, with what they sent last.
     latched: BTreeMap<GUID, Latched>,
     /// The key for the next of them.
@@ -56,10 +62,12 @@ impl Source {
         Self {
             dds_topic,
             message_type,
+            announced: None,
+            definition: None,
             values: Vec::new(),
             reading: Reading::Pending,
             live: false,
-            strangers: BTreeSet::new(),
+            strangers: BTreeMap::new(),
             latched: BTreeMap::new(),
             next_key: 0,
             durable: BTreeSet::new(),
@@ -129,14 +137,23 @@ impl Source {
         let (ours, strangers): (Vec<_>, Vec<_>) = writers
             .iter()
             .cloned()
-            .partition(|writer| writer.type_name == dds_type);
-        self.strangers = strangers.iter().map(|writer| writer.guid).collect();
+            .partition(|writer| writer.is_of(&dds_type, self.announced));
+        let why = |writer: &Endpoint| match writer.type_name == dds_type {
+            true => OTHER_DEFINITION,
+            false => OTHER_TYPE,
+        };
+        let strangers = strangers.iter().map(|writer| (writer.guid, why(writer)));
+        self.strangers = strangers.collect();
         let durable = ours.iter().filter(|writer| writer.transient_local);
         self.durable = durable.map(|writer| writer.guid).collect();
         ours
     }
 }
 
+/// Why samples of a writer are dropped whose type has another name.
+pub(crate) const OTHER_TYPE: &str = "publisher of another type";
+/// Why those of one are that announces another hash than the one that counts.
+pub(crate) const OTHER_DEFINITION: &str = "publisher of another definition";
 /// How many writers are remembered that have gone: more do not come back at once.
 const MAX_LAPSED: usize = 1024;
 

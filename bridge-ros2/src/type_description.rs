@@ -1,10 +1,10 @@
 //! The service `get_type_description` of a node (`type_description_interfaces/srv/GetTypeDescription`, REP-2016).
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use bytes::Bytes;
 use messages::{DescribedField, DescribedType, Dialect, Registry, TypeHash, TypeName};
-use tracing::debug;
 
 use crate::cdr::{CdrReader, CdrWriter, Malformed};
 use crate::domain::{Domain, DomainError};
@@ -13,10 +13,13 @@ use crate::service::{
     ServiceTypes,
 };
 
+/// What is told of types: each with what it needs, itself first.
+type Known = BTreeMap<(TypeName, TypeHash), Vec<DescribedType>>;
+
 /// Tells others what the types are that this node reads and writes. Dropping it withdraws the service.
 #[derive(Debug)]
 pub(crate) struct TypeServer {
-    known: Arc<Mutex<Registry>>,
+    known: Arc<Mutex<Known>>,
     server: ServiceServer,
 }
 
@@ -30,7 +33,7 @@ impl TypeServer {
         if let Some(hashes) = hashes {
             service.announce(domain, &hashes);
         }
-        let known = Arc::new(Mutex::new(Registry::empty(Dialect::Ros2)));
+        let known = Arc::new(Mutex::new(Known::new()));
         let asked = Arc::clone(&known);
         let handler = move |request: ServiceRequest| {
             let answer = read_request(&request.bytes).map(|(name, hash)| {
@@ -45,11 +48,15 @@ impl TypeServer {
     }
 
     /// A type that is read or written from now on.
-    pub(crate) fn learn(&self, described: &[DescribedType], name: &TypeName, hash: TypeHash) {
+    pub(crate) fn learn(&self, described: Vec<DescribedType>, name: &TypeName, hash: TypeHash) {
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Err(error) = known.add_described(name, described, hash) {
-            debug!(message_type = %name, "the type is not told to others: {error}");
-        }
+        known.insert((name.clone(), hash), described);
+    }
+
+    /// Whether that is told already.
+    pub(crate) fn tells(&self, name: &TypeName, hash: TypeHash) -> bool {
+        let known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        known.contains_key(&(name.clone(), hash))
     }
 
     /// What it has counted so far.
@@ -119,9 +126,9 @@ pub(crate) fn read_request(bytes: &[u8]) -> Result<(String, String), Malformed> 
     Ok((reader.string()?, reader.string()?))
 }
 
-/// The answer to a request for a type that the registry has, or has not. Texts of definitions are not told.
-pub(crate) fn answer(registry: &Registry, name: &str, hash: &str) -> Bytes {
-    let described = describe(registry, name, hash);
+/// The answer to a request for a type that is known, or not. Texts of definitions are not told.
+fn answer(known: &Known, name: &str, hash: &str) -> Bytes {
+    let described = describe(known, name, hash);
     let mut writer = CdrWriter::new();
     writer.bool(described.is_ok());
     writer.string(described.as_ref().err().map_or("", String::as_str));
@@ -138,15 +145,23 @@ pub(crate) fn answer(registry: &Registry, name: &str, hash: &str) -> Bytes {
     writer.finish()
 }
 
-fn describe(registry: &Registry, name: &str, hash: &str) -> Result<Vec<DescribedType>, String> {
+fn describe<'k>(known: &'k Known, name: &str, hash: &str) -> Result<&'k [DescribedType], String> {
     let unknown = || format!("type {name} is none of this node");
     let parsed: TypeName = name.parse().map_err(|_| unknown())?;
-    let ours = registry.type_hash(&parsed).map_err(|_| unknown())?;
+    let of_name = || known.iter().filter(|((of, _), _)| *of == parsed);
     // As in rcl, any hash will do where none is named.
-    if !hash.is_empty() && hash != ours.to_string() {
-        return Err(format!("type {name} has the hash {ours} here"));
+    let asked = of_name().find(|((_, ours), _)| hash.is_empty() || hash == ours.to_string());
+    if let Some((_, described)) = asked {
+        return Ok(described);
     }
-    registry.describe(&parsed).map_err(|_| unknown())
+    let hashes: Vec<String> = of_name().map(|((_, ours), _)| ours.to_string()).collect();
+    if hashes.is_empty() {
+        return Err(unknown());
+    }
+    Err(format!(
+        "type {name} has the hash {} here",
+        hashes.join(", ")
+    ))
 }
 
 fn write_type(writer: &mut CdrWriter, described: &DescribedType) {
@@ -214,32 +229,37 @@ mod tests {
         text.parse().unwrap()
     }
 
+    /// A node that has that one type of the bundle.
+    fn known(name: &TypeName) -> (Known, TypeHash) {
+        let registry = Registry::bundle(Dialect::Ros2);
+        let hash = registry.type_hash(name).unwrap();
+        let described = registry.describe(name).unwrap();
+        (Known::from([((name.clone(), hash), described)]), hash)
+    }
+
     #[test]
     fn what_is_answered_is_read_as_the_type_it_is() {
-        let registry = Registry::bundle(Dialect::Ros2);
         let wanted = name("sensor_msgs/JointState");
-        let hash = registry.type_hash(&wanted).unwrap();
+        let (known, hash) = known(&wanted);
         let asked = request(&wanted, hash);
         let (type_name, type_hash) = read_request(&asked).unwrap();
         assert_eq!(
             (type_name.as_str(), type_hash),
             ("sensor_msgs/msg/JointState", hash.to_string())
         );
-        let types = read_answer(&answer(&registry, &type_name, &hash.to_string())).unwrap();
-        assert_eq!(types, registry.describe(&wanted).unwrap());
-        for (type_name, type_hash) in [
-            ("x/msg/Y", ""),
-            ("std_msgs/msg/Bool", hash.to_string().as_str()),
-        ] {
-            let refused = read_answer(&answer(&registry, type_name, type_hash)).unwrap_err();
+        let types = read_answer(&answer(&known, &type_name, &hash.to_string())).unwrap();
+        assert_eq!(types, known[&(wanted, hash)]);
+        for (type_name, type_hash) in [("x/msg/Y", ""), ("sensor_msgs/msg/JointState", "RIHS01_0")]
+        {
+            let refused = read_answer(&answer(&known, type_name, type_hash)).unwrap_err();
             assert!(refused.contains("it does not tell: type"), "{refused}");
         }
     }
 
     #[test]
     fn an_answer_that_is_cut_anywhere_is_malformed() {
-        let registry = Registry::bundle(Dialect::Ros2);
-        let whole = answer(&registry, "geometry_msgs/msg/Twist", "");
+        let (known, _) = known(&name("geometry_msgs/Twist"));
+        let whole = answer(&known, "geometry_msgs/msg/Twist", "");
         // Behind the types come two counts that are not read, and what aligns them.
         for length in 0..whole.len() - 11 {
             assert!(read_answer(&whole[..length]).is_err(), "{length}");

@@ -113,7 +113,7 @@ codes! {
     Secret = "M114", "A password stands in a URL of the file, as in rtsp://user:password@camera. It is not shown here, but whoever can read the file, or a copy of it, has it. Write it as ${NAME}, which the environment of the program gives, and keep the file to its owner (chmod 600). What everybody gets to read, such as the URI of a namespace, and the addresses of the mapping take none at all.";
     PatternUnmatched = "M120", "No topic that is there now fits the pattern and its type. Only `ua-space check --environment` asks for that; a robot that is switched off is no fault of the mapping.";
     TopicAway = "M121", "Nobody publishes the topic that is read, or nobody subscribes to the one that is written, in the graph as it is now. Only `ua-space check --environment` asks for that.";
-    LiveTypeDiffers = "M122", "The topic is there with another message type, so not a single message would cross. Only `ua-space check --environment` asks for that.";
+    LiveTypeDiffers = "M122", "The topic or service is there with another type, so not a single message would cross. Only `ua-space check --environment` asks for that.";
     NamespaceIndex = "M123", "In the server that runs the namespace URI has another index, or none. The node ids of the mapping then mean other nodes, or none. Only `ua-space check --environment` asks for that.";
     ServiceAway = "M124", "Nobody offers the service in the graph as it is now. Only `ua-space check --environment` asks for that.";
     NodeAway = "M125", "The server that runs has no such variable. Only `ua-space check --environment` asks for that.";

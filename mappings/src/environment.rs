@@ -21,8 +21,9 @@ pub struct Environment {
 pub struct LiveSpace {
     /// By their names, with the leading `/`.
     pub topics: BTreeMap<String, LiveTopic>,
-    /// Names of services; `None` where they were not asked for.
-    pub services: Option<BTreeSet<String>>,
+    /// Services by their names, with the types they have, as `std_srvs/SetBool`: several where servers disagree, none where
+    /// nobody told. `None` where they were not asked for.
+    pub services: Option<BTreeMap<String, BTreeSet<String>>>,
 }
 
 /// A topic as it was.

@@ -124,7 +124,10 @@ fn environment() -> Environment {
             ("/conveyor/switch".to_owned(), topic("std_msgs/Bool", false)),
             ("/robot1/pose".to_owned(), topic("std_msgs/String", true)),
         ]),
-        services: Some(BTreeSet::from(["/conveyor/start".to_owned()])),
+        services: Some(BTreeMap::from([(
+            "/conveyor/start".to_owned(),
+            BTreeSet::from(["std_srvs/Trigger".to_owned()]),
+        )])),
     };
     Environment {
         spaces: BTreeMap::from([(SpaceId::ROS1, ros1)]),

@@ -160,6 +160,27 @@ impl Library {
         &mut self.registry
     }
 
+    /// Forgets what texts define, so that they are asked for again. What came another way stays.
+    pub fn forget_texts(&mut self) {
+        self.asked.clear();
+        let files = std::mem::take(&mut self.files);
+        if files.is_empty() {
+            return;
+        }
+        let built_in = Registry::bundle(self.dialect());
+        for (kind, name) in files.into_keys() {
+            match kind {
+                TextKind::Message => self.registry.restore(&name, &built_in),
+                TextKind::Service => self.registry.restore_service(&name, &built_in),
+                TextKind::Action => {
+                    for made in self.needed(kind, &name) {
+                        self.registry.restore(&made, &built_in);
+                    }
+                }
+            }
+        }
+    }
+
     /// The type of that name with all it needs.
     ///
     /// # Errors

@@ -60,6 +60,24 @@ impl Registry {
         self.definitions.keys()
     }
 
+    /// Puts the message of that name as `other` has it in the place of the one there is.
+    pub(crate) fn restore(&mut self, name: &TypeName, other: &Self) {
+        match other.definitions.get(name) {
+            Some(definition) => self
+                .definitions
+                .insert(name.clone(), Arc::clone(definition)),
+            None => self.definitions.remove(name),
+        };
+    }
+
+    /// Likewise the service.
+    pub(crate) fn restore_service(&mut self, name: &TypeName, other: &Self) {
+        match other.services.get(name) {
+            Some(definition) => self.services.insert(name.clone(), Arc::clone(definition)),
+            None => self.services.remove(name),
+        };
+    }
+
     /// Adds the text of a `.msg` file; it replaces a definition of the same name.
     ///
     /// # Errors

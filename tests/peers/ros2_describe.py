@@ -1,7 +1,8 @@
-"""A node of ROS 2 Iron and later, through Cyclone DDS, with a type of its own: it publishes it, announces the type's hash,
-and tells what the type is when it is asked.
+"""A node of ROS 2 Iron and later, through Cyclone DDS, with a type of its own: it publishes or reads it, announces the
+type's hash, and tells what the type is when it is asked.
 
-The type is `type_description_interfaces/msg/FieldType`, whose hash is the one ROS 2 publishes.
+The type is `type_description_interfaces/msg/FieldType`, whose hash is the one ROS 2 publishes; with --short HASH another of
+that name, of its first two fields.
 """
 
 import argparse
@@ -11,11 +12,13 @@ from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl.types import bounded_str, sequence, uint8, uint64
 from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 import lifetime
 import ros2_service
+import ros2_types
 from ros2_service_types import service, struct
 
 HASH = "RIHS01_a70b6dd919645a03a3586f7f821defbc886ea3e531a1d95cc0f380a3973ccaa6"
@@ -52,6 +55,8 @@ GET = service(
 # type_description_interfaces/msg/FieldType: 3 is uint8, 9 uint64, 21 a bounded string.
 TRUE = [("type_id", 3, 0), ("capacity", 9, 0), ("string_capacity", 9, 0), ("nested_type_name", 21, 255)]
 LIE = TRUE[:-1]
+SHORT = TRUE[:2]
+ShortFieldType = struct(f"{PACKAGE}/msg/FieldType", [("type_id", uint8, 0), ("capacity", uint64, 0)])
 
 
 def described(fields):
@@ -59,43 +64,56 @@ def described(fields):
     return Description(type_description=Individual(type_name=f"{PACKAGE}/msg/FieldType", fields=made))
 
 
-def announced():
+def announced(args):
     return Qos(
         Policy.Reliability.Reliable(duration(seconds=1)),
         Policy.Durability.TransientLocal,
         Policy.History.KeepLast(1),
         Policy.DataRepresentation(use_cdrv0_representation=True),
-        Policy.Userdata(f"typehash={HASH};".encode()),
+        Policy.Userdata(f"typehash={args.short or HASH};".encode()),
     )
 
 
-def tell_node(participant, name, writer):
-    """The list of nodes, with the writer as the node's."""
+def tell_node(participant, name, readers, writers):
+    """The list of nodes, with the endpoints as the node's."""
     import ros2_graph
 
     gid, entities, kind = ros2_graph.KINDS[16]
     topic = Topic(participant, "ros_discovery_info", kind)
     info = DataWriter(participant, topic, qos=ros2_graph.qos(Policy.History.KeepLast(1)))
-    node = entities("/", name, [], [gid(list(writer.guid.bytes))])
-    info.write(kind(gid(list(participant.guid.bytes)), [node]))
+    gids = [[gid(list(one.guid.bytes)) for one in endpoints] for endpoints in (readers, writers)]
+    info.write(kind(gid(list(participant.guid.bytes)), [entities("/", name, *gids)]))
     return info
 
 
-def serve(args, participant):
-    server = ros2_service.Server(participant, "/robot/get_type_description", GET)
-    name = "robot"
-    topic = Topic(participant, f"rt/{args.topic.lstrip('/')}", FieldType, qos=announced())
-    writer = DataWriter(participant, topic, qos=announced())
-    kept = tell_node(participant, name, writer)
-    writer.write(FieldType(type_id=7, capacity=8, string_capacity=9, nested_type_name="ten"))
+def answers(args, server):
+    for request in server.reader.take(N=100):
+        if not hasattr(request, "count"):
+            continue
+        lifetime.say(asked=request.type_name, hash=request.type_hash)
+        fields = SHORT if args.short else LIE if args.lie else TRUE
+        server.answer(request, GET[1](successful=True, type_description=described(fields)))
+
+
+def use(args, participant):
+    """Publishes a value (`serve`) or says those it reads (`read`), and answers who asks for the type."""
+    server = ros2_service.Server(participant, f"/{args.name}/get_type_description", GET)
+    kind = ShortFieldType if args.short else FieldType
+    qos = announced(args)
+    topic = Topic(participant, f"rt/{args.topic.lstrip('/')}", kind, qos=qos)
+    endpoint = DataWriter(participant, topic, qos=qos) if args.role == "serve" else DataReader(participant, topic, qos=qos)
+    ends = ([], [endpoint]) if args.role == "serve" else ([endpoint], [])
+    kept = tell_node(participant, args.name, *ends)
+    if args.role == "serve":
+        more = {} if args.short else {"string_capacity": 9, "nested_type_name": "ten"}
+        endpoint.write(kind(type_id=7, capacity=8, **more))
+    leave = lifetime.told()
     lifetime.say(ready=args.topic)
-    while kept:
-        for request in server.reader.take(N=100):
-            if not hasattr(request, "count"):
-                continue
-            lifetime.say(asked=request.type_name, hash=request.type_hash)
-            reply = GET[1](successful=True, type_description=described(LIE if args.lie else TRUE))
-            server.answer(request, reply)
+    while kept and not leave.is_set():
+        answers(args, server)
+        for sample in endpoint.take(N=100) if args.role == "read" else ():
+            if sample.sample_info.valid_data:
+                lifetime.say(value=ros2_types.plain(sample))
         time.sleep(0.005)
 
 
@@ -119,9 +137,11 @@ def ask(args, participant):
 
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("role", choices=["serve", "ask"])
+    parser.add_argument("role", choices=["serve", "read", "ask"])
     parser.add_argument("--topic", default="/ua_2_2_9")
     parser.add_argument("--domain", type=int, default=2)
+    parser.add_argument("--name", default="robot", help="the node's")
+    parser.add_argument("--short", default="", help="the other type of that name, and its hash")
     parser.add_argument("--lie", action="store_true", help="leave a field out")
     parser.add_argument("--node", default="/endpoints")
     parser.add_argument("--type", default="std_msgs/msg/String")
@@ -129,7 +149,7 @@ def main():
     parser.add_argument("--limit", type=float, default=60.0)
     args = parser.parse_args()
     lifetime.bound(args.limit)
-    {"serve": serve, "ask": ask}[args.role](args, DomainParticipant(args.domain))
+    {"serve": use, "read": use, "ask": ask}[args.role](args, DomainParticipant(args.domain))
 
 
 if __name__ == "__main__":

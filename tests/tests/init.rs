@@ -274,6 +274,9 @@ variables:
   - {node: ns=2;i=11, name: Covers, origin: 1, ros: {topic: /storage/covers, type: std_msgs/Int32}}
   - {node: ns=2;i=12, name: Park, origin: 2, ros: {topic: /park/busy, type: std_msgs/UInt32}}
   - {node: ns=2;i=13, name: Start, type: Boolean, origin: 0, ros: {space: 1, call: /conveyor/strat, type: std_srvs/SetBool, field: data}}
+  - {node: ns=2;i=14, name: Grip, type: Boolean, origin: 0, ros: {space: 2, call: /arm/grip, type: std_srvs/SetBool, field: data}}
+  - {node: ns=2;i=15, name: Gripp, type: Boolean, origin: 0, ros: {space: 2, call: /arm/gripp, type: std_srvs/SetBool, field: data}}
+  - {node: ns=2;i=16, name: Home, type: Boolean, origin: 0, ros: {space: 2, call: /arm/home, type: std_srvs/Trigger, when: true}}
 patterns:
   - {topics: "/robot*/pose", origin: 1, node: "ns=2;i=20{1}", name: "Robot{1}Pose"}
 "#;
@@ -288,6 +291,11 @@ fn what_is_named_otherwise_than_it_is_there_is_found() {
         cell.rospy("assembly_line_ros1.py", &["--more"]),
         cell.cyclone("assembly_line_ros2.py", &[]),
     );
+    let serves = |service: &str| {
+        let offered = ["serve", service, "std_srvs/SetBool", "--domain", "2"];
+        cell.cyclone("ros2_service.py", &offered)
+    };
+    let _services = (serves("/arm/grip"), serves("/arm/home"));
     // There the namespace has another index.
     let before = ["--before", "urn:ua-bridge:system-tests:before"];
     let _server = cell.asyncua("opcua_line.py", &[&[SERVER_ENDPOINT][..], &before].concat());
@@ -313,7 +321,9 @@ fn what_is_named_otherwise_than_it_is_there_is_found() {
         ("M122", 7, "type: std_msgs/UInt32"),
         ("M122", 8, "type: std_msgs/Bool"),
         ("M124", 9, "did you mean `/conveyor/start`?"),
-        ("M120", 11, "is a robot with such topics running?"),
+        ("M124", 11, "did you mean `/arm/grip`?"),
+        ("M122", 12, "type: std_srvs/SetBool"),
+        ("M120", 14, "is a robot with such topics running?"),
     ];
     assert_eq!(found.len(), expected.len(), "{found:?}");
     for (found, expected) in found.iter().zip(expected) {

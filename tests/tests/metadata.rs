@@ -197,3 +197,32 @@ fn an_opc_ua_client_reads_unit_range_and_texts_beside_the_value() {
         assert!(value.contains(part), "{part} in {value}");
     }
 }
+
+#[test]
+fn asyncua_reads_what_the_values_are_that_clients_write() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let written = CELL.to_owned()
+        + "  - {node: ns=2;i=20, name: Wanted, type: Double, origin: 0, unit: m/s, range: [0, 2]}\n  \
+           - {node: ns=2;i=21, name: Command, origin: 0, ros: {space: 2, topic: /cmd_vel, type: geometry_msgs/Twist}}\n";
+    let mapping = cell.file("cell.yaml", &written);
+    let mut judge = cell.asyncua("uadp_metadata.py", &[]);
+    let _server = cell.ua_server(&[mapping.to_str().unwrap()]);
+    let mut of = |name: &str| {
+        judge.wait_for_json(name, SOON, |line| {
+            (line["name"] == name).then(|| line.clone())
+        })
+    };
+    let wanted = of("ua_0_2_20");
+    assert_eq!(wanted["publisher"], 0);
+    let field = &wanted["fields"][0];
+    assert_eq!(
+        (&field["name"], &field["type"]),
+        (&json!("Wanted"), &json!(11))
+    );
+    assert_eq!(field["properties"]["EURange"], json!([0.0, 2.0]));
+    let command = of("ua_0_2_21");
+    assert_eq!(command["description"], TWIST);
+    assert_eq!(command["fields"].as_array().unwrap().len(), 6);
+}

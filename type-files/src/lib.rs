@@ -2,7 +2,7 @@
 //!
 //! The files of a mapping's `type_paths` are all read when they are opened, so that everything wrong with them is told at
 //! once. A ROS installation has thousands: its folders are listed when something is looked for the first time, and a file is
-//! read when its type is wanted. What is changed later is not seen.
+//! read when its type is wanted. What is changed later is seen when they are opened again.
 
 mod index;
 mod package;
@@ -145,6 +145,23 @@ impl TypeFiles {
             files.take(number, path, &mut walk);
         }
         files
+    }
+
+    /// Reads these `type_paths` in place of those there were, be they the same. What the installations have stays as it was
+    /// listed.
+    pub fn open_again(&mut self, paths: &[PathBuf]) {
+        let environment = std::mem::take(&mut self.environment);
+        let installed = std::mem::take(&mut self.installed);
+        *self = Self {
+            installed,
+            ..Self::open(paths, environment)
+        };
+    }
+
+    /// Whether there are `type_paths`.
+    #[must_use]
+    pub const fn has_paths(&self) -> bool {
+        !self.paths.is_empty()
     }
 
     fn take(&mut self, number: usize, path: &Path, walk: &mut Walk) {

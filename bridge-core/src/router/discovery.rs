@@ -16,7 +16,7 @@ use uadp::{NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader};
 use super::receive::DISCOVERY;
 use super::{About, Router};
 use crate::counters::Reason;
-use crate::description::{Described, Description, Source};
+use crate::description::{Described, Description, Source, mapped_leaves};
 use crate::learned::{Learned, News};
 use crate::loop_rule::{Side, may_cross};
 use crate::network::announcement_chunks;
@@ -110,16 +110,17 @@ impl Router {
         self.discovery.as_ref()?.due
     }
 
-    /// The type of a topic of our own space is known: it is announced, and again whenever it changes.
+    /// The type of a topic of our own space is known: it is announced, and again whenever it changes. Without a message it is
+    /// as the mapping says.
     pub(super) fn describe(
         &mut self,
         topic: TopicId,
-        (message_type, selection): (&MessageType, &Selection),
+        message: Option<(&MessageType, &Selection)>,
         now: Now,
     ) {
         let period = self.mapping.pubsub().metadata_period;
         let Some(Topic {
-            plan: Some(plan),
+            plan,
             description,
             announce_at,
             ..
@@ -127,15 +128,21 @@ impl Router {
         else {
             return;
         };
+        let variable = self.mapping.variable(topic);
+        let mapped = match (message, variable) {
+            (None, Some(variable)) => mapped_leaves(variable),
+            (Some(_), _) | (None, None) => Vec::new(),
+        };
+        let leaves = match (message, plan) {
+            (Some(_), Some(plan)) => plan.leaves(),
+            (None, _) if !mapped.is_empty() => &mapped,
+            (Some(_), None) | (None, _) => return,
+        };
         let source = Source {
             topic,
-            message_type,
-            selection,
-            leaves: plan.leaves(),
-            meaning: self
-                .mapping
-                .variable(topic)
-                .map(|variable| &variable.meaning),
+            message,
+            leaves,
+            variable,
             namespaces: self.mapping.namespaces(),
         };
         match Description::new(source, description.as_deref(), now.utc) {

@@ -8,7 +8,7 @@ use super::{About, Router};
 use crate::counters::Reason;
 use crate::gate::Gate;
 use crate::queue::Queue;
-use crate::settings::Now;
+use crate::settings::{Local, Now};
 use crate::topic::{Item, Role, Topic};
 
 impl Router {
@@ -44,7 +44,10 @@ impl Router {
                 self.regate(topic, now);
             }
             let (was, is) = (before.variable(topic), self.mapping.variable(topic));
-            if renamed || was.map(|v| &v.meaning) != is.map(|v| &v.meaning) {
+            let meant = was.map(|v| &v.meaning) != is.map(|v| &v.meaning);
+            // Only there does the mapping alone say what the values are.
+            let typed = self.settings.local == Local::Fields && was != is;
+            if renamed || meant || typed {
                 self.describe_again(topic, now);
             }
             // The periods may be shorter now.
@@ -99,7 +102,9 @@ impl Router {
             .get(&topic)
             .and_then(|entry| entry.bound.clone());
         if let Some((message_type, selection)) = bound {
-            self.describe(topic, (&message_type, &selection), now);
+            self.describe(topic, Some((&message_type, &selection)), now);
+        } else if self.settings.local == Local::Fields && topic.space == self.settings.own {
+            self.describe(topic, None, now);
         }
     }
 

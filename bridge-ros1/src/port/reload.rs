@@ -22,6 +22,7 @@ impl Ros1Port {
         let before = std::mem::replace(&mut self.mapping, Arc::clone(mapping));
         // What is peculiar under the new mapping is told anew.
         self.told.clear();
+        self.definitions.read_again(mapping.type_paths());
         let read = self.read(mapping);
         for index in 0..self.sources.len() {
             self.give_up_values(index, &read);
@@ -117,15 +118,22 @@ impl Ros1Port {
     }
 
     fn give_up_sinks(&mut self) {
-        let (mapping, own) = (&self.mapping, self.own);
+        let (mapping, own, definitions) = (&self.mapping, self.own, &mut self.definitions);
         let gone = self.sinks.extract_if(|topic, sink| {
+            // Its definition may be another since the files were read again.
+            let outdated = sink.open.as_ref().is_some_and(|open| {
+                let now = definitions.get(open.message_type.name());
+                now.is_ok_and(|now| now.md5() != open.message_type.md5())
+            });
             let variable = mapping.variable(*topic);
             let tied = variable.and_then(|variable| mapped(variable, own));
             let called = variable
                 .and_then(|variable| variable.service.as_ref())
                 .is_some_and(|service| service.space == own);
             // Values for a service have no topic.
-            called || !sink.is_like(&tied.unwrap_or_else(|| Sink::by_name(*topic, variable)))
+            called
+                || outdated
+                || !sink.is_like(&tied.unwrap_or_else(|| Sink::by_name(*topic, variable)))
         });
         // Their publishers end here, so that their topics may be advertised in another type.
         let gone = gone.map(|(topic, _)| PortEvent::Unbound { topic });

@@ -231,3 +231,30 @@ async fn a_topic_named_in_the_space_crosses_again_when_the_mapping_has_another_u
     .await;
     assert_eq!(a.subscribers(), 1);
 }
+
+#[tokio::test]
+async fn a_saved_definition_file_counts_from_the_next_reload_on_and_others_do_not_notice() {
+    let folder = std::env::temp_dir().join(format!("reload-types-{}", std::process::id()));
+    let file = folder.join("geometry_msgs/msg/Point.msg");
+    std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+    std::fs::write(&file, "float64 x\nfloat64 y\nfloat64 z\n").unwrap();
+    let text = format!(
+        "spaces: [{{id: 1}}, {{id: 2}}]\nnamespaces: {{2: urn:test}}\ntype_paths: [{}]\nvariables:\n  - {{node: ns=2;i=1, \
+         name: Arm, origin: 2, ros: {{space: 1, topic: /arm, type: geometry_msgs/Point}}}}\n  - {{node: ns=2;i=2, name: Other, \
+         origin: 2, ros: {{space: 1, topic: /other, type: std_msgs/Bool}}}}\n",
+        folder.display()
+    );
+    let mut cell = cell(&text);
+    let lines = events(&mut cell.port, 2).await;
+    assert!(
+        lines[0].starts_with("ua_2_2_1 is geometry_msgs/Point"),
+        "{lines:?}"
+    );
+    cell.port.reload(&parsed(&text));
+    assert_eq!(at_once(&mut cell).await, [""; 0]);
+    std::fs::write(&file, "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n").unwrap();
+    cell.port.reload(&parsed(&text));
+    std::fs::remove_dir_all(&folder).unwrap();
+    let expected = ["ua_2_2_1 unbound", &lines[0]];
+    assert_eq!(at_once(&mut cell).await, expected);
+}

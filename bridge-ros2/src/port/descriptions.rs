@@ -1,4 +1,4 @@
-//! Types that are known to the nodes that publish them: from ROS 2 Iron on each node tells what its types are.
+//! Types that are known to the nodes that use them: from ROS 2 Iron on each node tells what its types are.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -9,6 +9,7 @@ use tokio::time::Instant;
 use tracing::{debug, info, warn};
 
 use super::Ros2Port;
+use crate::definitions::Definition;
 use crate::graph::Endpoint;
 use crate::service::{ServiceClient, ServiceClientOptions, ServicePeers};
 use crate::type_description;
@@ -20,7 +21,7 @@ pub(super) struct Descriptions {
     calls: JoinSet<Told>,
 }
 
-/// A type as a writer announces it.
+/// A type as an endpoint announces it.
 type Wanted = (TypeName, TypeHash);
 /// Who was asked for what, and the answer.
 type Told = (Wanted, String, Result<Vec<DescribedType>, String>);
@@ -56,19 +57,42 @@ impl Descriptions {
 }
 
 impl Ros2Port {
-    /// Whether what these writers announce is the type we know, or nobody tells it: `false` while a node is asked. Writers
-    /// that announce no hash are of no release that tells.
-    pub(super) fn types_are_settled(&mut self, writers: &[Endpoint], now: Instant) -> bool {
-        let announced = writers.iter().filter_map(|writer| {
-            let name = TypeName::from_dds(&writer.type_name).ok()?;
-            Some((name, writer.type_hash?))
-        });
-        let Some(wanted) = announced.into_iter().next() else {
-            return true;
-        };
-        if self.definitions.hash_of(&wanted.0) == Some(wanted.1) {
-            return true;
+    /// Which of the definitions of a type counts on a topic with these endpoints, by its hash: the one that counts by now
+    /// while it is known and any of them announces it, else the first that is known, of which the nodes of the endpoints are
+    /// asked; else the first. Endpoints that announce none are of no release that does. `None` while a node is asked.
+    pub(super) fn hash_that_counts(
+        &mut self,
+        name: &TypeName,
+        endpoints: &[Endpoint],
+        current: Option<TypeHash>,
+        now: Instant,
+    ) -> Option<Option<TypeHash>> {
+        let dds_type = name.dds();
+        let of_type = endpoints
+            .iter()
+            .filter(|endpoint| endpoint.type_name == dds_type);
+        let mut announced: Vec<TypeHash> = Vec::new();
+        for hash in of_type.filter_map(|endpoint| endpoint.type_hash) {
+            if !announced.contains(&hash) {
+                announced.push(hash);
+            }
         }
+        let there = current.filter(|hash| announced.is_empty() || announced.contains(hash));
+        let candidates = there.into_iter().chain(announced.iter().copied());
+        for hash in candidates {
+            if self.definitions.of_hash(name, hash).is_some() {
+                return Some(Some(hash));
+            }
+        }
+        let mut settled = true;
+        for hash in &announced {
+            settled &= self.is_settled((name.clone(), *hash), endpoints, now);
+        }
+        settled.then(|| there.or_else(|| announced.first().copied()))
+    }
+
+    /// Whether a type of that hash is known, or nobody tells it: `false` while a node is asked.
+    fn is_settled(&mut self, wanted: Wanted, endpoints: &[Endpoint], now: Instant) -> bool {
         let full = self.descriptions.asked.len() >= MOST_ASKED;
         let state = match self.descriptions.asked.get(&wanted) {
             Some(state) => *state,
@@ -79,13 +103,19 @@ impl Ros2Port {
                 tries: 0,
             },
         };
-        let state = self.ask(&wanted, writers, state, now);
+        let state = self.ask(&wanted, endpoints, state, now);
         self.descriptions.asked.insert(wanted.clone(), state);
         !self.descriptions.is_waiting(&wanted)
     }
 
     /// The state after what can be done now.
-    fn ask(&mut self, wanted: &Wanted, writers: &[Endpoint], state: State, now: Instant) -> State {
+    fn ask(
+        &mut self,
+        wanted: &Wanted,
+        endpoints: &[Endpoint],
+        state: State,
+        now: Instant,
+    ) -> State {
         let State::Waiting { since, next, tries } = state else {
             return state;
         };
@@ -94,13 +124,13 @@ impl Ros2Port {
         }
         let (name, hash) = wanted;
         let dds_type = name.dds();
-        let alike = |writer: &&Endpoint| {
-            writer.type_hash.as_ref() == Some(hash) && writer.type_name == dds_type
+        let alike = |endpoint: &&Endpoint| {
+            endpoint.type_hash.as_ref() == Some(hash) && endpoint.type_name == dds_type
         };
-        let nodes: Vec<String> = writers
+        let nodes: Vec<String> = endpoints
             .iter()
             .filter(alike)
-            .filter_map(|writer| self.domain.owner(writer.guid))
+            .filter_map(|endpoint| self.domain.owner(endpoint.guid))
             .collect();
         let snapshot = self.descriptions.peers.look(now, FRESH);
         let services: Vec<_> = nodes
@@ -112,10 +142,7 @@ impl Ros2Port {
             if now.duration_since(since) < OFFERED_WITHIN {
                 return state;
             }
-            self.untold(
-                wanted,
-                "no node that publishes it offers get_type_description",
-            );
+            self.untold(wanted, "no node that uses it offers get_type_description");
             return State::Settled;
         };
         let options = ServiceClientOptions {
@@ -175,24 +202,28 @@ impl Ros2Port {
     /// Another answer would be no better than one that is not of the hash.
     fn described(&mut self, wanted: &Wanted, service: &str, types: &[DescribedType]) {
         let (name, hash) = wanted;
-        let from = || format!("type description of {service}");
-        match self.definitions.add_described(name, types, *hash, from) {
+        let from = format!("type description of {service}");
+        match self.definitions.add_described(name, types, *hash, &from) {
             Ok(()) => {
-                info!(message_type = %name, service, "the type was told by its publisher");
+                info!(message_type = %name, %hash, service, "the type was told by a node that uses it");
             }
             Err(error) => self.untold(wanted, &format!("{service}: {error}")),
         }
     }
 
-    fn untold(&self, (name, hash): &Wanted, why: &str) {
-        match self.definitions.hash_of(name) {
-            Some(ours) => warn!(
+    fn untold(&mut self, (name, hash): &Wanted, why: &str) {
+        match self.definitions.here(name) {
+            Ok(Definition {
+                hash: Some(ours),
+                from,
+                ..
+            }) => warn!(
                 message_type = %name,
-                definition = self.definitions.source(name),
-                "a publisher's type has the hash {hash}, ours {ours}: what it sends may be misread, or not at all; {why}"
+                definition = %from,
+                "another node's type has the hash {hash}, ours {ours}: it may be misread, or not at all; {why}"
             ),
-            None => {
-                warn!(message_type = %name, "the type is not told by those who publish it: {why}")
+            Ok(Definition { hash: None, .. }) | Err(_) => {
+                warn!(message_type = %name, %hash, "the type is not told by those who use it: {why}");
             }
         }
     }

@@ -5,19 +5,19 @@ use std::time::Duration;
 
 use bridge_node::PortEvent;
 use mappings::{PatternFault, PatternVariable, TopicId};
-use messages::{MessageType, Selection, TypeName};
+use messages::{Selection, TypeName};
 use rustdds::GUID;
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 
 use super::{MAX_TOPICS, Ros2Port, lost};
 use crate::compatibility::Incompatibility;
+use crate::definitions::Definition;
 use crate::domain::{Domain, DomainError};
 use crate::graph::{Endpoint, ros_topic};
-use crate::outlet::Outlet;
 use crate::qos::Requested;
-use crate::sink::{Open, Sink, shortest_deadline};
-use crate::source::{Reading, Source};
+use crate::sink::Sink;
+use crate::source::{OTHER_DEFINITION, OTHER_TYPE, Reading, Source};
 
 impl Ros2Port {
     /// Makes what is open fit what the domain holds, at most [`MAX_BATCH`] endpoints at a time: RustDDS' discovery
@@ -121,35 +121,37 @@ impl Ros2Port {
                 });
                 continue;
             }
-            let writers = self.graph.writers(&dds_topic).to_vec();
-            let types: Vec<String> = writers
-                .iter()
-                .map(|writer| writer.type_name.clone())
-                .collect();
-            for name in types
-                .iter()
-                .filter_map(|name| TypeName::from_dds(name).ok())
-            {
-                // So that its hash is known; that it is not known is told below.
-                let _known = self.definitions.get(&name).is_ok();
-            }
-            if !self.types_are_settled(&writers, now) {
-                continue;
-            }
-            let known = types
-                .iter()
-                .filter(|name| self.may_be(&dds_topic, name))
-                .cloned()
-                .collect::<Vec<_>>()
-                .iter()
-                .find_map(|name| self.message_type(topic, &dds_topic, name));
-            if let Some(message_type) = known {
-                let index = self.source(dds_topic, message_type.name().clone());
+            if let Some(name) = self.found_type(topic, &dds_topic, now) {
+                let index = self.source(dds_topic, name);
                 if let Some(source) = self.sources.get_mut(index) {
                     source.values.push((topic, selection));
                 }
             }
         }
+    }
+
+    /// The first type of a topic's writers that is known; `None` as long as a node is asked what one is.
+    fn found_type(&mut self, topic: TopicId, dds_topic: &str, now: Instant) -> Option<TypeName> {
+        let writers = self.graph.writers(dds_topic).to_vec();
+        let mut known = None;
+        for writer in &writers {
+            if known.is_some() || !self.may_be(dds_topic, &writer.type_name) {
+                continue;
+            }
+            let found = match TypeName::from_dds(&writer.type_name) {
+                Ok(name) => {
+                    let hash = self.hash_that_counts(&name, &writers, None, now)?;
+                    let found = self.definitions.announced(&name, hash);
+                    found.map_err(|error| error.to_string())
+                }
+                Err(error) => Err(error.to_string()),
+            };
+            match found {
+                Ok(definition) => known = Some(definition.name().clone()),
+                Err(error) => self.tell_unknown(topic, dds_topic, &error),
+            }
+        }
+        known
     }
 
     /// The value a topic is that the mapping does not name: by its own name, or by a pattern.
@@ -206,42 +208,28 @@ impl Ros2Port {
             .is_some_and(|variable| variable.binding(self.own).is_some())
     }
 
-    /// The type a peer names, or `None` after saying once why it cannot be used.
-    fn message_type(
-        &mut self,
-        topic: TopicId,
-        dds_topic: &str,
-        dds_type: &str,
-    ) -> Option<Arc<MessageType>> {
-        let found = match TypeName::from_dds(dds_type) {
-            Ok(name) => self
-                .definitions
-                .get(&name)
-                .map_err(|error| error.to_string()),
-            Err(error) => Err(error.to_string()),
-        };
-        match found {
-            Ok(message_type) => Some(message_type),
-            Err(error) => {
-                let first = self.tell_once(dds_topic, "unknown type", || {
-                    format!(
-                        "the topic cannot cross: {error}. Start the bridge where the ROS workspace that defines it \
-                         is sourced (AMENT_PREFIX_PATH), or map the topic to a known type"
-                    )
-                });
-                if first {
-                    self.events
-                        .push_back(lost(topic, "type without a definition", 1));
-                }
-                None
-            }
+    /// Says once why a topic cannot be used.
+    fn tell_unknown(&mut self, topic: TopicId, dds_topic: &str, error: &str) {
+        let first = self.tell_once(dds_topic, "unknown type", || {
+            format!(
+                "the topic cannot cross: {error}. Start the bridge where the ROS workspace that defines it is sourced \
+                 (AMENT_PREFIX_PATH), or map the topic to a known type"
+            )
+        });
+        if first {
+            self.events
+                .push_back(lost(topic, "type without a definition", 1));
         }
     }
 
     fn reconcile_source(&mut self, index: usize, now: Instant) {
         // Without a value it is one that the mapping no longer names.
-        let sources = self.sources.get_mut(index);
-        let Some(source) = sources.filter(|source| !source.values.is_empty()) else {
+        let is_read = |source: &Source| !source.values.is_empty();
+        if !self.sources.get(index).is_some_and(is_read) {
+            return;
+        }
+        let settled = self.settle_source(index, now);
+        let Some(source) = self.sources.get_mut(index) else {
             return;
         };
         let writers = self.graph.writers(&source.dds_topic);
@@ -264,7 +252,7 @@ impl Ros2Port {
                 let name = source.message_type.clone();
                 let known = self.definitions.get(&name).is_ok();
                 // What nobody knows and nobody publishes is asked for when somebody does.
-                if (known || !ours.is_empty()) && self.types_are_settled(&ours, now) {
+                if (known || !ours.is_empty()) && settled {
                     self.open_source(index, requested);
                 }
             }
@@ -284,9 +272,48 @@ impl Ros2Port {
             .collect();
         self.set_live(index, !ours.is_empty());
         self.note_incompatible(&Side::Source(index), offers);
-        if let Some(stranger) = strange {
+        if let Some(stranger) = strange.filter(|_| settled) {
             self.tell_stranger(index, &stranger);
         }
+    }
+
+    /// Finds which definition of a source's type counts by now; `false` as long as a node is asked. A reader of another
+    /// definition is closed, for one of this to be made.
+    fn settle_source(&mut self, index: usize, now: Instant) -> bool {
+        let Some(source) = self.sources.get(index) else {
+            return false;
+        };
+        let (name, current) = (source.message_type.clone(), source.announced);
+        let dds_type = name.dds();
+        let writers = self.graph.writers(&source.dds_topic);
+        let read_so = |writer: &&Endpoint| writer.is_of(&dds_type, current);
+        if current.is_some() && writers.iter().any(|writer| read_so(&writer)) {
+            return true;
+        }
+        let writers = writers.to_vec();
+        let Some(hash) = self.hash_that_counts(&name, &writers, current, now) else {
+            return false;
+        };
+        let found = self.definitions.announced(&name, hash).ok();
+        let Some(source) = self.sources.get_mut(index) else {
+            return false;
+        };
+        source.announced = hash.or(current);
+        let same = |(a, b): (&Definition, &Definition)| a.hash == b.hash;
+        let Reading::Open { slot, .. } = source.reading else {
+            return true;
+        };
+        if !source
+            .definition
+            .as_ref()
+            .zip(found.as_ref())
+            .is_none_or(same)
+        {
+            source.reading = Reading::Pending;
+            drop(self.inbox.remove(slot));
+            info!(topic = source.dds_topic, message_type = %name, "its publishers have another definition of the type now");
+        }
+        true
     }
 
     fn open_source(&mut self, index: usize, requested: Requested) {
@@ -294,8 +321,8 @@ impl Ros2Port {
             return;
         };
         let (topic, name) = (source.dds_topic.clone(), source.message_type.clone());
-        let message_type = match self.definitions.get(&name) {
-            Ok(message_type) => message_type,
+        let definition = match self.definitions.announced(&name, source.announced) {
+            Ok(definition) => definition,
             Err(error) => {
                 self.tell_once(&topic, "unknown type", || {
                     format!("the topic cannot cross: {error}")
@@ -303,22 +330,23 @@ impl Ros2Port {
                 return;
             }
         };
-        self.announce_type(&name.dds(), &name);
+        self.announce_type(&definition);
         let Some(reader) = self.make(|domain| domain.reader(&topic, &name.dds(), requested)) else {
             return;
         };
         let slot = self.inbox.insert(index, reader);
         if let Some(source) = self.sources.get_mut(index) {
             source.reading = Reading::Open { slot, requested };
-            let definition = self.definitions.source(&name);
-            info!(topic, message_type = %name, definition, ?requested, "subscribed");
+            source.announced = source.announced.or(definition.hash);
+            info!(topic, message_type = %name, definition = %definition.from, ?requested, "subscribed");
             for (topic, selection) in &source.values {
                 self.events.push_back(PortEvent::Bound {
                     topic: *topic,
-                    message_type: Arc::clone(&message_type),
+                    message_type: Arc::clone(&definition.message_type),
                     selection: selection.clone(),
                 });
             }
+            source.definition = Some(definition);
         }
     }
 
@@ -333,6 +361,9 @@ impl Ros2Port {
             return;
         };
         let (topic, dds_type) = (source.dds_topic.clone(), source.message_type.dds());
+        if let Some(definition) = &source.definition {
+            self.announce_type(definition);
+        }
         let Some(reader) = self.make(|domain| domain.reader(&topic, &dds_type, requested)) else {
             return;
         };
@@ -375,8 +406,21 @@ impl Ros2Port {
         let Some(source) = self.sources.get(index) else {
             return;
         };
-        let (topic, name) = (source.dds_topic.clone(), source.message_type.to_string());
-        self.tell_once(&topic, "publisher of another type", || {
+        let (topic, name) = (source.dds_topic.clone(), source.message_type.clone());
+        if let Some((theirs, ours)) = stranger.type_hash.zip(source.announced)
+            && stranger.type_name == name.dds()
+        {
+            let owner = self.domain.owner(stranger.guid);
+            self.tell_once(&topic, OTHER_DEFINITION, || {
+                format!(
+                    "a publisher of {} has another definition of {name}, with the hash {theirs}; the topic crosses with \
+                     {ours}: its messages are dropped",
+                    owner.as_deref().unwrap_or("an unnamed node"),
+                )
+            });
+            return;
+        }
+        self.tell_once(&topic, OTHER_TYPE, || {
             format!(
                 "a publisher has type {}, but the topic crosses as {name}: its messages are dropped",
                 stranger.type_name
@@ -384,106 +428,12 @@ impl Ros2Port {
         });
     }
 
-    fn reconcile_sink(&mut self, topic: TopicId, now: Instant) {
-        let Some(sink) = self.sinks.get_mut(&topic) else {
-            return;
-        };
-        if self.graph.is_at_home(topic.space.into()) {
-            // Another bridge serves its space in this domain. What was written would stand beside it, and grow old.
-            let given_up = sink.open.take().is_some();
-            let dds_topic = sink.dds_topic.clone();
-            if given_up {
-                self.tell_once(&dds_topic, "at home", || {
-                    format!(
-                        "another bridge of this domain serves space {}: its values are left to it",
-                        topic.space
-                    )
-                });
-            }
-            return;
-        }
-        let readers = self.graph.readers(&sink.dds_topic);
-        if let Some(open) = &mut sink.open {
-            match open.outlet.set_readers(readers, now) {
-                Ok(()) => {}
-                Err(refusal) => self.events.push_back(lost(topic, refusal.label(), 1)),
-            }
-            self.schedule.waiting |= open.outlet.is_waiting();
-            if open.outlet.is_stuck(now) {
-                self.replace_writer(topic, now);
-                return;
-            }
-            if let Some(deadline) = open.shorter_deadline(readers) {
-                let before = open.deadline.replace(deadline);
-                open.tightened += 1;
-                self.offer_deadline(topic, before, now);
-                return;
-            }
-            let offered = sink.offered.with_deadline(open.deadline);
-            let dds_type = open.message_type.name().dds();
-            let asks: Vec<_> = readers
-                .iter()
-                .filter(|reader| reader.type_name == dds_type)
-                .map(|reader| (reader.guid, Incompatibility::between(&offered, &reader.qos)))
-                .collect();
-            self.note_incompatible(&Side::Sink(topic), asks);
-        }
-        let Some(sink) = self.sinks.get(&topic) else {
-            return;
-        };
-        let readers = self.graph.readers(&sink.dds_topic);
-        if !sink.serves(readers) {
-            self.open_sink(topic);
-        }
-    }
-
-    /// A reader that acknowledges nothing must not keep a value from the others.
-    fn replace_writer(&mut self, topic: TopicId, now: Instant) {
-        if let Some(dds_topic) = self.advertise_anew(topic, now) {
-            warn!(
-                topic = dds_topic,
-                "a subscriber does not acknowledge; advertised anew for the others"
-            );
-        }
-    }
-
-    /// A reader that asks for a deadline is matched by a writer that offers it.
-    fn offer_deadline(&mut self, topic: TopicId, before: Option<rustdds::Duration>, now: Instant) {
-        if let Some(dds_topic) = self.advertise_anew(topic, now) {
-            info!(
-                topic = dds_topic,
-                "a subscriber asks for a deadline; advertised anew with it"
-            );
-        } else if let Some(open) = self
-            .sinks
-            .get_mut(&topic)
-            .and_then(|sink| sink.open.as_mut())
-        {
-            // The writer there is goes on with what it offers; the next look tries again.
-            open.deadline = before;
-        }
-    }
-
-    /// Puts another writer in the place of a sink's; returns the topic.
-    fn advertise_anew(&mut self, topic: TopicId, now: Instant) -> Option<String> {
-        let sink = self.sinks.get(&topic)?;
-        let open = sink.open.as_ref()?;
-        let dds_topic = sink.dds_topic.clone();
-        let qos = sink.offered.with_deadline(open.deadline);
-        let dds_type = open.message_type.name().dds();
-        let writer = self.make(|domain| domain.open_writer(&dds_topic, &dds_type, &qos))?;
-        if let Some(open) = self
-            .sinks
-            .get_mut(&topic)
-            .and_then(|sink| sink.open.as_mut())
-        {
-            open.outlet.replace_writer(writer, now);
-        }
-        Some(dds_topic)
-    }
-
     /// Tells and counts, once each, the endpoints of others that DDS does not match with ours.
-    fn note_incompatible(&mut self, side: &Side, peers: Vec<(GUID, Option<Incompatibility>)>) {
+    pub(super) fn note_incompatible(
+        &mut self,
+        side: &Side,
+        peers: Vec<(GUID, Option<Incompatibility>)>,
+    ) {
         for (guid, found) in peers {
             let Some(found) = found else {
                 self.incompatible.remove(&guid);
@@ -522,80 +472,17 @@ impl Ros2Port {
         }
     }
 
-    /// Opens a sink in the best type there is; one that is open in a lesser type is opened anew.
-    pub(super) fn open_sink(&mut self, topic: TopicId) {
-        let Some(sink) = self.sinks.get(&topic) else {
+    /// Has the domain announce the hash of a definition with the endpoints of its type that are made next.
+    pub(super) fn announce_type(&self, definition: &Definition) {
+        let (name, Some(hash)) = (definition.name(), definition.hash) else {
             return;
         };
-        let (dds_topic, offered) = (sink.dds_topic.clone(), sink.offered);
-        let mut found = None;
-        for name in sink.candidates(self.graph.readers(&sink.dds_topic)) {
-            match self.definitions.get(&name) {
-                Ok(message_type) => {
-                    found = Some(message_type);
-                    break;
-                }
-                Err(error) => {
-                    self.tell_once(&dds_topic, "unknown type", || {
-                        format!("no value can be written in the type asked for: {error}")
-                    });
-                }
-            }
+        self.domain.learn_type_hash(&name.dds(), hash.to_string());
+        if !self.told_types.tells(name, hash)
+            && let Ok(described) = self.definitions.described(name, hash)
+        {
+            self.told_types.learn(described, name, hash);
         }
-        let Some(message_type) = found else { return };
-        let dds_type = message_type.name().dds();
-        if self.is_open_as(topic, &message_type) {
-            self.tell_once(&dds_topic, "subscriber of another type", || {
-                format!("a subscriber asks for another type than {dds_type}, in which the topic is written")
-            });
-            return;
-        }
-        let deadline = shortest_deadline(self.graph.readers(&dds_topic));
-        let qos = offered.with_deadline(deadline);
-        self.announce_type(&dds_type, message_type.name());
-        let Some(writer) = self.make(|domain| domain.open_writer(&dds_topic, &dds_type, &qos))
-        else {
-            return;
-        };
-        let definition = self.definitions.source(message_type.name());
-        info!(topic = dds_topic, message_type = %message_type.name(), definition, ?offered, "advertised");
-        let mut outlet = Outlet::new(writer, offered);
-        if let Err(refusal) = outlet.set_readers(self.graph.readers(&dds_topic), Instant::now()) {
-            self.events.push_back(lost(topic, refusal.label(), 1));
-        }
-        let mut selection = Selection::Whole;
-        if let Some(sink) = self.sinks.get_mut(&topic) {
-            selection = sink.selection(message_type.name());
-            sink.open = Some(Open {
-                message_type: Arc::clone(&message_type),
-                outlet,
-                deadline,
-                tightened: 0,
-                stamps: sink.stamps(&message_type),
-            });
-        }
-        self.events.push_back(PortEvent::Bound {
-            topic,
-            message_type,
-            selection,
-        });
-    }
-
-    /// Has the domain announce the hash of a type.
-    fn announce_type(&self, dds_type: &str, name: &TypeName) {
-        if let Some(hash) = self.definitions.hash_of(name) {
-            self.domain.learn_type_hash(dds_type, hash.to_string());
-            if let Ok(described) = self.definitions.described(name) {
-                self.told_types.learn(&described, name, hash);
-            }
-        }
-    }
-
-    fn is_open_as(&self, topic: TopicId, message_type: &MessageType) -> bool {
-        self.sinks
-            .get(&topic)
-            .and_then(|sink| sink.open.as_ref())
-            .is_some_and(|open| open.message_type.name() == message_type.name())
     }
 
     /// Makes an endpoint if the budget allows; `None` when it does not, or when RustDDS fails, which is told once.
@@ -620,7 +507,7 @@ impl Ros2Port {
 }
 
 /// Which of our endpoints others are not matched with.
-enum Side {
+pub(super) enum Side {
     /// The reader of that source.
     Source(usize),
     /// The writer of that sink.

@@ -23,6 +23,7 @@ impl Ros2Port {
         let before = std::mem::replace(&mut self.mapping, Arc::clone(mapping));
         // What is peculiar under the new mapping is told anew.
         self.told.clear();
+        self.definitions.read_again(mapping.type_paths());
         let mut read = Read::new();
         for (variable, binding) in mapping.bindings(self.own) {
             if variable.topic.space == self.own {
@@ -64,7 +65,13 @@ impl Ros2Port {
         let Some(source) = self.sources.get_mut(index) else {
             return;
         };
+        // Its definition may be another since the files were read again.
+        let outdated = source
+            .definition
+            .as_ref()
+            .is_some_and(|it| !self.definitions.is_current(it, source.announced));
         let is_wanted = |value: &(TopicId, Selection)| match read.get(&source.dds_topic) {
+            _ if outdated => false,
             Some((message_type, values)) => {
                 source.message_type == *message_type && values.contains(value)
             }
@@ -108,15 +115,21 @@ impl Ros2Port {
     }
 
     fn give_up_sinks(&mut self) {
-        let (mapping, own) = (&self.mapping, self.own);
+        let (mapping, own, definitions) = (&self.mapping, self.own, &mut self.definitions);
         let gone = self.sinks.extract_if(|topic, sink| {
+            let outdated = sink
+                .open
+                .as_ref()
+                .is_some_and(|open| !definitions.is_current(&open.definition, open.announced));
             let variable = mapping.variable(*topic);
             let tied = variable.and_then(|variable| mapped(variable, own));
             let called = variable
                 .and_then(|variable| variable.service.as_ref())
                 .is_some_and(|service| service.space == own);
             // Values for a service have no topic.
-            called || !sink.is_like(&tied.unwrap_or_else(|| Sink::by_name(*topic, variable)))
+            called
+                || outdated
+                || !sink.is_like(&tied.unwrap_or_else(|| Sink::by_name(*topic, variable)))
         });
         // Their writers are disposed here.
         let gone = gone.map(|(topic, _)| PortEvent::Unbound { topic });
@@ -130,7 +143,7 @@ impl Ros2Port {
         message_type: TypeName,
         values: Vec<(TopicId, Selection)>,
     ) {
-        let index = self.source(dds_topic, message_type.clone());
+        let index = self.source(dds_topic, message_type);
         let Some(source) = self.sources.get_mut(index) else {
             return;
         };
@@ -144,7 +157,11 @@ impl Ros2Port {
         let Reading::Open { .. } = source.reading else {
             return;
         };
-        let Ok(message_type) = self.definitions.get(&message_type) else {
+        let Some(message_type) = source
+            .definition
+            .as_ref()
+            .map(|d| Arc::clone(&d.message_type))
+        else {
             return;
         };
         let received = now().utc;

@@ -43,8 +43,9 @@ impl ServiceGraph for Ros2Graph<'_> {
         array: bool,
     ) -> Result<Option<Arc<MessageType>>, String> {
         let name = self.definitions.standard_type(builtin, array);
-        name.map(|name| self.definitions.get(&name))
+        name.map(|name| self.definitions.here(&name))
             .transpose()
+            .map(|found| found.map(|found| found.message_type))
             .map_err(|error| error.to_string())
     }
 

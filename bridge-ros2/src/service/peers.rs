@@ -1,6 +1,6 @@
 //! Who else offers and calls services in a domain.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
@@ -96,6 +96,43 @@ impl Snapshot {
     }
 }
 
+/// The services that others than `participant` offer, with their types.
+pub(crate) fn offered(participant: &DomainParticipant) -> BTreeMap<String, BTreeSet<String>> {
+    let mut services: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    for (topic, endpoints) in Snapshot::of(participant).readers {
+        let name = topic
+            .strip_prefix("rq/")
+            .and_then(|name| name.strip_suffix("Request"));
+        let Some(name) = name.filter(|name| !name.contains("/_action/")) else {
+            continue;
+        };
+        let types = services.entry(format!("/{name}")).or_default();
+        types.extend(endpoints.iter().map(|one| service_type(&one.type_name)));
+    }
+    services
+}
+
+/// `std_srvs/SetBool` of `std_srvs::srv::dds_::SetBool_Request_`.
+fn service_type(request: &str) -> String {
+    let parts = request.split_once("::srv::dds_::");
+    let named = parts.and_then(|(package, rest)| Some((package, rest.strip_suffix("_Request_")?)));
+    named.map_or_else(
+        || request.to_owned(),
+        |(package, name)| format!("{package}/{name}"),
+    )
+}
+
 fn is_wanted(topic: &str) -> bool {
     topic.starts_with("rq/") || topic.starts_with("rr/") || topic.contains("/_action/")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_service_is_named_as_its_file_is() {
+        let of = ["std_srvs::srv::dds_::SetBool_Request_", "SomethingElse"];
+        assert_eq!(of.map(service_type), ["std_srvs/SetBool", "SomethingElse"]);
+    }
 }

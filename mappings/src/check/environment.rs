@@ -132,7 +132,16 @@ fn service(
     let Some(bound) = &variable.service else {
         return;
     };
-    let (ServiceRole::Call { service, .. } | ServiceRole::Poll { service, .. }) = &bound.role
+    let (ServiceRole::Call {
+        service,
+        service_type,
+        ..
+    }
+    | ServiceRole::Poll {
+        service,
+        service_type,
+        ..
+    }) = &bound.role
     else {
         return;
     };
@@ -140,16 +149,27 @@ fn service(
     let Some(services) = live.and_then(|live| live.services.as_ref()) else {
         return;
     };
-    if services.contains(service) {
-        return;
-    }
     let binding = binding_entry(entry, variable, bound.space);
     let named = binding.and_then(|one| given(&one.call).or_else(|| given(&one.poll)));
     let place = named.map_or(place, |(_, place)| place);
-    let message = format!("nobody offers the service `{}` now", short(service));
-    let note = findings.warning(Code::ServiceAway, place, message);
-    if let Some(near) = nearest(service, services.iter().map(String::as_str)) {
-        note.help(format!("did you mean `{}`?", short(near)));
+    let Some(types) = services.get(service) else {
+        let message = format!("nobody offers the service `{}` now", short(service));
+        let note = findings.warning(Code::ServiceAway, place, message);
+        if let Some(near) = nearest(service, services.keys().map(String::as_str)) {
+            note.help(format!("did you mean `{}`?", short(near)));
+        }
+        return;
+    };
+    let wanted = service_type.as_str();
+    if let Some(other) = types.iter().find(|one| one.as_str() != wanted) {
+        let message = format!(
+            "the service `{}` is called as {wanted}, and is {} now",
+            short(service),
+            short(other)
+        );
+        findings
+            .warning(Code::LiveTypeDiffers, place, message)
+            .help(format!("type: {}", short(other)));
     }
 }
 

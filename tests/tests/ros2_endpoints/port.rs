@@ -16,10 +16,14 @@ use crate::peer::{DOMAIN, SOON, heard, options, reads, string, writes};
 const LATCHED: [&str; 4] = ["--durability", "transient_local", "--depth", "1"];
 
 pub(crate) fn port() -> Ros2Port {
+    port_of(Arc::default())
+}
+
+pub(crate) fn port_of(mapping: Arc<Mapping>) -> Ros2Port {
     Ros2Port::start(PortOptions {
         domain: options(),
         own: SpaceId::new(DOMAIN).unwrap(),
-        mapping: Arc::new(Mapping::default()),
+        mapping,
         prefixes: Vec::new(),
     })
     .unwrap()

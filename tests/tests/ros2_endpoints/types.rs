@@ -1,13 +1,26 @@
 //! Types that nodes tell one another.
 
-use bridge_node::PortEvent;
+use bridge_node::{Delivery, Kept, Port, PortEvent};
+use mappings::Mapping;
+use messages::{Dialect, Registry};
 use serde_json::json;
 use system_tests::{Cell, Peer};
+use uadp::BuiltinType;
 
 use crate::peer::{SOON, writes};
-use crate::port::{bound, event, port, run_until, topic};
+use crate::port::{bound, event, port, port_of, run_until, topic};
 
 const UNKNOWN: &str = "type_description_interfaces/FieldType";
+
+/// The hash of another type of that name: of its first two fields.
+fn short() -> String {
+    let name = UNKNOWN.parse().unwrap();
+    let mut registry = Registry::empty(Dialect::Ros2);
+    registry
+        .add(&name, "uint8 type_id\nuint64 capacity\n")
+        .unwrap();
+    registry.type_hash(&name).unwrap().to_string()
+}
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_type_that_is_not_known_here_is_told_by_the_node_that_publishes_it() {
@@ -84,4 +97,182 @@ async fn the_node_tells_what_the_types_are_it_reads() {
         })],
         "{SOON:?}"
     );
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn two_definitions_of_one_name_are_each_read_as_their_publisher_has_it() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let (mut port, short) = (port(), short());
+    let _long = cell.cyclone("ros2_describe.py", &["serve"]);
+    let other = ["serve", "--topic", "/ua_2_2_8", "--name", "other"];
+    let _short = cell.cyclone(
+        "ros2_describe.py",
+        &[&other[..], &["--short", &short]].concat(),
+    );
+    let mut fields = std::collections::BTreeMap::new();
+    while fields.len() < 2 {
+        let (topic, leaves) = event(&mut port, |event| match event {
+            PortEvent::Bound {
+                topic,
+                message_type,
+                ..
+            } => Some((topic, message_type.leaves().len())),
+            _ => None,
+        })
+        .await;
+        fields.insert(topic, leaves);
+    }
+    assert_eq!(
+        fields.into_iter().collect::<Vec<_>>(),
+        [(topic("ua_2_2_8"), 2), (topic("ua_2_2_9"), 4)]
+    );
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_publisher_with_another_definition_than_the_topics_is_dropped_and_counted_until_it_is_alone()
+ {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let (mut port, short) = (port(), short());
+    let mut long = cell
+        .cyclone_started("ros2_describe.py", &["serve"])
+        .told()
+        .start()
+        .ready(SOON);
+    let of = topic("ua_2_2_9");
+    let first = event(&mut port, |event| match event {
+        PortEvent::Sample { payload, .. } => Some(payload),
+        _ => None,
+    })
+    .await;
+    assert_eq!(first[20], 9);
+    let other = ["serve", "--name", "other", "--short", &short];
+    let _short = cell.cyclone("ros2_describe.py", &other);
+    let lost = event(&mut port, |event| match event {
+        PortEvent::Lost { topic, why, .. } => Some((topic, why)),
+        PortEvent::Sample { .. } | PortEvent::Bound { .. } => Some((None, "it is read")),
+        _ => None,
+    })
+    .await;
+    assert_eq!(lost, (Some(of), "publisher of another definition"));
+    long.tell("leave");
+    let bound = event(&mut port, |event| match event {
+        PortEvent::Bound {
+            topic,
+            message_type,
+            ..
+        } => Some((topic, message_type.leaves().len())),
+        PortEvent::Sample { .. } => Some((of, 0)),
+        _ => None,
+    })
+    .await;
+    assert_eq!(bound, (of, 2));
+    let payload = event(&mut port, |event| match event {
+        PortEvent::Sample { payload, .. } => Some(payload),
+        _ => None,
+    })
+    .await;
+    assert_eq!((payload.len(), payload[4], payload[12]), (20, 7, 8));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_value_is_written_to_a_subscriber_whose_type_only_its_node_knows() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let (mut port, short) = (port(), short());
+    let of = topic("ua_1_2_9");
+    let reads = ["read", "--topic", "/ua_1_2_9"];
+    let reader = cell.cyclone("ros2_describe.py", &reads);
+    let shape = [
+        BuiltinType::Byte,
+        BuiltinType::UInt64,
+        BuiltinType::UInt64,
+        BuiltinType::String,
+    ];
+    port.wanted(of, &shape.map(|builtin| (builtin, false)), None);
+    assert_eq!(bound(&mut port, of).await, UNKNOWN);
+    let mut payload = vec![0, 1, 0, 0];
+    payload.extend_from_slice(&7_u64.to_le_bytes());
+    payload.extend_from_slice(&8_u64.to_le_bytes());
+    payload.extend_from_slice(&9_u64.to_le_bytes());
+    payload.extend_from_slice(b"\x04\0\0\0ten\0");
+    let delivery = Delivery {
+        topic: of,
+        payload: payload.into(),
+        source: None,
+        status: 0,
+        instance: None,
+        kept: Kept::Alone,
+    };
+    port.publish(delivery).unwrap();
+    run_until(&mut port, "the value is read", || {
+        !reader.values().is_empty()
+    })
+    .await;
+    let value =
+        json!({"type_id": 7, "capacity": 8, "string_capacity": 9, "nested_type_name": "ten"});
+    assert_eq!(reader.values(), [value]);
+
+    // Another that takes the same bytes for something else.
+    let other = [&reads[..], &["--name", "other", "--short", &short]].concat();
+    let _other = cell.cyclone("ros2_describe.py", &other);
+    let lost = event(&mut port, |event| match event {
+        PortEvent::Lost { topic, why, .. } => Some((topic, why)),
+        PortEvent::Bound { .. } => Some((None, "it is written anew")),
+        _ => None,
+    })
+    .await;
+    assert_eq!(lost, (Some(of), "subscriber of another definition"));
+}
+
+/// The next topic that is bound or unbound, with how many fields its type has, if it is bound.
+async fn next_bound(port: &mut bridge_ros2::Ros2Port) -> (mappings::TopicId, Option<usize>) {
+    event(port, |event| match event {
+        PortEvent::Bound {
+            topic,
+            message_type,
+            ..
+        } => Some((topic, Some(message_type.leaves().len()))),
+        PortEvent::Unbound { topic } => Some((topic, None)),
+        _ => None,
+    })
+    .await
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_saved_definition_file_counts_from_the_next_reload_on() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let file = cell.folder().join("types/geometry_msgs/msg/Point.msg");
+    std::fs::create_dir_all(file.parent().unwrap()).unwrap();
+    std::fs::write(&file, "float64 x\nfloat64 y\nfloat64 z\n").unwrap();
+    let text = format!(
+        "spaces: [{{id: 1}}, {{id: 2}}]\nnamespaces: {{2: urn:test}}\ntype_paths: [{}]\nvariables:\n  - {{node: ns=2;i=1, \
+         name: Read, origin: 2, ros: {{topic: /arm, type: geometry_msgs/Point}}}}\n  - {{node: ns=2;i=2, name: Written, \
+         origin: 1, ros: {{space: 2, topic: /to_arm, type: geometry_msgs/Point}}}}\n",
+        cell.folder().join("types").display()
+    );
+    let mapping = std::sync::Arc::new(Mapping::from_yaml(&text, "cell.yaml").mapping.unwrap());
+    let mut port = port_of(std::sync::Arc::clone(&mapping));
+    let (read, written) = (topic("ua_2_2_1"), topic("ua_1_2_2"));
+    let first = [next_bound(&mut port).await, next_bound(&mut port).await];
+    assert_eq!(first, [(read, Some(3)), (written, Some(3))]);
+    std::fs::write(&file, "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n").unwrap();
+    port.reload(&mapping);
+    let mut changed = Vec::new();
+    for _ in 0..4 {
+        changed.push(next_bound(&mut port).await);
+    }
+    let expected = [
+        (read, None),
+        (written, None),
+        (read, Some(4)),
+        (written, Some(4)),
+    ];
+    assert_eq!(changed, expected);
 }

@@ -400,7 +400,7 @@ impl Planner<'_> {
                     mappings::ServiceRole::Answer { .. } => None,
                 })
                 .collect();
-            let wanted = services.iter().filter(|name| {
+            let wanted = services.keys().filter(|name| {
                 let last = name.rsplit('/').next().unwrap_or_default();
                 !EACH_NODE.contains(&last)
                     && !of_mapping.contains(name.as_str())
@@ -460,9 +460,15 @@ fn candidates(name: &str, bound: Vec<(Bound, bool)>) -> Vec<Candidate> {
 }
 
 /// Services that nodes have for those who run them.
-const EACH_NODE: [&str; 4] = [
+const EACH_NODE: [&str; 10] = [
+    "describe_parameters",
     "get_loggers",
+    "get_parameter_types",
+    "get_parameters",
+    "get_type_description",
+    "list_parameters",
     "set_logger_level",
     "set_parameters",
+    "set_parameters_atomically",
     "tf2_frames",
 ];

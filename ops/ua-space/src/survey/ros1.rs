@@ -1,5 +1,6 @@
 //! The graph of a ROS 1 master.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use mappings::{LiveSpace, LiveTopic};
@@ -39,7 +40,15 @@ pub(crate) async fn survey(uri: &str) -> Result<LiveSpace, Failure> {
         }
     };
     let mut live = LiveSpace {
-        services: Some(graph.services.into_keys().take(MOST).collect()),
+        // The master knows no types of them.
+        services: Some(
+            graph
+                .services
+                .into_keys()
+                .take(MOST)
+                .map(|name| (name, BTreeSet::new()))
+                .collect(),
+        ),
         ..LiveSpace::default()
     };
     for (ends, published) in [(graph.publishers, true), (graph.subscribers, false)] {

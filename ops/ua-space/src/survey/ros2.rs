@@ -1,4 +1,4 @@
-//! The topics of a DDS domain.
+//! The topics and services of a DDS domain.
 
 use std::time::Duration;
 
@@ -18,14 +18,15 @@ pub(crate) async fn survey(domain: u16, wait: Duration) -> Result<LiveSpace, Fai
     let joined = join(domain)?;
     let end = Instant::now() + wait;
     let (mut graph, mut since) = (joined.graph(), Instant::now());
+    let mut services = joined.services();
     while Instant::now() < end {
         if !graph.participants().is_empty() && since.elapsed() >= SETTLED {
             break;
         }
         sleep(STEP).await;
-        let newer = joined.graph();
-        if newer != graph {
-            (graph, since) = (newer, Instant::now());
+        let (newer, offered) = (joined.graph(), joined.services());
+        if newer != graph || offered != services {
+            (graph, services, since) = (newer, offered, Instant::now());
         }
     }
     joined.leave(()).await;
@@ -33,7 +34,16 @@ pub(crate) async fn survey(domain: u16, wait: Duration) -> Result<LiveSpace, Fai
         let what = format!("nobody was discovered in DDS domain {domain} within {wait:?}");
         return Err(away(what, HELP));
     }
-    Ok(live(&graph))
+    let services = services.into_iter().take(MOST).map(|(name, mut types)| {
+        while types.len() > MOST_TYPES {
+            types.pop_last();
+        }
+        (name, types)
+    });
+    Ok(LiveSpace {
+        services: Some(services.collect()),
+        ..live(&graph)
+    })
 }
 
 fn join(domain: u16) -> Result<Domain, Failure> {

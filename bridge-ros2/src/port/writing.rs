@@ -1,0 +1,232 @@
+//! The topics we write: in which type and definition, and for whom.
+
+use std::sync::Arc;
+
+use bridge_node::PortEvent;
+use mappings::TopicId;
+use messages::Selection;
+use tokio::time::Instant;
+use tracing::{info, warn};
+
+use super::reconcile::Side;
+use super::{Ros2Port, lost};
+use crate::compatibility::Incompatibility;
+use crate::graph::Endpoint;
+use crate::outlet::Outlet;
+use crate::sink::{Open, shortest_deadline};
+
+impl Ros2Port {
+    pub(super) fn reconcile_sink(&mut self, topic: TopicId, now: Instant) {
+        let Some(sink) = self.sinks.get_mut(&topic) else {
+            return;
+        };
+        if self.graph.is_at_home(topic.space.into()) {
+            // Another bridge serves its space in this domain. What was written would stand beside it, and grow old.
+            let given_up = sink.open.take().is_some();
+            let dds_topic = sink.dds_topic.clone();
+            if given_up {
+                self.tell_once(&dds_topic, "at home", || {
+                    format!(
+                        "another bridge of this domain serves space {}: its values are left to it",
+                        topic.space
+                    )
+                });
+            }
+            return;
+        }
+        let readers = self.graph.readers(&sink.dds_topic);
+        if let Some(open) = &mut sink.open {
+            match open.outlet.set_readers(readers, now) {
+                Ok(()) => {}
+                Err(refusal) => self.events.push_back(lost(topic, refusal.label(), 1)),
+            }
+            self.schedule.waiting |= open.outlet.is_waiting();
+            if open.outlet.is_stuck(now) {
+                self.replace_writer(topic, now);
+                return;
+            }
+            if let Some(deadline) = open.shorter_deadline(readers) {
+                let before = open.deadline.replace(deadline);
+                open.tightened += 1;
+                self.offer_deadline(topic, before, now);
+                return;
+            }
+            let offered = sink.offered.with_deadline(open.deadline);
+            let dds_type = open.definition.name().dds();
+            let asks: Vec<_> = readers
+                .iter()
+                .filter(|reader| reader.type_name == dds_type)
+                .map(|reader| (reader.guid, Incompatibility::between(&offered, &reader.qos)))
+                .collect();
+            self.note_incompatible(&Side::Sink(topic), asks);
+        }
+        let Some(sink) = self.sinks.get(&topic) else {
+            return;
+        };
+        let readers = self.graph.readers(&sink.dds_topic);
+        if sink.serves(readers) {
+            self.note_other_definitions(topic);
+        } else {
+            self.open_sink(topic, now);
+        }
+    }
+
+    /// Tells and counts, once each, the readers that take what is written for another definition of its type.
+    fn note_other_definitions(&mut self, topic: TopicId) {
+        let Some(sink) = self.sinks.get(&topic) else {
+            return;
+        };
+        let Some(open) = &sink.open else { return };
+        let (name, ours) = (open.definition.name().clone(), open.announced);
+        let dds_type = name.dds();
+        let readers = self.graph.readers(&sink.dds_topic);
+        let other =
+            |reader: &&Endpoint| reader.type_name == dds_type && !reader.is_of(&dds_type, ours);
+        let others: Vec<Endpoint> = readers.iter().filter(other).cloned().collect();
+        let dds_topic = sink.dds_topic.clone();
+        for reader in others {
+            let (Some(theirs), Some(ours)) = (reader.type_hash, ours) else {
+                continue;
+            };
+            if !self.incompatible.insert(reader.guid) {
+                continue;
+            }
+            self.events.push_back(lost(topic, OTHER_DEFINITION_READ, 1));
+            let owner = self.domain.owner(reader.guid);
+            self.tell_once(&dds_topic, OTHER_DEFINITION_READ, || {
+                format!(
+                    "a subscriber of {} has another definition of {name}, with the hash {theirs}; the topic is written with \
+                     {ours}: it may misread the values",
+                    owner.as_deref().unwrap_or("an unnamed node"),
+                )
+            });
+        }
+    }
+
+    /// A reader that acknowledges nothing must not keep a value from the others.
+    fn replace_writer(&mut self, topic: TopicId, now: Instant) {
+        if let Some(dds_topic) = self.advertise_anew(topic, now) {
+            warn!(
+                topic = dds_topic,
+                "a subscriber does not acknowledge; advertised anew for the others"
+            );
+        }
+    }
+
+    /// A reader that asks for a deadline is matched by a writer that offers it.
+    fn offer_deadline(&mut self, topic: TopicId, before: Option<rustdds::Duration>, now: Instant) {
+        if let Some(dds_topic) = self.advertise_anew(topic, now) {
+            info!(
+                topic = dds_topic,
+                "a subscriber asks for a deadline; advertised anew with it"
+            );
+        } else if let Some(open) = self
+            .sinks
+            .get_mut(&topic)
+            .and_then(|sink| sink.open.as_mut())
+        {
+            // The writer there is goes on with what it offers; the next look tries again.
+            open.deadline = before;
+        }
+    }
+
+    /// Puts another writer in the place of a sink's; returns the topic.
+    pub(super) fn advertise_anew(&mut self, topic: TopicId, now: Instant) -> Option<String> {
+        let sink = self.sinks.get(&topic)?;
+        let open = sink.open.as_ref()?;
+        let dds_topic = sink.dds_topic.clone();
+        let qos = sink.offered.with_deadline(open.deadline);
+        let dds_type = open.definition.name().dds();
+        self.announce_type(&open.definition);
+        let writer = self.make(|domain| domain.open_writer(&dds_topic, &dds_type, &qos))?;
+        if let Some(open) = self
+            .sinks
+            .get_mut(&topic)
+            .and_then(|sink| sink.open.as_mut())
+        {
+            open.outlet.replace_writer(writer, now);
+        }
+        Some(dds_topic)
+    }
+
+    /// Opens a sink in the best type there is; one that is open in a lesser type is opened anew. Where a node is asked what
+    /// the type is, the next look goes on.
+    pub(super) fn open_sink(&mut self, topic: TopicId, now: Instant) {
+        let Some(sink) = self.sinks.get(&topic) else {
+            return;
+        };
+        let (dds_topic, offered) = (sink.dds_topic.clone(), sink.offered);
+        let readers = self.graph.readers(&dds_topic).to_vec();
+        let mut found = None;
+        for name in sink.candidates(&readers) {
+            let open = self.sinks.get(&topic).and_then(|sink| sink.open.as_ref());
+            let open = open.filter(|open| *open.definition.name() == name);
+            let current = open.and_then(|open| open.announced);
+            let Some(hash) = self.hash_that_counts(&name, &readers, current, now) else {
+                return;
+            };
+            match self.definitions.announced(&name, hash) {
+                Ok(definition) => {
+                    found = Some((hash.or(definition.hash), definition));
+                    break;
+                }
+                Err(error) => {
+                    self.tell_once(&dds_topic, "unknown type", || {
+                        format!("no value can be written in the type asked for: {error}")
+                    });
+                }
+            }
+        }
+        let Some((announced, definition)) = found else {
+            return;
+        };
+        let dds_type = definition.name().dds();
+        let sink = self.sinks.get_mut(&topic);
+        if let Some(open) = sink.and_then(|sink| sink.open.as_mut())
+            && (open.definition.name(), open.definition.hash)
+                == (definition.name(), definition.hash)
+        {
+            open.announced = announced;
+            if !readers.iter().any(|reader| reader.type_name == dds_type) {
+                self.tell_once(&dds_topic, "subscriber of another type", || {
+                    format!("a subscriber asks for another type than {dds_type}, in which the topic is written")
+                });
+            }
+            return;
+        }
+        let deadline = shortest_deadline(&readers);
+        let qos = offered.with_deadline(deadline);
+        self.announce_type(&definition);
+        let Some(writer) = self.make(|domain| domain.open_writer(&dds_topic, &dds_type, &qos))
+        else {
+            return;
+        };
+        info!(topic = dds_topic, message_type = %definition.name(), definition = %definition.from, ?offered, "advertised");
+        let mut outlet = Outlet::new(writer, offered);
+        if let Err(refusal) = outlet.set_readers(&readers, Instant::now()) {
+            self.events.push_back(lost(topic, refusal.label(), 1));
+        }
+        let message_type = Arc::clone(&definition.message_type);
+        let mut selection = Selection::Whole;
+        if let Some(sink) = self.sinks.get_mut(&topic) {
+            sink.learn_from(&message_type);
+            selection = sink.selection(message_type.name());
+            sink.open = Some(Open {
+                definition,
+                announced,
+                outlet,
+                deadline,
+                tightened: 0,
+                stamps: sink.stamps(&message_type),
+            });
+        }
+        self.events.push_back(PortEvent::Bound {
+            topic,
+            message_type,
+            selection,
+        });
+    }
+}
+
+/// Why a reader is counted that announces another hash than the one that is written.
+const OTHER_DEFINITION_READ: &str = "subscriber of another definition";
