@@ -16,13 +16,15 @@ use std::{
 use nix::sys::signal::Signal;
 use serde_json::Value;
 use system_tests::{
-    BareNode, Cell, MASTER, METRICS_ROS1, Peer, SERVER_ENDPOINT, UadpSocket, eventually, http_get,
-    metrics, string_frame, xml_rpc,
+    BareNode, Cell, Child, MASTER, METRICS_ROS1, METRICS_ROS2, Peer, SERVER_ENDPOINT, UadpSocket,
+    eventually, http_get, metrics, string_frame, xml_rpc,
 };
 use uadp::{NetworkMessage, NetworkMessageType, Scalar, Variant};
 
 const SOON: Duration = Duration::from_secs(30);
 const ROUTES: u16 = 500;
+/// How often each route is sent from DDS: at 50 Hz, for 8 s.
+const TICKS: u16 = 400;
 /// Each route is sent at 50 Hz: so many of them are due each millisecond.
 const EACH_MS: usize = 25;
 
@@ -77,7 +79,12 @@ fn listen(heard: &Arc<Mutex<Heard>>, ended: &Arc<AtomicBool>) -> std::thread::Jo
                     continue;
                 };
                 let route = message.writer_id.unwrap();
-                let said = text.parse().unwrap();
+                // Of what the peer of Cyclone DDS paces, the 12 digits before the time.
+                let number = match text.len() {
+                    36 => &text[8..20],
+                    _ => text,
+                };
+                let said = number.parse().unwrap();
                 let mut heard = heard.lock().unwrap();
                 heard.entry(route).or_default().push((sequence, said));
             }
@@ -285,6 +292,106 @@ fn bridge_ros2_leaves_the_routes_alone_that_an_edit_does_not_name() {
     }
     let sequences: Vec<u16> = heard[&1].iter().map(|(sequence, _)| *sequence).collect();
     assert!(sequences.is_sorted_by(|a, b| a < b), "{sequences:?}");
+}
+
+/// Has the peer send so many values on each of its topics, spread over 20 ms each; from which number on, and how many
+/// readers it had at the end.
+fn paced(peer: &mut Child, ticks: u16) -> (u16, u64) {
+    let sent = |peer: &Child| -> Vec<(u64, u64)> {
+        let lines = peer.json_lines();
+        let of = |line: &Value| Some((line["first"].as_u64()?, line["readers"].as_u64()?));
+        lines.iter().filter_map(of).collect()
+    };
+    let before = sent(peer).len();
+    peer.tell(&format!("{ticks} 36 20000000 0 0"));
+    let (first, readers) = eventually("it is sent", SOON, || sent(peer).get(before).copied());
+    (first.try_into().unwrap(), readers)
+}
+
+#[test]
+fn of_500_routes_from_dds_at_50_hz_only_the_edited_one_notices_the_edit() {
+    let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
+        return;
+    };
+    let mapping = |first: &str, more: &str| {
+        let text = mapping(ROUTES, first);
+        text.replace("{id: 1}", "{id: 1}\n  - {id: 2}")
+            .replace("origin: 1", "origin: 2")
+            + more
+    };
+    let written = "  - {node: ns=2;i=600, name: Written, origin: 1, ros: {space: 2, topic: /written, type: \
+                   std_msgs/String, field: data}}\n";
+    let file = cell.file("cell.yaml", &mapping("/r1", written));
+    let mut bridge = cell.bridge_ros2(&[file.to_str().unwrap()]);
+    let routes = ROUTES.to_string();
+    // It keeps all it sends, so that a busy machine costs time and no samples.
+    let kept = ["--first", "1", "--spread", "--depth", "1000"];
+    let pace = [&["pace", "/r", "--topics", &routes][..], &kept].concat();
+    let mut sends = cell.cyclone_c(&pace);
+    let mut moved = cell.cyclone_c(&["pace", "/moved"]);
+    let mut reads = cell.cyclone_c(&["sub", "/written", "std_msgs/String", "--counts"]);
+    let mut writers = |count: u64| {
+        reads.wait_for_json("the writers change", SOON, |line| {
+            (line["writers"] == count).then_some(())
+        });
+    };
+    writers(1);
+    eventually("each route has a reader", SOON, || {
+        (paced(&mut sends, 1).1 == u64::from(ROUTES)).then_some(())
+    });
+    let (heard, ended) = (Arc::default(), Arc::new(AtomicBool::new(false)));
+    let listener = listen(&heard, &ended);
+
+    let sending = std::thread::spawn(move || (paced(&mut sends, TICKS), sends));
+    let heard_of = |route: u16| {
+        let heard: std::sync::MutexGuard<'_, Heard> = heard.lock().unwrap();
+        heard.get(&route).map_or(0, Vec::len)
+    };
+    eventually("all are heard", SOON, || {
+        (1..=ROUTES).all(|route| heard_of(route) > 25).then_some(())
+    });
+    save(&file, &mapping("/moved", ""));
+    bridge.wait_for_line("was read again", SOON);
+    writers(0);
+    eventually("the other topic has a reader", SOON, || {
+        (paced(&mut moved, 1).1 == 1).then_some(())
+    });
+    let (first, _) = paced(&mut moved, 50);
+    let other = first + 50 - 1;
+    let ((first, _), mut sends) = sending.join().unwrap();
+    let last = first + TICKS - 1;
+    eventually("the last are heard", SOON, || {
+        let heard: std::sync::MutexGuard<'_, Heard> = heard.lock().unwrap();
+        let is_last = |(route, of): (&u16, &Vec<(u16, u16)>)| {
+            let last = if *route == 1 { other } else { last };
+            of.last().is_some_and(|(_, said)| *said == last)
+        };
+        heard.iter().all(is_last).then_some(())
+    });
+    ended.store(true, Ordering::Relaxed);
+    listener.join().unwrap();
+    eventually("what is taken out is disposed of", SOON, || {
+        (paced(&mut sends, 1).1 == u64::from(ROUTES) - 1).then_some(())
+    });
+    let lines = bridge.lines();
+    let unbound: Vec<&String> = lines
+        .iter()
+        .filter(|line| line.contains("unbound"))
+        .collect();
+    assert_eq!(unbound.len(), 2, "{unbound:?}");
+    let heard = heard.lock().unwrap();
+    assert_eq!(heard.len(), usize::from(ROUTES));
+    for (route, all) in heard.iter().filter(|(route, _)| **route != 1) {
+        let (first, number) = all[0];
+        let offset = first.wrapping_sub(number);
+        for (sequence, number) in all {
+            assert_eq!(sequence.wrapping_sub(*number), offset, "{route}: {all:?}");
+        }
+    }
+    let sequences: Vec<u16> = heard[&1].iter().map(|(sequence, _)| *sequence).collect();
+    assert!(sequences.is_sorted_by(|a, b| a < b), "{sequences:?}");
+    let status = metrics(METRICS_ROS2).unwrap();
+    assert_eq!(system_tests::drops(&status["topics"]), 0, "{status}");
 }
 
 #[test]

@@ -152,8 +152,13 @@ void subscribe(const Arguments& arguments) {
         });
     Line().field("ready", topic);
     uint64_t said = 0;
+    int writers = 0;
     while (!Lifetime::told()) {
         std::this_thread::sleep_for(std::chrono::milliseconds(50));
+        if (const int now = reader->writers(); now != writers) {
+            writers = now;
+            Line().field("writers", writers);
+        }
         const std::lock_guard<std::mutex> guard(heard);
         if (counts && tally.received() != said) {
             said = tally.received();

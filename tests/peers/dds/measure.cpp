@@ -179,6 +179,7 @@ void pace(const Arguments& arguments) {
         writers.push_back(
             participant->writer(dds_topic("rt", topic), dds_type("msg", "std_msgs/String"), quality));
     }
+    const bool spread = arguments.has("spread");
     Line().field("ready", writers.size());
     Body body;
     uint64_t number = 0;
@@ -191,6 +192,8 @@ void pace(const Arguments& arguments) {
             return;
         }
         uint64_t refused = 0;
+        // Those of a millisecond.
+        const uint64_t at_once = std::max<uint64_t>(1, writers.size() * 1000000 / std::max<int64_t>(period, 1));
         const uint64_t first = number;
         auto due = Clock::now();
         const auto start = due;
@@ -200,14 +203,26 @@ void pace(const Arguments& arguments) {
             }
             std::this_thread::sleep_until(due);
             for (uint32_t topic = 0; topic < writers.size(); ++topic) {
+                const auto later = std::chrono::nanoseconds(period) * topic / writers.size();
+                if (spread && topic % at_once == 0) {
+                    std::this_thread::sleep_until(due + later);
+                }
                 Stamp{topic, number, now()}.put(body, size);
                 refused += writers[topic]->write(body) ? 0 : 1;
             }
             due += std::chrono::nanoseconds(period);
         }
         const double seconds = std::chrono::duration<double>(Clock::now() - start).count();
-        Line().field("first", first).field("sent", ticks * writers.size()).field("refused", refused).field(
-            "seconds", seconds);
+        int readers = 0;
+        for (const auto& writer : writers) {
+            readers += writer->readers();
+        }
+        Line()
+            .field("first", first)
+            .field("sent", ticks * writers.size())
+            .field("refused", refused)
+            .field("seconds", seconds)
+            .field("readers", readers);
     }
 }
 
