@@ -108,6 +108,8 @@ impl Deny {
                     .cargo(&[
                         "install",
                         "--locked",
+                        // It runs for seconds and is built in a third of the time.
+                        "--debug",
                         &format!("cargo-deny@{DENY}"),
                         "--root",
                     ])
