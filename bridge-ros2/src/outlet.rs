@@ -112,8 +112,6 @@ impl Outlet {
 
     /// Puts a new writer of the same topic and policies in place. What waits is written once its readers know it.
     pub fn replace_writer(&mut self, writer: Writer, now: Instant) {
-        // Not for the reader because of which it is replaced.
-        let patience = if self.is_stuck(now) { SETTLE } else { PATIENCE };
         self.writer = writer;
         self.full_since = None;
         self.in_flight = 0;
@@ -121,9 +119,10 @@ impl Outlet {
             self.waiting.extend(self.last.clone());
         }
         if let Audience::Present { settling, .. } = &mut self.audience {
+            // Not for the reader because of which it is replaced.
             *settling = Some(Settling {
                 since: now,
-                patience,
+                patience: SETTLE,
             });
         }
     }
@@ -166,13 +165,7 @@ impl Outlet {
             Audience::Present { .. } => {}
         }
         if !self.is_settled(now) {
-            let bytes: usize = self.waiting.iter().map(|s| s.payload.len()).sum();
-            if self.waiting.len() < self.settling_room() && bytes < MAX_IN_FLIGHT {
-                self.waiting.push_back(sample);
-                return Ok(());
-            }
-            // Readers that have answered must not lose samples for one that says nothing.
-            self.settle();
+            return self.queue(sample, self.offered.waiting_room().max(SETTLING_ROOM));
         }
         self.flush(now)?;
         if !self.waiting.is_empty() {
@@ -229,27 +222,6 @@ impl Outlet {
         };
         settling.take_if(|settling| settling.is_over(&self.writer, now));
         settling.is_none()
-    }
-
-    /// How many samples may wait for readers to learn of the writer. Of a state topic as many as go out at once then: an old
-    /// value must not stand before a newer one.
-    fn settling_room(&self) -> usize {
-        match self.offered {
-            Offered::KeepLatest => SETTLING_STATES,
-            Offered::DropOldest(_) => SETTLING_EVENTS,
-        }
-    }
-
-    fn settle(&mut self) {
-        if let Audience::Present { settling, .. } = &mut self.audience {
-            *settling = None;
-        }
-    }
-
-    /// How many samples wait, which go with it.
-    #[must_use]
-    pub fn waiting(&self) -> u64 {
-        u64::try_from(self.waiting.len()).unwrap_or(u64::MAX)
     }
 
     /// A reader may match between two snapshots; what comes after the match is for it.
@@ -362,10 +334,9 @@ impl Settling {
         let readers = writer.matched_readers();
         let age = now.saturating_duration_since(self.since);
         let told = readers.silent + readers.greeting == 0 && readers.in_step > 0;
-        // Those that were seen may not have matched yet.
-        let some = readers.in_step + readers.greeting + readers.best_effort > 0;
+        // Where nobody has matched, the policies of those there are do not go with ours.
         told && readers.best_effort == 0
-            || some && readers.silent == 0 && age >= SETTLE
+            || readers.silent == 0 && age >= SETTLE
             || age >= self.patience
     }
 
@@ -380,9 +351,8 @@ impl Settling {
 const SETTLE: Duration = Duration::from_millis(250);
 /// How long to wait for a first reader that has not said anything: what tells it of us may have been lost, and said again.
 const PATIENCE: Duration = Duration::from_secs(3);
-/// Samples that may wait for that, by what the topic carries.
-const SETTLING_STATES: usize = 128;
-const SETTLING_EVENTS: usize = 512;
+/// Samples that may wait for that, at least.
+const SETTLING_ROOM: usize = 512;
 /// How long a state topic may lag behind for the sake of one reader. A reader that was killed, or lost its radio link,
 /// holds up RustDDS' writer until its lease ends, 10 to 20 s later.
 const STUCK_AFTER: Duration = Duration::from_millis(500);

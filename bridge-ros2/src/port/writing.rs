@@ -88,7 +88,7 @@ impl Ros2Port {
             let (Some(theirs), Some(ours)) = (reader.type_hash, ours) else {
                 continue;
             };
-            if !self.misreading.insert(reader.guid) {
+            if !self.incompatible.insert(reader.guid) {
                 continue;
             }
             self.events.push_back(lost(topic, OTHER_DEFINITION_READ, 1));
@@ -209,11 +209,6 @@ impl Ros2Port {
         let message_type = Arc::clone(&definition.message_type);
         let mut selection = Selection::Whole;
         if let Some(sink) = self.sinks.get_mut(&topic) {
-            let waiting = sink.open.as_ref().map_or(0, |open| open.outlet.waiting());
-            if waiting > 0 {
-                let events = &mut self.events;
-                events.push_back(lost(topic, "its type is another now", waiting));
-            }
             sink.learn_from(&message_type);
             selection = sink.selection(message_type.name());
             sink.open = Some(Open {
