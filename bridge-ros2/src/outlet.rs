@@ -335,9 +335,9 @@ impl Settling {
         let age = now.saturating_duration_since(self.since);
         let told = readers.silent + readers.greeting == 0 && readers.in_step > 0;
         // Where nobody has matched, the policies of those there are do not go with ours.
-        told && readers.best_effort == 0
-            || readers.silent == 0 && age >= SETTLE
-            || age >= self.patience
+        // Never before that: those that were seen may not all have matched yet.
+        let told = told && readers.best_effort == 0 || readers.silent == 0;
+        age >= SETTLE && told || age >= self.patience
     }
 
     /// Whether the readers most likely get what is written now.
