@@ -331,13 +331,9 @@ impl Settling {
     /// Whether the readers get what is written now: those that acknowledge say so.
     #[cfg(feature = "patched-dds")]
     fn is_over(&self, writer: &Writer, now: Instant) -> bool {
-        let readers = writer.matched_readers();
         let age = now.saturating_duration_since(self.since);
-        let told = readers.silent + readers.greeting == 0 && readers.in_step > 0;
-        // Where nobody has matched, the policies of those there are do not go with ours.
         // Never before that: those that were seen may not all have matched yet.
-        let told = told && readers.best_effort == 0 || readers.silent == 0;
-        age >= SETTLE && told || age >= self.patience
+        age >= SETTLE && writer.matched_readers().silent == 0 || age >= self.patience
     }
 
     /// Whether the readers most likely get what is written now.
