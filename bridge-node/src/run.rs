@@ -221,7 +221,11 @@ impl<P: Port> Shell<P> {
                 selection,
             } => match self.router.bind(topic, &message_type, &selection, now()) {
                 Ok(()) => info!(%topic, message_type = %message_type.name(), "bound"),
-                Err(error) => warn!(%topic, %error, "the topic cannot cross"),
+                Err(error) => {
+                    warn!(%topic, %error, "the topic cannot cross");
+                    // By what it was bound to before it would be misread.
+                    self.router.unbind(topic, now());
+                }
             },
             PortEvent::Unbound { topic } => self.unbound(topic),
             PortEvent::Left { topic, publisher } => self.router.left(topic, publisher, now()),

@@ -76,8 +76,8 @@ pub struct Services {
     /// The number of the next poll.
     next_poll: usize,
     tasks: JoinSet<()>,
-    /// The checksums of the types that are called: definitions may be others when a mapping is read again.
-    checksums: HashMap<TypeName, String>,
+    /// The types that are called: definitions may be others when a mapping is read again.
+    types: HashMap<TypeName, Arc<ServiceType>>,
 }
 
 /// What the values of one variable call.
@@ -148,10 +148,34 @@ impl Services {
             polls: Vec::new(),
             next_poll: 0,
             tasks: JoinSet::new(),
-            checksums: HashMap::new(),
+            types: HashMap::new(),
         };
         let events = services.reload(graph, own, (&Mapping::default(), mapping));
         (services, events)
+    }
+
+    /// The types of the services that the mapping calls, as far as they are known. One whose file cannot be read for the
+    /// moment is what it was.
+    fn called_types(
+        &self,
+        graph: &mut impl ServiceGraph,
+        own: SpaceId,
+        mapping: &Mapping,
+    ) -> HashMap<TypeName, Arc<ServiceType>> {
+        let mut types = HashMap::new();
+        for (variable, _) in mapping.services(own) {
+            let Some(name) = called_type(mapping, variable.topic) else {
+                continue;
+            };
+            if types.contains_key(name) {
+                continue;
+            }
+            let found = graph.service_type(name).ok();
+            if let Some(found) = found.or_else(|| self.types.get(name).cloned()) {
+                types.insert(name.clone(), found);
+            }
+        }
+        types
     }
 
     /// Ends what only `before` ties to services and starts what only `after` does; what both have alike goes on.
@@ -165,8 +189,12 @@ impl Services {
     ) -> Vec<PortEvent> {
         // Those that were ended before.
         while self.tasks.try_join_next().is_some() {}
-        let checksums = checksums(graph, own, after);
-        let alike = |name: &TypeName| self.checksums.get(name) == checksums.get(name);
+        let types = self.called_types(graph, own, after);
+        let alike = |name: &TypeName| match (self.types.get(name), types.get(name)) {
+            (Some(was), Some(is)) => was.is_same(is),
+            (None, None) => true,
+            (Some(_), None) | (None, Some(_)) => false,
+        };
         let defined = |topic: TopicId| called_type(after, topic).is_none_or(alike);
         let kept: HashSet<TopicId> = after
             .services(own)
@@ -174,7 +202,7 @@ impl Services {
             .filter(|topic| is_same(*topic, (before, after)) && defined(*topic))
             .collect();
         let kept = |topic: TopicId| kept.contains(&topic);
-        self.checksums = checksums;
+        self.types = types;
         let mut events = Vec::new();
         for (variable, binding) in before.services(own) {
             if !kept(variable.topic) {
@@ -495,24 +523,6 @@ fn called_type(mapping: &Mapping, topic: TopicId) -> Option<&TypeName> {
             ServiceRole::Poll { .. } | ServiceRole::Answer { .. } => None,
         },
     }
-}
-
-/// Of the types of the services that are called, as far as they are known.
-fn checksums(
-    graph: &mut impl ServiceGraph,
-    own: SpaceId,
-    mapping: &Mapping,
-) -> HashMap<TypeName, String> {
-    let mut checksums = HashMap::new();
-    for (variable, _) in mapping.services(own) {
-        if let Some(name) = called_type(mapping, variable.topic)
-            && !checksums.contains_key(name)
-            && let Ok(found) = graph.service_type(name)
-        {
-            checksums.insert(name.clone(), found.md5().to_owned());
-        }
-    }
-    checksums
 }
 
 fn bound(topic: TopicId, service_type: &ServiceType, selection: &Selection) -> PortEvent {

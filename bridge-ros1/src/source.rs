@@ -117,6 +117,11 @@ impl Source {
         }
     }
 
+    /// Has publishers that were not taken in looked at again, with their next message.
+    pub(crate) fn forget_strangers(&mut self) {
+        self.strangers.clear();
+    }
+
     /// Takes a publisher in. `found` is its type, unless there is none that can be read.
     pub(crate) fn meet(&mut self, peer: &Arc<Peer>, found: Option<Arc<MessageType>>) -> Met {
         let expected = |found: &Arc<MessageType>| {

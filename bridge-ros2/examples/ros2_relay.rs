@@ -57,7 +57,7 @@ async fn relay(from: String, to: String, domain: u16) -> Result<(), Failure> {
     })?;
     let (from, to) = (format!("rt{from}"), format!("rt{to}"));
     let offered = Offered::DropOldest(ROOM);
-    let mut outlet = Outlet::new(domain.writer(&to, TYPE, offered)?, offered);
+    let mut outlet = Outlet::new(domain.writer(&to, TYPE, offered)?, offered, domain.joined());
     let mut inbox = Inbox::new();
     inbox.insert(
         (),

@@ -59,14 +59,15 @@ impl Definitions {
         self.found.clear();
     }
 
-    /// Whether it is still what endpoints mean that announce this hash.
+    /// Whether it is still what endpoints mean that announce this hash. A file that cannot be read for the moment changes
+    /// nothing.
     pub(crate) fn is_current(
         &mut self,
         definition: &Definition,
         announced: Option<TypeHash>,
     ) -> bool {
         let now = self.announced(definition.name(), announced);
-        now.is_ok_and(|now| now.hash == definition.hash)
+        !now.is_ok_and(|now| now.hash != definition.hash)
     }
 
     /// The type of that name with all it needs, as endpoints mean it that announce no hash: built in, or read from files;

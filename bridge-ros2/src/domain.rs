@@ -15,6 +15,7 @@ use rustdds::{
     QosPolicies, QosPolicyBuilder, RTPSEntity, Subscriber, Topic, TopicKind,
 };
 use thiserror::Error;
+use tokio::time::Instant;
 use tracing::warn;
 
 use crate::clock::{self, RosClock};
@@ -158,6 +159,7 @@ pub struct Domain {
     // Dropped in this order: first the node withdraws its name, while the participant can still say so.
     node: Node,
     domain: u16,
+    joined: Instant,
     /// The type hashes to announce, by DDS type name.
     type_hashes: Mutex<BTreeMap<String, String>>,
     publisher: Publisher,
@@ -210,6 +212,7 @@ impl Domain {
         let domain = Self {
             node: Node::start(options.node.clone(), channels)?,
             domain: options.domain,
+            joined: Instant::now(),
             type_hashes: Mutex::default(),
             publisher,
             subscriber,
@@ -245,6 +248,12 @@ impl Domain {
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
             .insert(dds_type.to_owned(), hash.into());
+    }
+
+    /// When it was joined. Participants that were there before become known in the 250 ms from then on.
+    #[must_use]
+    pub fn joined(&self) -> Instant {
+        self.joined
     }
 
     /// What others have in the domain by now. Nodes of participants that are gone are forgotten with it.

@@ -22,6 +22,7 @@ use crate::raw::{Payload, Writer};
 pub struct Outlet {
     writer: Writer,
     offered: Offered,
+    joined: Instant,
     audience: Audience,
     /// Samples for which the send window had no room, oldest first.
     waiting: VecDeque<Sample>,
@@ -86,12 +87,14 @@ impl Refusal {
 }
 
 impl Outlet {
-    /// Wraps a writer created with the policies of `offered`.
+    /// Wraps a writer created with the policies of `offered` in a domain joined at `joined`
+    /// ([`Domain::joined`](crate::domain::Domain::joined)).
     #[must_use]
-    pub fn new(writer: Writer, offered: Offered) -> Self {
+    pub fn new(writer: Writer, offered: Offered, joined: Instant) -> Self {
         Self {
             writer,
             offered,
+            joined,
             audience: Audience::Nobody { held: None },
             waiting: VecDeque::new(),
             full_since: None,
@@ -112,6 +115,8 @@ impl Outlet {
 
     /// Puts a new writer of the same topic and policies in place. What waits is written once its readers know it.
     pub fn replace_writer(&mut self, writer: Writer, now: Instant) {
+        // Not for the reader because of which it is replaced.
+        let patience = if self.is_stuck(now) { SETTLE } else { PATIENCE };
         self.writer = writer;
         self.full_since = None;
         self.in_flight = 0;
@@ -119,10 +124,9 @@ impl Outlet {
             self.waiting.extend(self.last.clone());
         }
         if let Audience::Present { settling, .. } = &mut self.audience {
-            // Not for the reader because of which it is replaced.
             *settling = Some(Settling {
                 since: now,
-                patience: SETTLE,
+                patience,
             });
         }
     }
@@ -165,7 +169,13 @@ impl Outlet {
             Audience::Present { .. } => {}
         }
         if !self.is_settled(now) {
-            return self.queue(sample, self.offered.waiting_room().max(SETTLING_ROOM));
+            let bytes: usize = self.waiting.iter().map(|s| s.payload.len()).sum();
+            if self.waiting.len() < self.settling_room() && bytes < MAX_IN_FLIGHT {
+                self.waiting.push_back(sample);
+                return Ok(());
+            }
+            // Readers that have answered must not lose samples for one that says nothing.
+            self.settle();
         }
         self.flush(now)?;
         if !self.waiting.is_empty() {
@@ -220,8 +230,29 @@ impl Outlet {
         let Audience::Present { settling, .. } = &mut self.audience else {
             return true;
         };
-        settling.take_if(|settling| settling.is_over(&self.writer, now));
+        settling.take_if(|settling| settling.is_over(&self.writer, self.joined, now));
         settling.is_none()
+    }
+
+    /// How many samples may wait for readers to learn of the writer. Of a state topic as many as go out at once then: an old
+    /// value must not stand before a newer one.
+    fn settling_room(&self) -> usize {
+        match self.offered {
+            Offered::KeepLatest => SETTLING_STATES,
+            Offered::DropOldest(_) => SETTLING_EVENTS,
+        }
+    }
+
+    fn settle(&mut self) {
+        if let Audience::Present { settling, .. } = &mut self.audience {
+            *settling = None;
+        }
+    }
+
+    /// How many samples wait, which go with it.
+    #[must_use]
+    pub fn waiting(&self) -> u64 {
+        u64::try_from(self.waiting.len()).unwrap_or(u64::MAX)
     }
 
     /// A reader may match between two snapshots; what comes after the match is for it.
@@ -330,15 +361,22 @@ impl std::fmt::Debug for Outlet {
 impl Settling {
     /// Whether the readers get what is written now: those that acknowledge say so.
     #[cfg(feature = "patched-dds")]
-    fn is_over(&self, writer: &Writer, now: Instant) -> bool {
+    fn is_over(&self, writer: &Writer, joined: Instant, now: Instant) -> bool {
+        let readers = writer.matched_readers();
         let age = now.saturating_duration_since(self.since);
-        // Never before that: those that were seen may not all have matched yet.
-        age >= SETTLE && writer.matched_readers().silent == 0 || age >= self.patience
+        let told = readers.silent + readers.greeting == 0 && readers.in_step > 0;
+        // Readers that were there before us are not all known yet when the first of them has answered.
+        let all = now.saturating_duration_since(joined) >= SETTLE;
+        // Those that were seen may not have matched yet.
+        let some = readers.in_step + readers.greeting + readers.best_effort > 0;
+        told && readers.best_effort == 0 && all
+            || some && readers.silent == 0 && age >= SETTLE
+            || age >= self.patience
     }
 
     /// Whether the readers most likely get what is written now.
     #[cfg(not(feature = "patched-dds"))]
-    fn is_over(&self, _writer: &Writer, now: Instant) -> bool {
+    fn is_over(&self, _writer: &Writer, _joined: Instant, now: Instant) -> bool {
         now.saturating_duration_since(self.since) >= SETTLE.min(self.patience)
     }
 }
@@ -347,8 +385,9 @@ impl Settling {
 const SETTLE: Duration = Duration::from_millis(250);
 /// How long to wait for a first reader that has not said anything: what tells it of us may have been lost, and said again.
 const PATIENCE: Duration = Duration::from_secs(3);
-/// Samples that may wait for that, at least.
-const SETTLING_ROOM: usize = 512;
+/// Samples that may wait for that, by what the topic carries.
+const SETTLING_STATES: usize = 128;
+const SETTLING_EVENTS: usize = 512;
 /// How long a state topic may lag behind for the sake of one reader. A reader that was killed, or lost its radio link,
 /// holds up RustDDS' writer until its lease ends, 10 to 20 s later.
 const STUCK_AFTER: Duration = Duration::from_millis(500);

@@ -97,6 +97,8 @@ pub struct Ros2Port {
     clock: RosClock,
     /// Endpoints of others that were told and counted as incompatible with ours.
     incompatible: BTreeSet<GUID>,
+    /// Readers of others that were told and counted as having another definition of a type than we write.
+    misreading: BTreeSet<GUID>,
     /// What was already told, so that it is told once.
     told: BTreeSet<(String, &'static str)>,
     drops: Drops,
@@ -163,6 +165,7 @@ impl Ros2Port {
             budget: MAX_BATCH,
             clock,
             incompatible: BTreeSet::new(),
+            misreading: BTreeSet::new(),
             told: BTreeSet::new(),
             drops: Drops::default(),
             schedule: Schedule::new(),

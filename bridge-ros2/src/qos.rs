@@ -112,8 +112,7 @@ impl Offered {
 }
 
 /// Samples a reader keeps for us: while we are busy, or while they wait for one before them that was lost and is repaired,
-/// which takes seconds on an overloaded machine. What was read is released, and what waits for a repair is bounded by its
-/// bytes, too.
+/// which takes seconds on an overloaded machine. What was read is released, and what is not is bounded by its bytes, too.
 #[cfg(feature = "patched-dds")]
 pub const READER_DEPTH: i32 = 4096;
 /// Samples a reader keeps for us while we are busy. RustDDS as published keeps them until newer ones push them out, so this

@@ -147,7 +147,7 @@ impl Findings {
             let texts = [&mut found.label, &mut found.help];
             let texts = texts.into_iter().flatten().chain([&mut found.message]);
             for text in texts {
-                *text = secret::masked(&hidden(text, &secrets)).into_owned();
+                *text = secret::masked_where_cut(&hidden(text, &secrets)).into_owned();
             }
         }
         if self.left_out > 0 {

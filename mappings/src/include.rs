@@ -5,7 +5,6 @@ use crate::code::Code;
 use crate::document::{self, Document};
 use crate::findings::Findings;
 use crate::read::{At, Field, Reader};
-use crate::secret;
 use crate::surroundings::{Readers, Surroundings, beside, fits};
 use crate::tree::{self, MAX_BYTES, Place};
 
@@ -71,7 +70,7 @@ impl<'a> Loader<'a> {
         for (value, written) in tree.values {
             self.findings.hide(value, written);
         }
-        self.secrets(tree.secrets, &path);
+        self.secrets(&tree.secrets, &path);
         self.expanded = self.expanded.saturating_add(tree.expanded);
         if self.expanded > MAX_BYTES {
             let place = Place {
@@ -89,11 +88,16 @@ impl<'a> Loader<'a> {
         let (mut document, _) = document::read(&tree.root, &mut Reader::new(self.findings))?;
         let includes = document.include.take();
         let type_paths = document.type_paths.as_mut();
-        for At { value, .. } in type_paths
+        for At { place, value } in type_paths
             .and_then(|at| at.value.as_mut())
             .into_iter()
             .flatten()
         {
+            if value.as_ref().is_some_and(|named| named.contains("://")) {
+                let note = self.findings.warning(Code::TypePath, *place, URL);
+                note.help("a folder with ROS packages in it, or a file, relative to the mapping; a URL brings no types");
+                *value = None;
+            }
             // An empty one stays what it is, for a finding.
             if let Some(named) = value.as_mut().filter(|named| !named.is_empty()) {
                 *named = beside(&path, named);
@@ -113,29 +117,29 @@ impl<'a> Loader<'a> {
         Some(())
     }
 
-    /// Notes the passwords that stand in a file, and has them hidden.
-    fn secrets(&mut self, found: Vec<(Place, String)>, path: &str) {
-        if found.is_empty() {
+    /// Notes at the first of them that passwords stand in a file.
+    fn secrets(&mut self, found: &[Place], path: &str) {
+        let Some((place, more)) = found.split_first() else {
             return;
-        }
+        };
+        let here = "a password stands here in plain text";
+        let message = match more.len() {
+            0 => here.to_owned(),
+            more => format!("{here}, and {more} more in this file"),
+        };
         let readers = self.around.readers(path);
-        for (place, text) in found {
-            let masked = secret::masked(&text).into_owned();
-            self.findings.hide(text, masked);
-            let message = "a password stands here in plain text";
-            let note = self.findings.warning(Code::Secret, place, message);
-            let apart = "write it as ${NAME}, which the environment of the program gives";
-            let Some(readers) = readers else {
-                note.help(apart);
-                continue;
-            };
-            let (who, mode) = match readers {
-                Readers::Group => ("the group of the file", "g-r"),
-                Readers::Everybody => ("everybody on this host", "go-r"),
-            };
-            let help = format!("{apart}, or keep the file to its owner: chmod {mode} {path}");
-            note.label(format!("{who} can read it")).help(help);
-        }
+        let note = self.findings.warning(Code::Secret, *place, message);
+        let apart = "write it as ${NAME}, which the environment of the program gives";
+        let Some(readers) = readers else {
+            note.help(apart);
+            return;
+        };
+        let (who, mode) = match readers {
+            Readers::Group => ("the group of the file", "g-r"),
+            Readers::Everybody => ("everybody on this host", "go-r"),
+        };
+        let help = format!("{apart}, or keep the file to its owner: chmod {mode} {path}");
+        note.label(format!("{who} can read it")).help(help);
     }
 
     fn note(&mut self, fault: tree::Fault) {
@@ -146,6 +150,12 @@ impl<'a> Loader<'a> {
     }
 
     fn include(&mut self, named: &str, place: Place) {
+        if named.contains("://") {
+            let note = self.findings.error(Code::Include, place, URL);
+            note.help("files are read from the disk: write a path, from the folder of this file");
+            self.partial = true;
+            return;
+        }
         let from = self.open.last().cloned().unwrap_or_default();
         let (folder, last) = named.rsplit_once('/').unwrap_or(("", named));
         if folder.contains('*') {
@@ -290,5 +300,7 @@ fn once<T>(key: &str, whole: &mut Field<T>, part: Field<T>, findings: &mut Findi
     }
 }
 
+/// Not told with the text, which may have a password in it.
+const URL: &str = "a URL stands where a path of a file is wanted";
 const MAX_NESTED: usize = 8;
 const MAX_FILES: usize = 256;

@@ -95,8 +95,8 @@ pub(crate) struct Tree<'t> {
     pub(crate) values: BTreeMap<String, String>,
     /// How many bytes the values of variables come to, each time that one is named.
     pub(crate) expanded: usize,
-    /// The values with a password in them, which stands in the text.
-    pub(crate) secrets: Vec<(Place, String)>,
+    /// Where values have a password in them, which stands in the text.
+    pub(crate) secrets: Vec<Place>,
 }
 
 /// Reads the text of a file, whose number all places have. `variable` looks up the environment.
@@ -189,7 +189,7 @@ struct Builder<'v, 't> {
     faults: Vec<Fault>,
     values: BTreeMap<String, String>,
     expanded: usize,
-    secrets: Vec<(Place, String)>,
+    secrets: Vec<Place>,
     variable: &'v dyn Fn(&str) -> Option<String>,
 }
 
@@ -217,11 +217,10 @@ impl<'t> Builder<'_, 't> {
                 Ok(())
             }
             Event::Scalar(text, style, anchor, _) => {
-                let written = secret::is_written(&text);
-                let text = self.expand(text, place)?;
-                if written {
-                    self.secrets.push((place, text.clone().into_owned()));
+                if secret::is_written(&text) {
+                    self.secrets.push(place);
                 }
+                let text = self.expand(text, place)?;
                 let null = style == ScalarStyle::Plain
                     && matches!(&*text, "" | "~" | "null" | "Null" | "NULL");
                 let kind = if null { Kind::Null } else { Kind::Scalar(text) };

@@ -371,3 +371,64 @@ fn a_password_in_a_file_is_told_with_who_can_read_it_and_never_shown() {
         "{shown}"
     );
 }
+
+#[test]
+fn the_passwords_of_a_file_are_one_finding_and_leave_room_for_errors() {
+    let url = |n: usize| format!("  - \"http://robot:open-sesame-{n}@host\"\n");
+    let urls: String = (0..300).map(url).collect();
+    let text = format!("{HEAD}servr:\n{urls}");
+    let checked = Beside::default().check(&text);
+    let of_secrets: Vec<_> = checked
+        .findings
+        .iter()
+        .filter(|found| found.code == Code::Secret)
+        .collect();
+    let [found] = of_secrets[..] else {
+        panic!("{}", checked.render(&text));
+    };
+    assert!(
+        found.at.line == 4 && found.message.ends_with(", and 299 more in this file"),
+        "{found}"
+    );
+    let shown = checked.render(&text);
+    assert!(
+        shown.contains("servr") && !shown.contains("sesame"),
+        "{shown}"
+    );
+}
+
+#[test]
+fn a_url_is_no_path_and_its_password_is_not_shown() {
+    let url = "https://robot:open-sesame@host/x.yaml";
+    for (key, code) in [("include", Code::Include), ("type_paths", Code::TypePath)] {
+        let text = format!("{HEAD}{key}: [\"{url}\"]\n");
+        let wild = text.replace("x.yaml", "*.yaml");
+        let given = text.replace(url, "${URL}");
+        for text in [text, wild, given] {
+            let checked = Beside::default().set("URL", url).check(&text);
+            let mut codes = checked.findings.iter().map(|found| found.code);
+            assert!(codes.any(|found| found == code), "{text}");
+            let shown = checked.render(&text);
+            assert!(
+                shown.contains("a URL stands where a path") && !shown.contains("sesame"),
+                "{shown}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_long_value_of_the_environment_is_not_told_as_a_constant() {
+    let text = format!(
+        "{HEAD}variables:\n  - {{node: ns=2;i=1, name: A, origin: 1, ros: {{poll: /b, type: nav_msgs/GetPlan, \
+         request: {{tolerance: \"${{TOKEN}}\"}}, field: plan.poses}}}}\n"
+    );
+    let checked = Beside::default()
+        .set("TOKEN", &"open-sesame".repeat(8))
+        .check(&text);
+    let shown = checked.render(&text);
+    assert!(
+        shown.contains("`${TOKEN}` is not a number") && !shown.contains("sesame"),
+        "{shown}"
+    );
+}

@@ -96,7 +96,7 @@ pub enum PlanError {
         name: TypeName,
         /// The path of the field.
         path: String,
-        /// The text, cut at 64 characters.
+        /// The text, cut at 64 characters, with `...` behind.
         text: String,
         /// What may stand there, with its article.
         expected: String,

@@ -65,6 +65,11 @@ impl MessageType {
         &self.name
     }
 
+    /// Whether it is the same on the wire, by its fields and those of all messages in it.
+    pub fn is_same(&self, other: &Self) -> bool {
+        self.dialect == other.dialect && self.shape == other.shape
+    }
+
     /// The ROS whose bytes it describes.
     pub fn dialect(&self) -> Dialect {
         self.dialect

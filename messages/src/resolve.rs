@@ -15,7 +15,7 @@ pub(crate) const MOST_FIELDS: usize = 4096;
 const BIGGEST: usize = 64 << 20;
 
 /// A message with the messages in it, as the plan compiler walks it.
-#[derive(Debug)]
+#[derive(Debug, PartialEq, Eq)]
 pub(crate) struct Shape {
     pub(crate) name: TypeName,
     pub(crate) fields: Vec<ShapeField>,
@@ -28,14 +28,14 @@ pub(crate) struct Shape {
     height: usize,
 }
 
-#[derive(Debug)]
+#[derive(Debug, PartialEq, Eq)]
 pub(crate) struct ShapeField {
     pub(crate) name: String,
     pub(crate) kind: ShapeKind,
     pub(crate) arity: Arity,
 }
 
-#[derive(Debug)]
+#[derive(Debug, PartialEq, Eq)]
 pub(crate) enum ShapeKind {
     Primitive(Primitive),
     Message(Arc<Shape>),

@@ -30,6 +30,11 @@ impl ServiceType {
         &self.md5
     }
 
+    /// Whether requests and answers are the same on the wire, by their fields and those of all messages in them.
+    pub fn is_same(&self, other: &Self) -> bool {
+        self.request.is_same(&other.request) && self.response.is_same(&other.response)
+    }
+
     /// What a caller sends, `package/NameRequest`.
     pub fn request(&self) -> &Arc<MessageType> {
         &self.request

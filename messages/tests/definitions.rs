@@ -353,6 +353,24 @@ fn constants_are_told_with_their_values() {
 }
 
 #[test]
+fn a_service_is_the_same_while_no_message_in_it_is_another() {
+    for dialect in [Dialect::Ros1, Dialect::Ros2] {
+        let service = |inner: &str| {
+            let mut registry = Registry::empty(dialect);
+            registry.add(&name("t/Inner"), inner).unwrap();
+            registry
+                .add_service(&name("t/S"), "t/Inner[] all\n---\nbool ok\n")
+                .unwrap();
+            registry.service(&name("t/S")).unwrap()
+        };
+        let was = service("int32 a\n");
+        assert!(was.is_same(&service("# as before\nint32 a\n")));
+        assert!(!was.is_same(&service("int64 a\n")), "{dialect:?}");
+        assert!(!was.is_same(&service("int32 b\n")), "{dialect:?}");
+    }
+}
+
+#[test]
 fn a_service_is_two_messages_found_only_through_it() {
     let mut registry = Registry::bundle(Dialect::Ros1);
     let text = "uint8 ADD = 1\nuint8 cmd\n--- # the answer\nItem[] items\n";

@@ -52,7 +52,11 @@ fn options(network: &str) -> DomainOptions {
 
 /// A writer of the topic that knows so many readers, and is known to them.
 fn outlet(domain: &Domain, offered: Offered, readers: usize) -> Outlet {
-    let mut outlet = Outlet::new(domain.writer(TOPIC.1, STRING, offered).unwrap(), offered);
+    let mut outlet = Outlet::new(
+        domain.writer(TOPIC.1, STRING, offered).unwrap(),
+        offered,
+        domain.joined(),
+    );
     eventually("the readers are discovered", SOON, || {
         let graph = Graph::snapshot(domain.participant());
         let known = graph.readers(TOPIC.1);

@@ -136,7 +136,22 @@ impl Router {
         let leaves = match (message, plan) {
             (Some(_), Some(plan)) => plan.leaves(),
             (None, _) if !mapped.is_empty() => &mapped,
-            (Some(_), None) | (None, _) => return,
+            (Some(_), None) => return,
+            (None, _) => {
+                // The mapping has left it open again.
+                *description = None;
+                *announce_at = None;
+                let (_, _, writer_id) = topic.triple();
+                if let Some(discovery) = &mut self.discovery
+                    && let Some(topics) = discovery.writers.get_mut(&writer_id)
+                {
+                    topics.retain(|of| *of != topic);
+                    if topics.is_empty() {
+                        discovery.writers.remove(&writer_id);
+                    }
+                }
+                return;
+            }
         };
         let source = Source {
             topic,

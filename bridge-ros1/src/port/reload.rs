@@ -23,6 +23,10 @@ impl Ros1Port {
         // What is peculiar under the new mapping is told anew.
         self.told.clear();
         self.definitions.read_again(mapping.type_paths());
+        // A type that nobody knew may be known now.
+        for source in &mut self.sources {
+            source.forget_strangers();
+        }
         let read = self.read(mapping);
         for index in 0..self.sources.len() {
             self.give_up_values(index, &read);

@@ -100,7 +100,7 @@ impl Shared {
         let outputs = Outputs {
             peers: peers.clone(),
             feedback: FeedbackWriter::new(feedback),
-            status: Outlet::new(status, offered),
+            status: Outlet::new(status, offered, domain.joined()),
         };
         Ok(Self {
             action: action.clone(),

@@ -33,6 +33,7 @@ impl Ros2Port {
         self.graph = self.domain.graph();
         let graph = &self.graph;
         self.incompatible.retain(|guid| graph.holds(*guid));
+        self.misreading.retain(|guid| graph.holds(*guid));
         self.report_drops();
         self.announce_anew(now);
         self.take_descriptions(now);
@@ -286,8 +287,10 @@ impl Ros2Port {
         let (name, current) = (source.message_type.clone(), source.announced);
         let dds_type = name.dds();
         let writers = self.graph.writers(&source.dds_topic);
-        let read_so = |writer: &&Endpoint| writer.is_of(&dds_type, current);
-        if current.is_some() && writers.iter().any(|writer| read_so(&writer)) {
+        let read_so = |writer: &Endpoint| writer.is_of(&dds_type, current);
+        // Only while it is read by the definition of that hash: one that comes with ours goes before one nobody tells.
+        let known = source.definition.as_ref().map(|it| it.hash) == Some(current);
+        if current.is_some() && known && writers.iter().any(read_so) {
             return true;
         }
         let writers = writers.to_vec();
@@ -310,7 +313,12 @@ impl Ros2Port {
             .is_none_or(same)
         {
             source.reading = Reading::Pending;
+            source.live = false;
             drop(self.inbox.remove(slot));
+            // What was sent by the other definition is not to be repeated by this.
+            let unbound = source.values.iter();
+            self.events
+                .extend(unbound.map(|(topic, _)| PortEvent::Unbound { topic: *topic }));
             info!(topic = source.dds_topic, message_type = %name, "its publishers have another definition of the type now");
         }
         true

@@ -88,7 +88,7 @@ impl Ros2Port {
             let (Some(theirs), Some(ours)) = (reader.type_hash, ours) else {
                 continue;
             };
-            if !self.incompatible.insert(reader.guid) {
+            if !self.misreading.insert(reader.guid) {
                 continue;
             }
             self.events.push_back(lost(topic, OTHER_DEFINITION_READ, 1));
@@ -202,13 +202,18 @@ impl Ros2Port {
             return;
         };
         info!(topic = dds_topic, message_type = %definition.name(), definition = %definition.from, ?offered, "advertised");
-        let mut outlet = Outlet::new(writer, offered);
+        let mut outlet = Outlet::new(writer, offered, self.domain.joined());
         if let Err(refusal) = outlet.set_readers(&readers, Instant::now()) {
             self.events.push_back(lost(topic, refusal.label(), 1));
         }
         let message_type = Arc::clone(&definition.message_type);
         let mut selection = Selection::Whole;
         if let Some(sink) = self.sinks.get_mut(&topic) {
+            let waiting = sink.open.as_ref().map_or(0, |open| open.outlet.waiting());
+            if waiting > 0 {
+                let events = &mut self.events;
+                events.push_back(lost(topic, "its type is another now", waiting));
+            }
             sink.learn_from(&message_type);
             selection = sink.selection(message_type.name());
             sink.open = Some(Open {

@@ -208,6 +208,7 @@ impl<'c> Bindings<'c> {
             // Where no origin is known, that is the finding.
             reads: site.subject.origin.is_none_or(|origin| origin == space),
             declared: site.subject.declared,
+            alone: true,
         };
         let selection = chosen.selection(message_type.as_deref(), (place, way), findings)?;
         let fields = match message_type {

@@ -231,6 +231,7 @@ fn kind(
     let way = Way {
         reads: true,
         declared: None,
+        alone: false,
     };
     let Some(at) = &entry.r#type else {
         let selection = chosen.selection(None, (chosen_at(owner), way), findings)?;

@@ -335,6 +335,7 @@ fn asked(
         let way = Way {
             reads: false,
             declared: site.subject.declared,
+            alone: true,
         };
         let (mut taken, mut fields) = (Vec::new(), None);
         if chosen.names_fields() {
@@ -458,6 +459,7 @@ fn response_field(
     let way = Way {
         reads: true,
         declared: site.subject.declared,
+        alone: true,
     };
     let at = (chosen.place().unwrap_or(place), way);
     let Some(response) = response else {

@@ -65,6 +65,7 @@ pub(super) fn fields(
         // The variable has no one type that all would be converted to.
         let way = Way {
             declared: None,
+            alone: false,
             ..way
         };
         let one = shaping.select(field, message_type, (place, way), findings)?;

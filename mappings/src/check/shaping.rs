@@ -69,6 +69,8 @@ impl<'k> From<&'k FieldEntry> for Keys<'k> {
 pub(super) struct Way {
     pub(super) reads: bool,
     pub(super) declared: Option<ValueType>,
+    /// It is the one value of a variable, whose `type` may be given.
+    pub(super) alone: bool,
 }
 
 /// The field and the part of it; `None` when that is faulty, which is noted.
@@ -269,7 +271,7 @@ impl Shaping {
                 true => format!("scaled values do not fit {} without rounding", into.name()),
                 false => format!("not every {} fits {}", from.name(), into.name()),
             };
-            let help = match way.reads && self.scaled && declared.is_none() {
+            let help = match way.reads && self.scaled && way.alone && declared.is_none() {
                 true => {
                     "give the variable a `type: Double`, or say what becomes of a value that does not fit: `out_of_range: refuse` or `clamp`"
                 }

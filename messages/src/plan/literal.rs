@@ -136,10 +136,19 @@ impl<'m> Given<'m> {
         PlanError::Constant {
             name: self.message.clone(),
             path: self.path.to_owned(),
-            text: text.chars().take(64).collect(),
+            text: short(text),
             expected: expected.to_owned(),
         }
     }
+}
+
+/// At most 64 characters of a text; `...` stands where it was cut.
+fn short(text: &str) -> String {
+    let mut short: String = text.chars().take(64).collect();
+    if short.len() < text.len() {
+        short.push_str("...");
+    }
+    short
 }
 
 /// Most names of constants an error tells.
@@ -371,6 +380,13 @@ mod tests {
                 assert_eq!(number(kind, text), None, "{kind:?} {text}");
             }
         }
+    }
+
+    #[test]
+    fn a_long_text_is_told_with_where_it_was_cut() {
+        let long = "ä".repeat(64);
+        assert_eq!(short(&long), long);
+        assert_eq!(short(&format!("{long}x")), format!("{long}..."));
     }
 
     #[test]

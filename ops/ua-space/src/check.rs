@@ -1,5 +1,6 @@
 //! What is wrong with a mapping, for people and for programs.
 
+use std::fs::File;
 use std::io::{self, BufWriter, Write as _};
 use std::path::PathBuf;
 
@@ -65,7 +66,10 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
 fn read(file: &str) -> Result<String, Failure> {
     let read = match file {
         "-" => type_files::read_text(io::stdin().lock()),
-        file => Disk.read(file),
+        // It may be a pipe, which who names it here fills.
+        file => File::open(file)
+            .map_err(|error| error.to_string())
+            .and_then(type_files::read_text),
     };
     read.map_err(|why| Failure::Io(format!("cannot read {file}: {why}")))
 }

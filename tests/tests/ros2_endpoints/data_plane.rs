@@ -56,7 +56,11 @@ async fn sample(inbox: &mut Inbox<()>) -> (Vec<u8>, u64) {
 }
 
 fn outlet(domain: &Domain, offered: Offered) -> Outlet {
-    Outlet::new(domain.writer(OURS.1, STRING, offered).unwrap(), offered)
+    Outlet::new(
+        domain.writer(OURS.1, STRING, offered).unwrap(),
+        offered,
+        domain.joined(),
+    )
 }
 
 fn meet_readers(domain: &Domain, outlet: &mut Outlet) {

@@ -187,6 +187,18 @@ fn the_files_a_mapping_includes_and_the_environment_are_looked_at() {
 
 #[cfg(unix)]
 #[test]
+fn a_pipe_that_is_named_is_read_as_a_file() {
+    let ended = run_on(&["check", "/dev/stdin"], FAULTY.as_bytes());
+    assert_eq!(ended.code, 78, "{}", ended.stderr);
+    assert!(
+        ended.stdout.contains("--> /dev/stdin:6:5"),
+        "{}",
+        ended.stdout
+    );
+}
+
+#[cfg(unix)]
+#[test]
 fn a_password_in_a_file_others_can_read_is_told_and_not_shown() {
     use std::os::unix::fs::PermissionsExt as _;
     let text = "server: {endpoint: \"opc.tcp://robot:sesame@gateway\"}\n";
