@@ -112,6 +112,41 @@ fn values_cross_both_ways_with_secured_peers_and_nothing_of_them_is_readable_on_
     }
 }
 
+/// The GUIDs of secured peers do not tell whose they are, and each maker ties replies to requests in its own way.
+#[test]
+fn services_of_secured_peers_of_both_makers_answer() {
+    const CELL: &str = "
+spaces:
+  - {id: 2}
+namespaces:
+  2: urn:test
+variables:
+  - {node: ns=2;i=1, name: Light, type: Boolean, origin: 0, ros: {space: 2, call: /light, type: std_srvs/SetBool, field: data}}
+  - {node: ns=2;i=2, name: Lit, origin: 2, ros: {answer: ns=2;i=1, field: message}}
+  - {node: ns=2;i=3, name: Fan, type: Boolean, origin: 0, ros: {space: 2, call: /fan, type: std_srvs/SetBool, field: data}}
+  - {node: ns=2;i=4, name: Turned, origin: 2, ros: {answer: ns=2;i=3, field: message}}
+";
+    let Some(cell) = secured_cell(&[Peer::CycloneC, Peer::FastDds]) else {
+        return;
+    };
+    let keystore = Keystore::make(&cell, "keystore");
+    let file = cell.file("cell.yaml", CELL);
+    let mut ua = UaSide::join();
+    let _bridge = answering(cell.secured_bridge(&keystore, &[file.to_str().unwrap()]));
+    let _light = cell
+        .secured_cyclone(&keystore, &["serve", "/light", "--text", "by cyclone"])
+        .start()
+        .ready(SOON);
+    // A response in CDR: true, and a text of seven characters.
+    let reply = "0100000008000000627920666173740000";
+    let fan = ["serve", "/fan", "std_srvs/SetBool", "--hex", reply];
+    let _fan = cell.secured_fastdds(&keystore, &fan).start().ready(SOON);
+    for (asked, answered, text) in [(1, 2, "by cyclone"), (3, 4, "by fast")] {
+        ua.write((0, 2, asked), Scalar::Boolean(true));
+        ua.hear_scalar((2, 2, answered), Scalar::String(Some(text)));
+    }
+}
+
 #[test]
 fn secured_peers_get_each_others_keys_although_datagrams_are_lost() {
     let Some(cell) = secured_cell(&[Peer::CycloneC]) else {

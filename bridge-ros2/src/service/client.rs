@@ -410,7 +410,7 @@ impl Driver {
     }
 
     fn write(&self, request: &Bytes, server: GUID) -> Result<RequestKey, Unsent> {
-        let mapping = ServiceMapping::of(server);
+        let mapping = self.peers.mapping_of(server);
         let count = i64::try_from(self.count).unwrap_or(i64::MAX);
         let Outgoing { payload, related } = self
             .id
@@ -444,7 +444,7 @@ impl Driver {
     fn replied(&mut self, reply: Option<Received>) {
         // Ourselves as server, which no client here is for.
         let foreign = reply.filter(|reply| !self.peers.is_own(reply.writer));
-        let opened = foreign.map(|reply| self.id.open_reply(reply));
+        let opened = foreign.map(|reply| self.id.open_reply(self.peers.mapping_of(reply.writer), reply));
         if let Some(Ok(Some((key, body)))) = opened
             && let Some(asked) = self.keys.get(&key).and_then(|id| self.asked.remove(id))
         {

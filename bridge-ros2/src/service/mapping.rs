@@ -1,6 +1,6 @@
 //! How requests and replies are tied together on the wire, which each vendor's ROS 2 middleware does in its own way.
 //!
-//! The mapping is chosen per peer, from the vendor in its GUID: a server answers each client in the client's way, and
+//! The mapping is chosen per peer, from its vendor: a server answers each client in the client's way, and
 //! a client asks each server in the server's. Pure: bytes and identities in, bytes and identities out.
 
 use bytes::{Bytes, BytesMut};
@@ -21,10 +21,10 @@ pub enum ServiceMapping {
 }
 
 impl ServiceMapping {
-    /// The way of whoever has an endpoint of that GUID. Vendors start a GUID with their number (RTPS 2.5, 8.2.4.1).
+    /// The way of a vendor, by its number in the OMG's list.
     #[must_use]
-    pub fn of(endpoint: GUID) -> Self {
-        if endpoint.prefix.as_ref().starts_with(&CYCLONE) {
+    pub fn of(vendor: [u8; 2]) -> Self {
+        if vendor == CYCLONE {
             Self::Cyclone
         } else {
             Self::Enhanced
@@ -101,10 +101,13 @@ impl Fault {
 }
 
 /// Takes a request apart: how to answer it, and its body behind an encapsulation header.
-pub(super) fn open_request(received: Received) -> Result<(ReplyTo, Bytes), Fault> {
+pub(super) fn open_request(
+    mapping: ServiceMapping,
+    received: Received,
+) -> Result<(ReplyTo, Bytes), Fault> {
     let order = ByteOrder::of(&received.payload)?;
     let client = received.writer;
-    match ServiceMapping::of(client) {
+    match mapping {
         ServiceMapping::Cyclone => {
             let (header, body) = split(&received.payload, order)?;
             Ok((ReplyTo::Cyclone { header, client }, body))
@@ -186,10 +189,11 @@ impl ClientId {
     /// Takes a reply apart. `None` when it is for another client.
     pub(super) fn open_reply(
         self,
+        mapping: ServiceMapping,
         received: Received,
     ) -> Result<Option<(RequestKey, Bytes)>, Fault> {
         let order = ByteOrder::of(&received.payload)?;
-        match ServiceMapping::of(received.writer) {
+        match mapping {
             ServiceMapping::Cyclone => {
                 let (header, body) = split(&received.payload, order)?;
                 let (id, number) = header.split_at(8);
@@ -343,7 +347,7 @@ mod tests {
                 sequence: 9,
                 related: None,
             };
-            let (to, body) = open_request(request).unwrap();
+            let (to, body) = open_request(ServiceMapping::Cyclone, request).unwrap();
             assert_eq!(body.as_ref(), [0, order, 0, 0, 1]);
             let reply = seal_reply(&to, Bytes::from_static(TRUE)).unwrap();
             assert_eq!(reply.payload[12..20], [5, 0, 0, 0, 0, 0, 0, 0]);
@@ -370,7 +374,7 @@ mod tests {
             sequence_number: SequenceNumber::from_high_low(-1, 0),
         };
         for (related, client) in [(Some(named), reader), (None, writer)] {
-            let (to, _) = open_request(request(related)).unwrap();
+            let (to, _) = open_request(ServiceMapping::Enhanced, request(related)).unwrap();
             let reply = seal_reply(&to, Bytes::from_static(TRUE)).unwrap();
             assert_eq!(reply.payload.as_ref(), TRUE);
             let identity = reply.related.unwrap();
@@ -406,10 +410,10 @@ mod tests {
             };
             let reply = received(reply, guid(vendor, 3), 1);
             assert_eq!(
-                ours().open_reply(reply.clone()),
+                ours().open_reply(mapping, reply.clone()),
                 Ok(Some((key, Bytes::from_static(TRUE))))
             );
-            assert_eq!(other.open_reply(reply), Ok(None));
+            assert_eq!(other.open_reply(mapping, reply), Ok(None));
         }
     }
 
@@ -426,7 +430,10 @@ mod tests {
                 sequence: 1,
                 related: None,
             };
-            assert_eq!(open_request(request).unwrap_err(), fault);
+            assert_eq!(
+                open_request(ServiceMapping::Cyclone, request).unwrap_err(),
+                fault
+            );
         }
         let to = ReplyTo::Cyclone {
             header: [0; CYCLONE_HEADER],

@@ -10,6 +10,8 @@ use tokio::time::Instant;
 use crate::domain::Domain;
 use crate::graph::Endpoint;
 
+use super::ServiceMapping;
+
 /// The endpoints of other participants on the topics of services and actions, shared by all of a process: RustDDS'
 /// discovery is copied once for all that look at the same time.
 ///
@@ -52,6 +54,11 @@ impl ServicePeers {
         snapshot
     }
 
+    /// The way of whoever has that endpoint.
+    pub(crate) fn mapping_of(&self, endpoint: GUID) -> ServiceMapping {
+        ServiceMapping::of(vendor_of(&self.0.participant, endpoint))
+    }
+
     /// Whether an endpoint is one of ours.
     pub(crate) fn is_own(&self, endpoint: GUID) -> bool {
         endpoint.prefix == self.0.participant.guid().prefix
@@ -62,6 +69,24 @@ impl std::fmt::Debug for ServicePeers {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("ServicePeers").finish_non_exhaustive()
     }
+}
+
+/// The vendor of a participant with that endpoint, as it says itself. GUIDs start with the same number (RTPS 2.5, 8.2.4.1)
+/// unless DDS Security makes them (DDS Security 1.1, 9.3.3).
+#[cfg(feature = "patched-dds")]
+fn vendor_of(participant: &DomainParticipant, endpoint: GUID) -> [u8; 2] {
+    let told = participant.vendor_of(endpoint.prefix);
+    told.unwrap_or_else(|| vendor_in(endpoint))
+}
+
+#[cfg(not(feature = "patched-dds"))]
+fn vendor_of(_participant: &DomainParticipant, endpoint: GUID) -> [u8; 2] {
+    vendor_in(endpoint)
+}
+
+fn vendor_in(endpoint: GUID) -> [u8; 2] {
+    let [a, b, ..] = endpoint.to_bytes();
+    [a, b]
 }
 
 impl Snapshot {

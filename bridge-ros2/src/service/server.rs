@@ -271,7 +271,10 @@ impl Driver {
         let opened = match request {
             // Of a client of ours: nobody here is to be asked what others are.
             Some(request) if self.peers.is_own(request.writer) => return,
-            Some(request) => mapping::open_request(request).map_err(mapping::Fault::label),
+            Some(request) => {
+                let mapping = self.peers.mapping_of(request.writer);
+                mapping::open_request(mapping, request).map_err(mapping::Fault::label)
+            }
             None => Err("an unknown encoding"),
         };
         match opened {

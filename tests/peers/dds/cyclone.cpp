@@ -1,4 +1,5 @@
-// Cyclone DDS by its C library. Its type is std_msgs/String; CYCLONEDDS_URI names the interface, as everywhere.
+// Cyclone DDS by its C library. Its message is std_msgs/String, its service std_srvs/SetBool; CYCLONEDDS_URI names the
+// interface, as everywhere.
 #include <atomic>
 #include <cstdio>
 #include <map>
@@ -7,7 +8,7 @@
 
 #include "domain.hpp"
 #include "lines.hpp"
-#include "std_msgs_string.h"
+#include "ros_types.h"
 
 namespace {
 
@@ -150,17 +151,60 @@ public:
         return std::make_unique<CycloneReader>(participant_, make_topic(topic, type), quality, std::move(heard));
     }
 
+    dds_entity_t topic_of(const std::string& name, const dds_topic_descriptor_t& type) {
+        return made(dds_create_topic(participant_, &type, name.c_str(), nullptr, nullptr), "topic");
+    }
+    dds_entity_t entity() const { return participant_; }
+
 private:
     dds_entity_t make_topic(const std::string& name, const std::string& type) {
         if (type != std_msgs_msg_dds__String__desc.m_typename) {
             Arguments::fail("this peer knows std_msgs/String only, not " + type);
         }
-        return made(
-            dds_create_topic(participant_, &std_msgs_msg_dds__String__desc, name.c_str(), nullptr, nullptr), "topic");
+        return topic_of(name, std_msgs_msg_dds__String__desc);
     }
 
     dds_entity_t participant_;
 };
+
+using Request = std_srvs_srv_dds__SetBool_Request_;
+using Reply = std_srvs_srv_dds__SetBool_Response_;
+
+// Calls `heard` with each sample there is.
+template <typename Kind, typename Heard> void take_all(dds_entity_t reader, const Heard& heard) {
+    void* samples[1] = {};
+    dds_sample_info_t info;
+    while (dds_take(reader, samples, &info, 1, 1) > 0) {
+        if (info.valid_data) {
+            heard(*static_cast<const Kind*>(samples[0]));
+        }
+        dds_return_loan(reader, samples, 1);
+    }
+}
+
+// A server of std_srvs/SetBool, which answers each request with what it says and --text.
+void serve(const Arguments& arguments) {
+    const std::string name = arguments.position(1, "a service");
+    std::string text = arguments.text("text", "served");
+    CycloneParticipant participant(arguments);
+    const dds_entity_t requests
+        = participant.topic_of(dds_topic("rq", name, "Request"), std_srvs_srv_dds__SetBool_Request__desc);
+    const dds_entity_t replies
+        = participant.topic_of(dds_topic("rr", name, "Reply"), std_srvs_srv_dds__SetBool_Response__desc);
+    dds_qos_t* qos = policies(Quality{});
+    const dds_entity_t writer = made(dds_create_writer(participant.entity(), replies, qos, nullptr), "writer");
+    const dds_entity_t reader = made(dds_create_reader(participant.entity(), requests, qos, nullptr), "reader");
+    dds_delete_qos(qos);
+    Line().field("ready", name);
+    while (!Lifetime::told()) {
+        take_all<Request>(reader, [&](const Request& request) {
+            const Reply reply{request.client, request.count, request.data, text.data()};
+            const bool taken = dds_write(writer, &reply) == DDS_RETCODE_OK;
+            Line().field("request", request.data).field("replied", taken);
+        });
+        std::this_thread::sleep_for(std::chrono::milliseconds(2));
+    }
+}
 
 } // namespace
 
@@ -171,8 +215,10 @@ std::unique_ptr<Participant> join(const Arguments& arguments) {
 int main(int count, char** words) {
     const Arguments arguments(count, words);
     Lifetime::bound(arguments.number("limit", 120));
-    const std::string command = arguments.position(0, "a command: pub, sub, relay, crowd");
-    if (!run_shared(command, arguments)) {
+    const std::string command = arguments.position(0, "a command; README.md lists them");
+    if (command == "serve") {
+        serve(arguments);
+    } else if (!run_shared(command, arguments)) {
         Arguments::fail("there is no command " + command);
     }
     return 0;

@@ -33,7 +33,7 @@ const PROGRAMS: &[Program] = &[
     Program {
         name: "cyclone-peer",
         sources: &["cyclone.cpp", "commands.cpp", "measure.cpp"],
-        types: Some("std_msgs_string"),
+        types: Some("ros_types"),
         libraries: &["-lddsc", "-pthread"],
     },
 ];
