@@ -6,6 +6,7 @@
 
 mod descriptions;
 mod drops;
+mod inquiry;
 mod reconcile;
 mod reload;
 mod schedule;

@@ -3,7 +3,7 @@
 use bridge_node::Described;
 use bytes::{Bytes, BytesMut};
 use mappings::{Overflow, TopicId, Variable};
-use messages::{MessageType, Selection, TypeHash, TypeName};
+use messages::{MessageType, Selection, TypeName};
 use rustdds::Duration;
 
 use crate::clock::RosTime;
@@ -34,8 +34,6 @@ pub(crate) struct Sink {
 #[derive(Debug)]
 pub(crate) struct Open {
     pub(crate) definition: Definition,
-    /// The hash of the type that counts among those readers announce; others of it are strangers.
-    pub(crate) announced: Option<TypeHash>,
     pub(crate) outlet: Outlet,
     /// The shortest deadline readers asked for, which the writer offers.
     pub(crate) deadline: Option<Duration>,
@@ -121,8 +119,8 @@ impl Sink {
             && self.offered == other.offered
     }
 
-    /// The types it could have, best first: the mapping's; what a subscriber asks for; what its writer
-    /// says; the standard type of the value.
+    /// The types it could have, best first: the mapping's; what a subscriber asks for, that in which it is written first;
+    /// what its writer says; the standard type of the value.
     pub(crate) fn candidates(&self, readers: &[Endpoint]) -> Vec<TypeName> {
         if let Some((message_type, _)) = &self.mapped {
             return vec![message_type.clone()];
@@ -132,6 +130,12 @@ impl Sink {
             .iter()
             .filter_map(|reader| TypeName::from_dds(&reader.type_name).ok());
         let learned = self.learned.as_ref().map(|(name, _)| name.clone());
+        let written = self.open.as_ref().map(|open| open.definition.name());
+        let is_asked_for = |name: &&TypeName| {
+            let dds_type = name.dds();
+            readers.iter().any(|reader| reader.type_name == dds_type)
+        };
+        candidates.extend(written.filter(is_asked_for).cloned());
         for name in asked_for.chain(learned).chain(self.standard.clone()) {
             if !candidates.contains(&name) {
                 candidates.push(name);
@@ -140,11 +144,12 @@ impl Sink {
         candidates
     }
 
-    /// Whether what is open serves somebody, so that it is not to be given up for another type.
+    /// Whether what is open serves somebody, so that it is not to be given up for another type. A subscriber whose definition
+    /// nobody tells is not served by ours: it may misread it.
     pub(crate) fn serves(&self, readers: &[Endpoint]) -> bool {
         self.open.as_ref().is_some_and(|open| {
             let dds_type = open.definition.name().dds();
-            let served = |reader: &Endpoint| reader.is_of(&dds_type, open.announced);
+            let served = |reader: &Endpoint| reader.is_of(&dds_type, open.definition.hash);
             readers.is_empty() || readers.iter().any(served)
         })
     }

@@ -88,7 +88,7 @@ def tell_node(participant, name, readers, writers):
 
 def answers(args, server):
     for request in server.reader.take(N=100):
-        if not hasattr(request, "count"):
+        if not hasattr(request, "count") or args.silent:
             continue
         lifetime.say(asked=request.type_name, hash=request.type_hash)
         fields = SHORT if args.short else LIE if args.lie else TRUE
@@ -97,7 +97,9 @@ def answers(args, server):
 
 def use(args, participant):
     """Publishes a value (`serve`) or says those it reads (`read`), and answers who asks for the type."""
-    server = ros2_service.Server(participant, f"/{args.name}/get_type_description", GET)
+    server = None
+    if not args.no_service:
+        server = ros2_service.Server(participant, f"/{args.name}/get_type_description", GET)
     kind = ShortFieldType if args.short else FieldType
     qos = announced(args)
     topic = Topic(participant, f"rt/{args.topic.lstrip('/')}", kind, qos=qos)
@@ -110,7 +112,8 @@ def use(args, participant):
     leave = lifetime.told()
     lifetime.say(ready=args.topic)
     while kept and not leave.is_set():
-        answers(args, server)
+        if server:
+            answers(args, server)
         for sample in endpoint.take(N=100) if args.role == "read" else ():
             if sample.sample_info.valid_data:
                 lifetime.say(value=ros2_types.plain(sample))
@@ -143,6 +146,8 @@ def main():
     parser.add_argument("--name", default="robot", help="the node's")
     parser.add_argument("--short", default="", help="the other type of that name, and its hash")
     parser.add_argument("--lie", action="store_true", help="leave a field out")
+    parser.add_argument("--silent", action="store_true", help="answer nobody who asks")
+    parser.add_argument("--no-service", action="store_true", help="do not offer to be asked")
     parser.add_argument("--node", default="/endpoints")
     parser.add_argument("--type", default="std_msgs/msg/String")
     parser.add_argument("--hash", default="")

@@ -4,12 +4,13 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use messages::{DescribedType, TypeHash, TypeName};
+use rustdds::GUID;
 use tokio::task::JoinSet;
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 
 use super::Ros2Port;
-use crate::definitions::Definition;
+use super::inquiry::{Inquiry, Outcome};
 use crate::graph::Endpoint;
 use crate::service::{ServiceClient, ServiceClientOptions, ServicePeers};
 use crate::type_description;
@@ -17,7 +18,7 @@ use crate::type_description;
 /// What was asked for, and what came of it.
 pub(super) struct Descriptions {
     peers: ServicePeers,
-    asked: BTreeMap<Wanted, State>,
+    asked: BTreeMap<Wanted, Inquiry>,
     calls: JoinSet<Told>,
 }
 
@@ -25,21 +26,6 @@ pub(super) struct Descriptions {
 type Wanted = (TypeName, TypeHash);
 /// Who was asked for what, and the answer.
 type Told = (Wanted, String, Result<Vec<DescribedType>, String>);
-
-#[derive(Debug, Clone, Copy)]
-enum State {
-    /// To be asked for, not before `next`.
-    Waiting {
-        since: Instant,
-        next: Instant,
-        tries: u8,
-    },
-    Asking {
-        tries: u8,
-    },
-    /// It is known, or nobody tells it.
-    Settled,
-}
 
 impl Descriptions {
     pub(super) fn new(peers: ServicePeers) -> Self {
@@ -49,17 +35,13 @@ impl Descriptions {
             calls: JoinSet::new(),
         }
     }
-
-    /// Whether a call is out or will be, so that there is something to look for again.
-    fn is_waiting(&self, wanted: &Wanted) -> bool {
-        !matches!(self.asked.get(wanted), Some(State::Settled) | None)
-    }
 }
 
 impl Ros2Port {
     /// Which of the definitions of a type counts on a topic with these endpoints, by its hash: the one that counts by now
     /// while it is known and any of them announces it, else the first that is known, of which the nodes of the endpoints are
-    /// asked; else the first. Endpoints that announce none are of no release that does. `None` while a node is asked.
+    /// asked; else the first. Endpoints that announce none are of no release that does. `None` while a node is asked for the
+    /// first time.
     pub(super) fn hash_that_counts(
         &mut self,
         name: &TypeName,
@@ -91,46 +73,44 @@ impl Ros2Port {
         settled.then(|| there.or_else(|| announced.first().copied()))
     }
 
-    /// Whether a type of that hash is known, or nobody tells it: `false` while a node is asked.
+    /// Whether a type of that hash is known, or nobody tells it: `false` while a node is asked for the first time.
     fn is_settled(&mut self, wanted: Wanted, endpoints: &[Endpoint], now: Instant) -> bool {
         let full = self.descriptions.asked.len() >= MOST_ASKED;
-        let state = match self.descriptions.asked.get(&wanted) {
-            Some(state) => *state,
+        let mut inquiry = match self.descriptions.asked.remove(&wanted) {
+            Some(inquiry) => inquiry,
             None if full => return true,
-            None => State::Waiting {
-                since: now,
-                next: now,
-                tries: 0,
-            },
+            None => Inquiry::new(now),
         };
-        let state = self.ask(&wanted, endpoints, state, now);
-        self.descriptions.asked.insert(wanted.clone(), state);
-        !self.descriptions.is_waiting(&wanted)
-    }
-
-    /// The state after what can be done now.
-    fn ask(
-        &mut self,
-        wanted: &Wanted,
-        endpoints: &[Endpoint],
-        state: State,
-        now: Instant,
-    ) -> State {
-        let State::Waiting { since, next, tries } = state else {
-            return state;
-        };
-        if now < next || self.descriptions.calls.len() >= MOST_CALLS {
-            return state;
-        }
-        let (name, hash) = wanted;
+        let (name, hash) = &wanted;
         let dds_type = name.dds();
         let alike = |endpoint: &&Endpoint| {
             endpoint.type_hash.as_ref() == Some(hash) && endpoint.type_name == dds_type
         };
-        let nodes: Vec<String> = endpoints
+        let alike: Vec<GUID> = endpoints.iter().filter(alike).map(|it| it.guid).collect();
+        inquiry.meet(alike.iter().copied(), |guid| self.graph.holds(guid), now);
+        self.ask(&wanted, &alike, &mut inquiry, now);
+        let settled = !inquiry.is_waited_for();
+        self.descriptions.asked.insert(wanted, inquiry);
+        settled
+    }
+
+    /// Asks one of the nodes of these endpoints, if it is due and any offers to tell.
+    fn ask(&mut self, wanted: &Wanted, alike: &[GUID], inquiry: &mut Inquiry, now: Instant) {
+        let Some(turn) = inquiry.due(now) else {
+            return;
+        };
+        // What nobody waits for leaves room for what somebody does.
+        let most = match inquiry.is_waited_for() {
+            true => MOST_CALLS,
+            false => MOST_CALLS / 2,
+        };
+        if self.descriptions.calls.len() >= most {
+            return;
+        }
+        let (name, hash) = wanted;
+        let nodes: Vec<String> = alike
             .iter()
-            .filter(alike)
-            .filter_map(|endpoint| self.domain.owner(endpoint.guid))
+            .filter_map(|guid| self.domain.owner(*guid))
             .collect();
         let snapshot = self.descriptions.peers.look(now, FRESH);
         let services: Vec<_> = nodes
@@ -138,12 +118,14 @@ impl Ros2Port {
             .map(|node| type_description::service(node))
             .filter(|service| !snapshot.readers(&service.request_topic()).is_empty())
             .collect();
-        let Some(service) = services.get(usize::from(tries) % services.len().max(1)) else {
-            if now.duration_since(since) < OFFERED_WITHIN {
-                return state;
-            }
-            self.untold(wanted, "no node that uses it offers get_type_description");
-            return State::Settled;
+        let Some(service) = services.get(turn % services.len().max(1)) else {
+            let outcome = inquiry.nobody(now);
+            self.tell_untold(
+                wanted,
+                outcome,
+                "no node that uses it offers get_type_description",
+            );
+            return;
         };
         let options = ServiceClientOptions {
             timeout: Some(ANSWERED_WITHIN),
@@ -152,7 +134,7 @@ impl Ros2Port {
         let peers = self.descriptions.peers.clone();
         let opened = self.make(|domain| ServiceClient::open(domain, &peers, service, options));
         let Some(client) = opened else {
-            return state;
+            return;
         };
         debug!(message_type = %name, service = service.name, "asking what the type is");
         let request = type_description::request(name, *hash);
@@ -164,7 +146,7 @@ impl Ros2Port {
             };
             (wanted, asked, told)
         });
-        State::Asking { tries }
+        inquiry.asked();
     }
 
     /// Takes in what was answered since the last look.
@@ -173,70 +155,57 @@ impl Ros2Port {
             let Ok((wanted, service, told)) = ended else {
                 continue;
             };
-            let tries = match self.descriptions.asked.get(&wanted) {
-                Some(State::Asking { tries }) => tries + 1,
-                Some(State::Waiting { .. } | State::Settled) | None => continue,
+            let Some(mut inquiry) = self.descriptions.asked.remove(&wanted) else {
+                continue;
             };
-            let state = match told {
-                Ok(types) => {
-                    self.described(&wanted, &service, &types);
-                    State::Settled
-                }
-                Err(why) if tries >= MOST_TRIES => {
-                    self.untold(&wanted, &format!("{service}: {why}"));
-                    State::Settled
-                }
-                Err(why) => {
-                    debug!(message_type = %wanted.0, service, why, "the type was not told");
-                    State::Waiting {
-                        since: now,
-                        next: now + PAUSE * u32::from(tries),
-                        tries,
-                    }
-                }
+            let (outcome, why) = match told {
+                Ok(types) => match self.described(&wanted, &service, &types) {
+                    Ok(()) => (inquiry.told(), String::new()),
+                    // The same node would not tell anything else so soon.
+                    Err(why) => (inquiry.untold(now), why),
+                },
+                Err(why) => (inquiry.failed(now), why),
             };
-            self.descriptions.asked.insert(wanted, state);
+            debug!(message_type = %wanted.0, service, ?outcome, why, "asked what the type is");
+            self.tell_untold(&wanted, outcome, &format!("{service}: {why}"));
+            self.descriptions.asked.insert(wanted, inquiry);
         }
     }
 
-    /// Another answer would be no better than one that is not of the hash.
-    fn described(&mut self, wanted: &Wanted, service: &str, types: &[DescribedType]) {
-        let (name, hash) = wanted;
+    /// Believes what is of the hash.
+    fn described(
+        &mut self,
+        (name, hash): &Wanted,
+        service: &str,
+        types: &[DescribedType],
+    ) -> Result<(), String> {
         let from = format!("type description of {service}");
-        match self.definitions.add_described(name, types, *hash, &from) {
-            Ok(()) => {
-                info!(message_type = %name, %hash, service, "the type was told by a node that uses it");
-            }
-            Err(error) => self.untold(wanted, &format!("{service}: {error}")),
-        }
+        let added = self.definitions.add_described(name, types, *hash, &from);
+        added.map_err(|error| error.to_string())?;
+        info!(message_type = %name, %hash, service, "the type was told by a node that uses it");
+        Ok(())
     }
 
-    fn untold(&mut self, (name, hash): &Wanted, why: &str) {
-        match self.definitions.here(name) {
-            Ok(Definition {
-                hash: Some(ours),
-                from,
-                ..
-            }) => warn!(
+    fn tell_untold(&mut self, (name, hash): &Wanted, outcome: Outcome, why: &str) {
+        if outcome != Outcome::Untold {
+            return;
+        }
+        let ours = self.definitions.here(name).ok();
+        let ours = ours.and_then(|here| Some((here.hash?, here.from)));
+        if let Some((ours, from)) = ours {
+            warn!(
                 message_type = %name,
                 definition = %from,
                 "another node's type has the hash {hash}, ours {ours}: it may be misread, or not at all; {why}"
-            ),
-            Ok(Definition { hash: None, .. }) | Err(_) => {
-                warn!(message_type = %name, %hash, "the type is not told by those who use it: {why}");
-            }
+            );
+        } else {
+            warn!(message_type = %name, %hash, "the type is not told by those who use it: {why}");
         }
     }
 }
 
-/// How long a node may take to tell its name and services.
-const OFFERED_WITHIN: Duration = Duration::from_secs(3);
 /// How long a call may take.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(3);
-/// Calls for one type.
-const MOST_TRIES: u8 = 3;
-/// After the first call that failed; longer after the next.
-const PAUSE: Duration = Duration::from_secs(1);
 /// Calls at a time: each has two endpoints.
 const MOST_CALLS: usize = 4;
 /// Types asked for while the program runs: anybody in the domain can invent names.

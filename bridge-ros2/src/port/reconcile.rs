@@ -131,7 +131,7 @@ impl Ros2Port {
         }
     }
 
-    /// The first type of a topic's writers that is known; `None` as long as a node is asked what one is.
+    /// The first type of a topic's writers that is known; `None` as long as none is, or a node is asked what it is.
     fn found_type(&mut self, topic: TopicId, dds_topic: &str, now: Instant) -> Option<TypeName> {
         let writers = self.graph.writers(dds_topic).to_vec();
         let mut known = None;
@@ -141,7 +141,9 @@ impl Ros2Port {
             }
             let found = match TypeName::from_dds(&writer.type_name) {
                 Ok(name) => {
-                    let hash = self.hash_that_counts(&name, &writers, None, now)?;
+                    let Some(hash) = self.hash_that_counts(&name, &writers, None, now) else {
+                        continue;
+                    };
                     let found = self.definitions.announced(&name, hash);
                     found.map_err(|error| error.to_string())
                 }
@@ -189,7 +191,11 @@ impl Ros2Port {
     }
 
     /// What a pattern makes of a topic that is written in that type.
-    fn made_of(&self, name: &str, dds_type: &str) -> Option<Result<PatternVariable, PatternFault>> {
+    pub(super) fn made_of(
+        &self,
+        name: &str,
+        dds_type: &str,
+    ) -> Option<Result<PatternVariable, PatternFault>> {
         let message_type = TypeName::from_dds(dds_type).ok()?;
         let name = format!("/{name}");
         self.mapping.matching(self.own, &name, Some(&message_type))
@@ -203,7 +209,7 @@ impl Ros2Port {
     }
 
     /// Whether the mapping gives this value to another ROS topic of our domain.
-    fn is_tied(&self, topic: TopicId) -> bool {
+    pub(super) fn is_tied(&self, topic: TopicId) -> bool {
         self.mapping
             .variable(topic)
             .is_some_and(|variable| variable.binding(self.own).is_some())

@@ -9,6 +9,7 @@ use messages::{Selection, TypeName};
 
 use super::Ros2Port;
 use super::services::Ros2Graph;
+use super::writing::unwritten;
 use crate::graph::{dds_topic, ros_topic};
 use crate::sink::Sink;
 use crate::source::{Reading, Source};
@@ -57,12 +58,15 @@ impl Ros2Port {
                 self.sinks.insert(topic, sink);
             }
         }
+        for index in 0..self.sources.len() {
+            self.take_up_found(index);
+        }
         self.schedule.changed = true;
     }
 
-    /// Lets go of the values of a topic that are no longer made of it, and of the topic where none is left.
+    /// Lets go of the values of a topic that are no longer made of it; and of the topic, where it is read as another type.
     fn give_up_values(&mut self, index: usize, read: &Read) {
-        let Some(source) = self.sources.get_mut(index) else {
+        let Some(source) = self.sources.get(index) else {
             return;
         };
         // Its definition may be another since the files were read again.
@@ -70,37 +74,30 @@ impl Ros2Port {
             .definition
             .as_ref()
             .is_some_and(|it| !self.definitions.is_current(it, source.announced));
-        let is_wanted = |value: &(TopicId, Selection)| match read.get(&source.dds_topic) {
+        let (dds_topic, message_type) = (source.dds_topic.clone(), source.message_type.clone());
+        let found = self.found_value(&dds_topic, &message_type);
+        let is_wanted = |value: &(TopicId, Selection)| match read.get(&dds_topic) {
             _ if outdated => false,
-            Some((message_type, values)) => {
-                source.message_type == *message_type && values.contains(value)
-            }
-            None => {
-                // A topic that was found: of the space, and that the mapping does not tie to another; or by a pattern.
-                let Some(name) = ros_topic(&source.dds_topic) else {
-                    return false;
-                };
-                match name.parse::<TopicId>() {
-                    Ok(named) => {
-                        let variable = self.mapping.variable(value.0);
-                        named == value.0
-                            && value.1 == Selection::Whole
-                            && variable.is_none_or(|v| v.binding(self.own).is_none())
-                    }
-                    Err(_) => {
-                        let kind = Some(&source.message_type);
-                        let made = self.mapping.matching(self.own, &format!("/{name}"), kind);
-                        made.and_then(Result::ok)
-                            .is_some_and(|made| (made.topic, made.selection) == *value)
-                    }
-                }
-            }
+            Some((of, values)) => message_type == *of && values.contains(value),
+            None => found.as_ref() == Some(value),
+        };
+        let Some(source) = self.sources.get_mut(index) else {
+            return;
         };
         let gone = source.values.extract_if(.., |value| !is_wanted(value));
         let gone: Vec<_> = gone.map(|(topic, _)| topic).collect();
         let unbound = gone.into_iter().map(|topic| PortEvent::Unbound { topic });
         self.events.extend(unbound);
-        if source.values.is_empty() {
+        let read_alike = read
+            .get(&dds_topic)
+            .is_none_or(|(of, _)| message_type == *of);
+        if source.values.is_empty() && (outdated || !read_alike) {
+            self.give_up_source(index);
+        }
+    }
+
+    fn give_up_source(&mut self, index: usize) {
+        if let Some(source) = self.sources.get_mut(index) {
             if let Reading::Open { slot, .. } = source.reading {
                 // Whoever published to it sees the reader disposed.
                 drop(self.inbox.remove(slot));
@@ -114,13 +111,51 @@ impl Ros2Port {
         }
     }
 
+    /// The value that a topic is which was found, in that type: of the space, and the mapping does not tie it to another; or
+    /// by a pattern.
+    fn found_value(
+        &self,
+        dds_topic: &str,
+        message_type: &TypeName,
+    ) -> Option<(TopicId, Selection)> {
+        let name = ros_topic(dds_topic)?;
+        if let Ok(topic) = name.parse::<TopicId>() {
+            return (topic.space == self.own && !self.is_tied(topic))
+                .then_some((topic, Selection::Whole));
+        }
+        let made = self.made_of(name, &message_type.dds())?.ok()?;
+        Some((made.topic, made.selection))
+    }
+
+    /// Makes the value of a topic that the mapping does not name, where all it had were given up: while it is read alike its
+    /// reader goes on. Lets go of the topic where there is no such value.
+    fn take_up_found(&mut self, index: usize) {
+        let Some(source) = self.sources.get(index) else {
+            return;
+        };
+        if !source.values.is_empty() || self.source_of.get(&source.dds_topic) != Some(&index) {
+            return;
+        }
+        let (dds_topic, message_type) = (source.dds_topic.clone(), source.message_type.clone());
+        // Others who write where values of other spaces go are not a value of ours.
+        let is_written = self.sinks.values().any(|sink| sink.dds_topic == dds_topic);
+        let found = self.found_value(&dds_topic, &message_type);
+        let found = found.filter(|(topic, _)| {
+            let is_made = |source: &Source| source.values.iter().any(|(other, _)| other == topic);
+            !is_written && !self.sources.iter().any(is_made)
+        });
+        match found {
+            Some(value) => self.take_up_values(dds_topic, message_type, vec![value]),
+            None => self.give_up_source(index),
+        }
+    }
+
     fn give_up_sinks(&mut self) {
         let (mapping, own, definitions) = (&self.mapping, self.own, &mut self.definitions);
         let gone = self.sinks.extract_if(|topic, sink| {
-            let outdated = sink
-                .open
-                .as_ref()
-                .is_some_and(|open| !definitions.is_current(&open.definition, open.announced));
+            let outdated = sink.open.as_ref().is_some_and(|open| {
+                !definitions.is_current(&open.definition, open.definition.hash)
+            });
             let variable = mapping.variable(*topic);
             let tied = variable.and_then(|variable| mapped(variable, own));
             let called = variable
@@ -132,8 +167,12 @@ impl Ros2Port {
                 || !sink.is_like(&tied.unwrap_or_else(|| Sink::by_name(*topic, variable)))
         });
         // Their writers are disposed here.
-        let gone = gone.map(|(topic, _)| PortEvent::Unbound { topic });
-        self.events.extend(gone);
+        for (topic, sink) in gone {
+            let open = sink.open.as_ref();
+            self.events
+                .extend(open.and_then(|open| unwritten(topic, open)));
+            self.events.push_back(PortEvent::Unbound { topic });
+        }
     }
 
     /// Makes values of a topic that the mapping reads, of which some may be made already.

@@ -22,9 +22,10 @@ impl Ros2Port {
         };
         if self.graph.is_at_home(topic.space.into()) {
             // Another bridge serves its space in this domain. What was written would stand beside it, and grow old.
-            let given_up = sink.open.take().is_some();
+            let given_up = sink.open.take();
             let dds_topic = sink.dds_topic.clone();
-            if given_up {
+            if let Some(open) = given_up {
+                self.events.extend(unwritten(topic, &open));
                 self.tell_once(&dds_topic, "at home", || {
                     format!(
                         "another bridge of this domain serves space {}: its values are left to it",
@@ -65,25 +66,35 @@ impl Ros2Port {
         };
         let readers = self.graph.readers(&sink.dds_topic);
         if sink.serves(readers) {
-            self.note_other_definitions(topic);
+            self.note_others(topic);
         } else {
             self.open_sink(topic, now);
         }
     }
 
-    /// Tells and counts, once each, the readers that take what is written for another definition of its type.
-    fn note_other_definitions(&mut self, topic: TopicId) {
+    /// Tells of the readers that what is written does not serve: those of another type, and, counted once each, those that
+    /// take it for another definition of its type.
+    fn note_others(&mut self, topic: TopicId) {
         let Some(sink) = self.sinks.get(&topic) else {
             return;
         };
         let Some(open) = &sink.open else { return };
-        let (name, ours) = (open.definition.name().clone(), open.announced);
+        let (name, ours) = (open.definition.name().clone(), open.definition.hash);
         let dds_type = name.dds();
         let readers = self.graph.readers(&sink.dds_topic);
+        let of_another_type = readers.iter().find(|reader| reader.type_name != dds_type);
+        let of_another_type = of_another_type.map(|reader| reader.type_name.clone());
         let other =
             |reader: &&Endpoint| reader.type_name == dds_type && !reader.is_of(&dds_type, ours);
         let others: Vec<Endpoint> = readers.iter().filter(other).cloned().collect();
         let dds_topic = sink.dds_topic.clone();
+        if let Some(other) = of_another_type {
+            self.tell_once(&dds_topic, "subscriber of another type", || {
+                format!(
+                    "a subscriber asks for the type {other}, the topic is written in {dds_type}: it gets no values"
+                )
+            });
+        }
         for reader in others {
             let (Some(theirs), Some(ours)) = (reader.type_hash, ours) else {
                 continue;
@@ -149,8 +160,9 @@ impl Ros2Port {
         Some(dds_topic)
     }
 
-    /// Opens a sink in the best type there is; one that is open in a lesser type is opened anew. Where a node is asked what
-    /// the type is, the next look goes on.
+    /// Opens a sink in the best type that is known; one that is open in a lesser type is opened anew. Where a node is asked
+    /// what the type of a subscriber is, another subscriber's is not kept waiting: it stays with that one, which is served.
+    /// A type nobody asks for is not worth opening before the answer.
     pub(super) fn open_sink(&mut self, topic: TopicId, now: Instant) {
         let Some(sink) = self.sinks.get(&topic) else {
             return;
@@ -158,16 +170,22 @@ impl Ros2Port {
         let (dds_topic, offered) = (sink.dds_topic.clone(), sink.offered);
         let readers = self.graph.readers(&dds_topic).to_vec();
         let mut found = None;
+        let mut asking = false;
         for name in sink.candidates(&readers) {
             let open = self.sinks.get(&topic).and_then(|sink| sink.open.as_ref());
             let open = open.filter(|open| *open.definition.name() == name);
-            let current = open.and_then(|open| open.announced);
+            let is_open = open.is_some();
+            let current = open.and_then(|open| open.definition.hash);
             let Some(hash) = self.hash_that_counts(&name, &readers, current, now) else {
-                return;
+                if is_open {
+                    return;
+                }
+                asking = true;
+                continue;
             };
             match self.definitions.announced(&name, hash) {
                 Ok(definition) => {
-                    found = Some((hash.or(definition.hash), definition));
+                    found = Some(definition);
                     break;
                 }
                 Err(error) => {
@@ -177,21 +195,18 @@ impl Ros2Port {
                 }
             }
         }
-        let Some((announced, definition)) = found else {
+        let Some(definition) = found else {
             return;
         };
         let dds_type = definition.name().dds();
-        let sink = self.sinks.get_mut(&topic);
-        if let Some(open) = sink.and_then(|sink| sink.open.as_mut())
-            && (open.definition.name(), open.definition.hash)
-                == (definition.name(), definition.hash)
-        {
-            open.announced = announced;
-            if !readers.iter().any(|reader| reader.type_name == dds_type) {
-                self.tell_once(&dds_topic, "subscriber of another type", || {
-                    format!("a subscriber asks for another type than {dds_type}, in which the topic is written")
-                });
-            }
+        if asking && !readers.iter().any(|reader| reader.type_name == dds_type) {
+            return;
+        }
+        let open = self.sinks.get(&topic).and_then(|sink| sink.open.as_ref());
+        if open.is_some_and(|open| {
+            (open.definition.name(), open.definition.hash) == (definition.name(), definition.hash)
+        }) {
+            self.note_others(topic);
             return;
         }
         let deadline = shortest_deadline(&readers);
@@ -209,16 +224,13 @@ impl Ros2Port {
         let message_type = Arc::clone(&definition.message_type);
         let mut selection = Selection::Whole;
         if let Some(sink) = self.sinks.get_mut(&topic) {
-            let waiting = sink.open.as_ref().map_or(0, |open| open.outlet.waiting());
-            if waiting > 0 {
-                let events = &mut self.events;
-                events.push_back(lost(topic, "its type is another now", waiting));
-            }
+            let before = sink.open.as_ref();
+            self.events
+                .extend(before.and_then(|open| unwritten(topic, open)));
             sink.learn_from(&message_type);
             selection = sink.selection(message_type.name());
             sink.open = Some(Open {
                 definition,
-                announced,
                 outlet,
                 deadline,
                 tightened: 0,
@@ -231,6 +243,12 @@ impl Ros2Port {
             selection,
         });
     }
+}
+
+/// What goes with a writer that is given up: values that still wait to be written.
+pub(super) fn unwritten(topic: TopicId, open: &Open) -> Option<PortEvent> {
+    let waiting = open.outlet.waiting();
+    (waiting > 0).then(|| lost(topic, "its writer was given up", waiting))
 }
 
 /// Why a reader is counted that announces another hash than the one that is written.

@@ -11,7 +11,7 @@ use serde_json::json;
 use system_tests::{Cell, Child, Peer};
 use uadp::BuiltinType;
 
-use crate::peer::{DOMAIN, SOON, heard, options, reads, string, writes};
+use crate::peer::{DOMAIN, SOON, heard, is_string, options, reads, string, writes};
 
 const LATCHED: [&str; 4] = ["--durability", "transient_local", "--depth", "1"];
 
@@ -234,6 +234,81 @@ async fn samples_of_another_type_than_the_topics_are_not_handed_up() {
         assert_eq!(payload[4], 1, "{payload:?}");
         assert!(payload.len() <= 8, "{payload:?}");
     }
+}
+
+/// A mapping of space 2.
+fn cell_of(text: &str) -> Arc<Mapping> {
+    let text = format!("spaces: [{{id: 1}}, {{id: 2}}]\nnamespaces: {{2: urn:test}}\n{text}");
+    Arc::new(Mapping::from_yaml(&text, "cell.yaml").mapping.unwrap())
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_topic_that_becomes_another_value_at_a_reload_loses_and_repeats_no_sample() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let named = |number| {
+        cell_of(&format!(
+            "variables: [{{node: ns=2;i={number}, name: Read, origin: 2, ros: {{topic: /arm3, type: std_msgs/String}}}}]"
+        ))
+    };
+    let found = "patterns: [{topics: \"/arm*\", node: \"ns=2;i=10{1}\", name: \"Arm{1}\", origin: 2, type: std_msgs/String}]";
+    let mut port = port_of(named(1));
+    let numbered = ["--numbered", "3000", "--rate", "1000"];
+    let more = [&["--wait-readers", "1"], &numbered[..]].concat();
+    let _peer = writes(&cell, "/arm3", "std_msgs/String", &more);
+    let mut values = Vec::new();
+    for number in 0..3000 {
+        match number {
+            1000 => drop(port.reload(&named(2))),
+            2000 => drop(port.reload(&cell_of(found))),
+            _ => {}
+        }
+        let (of, payload) = event(&mut port, |event| match event {
+            PortEvent::Sample { topic, payload, .. } => Some((topic, payload)),
+            _ => None,
+        })
+        .await;
+        assert!(
+            is_string(&payload, &number.to_string()),
+            "{number} is {payload:?}"
+        );
+        if values.last() != Some(&of) {
+            values.push(of);
+        }
+    }
+    assert_eq!(values, ["ua_2_2_1", "ua_2_2_2", "ua_2_2_103"].map(topic));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_value_that_waits_for_room_when_its_topic_is_given_up_is_counted() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut port = port();
+    let of = topic("ua_1_2_3");
+    let reader = reads(&cell, "/ua_1_2_3", "std_msgs/String", &LATCHED[..2]);
+    port.wanted(of, &[(BuiltinType::String, false)], None);
+    assert_eq!(bound(&mut port, of).await, "std_msgs/String");
+    port.publish(delivery(of, "before")).unwrap();
+    run_until(&mut port, "it hears", || last_is(&reader, "before")).await;
+    reader.signal(Signal::SIGSTOP);
+    // One takes the place of another that waits when there is no room.
+    let refused = (0..1000).find_map(|number| {
+        let refused = port.publish(delivery(of, &number.to_string()));
+        refused.err()
+    });
+    assert_eq!(refused, Some("subscriber too slow"));
+    let events =
+        "variables: [{node: ns=2;i=3, name: Written, origin: 1, queue: {drop_oldest: 10}}]";
+    port.reload(&cell_of(events));
+    let lost = event(&mut port, |event| match event {
+        PortEvent::Lost { topic, why, count } => Some((topic, why, count)),
+        PortEvent::Unbound { .. } => Some((None, "it is given up", 0)),
+        _ => None,
+    })
+    .await;
+    assert_eq!(lost, (Some(of), "its writer was given up", 1));
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]

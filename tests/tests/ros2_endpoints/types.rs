@@ -1,13 +1,17 @@
 //! Types that nodes tell one another.
 
+use std::time::Duration;
+
 use bridge_node::{Delivery, Kept, Port, PortEvent};
+use bridge_ros2::domain::{Domain, DomainOptions, can_announce_type_hashes};
+use bridge_ros2::qos::{Offered, Requested};
 use mappings::Mapping;
 use messages::{Dialect, Registry};
 use serde_json::json;
 use system_tests::{Cell, Peer};
 use uadp::BuiltinType;
 
-use crate::peer::{SOON, writes};
+use crate::peer::{SOON, options, writes};
 use crate::port::{bound, event, port, port_of, run_until, topic};
 
 const UNKNOWN: &str = "type_description_interfaces/FieldType";
@@ -227,6 +231,127 @@ async fn a_value_is_written_to_a_subscriber_whose_type_only_its_node_knows() {
     })
     .await;
     assert_eq!(lost, (Some(of), "subscriber of another definition"));
+}
+
+const STRING: &str = "std_msgs::msg::dds_::String_";
+
+/// Another node of the domain, which tells nobody what its types are.
+fn other(name: &str) -> Domain {
+    Domain::join(&DomainOptions {
+        node: name.into(),
+        ..options()
+    })
+    .unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_type_that_a_node_is_asked_for_keeps_no_topic_of_a_known_type_waiting() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    // Their vendor comes first: so do their endpoints.
+    let asked = ["--silent", "--name", "asked"];
+    let reads = [&["read", "--topic", "/ua_1_2_9"], &asked[..]].concat();
+    let _reader = cell.cyclone("ros2_describe.py", &reads);
+    let serves = [&["serve", "--topic", "/ua_2_2_9"], &asked[..]].concat();
+    let _writer = cell.cyclone("ros2_describe.py", &serves);
+    let known = other("known");
+    let volatile = Requested::from_writers(&[]);
+    let _read = known.reader("rt/ua_1_2_9", STRING, volatile).unwrap();
+    let _written = known
+        .writer("rt/ua_2_2_9", STRING, Offered::KeepLatest)
+        .unwrap();
+
+    let mut port = port();
+    let shape = [(BuiltinType::Double, false); 2];
+    port.wanted(topic("ua_1_2_9"), &shape, None);
+    let mut types = std::collections::BTreeMap::new();
+    // The calls time out after 12 s together.
+    while types.len() < 2 {
+        let (topic, name) = event(&mut port, |event| match event {
+            PortEvent::Bound {
+                topic,
+                message_type,
+                ..
+            } => Some((topic, message_type.name().to_string())),
+            _ => None,
+        })
+        .await;
+        types.insert(topic, name);
+    }
+    let string = |name| (topic(name), "std_msgs/String".to_owned());
+    assert_eq!(
+        types.into_iter().collect::<Vec<_>>(),
+        [string("ua_1_2_9"), string("ua_2_2_9")]
+    );
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_type_that_nobody_told_is_asked_of_a_node_that_comes_later() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mut port = port();
+    let _mute = cell.cyclone("ros2_describe.py", &["serve", "--no-service"]);
+    let why = event(&mut port, |event| match event {
+        PortEvent::Bound { .. } => Some("bound"),
+        PortEvent::Lost { why, .. } => Some(why),
+        _ => None,
+    })
+    .await;
+    assert_eq!(why, "type without a definition");
+    let _tells = cell.cyclone("ros2_describe.py", &["serve", "--name", "later"]);
+    assert_eq!(bound(&mut port, topic("ua_2_2_9")).await, UNKNOWN);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn of_subscribers_of_two_definitions_the_one_that_is_not_written_is_told() {
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    if !can_announce_type_hashes() {
+        Cell::skip("RustDDS as published announces no type hashes");
+        return;
+    }
+    let (mut port, of) = (port(), topic("ua_1_2_3"));
+    port.wanted(of, &[(BuiltinType::String, false)], None);
+    assert_eq!(bound(&mut port, of).await, "std_msgs/String");
+    let lost = |event| match event {
+        PortEvent::Lost { topic, why, .. } => Some((topic, why)),
+        _ => None,
+    };
+    let misreads = (Some(of), "subscriber of another definition");
+    let volatile = Requested::from_writers(&[]);
+
+    // Nobody tells its definition, so ours is written.
+    let untold = other("untold");
+    untold.learn_type_hash(STRING, format!("RIHS01_{}", "5".repeat(64)));
+    let _untold = untold.reader("rt/ua_1_2_3", STRING, volatile).unwrap();
+    assert_eq!(event(&mut port, lost).await, misreads);
+
+    let ours = other("ours");
+    let name = "std_msgs/String".parse().unwrap();
+    let hash = Registry::bundle(Dialect::Ros2).type_hash(&name).unwrap();
+    ours.learn_type_hash(STRING, hash.to_string());
+    let _ours = ours.reader("rt/ua_1_2_3", STRING, volatile).unwrap();
+    // Discovered after it.
+    let after = topic("ua_1_2_4");
+    let bool = "std_msgs::msg::dds_::Bool_";
+    let _after = ours.reader("rt/ua_1_2_4", bool, volatile).unwrap();
+    port.wanted(after, &[(BuiltinType::Double, false); 2], None);
+    let mut told = Vec::new();
+    event(&mut port, |event| match event {
+        PortEvent::Bound { topic, .. } if topic == after => Some(()),
+        event => {
+            told.extend(lost(event));
+            None
+        }
+    })
+    .await;
+    while let Ok(event) = tokio::time::timeout(Duration::ZERO, port.recv()).await {
+        told.extend(lost(event));
+    }
+    assert_eq!(told, []);
 }
 
 /// The next topic that is bound or unbound, with how many fields its type has, if it is bound.
