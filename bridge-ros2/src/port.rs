@@ -19,7 +19,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, now};
+use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, TypePaths, now};
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{Selection, TypeName};
@@ -58,6 +58,8 @@ pub struct PortOptions {
     pub own: SpaceId,
     /// The cell.
     pub mapping: Arc<Mapping>,
+    /// The definitions of its `type_paths`.
+    pub types: Arc<TypePaths>,
     /// Where to look for message definitions that are not built in, as `AMENT_PREFIX_PATH` lists.
     pub prefixes: Vec<PathBuf>,
 }
@@ -115,6 +117,7 @@ impl Ros2Port {
             domain: domain_options,
             own,
             mapping,
+            types,
             prefixes,
         } = options;
         let domain = Domain::join(&domain_options)?;
@@ -128,7 +131,7 @@ impl Ros2Port {
             "joined the DDS domain"
         );
         let presence = domain.announce_bridge(own.into())?;
-        let mut definitions = Definitions::new(mapping.type_paths(), prefixes);
+        let mut definitions = Definitions::new(types, prefixes);
         let peers = ServicePeers::new(&domain);
         let declared =
             services::parameters(own, domain_options.domain, domain_options.node.use_sim_time);
@@ -531,9 +534,9 @@ impl Port for Ros2Port {
         debug!(%topic, silent, "the writer in the space");
     }
 
-    fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<String> {
+    fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
         let restart = self.fixed(mapping);
-        self.go_over_to(mapping);
+        self.go_over_to(mapping, types);
         restart
     }
 
