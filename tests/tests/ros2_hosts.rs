@@ -45,7 +45,7 @@ fn bridge(cell: &Cell) -> Child {
 
 /// Readers on the other host that have heard the first value, so that no later one is from before their time.
 fn listeners(cell: &Cell, host: &Host, ua: &mut UaSide) -> [Child; 2] {
-    let mut readers = peers(cell, host, &["sub", EVENTS.1, STRING, "--counts"]);
+    let readers = peers(cell, host, &["sub", EVENTS.1, STRING, "--counts"]);
     eventually("both readers hear the bridge", SOON, || {
         ua.write(EVENTS.0, Scalar::String(Some("hello")));
         std::thread::sleep(Duration::from_millis(50));
