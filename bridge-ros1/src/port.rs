@@ -679,14 +679,15 @@ impl Port for Ros1Port {
             self.open_sink(topic);
             return;
         };
-        // What somebody subscribed to stays as it is; without a word nothing changes.
-        if sink.mapped.is_some() || open.publisher.subscribers() > 0 || learned.is_none() {
-            return;
-        }
         let message_type = Arc::clone(&open.message_type);
-        let before = sink.selection(message_type.name());
+        let subscribed = open.publisher.subscribers() > 0;
         let same = |name: &TypeName| name == message_type.name();
         let other_type = learned.as_ref().is_some_and(|(name, _)| !same(name));
+        // The type that somebody subscribed to stays, whatever of it the value is; without a word nothing changes.
+        if sink.mapped.is_some() || (subscribed && other_type) || learned.is_none() {
+            return;
+        }
+        let before = sink.selection(message_type.name());
         sink.learned = learned;
         let selection = sink.selection(message_type.name());
         if other_type {
