@@ -32,6 +32,9 @@ impl Definitions {
 
     /// Takes what the `type_paths` have by now. What peers brought stays.
     pub fn replace(&mut self, types: &Arc<TypePaths>) {
+        if self.files.paths().is_none() && types.is_none() {
+            return;
+        }
         self.library.forget_texts();
         self.files.replace(Arc::clone(types));
     }

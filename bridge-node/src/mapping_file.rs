@@ -15,7 +15,7 @@ use serde::Serialize;
 use sha2::{Digest, Sha256};
 use tokio::signal::unix::Signal;
 use tokio::sync::watch;
-use tokio::time::{MissedTickBehavior, interval};
+use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::{error, info, warn};
 use type_files::{Environment, TypeFiles, TypePaths};
 
@@ -411,7 +411,17 @@ impl MappingFile {
             turn = turn.wrapping_add(1);
             // Elsewhere, since no sample should wait for a disk. One at a time: what is saved meanwhile differs from what
             // was seen before the reading, and a signal is kept.
-            let looked = tokio::task::spawn_blocking(|| look.take()).await;
+            let mut looking = tokio::task::spawn_blocking(|| look.take());
+            let looked = match timeout(SLOW, &mut looking).await {
+                Ok(looked) => looked,
+                Err(_) => {
+                    warn!(
+                        "the files of the mapping have not been read within {} s: what runs stays as it is until they are",
+                        SLOW.as_secs()
+                    );
+                    looking.await
+                }
+            };
             let Looked { seen, reading } = looked.unwrap_or_else(|error| Looked {
                 seen: None,
                 reading: Some(Err(error.to_string())),
@@ -451,7 +461,7 @@ impl MappingFile {
         self.hash.clone_from(&reading.hash);
         self.fingerprint = reading.fingerprint;
         if let Some((first, more)) = reading.spoiled.split_first() {
-            for why in more {
+            for why in more.iter().take(MOST_TOLD) {
                 error!("{why}");
             }
             let more = match more.len() {
@@ -561,5 +571,9 @@ fn seconds() -> i64 {
 
 /// How often the files are looked at. One that was the same twice is no longer being written.
 const LOOK: Duration = Duration::from_millis(250);
+/// After that time a disk is said not to answer.
+const SLOW: Duration = Duration::from_secs(5);
+/// Faulty definitions named in one go; more are of one cause.
+const MOST_TOLD: usize = 10;
 /// Definition files and folders looked at with each look: some 1000 a second, of which each costs a microsecond or two.
 const LOOKED_AT_ONCE: usize = 256;

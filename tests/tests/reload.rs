@@ -291,6 +291,17 @@ fn a_definition_file_that_is_saved_counts_and_a_faulty_one_changes_nothing_and_s
     eventually("it is refused", SOON, || {
         (about("refused") == 2).then_some(())
     });
+    save(&folder.join("Point.msg"), "float64 x\nNowhere n\n");
+    eventually("it is refused, too", SOON, || {
+        (about("refused") == 3).then_some(())
+    });
+    let why = about("stale");
+    assert!(
+        why.as_str()
+            .unwrap()
+            .contains("`geometry_msgs/Point` needs"),
+        "{why}"
+    );
     assert_eq!(about("reloads"), 0);
 
     save(&folder.join("Point.msg"), POINT);
@@ -316,7 +327,7 @@ fn a_definition_file_that_is_saved_counts_and_a_faulty_one_changes_nothing_and_s
     eventually("all are read", SOON, || {
         (about("reloads") == 3).then_some(())
     });
-    assert_eq!(about("refused"), 2);
+    assert_eq!(about("refused"), 3);
 }
 
 #[test]

@@ -137,6 +137,12 @@ impl TypeFiles {
         }
     }
 
+    /// Those that were read.
+    #[must_use]
+    pub fn paths(&self) -> &TypePaths {
+        &self.own
+    }
+
     /// Takes others in place of those that were read. What the installations have stays as it was listed.
     pub fn replace(&mut self, own: Arc<TypePaths>) {
         self.own = own;

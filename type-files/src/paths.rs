@@ -47,6 +47,12 @@ impl TypePaths {
         read
     }
 
+    /// Whether there are no `type_paths`.
+    #[must_use]
+    pub const fn is_none(&self) -> bool {
+        self.paths.is_empty()
+    }
+
     /// What is wrong with them, up to a bound.
     pub(crate) fn faults(&self) -> Vec<PathFault> {
         let told = self.faults.iter().take(MOST_FAULTS);
