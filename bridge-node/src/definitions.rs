@@ -1,7 +1,6 @@
 //! Type definitions for a port: those built in, those in files, and those that peers bring.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::sync::Arc;
 
 use messages::{
@@ -9,7 +8,7 @@ use messages::{
     TypeName,
 };
 use tracing::{info, warn};
-use type_files::{Environment, TypeFiles};
+use type_files::{Environment, TypeFiles, TypePaths};
 
 /// Finds types by name; a definition once read stays until all are read again.
 #[derive(Debug)]
@@ -21,23 +20,23 @@ pub struct Definitions {
 }
 
 impl Definitions {
-    /// With the built-in definitions of one ROS, the mapping's `type_paths`, and the ROS installations there are.
+    /// With the built-in definitions of one ROS, those of the mapping's `type_paths`, and the ROS installations there are.
     #[must_use]
-    pub fn new(dialect: Dialect, type_paths: &[PathBuf], environment: Environment) -> Self {
+    pub fn new(dialect: Dialect, types: Arc<TypePaths>, environment: Environment) -> Self {
         Self {
             library: Library::new(Registry::bundle(dialect)),
-            // What is wrong with them was told when the mapping was checked.
-            files: TypeFiles::open(type_paths, environment),
+            files: TypeFiles::new(types, environment),
             peers: BTreeMap::new(),
         }
     }
 
-    /// Reads the definition files again, those of these `type_paths`. What peers brought stays.
-    pub fn read_again(&mut self, type_paths: &[PathBuf]) {
-        if self.files.has_paths() || !type_paths.is_empty() {
-            self.library.forget_texts();
-            self.files.open_again(type_paths);
+    /// Takes what the `type_paths` have by now. What peers brought stays.
+    pub fn replace(&mut self, types: &Arc<TypePaths>) {
+        if self.files.paths().is_none() && types.is_none() {
+            return;
         }
+        self.library.forget_texts();
+        self.files.replace(Arc::clone(types));
     }
 
     /// What is known by now.

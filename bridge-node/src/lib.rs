@@ -27,4 +27,4 @@ pub use port::{Delivery, Port, PortEvent};
 pub use program::{Context, Program, run};
 pub use services::{CallFault, Outcome, ServiceCall, ServiceGraph, Services};
 pub use stamp::wants_stamp;
-pub use type_files::Environment;
+pub use type_files::{Environment, TypePaths};

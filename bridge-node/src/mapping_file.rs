@@ -1,7 +1,7 @@
 //! The mapping as a file that people edit while the program runs.
 
 use std::cell::RefCell;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::os::unix::fs::MetadataExt as _;
@@ -9,13 +9,15 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use mappings::{Checked, Code, Diagnostic, Mapping, Readers, Severity, Surroundings, TypeFiles};
+use mappings::{Checked, Code, Diagnostic, Mapping, Readers, Severity, Surroundings, TypeOrigin};
+use messages::{Dialect, TypeName};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use tokio::signal::unix::Signal;
 use tokio::sync::watch;
-use tokio::time::{MissedTickBehavior, interval};
+use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::{error, info, warn};
+use type_files::{Environment, TypeFiles, TypePaths};
 
 use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
@@ -24,6 +26,8 @@ use crate::exit::{Failure, FailureKind};
 #[derive(Debug, Clone)]
 pub(crate) struct Running {
     pub(crate) mapping: Arc<Mapping>,
+    /// What its `type_paths` have.
+    pub(crate) types: Arc<TypePaths>,
     pub(crate) about: Arc<About>,
 }
 
@@ -71,8 +75,50 @@ struct Reading {
     /// As rustc tells it.
     rendered: String,
     hash: String,
-    /// What was read, or would have been, and how each was before it was read.
-    files: Stamps,
+    /// Of what the `type_paths` have.
+    fingerprint: u64,
+    types: Arc<TypePaths>,
+    /// Types the mapping names that are defined by files.
+    known: Known,
+    /// What is wrong with definitions that run.
+    spoiled: Vec<String>,
+    /// Definitions that are not what runs.
+    differing: usize,
+    files: Seen,
+}
+
+type Known = BTreeSet<(Dialect, TypeName)>;
+
+/// What was read, or would have been, and how each file and folder was before that.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+struct Seen {
+    /// The mapping and what it includes.
+    mapping: Stamps,
+    /// What is at and below the `type_paths`.
+    types: Stamps,
+}
+
+impl Seen {
+    /// How the same files are by now.
+    fn again(&self) -> Self {
+        let look = |stamps: &Stamps| {
+            let files = stamps.keys();
+            files.map(|file| (file.clone(), stamp(file))).collect()
+        };
+        Self {
+            mapping: look(&self.mapping),
+            types: look(&self.types),
+        }
+    }
+
+    /// Whether one of them is another by now: of the mapping's any, of the others those whose turn it is.
+    fn differ(&self, turn: usize) -> bool {
+        let turns = self.types.len().div_ceil(LOOKED_AT_ONCE).max(1);
+        let first = turn % turns * LOOKED_AT_ONCE;
+        let types = self.types.iter().skip(first).take(LOOKED_AT_ONCE);
+        let mut looked_at = self.mapping.iter().chain(types);
+        looked_at.any(|(file, was)| stamp(file) != *was)
+    }
 }
 
 /// How files were when they were looked at; `None` for one that is not there.
@@ -99,11 +145,11 @@ fn stamp(file: &Path) -> Option<Stamp> {
     })
 }
 
-/// Reads the mapping and what it includes.
+/// Reads the mapping, what it includes, and the definitions of its `type_paths`.
 ///
 /// # Errors
 /// Why the file cannot be read.
-fn read(file: &Path) -> Result<Reading, String> {
+fn read(file: &Path, running: &TypePaths, known: &Known) -> Result<Reading, String> {
     let disk = Disk::default();
     let name = file.display().to_string();
     let text = disk
@@ -121,26 +167,101 @@ fn read(file: &Path) -> Result<Reading, String> {
         // Writing to a string does not fail.
         let _written = write!(hash, "{byte:02x}");
     }
+    let types = disk.types.into_inner();
+    let mut spoiled: Vec<String> = types.spoiled(running).into_iter().map(Into::into).collect();
+    let mut defined = Known::new();
+    for used in &checked.types {
+        let key = (used.dialect, used.name.clone());
+        match &used.source {
+            TypeOrigin::File(_) => {
+                defined.insert(key);
+            }
+            TypeOrigin::Unknown if known.contains(&key) => {
+                let file = types.file(used.dialect, &used.name);
+                spoiled.extend(file.map(|file| {
+                    format!("{file}: what `{}` needs is not defined any more", used.name)
+                }));
+            }
+            TypeOrigin::Unknown | TypeOrigin::BuiltIn => {}
+        }
+    }
     Ok(Reading {
         rendered: checked.render_all(),
         checked,
         hash,
+        fingerprint: types.fingerprint(),
+        differing: types.differing(running),
+        types,
+        known: defined,
+        spoiled,
         files: disk.seen.into_inner(),
     })
+}
+
+/// What one look at the files found.
+#[derive(Debug)]
+struct Looked {
+    /// How they are, as long as that is not how they were read.
+    seen: Option<Seen>,
+    reading: Option<Result<Reading, String>>,
+}
+
+/// What is looked for.
+#[derive(Debug)]
+struct Look {
+    file: PathBuf,
+    /// As they were read last.
+    files: Arc<Seen>,
+    /// As they were at the last look, where that is not how they were read.
+    before: Option<Seen>,
+    turn: usize,
+    /// Whether they are to be read whatever they are.
+    asked: bool,
+    running: Arc<TypePaths>,
+    known: Arc<Known>,
+}
+
+impl Look {
+    /// Looks at the files, and reads them if they are other ones that are no longer being written.
+    fn take(self) -> Looked {
+        let reading = || Some(read(&self.file, &self.running, &self.known));
+        if !self.asked && self.before.is_none() && !self.files.differ(self.turn) {
+            return Looked {
+                seen: None,
+                reading: None,
+            };
+        }
+        let is = self.files.again();
+        // Written to until just now, or about to be: a file that is saved is gone or empty for a moment.
+        let at = is.mapping.get(&self.file).copied().flatten();
+        let settled = self.before.as_ref() == Some(&is) && at.is_some_and(|at| at.len > 0);
+        let differs = is != *self.files;
+        let wanted = self.asked || (settled && differs);
+        Looked {
+            seen: (differs || wanted).then_some(is),
+            reading: if wanted { reading() } else { None },
+        }
+    }
 }
 
 /// The files and the environment of this process. Remembers each file and folder it was asked for, and how that was
 /// before it was read.
 #[derive(Debug, Default)]
 struct Disk {
-    seen: RefCell<Stamps>,
+    seen: RefCell<Seen>,
+    types: RefCell<Arc<TypePaths>>,
 }
 
 impl Disk {
     fn see(&self, path: &str) {
-        let path = PathBuf::from(path);
-        let stamp = stamp(&path);
-        self.seen.borrow_mut().insert(path, stamp);
+        see(&mut self.seen.borrow_mut().mapping, Path::new(path));
+    }
+}
+
+/// How it was at first counts, as something is read by then.
+fn see(seen: &mut Stamps, path: &Path) {
+    if !seen.contains_key(path) {
+        seen.insert(path.to_owned(), stamp(path));
     }
 }
 
@@ -163,8 +284,12 @@ impl Surroundings for Disk {
         type_files::Disk.readers(file)
     }
 
-    fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
-        type_files::Disk.types(paths)
+    fn types(&self, paths: &[PathBuf]) -> Box<dyn mappings::TypeFiles> {
+        let mut seen = self.seen.borrow_mut();
+        let own = TypePaths::read(paths, &mut |path| see(&mut seen.types, path));
+        let own = Arc::new(own);
+        self.types.replace(Arc::clone(&own));
+        Box::new(TypeFiles::new(own, Environment::from_env()))
     }
 }
 
@@ -173,9 +298,13 @@ impl Surroundings for Disk {
 pub(crate) struct MappingFile {
     file: Option<PathBuf>,
     /// The files as they were when they were last read.
-    files: Stamps,
+    files: Arc<Seen>,
     /// Of the last reading, taken or refused.
     hash: String,
+    /// Likewise.
+    fingerprint: u64,
+    /// Of the types that what runs names, those that are defined by files.
+    known: Arc<Known>,
     running: Running,
 }
 
@@ -189,17 +318,21 @@ impl MappingFile {
         let Some(file) = file else {
             let running = Running {
                 mapping: Arc::default(),
+                types: Arc::default(),
                 about: Arc::default(),
             };
             let without = Self {
                 file: None,
-                files: Stamps::new(),
+                files: Arc::default(),
                 hash: String::new(),
+                fingerprint: 0,
+                known: Arc::default(),
                 running,
             };
             return Ok((!only_check).then_some(without));
         };
-        let mut reading = read(file).map_err(|error| Failure::new(FailureKind::Io, error))?;
+        let mut reading = read(file, &TypePaths::default(), &Known::new())
+            .map_err(|error| Failure::new(FailureKind::Io, error))?;
         if !only_check && reading.checked.mapping.is_some() && reading.leave_to_the_run(file) {
             reading.rendered = reading.checked.render_all();
         }
@@ -220,10 +353,13 @@ impl MappingFile {
                 };
                 Ok(Some(Self {
                     file: Some(file.to_owned()),
-                    files: reading.files,
+                    files: Arc::new(reading.files),
                     hash: reading.hash,
+                    fingerprint: reading.fingerprint,
+                    known: Arc::new(reading.known),
                     running: Running {
                         mapping: Arc::new(mapping),
+                        types: reading.types,
                         about: Arc::new(about),
                     },
                 }))
@@ -240,15 +376,18 @@ impl MappingFile {
         &self.running
     }
 
-    /// Reads the file again whenever it was saved, and at each SIGHUP, and tells `shells` of what is to run. Never ends.
+    /// Reads the files again whenever one of them was saved, and at each SIGHUP, and tells `shells` of what is to run. Never
+    /// ends.
     ///
     /// The files are looked at, not listened to: that sees what inotify does not, as a folder of a container that is
     /// mounted anew and files on a network, costs a handful of system calls, and is how a file that is being written is
-    /// waited for in any case.
+    /// waited for in any case. Of the definitions, of which there may be thousands, a bounded number has its turn with
+    /// each look.
     pub(crate) async fn follow(mut self, mut hangup: Signal, shells: watch::Sender<Running>) {
         let mut looks = interval(LOOK);
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut seen = self.files.clone();
+        let mut before = None;
+        let mut turn = 0_usize;
         loop {
             let asked = tokio::select! {
                 Some(()) = hangup.recv() => true,
@@ -260,30 +399,44 @@ impl MappingFile {
                 }
                 continue;
             };
-            let is: Stamps = self
-                .files
-                .keys()
-                .map(|file| (file.clone(), stamp(file)))
-                .collect();
-            // Written to until just now, or about to be: a file that is saved is gone or empty for a moment.
-            let settled = is == seen
-                && is
-                    .get(&file)
-                    .is_some_and(|at| at.is_some_and(|at| at.len > 0));
-            let wanted = asked || (settled && is != self.files);
-            seen = is;
-            if !wanted {
+            let look = Look {
+                file,
+                files: Arc::clone(&self.files),
+                before: before.take(),
+                turn,
+                asked,
+                running: Arc::clone(&self.running.types),
+                known: Arc::clone(&self.known),
+            };
+            turn = turn.wrapping_add(1);
+            // Elsewhere, since no sample should wait for a disk. One at a time: what is saved meanwhile differs from what
+            // was seen before the reading, and a signal is kept.
+            let mut looking = tokio::task::spawn_blocking(|| look.take());
+            let looked = match timeout(SLOW, &mut looking).await {
+                Ok(looked) => looked,
+                Err(_) => {
+                    warn!(
+                        "the files of the mapping have not been read within {} s: what runs stays as it is until they are",
+                        SLOW.as_secs()
+                    );
+                    looking.await
+                }
+            };
+            let Looked { seen, reading } = looked.unwrap_or_else(|error| Looked {
+                seen: None,
+                reading: Some(Err(error.to_string())),
+            });
+            let Some(reading) = reading else {
+                before = seen;
                 continue;
+            };
+            if let Some(seen) = seen {
+                // One that cannot be read is told of once.
+                self.files = Arc::new(seen);
             }
-            // One that cannot be read is told of once.
-            self.files.clone_from(&seen);
-            // Elsewhere, since a large one takes longer than a sample should wait.
-            let reading = tokio::task::spawn_blocking(move || read(&file)).await;
-            let reading = reading.unwrap_or_else(|error| Err(error.to_string()));
             if self.take(reading, asked) {
                 shells.send_replace(self.running.clone());
             }
-            seen.clone_from(&self.files);
         }
     }
 
@@ -301,18 +454,30 @@ impl MappingFile {
                 return true;
             }
         };
-        self.files = std::mem::take(&mut reading.files);
-        if reading.hash == self.hash && !asked {
+        self.files = Arc::new(std::mem::take(&mut reading.files));
+        if (&reading.hash, reading.fingerprint) == (&self.hash, self.fingerprint) && !asked {
             return false;
         }
         self.hash.clone_from(&reading.hash);
+        self.fingerprint = reading.fingerprint;
+        if let Some((first, more)) = reading.spoiled.split_first() {
+            for why in more.iter().take(MOST_TOLD) {
+                error!("{why}");
+            }
+            let more = match more.len() {
+                0 => String::new(),
+                more => format!(" (and {more} more)"),
+            };
+            self.refuse(format!("a definition that runs is faulty: {first}{more}"));
+            return true;
+        }
         if reading.checked.mapping.is_some() {
             // What is doubted was told at the start.
             let _rendered_no_more = reading.leave_to_the_run(&file);
         }
         tell(&reading.checked.findings);
-        match &reading.checked.mapping {
-            Some(mapping) => self.adopt(&file, mapping, reading.hash),
+        match reading.checked.mapping.take() {
+            Some(mapping) => self.adopt(&file, &mapping, reading),
             None => {
                 let errors = reading.checked.findings.iter();
                 let errors = errors.filter(|f| f.severity == Severity::Error).count();
@@ -333,25 +498,28 @@ impl MappingFile {
         about.stale = Some(why);
     }
 
-    fn adopt(&mut self, file: &Path, mapping: &Mapping, hash: String) {
+    fn adopt(&mut self, file: &Path, mapping: &Mapping, reading: Reading) {
         let difference = mapping.difference(&self.running.mapping);
         info!(
-            hash,
+            hash = reading.hash,
             added = difference.added.len(),
             changed = difference.changed.len(),
             removed = difference.removed.len(),
             same = difference.same,
+            definitions = reading.differing,
             "{} was read again",
             file.display()
         );
         let about = Arc::make_mut(&mut self.running.about);
-        about.hash = hash;
+        about.hash = reading.hash;
         about.loaded = seconds();
         about.variables = mapping.variables().len();
         about.reloads += 1;
         about.stale = None;
         // A copy, made by this thread: that of the thread that read lies among what it left, whose room would stay taken.
         self.running.mapping = Arc::new(mapping.clone());
+        self.running.types = reading.types;
+        self.known = Arc::new(reading.known);
     }
 }
 
@@ -403,3 +571,9 @@ fn seconds() -> i64 {
 
 /// How often the files are looked at. One that was the same twice is no longer being written.
 const LOOK: Duration = Duration::from_millis(250);
+/// After that time a disk is said not to answer.
+const SLOW: Duration = Duration::from_secs(5);
+/// Faulty definitions named in one go; more are of one cause.
+const MOST_TOLD: usize = 10;
+/// Definition files and folders looked at with each look: some 1000 a second, of which each costs a microsecond or two.
+const LOOKED_AT_ONCE: usize = 256;

@@ -6,6 +6,7 @@ use bridge_core::{Described, Kept, PublisherKey, Reason};
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
 use messages::{MessageType, Selection};
+use type_files::TypePaths;
 use uadp::{BuiltinType, Timestamp};
 
 /// The local side of a bridge: a ROS 1 graph, a DDS domain, or an OPC UA address space.
@@ -47,8 +48,9 @@ pub trait Port: Send + 'static {
 
     /// Another mapping takes the place of the one there is. What both say alike goes on undisturbed; what only the old one
     /// says is given up ([`PortEvent::Unbound`]), and what only the new one says taken up. Returns what is not changed
-    /// while the program runs, by its keys in the mapping and with the reason, for people.
-    fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<String>;
+    /// while the program runs, by its keys in the mapping and with the reason, for people. `types` are the definitions of
+    /// its `type_paths`, which may be others although the mapping is the same.
+    fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String>;
 
     /// Withdraws every registration and ends. Bounded by 2 s.
     fn shutdown(self) -> impl Future<Output = ()> + Send;

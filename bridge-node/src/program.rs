@@ -13,6 +13,7 @@ use tokio::sync::watch;
 use tokio::task::{JoinError, JoinSet};
 use tracing::{Instrument, Span, error, info, info_span};
 use transport::{Options, Udp};
+use type_files::TypePaths;
 
 use crate::arguments::Arguments;
 use crate::exit::{Failure, FailureKind};
@@ -55,6 +56,8 @@ pub trait Program: Parser {
 pub struct Context {
     /// The cell, as the mapping has it.
     pub mapping: Arc<Mapping>,
+    /// The definitions of its `type_paths`.
+    pub types: Arc<TypePaths>,
     /// The space to serve.
     pub own: SpaceId,
 }
@@ -97,7 +100,7 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
         .enable_all()
         .build()
         .map_err(|error| Failure::new(FailureKind::Io, format!("cannot start: {error}")))?;
-    runtime.block_on(async move {
+    let ended = runtime.block_on(async move {
         let arguments = program.arguments();
         let running = file.running().clone();
         let spaces = program.spaces(&running.mapping)?;
@@ -133,7 +136,10 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
             ended = ended.and(how(Some(next)));
         }
         ended
-    })
+    });
+    // A look at files on a disk that does not answer is not waited for.
+    runtime.shutdown_background();
+    ended
 }
 
 /// What carries one space, ready to run.
@@ -144,7 +150,11 @@ async fn prepare<P: Program>(
     requests: Requests,
 ) -> Result<Shell<P::Port>, Failure> {
     let arguments = program.arguments();
-    let Running { mapping, about } = changes.borrow().clone();
+    let Running {
+        mapping,
+        types,
+        about,
+    } = changes.borrow().clone();
     info!(
         version = env!("CARGO_PKG_VERSION"),
         space = %own,
@@ -162,6 +172,7 @@ async fn prepare<P: Program>(
     let router = Router::new(settings, Arc::clone(&mapping));
     let context = Context {
         mapping: Arc::clone(&mapping),
+        types,
         own,
     };
     Ok(Shell {

@@ -160,13 +160,13 @@ impl<P: Port> Shell<P> {
 
     /// Goes over to another mapping, where it is another.
     fn reload(&mut self) {
-        let mapping = Arc::clone(&self.changes.borrow_and_update().mapping);
+        let Running { mapping, types, .. } = self.changes.borrow_and_update().clone();
         if Arc::ptr_eq(&mapping, self.router.mapping()) {
             return;
         }
         self.router.replace_mapping(Arc::clone(&mapping), now());
         self.restart = self.fixed.differing(&mapping);
-        self.restart.extend(self.port.reload(&mapping));
+        self.restart.extend(self.port.reload(&mapping, &types));
         if !self.restart.is_empty() {
             warn!(
                 "restart needed: {} stay as they were; the rest of the mapping is taken",

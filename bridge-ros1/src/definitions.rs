@@ -4,7 +4,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use bridge_node::Environment;
+use bridge_node::{Environment, TypePaths};
 use messages::{DefinitionError, Dialect, MessageType, NameError, ServiceType, TypeName};
 use tcpros::ConnectionHeader;
 use uadp::BuiltinType;
@@ -17,19 +17,19 @@ pub(crate) struct Definitions {
 
 impl Definitions {
     /// With those of the mapping's `type_paths`, and of the folders with packages that `ROS_PACKAGE_PATH` lists.
-    pub(crate) fn new(type_paths: &[PathBuf], packages: Vec<PathBuf>) -> Self {
+    pub(crate) fn new(types: Arc<TypePaths>, packages: Vec<PathBuf>) -> Self {
         let environment = Environment {
             ros1: packages,
             ros2: Vec::new(),
         };
         Self {
-            known: bridge_node::Definitions::new(Dialect::Ros1, type_paths, environment),
+            known: bridge_node::Definitions::new(Dialect::Ros1, types, environment),
         }
     }
 
-    /// Reads the files again, by the mapping's `type_paths`.
-    pub(crate) fn read_again(&mut self, type_paths: &[PathBuf]) {
-        self.known.read_again(type_paths);
+    /// Takes what the mapping's `type_paths` have by now.
+    pub(crate) fn replace(&mut self, types: &Arc<TypePaths>) {
+        self.known.replace(types);
     }
 
     /// The type a publisher has: by the text in its header, else the known type of that name and checksum.
@@ -134,7 +134,7 @@ mod tests {
 
     #[test]
     fn a_type_nobody_has_heard_of_is_learned_from_its_publisher() {
-        let mut definitions = Definitions::new(&[], vec![]);
+        let mut definitions = Definitions::new(Arc::default(), vec![]);
         let text = "robot_msgs/Joint[] joints\n\
             ================================================================================\n\
             MSG: robot_msgs/Joint\nstring name\nfloat64 angle\n";
@@ -150,7 +150,7 @@ mod tests {
 
     #[test]
     fn a_publisher_without_a_text_is_known_by_its_checksum() {
-        let mut definitions = Definitions::new(&[], vec![]);
+        let mut definitions = Definitions::new(Arc::default(), vec![]);
         let string = "992ce8a1687cec8c8bd883ec73ca41d1";
         let found = definitions
             .of_publisher(&header("std_msgs/String", string, ""))
@@ -162,7 +162,7 @@ mod tests {
 
     #[test]
     fn a_text_that_is_not_that_of_the_checksum_is_not_believed() {
-        let mut definitions = Definitions::new(&[], vec![]);
+        let mut definitions = Definitions::new(Arc::default(), vec![]);
         let lie = header("robot_msgs/Arm", &"0".repeat(32), "int32 a\n");
         assert!(matches!(
             definitions.of_publisher(&lie),
@@ -178,8 +178,11 @@ mod tests {
 
     #[test]
     fn a_message_without_fields_has_a_type() {
-        let found =
-            Definitions::new(&[], vec![]).of_publisher(&header("std_msgs/Empty", EMPTY, ""));
+        let found = Definitions::new(Arc::default(), vec![]).of_publisher(&header(
+            "std_msgs/Empty",
+            EMPTY,
+            "",
+        ));
         assert_eq!(found.unwrap().leaves().len(), 0);
     }
 
@@ -189,8 +192,8 @@ mod tests {
         let folder = root.join("src/repository/robot_msgs/msg");
         std::fs::create_dir_all(&folder).unwrap();
         std::fs::write(folder.join("Leg.msg"), "float64 knee\n").unwrap();
-        let found =
-            Definitions::new(&[], vec![root.clone()]).get(&"robot_msgs/Leg".parse().unwrap());
+        let found = Definitions::new(Arc::default(), vec![root.clone()])
+            .get(&"robot_msgs/Leg".parse().unwrap());
         std::fs::remove_dir_all(&root).unwrap();
         assert_eq!(found.unwrap().leaves()[0].path, "knee");
     }

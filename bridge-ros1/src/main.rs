@@ -104,6 +104,7 @@ impl Program for BridgeRos1 {
                 .map_err(|error| Failure::new(FailureKind::Usage, error.to_string()))?,
             own: context.own,
             mapping: context.mapping,
+            types: context.types,
             packages: std::env::var_os("ROS_PACKAGE_PATH")
                 .map(|list| std::env::split_paths(&list).collect::<Vec<PathBuf>>())
                 .unwrap_or_default(),

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, timestamp};
+use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, TypePaths, timestamp};
 use mappings::{Mapping, SpaceId, TopicId, Variable};
 use messages::{MessageType, Selection, TypeName};
 use tcpros::{
@@ -34,6 +34,8 @@ pub struct PortOptions {
     pub own: SpaceId,
     /// The cell.
     pub mapping: Arc<Mapping>,
+    /// The definitions of its `type_paths`.
+    pub types: Arc<TypePaths>,
     /// Where to look for message definitions that are not built in, as `ROS_PACKAGE_PATH` lists.
     pub packages: Vec<PathBuf>,
 }
@@ -72,12 +74,13 @@ impl Ros1Port {
             node,
             own,
             mapping,
+            types,
             packages,
         } = options;
         let master = node.master_uri.clone();
         let node = Node::start(node)?;
         info!(node = node.name(), uri = node.uri(), master, space = %own, "started the ROS 1 node");
-        let mut definitions = Definitions::new(mapping.type_paths(), packages);
+        let mut definitions = Definitions::new(types, packages);
         let mut graph = Ros1Graph {
             node: &node,
             definitions: &mut definitions,
@@ -676,14 +679,15 @@ impl Port for Ros1Port {
             self.open_sink(topic);
             return;
         };
-        // What somebody subscribed to stays as it is; without a word nothing changes.
-        if sink.mapped.is_some() || open.publisher.subscribers() > 0 || learned.is_none() {
-            return;
-        }
         let message_type = Arc::clone(&open.message_type);
-        let before = sink.selection(message_type.name());
+        let subscribed = open.publisher.subscribers() > 0;
         let same = |name: &TypeName| name == message_type.name();
         let other_type = learned.as_ref().is_some_and(|(name, _)| !same(name));
+        // The type that somebody subscribed to stays, whatever of it the value is; without a word nothing changes.
+        if sink.mapped.is_some() || (subscribed && other_type) || learned.is_none() {
+            return;
+        }
+        let before = sink.selection(message_type.name());
         sink.learned = learned;
         let selection = sink.selection(message_type.name());
         if other_type {
@@ -711,8 +715,8 @@ impl Port for Ros1Port {
         }
     }
 
-    fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<String> {
-        self.go_over_to(mapping);
+    fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
+        self.go_over_to(mapping, types);
         Vec::new()
     }
 

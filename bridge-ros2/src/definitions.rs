@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use bridge_node::Environment;
+use bridge_node::{Environment, TypePaths};
 use messages::{
     DefinitionError, DescribedType, Dialect, MessageType, Registry, ServiceType, ServiceTypeHashes,
     TypeHash, TypeName,
@@ -41,21 +41,21 @@ impl Definition {
 impl Definitions {
     /// With the built-in definitions, those of the mapping's `type_paths`, and the prefixes of ROS 2 installations, as
     /// `AMENT_PREFIX_PATH` lists them.
-    pub(crate) fn new(type_paths: &[PathBuf], prefixes: Vec<PathBuf>) -> Self {
+    pub(crate) fn new(types: Arc<TypePaths>, prefixes: Vec<PathBuf>) -> Self {
         let environment = Environment {
             ros1: Vec::new(),
             ros2: prefixes,
         };
         Self {
-            known: bridge_node::Definitions::new(Dialect::Ros2, type_paths, environment),
+            known: bridge_node::Definitions::new(Dialect::Ros2, types, environment),
             found: BTreeMap::new(),
             told: BTreeMap::new(),
         }
     }
 
-    /// Reads the files again, by the mapping's `type_paths`. What nodes told stays.
-    pub(crate) fn read_again(&mut self, type_paths: &[PathBuf]) {
-        self.known.read_again(type_paths);
+    /// Takes what the mapping's `type_paths` have by now. What nodes told stays.
+    pub(crate) fn replace(&mut self, types: &Arc<TypePaths>) {
+        self.known.replace(types);
         self.found.clear();
     }
 
@@ -213,15 +213,15 @@ mod tests {
         std::fs::write(folder.join("Arm.msg"), "robot_msgs/Joint[] joints\n").unwrap();
         std::fs::write(folder.join("Joint.msg"), "string name\nfloat64 angle\n").unwrap();
 
-        let found =
-            Definitions::new(&[], vec![prefix.clone()]).get(&"robot_msgs/Arm".parse().unwrap());
+        let found = Definitions::new(Arc::default(), vec![prefix.clone()])
+            .get(&"robot_msgs/Arm".parse().unwrap());
         std::fs::remove_dir_all(&prefix).unwrap();
         assert_eq!(found.unwrap().message_type.leaves()[0].path, "joints");
     }
 
     #[test]
     fn a_type_nobody_defines_is_named_in_the_error() {
-        let error = Definitions::new(&[], vec![])
+        let error = Definitions::new(Arc::default(), vec![])
             .get(&"robot_msgs/Arm".parse().unwrap())
             .unwrap_err();
         assert!(error.to_string().contains("robot_msgs/Arm"), "{error}");
@@ -238,7 +238,7 @@ mod tests {
     #[test]
     fn definitions_of_one_name_are_kept_apart_by_their_hashes() {
         let name: TypeName = "robot_msgs/Arm".parse().unwrap();
-        let mut definitions = Definitions::new(&[], vec![]);
+        let mut definitions = Definitions::new(Arc::default(), vec![]);
         let (old, old_hash) = told(&name, "float64 angle\n");
         let (new, new_hash) = told(&name, "float32 speed\nfloat64 angle\n");
         definitions
@@ -261,7 +261,7 @@ mod tests {
     #[test]
     fn what_is_told_leaves_what_is_known_here_as_it_was() {
         let name: TypeName = "std_msgs/Bool".parse().unwrap();
-        let mut definitions = Definitions::new(&[], vec![]);
+        let mut definitions = Definitions::new(Arc::default(), vec![]);
         let here = definitions.get(&name).unwrap();
         let (other, hash) = told(&name, "string data\n");
         definitions

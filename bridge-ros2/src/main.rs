@@ -214,7 +214,11 @@ impl Program for BridgeRos2 {
     }
 
     async fn start(&self, context: Context) -> Result<Ros2Port, Failure> {
-        let Context { mapping, own } = context;
+        let Context {
+            mapping,
+            types,
+            own,
+        } = context;
         let security = self.security()?;
         let options = PortOptions {
             domain: DomainOptions {
@@ -229,6 +233,7 @@ impl Program for BridgeRos2 {
             },
             own,
             mapping,
+            types,
             prefixes: std::env::var_os("AMENT_PREFIX_PATH")
                 .map(|list| std::env::split_paths(&list).collect::<Vec<PathBuf>>())
                 .unwrap_or_default(),

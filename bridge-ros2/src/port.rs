@@ -20,7 +20,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, now};
+use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, TypePaths, now};
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{Selection, TypeName};
@@ -59,6 +59,8 @@ pub struct PortOptions {
     pub own: SpaceId,
     /// The cell.
     pub mapping: Arc<Mapping>,
+    /// The definitions of its `type_paths`.
+    pub types: Arc<TypePaths>,
     /// Where to look for message definitions that are not built in, as `AMENT_PREFIX_PATH` lists.
     pub prefixes: Vec<PathBuf>,
 }
@@ -116,6 +118,7 @@ impl Ros2Port {
             domain: domain_options,
             own,
             mapping,
+            types,
             prefixes,
         } = options;
         let domain = Domain::join(&domain_options)?;
@@ -129,7 +132,7 @@ impl Ros2Port {
             "joined the DDS domain"
         );
         let presence = domain.announce_bridge(own.into())?;
-        let mut definitions = Definitions::new(mapping.type_paths(), prefixes);
+        let mut definitions = Definitions::new(types, prefixes);
         let peers = ServicePeers::new(&domain);
         let declared =
             services::parameters(own, domain_options.domain, domain_options.node.use_sim_time);
@@ -505,15 +508,15 @@ impl Port for Ros2Port {
             self.open_sink(topic, Instant::now());
             return;
         };
-        // What somebody subscribed to stays as it is; without a word nothing changes.
-        let readers = self.graph.readers(&sink.dds_topic);
-        if sink.mapped.is_some() || !readers.is_empty() || learned.is_none() {
-            return;
-        }
         let message_type = Arc::clone(&open.definition.message_type);
-        let before = sink.selection(message_type.name());
+        let subscribed = !self.graph.readers(&sink.dds_topic).is_empty();
         let same = |name: &TypeName| name == message_type.name();
         let other_type = learned.as_ref().is_some_and(|(name, _)| !same(name));
+        // The type that somebody subscribed to stays, whatever of it the value is; without a word nothing changes.
+        if sink.mapped.is_some() || (subscribed && other_type) || learned.is_none() {
+            return;
+        }
+        let before = sink.selection(message_type.name());
         sink.learned = learned;
         let selection = sink.selection(message_type.name());
         if other_type {
@@ -532,9 +535,9 @@ impl Port for Ros2Port {
         debug!(%topic, silent, "the writer in the space");
     }
 
-    fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<String> {
+    fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
         let restart = self.fixed(mapping);
-        self.go_over_to(mapping);
+        self.go_over_to(mapping, types);
         restart
     }
 

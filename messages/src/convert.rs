@@ -116,6 +116,20 @@ mod tests {
         }
 
         #[test]
+        fn a_time_loses_less_than_100_ns_on_its_first_way_and_nothing_on_any_other(sec in i64::from(i32::MIN)..=i64::from(u32::MAX), nanosec in 0u32..1_000_000_000) {
+            let (back, rest) = date_time_to_time(time_to_date_time(sec, nanosec));
+            prop_assert_eq!((back, rest), (sec, nanosec - nanosec % 100));
+            prop_assert_eq!(date_time_to_time(time_to_date_time(back, rest)), (back, rest));
+        }
+
+        #[test]
+        fn a_duration_that_went_to_and_fro_stays_what_it_is(sec in i32::MIN..i32::MAX, nanosec in 0u32..1_000_000_000) {
+            let (back, rest) = millis_to_duration(duration_to_millis(sec, i64::from(nanosec))).unwrap();
+            let again = millis_to_duration(duration_to_millis(back, i64::from(rest)));
+            prop_assert_eq!(again, Some((back, rest)));
+        }
+
+        #[test]
         fn any_duration_returns_within_245_nanoseconds(sec in i32::MIN..i32::MAX, nanosec in 0u32..1_000_000_000) {
             let (back, rest) = millis_to_duration(duration_to_millis(sec, i64::from(nanosec))).unwrap();
             let drift = (i64::from(back) - i64::from(sec)) * NANOS_PER_SECOND + i64::from(rest) - i64::from(nanosec);

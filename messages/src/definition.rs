@@ -222,6 +222,14 @@ impl Definition {
             .split_once(char::is_whitespace)
             .ok_or("a type and a name expected")?;
         let rest = rest.trim_start();
+        // rosidl takes it for `uint8`, and the `char` of IDL for a type of its own.
+        let byte = written
+            .strip_prefix("char")
+            .filter(|arity| {
+                dialect == Dialect::Ros2 && (arity.is_empty() || arity.starts_with('['))
+            })
+            .map(|arity| format!("uint8{arity}"));
+        let written = byte.as_deref().unwrap_or(written);
         match rest.split_once('=') {
             Some((name, value)) if is_identifier(name.trim_end()) => {
                 self.constant(dialect, line, (written, name.trim_end(), value.trim()))

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use crate::definition::{Definition, Line};
 use crate::resolve::Resolver;
 use crate::type_hash::{
-    ARRAY, BOUNDED_SEQUENCE, BOUNDED_STRING, BOUNDED_WSTRING, BYTE, NESTED, STRING,
+    ARRAY, BOUNDED_SEQUENCE, BOUNDED_STRING, BOUNDED_WSTRING, BYTE, CHAR, NESTED, STRING,
     UNBOUNDED_SEQUENCE, WSTRING,
 };
 use crate::{DefinitionError, Dialect, MessageType, Registry, TypeHash, TypeName};
@@ -186,6 +186,7 @@ fn written(field: &DescribedField) -> Option<String> {
         10 => "float32".to_owned(),
         11 => "float64".to_owned(),
         15 => "bool".to_owned(),
+        CHAR => "char".to_owned(),
         BYTE => "byte".to_owned(),
         STRING => "string".to_owned(),
         WSTRING => "wstring".to_owned(),

@@ -13,7 +13,7 @@ use sha2::{Digest, Sha256};
 
 use crate::definition::{Arity, Definition, Field, FieldType, Number, Primitive, Text};
 use crate::resolve::hex;
-use crate::{DefinitionError, DescribedField, DescribedType, Registry, TypeName};
+use crate::{DefinitionError, DescribedField, DescribedType, Dialect, Registry, TypeName};
 
 /// The hash of a ROS 2 type, as nodes from Iron on announce it. Prints as `RIHS01_` and 64 hex digits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -220,8 +220,11 @@ impl<'r> Described<'r> {
         if self.types.contains_key(full) {
             return Ok(());
         }
-        let mut fields: Vec<FieldDescription> =
-            definition.fields.iter().map(FieldDescription::of).collect();
+        let dialect = self.registry.dialect();
+        let fields = definition.fields.iter();
+        let mut fields: Vec<FieldDescription> = fields
+            .map(|field| FieldDescription::of(field, dialect))
+            .collect();
         if fields.is_empty() {
             // What rosidl puts into an empty message, as C has no empty struct.
             fields.push(FieldDescription::new(
@@ -436,12 +439,17 @@ impl FieldDescription {
         }
     }
 
-    fn of(field: &Field) -> Self {
+    fn of(field: &Field, dialect: Dialect) -> Self {
         let mut found = match &field.kind {
             FieldType::Message(name) => Self::nested(&field.name, &name.ros2()),
             // The parser takes it for `uint8`, whose values and bytes are the same.
             FieldType::Primitive(_) if base(&field.written) == "byte" => {
                 Self::new(&field.name, BYTE)
+            }
+            FieldType::Primitive(_)
+                if dialect == Dialect::Ros2 && base(&field.written) == "char" =>
+            {
+                Self::new(&field.name, CHAR)
             }
             FieldType::Primitive(Primitive::Number(number)) => {
                 Self::new(&field.name, number.type_id())
@@ -504,6 +512,8 @@ const TIME: &str = "builtin_interfaces/msg/Time";
 const UUID: &str = "unique_identifier_msgs/msg/UUID";
 // `type_description_interfaces/msg/FieldType`, whose arrays of a type are numbered as far behind it as this:
 pub(crate) const NESTED: u8 = 1;
+/// The `char` of IDL.
+pub(crate) const CHAR: u8 = 13;
 pub(crate) const BYTE: u8 = 16;
 pub(crate) const STRING: u8 = 17;
 pub(crate) const WSTRING: u8 = 18;

@@ -4,6 +4,7 @@
 use std::collections::BTreeSet;
 
 use messages::{Dialect, Registry, TextKind, TypeName};
+use uadp::BuiltinType;
 
 const HASHES: &str = include_str!("data/ros2_type_hashes.txt");
 
@@ -263,6 +264,39 @@ fn what_is_missing_or_contains_itself_is_an_error_as_elsewhere() {
     assert!(registry.service_type_hashes(&name("a/Unknown")).is_err());
     let action = "Ring ring\n---\n---\n";
     assert!(registry.action_type_hashes(&name("a/Act"), action).is_err());
+}
+
+/// The hash is the SHA-256 that Python computes of the description, in which such a field has FIELD_TYPE_CHAR (13).
+#[test]
+fn a_char_of_idl_is_a_type_of_its_own_and_comes_back_from_its_description() {
+    let idl = "module robot_msgs { module msg {
+        typedef char char__4[4];
+        struct Key { char letter; char__4 word; octet octet; }; }; };";
+    let key = name("robot_msgs/Key");
+    let mut registry = Registry::empty(Dialect::Ros2);
+    registry.add_idl(TextKind::Message, &key, idl).unwrap();
+    let hash = registry.type_hash(&key).unwrap();
+    let expected = "0002d06732862500c8797638eea2b46640ccf5f690cd1aaaf3e25e97be1768a3";
+    assert_eq!(hash.to_string(), format!("RIHS01_{expected}"));
+    let told = registry.describe(&key).unwrap();
+    let mut other = Registry::empty(Dialect::Ros2);
+    other.add_described(&key, &told, hash).unwrap();
+    assert_eq!(other.describe(&key).unwrap(), told);
+    let values: Vec<_> = other
+        .get(&key)
+        .unwrap()
+        .leaves()
+        .iter()
+        .map(|l| l.builtin)
+        .collect();
+    assert_eq!(
+        values,
+        [
+            BuiltinType::Byte,
+            BuiltinType::ByteString,
+            BuiltinType::Byte
+        ]
+    );
 }
 
 #[test]

@@ -7,7 +7,7 @@ from types import new_class
 from cyclonedds.core import Policy, Qos
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.annotations import final
-from cyclonedds.idl.types import array, float64, int8, int32, int64, sequence, uint8, uint32, uint64
+from cyclonedds.idl.types import array, float32, float64, int8, int32, int64, sequence, uint8, uint32, uint64
 from cyclonedds.util import duration
 
 from ros2_types import Time
@@ -133,6 +133,12 @@ SERVICES = {
         "action_msgs/srv/CancelGoal",
         [("goal_info", GoalInfo, GoalInfo)],
         [("return_code", int8, 0), ("goals_canceling", sequence[GoalInfo], list)],
+    ),
+    # As tests/tests/shaped.rs defines it.
+    "robot_msgs/Move": service(
+        "robot_msgs/srv/Move",
+        [("speed", float32, 0.0), ("dry", bool, False), ("mode", str, "")],
+        [("refused", bool, False), ("codes", sequence[int32], list), ("took", float64, 0.0)],
     ),
     # The Fibonacci of the ROS tutorials under a package of its own.
     "demo_msgs/Fibonacci_SendGoal": service(

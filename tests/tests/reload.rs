@@ -5,7 +5,7 @@ use std::{
     fs,
     io::Write as _,
     net::TcpStream,
-    path::Path,
+    path::{Path, PathBuf},
     sync::{
         Arc, Mutex,
         atomic::{AtomicBool, Ordering},
@@ -16,8 +16,8 @@ use std::{
 use nix::sys::signal::Signal;
 use serde_json::Value;
 use system_tests::{
-    BareNode, Cell, Child, MASTER, METRICS_ROS1, METRICS_ROS2, Peer, SERVER_ENDPOINT, UadpSocket,
-    eventually, http_get, metrics, string_frame, xml_rpc,
+    BareNode, Cell, Child, MASTER, METRICS_ROS1, METRICS_ROS2, Peer, SERVER_ENDPOINT, UaSide,
+    UadpSocket, eventually, http_get, metrics, string_frame, xml_rpc,
 };
 use uadp::{NetworkMessage, NetworkMessageType, Scalar, Variant};
 
@@ -238,6 +238,142 @@ fn a_faulty_file_changes_nothing_and_says_why_and_a_mended_one_is_taken() {
     assert_eq!(about("restart_needed"), serde_json::json!(["pubsub.ttl"]));
     let _third = node.publish(&["/r3".to_owned()]);
     bridge.end();
+}
+
+/// A mapping whose first value is written to a topic of that type, and whose second is read from `/r1`.
+const DEFINED: &str = "
+spaces:
+  - {id: 1}
+namespaces:
+  2: urn:test
+type_paths: [types]
+variables:
+  - {node: ns=2;i=1, name: Goal, type: Double, origin: 0, ros: {space: 1, topic: /goal, type: geometry_msgs/Point, field: x}}
+  - {node: ns=2;i=2, name: Said, origin: 1, ros: {topic: /r1, type: std_msgs/String, field: data}}
+";
+
+/// [`DEFINED`], with a definition of its type and another one, and the folder of the first.
+fn defined(cell: &Cell, point: &str) -> (PathBuf, PathBuf) {
+    let folder = cell.folder().join("types/geometry_msgs/msg");
+    fs::create_dir_all(&folder).unwrap();
+    fs::write(folder.join("Point.msg"), point).unwrap();
+    fs::write(folder.join("Other.msg"), "bool a\n").unwrap();
+    (cell.file("cell.yaml", DEFINED), folder)
+}
+
+const POINT: &str = "float64 x\nfloat64 y\nfloat64 z\n";
+
+#[test]
+fn a_definition_file_that_is_saved_counts_and_a_faulty_one_changes_nothing_and_says_why() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let (file, folder) = defined(&cell, "float64 x\nfloat64 y\n");
+    let mut bridge = cell.bridge_ros1(&[file.to_str().unwrap()]);
+    let mut ua = UaSide::join();
+    let reader = cell.rospy("ros1_sub.py", &["/goal", "geometry_msgs/Point"]);
+    bridge.wait_for_line("md5", SOON);
+    let first = about("hash");
+
+    save(&folder.join("Point.msg"), "float64 x\nfloat64 9y\n");
+    bridge.wait_for_line("nothing is changed", SOON);
+    let why = about("stale");
+    let why = why.as_str().unwrap();
+    assert!(why.contains("geometry_msgs/msg/Point.msg:2: "), "{why}");
+    assert_eq!(
+        (about("reloads"), about("refused")),
+        (0.into(), 1.into()),
+        "{why}"
+    );
+    // Its field is there no longer, so that the mapping cannot run with it.
+    save(&folder.join("Point.msg"), "float64 y\n");
+    eventually("it is refused", SOON, || {
+        (about("refused") == 2).then_some(())
+    });
+    save(&folder.join("Point.msg"), "float64 x\nNowhere n\n");
+    eventually("it is refused, too", SOON, || {
+        (about("refused") == 3).then_some(())
+    });
+    let why = about("stale");
+    assert!(
+        why.as_str()
+            .unwrap()
+            .contains("`geometry_msgs/Point` needs"),
+        "{why}"
+    );
+    assert_eq!(about("reloads"), 0);
+
+    save(&folder.join("Point.msg"), POINT);
+    bridge.wait_for_line("was read again", SOON);
+    assert_eq!((about("stale"), about("reloads")), (Value::Null, 1.into()));
+    assert_eq!(
+        about("hash"),
+        first,
+        "that of the mapping, which is the same"
+    );
+    eventually("the peer has the value", SOON, || {
+        ua.write((0, 2, 1), Scalar::Double(1.5));
+        let values = reader.values();
+        values.iter().any(|value| value["x"] == 1.5).then_some(())
+    });
+
+    // One more file, in a folder of its own, and one less.
+    let more = folder.with_file_name("action");
+    fs::create_dir(&more).unwrap();
+    fs::write(more.join("Go.action"), "---\n---\n").unwrap();
+    eventually("it is read", SOON, || (about("reloads") == 2).then_some(()));
+    fs::remove_file(folder.join("Other.msg")).unwrap();
+    eventually("all are read", SOON, || {
+        (about("reloads") == 3).then_some(())
+    });
+    assert_eq!(about("refused"), 3);
+}
+
+#[test]
+fn values_cross_while_definitions_are_read_and_what_is_saved_meanwhile_is_read_next() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let (file, folder) = defined(&cell, POINT);
+    let mut bridge = cell.bridge_ros1(&[file.to_str().unwrap()]);
+    let node = BareNode::start("/robot");
+    let mut streams = node.publish(&["/r1".to_owned()]);
+    let ua = UaSide::join();
+    let mut crosses = |text: &str| {
+        streams[0].write_all(&string_frame(text)).unwrap();
+        ua.hear_scalar((1, 2, 2), Scalar::String(Some(text)));
+    };
+    let waits = |lease: &mut Child| {
+        lease.wait_for_json("a reader waits", SOON, |line| line.get("waits").cloned());
+    };
+    let path = folder.join("Point.msg");
+    let lease = || {
+        let lease = cell.asyncua_started("lease.py", &[path.to_str().unwrap()]);
+        lease.told().start().ready(SOON)
+    };
+
+    let mut held = lease();
+    // This one is read before the other.
+    save(&folder.join("Other.msg"), "bool b\n");
+    waits(&mut held);
+    crosses("meanwhile");
+    assert_eq!((about("reloads"), about("stale")), (0.into(), Value::Null));
+    save(&folder.join("Other.msg"), "bool c\n");
+    crosses("still");
+    held.tell("");
+    eventually("both are read", SOON, || {
+        (about("reloads") == 2).then_some(())
+    });
+    crosses("after");
+    assert!(held.end().success());
+
+    let mut held = lease();
+    bridge.signal(Signal::SIGHUP);
+    waits(&mut held);
+    // A reader that waits for a disk does not keep the program from its end.
+    assert!(bridge.end().success());
 }
 
 #[test]

@@ -8,31 +8,44 @@ use messages::{Dialect, TextKind, TypeName};
 
 use crate::package::{MANIFEST, Package};
 
-/// Files by what they define; the first of a name counts.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct Index {
-    files: BTreeMap<(Dialect, TextKind, TypeName), PathBuf>,
+/// Files, or what is in them, by what they define; the first of a name counts.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Index<F> {
+    files: BTreeMap<(Dialect, TextKind, TypeName), F>,
 }
 
-impl Index {
+impl<F> Default for Index<F> {
+    fn default() -> Self {
+        Self {
+            files: BTreeMap::new(),
+        }
+    }
+}
+
+impl Index<PathBuf> {
     pub(crate) fn of(dialect: Dialect, files: impl Iterator<Item = DefinitionFile>) -> Self {
         let mut index = Self::default();
         for file in files.filter(|file| file.of(dialect)) {
             if let Some(name) = file.name() {
-                index.insert(dialect, &file, &name);
+                index.insert(dialect, file.kind, &name, file.path);
             }
         }
         index
     }
+}
 
-    pub(crate) fn insert(&mut self, dialect: Dialect, file: &DefinitionFile, name: &TypeName) {
-        let key = (dialect, file.kind, name.clone());
-        self.files.entry(key).or_insert_with(|| file.path.clone());
+impl<F> Index<F> {
+    pub(crate) fn insert(&mut self, dialect: Dialect, kind: TextKind, name: &TypeName, file: F) {
+        let key = (dialect, kind, name.clone());
+        self.files.entry(key).or_insert(file);
     }
 
-    pub(crate) fn get(&self, dialect: Dialect, kind: TextKind, name: &TypeName) -> Option<&Path> {
-        let path = self.files.get(&(dialect, kind, name.clone()));
-        path.map(PathBuf::as_path)
+    pub(crate) fn get(&self, dialect: Dialect, kind: TextKind, name: &TypeName) -> Option<&F> {
+        self.files.get(&(dialect, kind, name.clone()))
+    }
+
+    pub(crate) fn all(&self) -> impl Iterator<Item = (&(Dialect, TextKind, TypeName), &F)> {
+        self.files.iter()
     }
 
     pub(crate) fn names(
@@ -85,23 +98,35 @@ impl DefinitionFile {
 }
 
 /// Looks through folders, of which there may be only so many.
-#[derive(Debug)]
-pub(crate) struct Walk {
+pub(crate) struct Walk<'s> {
     folders: usize,
     files: usize,
+    /// Told of each folder and file before it is looked at.
+    see: &'s mut dyn FnMut(&Path),
 }
 
-impl Walk {
-    pub(crate) const fn new() -> Self {
+impl<'s> Walk<'s> {
+    pub(crate) fn new(see: &'s mut dyn FnMut(&Path)) -> Self {
         Self {
             folders: MOST_FOLDERS,
             files: MOST_FILES,
+            see,
         }
+    }
+
+    pub(crate) fn see(&mut self, path: &Path) {
+        (self.see)(path);
+    }
+
+    fn package(&mut self, folder: &Path) -> Package {
+        self.see(&folder.join(MANIFEST));
+        Package::of(folder)
     }
 
     /// The definitions at or below a path: of packages, and of files that lie beside a `package.xml` or in a folder named
     /// after their package.
     pub(crate) fn all(&mut self, path: &Path) -> io::Result<Vec<DefinitionFile>> {
+        self.see(path);
         if path.metadata()?.is_file() {
             let folder = path.parent().unwrap_or_else(|| Path::new(""));
             let (folder, kind) = match (kind_of(folder), folder.parent()) {
@@ -109,14 +134,15 @@ impl Walk {
                 _ => (folder, None),
             };
             let folder = folder.canonicalize()?;
-            let file = DefinitionFile::of_path(path.to_owned(), &Package::of(&folder), kind);
+            let package = self.package(&folder);
+            let file = DefinitionFile::of_path(path.to_owned(), &package, kind);
             return Ok(file.into_iter().collect());
         }
         let mut found = Vec::new();
         // Of a path to the `msg` folder itself the package is the folder around.
         match (kind_of(path), path.parent()) {
             (Some(kind), Some(around)) => {
-                let package = Package::of(&around.canonicalize()?);
+                let package = self.package(&around.canonicalize()?);
                 self.folder_of(&package, (path, Some(kind)), &mut found);
             }
             _ => self.walk(path, (crate::DEEPEST, true), None, &mut found),
@@ -165,7 +191,7 @@ impl Walk {
         let mut here = Vec::new();
         if loose || is_package || !kinds.is_empty() {
             let named = folder.canonicalize();
-            let package = Package::of(named.as_deref().unwrap_or(folder));
+            let package = self.package(named.as_deref().unwrap_or(folder));
             for (path, kind) in &kinds {
                 self.folder_of(&package, (path, Some(*kind)), &mut here);
             }
@@ -225,6 +251,7 @@ impl Walk {
     /// In order; `None` when it cannot be read, or when enough were.
     fn entries(&mut self, folder: &Path) -> Option<Vec<PathBuf>> {
         self.folders = self.folders.checked_sub(1)?;
+        self.see(folder);
         let entries = std::fs::read_dir(folder).ok()?;
         let mut paths: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
         paths.sort();

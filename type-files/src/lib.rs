@@ -1,36 +1,32 @@
 //! Definition files of ROS types: where they are, and what is wrong with them.
 //!
-//! The files of a mapping's `type_paths` are all read when they are opened, so that everything wrong with them is told at
-//! once. A ROS installation has thousands: its folders are listed when something is looked for the first time, and a file is
-//! read when its type is wanted. What is changed later is seen when they are opened again.
+//! The files of a mapping's `type_paths` are all read at one moment, so that everything wrong with them is told at once,
+//! and kept: what is changed later is seen when they are read again. A ROS installation has thousands: its folders are
+//! listed when something is looked for the first time, and a file is read when its type is wanted.
 
 mod index;
 mod package;
+mod paths;
 
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use mappings::{PathFault, PathFaultKind, Readers, Surroundings};
-use messages::{
-    DefinitionError, DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName,
-    check_text,
-};
+use mappings::{PathFault, Readers, Surroundings};
+use messages::{DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName};
 use tracing::warn;
 
 use self::index::{Index, Walk};
+pub use self::paths::TypePaths;
 
 /// Definitions in files, for one program.
 #[derive(Debug, Clone)]
 pub struct TypeFiles {
-    paths: Vec<PathBuf>,
-    /// What the `type_paths` have.
-    own: Index,
-    faults: Vec<PathFault>,
+    own: Arc<TypePaths>,
     environment: Environment,
     /// What the installations have, once it was asked for.
-    installed: [Option<Index>; 2],
+    installed: [Option<Index<PathBuf>>; 2],
 }
 
 /// The ROS installations the program was started in.
@@ -83,7 +79,8 @@ impl Surroundings for Disk {
     }
 
     fn types(&self, paths: &[PathBuf]) -> Box<dyn mappings::TypeFiles> {
-        Box::new(TypeFiles::open(paths, Environment::from_env()))
+        let own = TypePaths::read(paths, &mut |_| {});
+        Box::new(TypeFiles::new(Arc::new(own), Environment::from_env()))
     }
 }
 
@@ -130,106 +127,40 @@ pub fn read_text(from: impl Read) -> Result<String, String> {
 }
 
 impl TypeFiles {
-    /// Reads all files of `paths`, which are folders with packages at or below them, or single files.
+    /// Those that were read, and those of the installations.
     #[must_use]
-    pub fn open(paths: &[PathBuf], environment: Environment) -> Self {
-        let mut files = Self {
-            paths: paths.to_vec(),
-            own: Index::default(),
-            faults: Vec::new(),
+    pub const fn new(own: Arc<TypePaths>, environment: Environment) -> Self {
+        Self {
+            own,
             environment,
             installed: [None, None],
-        };
-        let mut walk = Walk::new();
-        for (number, path) in paths.iter().enumerate() {
-            files.take(number, path, &mut walk);
         }
-        files
     }
 
-    /// Reads these `type_paths` in place of those there were, be they the same. What the installations have stays as it was
-    /// listed.
-    pub fn open_again(&mut self, paths: &[PathBuf]) {
-        let environment = std::mem::take(&mut self.environment);
-        let installed = std::mem::take(&mut self.installed);
-        *self = Self {
-            installed,
-            ..Self::open(paths, environment)
-        };
-    }
-
-    /// Whether there are `type_paths`.
+    /// Those that were read.
     #[must_use]
-    pub const fn has_paths(&self) -> bool {
-        !self.paths.is_empty()
+    pub fn paths(&self) -> &TypePaths {
+        &self.own
     }
 
-    fn take(&mut self, number: usize, path: &Path, walk: &mut Walk) {
-        let mut fault = |what| {
-            if self.faults.len() < MOST_FAULTS {
-                self.faults.push(PathFault { path: number, what });
-            }
-        };
-        let found = match walk.all(path) {
-            Ok(found) if found.is_empty() => {
-                let why = format!("{}: no definition files in it", path.display());
-                return fault(PathFaultKind::Empty(why));
-            }
-            Ok(found) => found,
-            Err(error) => {
-                let why = format!("{}: {error}", path.display());
-                return fault(PathFaultKind::Empty(why));
-            }
-        };
-        for file in found {
-            let Some(name) = file.name() else {
-                let why = format!(
-                    "{}: package and file are no name of a type: letters, digits and `_`, a letter first",
-                    file.path.display()
-                );
-                fault(PathFaultKind::File(why));
-                continue;
-            };
-            let text = match read(&file.path) {
-                Ok(text) => text,
-                Err(error) => {
-                    let why = format!("{}: {error}", file.path.display());
-                    fault(PathFaultKind::File(why));
-                    continue;
-                }
-            };
-            let text = definition(text, &file.path);
-            let mut refused = None;
-            let mut fits = false;
-            for dialect in [Dialect::Ros1, Dialect::Ros2] {
-                if !file.of(dialect) {
-                    continue;
-                }
-                match check_text(dialect, file.kind, &name, &text) {
-                    Ok(()) => {
-                        self.own.insert(dialect, &file, &name);
-                        fits = true;
-                    }
-                    Err(error) => refused = refused.or(Some(error)),
-                }
-            }
-            if let (false, Some(error)) = (fits, refused) {
-                fault(PathFaultKind::File(told(&file.path, &error)));
-            }
-        }
+    /// Takes others in place of those that were read. What the installations have stays as it was listed.
+    pub fn replace(&mut self, own: Arc<TypePaths>) {
+        self.own = own;
     }
 
-    fn installed(&mut self, dialect: Dialect) -> &Index {
+    fn installed(&mut self, dialect: Dialect) -> &Index<PathBuf> {
         let [ros1, ros2] = &mut self.installed;
         let environment = &self.environment;
         match dialect {
             Dialect::Ros1 => ros1.get_or_insert_with(|| {
-                let mut walk = Walk::new();
+                let mut unseen = |_: &Path| {};
+                let mut walk = Walk::new(&mut unseen);
                 let roots = environment.ros1.iter();
                 Index::of(dialect, roots.flat_map(|root| walk.packages(root, DEEPEST)))
             }),
             Dialect::Ros2 => ros2.get_or_insert_with(|| {
-                let mut walk = Walk::new();
+                let mut unseen = |_: &Path| {};
+                let mut walk = Walk::new(&mut unseen);
                 let roots = environment.ros2.iter();
                 Index::of(
                     dialect,
@@ -247,12 +178,12 @@ impl DefinitionTexts for TypeFiles {
         kind: TextKind,
         name: &TypeName,
     ) -> Option<DefinitionText> {
-        let path = match self.own.get(dialect, kind, name) {
-            Some(path) => path.to_owned(),
-            None => self.installed(dialect).get(dialect, kind, name)?.to_owned(),
-        };
-        match read(&path) {
-            Ok(text) => Some(definition(text, &path)),
+        if let Some(text) = self.own.index.get(dialect, kind, name) {
+            return Some(DefinitionText::clone(text));
+        }
+        let path = self.installed(dialect).get(dialect, kind, name)?;
+        match read(path) {
+            Ok(text) => Some(definition(text, path)),
             Err(error) => {
                 warn!(file = %path.display(), %error, "definition not readable");
                 None
@@ -261,13 +192,13 @@ impl DefinitionTexts for TypeFiles {
     }
 
     fn names(&mut self, dialect: Dialect, kind: TextKind) -> Vec<TypeName> {
-        let mut names: Vec<TypeName> = self.own.names(dialect, kind).cloned().collect();
+        let mut names: Vec<TypeName> = self.own.index.names(dialect, kind).cloned().collect();
         names.extend(self.installed(dialect).names(dialect, kind).cloned());
         names
     }
 
     fn places(&self, dialect: Dialect) -> Vec<String> {
-        let paths = self.paths.iter().map(|path| path.display().to_string());
+        let paths = self.own.paths.iter().map(|path| path.display().to_string());
         let (variable, roots) = match dialect {
             Dialect::Ros1 => (ROS_PACKAGE_PATH, &self.environment.ros1),
             Dialect::Ros2 => (AMENT_PREFIX_PATH, &self.environment.ros2),
@@ -280,21 +211,7 @@ impl DefinitionTexts for TypeFiles {
 
 impl mappings::TypeFiles for TypeFiles {
     fn faults(&mut self) -> Vec<PathFault> {
-        std::mem::take(&mut self.faults)
-    }
-}
-
-/// `file:line: why`
-fn told(file: &Path, error: &DefinitionError) -> String {
-    match error {
-        DefinitionError::Syntax {
-            line, reason, text, ..
-        } => format!("{}:{line}: {reason}: `{text}`", file.display()),
-        DefinitionError::Unknown { .. }
-        | DefinitionError::Cyclic { .. }
-        | DefinitionError::TooDeep { .. }
-        | DefinitionError::TooBig { .. }
-        | DefinitionError::OtherHash { .. } => format!("{}: {error}", file.display()),
+        self.own.faults()
     }
 }
 
@@ -331,8 +248,6 @@ const AMENT_PREFIX_PATH: &str = "AMENT_PREFIX_PATH";
 const MOST_OF_A_MAPPING: u64 = 8 << 20;
 /// More than any definition has.
 const MOST_BYTES: u64 = 1 << 20;
-/// Faults that are told; more are of one cause.
-const MOST_FAULTS: usize = 100;
 /// How deep a package may lie in a workspace.
 const DEEPEST: usize = 8;
 

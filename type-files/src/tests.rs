@@ -1,6 +1,6 @@
 use std::collections::BTreeMap;
 
-use mappings::TypeFiles as _;
+use mappings::{PathFaultKind, TypeFiles as _};
 use messages::{Library, Registry};
 
 use super::*;
@@ -28,6 +28,10 @@ impl Drop for Folder {
     fn drop(&mut self) {
         std::fs::remove_dir_all(&self.0).unwrap();
     }
+}
+
+fn open(paths: &[PathBuf], environment: Environment) -> TypeFiles {
+    TypeFiles::new(Arc::new(TypePaths::read(paths, &mut |_| {})), environment)
 }
 
 fn name(text: &str) -> TypeName {
@@ -63,7 +67,7 @@ fn a_path_wins_over_the_installation_and_both_over_what_is_built_in() {
         ros1: vec![folder.path("ws")],
         ros2: vec![],
     };
-    let mut files = TypeFiles::open(&[folder.path("types")], environment);
+    let mut files = open(&[folder.path("types")], environment);
     assert!(files.faults().is_empty());
     let mut library = Library::new(Registry::bundle(Dialect::Ros1));
     let service = library
@@ -122,7 +126,7 @@ fn an_installation_of_ros_2_is_read_below_share_and_prefers_the_msg_to_the_idl_m
         ros1: vec![],
         ros2: vec![folder.path("install")],
     };
-    let mut files = TypeFiles::open(&[], environment);
+    let mut files = open(&[], environment);
     let mut library = Library::new(Registry::bundle(Dialect::Ros2));
     let hip = library.message(&name("nav/Hip"), &mut files).unwrap();
     assert_eq!(hip.leaves()[0].path, "leg.knee");
@@ -173,13 +177,13 @@ fn what_one_ros_is_to_ignore_is_only_looked_into_for_the_other() {
         let names = files.names(dialect, TextKind::Message);
         names.iter().map(ToString::to_string).collect()
     };
-    let mut files = TypeFiles::open(&[], environment);
+    let mut files = open(&[], environment);
     assert_eq!(
         names(&mut files, Dialect::Ros1),
         ["ament_msgs/Arm", "colcon_msgs/Arm", "robot_msgs/Arm"],
         "the last by its package.xml, and none within it"
     );
-    let mut files = TypeFiles::open(std::slice::from_ref(&folder.0), Environment::default());
+    let mut files = open(std::slice::from_ref(&folder.0), Environment::default());
     assert_eq!(
         names(&mut files, Dialect::Ros2),
         ["inner_msgs/Arm", "old_msgs/Arm"]
@@ -206,7 +210,7 @@ fn a_file_that_does_not_parse_is_told_with_its_line_and_the_others_count() {
     );
     let paths = ["types", "empty", "nowhere", "types/robot_msgs/msg/Good.msg"]
         .map(|path| folder.path(path));
-    let mut files = TypeFiles::open(&paths, Environment::default());
+    let mut files = open(&paths, Environment::default());
     let faults = files.faults();
     let told: Vec<(usize, String)> = faults
         .into_iter()
@@ -244,7 +248,7 @@ fn a_file_that_does_not_parse_is_told_with_its_line_and_the_others_count() {
 #[test]
 fn a_single_file_is_of_the_package_around_its_folder() {
     let folder = Folder::new("single", &[("robot_msgs/msg/Arm.msg", "bool x\n")]);
-    let mut files = TypeFiles::open(
+    let mut files = open(
         &[folder.path("robot_msgs/msg/Arm.msg")],
         Environment::default(),
     );
@@ -285,7 +289,7 @@ const ROBOT: [(&str, &str); 8] = [
 
 /// Name and md5 of each service of the folders, and of each message of each action.
 fn md5s(paths: &[PathBuf]) -> BTreeMap<String, String> {
-    let mut files = TypeFiles::open(paths, Environment::default());
+    let mut files = open(paths, Environment::default());
     assert_eq!(files.faults(), []);
     let mut library = Library::new(Registry::bundle(Dialect::Ros1));
     let mut found = BTreeMap::new();
@@ -378,4 +382,59 @@ fn who_may_read_a_file_is_told_by_its_mode() {
         assert_eq!(told, readers, "{mode:o}");
     }
     assert_eq!(Disk.readers("/nowhere/cell.yaml"), None);
+}
+
+#[test]
+fn what_is_looked_at_is_told_of_and_a_file_that_does_not_count_any_more_is_named() {
+    let folder = Folder::new(
+        "seen",
+        &[
+            ("types/robot_msgs/msg/Arm.msg", "bool x\n"),
+            ("types/robot_msgs/msg/Leg.msg", "bool 9x\n"),
+        ],
+    );
+    let read = || {
+        let mut seen = Vec::new();
+        let read = TypePaths::read(&[folder.path("types")], &mut |path| {
+            seen.push(path.strip_prefix(&folder.0).unwrap().to_owned());
+        });
+        (read, seen)
+    };
+    let (before, seen) = read();
+    for path in [
+        "types",
+        "types/robot_msgs",
+        "types/robot_msgs/package.xml",
+        "types/robot_msgs/msg",
+        "types/robot_msgs/msg/Arm.msg",
+        "types/robot_msgs/msg/Leg.msg",
+    ] {
+        assert!(seen.contains(&PathBuf::from(path)), "{path}: {seen:?}");
+    }
+    let (same, _) = read();
+    assert_eq!(same, before);
+    assert_eq!(
+        (same.fingerprint(), same.differing(&before)),
+        (before.fingerprint(), 0)
+    );
+    assert_eq!(same.spoiled(&before), [""; 0], "it never counted");
+
+    let arm = folder.path("types/robot_msgs/msg/Arm.msg");
+    std::fs::write(&arm, "bool x\nbool y\n").unwrap();
+    let (changed, _) = read();
+    assert_ne!(changed.fingerprint(), before.fingerprint());
+    assert_eq!(changed.differing(&before), 1);
+    std::fs::write(&arm, "bool x\nbool\n").unwrap();
+    let (faulty, _) = read();
+    let spoiled = faulty.spoiled(&before);
+    assert!(
+        matches!(spoiled.as_slice(), [one] if one.contains("Arm.msg:2: ")),
+        "{spoiled:?}"
+    );
+    std::fs::remove_file(&arm).unwrap();
+    let (without, _) = read();
+    assert_eq!(
+        (without.spoiled(&before), without.differing(&before)),
+        (vec![], 1)
+    );
 }

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use bridge_node::PortEvent;
+use bridge_node::{PortEvent, TypePaths};
 use mappings::{Mapping, TopicId, Variable};
 use messages::{Selection, TypeName};
 use tracing::warn;
@@ -18,11 +18,11 @@ type Read = BTreeMap<String, (TypeName, Vec<(TopicId, Selection)>)>;
 
 impl Ros1Port {
     /// Everything is given up before anything is taken up, as a value or a topic may only have changed hands.
-    pub(super) fn go_over_to(&mut self, mapping: &Arc<Mapping>) {
+    pub(super) fn go_over_to(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) {
         let before = std::mem::replace(&mut self.mapping, Arc::clone(mapping));
         // What is peculiar under the new mapping is told anew.
         self.told.clear();
-        self.definitions.read_again(mapping.type_paths());
+        self.definitions.replace(types);
         // A type that nobody knew may be known now.
         for source in &mut self.sources {
             source.forget_strangers();

@@ -10,7 +10,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Delivery, Kept, Port, PortEvent};
+use bridge_node::{Delivery, Kept, Port, PortEvent, TypePaths};
 use bridge_ros1::{PortOptions, Ros1Port};
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
@@ -39,10 +39,12 @@ fn cell(mapping: &str) -> Cell {
         options.advertise_as("127.0.0.1");
         options
     };
+    let mapping = parsed(mapping);
     let port = Ros1Port::start(PortOptions {
         node: options("bridge"),
         own: SpaceId::ROS1,
-        mapping: parsed(mapping),
+        types: types(&mapping),
+        mapping,
         packages: Vec::new(),
     })
     .unwrap();
@@ -52,6 +54,10 @@ fn cell(mapping: &str) -> Cell {
         node,
         port,
     }
+}
+
+fn types(mapping: &Mapping) -> Arc<TypePaths> {
+    Arc::new(TypePaths::read(mapping.type_paths(), &mut |_| {}))
 }
 
 fn parsed(mapping: &str) -> Arc<Mapping> {

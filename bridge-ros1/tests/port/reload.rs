@@ -9,7 +9,7 @@ use tcpros::{Inbox, SubscriberOptions, Wanted};
 use tokio::time::timeout;
 
 use crate::services::{event, offer};
-use crate::{Cell, advertise, cell, delivery, events, line, message, parsed, run_until};
+use crate::{Cell, advertise, cell, delivery, events, line, message, parsed, run_until, types};
 
 /// X and Y of /target are read, Park is written to /park.
 const BEFORE: &str = crate::TWO_FIELDS;
@@ -18,6 +18,12 @@ const BEFORE: &str = crate::TWO_FIELDS;
 fn edited(from: &str, to: &str) -> Arc<mappings::Mapping> {
     assert!(BEFORE.contains(from));
     parsed(&BEFORE.replacen(from, to, 1))
+}
+
+impl Cell {
+    fn go_over(&mut self, mapping: &Arc<mappings::Mapping>) -> Vec<String> {
+        self.port.reload(mapping, &types(mapping))
+    }
 }
 
 /// What the port says within a short while, when nothing or little is expected.
@@ -35,7 +41,7 @@ async fn the_same_mapping_changes_nothing() {
     let publisher = advertise(&cell.node, "/target", "geometry_msgs/Point", true);
     let _sent = publisher.publish(Bytes::from_static(b"p"));
     events(&mut cell.port, 7).await;
-    assert_eq!(cell.port.reload(&parsed(BEFORE)), [""; 0]);
+    assert_eq!(cell.go_over(&parsed(BEFORE)), [""; 0]);
     assert_eq!(at_once(&mut cell).await, [""; 0]);
     let _sent = publisher.publish(Bytes::from_static(b"q"));
     let lines = events(&mut cell.port, 2).await;
@@ -48,7 +54,7 @@ async fn a_value_that_changes_its_field_hears_what_was_latched_and_the_other_hea
     let publisher = advertise(&cell.node, "/target", "geometry_msgs/Point", true);
     let _sent = publisher.publish(Bytes::from_static(b"p"));
     events(&mut cell.port, 7).await;
-    cell.port.reload(&edited("field: y", "field: z"));
+    cell.go_over(&edited("field: y", "field: z"));
     let expected = [
         "ua_1_2_2 unbound",
         "ua_1_2_2 is geometry_msgs/Point z",
@@ -69,7 +75,7 @@ async fn a_topic_without_values_is_let_go_and_one_that_gets_some_is_read() {
     events(&mut cell.port, 7).await;
     assert_eq!(publishers.each_ref().map(|p| p.subscribers()), [1, 0]);
     let text = BEFORE.replace(old, new).replace("field: y", "field: z");
-    cell.port.reload(&parsed(&text));
+    cell.go_over(&parsed(&text));
     let expected = [
         "ua_1_2_1 unbound",
         "ua_1_2_2 unbound",
@@ -87,7 +93,7 @@ async fn a_topic_without_values_is_let_go_and_one_that_gets_some_is_read() {
     .await;
     assert_eq!(publishers[1].subscribers(), 1);
     // And back again, as a file is that was saved too early.
-    cell.port.reload(&parsed(BEFORE));
+    cell.go_over(&parsed(BEFORE));
     events(&mut cell.port, 8).await;
     assert_eq!(publishers[0].subscribers(), 1);
 }
@@ -97,16 +103,14 @@ async fn a_topic_that_went_and_came_back_is_read_once_whatever_is_edited_next() 
     let mut cell = cell(BEFORE);
     let publisher = advertise(&cell.node, "/target", "geometry_msgs/Point", false);
     events(&mut cell.port, 5).await;
-    cell.port
-        .reload(&parsed(&BEFORE.replace("/target", "/goal")));
+    cell.go_over(&parsed(&BEFORE.replace("/target", "/goal")));
     events(&mut cell.port, 2).await;
-    cell.port.reload(&parsed(BEFORE));
+    cell.go_over(&parsed(BEFORE));
     // Bound and live again, both of them.
     event(&mut cell, "ua_1_2_1", "live true").await;
     event(&mut cell, "ua_1_2_2", "live true").await;
     for name in ["Stop", "Halt"] {
-        cell.port
-            .reload(&edited("name: Park", &format!("name: {name}")));
+        cell.go_over(&edited("name: Park", &format!("name: {name}")));
         assert_eq!(at_once(&mut cell).await, [""; 0]);
     }
     let _sent = publisher.publish(Bytes::from_static(b"q"));
@@ -135,7 +139,7 @@ async fn a_topic_that_is_written_may_change_its_type_and_may_come_under_its_own_
 
     let other = BEFORE.replace("type: Boolean", "type: Int16");
     let other = parsed(&other.replace("type: std_msgs/Bool", "type: std_msgs/Int16"));
-    cell.port.reload(&other);
+    cell.go_over(&other);
     let stale = cell.port.publish(delivery("ua_2_2_3", b"\x01"));
     assert_eq!(stale, Err("type changes"), "it is still in the old one");
     let lines = at_once(&mut cell).await;
@@ -152,7 +156,7 @@ async fn a_topic_that_is_written_may_change_its_type_and_may_come_under_its_own_
     let begin = BEFORE
         .find("    ros:\n      - {space: 1, topic: /park")
         .unwrap();
-    cell.port.reload(&parsed(&BEFORE[..begin]));
+    cell.go_over(&parsed(&BEFORE[..begin]));
     assert_eq!(at_once(&mut cell).await, ["ua_2_2_3 unbound"]);
     let refused = cell.port.publish(delivery("ua_2_2_3", b"\x01"));
     assert_eq!(refused, Err("no publisher yet"), "until its type is known");
@@ -183,7 +187,7 @@ variables:
     event(&mut cell, "ua_1_2_2", "=").await;
     event(&mut cell, "ua_1_2_5", "=").await;
 
-    cell.port.reload(&parsed(&service("/lamp", "50ms")));
+    cell.go_over(&parsed(&service("/lamp", "50ms")));
     for line in ["unbound", "is std_srvs/SetBoolRequest"] {
         event(&mut cell, "ua_0_2_1", line).await;
     }
@@ -196,7 +200,7 @@ variables:
     // The poll is the same in both and went on.
     event(&mut cell, "ua_1_2_5", "=").await;
 
-    cell.port.reload(&parsed(&service("/lamp", "1h")));
+    cell.go_over(&parsed(&service("/lamp", "1h")));
     event(&mut cell, "ua_1_2_5", "unbound").await;
     // The first call of the new poll is at once, and the next not today.
     event(&mut cell, "ua_1_2_5", "=").await;
@@ -218,11 +222,11 @@ async fn a_topic_named_in_the_space_crosses_again_when_the_mapping_has_another_u
         named.publish(Bytes::from_static(b"\x01")),
     );
     event(&mut cell, "ua_1_2_7", "= b\"\\0\"").await;
-    cell.port.reload(&parsed(crate::NOTHING));
+    cell.go_over(&parsed(crate::NOTHING));
     event(&mut cell, "ua_1_2_7", "unbound").await;
     event(&mut cell, "ua_1_2_7", "is std_msgs/Bool whole").await;
     event(&mut cell, "ua_1_2_7", "= b\"\\x01\"").await;
-    cell.port.reload(&parsed(tied));
+    cell.go_over(&parsed(tied));
     event(&mut cell, "ua_1_2_7", "unbound").await;
     event(&mut cell, "ua_1_2_7", "= b\"\\0\"").await;
     run_until(&mut cell.port, "the other is let go", || {
@@ -250,10 +254,10 @@ async fn a_saved_definition_file_counts_from_the_next_reload_on_and_others_do_no
         lines[0].starts_with("ua_2_2_1 is geometry_msgs/Point"),
         "{lines:?}"
     );
-    cell.port.reload(&parsed(&text));
+    cell.go_over(&parsed(&text));
     assert_eq!(at_once(&mut cell).await, [""; 0]);
     std::fs::write(&file, "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n").unwrap();
-    cell.port.reload(&parsed(&text));
+    cell.go_over(&parsed(&text));
     std::fs::remove_dir_all(&folder).unwrap();
     let expected = ["ua_2_2_1 unbound", &lines[0]];
     assert_eq!(at_once(&mut cell).await, expected);

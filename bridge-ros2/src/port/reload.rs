@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use bridge_node::{PortEvent, now};
+use bridge_node::{PortEvent, TypePaths, now};
 use mappings::{Mapping, SpaceId, TopicId, Variable};
 use messages::{Selection, TypeName};
 
@@ -20,11 +20,11 @@ type Read = BTreeMap<String, (TypeName, Vec<(TopicId, Selection)>)>;
 impl Ros2Port {
     /// Everything is given up before anything is taken up, as a value or a topic may only have changed hands. Endpoints
     /// are made with the next look at the domain.
-    pub(super) fn go_over_to(&mut self, mapping: &Arc<Mapping>) {
+    pub(super) fn go_over_to(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) {
         let before = std::mem::replace(&mut self.mapping, Arc::clone(mapping));
         // What is peculiar under the new mapping is told anew.
         self.told.clear();
-        self.definitions.read_again(mapping.type_paths());
+        self.definitions.replace(types);
         let mut read = Read::new();
         for (variable, binding) in mapping.bindings(self.own) {
             if variable.topic.space == self.own {

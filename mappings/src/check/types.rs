@@ -200,9 +200,9 @@ impl Types {
 
 fn origin(library: &Library, kind: TextKind, name: &TypeName, known: bool) -> TypeOrigin {
     match library.file(kind, name) {
-        Some(file) => TypeOrigin::File(file.to_string()),
+        Some(file) if known => TypeOrigin::File(file.to_string()),
         None if known => TypeOrigin::BuiltIn,
-        None => TypeOrigin::Unknown,
+        Some(_) | None => TypeOrigin::Unknown,
     }
 }
 

@@ -4,7 +4,7 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Delivery, Described, Failure, FailureKind, Kept, Port, PortEvent};
+use bridge_node::{Delivery, Described, Failure, FailureKind, Kept, Port, PortEvent, TypePaths};
 use mappings::{Mapping, Server, SpaceId, TopicId};
 use opcua::server::ServerHandle;
 use opcua::server::address_space::AddressSpace;
@@ -197,7 +197,7 @@ impl Port for ServerPort {
         self.space.set_silent(topic, silent);
     }
 
-    fn reload(&mut self, mapping: &Arc<Mapping>) -> Vec<String> {
+    fn reload(&mut self, mapping: &Arc<Mapping>, _: &Arc<TypePaths>) -> Vec<String> {
         let (was, is) = (&self.described, mapping.server());
         let endpoint = self.mapped_url && was.endpoint != is.endpoint;
         let mut restart: Vec<String> = [

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_node::{Delivery, Kept, Port, PortEvent};
+use bridge_node::{Delivery, Kept, Port, PortEvent, TypePaths};
 use bridge_ros2::{PortOptions, Ros2Port};
 use mappings::{Mapping, SpaceId, TopicId};
 use nix::sys::signal::Signal;
@@ -23,10 +23,15 @@ pub(crate) fn port_of(mapping: Arc<Mapping>) -> Ros2Port {
     Ros2Port::start(PortOptions {
         domain: options(),
         own: SpaceId::new(DOMAIN).unwrap(),
+        types: types(&mapping),
         mapping,
         prefixes: Vec::new(),
     })
     .unwrap()
+}
+
+pub(crate) fn types(mapping: &Mapping) -> Arc<TypePaths> {
+    Arc::new(TypePaths::read(mapping.type_paths(), &mut |_| {}))
 }
 
 pub(crate) fn topic(name: &str) -> TopicId {

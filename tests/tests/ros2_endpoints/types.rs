@@ -12,7 +12,7 @@ use system_tests::{Cell, Peer};
 use uadp::BuiltinType;
 
 use crate::peer::{SOON, options, writes};
-use crate::port::{bound, event, port, port_of, run_until, topic};
+use crate::port::{bound, event, port, port_of, run_until, topic, types};
 
 const UNKNOWN: &str = "type_description_interfaces/FieldType";
 
@@ -388,7 +388,7 @@ async fn a_saved_definition_file_counts_from_the_next_reload_on() {
     let first = [next_bound(&mut port).await, next_bound(&mut port).await];
     assert_eq!(first, [(read, Some(3)), (written, Some(3))]);
     std::fs::write(&file, "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n").unwrap();
-    port.reload(&mapping);
+    port.reload(&mapping, &types(&mapping));
     let mut changed = Vec::new();
     for _ in 0..4 {
         changed.push(next_bound(&mut port).await);
