@@ -170,37 +170,40 @@ pub struct Counters {
     pub described: u64,
     /// Keep-alives sent.
     pub keep_alives: u64,
-    dropped: [u64; Reason::ALL.len()],
+    /// Of the reasons that occurred, in their order: most topics have few.
+    dropped: Vec<(Reason, u64)>,
 }
 
 impl Counters {
     /// How many were dropped for `reason`.
     #[must_use]
     pub fn dropped(&self, reason: Reason) -> u64 {
-        Reason::ALL
-            .iter()
-            .zip(self.dropped)
-            .find_map(|(each, count)| (*each == reason).then_some(count))
+        self.drops()
+            .find_map(|(each, count)| (each == reason).then_some(count))
             .unwrap_or_default()
     }
 
     /// Every reason that occurred, with its count.
     pub fn drops(&self) -> impl Iterator<Item = (Reason, u64)> {
-        Reason::ALL
-            .into_iter()
-            .zip(self.dropped)
-            .filter(|(_, count)| *count > 0)
+        self.dropped.iter().copied()
     }
 
     /// Adds `count` drops and says how many there are now.
     pub(crate) fn add(&mut self, reason: Reason, count: u64) -> u64 {
-        for (each, total) in Reason::ALL.iter().zip(&mut self.dropped) {
-            if *each == reason {
-                *total = total.saturating_add(count);
-                return *total;
-            }
+        let place = self
+            .dropped
+            .binary_search_by_key(&reason, |(each, _)| *each);
+        if let Err(before) = place
+            && count > 0
+        {
+            self.dropped.insert(before, (reason, count));
+            return count;
         }
-        0
+        let known = place.ok().and_then(|found| self.dropped.get_mut(found));
+        known.map_or(0, |(_, total)| {
+            *total = total.saturating_add(count);
+            *total
+        })
     }
 }
 

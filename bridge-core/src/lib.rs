@@ -18,6 +18,7 @@ mod loop_rule;
 mod network;
 mod output;
 mod pace;
+mod plans;
 mod queue;
 mod reader;
 mod router;

@@ -30,7 +30,7 @@ pub(crate) struct Reader {
     /// last repeated another than the newest.
     several: Option<Instant>,
     /// A sample that waits for its local type.
-    pub(crate) held: Option<Held>,
+    pub(crate) held: Option<Box<Held>>,
     /// When the port was last asked for the local type.
     pub(crate) asked: Option<Instant>,
     /// Builtin type of each field, and whether it is an array, of a sample of the present version.

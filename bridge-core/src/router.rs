@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use mappings::{Mapping, Overflow, SpaceId, TopicId};
-use messages::{Dialect, MessageType, Plan, PlanError, Selection, Wire};
+use messages::{Dialect, MessageType, PlanError, Selection, Wire};
 use uadp::{Fields, Timestamp};
 
 use crate::counters::{Counters, Reason, Verdict, is_told};
@@ -23,6 +23,7 @@ use crate::loop_rule::{Side, may_cross};
 use crate::network::{chunk, data_set_header, encode, keep_alive, prepare_chunks};
 use crate::output::{Delivery, Heard, Kept, Notice, Output, PublisherKey};
 use crate::pace::Pace;
+use crate::plans::Plans;
 use crate::reader::{Held, Reader};
 use crate::settings::{Local, Now, Settings};
 use crate::topic::{Item, Role, Sending, Topic};
@@ -38,6 +39,7 @@ pub struct Router {
     settings: Settings,
     mapping: Arc<Mapping>,
     topics: HashMap<TopicId, Topic>,
+    plans: Plans,
     /// Topics with something in their queue, served in turn: a camera cannot starve a button.
     ready: VecDeque<TopicId>,
     /// Topics in the midst of a large message, which wait for `pace`.
@@ -65,6 +67,7 @@ impl Router {
             settings,
             mapping,
             topics: HashMap::new(),
+            plans: Plans::default(),
             ready: VecDeque::new(),
             paced: VecDeque::new(),
             pace: Pace::default(),
@@ -96,7 +99,7 @@ impl Router {
             // A side that speaks in fields needs no plan.
             Local::Fields => return Ok(()),
         };
-        let plan = Plan::compile(message_type, selection, wire)?;
+        let plan = self.plans.plan(message_type, selection, wire)?;
         // A message as bytes is in the dialect of its origin; that of an OPC UA origin is taken as it is.
         let origin = match topic.space {
             SpaceId::UA => None,
@@ -136,7 +139,7 @@ impl Router {
                 status,
                 arrived,
                 ..
-            } = held;
+            } = *held;
             let sample = Sample {
                 fields,
                 source,
@@ -640,10 +643,10 @@ impl Router {
                 .variable(topic)
                 .map_or(Overflow::KeepLatest, |found| found.overflow);
             let role = if topic.space == self.settings.own {
-                Role::Ours(Writer::new(now.monotonic))
+                Role::Ours(Box::new(Writer::new(now.monotonic)))
             } else {
                 let from = from.unwrap_or_else(|| SocketAddr::from(([0, 0, 0, 0], 0)));
-                Role::Theirs(Reader::new(from, now.monotonic))
+                Role::Theirs(Box::new(Reader::new(from, now.monotonic)))
             };
             let mut entry = Topic::new(role, overflow);
             entry.gate = match self.mapping.variable(topic) {

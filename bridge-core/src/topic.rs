@@ -21,7 +21,7 @@ pub(crate) struct Topic {
     pub(crate) role: Role,
     /// How its bytes become fields or the other way. `None` until the local type is known, and for a local side
     /// that speaks in fields.
-    pub(crate) plan: Option<Plan>,
+    pub(crate) plan: Option<Arc<Plan>>,
     /// What the plan of a topic of our own space was made of.
     pub(crate) bound: Option<(Arc<MessageType>, Selection)>,
     /// For bytes of the other ROS, what makes them ours, or why nothing does.
@@ -43,12 +43,13 @@ pub(crate) struct Topic {
     pub(crate) timer: Option<Instant>,
 }
 
+// In Boxes, because the Router's table of topics has room for up to twice as many as there are.
 #[derive(Debug)]
 pub(crate) enum Role {
     /// Produced here: we are its DataSetWriter.
-    Ours(Writer),
+    Ours(Box<Writer>),
     /// Produced elsewhere.
-    Theirs(Reader),
+    Theirs(Box<Reader>),
 }
 
 /// A sample on its way out.

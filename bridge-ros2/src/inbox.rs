@@ -18,7 +18,8 @@ use crate::raw::{Payload, Reader};
 /// Readers by a key of the owner's choice.
 #[derive(Debug)]
 pub struct Inbox<K> {
-    slots: BTreeMap<u64, Slot<K>>,
+    /// In Boxes, because the nodes of a map that grows at its end stay half empty.
+    slots: BTreeMap<u64, Box<Slot<K>>>,
     next_slot: u64,
     ready: Arc<Ready>,
 }
@@ -73,13 +74,13 @@ impl<K: Clone> Inbox<K> {
         wakeup.wake_by_ref();
         self.slots.insert(
             id,
-            Slot {
+            Box::new(Slot {
                 key,
                 reader,
                 delivered: BTreeMap::new(),
                 waker: Waker::from(Arc::clone(&wakeup)),
                 wakeup,
-            },
+            }),
         );
         SlotId(id)
     }

@@ -81,7 +81,7 @@ pub struct Ros2Port {
     told_types: TypeServer,
     graph: Graph,
     /// Topics we read; a source never goes away, so that its index names it.
-    sources: Vec<Source>,
+    sources: Vec<Box<Source>>,
     source_of: BTreeMap<String, usize>,
     inbox: Inbox<usize>,
     /// Services that are called for values.
@@ -90,7 +90,8 @@ pub struct Ros2Port {
     peers: ServicePeers,
     parameters: ParameterServer,
     /// Topics we write.
-    sinks: HashMap<TopicId, Sink>,
+    /// In Boxes, because the table has room for up to twice as many as there are.
+    sinks: HashMap<TopicId, Box<Sink>>,
     /// Readers that were replaced; they hear on until their successor is matched.
     retired: VecDeque<(Instant, Reader)>,
     /// What `recv` hands out next; filled only while it is empty, or by one pass over the topics.
@@ -185,12 +186,16 @@ impl Ros2Port {
                 let name = binding.message_type.clone();
                 let index = self.source(dds_topic(&binding.ros_topic), name);
                 if let Some(source) = self.sources.get_mut(index) {
+                    // Most topics have one.
+                    if source.values.is_empty() {
+                        source.values.reserve_exact(1);
+                    }
                     source.values.push((variable.topic, selection));
                 }
             } else {
                 let name = binding.message_type.clone();
                 let sink = Sink::mapped(&binding.ros_topic, name, selection, variable.overflow);
-                self.sinks.insert(variable.topic, sink);
+                self.sinks.insert(variable.topic, Box::new(sink));
             }
         }
     }
@@ -213,7 +218,8 @@ impl Ros2Port {
         let next = self.sources.len();
         let index = *self.source_of.entry(dds_topic.clone()).or_insert(next);
         if index == next {
-            self.sources.push(Source::new(dds_topic, message_type));
+            let source = Source::new(dds_topic, message_type);
+            self.sources.push(Box::new(source));
         }
         index
     }
@@ -449,7 +455,7 @@ impl Port for Ros2Port {
             open: Some(open),
             dds_topic,
             ..
-        }) = self.sinks.get_mut(&topic)
+        }) = self.sinks.get_mut(&topic).map(Box::as_mut)
         else {
             return Err("no writer yet");
         };
@@ -491,7 +497,7 @@ impl Port for Ros2Port {
                 return;
             }
             let sink = Sink::by_name(topic, self.mapping.variable(topic));
-            self.sinks.insert(topic, sink);
+            self.sinks.insert(topic, Box::new(sink));
         }
         let standard = match shape {
             [(builtin, array)] => self.definitions.standard_type(*builtin, *array),

@@ -195,7 +195,7 @@ impl Mapping {
     /// Every binding to a service of one space.
     pub fn services(&self, space: SpaceId) -> impl Iterator<Item = (&Variable, &ServiceBinding)> {
         self.variables.iter().filter_map(move |v| {
-            let service = v.service.as_ref()?;
+            let service = v.service.as_deref()?;
             (service.space == space).then_some((v, service))
         })
     }
@@ -442,7 +442,7 @@ pub struct Variable {
     /// At most one per space.
     pub bindings: Vec<Binding>,
     /// The service tied to it, in a space where no topic is.
-    pub service: Option<ServiceBinding>,
+    pub service: Option<Box<ServiceBinding>>,
     /// What its queue does when full.
     pub overflow: Overflow,
     /// Which of its values its origin sends.

@@ -185,6 +185,42 @@ fn five_hundred_topics_take_few_threads_little_memory_and_no_processor_when_idle
     assert!(bridge.runs());
 }
 
+#[test]
+fn five_thousand_routes_of_a_mapping_take_little_memory() {
+    const ROUTES: usize = 5000;
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let mut text = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:test}\nvariables:\n".to_owned();
+    for route in 1..=ROUTES {
+        // Half of them are read, the others written.
+        let origin = 1 + route % 2;
+        text += &format!(
+            "  - {{node: ns=2;i={route}, name: R{route}, origin: {origin}, \
+             ros: [{{space: 2, topic: /robot{}/value{route}, type: std_msgs/Float64, field: data}}]}}\n",
+            route % 50
+        );
+    }
+    let mapping = cell.file("cell.yaml", &text);
+    let mut bridge = cell.bridge_ros2(&[mapping.to_str().unwrap()]);
+    let is_bound = |line: &&String| line.contains("bound") && line.contains("topic=ua_");
+    eventually("all routes are there", 2 * SOON, || {
+        (bridge.lines().iter().filter(is_bound).count() >= ROUTES).then_some(())
+    });
+    // It hears its own announcements for a while.
+    let (mut memory, mut since) = (0, Instant::now());
+    eventually("its memory stays as it is", SOON, || {
+        let more = resident(bridge.id());
+        if more != memory {
+            (memory, since) = (more, Instant::now());
+        }
+        (since.elapsed() > Duration::from_secs(2)).then_some(())
+    });
+    println!("{ROUTES} routes: {} MB", memory / 1_000_000);
+    assert!(memory < 80_000_000, "{memory} bytes");
+    assert!(bridge.runs());
+}
+
 /// A second bridge on the domain, for the values of that space, as it answers.
 fn second_bridge(space: &str) -> Child {
     const METRICS: &str = "127.0.0.1:9202";

@@ -228,13 +228,14 @@ impl Router {
         }
         let shape = reader.shape.clone().filter(|_| asks);
         let fields = sample.fields.bytes();
-        reader.held = (fields.len() <= MAX_HELD).then(|| Held {
+        let held = || Held {
             fields: fields.to_vec(),
             source: sample.source,
             instance: sample.instance,
             status: sample.status,
             arrived: sample.arrived,
-        });
+        };
+        reader.held = (fields.len() <= MAX_HELD).then(|| Box::new(held()));
         if let Some(shape) = shape {
             self.tell_unbound(topic, shape, now);
         }

@@ -114,7 +114,8 @@ impl Ros2Port {
                 });
                 return;
             }
-            let same = |source: &&Source| source.values.iter().any(|(other, _)| *other == topic);
+            let same =
+                |source: &&Box<Source>| source.values.iter().any(|(other, _)| *other == topic);
             if let Some(other) = self.sources.iter().find(same) {
                 let other = other.dds_topic.clone();
                 self.tell_once(&dds_topic, "pattern", || {
@@ -231,7 +232,7 @@ impl Ros2Port {
 
     fn reconcile_source(&mut self, index: usize, now: Instant) {
         // Without a value it is one that the mapping no longer names.
-        let is_read = |source: &Source| !source.values.is_empty();
+        let is_read = |source: &Box<Source>| !source.values.is_empty();
         if !self.sources.get(index).is_some_and(is_read) {
             return;
         }

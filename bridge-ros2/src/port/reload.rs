@@ -55,7 +55,7 @@ impl Ros2Port {
                 && !self.sinks.contains_key(&topic)
                 && let Some(sink) = mapped(variable, self.own)
             {
-                self.sinks.insert(topic, sink);
+                self.sinks.insert(topic, Box::new(sink));
             }
         }
         for index in 0..self.sources.len() {
@@ -104,7 +104,7 @@ impl Ros2Port {
             }
             // Its index stays, by which the inbox names it; its name is free for another.
             let (topic, message_type) = (source.dds_topic.clone(), source.message_type.clone());
-            *source = Source::new(topic.clone(), message_type);
+            **source = Source::new(topic.clone(), message_type);
             if self.source_of.get(&topic) == Some(&index) {
                 self.source_of.remove(&topic);
             }

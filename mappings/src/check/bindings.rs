@@ -152,8 +152,11 @@ impl<'c> Bindings<'c> {
             Some(service) if Some(service.binding.space) == subject.origin => services.or(topics),
             Some(_) | None => topics.or(services),
         };
+        let mut bindings: Vec<Binding> = found.into_iter().map(|one| one.binding).collect();
+        // Kept as long as the mapping.
+        bindings.shrink_to_fit();
         Bound {
-            bindings: found.into_iter().map(|one| one.binding).collect(),
+            bindings,
             fields,
             service,
         }

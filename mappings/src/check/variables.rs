@@ -91,7 +91,9 @@ pub(super) fn check(
     let variables = drafts
         .iter()
         .filter_map(|draft| variable(draft, &mut bindings, findings));
-    let variables = variables.collect();
+    let mut variables: Vec<Variable> = variables.collect();
+    // Kept as long as the mapping.
+    variables.shrink_to_fit();
     bindings.conflicts(findings);
     variables
 }
@@ -341,7 +343,7 @@ fn variable(
     let meaning = meaning::check(entry, (value_type, several), findings);
     let service = bound
         .service
-        .map(|service| service.settled(value_type, findings));
+        .map(|service| Box::new(service.settled(value_type, findings)));
     let (node, _) = draft.node.clone()?;
     let topic = draft.topic()?;
     Some(Variable {
