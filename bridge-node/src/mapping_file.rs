@@ -222,6 +222,25 @@ struct Look {
 }
 
 impl Look {
+    /// [`take`](Self::take) in another thread, since no sample should wait for a disk.
+    async fn take_elsewhere(self) -> Looked {
+        let mut looking = tokio::task::spawn_blocking(|| self.take());
+        let looked = match timeout(SLOW, &mut looking).await {
+            Ok(looked) => looked,
+            Err(_) => {
+                warn!(
+                    "the files of the mapping have not been read within {} s: what runs stays as it is until they are",
+                    SLOW.as_secs()
+                );
+                looking.await
+            }
+        };
+        looked.unwrap_or_else(|error| Looked {
+            seen: None,
+            reading: Some(Err(error.to_string())),
+        })
+    }
+
     /// Looks at the files, and reads them if they are other ones that are no longer being written.
     fn take(self) -> Looked {
         let reading = || Some(read(&self.file, &self.running, &self.known));
@@ -409,23 +428,8 @@ impl MappingFile {
                 known: Arc::clone(&self.known),
             };
             turn = turn.wrapping_add(1);
-            // Elsewhere, since no sample should wait for a disk. One at a time: what is saved meanwhile differs from what
-            // was seen before the reading, and a signal is kept.
-            let mut looking = tokio::task::spawn_blocking(|| look.take());
-            let looked = match timeout(SLOW, &mut looking).await {
-                Ok(looked) => looked,
-                Err(_) => {
-                    warn!(
-                        "the files of the mapping have not been read within {} s: what runs stays as it is until they are",
-                        SLOW.as_secs()
-                    );
-                    looking.await
-                }
-            };
-            let Looked { seen, reading } = looked.unwrap_or_else(|error| Looked {
-                seen: None,
-                reading: Some(Err(error.to_string())),
-            });
+            // One at a time: what is saved meanwhile differs from what was seen before the reading, and a signal is kept.
+            let Looked { seen, reading } = look.take_elsewhere().await;
             let Some(reading) = reading else {
                 before = seen;
                 continue;

@@ -81,6 +81,10 @@ pub struct Ros2Port {
     told_types: TypeServer,
     graph: Graph,
     /// Topics we read; a source never goes away, so that its index names it.
+    #[expect(
+        clippy::vec_box,
+        reason = "a vector that grows has room for twice what is in it"
+    )]
     sources: Vec<Box<Source>>,
     source_of: BTreeMap<String, usize>,
     inbox: Inbox<usize>,

@@ -114,9 +114,10 @@ impl Ros2Port {
                 });
                 return;
             }
+            let mut sources = self.sources.iter();
             let same =
-                |source: &&Box<Source>| source.values.iter().any(|(other, _)| *other == topic);
-            if let Some(other) = self.sources.iter().find(same) {
+                sources.find(|source| source.values.iter().any(|(other, _)| *other == topic));
+            if let Some(other) = same {
                 let other = other.dds_topic.clone();
                 self.tell_once(&dds_topic, "pattern", || {
                     format!("it would be {topic}, which {other} is already: it does not cross")
@@ -232,8 +233,8 @@ impl Ros2Port {
 
     fn reconcile_source(&mut self, index: usize, now: Instant) {
         // Without a value it is one that the mapping no longer names.
-        let is_read = |source: &Box<Source>| !source.values.is_empty();
-        if !self.sources.get(index).is_some_and(is_read) {
+        let source = self.sources.get(index);
+        if source.is_none_or(|source| source.values.is_empty()) {
             return;
         }
         let settled = self.settle_source(index, now);

@@ -141,8 +141,8 @@ impl Ros2Port {
         let is_written = self.sinks.values().any(|sink| sink.dds_topic == dds_topic);
         let found = self.found_value(&dds_topic, &message_type);
         let found = found.filter(|(topic, _)| {
-            let is_made = |source: &Source| source.values.iter().any(|(other, _)| other == topic);
-            !is_written && !self.sources.iter().any(is_made)
+            let mut made = self.sources.iter().flat_map(|source| &source.values);
+            !is_written && made.all(|(other, _)| other != topic)
         });
         match found {
             Some(value) => self.take_up_values(dds_topic, message_type, vec![value]),

@@ -444,7 +444,10 @@ impl Driver {
     fn replied(&mut self, reply: Option<Received>) {
         // Ourselves as server, which no client here is for.
         let foreign = reply.filter(|reply| !self.peers.is_own(reply.writer));
-        let opened = foreign.map(|reply| self.id.open_reply(self.peers.mapping_of(reply.writer), reply));
+        let opened = foreign.map(|reply| {
+            self.id
+                .open_reply(self.peers.mapping_of(reply.writer), reply)
+        });
         if let Some(Ok(Some((key, body)))) = opened
             && let Some(asked) = self.keys.get(&key).and_then(|id| self.asked.remove(id))
         {

@@ -34,6 +34,10 @@ pub(crate) fn types(mapping: &Mapping) -> Arc<TypePaths> {
     Arc::new(TypePaths::read(mapping.type_paths(), &mut |_| {}))
 }
 
+fn reload(port: &mut Ros2Port, mapping: &Arc<Mapping>) -> Vec<String> {
+    port.reload(mapping, &types(mapping))
+}
+
 pub(crate) fn topic(name: &str) -> TopicId {
     name.parse().unwrap()
 }
@@ -265,8 +269,8 @@ async fn a_topic_that_becomes_another_value_at_a_reload_loses_and_repeats_no_sam
     let mut values = Vec::new();
     for number in 0..3000 {
         match number {
-            1000 => drop(port.reload(&named(2))),
-            2000 => drop(port.reload(&cell_of(found))),
+            1000 => drop(reload(&mut port, &named(2))),
+            2000 => drop(reload(&mut port, &cell_of(found))),
             _ => {}
         }
         let (of, payload) = event(&mut port, |event| match event {
@@ -306,7 +310,7 @@ async fn a_value_that_waits_for_room_when_its_topic_is_given_up_is_counted() {
     assert_eq!(refused, Some("subscriber too slow"));
     let events =
         "variables: [{node: ns=2;i=3, name: Written, origin: 1, queue: {drop_oldest: 10}}]";
-    port.reload(&cell_of(events));
+    reload(&mut port, &cell_of(events));
     let lost = event(&mut port, |event| match event {
         PortEvent::Lost { topic, why, count } => Some((topic, why, count)),
         PortEvent::Unbound { .. } => Some((None, "it is given up", 0)),
