@@ -17,7 +17,7 @@ use crate::domain::{Domain, DomainError};
 use crate::graph::{Endpoint, ros_topic};
 use crate::qos::Requested;
 use crate::sink::Sink;
-use crate::source::{OTHER_DEFINITION, OTHER_TYPE, Reading, Source};
+use crate::source::{OTHER_DEFINITION, OTHER_TYPE, Reading};
 
 impl Ros2Port {
     /// Makes what is open fit what the domain holds, at most [`MAX_BATCH`] endpoints at a time: RustDDS' discovery
