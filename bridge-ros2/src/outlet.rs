@@ -50,6 +50,8 @@ enum Audience {
     Present {
         /// Until what is written reaches them; none when it does.
         settling: Option<Settling>,
+        /// How many there are, as far as they were seen.
+        seen: usize,
         sample_size: usize,
     },
 }
@@ -218,7 +220,7 @@ impl Outlet {
             }
             return Ok(());
         }
-        match self.greet(now, limits::sample_size(readers)) {
+        match self.greet(now, readers.len(), limits::sample_size(readers)) {
             Some(held) => self.offer(held.payload, held.source, now),
             None => Ok(()),
         }
@@ -227,10 +229,10 @@ impl Outlet {
     /// Whether what is written now reaches the readers there are. Asked for the first time when there is something to
     /// write; readers that come later join a stream that waits for nobody.
     fn is_settled(&mut self, now: Instant) -> bool {
-        let Audience::Present { settling, .. } = &mut self.audience else {
+        let Audience::Present { settling, seen, .. } = &mut self.audience else {
             return true;
         };
-        settling.take_if(|settling| settling.is_over(&self.writer, self.joined, now));
+        settling.take_if(|settling| settling.is_over(&self.writer, *seen, self.joined, now));
         settling.is_none()
     }
 
@@ -262,16 +264,18 @@ impl Outlet {
                 && current.count() > 0
             {
                 // The value held back is older than the one about to be written, which replaces it.
-                drop(self.greet(now, limits::TO_ANY));
+                drop(self.greet(now, 1, limits::TO_ANY));
             }
         }
     }
 
     /// Takes note of readers; returns the value that was held back from nobody.
-    fn greet(&mut self, now: Instant, size: usize) -> Option<Sample> {
+    fn greet(&mut self, now: Instant, number: usize, size: usize) -> Option<Sample> {
         match &mut self.audience {
-            Audience::Present { sample_size, .. } => {
-                *sample_size = size;
+            Audience::Present {
+                seen, sample_size, ..
+            } => {
+                (*seen, *sample_size) = (number, size);
                 None
             }
             Audience::Nobody { held } => {
@@ -281,6 +285,7 @@ impl Outlet {
                         since: now,
                         patience: PATIENCE,
                     }),
+                    seen: number,
                     sample_size: size,
                 };
                 held
@@ -361,13 +366,13 @@ impl std::fmt::Debug for Outlet {
 impl Settling {
     /// Whether the readers get what is written now: those that acknowledge say so.
     #[cfg(feature = "patched-dds")]
-    fn is_over(&self, writer: &Writer, joined: Instant, now: Instant) -> bool {
+    fn is_over(&self, writer: &Writer, seen: usize, joined: Instant, now: Instant) -> bool {
         let readers = writer.matched_readers();
         let age = now.saturating_duration_since(self.since);
         let told = readers.silent + readers.greeting == 0 && readers.in_step > 0;
-        // Readers that were there before us are not all known yet when the first of them has answered.
-        let all = now.saturating_duration_since(joined) >= SETTLE;
-        // Those that were seen may not have matched yet.
+        // Readers that were there before us are not all known yet when the first of them has answered, and those that were
+        // seen may not have matched yet.
+        let all = readers.in_step >= seen && now.saturating_duration_since(joined) >= SETTLE;
         let some = readers.in_step + readers.greeting + readers.best_effort > 0;
         told && readers.best_effort == 0 && all
             || some && readers.silent == 0 && age >= SETTLE
@@ -376,7 +381,7 @@ impl Settling {
 
     /// Whether the readers most likely get what is written now.
     #[cfg(not(feature = "patched-dds"))]
-    fn is_over(&self, _writer: &Writer, _joined: Instant, now: Instant) -> bool {
+    fn is_over(&self, _writer: &Writer, _seen: usize, _joined: Instant, now: Instant) -> bool {
         now.saturating_duration_since(self.since) >= SETTLE.min(self.patience)
     }
 }

@@ -532,6 +532,10 @@ impl Port for Ros2Port {
         if other_type {
             self.open_sink(topic, Instant::now());
         } else if selection != before {
+            let stamps = sink.stamps(&message_type);
+            if let Some(open) = &mut sink.open {
+                open.stamps = stamps;
+            }
             self.events.push_back(PortEvent::Bound {
                 topic,
                 message_type,
