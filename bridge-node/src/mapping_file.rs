@@ -1,24 +1,28 @@
 //! The mapping as a file that people edit while the program runs.
 
+mod look;
+
 use std::cell::RefCell;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::io::Write as _;
-use std::os::unix::fs::MetadataExt as _;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use mappings::{Checked, Code, Diagnostic, Mapping, Readers, Severity, Surroundings, TypeOrigin};
-use messages::{Dialect, TypeName};
+use mappings::{
+    Checked, Code, Diagnostic, Mapping, Readers, Severity, Surroundings, TypeOrigin, TypeUse,
+};
+use messages::{Dialect, TextKind, TypeName};
 use serde::Serialize;
 use sha2::{Digest, Sha256};
 use tokio::signal::unix::Signal;
 use tokio::sync::watch;
-use tokio::time::{MissedTickBehavior, interval, timeout};
+use tokio::time::{MissedTickBehavior, interval};
 use tracing::{error, info, warn};
 use type_files::{Environment, TypeFiles, TypePaths};
 
+use self::look::{Before, Look, Seen, see};
 use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
 
@@ -80,82 +84,44 @@ struct Reading {
     types: Arc<TypePaths>,
     /// Types the mapping names that are defined by files.
     known: Known,
-    /// What is wrong with definitions that run.
-    spoiled: Vec<String>,
     /// Definitions that are not what runs.
     differing: usize,
     files: Seen,
 }
 
-type Known = BTreeSet<(Dialect, TypeName)>;
-
-/// What was read, or would have been, and how each file and folder was before that.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
-struct Seen {
-    /// The mapping and what it includes.
-    mapping: Stamps,
-    /// What is at and below the `type_paths`.
-    types: Stamps,
-}
-
-impl Seen {
-    /// How the same files are by now.
-    fn again(&self) -> Self {
-        let look = |stamps: &Stamps| {
-            let files = stamps.keys();
-            files.map(|file| (file.clone(), stamp(file))).collect()
-        };
-        Self {
-            mapping: look(&self.mapping),
-            types: look(&self.types),
-        }
-    }
-
-    /// Whether one of them is another by now: of the mapping's any, of the others those whose turn it is.
-    fn differ(&self, turn: usize) -> bool {
-        let turns = self.types.len().div_ceil(LOOKED_AT_ONCE).max(1);
-        let first = turn % turns * LOOKED_AT_ONCE;
-        let types = self.types.iter().skip(first).take(LOOKED_AT_ONCE);
-        let mut looked_at = self.mapping.iter().chain(types);
-        looked_at.any(|(file, was)| stamp(file) != *was)
-    }
-}
-
-/// How files were when they were looked at; `None` for one that is not there.
-type Stamps = BTreeMap<PathBuf, Option<Stamp>>;
-
-/// What changes when a file is written, renamed over, or the link to it is turned to another.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-struct Stamp {
-    device: u64,
-    inode: u64,
-    len: u64,
-    modified: (i64, i64),
-    changed: (i64, i64),
-}
-
-fn stamp(file: &Path) -> Option<Stamp> {
-    let found = std::fs::metadata(file).ok()?;
-    Some(Stamp {
-        device: found.dev(),
-        inode: found.ino(),
-        len: found.len(),
-        modified: (found.mtime(), found.mtime_nsec()),
-        changed: (found.ctime(), found.ctime_nsec()),
-    })
-}
+type Known = BTreeSet<(Dialect, TextKind, TypeName)>;
 
 /// Reads the mapping, what it includes, and the definitions of its `type_paths`.
 ///
 /// # Errors
 /// Why the file cannot be read.
 fn read(file: &Path, running: &TypePaths, known: &Known) -> Result<Reading, String> {
-    let disk = Disk::default();
+    let disk = Disk {
+        running,
+        seen: RefCell::default(),
+        types: RefCell::default(),
+    };
     let name = file.display().to_string();
     let text = disk
         .read(&name)
         .map_err(|error| format!("cannot read the mapping {name}: {error}"))?;
-    let checked = Mapping::from_text(&text, &name, &disk);
+    let mut checked = Mapping::from_text(&text, &name, &disk);
+    let mut types = disk.types();
+    let lost: Vec<&TypeUse> = checked
+        .types
+        .iter()
+        .filter(|used| used.source == TypeOrigin::Unknown && known.contains(&key(used)))
+        .filter(|used| types.file(used.dialect, used.kind, &used.name).is_some())
+        .collect();
+    if !lost.is_empty() {
+        let mut whole = TypePaths::clone(&types);
+        for used in lost {
+            whole.keep_whole(running, used.dialect, used.kind, &used.name);
+        }
+        types = Arc::new(whole);
+        disk.types.replace(Some(Arc::clone(&types)));
+        checked = Mapping::from_text(&text, &name, &disk);
+    }
     let mut all = Sha256::new();
     for source in &checked.sources {
         all.update(&source.text);
@@ -167,24 +133,9 @@ fn read(file: &Path, running: &TypePaths, known: &Known) -> Result<Reading, Stri
         // Writing to a string does not fail.
         let _written = write!(hash, "{byte:02x}");
     }
-    let types = disk.types.into_inner();
-    let mut spoiled: Vec<String> = types.spoiled(running).into_iter().map(Into::into).collect();
-    let mut defined = Known::new();
-    for used in &checked.types {
-        let key = (used.dialect, used.name.clone());
-        match &used.source {
-            TypeOrigin::File(_) => {
-                defined.insert(key);
-            }
-            TypeOrigin::Unknown if known.contains(&key) => {
-                let file = types.file(used.dialect, &used.name);
-                spoiled.extend(file.map(|file| {
-                    format!("{file}: what `{}` needs is not defined any more", used.name)
-                }));
-            }
-            TypeOrigin::Unknown | TypeOrigin::BuiltIn => {}
-        }
-    }
+    let defined = checked.types.iter();
+    let defined = defined.filter(|used| matches!(used.source, TypeOrigin::File(_)));
+    let defined = defined.map(key).collect();
     Ok(Reading {
         rendered: checked.render_all(),
         checked,
@@ -193,98 +144,36 @@ fn read(file: &Path, running: &TypePaths, known: &Known) -> Result<Reading, Stri
         differing: types.differing(running),
         types,
         known: defined,
-        spoiled,
         files: disk.seen.into_inner(),
     })
 }
 
-/// What one look at the files found.
-#[derive(Debug)]
-struct Looked {
-    /// How they are, as long as that is not how they were read.
-    seen: Option<Seen>,
-    reading: Option<Result<Reading, String>>,
-}
-
-/// What is looked for.
-#[derive(Debug)]
-struct Look {
-    file: PathBuf,
-    /// As they were read last.
-    files: Arc<Seen>,
-    /// As they were at the last look, where that is not how they were read.
-    before: Option<Seen>,
-    turn: usize,
-    /// Whether they are to be read whatever they are.
-    asked: bool,
-    running: Arc<TypePaths>,
-    known: Arc<Known>,
-}
-
-impl Look {
-    /// [`take`](Self::take) in another thread, since no sample should wait for a disk.
-    async fn take_elsewhere(self) -> Looked {
-        let mut looking = tokio::task::spawn_blocking(|| self.take());
-        let looked = match timeout(SLOW, &mut looking).await {
-            Ok(looked) => looked,
-            Err(_) => {
-                warn!(
-                    "the files of the mapping have not been read within {} s: what runs stays as it is until they are",
-                    SLOW.as_secs()
-                );
-                looking.await
-            }
-        };
-        looked.unwrap_or_else(|error| Looked {
-            seen: None,
-            reading: Some(Err(error.to_string())),
-        })
-    }
-
-    /// Looks at the files, and reads them if they are other ones that are no longer being written.
-    fn take(self) -> Looked {
-        let reading = || Some(read(&self.file, &self.running, &self.known));
-        if !self.asked && self.before.is_none() && !self.files.differ(self.turn) {
-            return Looked {
-                seen: None,
-                reading: None,
-            };
-        }
-        let is = self.files.again();
-        // Written to until just now, or about to be: a file that is saved is gone or empty for a moment.
-        let at = is.mapping.get(&self.file).copied().flatten();
-        let settled = self.before.as_ref() == Some(&is) && at.is_some_and(|at| at.len > 0);
-        let differs = is != *self.files;
-        let wanted = self.asked || (settled && differs);
-        Looked {
-            seen: (differs || wanted).then_some(is),
-            reading: if wanted { reading() } else { None },
-        }
-    }
+fn key(used: &TypeUse) -> (Dialect, TextKind, TypeName) {
+    (used.dialect, used.kind, used.name.clone())
 }
 
 /// The files and the environment of this process. Remembers each file and folder it was asked for, and how that was
 /// before it was read.
-#[derive(Debug, Default)]
-struct Disk {
+#[derive(Debug)]
+struct Disk<'r> {
+    /// What runs, for definitions that cannot be had.
+    running: &'r TypePaths,
     seen: RefCell<Seen>,
-    types: RefCell<Arc<TypePaths>>,
+    /// What the `type_paths` have, once they were read.
+    types: RefCell<Option<Arc<TypePaths>>>,
 }
 
-impl Disk {
+impl Disk<'_> {
+    fn types(&self) -> Arc<TypePaths> {
+        self.types.borrow().clone().unwrap_or_default()
+    }
+
     fn see(&self, path: &str) {
         see(&mut self.seen.borrow_mut().mapping, Path::new(path));
     }
 }
 
-/// How it was at first counts, as something is read by then.
-fn see(seen: &mut Stamps, path: &Path) {
-    if !seen.contains_key(path) {
-        seen.insert(path.to_owned(), stamp(path));
-    }
-}
-
-impl Surroundings for Disk {
+impl Surroundings for Disk<'_> {
     fn read(&self, file: &str) -> Result<String, String> {
         self.see(file);
         type_files::Disk.read(file)
@@ -304,10 +193,13 @@ impl Surroundings for Disk {
     }
 
     fn types(&self, paths: &[PathBuf]) -> Box<dyn mappings::TypeFiles> {
-        let mut seen = self.seen.borrow_mut();
-        let own = TypePaths::read(paths, &mut |path| see(&mut seen.types, path));
-        let own = Arc::new(own);
-        self.types.replace(Arc::clone(&own));
+        let read = || {
+            let mut seen = self.seen.borrow_mut();
+            let mut own = TypePaths::read(paths, &mut |path| see(&mut seen.types, path));
+            own.keep(self.running);
+            Arc::new(own)
+        };
+        let own = Arc::clone(self.types.borrow_mut().get_or_insert_with(read));
         Box::new(TypeFiles::new(own, Environment::from_env()))
     }
 }
@@ -324,6 +216,10 @@ pub(crate) struct MappingFile {
     fingerprint: u64,
     /// Of the types that what runs names, those that are defined by files.
     known: Arc<Known>,
+    /// What was told of definitions that are those of before.
+    told: BTreeSet<String>,
+    /// Whether it was told that the file is gone.
+    gone: bool,
     running: Running,
 }
 
@@ -346,6 +242,8 @@ impl MappingFile {
                 hash: String::new(),
                 fingerprint: 0,
                 known: Arc::default(),
+                told: BTreeSet::new(),
+                gone: false,
                 running,
             };
             return Ok((!only_check).then_some(without));
@@ -376,6 +274,8 @@ impl MappingFile {
                     hash: reading.hash,
                     fingerprint: reading.fingerprint,
                     known: Arc::new(reading.known),
+                    told: BTreeSet::new(),
+                    gone: false,
                     running: Running {
                         mapping: Arc::new(mapping),
                         types: reading.types,
@@ -405,8 +305,9 @@ impl MappingFile {
     pub(crate) async fn follow(mut self, mut hangup: Signal, shells: watch::Sender<Running>) {
         let mut looks = interval(LOOK);
         looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut before = None;
+        let mut before = Before::default();
         let mut turn = 0_usize;
+        let mut again = None;
         loop {
             let asked = tokio::select! {
                 Some(()) = hangup.recv() => true,
@@ -421,22 +322,37 @@ impl MappingFile {
             let look = Look {
                 file,
                 files: Arc::clone(&self.files),
-                before: before.take(),
+                before: std::mem::take(&mut before),
                 turn,
                 asked,
+                gone: self.gone,
+                again: again.is_some_and(|since| turn.wrapping_sub(since) >= AGAIN),
                 running: Arc::clone(&self.running.types),
                 known: Arc::clone(&self.known),
             };
             turn = turn.wrapping_add(1);
             // One at a time: what is saved meanwhile differs from what was seen before the reading, and a signal is kept.
-            let Looked { seen, reading } = look.take_elsewhere().await;
-            let Some(reading) = reading else {
-                before = seen;
+            let looked = look.take_elsewhere().await;
+            if looked.gone && !self.gone {
+                self.lose();
+                shells.send_replace(self.running.clone());
+            }
+            let Some(reading) = looked.reading else {
+                before = looked.before;
                 continue;
             };
-            if let Some(seen) = seen {
-                // One that cannot be read is told of once.
-                self.files = Arc::new(seen);
+            // One that cannot be read is told of once.
+            let files = Arc::make_mut(&mut self.files);
+            if let Some(mapping) = looked.before.mapping {
+                files.mapping = mapping;
+            }
+            if let Some((types, _)) = looked.before.types {
+                files.types = types;
+            }
+            self.gone = false;
+            if let Ok(reading) = &reading {
+                let without = reading.types.is_without_folder();
+                again = without.then_some(turn);
             }
             if self.take(reading, asked) {
                 shells.send_replace(self.running.clone());
@@ -464,17 +380,21 @@ impl MappingFile {
         }
         self.hash.clone_from(&reading.hash);
         self.fingerprint = reading.fingerprint;
-        if let Some((first, more)) = reading.spoiled.split_first() {
-            for why in more.iter().take(MOST_TOLD) {
+        let kept = reading.types.kept().to_vec();
+        let same = reading.hash == self.running.about.hash && reading.differing == 0;
+        if let Some(why) = reason(&kept).filter(|_| same) {
+            for why in kept.iter().skip(1).take(MOST_TOLD) {
                 error!("{why}");
             }
-            let more = match more.len() {
-                0 => String::new(),
-                more => format!(" (and {more} more)"),
-            };
-            self.refuse(format!("a definition that runs is faulty: {first}{more}"));
+            self.told = kept.into_iter().collect();
+            self.refuse(why);
             return true;
         }
+        let untold = kept.iter().filter(|why| asked || !self.told.contains(*why));
+        for why in untold.take(MOST_TOLD) {
+            error!("{why}: the definitions of before count");
+        }
+        self.told = kept.into_iter().collect();
         if reading.checked.mapping.is_some() {
             // What is doubted was told at the start.
             let _rendered_no_more = reading.leave_to_the_run(&file);
@@ -502,6 +422,19 @@ impl MappingFile {
         about.stale = Some(why);
     }
 
+    /// Tells that the file is gone. Once it is there it is taken as another one.
+    fn lose(&mut self) {
+        let Some(file) = &self.file else {
+            return;
+        };
+        let about = Arc::make_mut(&mut self.running.about);
+        let why = format!("{} is gone or empty", file.display());
+        warn!(running = about.hash, "{why}: what runs stays as it is");
+        about.stale = Some(why);
+        self.gone = true;
+        self.hash.clear();
+    }
+
     fn adopt(&mut self, file: &Path, mapping: &Mapping, reading: Reading) {
         let difference = mapping.difference(&self.running.mapping);
         info!(
@@ -519,12 +452,22 @@ impl MappingFile {
         about.loaded = seconds();
         about.variables = mapping.variables().len();
         about.reloads += 1;
-        about.stale = None;
+        about.stale = reason(reading.types.kept());
         // A copy, made by this thread: that of the thread that read lies among what it left, whose room would stay taken.
         self.running.mapping = Arc::new(mapping.clone());
         self.running.types = reading.types;
         self.known = Arc::new(reading.known);
     }
+}
+
+/// Why what runs has definitions of before, if it has.
+fn reason(kept: &[String]) -> Option<String> {
+    let (first, more) = kept.split_first()?;
+    let more = match more.len() {
+        0 => String::new(),
+        more => format!(" (and {more} more)"),
+    };
+    Some(format!("the definitions of before count: {first}{more}"))
 }
 
 /// Logs findings, each with what to do about it.
@@ -575,9 +518,38 @@ fn seconds() -> i64 {
 
 /// How often the files are looked at. One that was the same twice is no longer being written.
 const LOOK: Duration = Duration::from_millis(250);
-/// After that time a disk is said not to answer.
-const SLOW: Duration = Duration::from_secs(5);
+/// After so many looks, ten seconds, folders of definitions that could not be listed are looked into again, whatever can
+/// be seen of them.
+const AGAIN: usize = 40;
 /// Faulty definitions named in one go; more are of one cause.
 const MOST_TOLD: usize = 10;
-/// Definition files and folders looked at with each look: some 1000 a second, of which each costs a microsecond or two.
-const LOOKED_AT_ONCE: usize = 256;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_faulty_definition_keeps_its_text_and_no_mapping_from_being_taken() {
+        let folder = std::env::temp_dir().join(format!("bridge-mapping-{}", std::process::id()));
+        std::fs::create_dir_all(folder.join("types/my_msgs/msg")).unwrap();
+        let write = |file: &str, text: &str| std::fs::write(folder.join(file), text).unwrap();
+        write("types/my_msgs/msg/Arm.msg", "bool x\n");
+        write("cell.yaml", "spaces: [{id: 1}]\ntype_paths: [types]\n");
+        let file = folder.join("cell.yaml");
+        let mut mapping = MappingFile::open(Some(&file), false).unwrap().unwrap();
+        let mut take = || {
+            let reading = read(&file, &mapping.running.types, &mapping.known);
+            assert!(mapping.take(reading, false));
+            let about = &mapping.running.about;
+            let stale = about.stale.clone().unwrap_or_default();
+            (about.reloads, about.refused, stale.contains("Arm.msg:1: "))
+        };
+        write("types/my_msgs/msg/Arm.msg", "bool 9x\n");
+        assert_eq!(take(), (0, 1, true));
+        write("cell.yaml", "spaces: [{id: 2}]\ntype_paths: [types]\n");
+        assert_eq!(take(), (1, 1, true));
+        write("types/my_msgs/msg/Arm.msg", "bool y\n");
+        assert_eq!(take(), (2, 1, false));
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+}

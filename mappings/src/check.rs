@@ -17,7 +17,7 @@ mod variables;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use messages::{DefinitionTexts, Dialect, NoTexts, TypeName};
+use messages::{DefinitionTexts, Dialect, NoTexts, TextKind, TypeName};
 
 use crate::code::Code;
 use crate::diagnostic::{Diagnostic, Severity};
@@ -49,6 +49,8 @@ pub struct Checked {
 pub struct TypeUse {
     /// Of which ROS.
     pub dialect: Dialect,
+    /// Whether it is a message or a service.
+    pub kind: TextKind,
     /// Its name.
     pub name: TypeName,
     /// Where its definition is from.

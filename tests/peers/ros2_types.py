@@ -75,6 +75,13 @@ class Twist(IdlStruct, typename="geometry_msgs.msg.dds_.Twist_"):
 
 @dataclass
 @final
+class TwistStamped(IdlStruct, typename="geometry_msgs.msg.dds_.TwistStamped_"):
+    header: Header = field(default_factory=Header)
+    twist: Twist = field(default_factory=Twist)
+
+
+@dataclass
+@final
 class Point32(IdlStruct, typename="geometry_msgs.msg.dds_.Point32_"):
     x: float32 = 0.0
     y: float32 = 0.0
@@ -127,6 +134,7 @@ TYPES = {
     "std_msgs/String": String,
     "sensor_msgs/JointState": JointState,
     "geometry_msgs/Twist": Twist,
+    "geometry_msgs/TwistStamped": TwistStamped,
     "geometry_msgs/PolygonStamped": PolygonStamped,
     "rosgraph_msgs/Clock": Clock,
     "rcl_interfaces/Log": Log,

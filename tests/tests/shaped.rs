@@ -21,6 +21,8 @@ patterns:
   - {topics: "/robot*/goal", origin: 1, node: "ns=2;i=40{1}", name: "Goal{1}", type: geometry_msgs/Twist, as: structure}
   - {topics: "/robot*/effort", origin: 1, node: "ns=2;i=50{1}", name: "Effort{1}", type: sensor_msgs/JointState, field: "effort[1:3]", scale: 0.5, offset: 1}
   - {topics: "/robot*/turn", origin: 1, node: "ns=2;i=55{1}", name: "Turn{1}", type: geometry_msgs/Twist, fields: [linear.x, angular.z]}
+  - {topics: "/robot*/stamped", origin: 1, node: "ns=2;i=56{1}", name: "Stamped{1}", type: geometry_msgs/TwistStamped, fields: [twist.linear.x, twist.angular.z]}
+  - {topics: "/arm*/stamped", origin: 2, node: "ns=2;i=98{1}", name: "ArmStamped{1}", fields: [twist.linear.x, twist.angular.z]}
   - {topics: "/arm*/joints", origin: 2, node: "ns=2;i=60{1}", name: "ArmElbow{1}", field: "position[name=elbow]", scale: 1000}
   - {topics: "/arm*/gate", origin: 2, node: "ns=2;i=70{1}", name: "ArmClosed{1}", field: data, invert: true}
   - {topics: "/arm*/speed", origin: 2, node: "ns=2;i=80{1}", name: "ArmSpeed{1}", fields: [{field: linear.x, scale: 100}, angular.z]}
@@ -166,6 +168,33 @@ fn what_patterns_take_of_messages_reaches_the_peers_of_the_other_side() {
     has(&closed, &json!({"data": false}));
     has(&goal, &twist());
     has(&turned, &turn());
+}
+
+/// Somebody subscribed before anything was known of the value: what is sent then is not the whole message.
+#[test]
+fn a_header_that_is_no_part_of_the_value_is_stamped_by_the_bridge() {
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let file = cell.file("cell.yaml", PATTERNS);
+    let file = file.to_str().unwrap();
+    let _bridges = (cell.bridge_ros1(&[file]), cell.bridge_ros2(&[file]));
+    let kind = "geometry_msgs/TwistStamped";
+    let sent = json!({"twist": twist()});
+    let stamp = |reader: &Child| {
+        eventually("the twist has come", SOON, || {
+            let values = reader.values();
+            let value = values.iter().find(|value| value["twist"] == turn())?;
+            Some(value["header"]["stamp"].clone())
+        })
+    };
+    let in_two = heard_in_ros2(&cell, "/ua_1_2_561", kind);
+    let in_one = heard_in_ros1(&cell, "/ua_2_2_981", kind);
+    let _robot = in_ros1(&cell, "/robot1/stamped", kind, &sent);
+    assert!(stamp(&in_two)["sec"].as_i64() > Some(0));
+    let _arm = in_ros2(&cell, "/arm1/stamped", kind, &sent);
+    assert!(stamp(&in_one)["secs"].as_i64() > Some(0));
 }
 
 /// A service whose request and answer are converted, in both ROS; the values of ROS 2 have twenty more.

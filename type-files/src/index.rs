@@ -40,6 +40,11 @@ impl<F> Index<F> {
         self.files.entry(key).or_insert(file);
     }
 
+    /// In place of what it may have of that name.
+    pub(crate) fn set(&mut self, key: (Dialect, TextKind, TypeName), file: F) {
+        self.files.insert(key, file);
+    }
+
     pub(crate) fn get(&self, dialect: Dialect, kind: TextKind, name: &TypeName) -> Option<&F> {
         self.files.get(&(dialect, kind, name.clone()))
     }
@@ -101,6 +106,8 @@ impl DefinitionFile {
 pub(crate) struct Walk<'s> {
     folders: usize,
     files: usize,
+    /// Folders that cannot be listed, and why.
+    unlisted: Vec<(PathBuf, String)>,
     /// Told of each folder and file before it is looked at.
     see: &'s mut dyn FnMut(&Path),
 }
@@ -110,12 +117,18 @@ impl<'s> Walk<'s> {
         Self {
             folders: MOST_FOLDERS,
             files: MOST_FILES,
+            unlisted: Vec::new(),
             see,
         }
     }
 
     pub(crate) fn see(&mut self, path: &Path) {
         (self.see)(path);
+    }
+
+    /// Folders that could not be listed since this was asked last, and why.
+    pub(crate) fn take_unlisted(&mut self) -> Vec<(PathBuf, String)> {
+        std::mem::take(&mut self.unlisted)
     }
 
     fn package(&mut self, folder: &Path) -> Package {
@@ -240,7 +253,7 @@ impl<'s> Walk<'s> {
         let files = entries
             .iter()
             .filter_map(|path| DefinitionFile::of_path(path.clone(), package, kind))
-            .filter(|file| file.path.is_file());
+            .filter(|file| is_file_or_unknown(&file.path));
         let mut files: Vec<DefinitionFile> = files.take(self.files).collect();
         self.files -= files.len().min(self.files);
         // rosidl installs an .idl made of each .msg beside it.
@@ -252,16 +265,38 @@ impl<'s> Walk<'s> {
     fn entries(&mut self, folder: &Path) -> Option<Vec<PathBuf>> {
         self.folders = self.folders.checked_sub(1)?;
         self.see(folder);
-        let entries = std::fs::read_dir(folder).ok()?;
-        let mut paths: Vec<PathBuf> = entries.filter_map(|e| Some(e.ok()?.path())).collect();
-        paths.sort();
-        Some(paths)
+        let listed = std::fs::read_dir(folder).and_then(|entries| {
+            entries
+                .map(|entry| Ok(entry?.path()))
+                .collect::<io::Result<Vec<PathBuf>>>()
+        });
+        match listed {
+            Ok(mut paths) => {
+                paths.sort();
+                Some(paths)
+            }
+            Err(error) => {
+                self.unlisted.push((folder.to_owned(), error.to_string()));
+                None
+            }
+        }
     }
 }
 
-/// A folder that is no link, as links may lead in circles.
+/// A folder that is no link, as links may lead in circles; or what cannot be looked at, which is told when it is listed.
 fn is_real_folder(path: &Path) -> bool {
-    path.symlink_metadata().is_ok_and(|found| found.is_dir())
+    match path.symlink_metadata() {
+        Ok(found) => found.is_dir(),
+        Err(error) => error.kind() != io::ErrorKind::NotFound,
+    }
+}
+
+/// A file, or what cannot be looked at, which is told when it is read.
+fn is_file_or_unknown(path: &Path) -> bool {
+    match path.metadata() {
+        Ok(found) => found.is_file(),
+        Err(error) => error.kind() != io::ErrorKind::NotFound,
+    }
 }
 
 fn is_hidden(path: &Path) -> bool {

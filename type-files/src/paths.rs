@@ -1,27 +1,40 @@
 //! What the `type_paths` of a mapping have.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use mappings::{PathFault, PathFaultKind};
-use messages::{DefinitionError, DefinitionText, Dialect, TextKind, TypeName, check_text};
+use messages::{
+    DefinitionError, DefinitionText, DefinitionTexts, Dialect, Library, Registry, TextKind,
+    TypeName, check_text,
+};
 
 use crate::index::{DefinitionFile, Index, Walk};
 use crate::{definition, read};
 
 /// The definition files of a mapping's `type_paths`, as they were when they were read.
-#[derive(Debug, Default, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct TypePaths {
     pub(crate) paths: Vec<PathBuf>,
     pub(crate) index: Index<Arc<DefinitionText>>,
     faults: Vec<Fault>,
+    /// Folders below them that cannot be listed, and why.
+    unlisted: Vec<(PathBuf, String)>,
+    /// What is wrong where the definitions of before count.
+    kept: Vec<String>,
+    /// Whether a folder is among that.
+    without_folder: bool,
     /// Of all texts.
     bytes: usize,
 }
 
-#[derive(Debug, PartialEq, Eq)]
+/// The texts of each file, and what they define.
+type Texts<'t> =
+    BTreeMap<&'t Path, Vec<(&'t (Dialect, TextKind, TypeName), &'t Arc<DefinitionText>)>>;
+
+#[derive(Debug, Clone, PartialEq, Eq)]
 struct Fault {
     /// Which of the paths, from 0.
     path: usize,
@@ -66,25 +79,80 @@ impl TypePaths {
         .collect()
     }
 
-    /// What is wrong, for people, with files that counted in `before` and do not count here.
-    #[must_use]
-    pub fn spoiled(&self, before: &Self) -> Vec<&str> {
-        if self.faults.is_empty() {
-            return Vec::new();
+    /// Takes over from `before` what counted there and cannot be had: the texts of files that are faulty, and those below
+    /// folders that cannot be listed or have none left. What is wrong with them is then [`kept`](Self::kept), and no fault.
+    pub fn keep(&mut self, before: &Self) {
+        let mut texts = Texts::new();
+        for (key, text) in before.index.all() {
+            let of_file = texts.entry(Path::new(&*text.file)).or_default();
+            of_file.push((key, text));
         }
-        let counted: BTreeSet<&str> = before.index.all().map(|(_, text)| &*text.file).collect();
-        let faults = self.faults.iter();
-        faults
-            .filter(|fault| fault.file.as_deref().is_some_and(|f| counted.contains(f)))
-            .map(|fault| fault.why.as_str())
-            .collect()
+        for fault in std::mem::take(&mut self.faults) {
+            let place = match &fault.file {
+                Some(file) => Some(PathBuf::from(file)),
+                None => self.paths.get(fault.path).cloned(),
+            };
+            if place.is_some_and(|place| self.take_over(&texts, &place)) {
+                self.without_folder |= fault.file.is_none();
+                self.kept.push(fault.why);
+            } else {
+                self.faults.push(fault);
+            }
+        }
+        for (folder, why) in std::mem::take(&mut self.unlisted) {
+            if self.take_over(&texts, &folder) {
+                self.without_folder = true;
+                self.kept.push(format!("{}: {why}", folder.display()));
+            }
+        }
     }
 
-    /// The file a message, or else a service, of that name is from.
+    /// Takes over from `before` a type and all it needs, where it is of a file and that does not do.
+    pub fn keep_whole(&mut self, before: &Self, dialect: Dialect, kind: TextKind, name: &TypeName) {
+        let Some(file) = self.file(dialect, kind, name) else {
+            return;
+        };
+        self.kept.push(format!(
+            "{file}: what `{name}` needs is not defined any more"
+        ));
+        let mut asked = Asked {
+            of: before,
+            found: Vec::new(),
+        };
+        let mut library = Library::new(Registry::bundle(dialect));
+        // What it is does not matter, only what was looked for.
+        let _known = match kind {
+            TextKind::Message => library.message(name, &mut asked).is_ok(),
+            TextKind::Service => library.service(name, &mut asked).is_ok(),
+            TextKind::Action => library.action_messages(name, &mut asked).is_ok(),
+        };
+        for (kind, name) in asked.found {
+            // A file counts in both.
+            for dialect in [Dialect::Ros1, Dialect::Ros2] {
+                if let Some(text) = before.index.get(dialect, kind, &name) {
+                    let key = (dialect, kind, name.clone());
+                    self.index.set(key, Arc::clone(text));
+                }
+            }
+        }
+    }
+
+    /// What is wrong, for people, where the definitions of before count.
     #[must_use]
-    pub fn file(&self, dialect: Dialect, name: &TypeName) -> Option<&str> {
-        let of = |kind| self.index.get(dialect, kind, name);
-        let text = of(TextKind::Message).or_else(|| of(TextKind::Service))?;
+    pub fn kept(&self) -> &[String] {
+        &self.kept
+    }
+
+    /// Whether folders are among that, which may be back while all that can be seen of them is the same.
+    #[must_use]
+    pub const fn is_without_folder(&self) -> bool {
+        self.without_folder
+    }
+
+    /// The file a definition is from.
+    #[must_use]
+    pub fn file(&self, dialect: Dialect, kind: TextKind, name: &TypeName) -> Option<&str> {
+        let text = self.index.get(dialect, kind, name)?;
         Some(&text.file)
     }
 
@@ -112,14 +180,45 @@ impl TypePaths {
         for fault in &self.faults {
             fault.why.hash(&mut all);
         }
+        self.kept.hash(&mut all);
         all.finish()
     }
 
+    /// Whether there was something at or below that place that is taken over.
+    fn take_over(&mut self, before: &Texts<'_>, place: &Path) -> bool {
+        let mut any = false;
+        let below = before.range(place..);
+        for (file, texts) in below.take_while(|(file, _)| file.starts_with(place)) {
+            let bytes = texts.first().map_or(0, |(_, text)| text.text.len());
+            let bytes = self.bytes.saturating_add(bytes);
+            if bytes > MOST_TOGETHER {
+                break;
+            }
+            self.bytes = bytes;
+            for (key, text) in texts {
+                let (dialect, kind, name) = key;
+                // It may have been read by another of the paths.
+                if self.file(*dialect, *kind, name).map(Path::new) != Some(*file) {
+                    self.index.set((*key).clone(), Arc::clone(text));
+                    any = true;
+                }
+            }
+        }
+        any
+    }
+
     fn take(&mut self, number: usize, path: &Path, walk: &mut Walk<'_>) {
-        let found = match walk.all(path) {
-            Ok(found) if found.is_empty() => Err("no definition files in it".to_owned()),
-            Ok(found) => Ok(found),
-            Err(error) => Err(error.to_string()),
+        let found = walk.all(path);
+        let (own, below): (Vec<_>, Vec<_>) = walk
+            .take_unlisted()
+            .into_iter()
+            .partition(|(folder, _)| folder == path);
+        self.unlisted.extend(below);
+        let found = match (found, own.into_iter().next()) {
+            (Ok(_), Some((_, why))) => Err(why),
+            (Ok(found), None) if found.is_empty() => Err("no definition files in it".to_owned()),
+            (Ok(found), None) => Ok(found),
+            (Err(error), _) => Err(error.to_string()),
         };
         match found {
             Ok(found) => {
@@ -173,6 +272,33 @@ impl TypePaths {
             Some(error) if !fits => Err(told(&file.path, &error)),
             Some(_) | None => Ok(()),
         }
+    }
+}
+
+/// Notes what is looked for and found.
+struct Asked<'t> {
+    of: &'t TypePaths,
+    found: Vec<(TextKind, TypeName)>,
+}
+
+impl DefinitionTexts for Asked<'_> {
+    fn find(
+        &mut self,
+        dialect: Dialect,
+        kind: TextKind,
+        name: &TypeName,
+    ) -> Option<DefinitionText> {
+        let text = self.of.index.get(dialect, kind, name)?;
+        self.found.push((kind, name.clone()));
+        Some(DefinitionText::clone(text))
+    }
+
+    fn names(&mut self, _: Dialect, _: TextKind) -> Vec<TypeName> {
+        Vec::new()
+    }
+
+    fn places(&self, _: Dialect) -> Vec<String> {
+        Vec::new()
     }
 }
 

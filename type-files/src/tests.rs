@@ -417,7 +417,9 @@ fn what_is_looked_at_is_told_of_and_a_file_that_does_not_count_any_more_is_named
         (same.fingerprint(), same.differing(&before)),
         (before.fingerprint(), 0)
     );
-    assert_eq!(same.spoiled(&before), [""; 0], "it never counted");
+    let mut same = same;
+    same.keep(&before);
+    assert_eq!(same.kept(), [""; 0], "it never counted");
 
     let arm = folder.path("types/robot_msgs/msg/Arm.msg");
     std::fs::write(&arm, "bool x\nbool y\n").unwrap();
@@ -425,16 +427,87 @@ fn what_is_looked_at_is_told_of_and_a_file_that_does_not_count_any_more_is_named
     assert_ne!(changed.fingerprint(), before.fingerprint());
     assert_eq!(changed.differing(&before), 1);
     std::fs::write(&arm, "bool x\nbool\n").unwrap();
-    let (faulty, _) = read();
-    let spoiled = faulty.spoiled(&before);
+    let (mut faulty, _) = read();
+    assert_eq!(faulty.differing(&before), 1);
+    faulty.keep(&before);
     assert!(
-        matches!(spoiled.as_slice(), [one] if one.contains("Arm.msg:2: ")),
-        "{spoiled:?}"
+        matches!(faulty.kept(), [one] if one.contains("Arm.msg:2: ")),
+        "{:?}",
+        faulty.kept()
     );
+    assert_eq!(faulty.differing(&before), 0, "it has the text of before");
+    std::fs::write(folder.path("types/robot_msgs/msg/Leg.msg"), "bool x\n").unwrap();
+    let (mut other, _) = read();
+    other.keep(&faulty);
+    assert_eq!((other.kept().len(), other.differing(&before)), (1, 1));
+
     std::fs::remove_file(&arm).unwrap();
-    let (without, _) = read();
+    let (mut without, _) = read();
+    without.keep(&before);
     assert_eq!(
-        (without.spoiled(&before), without.differing(&before)),
-        (vec![], 1)
+        (without.kept().len(), without.differing(&before)),
+        (0, 2),
+        "one file less, and one more"
     );
+    assert!(!without.is_without_folder());
+}
+
+#[test]
+fn a_folder_that_is_gone_or_has_none_left_keeps_its_definitions() {
+    let folder = Folder::new(
+        "gone",
+        &[
+            ("a/robot_msgs/msg/Arm.msg", "bool x\n"),
+            ("b/other_msgs/msg/Arm.msg", "bool x\n"),
+        ],
+    );
+    let paths = [folder.path("a"), folder.path("b")];
+    let read = || TypePaths::read(&paths, &mut |_| {});
+    let before = read();
+    std::fs::rename(folder.path("a"), folder.path("away")).unwrap();
+    std::fs::remove_file(folder.path("b/other_msgs/msg/Arm.msg")).unwrap();
+    let mut gone = read();
+    gone.keep(&before);
+    assert_eq!((gone.kept().len(), gone.differing(&before)), (2, 0));
+    assert!(gone.is_without_folder());
+    assert_eq!(gone.faults(), []);
+
+    std::fs::rename(folder.path("away"), folder.path("a")).unwrap();
+    let mut back = read();
+    back.keep(&gone);
+    assert!(matches!(back.kept(), [one] if one.contains("/b: ")));
+    let mut first = read();
+    first.keep(&TypePaths::default());
+    assert_eq!(first.faults().len(), 1, "it never counted");
+}
+
+#[test]
+fn a_type_is_kept_with_what_it_needs() {
+    let folder = Folder::new(
+        "whole",
+        &[
+            ("types/robot_msgs/srv/Move.srv", "Arm arm\n---\n"),
+            ("types/robot_msgs/msg/Arm.msg", "Leg leg\n"),
+            ("types/robot_msgs/msg/Leg.msg", "bool x\n"),
+            ("types/robot_msgs/msg/Other.msg", "bool x\n"),
+        ],
+    );
+    let paths = [folder.path("types")];
+    let read = || TypePaths::read(&paths, &mut |_| {});
+    let before = read();
+    for file in ["Leg", "Other"] {
+        let file = format!("types/robot_msgs/msg/{file}.msg");
+        std::fs::remove_file(folder.path(&file)).unwrap();
+    }
+    std::fs::write(folder.path("types/robot_msgs/msg/Arm.msg"), "Nowhere leg\n").unwrap();
+    let mut without = read();
+    let service = name("robot_msgs/Move");
+    without.keep_whole(&before, Dialect::Ros1, TextKind::Service, &service);
+    assert!(matches!(without.kept(), [one] if one.contains("`robot_msgs/Move` needs")));
+    for (message, is_there) in [("Leg", true), ("Other", false)] {
+        let message = name(&format!("robot_msgs/{message}"));
+        let file = without.file(Dialect::Ros1, TextKind::Message, &message);
+        assert_eq!(file.is_some(), is_there, "{message}");
+    }
+    assert_eq!(without.differing(&before), 1, "for either ROS");
 }

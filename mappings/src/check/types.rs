@@ -141,6 +141,7 @@ impl Types {
         let found = library.service(name, files.as_mut()).ok();
         used.push(TypeUse {
             dialect,
+            kind: TextKind::Service,
             name: name.clone(),
             source: origin(library, TextKind::Service, name, found.is_some()),
         });
@@ -163,6 +164,7 @@ impl Types {
         let found = library.message(name, files.as_mut()).map_err(Box::new);
         used.push(TypeUse {
             dialect,
+            kind: TextKind::Message,
             name: name.clone(),
             source: origin(library, TextKind::Message, name, found.is_ok()),
         });
