@@ -395,13 +395,19 @@ impl MappingFile {
             error!("{why}: the definitions of before count");
         }
         self.told = kept.into_iter().collect();
+        self.judge(&file, reading);
+        true
+    }
+
+    /// Adopts what was read if it can run.
+    fn judge(&mut self, file: &Path, mut reading: Reading) {
         if reading.checked.mapping.is_some() {
             // What is doubted was told at the start.
-            let _rendered_no_more = reading.leave_to_the_run(&file);
+            let _rendered_no_more = reading.leave_to_the_run(file);
         }
         tell(&reading.checked.findings);
         match reading.checked.mapping.take() {
-            Some(mapping) => self.adopt(&file, &mapping, reading),
+            Some(mapping) => self.adopt(file, &mapping, reading),
             None => {
                 let errors = reading.checked.findings.iter();
                 let errors = errors.filter(|f| f.severity == Severity::Error).count();
@@ -409,7 +415,6 @@ impl MappingFile {
                 self.refuse(format!("{} cannot run ({errors} error{s})", file.display()));
             }
         }
-        true
     }
 
     fn refuse(&mut self, why: String) {
