@@ -30,6 +30,10 @@ fn values_call_services_of_both_vendors_and_their_answers_are_values() {
     ua.write((0, 2, 1), Scalar::Boolean(true));
     let light = Vendor::FastDds.serves(&cell, "/light");
     ua.hear_scalar((2, 2, 2), Scalar::String(Some("done")));
+    // The answer may be here before the server's line about it is.
+    eventually("the server has told of the call", SOON, || {
+        (!Vendor::FastDds.asked(&light).is_empty()).then_some(())
+    });
     assert_eq!(Vendor::FastDds.asked(&light), [true]);
 
     let go = cyclone_serves(&cell, "/go", &[]);
