@@ -108,12 +108,18 @@ impl Driver {
             if !poll_fn(|cx| self.poll_wake(timer.as_mut(), cx)).await {
                 return;
             }
+            let mut turns = 0_u32;
             while let turned @ (Turned::Unfinished | Turned::Ended) = self.event_loop.turn() {
                 if turned == Turned::Ended {
                     debug!("the DDS traffic of a participant has ended");
                     return;
                 }
-                tokio::task::yield_now().await;
+                turns = turns.saturating_add(1);
+                if turns == 1 {
+                    let_others_run().await;
+                } else {
+                    tokio::task::yield_now().await;
+                }
                 // A socket that is never empty must not keep the others from being read.
                 poll_fn(|cx| Poll::Ready(self.poll_sockets(cx))).await;
             }
@@ -158,6 +164,20 @@ impl Driver {
         }
         found
     }
+}
+
+/// Lets the tasks run that are ready, without the look at the sockets that
+/// [`yield_now`](tokio::task::yield_now) takes: a system call for each sample.
+async fn let_others_run() {
+    let mut ran = false;
+    poll_fn(|cx| {
+        if std::mem::replace(&mut ran, true) {
+            return Poll::Ready(());
+        }
+        cx.waker().wake_by_ref();
+        Poll::Pending
+    })
+    .await;
 }
 
 enum Sockets {
