@@ -14,7 +14,7 @@ use crate::{
     namespace::{Namespaces, REFUSED},
     peers,
     shell::{Ended, run as must, status, step},
-    workspace::Workspace,
+    workspace::{SHIPPED, Workspace},
 };
 
 /// Measures one hop of each bridge beside the floor and roscpp's relay, all in one run.
@@ -79,13 +79,20 @@ fn measured(
     let rustdds = Rustdds::prepare(workspace)?;
     let mut build = rustdds.cargo(
         workspace,
-        &["build", "--release", "--bins", "--examples", "--locked"],
+        &[
+            "build",
+            "--profile",
+            SHIPPED,
+            "--bins",
+            "--examples",
+            "--locked",
+        ],
     );
     for package in packages {
         build.args(["--package", package]);
     }
     must(&mut build)?;
-    let programs = workspace.target.join("release");
+    let programs = workspace.target.join(SHIPPED);
     let program = programs.join(bench);
     ensure!(
         program.is_file(),

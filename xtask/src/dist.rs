@@ -7,7 +7,7 @@ use anyhow::Context as _;
 use crate::{
     dds::Rustdds,
     shell::{Ended, run as must, step},
-    workspace::Workspace,
+    workspace::{SHIPPED, Workspace},
 };
 
 /// Packages with one program each, of the same name.
@@ -17,7 +17,10 @@ const PROGRAMS: [&str; 4] = ["bridge-ros1", "bridge-ros2", "ua-server", "ua-spac
 pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
     let rustdds = Rustdds::prepare(workspace)?;
     step("building the programs with optimisation (some minutes the first time)");
-    let mut build = rustdds.cargo(workspace, &["build", "--release", "--locked", "--bins"]);
+    let mut build = rustdds.cargo(
+        workspace,
+        &["build", "--profile", SHIPPED, "--locked", "--bins"],
+    );
     for package in PROGRAMS {
         build.args(["--package", package]);
     }
@@ -26,7 +29,7 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
     fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
     for program in PROGRAMS {
         let target = folder.join(program);
-        fs::copy(workspace.target.join("release").join(program), &target)
+        fs::copy(workspace.target.join(SHIPPED).join(program), &target)
             .with_context(|| target.display().to_string())?;
         println!("{}", target.display());
     }

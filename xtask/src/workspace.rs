@@ -5,6 +5,9 @@ use std::{env, ffi::OsString, path::PathBuf, process::Command};
 use anyhow::{Context as _, ensure};
 use serde_json::Value;
 
+/// The profile of what is handed out and measured as a whole, and its folder below `target`.
+pub(crate) const SHIPPED: &str = "shipped";
+
 /// The paths of this workspace.
 pub(crate) struct Workspace {
     pub(crate) root: PathBuf,
