@@ -24,8 +24,32 @@ pub enum Peer {
     FastDds,
     /// Cyclone DDS from Debian or Ubuntu, in a program that `cargo xtask test` compiles.
     CycloneC,
+    /// rclpy over Fast DDS, of each [`Distribution`], in the Python environments that `cargo xtask test` makes.
+    Ros2,
     /// Wireshark's tshark, from Debian or Ubuntu.
     Tshark,
+}
+
+/// A distribution of ROS 2 that is there as a peer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Distribution {
+    /// Jazzy Jalisco, over Fast DDS 2.14.
+    Jazzy,
+    /// Kilted Kaiju, over Fast DDS 3.2.
+    Kilted,
+}
+
+impl Distribution {
+    /// All of them.
+    pub const ALL: [Self; 2] = [Self::Jazzy, Self::Kilted];
+
+    pub(crate) fn python(self) -> PathBuf {
+        compiled(match self {
+            Self::Jazzy => "ros2-jazzy",
+            Self::Kilted => "ros2-kilted",
+        })
+        .join("bin/python")
+    }
 }
 
 /// A network namespace with nothing in it but a loopback that carries multicast, and a folder for files.
@@ -149,7 +173,7 @@ fn python() -> PathBuf {
     )
 }
 
-/// Where the peers are that `cargo xtask test` compiles.
+/// Where the peers are that `cargo xtask test` compiles, or installs beside them.
 pub(crate) fn compiled(name: &str) -> PathBuf {
     env::var_os("UA_PEERS")
         .map_or_else(
@@ -161,6 +185,7 @@ pub(crate) fn compiled(name: &str) -> PathBuf {
 
 fn find(peer: Peer, python: &Path) -> Result<(), String> {
     let (fastdds, cyclone) = (compiled(FASTDDS), compiled(CYCLONE));
+    let [jazzy, kilted] = Distribution::ALL.map(Distribution::python);
     let needed: &[&Path] = match peer {
         Peer::Ros1 => &[
             Path::new("/usr/bin/rosmaster"),
@@ -175,6 +200,7 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
         Peer::Python => &[python],
         Peer::FastDds => &[&fastdds],
         Peer::CycloneC => &[&cyclone],
+        Peer::Ros2 => &[&jazzy, &kilted],
         Peer::Tshark => &[Path::new(TSHARK)],
     };
     match needed.iter().find(|path| !path.exists()) {

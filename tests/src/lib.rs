@@ -28,7 +28,7 @@ mod wait;
 pub use arrows::{forbidden, tree};
 pub use bare_node::{BareNode, BareSubscription, PATIENCE, string_frame};
 pub use capture::{Capture, Dissected, hex, is_true};
-pub use cell::{Cell, Peer, without_data};
+pub use cell::{Cell, Distribution, Peer, without_data};
 pub use child::{Child, Started};
 pub use enclave::{Keystore, Wiretap};
 pub use host::{HERE, Host, THERE, WIRE, Wire};

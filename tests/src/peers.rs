@@ -9,7 +9,7 @@ use nix::sys::signal::Signal;
 
 use crate::{
     Cell, Child, GROUP, Started,
-    cell::{CYCLONE, FASTDDS, compiled},
+    cell::{CYCLONE, Distribution, FASTDDS, compiled},
     eventually, program, xml_rpc,
 };
 
@@ -149,6 +149,31 @@ impl Cell {
             .args(args)
             .args(["--domain", "2"])
             .told()
+    }
+
+    /// An rclpy script of `peers/` in domain 2 that has said it is ready.
+    #[must_use]
+    pub fn rclpy(&self, distribution: Distribution, script: &str, args: &[&str]) -> Child {
+        self.rclpy_started(distribution, script, args)
+            .start()
+            .ready(START)
+    }
+
+    /// An rclpy script of `peers/` in domain 2, not started yet.
+    #[must_use]
+    pub fn rclpy_started(
+        &self,
+        distribution: Distribution,
+        script: &str,
+        args: &[&str],
+    ) -> Started {
+        Started::new(script, &distribution.python())
+            .env("PYTHONUNBUFFERED", "1")
+            .env("ROS_DOMAIN_ID", "2")
+            .env("ROS_HOME", self.folder().join("ros"))
+            .env("ROS_LOG_DIR", self.folder().join("ros/log"))
+            .args([peer_script(script)])
+            .args(args)
     }
 
     /// An asyncua script of `peers/` that stays and has said it is ready.

@@ -1,5 +1,5 @@
 //! The software of other makers that the system tests talk to: ROS 1 and the DDS libraries from Debian or Ubuntu, the
-//! rest from PyPI.
+//! rest, ROS 2 among it, from PyPI.
 
 mod native;
 
@@ -53,19 +53,30 @@ const APT_DDS: &[&str] = &[
     "cyclonedds-tools",
 ];
 
+/// Python environments among the peers, and the lists of `tests/peers` of what is in each. Distributions of ROS 2 have
+/// the same packages in different versions.
+const VENVS: [(&str, &str); 3] = [
+    (PYTHON, "requirements.txt"),
+    ("ros2-jazzy", "ros2-jazzy.txt"),
+    ("ros2-kilted", "ros2-kilted.txt"),
+];
+
+const PYTHON: &str = "venv";
+
 /// Installs what is missing. What cannot be installed is told; its tests then skip themselves, or fail with `CI=true`.
 pub(crate) fn install(workspace: &Workspace) -> Ended {
     let mut ended = Ended::WELL;
-    for (which, result) in [
-        ("from apt", apt()),
-        ("from PyPI", venv(workspace)),
-        ("of DDS", native::build(workspace)),
-    ] {
+    let mut told = |which: &str, result: anyhow::Result<()>| {
         if let Err(error) = result {
             eprintln!("xtask: the peers {which} are not complete: {error:#}");
             ended = Ended::BADLY;
         }
+    };
+    told("from apt", apt());
+    for (folder, requirements) in VENVS {
+        told("from PyPI", venv(workspace, folder, requirements));
     }
+    told("of DDS", native::build(workspace));
     ended
 }
 
@@ -78,9 +89,13 @@ pub(crate) fn run(workspace: &Workspace) -> Ended {
     ended
 }
 
-/// The Python that has the peers of PyPI.
+/// The Python that has the peers of PyPI but ROS 2.
 pub(crate) fn python(workspace: &Workspace) -> PathBuf {
-    workspace.venv().join("bin/python")
+    python_of(&workspace.peers().join(PYTHON))
+}
+
+fn python_of(venv: &Path) -> PathBuf {
+    venv.join("bin/python")
 }
 
 fn apt() -> anyhow::Result<()> {
@@ -137,9 +152,9 @@ fn as_root(program: &str) -> Command {
     command
 }
 
-fn venv(workspace: &Workspace) -> anyhow::Result<()> {
-    let folder = workspace.venv();
-    let requirements = workspace.root.join("tests/peers/requirements.txt");
+fn venv(workspace: &Workspace, folder: &str, requirements: &str) -> anyhow::Result<()> {
+    let folder = workspace.peers().join(folder);
+    let requirements = workspace.root.join("tests/peers").join(requirements);
     let wanted = fs::read_to_string(&requirements)
         .with_context(|| format!("{} cannot be read", requirements.display()))?;
     let installed = folder.join("requirements.txt");
@@ -164,7 +179,7 @@ fn venv(workspace: &Workspace) -> anyhow::Result<()> {
             .arg(&folder),
     )?;
     must(
-        Command::new(python(workspace))
+        Command::new(python_of(&folder))
             .args([
                 "-m",
                 "pip",

@@ -47,11 +47,6 @@ impl Workspace {
         self.target.join("peers")
     }
 
-    /// The Python environment among them.
-    pub(crate) fn venv(&self) -> PathBuf {
-        self.peers().join("venv")
-    }
-
     /// A command of cargo, in the root.
     pub(crate) fn cargo(&self, arguments: &[&str]) -> Command {
         let mut command = Command::new(cargo_program());
