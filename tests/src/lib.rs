@@ -34,7 +34,9 @@ pub use child::{Child, Started};
 pub use enclave::{Keystore, Wiretap};
 pub use host::{HERE, Host, THERE, WIRE, Wire};
 pub use judge::Judge;
-pub use net::{GROUP, UadpSocket, group_member, http_get, metrics, xml_rpc};
+pub use net::{
+    GROUP, UadpSocket, all_overflowed, group_member, http_get, metrics, overflowed, xml_rpc,
+};
 pub use numbered::{Numbered, numbered};
 pub use peers::MASTER;
 pub use programs::{

@@ -3,6 +3,7 @@
 use std::{
     io::{Read, Write},
     net::{Ipv4Addr, SocketAddrV4, TcpStream, UdpSocket},
+    os::fd::AsRawFd as _,
     time::{Duration, Instant},
 };
 
@@ -91,6 +92,32 @@ pub fn group_member(group: SocketAddrV4) -> UdpSocket {
         .join_multicast_v4(group.ip(), &Ipv4Addr::LOCALHOST)
         .unwrap();
     socket.into()
+}
+
+/// The datagrams the kernel dropped because this socket was full: no loss of whoever sent them.
+#[must_use]
+pub fn overflowed(socket: &UdpSocket) -> Option<u64> {
+    let link = std::fs::read_link(format!("/proc/self/fd/{}", socket.as_raw_fd())).ok()?;
+    let inode = link.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?;
+    udp_sockets()?
+        .into_iter()
+        .find_map(|(of, dropped)| (of == inode).then_some(dropped))
+}
+
+/// The same of all UDP sockets of this thread's network together.
+#[must_use]
+pub fn all_overflowed() -> Option<u64> {
+    Some(udp_sockets()?.into_iter().map(|(_, dropped)| dropped).sum())
+}
+
+/// Inode and drops of each, the columns 10 and 13 of Linux' `/proc/net/udp`.
+fn udp_sockets() -> Option<Vec<(String, u64)>> {
+    let table = std::fs::read_to_string("/proc/thread-self/net/udp").ok()?;
+    let rows = table.lines().skip(1).map(|row| {
+        let mut words = row.split_whitespace().skip(9);
+        Some((words.next()?.to_owned(), words.last()?.parse().ok()?))
+    });
+    rows.collect()
 }
 
 /// What a program says about itself at `/status`, or `None` while it does not answer.

@@ -50,6 +50,33 @@ struct Stamp {
     }
 };
 
+// Filler, then a number of 11 digits: with its length and the NUL a text of one is 16 bytes.
+struct Ticket {
+    static constexpr size_t LENGTH = 11;
+
+    static void put(Body& body, size_t size, uint64_t number) {
+        const size_t length = std::max(size, LENGTH);
+        if (body.size() != 4 + length + 1) {
+            body = of_text(std::string(length, '.'));
+        }
+        char digits[LENGTH + 1];
+        std::snprintf(digits, sizeof digits, "%011llu", static_cast<unsigned long long>(number % 100000000000));
+        std::memcpy(body.data() + 4 + length - LENGTH, digits, LENGTH);
+    }
+
+    static std::optional<uint64_t> of(const Body& body) {
+        const auto text = text_of(body);
+        if (!text || text->size() < LENGTH) {
+            return std::nullopt;
+        }
+        const std::string digits(text->substr(text->size() - LENGTH));
+        if (digits.find_first_not_of("0123456789") != std::string::npos) {
+            return std::nullopt;
+        }
+        return std::stoull(digits);
+    }
+};
+
 std::string json(const std::vector<int64_t>& numbers) {
     std::string text = "[";
     for (const int64_t number : numbers) {
@@ -73,6 +100,7 @@ public:
     void pass(int lane, uint64_t count, size_t size, uint64_t window) {
         std::unique_lock<std::mutex> guard(lock_);
         times_.clear();
+        sent_.clear();
         first_ = next_;
         end_ = next_ + count;
         size_ = size;
@@ -102,19 +130,20 @@ public:
 private:
     void send() {
         if (next_ < end_) {
-            Stamp{0, next_++, now()}.put(body_, size_);
+            Ticket::put(body_, size_, next_++);
+            sent_.push_back(now());
             writer_->write(body_);
         }
     }
 
     void hear(const Body& body) {
         const int64_t heard = now();
-        const auto stamp = Stamp::of(body);
+        const auto number = Ticket::of(body);
         const std::lock_guard<std::mutex> guard(lock_);
-        if (!stamp || stamp->number < std::max(first_, first_after_loss_) || stamp->number >= end_) {
+        if (!number || *number < std::max(first_, first_after_loss_) || *number >= next_) {
             return;
         }
-        times_.push_back(heard - stamp->sent);
+        times_.push_back(heard - sent_[*number - first_]);
         send();
         if (next_ == end_) {
             changed_.notify_all();
@@ -131,6 +160,8 @@ private:
     size_t size_ = 0;
     Body body_;
     std::vector<int64_t> times_;
+    // When what was sent since `first_` was.
+    std::vector<int64_t> sent_;
     std::unique_ptr<Writer> writer_;
     std::unique_ptr<Reader> reader_;
 };

@@ -8,7 +8,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use system_tests::{
-    BareNode, Cell, GROUP, eventually, group_member, per_message, processor_time, string_frame,
+    BareNode, Cell, GROUP, eventually, group_member, overflowed, per_message, processor_time,
+    string_frame,
 };
 
 pub(crate) fn measure(cell: &Cell, seconds: u64) {
@@ -47,10 +48,14 @@ pub(crate) fn measure(cell: &Cell, seconds: u64) {
     println!(
         "| {sent} | {received} | {} | {} | {:.0} % of one core | {:.1} us |",
         sent - received,
-        dropped_by(&listener),
+        shown(overflowed(&listener)),
         used.as_secs_f64() / took.as_secs_f64() * 100.0,
         per_message(used, sent)
     );
+}
+
+fn shown(count: Option<u64>) -> String {
+    count.map_or_else(|| "unknown".to_owned(), |count| count.to_string())
 }
 
 /// Events, of which none may give way.
@@ -136,21 +141,6 @@ fn parsed(datagram: &[u8]) -> Option<(usize, u64)> {
     let topic = std::str::from_utf8(topic).ok()?.parse().ok()?;
     let number = std::str::from_utf8(number).ok()?.parse().ok()?;
     Some((topic, number))
-}
-
-/// What the kernel dropped because this socket was full: no loss of the bridge's.
-fn dropped_by(listener: &UdpSocket) -> String {
-    use std::os::fd::AsRawFd as _;
-    let dropped = || {
-        let link = std::fs::read_link(format!("/proc/self/fd/{}", listener.as_raw_fd())).ok()?;
-        let inode = link.to_str()?.strip_prefix("socket:[")?.strip_suffix(']')?;
-        let table = std::fs::read_to_string("/proc/thread-self/net/udp").ok()?;
-        let row = table
-            .lines()
-            .find(|row| row.split_whitespace().any(|word| word == inode))?;
-        row.split_whitespace().last().map(str::to_owned)
-    };
-    dropped().unwrap_or_else(|| "unknown".to_owned())
 }
 
 const TOPICS: usize = 50;

@@ -63,6 +63,8 @@ struct Plan {
     parts: Vec<String>,
     /// Of each size, one at a time, through each relay; a tenth of it where samples are large.
     messages: u64,
+    /// Of these at a time through one relay, then through the next.
+    turn: u64,
     /// At 1 kHz, and of doing nothing.
     seconds: u64,
     /// Of what happens a few times only.
@@ -76,6 +78,7 @@ impl Plan {
             help: false,
             parts: Vec::new(),
             messages: 5000,
+            turn: 50,
             seconds: 20,
             turns: 20,
         };
@@ -91,6 +94,7 @@ impl Plan {
                         ..plan
                     }
                 }
+                "--turn" => plan.turn = args.next()?.parse().ok().filter(|turn| *turn > 0)?,
                 "--seconds" => plan.seconds = args.next()?.parse().ok()?,
                 part if PARTS.contains(&part) => plan.parts.push(part.to_owned()),
                 _ => return None,
@@ -115,9 +119,10 @@ const PARTS: [&str; 7] = [
 ];
 
 const HELP: &str = "\
-bench-ros2 [--quick] [--seconds N] [PART..]
+bench-ros2 [--quick] [--seconds N] [--turn N] [PART..]
 
   --quick      a trial of a minute; its figures are no measurement
   --seconds N  how long each path gets messages at 1 kHz, 20 unless told
+  --turn N     samples through one relay before the next has its turn, 50 unless told
   PART         round-trip, throughput, joining, idle, many, through, bursts; all unless told
 ";

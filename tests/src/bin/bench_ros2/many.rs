@@ -4,7 +4,10 @@ use std::collections::HashSet;
 use std::fmt::Write as _;
 use std::time::Duration;
 
-use system_tests::{Cell, GROUP, UaSide, eventually, group_member, per_message, processor_time};
+use system_tests::{
+    Cell, GROUP, METRICS_ROS2, UaSide, all_overflowed, drops, eventually, group_member, metrics,
+    number, overflowed, per_message, processor_time,
+};
 use uadp::Scalar;
 
 use crate::ends::{Meter, Pace, Pacer, Report, START};
@@ -14,8 +17,10 @@ pub(crate) fn measure(cell: &Cell, seconds: u64) {
     println!(
         "\n{TOPICS} topics of {SIZE} B at 1 kHz each through bridge-ros2, {seconds} s; microseconds:\n"
     );
-    println!("| way | sent | received | p50 | p99 | CPU share of the bridge | CPU per message |");
-    println!("|---|---|---|---|---|---|---|");
+    println!(
+        "| way | sent | received | dropped by the bridge | in the receiver's socket | in other sockets | p50 | p99 | CPU share of the bridge | CPU per message |"
+    );
+    println!("|---|---|---|---|---|---|---|---|---|---|");
     to_dds(cell, seconds);
     to_uadp(cell, seconds);
 }
@@ -42,6 +47,7 @@ fn to_dds(cell: &Cell, seconds: u64) {
         whole = if heard == TOPICS as u64 { whole + 1 } else { 0 };
         (whole == 2).then_some(())
     });
+    let dropped = Dropped::so_far(0);
     let before = processor_time(bridge.id());
     let start = now();
     let mut due = start;
@@ -55,7 +61,18 @@ fn to_dds(cell: &Cell, seconds: u64) {
     let sent = seconds * 1000 * TOPICS as u64;
     let report = meter.report(sent);
     let used = processor_time(bridge.id()) - before;
-    row("UADP -> DDS", sent, report, used, took);
+    // The receiver's socket is Cyclone's own, and what it loses is repaired.
+    let dropped = Dropped::so_far(0).since(&dropped);
+    row(
+        "UADP -> DDS",
+        Ran {
+            sent,
+            report,
+            dropped,
+            used,
+            took,
+        },
+    );
 }
 
 fn to_uadp(cell: &Cell, seconds: u64) {
@@ -81,6 +98,8 @@ fn to_uadp(cell: &Cell, seconds: u64) {
         (crossed.len() == TOPICS).then_some(())
     });
     heard.report = Report::default();
+    let full = || overflowed(&listener).unwrap_or_default();
+    let dropped = Dropped::so_far(full());
     let before = processor_time(bridge.id());
     let start = now();
     let sent = seconds * 1000 * TOPICS as u64;
@@ -100,13 +119,69 @@ fn to_uadp(cell: &Cell, seconds: u64) {
         sender.join().unwrap()
     });
     let used = processor_time(bridge.id()) - before;
-    row("DDS -> UADP", sent, heard.report, used, took);
+    let dropped = Dropped::so_far(full()).since(&dropped);
+    row(
+        "DDS -> UADP",
+        Ran {
+            sent,
+            report: heard.report,
+            dropped,
+            used,
+            took,
+        },
+    );
 }
 
-fn row(way: &str, sent: u64, mut report: Report, used: Duration, took: Duration) {
+/// Where samples and datagrams were dropped.
+struct Dropped {
+    by_bridge: u64,
+    in_receiver: u64,
+    in_others: u64,
+}
+
+impl Dropped {
+    fn so_far(in_receiver: u64) -> Self {
+        let bridge = metrics(METRICS_ROS2).unwrap_or_default();
+        Self {
+            // The group brings back what the bridge itself has sent.
+            by_bridge: drops(&bridge) - number(&bridge, "looped"),
+            in_receiver,
+            in_others: all_overflowed().unwrap_or_default() - in_receiver,
+        }
+    }
+
+    fn since(&self, before: &Self) -> Self {
+        Self {
+            by_bridge: self.by_bridge - before.by_bridge,
+            in_receiver: self.in_receiver - before.in_receiver,
+            in_others: self.in_others - before.in_others,
+        }
+    }
+}
+
+/// What came of one way.
+struct Ran {
+    sent: u64,
+    report: Report,
+    dropped: Dropped,
+    used: Duration,
+    took: Duration,
+}
+
+fn row(way: &str, ran: Ran) {
+    let Ran {
+        sent,
+        mut report,
+        dropped,
+        used,
+        took,
+    } = ran;
     println!(
-        "| {way} | {sent} | {} | {:.0} | {:.0} | {:.0} % of one core | {:.1} |",
+        "| {way} | {sent} | {} | {} | {} | {} | {:.0} | {:.0} | {:.0} % of one core | {:.1} |",
         report.distinct,
+        dropped.by_bridge,
+        dropped.in_receiver,
+        dropped.in_others,
         report.times.at(0.5),
         report.times.at(0.99),
         used.as_secs_f64() / took.as_secs_f64() * 100.0,

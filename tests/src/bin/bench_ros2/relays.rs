@@ -28,16 +28,17 @@ pub(crate) fn measure(cell: &Cell, plan: &Plan) {
         path.begin(&mut pinger);
     }
     if plan.has("round-trip") {
-        round_trip(&mut paths, &mut pinger, plan.messages);
+        round_trip(&mut paths, &mut pinger, plan);
     }
     if plan.has("throughput") {
-        throughput(&mut paths, &mut pinger, plan.messages);
+        throughput(&mut paths, &mut pinger, plan);
     }
 }
 
-fn round_trip(paths: &mut [Path], pinger: &mut Pinger, messages: u64) {
+fn round_trip(paths: &mut [Path], pinger: &mut Pinger, plan: &Plan) {
     println!(
-        "\nThere and back, one sample at a time, the relays in turns of {TURN}; microseconds:\n"
+        "\nThere and back, one sample at a time, the relays in turns of {}; microseconds:\n",
+        plan.turn
     );
     println!(
         "| payload | relay | samples | lost | p50 | p99 | p50 / Cyclone | CPU of the relay per sample |"
@@ -45,26 +46,26 @@ fn round_trip(paths: &mut [Path], pinger: &mut Pinger, messages: u64) {
     println!("|---|---|---|---|---|---|---|---|");
     for (size, shown) in SIZES {
         let messages = if size > LARGE {
-            messages / 10
+            plan.messages / 10
         } else {
-            messages
+            plan.messages
         };
         let load = Load {
             samples: messages / 10,
             size,
             window: 1,
         };
-        pass(paths, pinger, load);
+        pass(paths, pinger, plan.turn, load);
         let samples = messages;
-        let passed = pass(paths, pinger, Load { samples, ..load });
+        let passed = pass(paths, pinger, plan.turn, Load { samples, ..load });
         print(shown, paths, passed);
     }
 }
 
-fn throughput(paths: &mut [Path], pinger: &mut Pinger, messages: u64) {
+fn throughput(paths: &mut [Path], pinger: &mut Pinger, plan: &Plan) {
     println!(
         "\nWith a window of 32 samples on the way (2 of 1 MiB), in turns of {}:\n",
-        TURN * 20
+        plan.turn * 20
     );
     println!(
         "| payload | relay | samples | lost | samples/s | p99, us | CPU of the relay per sample, us |"
@@ -72,16 +73,16 @@ fn throughput(paths: &mut [Path], pinger: &mut Pinger, messages: u64) {
     println!("|---|---|---|---|---|---|---|");
     for (size, shown) in SIZES {
         let (samples, window) = if size > LARGE {
-            (messages / 10, 2)
+            (plan.messages / 10, 2)
         } else {
-            (messages * 4, 32)
+            (plan.messages * 4, 32)
         };
         let load = Load {
             samples,
             size,
             window,
         };
-        let passed = pass(paths, pinger, load);
+        let passed = pass(paths, pinger, plan.turn, load);
         for (path, passed) in paths.iter().zip(passed) {
             let Some(mut passed) = passed else { continue };
             let count = passed.times.count();
@@ -121,12 +122,12 @@ fn print(size: &str, paths: &[Path], passed: Vec<Option<Passed>>) {
 }
 
 /// Sends through all paths in turns. `None` for a path that does not carry so much at once.
-fn pass(paths: &mut [Path], pinger: &mut Pinger, load: Load) -> Vec<Option<Passed>> {
+fn pass(paths: &mut [Path], pinger: &mut Pinger, turn: u64, load: Load) -> Vec<Option<Passed>> {
     let mut all: Vec<Option<Passed>> = paths
         .iter()
         .map(|path| path.carries(load).then(Passed::default))
         .collect();
-    let turn = if load.window == 1 { TURN } else { TURN * 20 };
+    let turn = if load.window == 1 { turn } else { turn * 20 };
     let mut left = load.samples;
     while left > 0 {
         let samples = left.min(turn);
@@ -230,8 +231,8 @@ impl Path {
 
 fn datagrams(socket: &UdpSocket, Load { samples, size, .. }: Load) -> Passed {
     let mut passed = Passed::default();
-    let sent = vec![b'.'; size];
-    let mut heard = vec![0; size];
+    let sent = vec![b'.'; size + 5];
+    let mut heard = vec![0; size + 5];
     for _ in 0..samples {
         let start = Instant::now();
         socket.send(&sent).unwrap();
@@ -289,9 +290,9 @@ fn topics(lane: usize) -> (String, String) {
 }
 
 const LANES: usize = 3;
-const TURN: u64 = 50;
+/// Characters of a text, and what is said of it. Its length and the NUL add 5 bytes.
 const SIZES: [(usize, &str); 4] = [
-    (40, "40 B"),
+    (11, "16 B"),
     (1024, "1 KiB"),
     (LARGE, "64 kB"),
     (1 << 20, "1 MiB"),
