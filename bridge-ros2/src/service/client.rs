@@ -16,7 +16,7 @@ use tracing::debug;
 use super::error::{CallPhase, ServiceError};
 use super::mapping::{ClientId, Outgoing, Received, RequestKey};
 use super::opening::Opening;
-use super::pace::{Awaited, FRESH, Pace};
+use super::pace::{Awaited, FRESH, Pace, may_ask};
 use super::peers::{ServicePeers, Snapshot};
 use super::{SETTLE, Service, ServiceMapping, next, policies};
 use crate::domain::{Domain, DomainError};
@@ -231,7 +231,7 @@ struct Driver {
     servers: BTreeMap<GUID, Instant>,
     /// A type that a server has instead of ours.
     other_type: Option<String>,
-    /// Calls that wait for a server or for the send window, oldest first.
+    /// Calls that wait for a server, for it to take what it was sent, or for the send window, oldest first.
     waiting: VecDeque<Call>,
     /// Calls that wait for a reply.
     asked: BTreeMap<u64, Asked>,
@@ -250,6 +250,7 @@ struct Asked {
     call: Call,
     keys: Vec<RequestKey>,
     servers: Vec<GUID>,
+    since: Instant,
 }
 
 impl Driver {
@@ -333,6 +334,7 @@ impl Driver {
         // Those too that are new: the others may be dead, with their leases still running.
         let servers: Vec<GUID> = self.servers.keys().copied().collect();
         while self.opening.is_over(&self.writer, now)
+            && may_ask(self.asked.values().rev().map(|asked| asked.since), now)
             && let Some(call) = self.waiting.pop_front()
         {
             if call.done.is_closed() {
@@ -340,7 +342,7 @@ impl Driver {
                 continue;
             }
             call.enter(CallPhase::Request);
-            if let Some(unsent) = self.ask(call, &servers) {
+            if let Some(unsent) = self.ask(call, &servers, now) {
                 self.waiting.push_front(unsent);
                 return;
             }
@@ -376,7 +378,7 @@ impl Driver {
     }
 
     /// Writes a request to the servers; returns it when the send window is full.
-    fn ask(&mut self, call: Call, servers: &[GUID]) -> Option<Call> {
+    fn ask(&mut self, call: Call, servers: &[GUID], now: Instant) -> Option<Call> {
         self.count += 1;
         let (mut keys, mut asked) = (Vec::new(), Vec::new());
         for server in servers {
@@ -404,6 +406,7 @@ impl Driver {
             call,
             keys,
             servers: asked,
+            since: now,
         };
         self.asked.insert(self.count, asked);
         None
@@ -453,6 +456,9 @@ impl Driver {
         {
             self.forget_keys(&asked.keys);
             asked.call.end(Ok(body));
+            if !self.waiting.is_empty() {
+                self.ask_waiting(Instant::now());
+            }
             return;
         }
         debug!(service = self.service.name, "a reply for nobody here");

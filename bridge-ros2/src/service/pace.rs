@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use tokio::time::Instant;
+
 use super::{BUSY, IDLE};
 
 /// What the calls of a client wait for.
@@ -63,9 +65,36 @@ impl Pace {
 /// still running, and its successor there.
 pub(super) const FRESH: Duration = Duration::from_millis(20);
 
+/// Whether one more request may be sent now, given when those that are unanswered were sent, newest first.
+///
+/// A server of rmw keeps the last ten requests that it has not taken yet (`rmw_qos_profile_services_default`), also where
+/// delivery is reliable: of twenty at once the first ten are gone, and nobody is told. Those that are answered it has taken.
+/// One that it answers late, such as for the result of a goal, it has taken by then most likely.
+pub(super) fn may_ask(unanswered: impl Iterator<Item = Instant>, now: Instant) -> bool {
+    let recent = unanswered.take_while(|sent| now.saturating_duration_since(*sent) < TAKEN);
+    recent.take(AT_ONCE).count() < AT_ONCE
+}
+
+/// Requests that a server has to keep, at most.
+const AT_ONCE: usize = 8;
+/// After that time a server has taken a request, answered or not.
+const TAKEN: Duration = Duration::from_millis(100);
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_server_is_not_sent_more_than_it_keeps_until_it_answers_or_some_time_is_over() {
+        let now = Instant::now();
+        let ago = |millis| now - Duration::from_millis(millis);
+        assert!(may_ask(std::iter::empty(), now));
+        assert!(may_ask((0..7).map(ago), now));
+        assert!(!may_ask((0..8).map(ago), now));
+        // One of eight is from long ago, and so is what came before.
+        assert!(may_ask((93..900).map(ago), now));
+        assert!(!may_ask((92..900).map(ago), now));
+    }
 
     /// The times of the looks within so long, while that is awaited.
     fn looks(pace: &mut Pace, awaited: Awaited, within: Duration) -> Vec<Duration> {
