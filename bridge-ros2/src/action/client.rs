@@ -212,9 +212,12 @@ impl Shared {
 
     pub(super) async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, ServiceError> {
         let reply = self.cancel.call(wire::cancel_request(what)).await?;
-        wire::read_cancel_answer(&reply).map_err(|Malformed| ServiceError::Reply {
-            service: self.cancel.service().to_owned(),
-        })
+        match wire::read_cancel_answer(&reply) {
+            Ok(answer) => Ok(answer.to(what)),
+            Err(Malformed) => Err(ServiceError::Reply {
+                service: self.cancel.service().to_owned(),
+            }),
+        }
     }
 
     /// Nobody holds the goal any more.

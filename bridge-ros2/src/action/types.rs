@@ -159,3 +159,55 @@ pub struct CancelAnswer {
     /// The goals that are being cancelled now. How they end is told with their results.
     pub goals: Vec<GoalInfo>,
 }
+
+impl CancelAnswer {
+    /// The answer to that request. A server of rclpy that goes on with a goal says no more than which goals it cancels,
+    /// and that is not among them.
+    pub(super) fn to(self, what: CancelWhat) -> Self {
+        match what {
+            CancelWhat::Goal(id)
+                if self.code == CancelCode::None && self.goals.iter().all(|info| info.id != id) =>
+            {
+                let code = CancelCode::Rejected;
+                Self { code, ..self }
+            }
+            CancelWhat::Goal(_)
+            | CancelWhat::All
+            | CancelWhat::Until(_)
+            | CancelWhat::GoalAndUntil(..) => self,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_goal_that_is_not_among_those_cancelled_is_rejected() {
+        let [one, other] = [1, 2].map(|byte| GoalId::from_bytes([byte; 16]));
+        let answer = |code, id: Option<GoalId>| {
+            let stamp = RosTime::default();
+            let goals = id.map(|id| GoalInfo { id, stamp });
+            let goals = goals.into_iter().collect();
+            CancelAnswer { code, goals }
+        };
+        let code = |said: CancelAnswer, what| said.to(what).code;
+        let none = answer(CancelCode::None, None);
+        assert_eq!(
+            code(none.clone(), CancelWhat::Goal(one)),
+            CancelCode::Rejected
+        );
+        // Where more than one may be meant, none may be there.
+        assert_eq!(code(none.clone(), CancelWhat::All), CancelCode::None);
+        assert_eq!(
+            code(none, CancelWhat::Until(RosTime::default())),
+            CancelCode::None
+        );
+        let known = answer(CancelCode::None, Some(one));
+        assert_eq!(code(known.clone(), CancelWhat::Goal(one)), CancelCode::None);
+        assert_eq!(code(known, CancelWhat::Goal(other)), CancelCode::Rejected);
+        let ended = answer(CancelCode::Terminated, None);
+        assert_eq!(code(ended, CancelWhat::Goal(one)), CancelCode::Terminated);
+    }
+}
