@@ -43,12 +43,21 @@ impl Distribution {
     /// All of them.
     pub const ALL: [Self; 2] = [Self::Jazzy, Self::Kilted];
 
+    /// Where the files of a package are, such as its definitions.
+    #[must_use]
+    pub fn share(self, package: &str) -> PathBuf {
+        self.prefix().join("share").join(package)
+    }
+
     pub(crate) fn python(self) -> PathBuf {
+        self.prefix().join("bin/python")
+    }
+
+    fn prefix(self) -> PathBuf {
         compiled(match self {
             Self::Jazzy => "ros2-jazzy",
             Self::Kilted => "ros2-kilted",
         })
-        .join("bin/python")
     }
 }
 

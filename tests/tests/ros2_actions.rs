@@ -6,14 +6,16 @@ mod fastdds;
 mod fibonacci;
 #[path = "ros2_actions/graph.rs"]
 mod graph;
+#[path = "ros2_actions/rclpy.rs"]
+mod rclpy;
 #[path = "ros2_actions/served.rs"]
 mod served;
 
 use std::time::Duration;
 
 use bridge_ros2::action::{
-    ActionClient, ActionClientOptions, CancelCode, CancelWhat, GoalEvent, GoalHandle, LostReason,
-    Outcome, Status,
+    Action, ActionClient, ActionClientOptions, CancelCode, CancelWhat, GoalEvent, GoalHandle,
+    LostReason, Outcome, Status,
 };
 use nix::sys::signal::Signal;
 use system_tests::{Cell, Child, Peer};
@@ -22,8 +24,12 @@ use tokio::time::timeout;
 use fibonacci::{ACTION, Ours, SOON, goal, numbers, until};
 
 fn client(ours: &Ours) -> ActionClient {
+    client_of(ours, &fibonacci::action())
+}
+
+fn client_of(ours: &Ours, action: &Action) -> ActionClient {
     let options = ActionClientOptions::default();
-    ActionClient::open(&ours.domain, &ours.peers, &fibonacci::action(), options).unwrap()
+    ActionClient::open(&ours.domain, &ours.peers, action, options).unwrap()
 }
 
 fn cyclone(cell: &Cell, more: &[&str]) -> Child {

@@ -4,21 +4,22 @@ use std::collections::HashMap;
 use std::time::Duration;
 
 use bridge_ros2::action::{
-    ActionServer, ActionServerOptions, GoalError, NewGoal, ServerCounters, ServerEvent, ServerGoal,
+    Action, ActionServer, ActionServerOptions, GoalError, NewGoal, ServerCounters, ServerEvent,
+    ServerGoal,
 };
 use bytes::Bytes;
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, Peer};
 use tokio::sync::watch;
-use tokio::task::AbortHandle;
+use tokio::task::JoinHandle;
 
 use crate::fibonacci::{self, ACTION, Ours, SOON, feedback, result, until};
 
 /// A server at work, until dropped.
 pub(crate) struct Serving {
     counters: watch::Receiver<ServerCounters>,
-    task: AbortHandle,
+    task: JoinHandle<()>,
 }
 
 impl Drop for Serving {
@@ -28,6 +29,12 @@ impl Drop for Serving {
 }
 
 impl Serving {
+    /// Ends it, and returns when all of it is gone.
+    pub(crate) async fn end(mut self) {
+        self.task.abort();
+        assert!((&mut self.task).await.unwrap_err().is_cancelled());
+    }
+
     pub(crate) fn counters(&self) -> ServerCounters {
         *self.counters.borrow()
     }
@@ -37,10 +44,14 @@ pub(crate) fn options() -> ActionServerOptions {
     ActionServerOptions::new(Bytes::from(result(&[])))
 }
 
-/// What the Cyclone peer does with goals, so does this.
+/// What the peers do with goals, so does this.
 pub(crate) fn serve(ours: &Ours, options: ActionServerOptions) -> Serving {
-    let action = fibonacci::action();
-    let mut server = ActionServer::open(&ours.domain, &ours.peers, &action, options).unwrap();
+    serve_as(ours, &fibonacci::action(), options)
+}
+
+/// The same for an action with the messages of Fibonacci, whatever its name and type.
+pub(crate) fn serve_as(ours: &Ours, action: &Action, options: ActionServerOptions) -> Serving {
+    let mut server = ActionServer::open(&ours.domain, &ours.peers, action, options).unwrap();
     let (counters, heard) = watch::channel(server.counters());
     let task = tokio::spawn(async move {
         let mut orders = HashMap::new();
@@ -63,7 +74,7 @@ pub(crate) fn serve(ours: &Ours, options: ActionServerOptions) -> Serving {
     });
     Serving {
         counters: heard,
-        task: task.abort_handle(),
+        task,
     }
 }
 
@@ -95,8 +106,13 @@ async fn work(goal: ServerGoal, order: i32) {
     }
     if order >= 100 {
         goal.cancel_agreed().await;
+        let result = result(&numbers);
+        let end = match order {
+            110 => goal.succeed(&result),
+            112 => goal.abort(&result),
+            _ => goal.canceled(&result),
+        };
         // Or the server is no more.
-        let end = goal.canceled(&result(&numbers));
         assert!(matches!(end, Ok(()) | Err(GoalError::Closed)), "{end:?}");
     } else {
         goal.succeed(&result(&numbers)).unwrap();
@@ -110,7 +126,7 @@ fn cyclone(cell: &Cell, more: &[&str]) -> Child {
 }
 
 /// Waits for a line with these fields.
-async fn said(client: &Child, wanted: &Value) -> Value {
+pub(crate) async fn said(client: &Child, wanted: &Value) -> Value {
     let wanted = wanted.as_object().unwrap();
     let found = || {
         let mut lines = client.json_lines().into_iter();
@@ -124,7 +140,11 @@ async fn said(client: &Child, wanted: &Value) -> Value {
     found().unwrap()
 }
 
-fn of<'l>(lines: &'l [Value], key: &'l str, goal: u64) -> impl Iterator<Item = &'l Value> {
+pub(crate) fn of<'l>(
+    lines: &'l [Value],
+    key: &'l str,
+    goal: u64,
+) -> impl Iterator<Item = &'l Value> {
     lines.iter().filter(move |line| line[key] == goal)
 }
 
