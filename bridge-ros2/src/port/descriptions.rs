@@ -1,11 +1,11 @@
 //! Types that are known to the nodes that use them: from ROS 2 Iron on each node tells what its types are.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashMap};
 use std::time::Duration;
 
 use messages::{DescribedType, TypeHash, TypeName};
 use rustdds::GUID;
-use tokio::task::JoinSet;
+use tokio::task::{Id, JoinSet};
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 
@@ -19,20 +19,58 @@ use crate::type_description;
 pub(super) struct Descriptions {
     peers: ServicePeers,
     asked: BTreeMap<Wanted, Inquiry>,
-    calls: JoinSet<Told>,
+    calls: Calls,
+}
+
+/// The calls that are out.
+#[derive(Default)]
+struct Calls {
+    tasks: JoinSet<Answer>,
+    /// What each of them asks for, and whom.
+    asking: HashMap<Id, (Wanted, String)>,
 }
 
 /// A type as an endpoint announces it.
 type Wanted = (TypeName, TypeHash);
-/// Who was asked for what, and the answer.
-type Told = (Wanted, String, Result<Vec<DescribedType>, String>);
+/// The type with what it needs, or why there is none.
+type Answer = Result<Vec<DescribedType>, String>;
 
 impl Descriptions {
     pub(super) fn new(peers: ServicePeers) -> Self {
         Self {
             peers,
             asked: BTreeMap::new(),
-            calls: JoinSet::new(),
+            calls: Calls::default(),
+        }
+    }
+}
+
+impl Calls {
+    fn begin(
+        &mut self,
+        wanted: Wanted,
+        service: String,
+        call: impl Future<Output = Answer> + Send + 'static,
+    ) {
+        let task = self.tasks.spawn(call);
+        self.asking.insert(task.id(), (wanted, service));
+    }
+
+    fn len(&self) -> usize {
+        self.tasks.len()
+    }
+
+    /// One that has ended: what was asked for, who was asked, and the answer. One that was broken off has failed like any
+    /// other: whoever waits for it must not do so for ever.
+    fn ended(&mut self) -> Option<(Wanted, String, Answer)> {
+        loop {
+            let (task, answer) = match self.tasks.try_join_next_with_id()? {
+                Ok(ended) => ended,
+                Err(error) => (error.id(), Err(format!("the call was broken off: {error}"))),
+            };
+            if let Some((wanted, service)) = self.asking.remove(&task) {
+                return Some((wanted, service, answer));
+            }
         }
     }
 }
@@ -138,23 +176,20 @@ impl Ros2Port {
         };
         debug!(message_type = %name, service = service.name, "asking what the type is");
         let request = type_description::request(name, *hash);
-        let (wanted, asked) = (wanted.clone(), service.name.clone());
-        self.descriptions.calls.spawn(async move {
-            let told = match client.call(request).await {
+        let asked = service.name.clone();
+        let calls = &mut self.descriptions.calls;
+        calls.begin(wanted.clone(), asked, async move {
+            match client.call(request).await {
                 Ok(answer) => type_description::read_answer(&answer),
                 Err(error) => Err(error.to_string()),
-            };
-            (wanted, asked, told)
+            }
         });
         inquiry.asked();
     }
 
     /// Takes in what was answered since the last look.
     pub(super) fn take_descriptions(&mut self, now: Instant) {
-        while let Some(ended) = self.descriptions.calls.try_join_next() {
-            let Ok((wanted, service, told)) = ended else {
-                continue;
-            };
+        while let Some((wanted, service, told)) = self.descriptions.calls.ended() {
             let Some(mut inquiry) = self.descriptions.asked.remove(&wanted) else {
                 continue;
             };
@@ -212,3 +247,35 @@ const MOST_CALLS: usize = 4;
 const MOST_ASKED: usize = 1024;
 /// How old what is known of services may be.
 const FRESH: Duration = Duration::from_millis(100);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn a_call_that_is_broken_off_has_failed() {
+        let wanted = |name: &str| -> Wanted {
+            let name: TypeName = name.parse().unwrap();
+            let hash = messages::Registry::bundle(messages::Dialect::Ros2).type_hash(&name);
+            (name, hash.unwrap())
+        };
+        let (panics, hangs) = (wanted("std_msgs/Bool"), wanted("std_msgs/String"));
+        let mut calls = Calls::default();
+        calls.begin(panics.clone(), "/panics".to_owned(), async {
+            panic!("as the test wants it")
+        });
+        calls.begin(hangs.clone(), "/hangs".to_owned(), std::future::pending());
+        // The runtime of a test has one thread: both have their turn.
+        tokio::task::yield_now().await;
+        calls.tasks.abort_all();
+        tokio::task::yield_now().await;
+        let mut ended = BTreeMap::new();
+        while let Some((wanted, service, answer)) = calls.ended() {
+            ended.insert(wanted, (service, answer.is_err()));
+        }
+        let failed = |service: &str| (service.to_owned(), true);
+        let expected = [(panics, failed("/panics")), (hangs, failed("/hangs"))];
+        assert_eq!(ended, BTreeMap::from(expected));
+        assert_eq!((calls.len(), calls.asking.len()), (0, 0));
+    }
+}
