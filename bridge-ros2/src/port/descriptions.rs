@@ -125,7 +125,8 @@ impl Ros2Port {
             endpoint.type_hash.as_ref() == Some(hash) && endpoint.type_name == dds_type
         };
         let alike: Vec<GUID> = endpoints.iter().filter(alike).map(|it| it.guid).collect();
-        inquiry.meet(alike.iter().copied(), |guid| self.graph.holds(guid), now);
+        let met = inquiry.meet(alike.iter().copied(), |guid| self.graph.holds(guid), now);
+        self.tell_untold(&wanted, met, "they leave before they could tell it");
         self.ask(&wanted, &alike, &mut inquiry, now);
         let settled = !inquiry.is_waited_for();
         self.descriptions.asked.insert(wanted, inquiry);

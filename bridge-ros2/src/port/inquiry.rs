@@ -18,6 +18,8 @@ pub(super) struct Inquiry {
     calls: usize,
     /// How long to wait before it is asked for once more; none until nobody told it.
     pause: Option<Duration>,
+    /// How often in a row all who could have told it left before they had the time to.
+    cut_short: u8,
 }
 
 #[derive(Debug)]
@@ -58,6 +60,7 @@ impl Inquiry {
             looked: now,
             calls: 0,
             pause: None,
+            cut_short: 0,
         }
     }
 
@@ -71,34 +74,47 @@ impl Inquiry {
 
     /// Takes note of the endpoints whose nodes could tell it. Somebody new is worth asking at once; where all others have
     /// left, or nobody wanted to know for a while, it begins anew, with the time that a node has to tell of its services.
+    /// Where they leave and come before that time is over, again and again, nothing waits for it any longer.
     pub(super) fn meet(
         &mut self,
         endpoints: impl IntoIterator<Item = GUID>,
         is_there: impl Fn(GUID) -> bool,
         now: Instant,
-    ) {
+    ) -> Outcome {
         let lapsed = now.duration_since(self.looked) > OFFERED_WITHIN;
         self.looked = now;
         // While a call is out nobody is noted: who comes then is new at the next look.
         if matches!(self.state, State::Asking { .. } | State::Told) {
-            return;
+            return Outcome::GoesOn;
         }
         let new: Vec<GUID> = endpoints
             .into_iter()
             .filter(|guid| !self.seen.contains(guid))
             .collect();
         let anyone_new = !new.is_empty();
+        let unanswered = !self.seen.is_empty() && matches!(self.state, State::Waiting { .. });
         if anyone_new {
             self.seen.retain(|guid| is_there(*guid));
         }
         let anew = lapsed || self.seen.is_empty();
         self.seen.extend(new);
+        let mut outcome = Outcome::GoesOn;
         if anew {
-            self.pause = None;
+            self.cut_short = if unanswered {
+                self.cut_short.saturating_add(1)
+            } else {
+                0
+            };
+            if self.cut_short < MOST_CUT_SHORT {
+                self.pause = None;
+            } else if self.pause.is_none() {
+                outcome = self.untold(now);
+            }
         }
         if anew || anyone_new && matches!(self.state, State::Untold { .. }) {
             self.state = State::begin(now);
         }
+        outcome
     }
 
     /// Whether somebody is to be asked, and how many were before: of those who can tell, the next one's turn it is.
@@ -179,6 +195,8 @@ impl State {
 
 /// How long a node may take to tell its name and services.
 const OFFERED_WITHIN: Duration = Duration::from_secs(3);
+/// How often all may leave before that time is over: whoever comes next is asked beside what goes on.
+const MOST_CUT_SHORT: u8 = 3;
 /// Calls for one type.
 const MOST_TRIES: u8 = 3;
 /// After the first call that failed; longer after the next.
@@ -272,6 +290,37 @@ mod tests {
         inquiry.meet(OLD, |_| true, back);
         assert_eq!(inquiry.nobody(back), Outcome::GoesOn);
         assert_eq!(inquiry.nobody(back + OFFERED_WITHIN), Outcome::Untold);
+    }
+
+    #[test]
+    fn nodes_that_leave_before_they_could_tell_it_are_not_waited_for_for_ever() {
+        let life = OFFERED_WITHIN / 3;
+        for away in [LOOK, OFFERED_WITHIN * 2] {
+            let mut now = Instant::now();
+            let mut inquiry = Inquiry::new(now);
+            for number in 0..20 {
+                let one = guid(number);
+                let first = inquiry.meet([one], |it| it == one, now);
+                let is_last = number == MOST_CUT_SHORT;
+                assert_eq!(first == Outcome::Untold, is_last, "{number}: {first:?}");
+                // Asked all the same.
+                assert_eq!(inquiry.due(now), Some(0));
+                assert_eq!(inquiry.is_waited_for(), number < MOST_CUT_SHORT, "{number}");
+                assert_eq!(inquiry.nobody(now), Outcome::GoesOn);
+                now += life;
+                assert_eq!(inquiry.meet([one], |it| it == one, now), Outcome::GoesOn);
+                assert_eq!(inquiry.nobody(now), Outcome::GoesOn);
+                now += away;
+            }
+            // One that stays and tells nothing has had its time: the next is waited for as the first was.
+            let stays = guid(100);
+            inquiry.meet([stays], |it| it == stays, now);
+            now += OFFERED_WITHIN;
+            inquiry.meet([stays], |it| it == stays, now);
+            assert_eq!(inquiry.nobody(now), Outcome::UntoldAgain);
+            inquiry.meet([guid(101)], |it| it == guid(101), now + LOOK);
+            assert!(inquiry.is_waited_for());
+        }
     }
 
     #[test]

@@ -226,8 +226,7 @@ impl Ros2Port {
             )
         });
         if first {
-            self.events
-                .push_back(lost(topic, "type without a definition", 1));
+            self.events.push_back(lost(topic, UNKNOWN_TYPE, 1));
         }
     }
 
@@ -340,9 +339,15 @@ impl Ros2Port {
         let definition = match self.definitions.announced(&name, source.announced) {
             Ok(definition) => definition,
             Err(error) => {
-                self.tell_once(&topic, "unknown type", || {
+                let values: Vec<_> = source.values.iter().map(|(topic, _)| *topic).collect();
+                let first = self.tell_once(&topic, "unknown type", || {
                     format!("the topic cannot cross: {error}")
                 });
+                if first {
+                    let uncrossed = values.into_iter();
+                    self.events
+                        .extend(uncrossed.map(|topic| lost(topic, UNKNOWN_TYPE, 1)));
+                }
                 return;
             }
         };
@@ -530,6 +535,8 @@ pub(super) enum Side {
     Sink(TopicId),
 }
 
+/// Why a topic is counted whose type nobody knows.
+const UNKNOWN_TYPE: &str = "type without a definition";
 /// How long a replaced reader hears on.
 const RETIRE_AFTER: Duration = Duration::from_secs(2);
 /// Endpoints made in one go. RustDDS queues two commands for each, and has room for 1024.

@@ -305,6 +305,53 @@ async fn a_type_that_nobody_told_is_asked_of_a_node_that_comes_later() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_topic_does_not_wait_for_ever_for_nodes_that_leave_before_they_could_tell_its_type() {
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    if !can_announce_type_hashes() {
+        Cell::skip("RustDDS as published announces no type hashes");
+        return;
+    }
+    const NOBODYS: &str = "nobody_msgs::msg::dds_::Unheard_";
+    let mut port = port();
+    let mut found = std::collections::BTreeSet::new();
+    for number in 0..8 {
+        let leaves = other(&format!("leaves{number}"));
+        let write = |name, kind| {
+            leaves.learn_type_hash(kind, format!("RIHS01_{}", "5".repeat(64)));
+            leaves.writer(name, kind, Offered::KeepLatest).unwrap()
+        };
+        let writers = (write("rt/ua_2_2_8", STRING), write("rt/ua_2_2_9", NOBODYS));
+        // Less than the 3 s that a node has to tell of its services.
+        let until = tokio::time::Instant::now() + Duration::from_secs(1);
+        while let Ok(event) = tokio::time::timeout_at(until, port.recv()).await {
+            match event {
+                PortEvent::Bound {
+                    topic,
+                    message_type,
+                    ..
+                } => found.insert((topic, message_type.name().to_string())),
+                PortEvent::Lost {
+                    topic: Some(topic),
+                    why,
+                    ..
+                } => found.insert((topic, why.to_owned())),
+                _ => false,
+            };
+        }
+        assert!(leaves.leave(writers).await);
+        // Before anybody could know that nobody tells it.
+        assert!(number > 0 || found.is_empty(), "{found:?}");
+    }
+    let expected = [
+        (topic("ua_2_2_8"), "std_msgs/String".to_owned()),
+        (topic("ua_2_2_9"), "type without a definition".to_owned()),
+    ];
+    assert_eq!(found.into_iter().collect::<Vec<_>>(), expected);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn of_subscribers_of_two_definitions_the_one_that_is_not_written_is_told() {
     let Some(_cell) = Cell::with(&[]) else {
         return;
