@@ -36,6 +36,16 @@ impl Definition {
     pub(crate) fn name(&self) -> &TypeName {
         self.message_type.name()
     }
+
+    /// Whether both are one definition: by their hashes, or, where there are none, by what they are made of.
+    pub(crate) fn is_same(&self, other: &Self) -> bool {
+        match (self.hash, other.hash) {
+            (None, None) => {
+                self.name() == other.name() && self.message_type.is_same(&other.message_type)
+            }
+            (ours, theirs) => ours == theirs,
+        }
+    }
 }
 
 impl Definitions {
@@ -67,7 +77,7 @@ impl Definitions {
         announced: Option<TypeHash>,
     ) -> bool {
         let now = self.announced(definition.name(), announced);
-        !now.is_ok_and(|now| now.hash != definition.hash)
+        !now.is_ok_and(|now| !now.is_same(definition))
     }
 
     /// The type of that name with all it needs, as endpoints mean it that announce no hash: built in, or read from files;
@@ -225,6 +235,27 @@ mod tests {
             .get(&"robot_msgs/Arm".parse().unwrap())
             .unwrap_err();
         assert!(error.to_string().contains("robot_msgs/Arm"), "{error}");
+    }
+
+    #[test]
+    fn a_definition_without_a_hash_is_another_when_it_is_made_of_other_fields() {
+        let name: TypeName = "robot_msgs/Arm".parse().unwrap();
+        let without = |text| {
+            let mut registry = Registry::empty(Dialect::Ros2);
+            registry.add(&name, text).unwrap();
+            Definition {
+                message_type: registry.get(&name).unwrap(),
+                hash: None,
+                from: "a file".into(),
+            }
+        };
+        let (old, new) = (without("float64 angle\n"), without("float32 angle\n"));
+        assert!(old.is_same(&without("float64 angle # in rad\n")));
+        assert!(!old.is_same(&new));
+        let mut definitions = Definitions::new(Arc::default(), vec![]);
+        definitions.found.insert(name.clone(), new.clone());
+        assert!(definitions.is_current(&new, None));
+        assert!(!definitions.is_current(&old, None));
     }
 
     /// Description and hash of a type, as a node would tell it.

@@ -204,7 +204,7 @@ impl Ros2Port {
         }
         let open = self.sinks.get(&topic).and_then(|sink| sink.open.as_ref());
         if open.is_some_and(|open| {
-            (open.definition.name(), open.definition.hash) == (definition.name(), definition.hash)
+            open.definition.name() == definition.name() && open.definition.is_same(&definition)
         }) {
             self.note_others(topic);
             return;
