@@ -32,6 +32,14 @@ pub struct Outlet {
     in_flight: usize,
     /// Of a state topic, the value its readers have: another writer has to begin with it.
     last: Option<Sample>,
+    /// Writers that were replaced, oldest first, while their readers may lack something of what they wrote.
+    former: VecDeque<Former>,
+}
+
+/// A writer that writes nothing any more, and repairs what it has written.
+pub struct Former {
+    writer: Writer,
+    until: Instant,
 }
 
 #[derive(Debug, Clone)]
@@ -102,6 +110,7 @@ impl Outlet {
             full_since: None,
             in_flight: 0,
             last: None,
+            former: VecDeque::new(),
         }
     }
 
@@ -119,9 +128,14 @@ impl Outlet {
     pub fn replace_writer(&mut self, writer: Writer, now: Instant) {
         // Not for the reader because of which it is replaced.
         let patience = if self.is_stuck(now) { SETTLE } else { PATIENCE };
-        self.writer = writer;
+        let before = std::mem::replace(&mut self.writer, writer);
         self.full_since = None;
-        self.in_flight = 0;
+        let in_flight = std::mem::take(&mut self.in_flight);
+        self.former
+            .extend(Former::of(before, self.offered, in_flight, now));
+        if self.former.len() > MOST_FORMER {
+            self.former.pop_front();
+        }
         if self.waiting.is_empty() {
             self.waiting.extend(self.last.clone());
         }
@@ -131,6 +145,11 @@ impl Outlet {
                 patience,
             });
         }
+    }
+
+    /// Gives the topic up, but for what its readers may lack of what was written; what waits is dropped.
+    pub fn give_up(self, now: Instant) -> Option<Former> {
+        Former::of(self.writer, self.offered, self.in_flight, now)
     }
 
     /// The writer's GUID.
@@ -214,7 +233,9 @@ impl Outlet {
     pub fn set_readers(&mut self, readers: &[Endpoint], now: Instant) -> Result<(), Refusal> {
         // Statuses are read so that their channel never fills up; the snapshot is the newer knowledge.
         while self.writer.try_recv_status().is_some() {}
+        self.former.retain(|former| !former.is_done(now));
         if readers.is_empty() {
+            self.former.clear();
             if !matches!(self.audience, Audience::Nobody { .. }) {
                 self.audience = Audience::Nobody { held: None };
             }
@@ -229,10 +250,15 @@ impl Outlet {
     /// Whether what is written now reaches the readers there are. Asked for the first time when there is something to
     /// write; readers that come later join a stream that waits for nobody.
     fn is_settled(&mut self, now: Instant) -> bool {
+        self.former.retain(|former| !former.is_done(now));
+        // What is repaired is older than what is written now.
+        let repaired = self.former.is_empty();
         let Audience::Present { settling, seen, .. } = &mut self.audience else {
             return true;
         };
-        settling.take_if(|settling| settling.is_over(&self.writer, *seen, self.joined, now));
+        settling.take_if(|settling| {
+            repaired && settling.is_over(&self.writer, *seen, self.joined, now)
+        });
         settling.is_none()
     }
 
@@ -352,6 +378,33 @@ impl Outlet {
     }
 }
 
+impl Former {
+    /// Where every value counts and there may be somebody who lacks one. Of a state only the last value does, with which the
+    /// next writer begins: an old one must not reach anybody beside it.
+    fn of(writer: Writer, offered: Offered, in_flight: usize, now: Instant) -> Option<Self> {
+        (matches!(offered, Offered::DropOldest(_)) && in_flight > 0).then(|| Self {
+            writer,
+            until: now + REPAIRED_WITHIN,
+        })
+    }
+
+    /// Whether its readers have all of what it wrote, or have had the time to ask for it.
+    #[must_use]
+    pub fn is_done(&self, now: Instant) -> bool {
+        // The answer is immediate with a wait of zero.
+        let acknowledged = self.writer.wait_for_acknowledgments(Duration::ZERO);
+        now >= self.until || !matches!(acknowledged, Ok(false))
+    }
+}
+
+impl std::fmt::Debug for Former {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Former")
+            .field("writer", &self.writer.guid())
+            .finish_non_exhaustive()
+    }
+}
+
 impl std::fmt::Debug for Outlet {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Outlet")
@@ -396,5 +449,10 @@ const SETTLING_EVENTS: usize = 512;
 /// How long a state topic may lag behind for the sake of one reader. A reader that was killed, or lost its radio link,
 /// holds up RustDDS' writer until its lease ends, 10 to 20 s later.
 const STUCK_AFTER: Duration = Duration::from_millis(500);
+/// How long a writer that was replaced stays for those that lack something. What it waits for is a repair or two; a reader
+/// that was killed acknowledges nothing.
+const REPAIRED_WITHIN: Duration = Duration::from_secs(1);
+/// Writers of a topic that are kept so.
+const MOST_FORMER: usize = 2;
 /// Memory a topic may take for readers that do not acknowledge; the send window counts samples, whatever their size.
 const MAX_IN_FLIGHT: usize = 64 * 1024 * 1024;

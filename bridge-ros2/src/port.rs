@@ -35,7 +35,7 @@ use crate::domain::{Domain, DomainError, DomainOptions};
 use crate::graph::{Graph, dds_topic};
 use crate::inbox::{Inbox, Taken};
 use crate::limits;
-use crate::outlet::Refusal;
+use crate::outlet::{Former, Refusal};
 use crate::parameters::ParameterServer;
 use crate::raw::{Payload, RawWriter, Reader};
 use crate::service::ServicePeers;
@@ -98,6 +98,8 @@ pub struct Ros2Port {
     sinks: HashMap<TopicId, Box<Sink>>,
     /// Readers that were replaced; they hear on until their successor is matched.
     retired: VecDeque<(Instant, Reader)>,
+    /// Writers that were given up, while their readers may lack something.
+    former: VecDeque<Former>,
     /// What `recv` hands out next; filled only while it is empty, or by one pass over the topics.
     events: VecDeque<PortEvent>,
     /// Endpoints that may still be made before the next [`reconcile`](Self::reconcile).
@@ -170,6 +172,7 @@ impl Ros2Port {
             inbox: Inbox::new(),
             sinks: HashMap::new(),
             retired: VecDeque::new(),
+            former: VecDeque::new(),
             events: bound.into(),
             budget: MAX_BATCH,
             clock,
@@ -563,6 +566,7 @@ impl Port for Ros2Port {
             inbox,
             sinks,
             retired,
+            former,
             services,
             peers,
             parameters,
@@ -579,7 +583,10 @@ impl Port for Ros2Port {
             descriptions,
             told_types,
         ));
-        if !domain.leave((inbox, sinks, retired, presence)).await {
+        if !domain
+            .leave((inbox, sinks, retired, former, presence))
+            .await
+        {
             warn!("the DDS endpoints were not disposed in time; peers notice when the lease ends");
         }
     }

@@ -30,6 +30,7 @@ impl Ros2Port {
         while self.retired.front().is_some_and(|(until, _)| *until <= now) {
             self.retired.pop_front();
         }
+        self.former.retain(|former| !former.is_done(now));
         self.graph = self.domain.graph();
         let graph = &self.graph;
         self.incompatible.retain(|guid| graph.holds(*guid));

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use bridge_node::{PortEvent, TypePaths, now};
 use mappings::{Mapping, SpaceId, TopicId, Variable};
 use messages::{Selection, TypeName};
+use tokio::time::Instant;
 
 use super::Ros2Port;
 use super::services::Ros2Graph;
@@ -166,13 +167,17 @@ impl Ros2Port {
                 || outdated
                 || !sink.is_like(&tied.unwrap_or_else(|| Sink::by_name(*topic, variable)))
         });
-        // Their writers are disposed here.
+        // Their writers are disposed here, or when their readers have what was written.
+        let now = Instant::now();
         for (topic, sink) in gone {
-            let open = sink.open.as_ref();
-            self.events
-                .extend(open.and_then(|open| unwritten(topic, open)));
+            if let Some(open) = sink.open {
+                self.events.extend(unwritten(topic, &open));
+                self.former.extend(open.outlet.give_up(now));
+            }
             self.events.push_back(PortEvent::Unbound { topic });
         }
+        let too_many = self.former.len().saturating_sub(MOST_FORMER);
+        drop(self.former.drain(..too_many));
     }
 
     /// Makes values of a topic that the mapping reads, of which some may be made already.
@@ -235,3 +240,6 @@ fn mapped(variable: &Variable, own: SpaceId) -> Option<Sink> {
         variable.overflow,
     ))
 }
+
+/// Writers that were given up and stay for a while.
+const MOST_FORMER: usize = 256;

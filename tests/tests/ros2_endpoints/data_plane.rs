@@ -9,6 +9,7 @@ use bridge_ros2::inbox::{Inbox, Taken};
 use bridge_ros2::outlet::Outlet;
 use bridge_ros2::qos::{Offered, Requested};
 use bridge_ros2::raw::Payload;
+use nix::sys::signal::Signal;
 use serde_json::Value;
 use system_tests::{Cell, Peer, eventually};
 
@@ -168,6 +169,41 @@ async fn a_late_joiner_gets_the_last_value_and_no_older_one() {
     let mut later = reads(&cell, OURS.0, TEXT, &LATCHED);
     later.wait_for_line("\"last\"", SOON);
     assert_eq!(heard(&later), ["last"]);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_writer_that_is_replaced_repairs_what_its_reader_lacks() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let domain = join();
+    let offered = Offered::DropOldest(NonZeroU16::new(1000).unwrap());
+    let mut out = outlet(&domain, offered);
+    let mut reader = reads(&cell, OURS.0, TEXT, &[]);
+    meet_readers(&domain, &mut out);
+    offer(&mut out, "first");
+    sent(&mut out).await;
+    reader.wait_for_line("\"first\"", SOON);
+    reader.signal(Signal::SIGSTOP);
+    // More than its socket has room for.
+    let large = "x".repeat(100_000);
+    for number in 0..30 {
+        offer(&mut out, &format!("{number} {large}"));
+    }
+    sent(&mut out).await;
+    let writer = domain.writer(OURS.1, STRING, offered).unwrap();
+    out.replace_writer(writer, now());
+    offer(&mut out, "last");
+    reader.signal(Signal::SIGCONT);
+    sent(&mut out).await;
+    reader.wait_for_line("\"last\"", SOON);
+    let heard = heard(&reader);
+    let heard: Vec<_> = heard.iter().filter_map(|it| it.split(' ').next()).collect();
+    let numbers: Vec<String> = (0..30).map(|number: u32| number.to_string()).collect();
+    let mut expected: Vec<&str> = vec!["first"];
+    expected.extend(numbers.iter().map(String::as_str));
+    expected.push("last");
+    assert_eq!(heard, expected);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
