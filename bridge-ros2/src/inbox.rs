@@ -106,6 +106,14 @@ impl<K: Clone> Inbox<K> {
         self.slots.remove(&id.0).map(|slot| slot.reader)
     }
 
+    /// What the reader in a slot holds and was not delivered: its history at most.
+    pub fn drain(&mut self, id: SlotId) -> Vec<Taken<K>> {
+        let Some(slot) = self.slots.get_mut(&id.0) else {
+            return Vec::new();
+        };
+        std::iter::from_fn(|| slot.take()).collect()
+    }
+
     /// Forgets writers of a slot that are not in `alive`, once there are many of them: what they wrote stays in the
     /// cache of the topic, and another reader of it would hand it out again.
     pub fn retain_writers(&mut self, id: SlotId, mut alive: impl FnMut(&GUID) -> bool) {

@@ -15,6 +15,7 @@ use crate::compatibility::Incompatibility;
 use crate::definitions::Definition;
 use crate::domain::{Domain, DomainError};
 use crate::graph::{Endpoint, ros_topic};
+use crate::inbox::SlotId;
 use crate::qos::Requested;
 use crate::sink::Sink;
 use crate::source::{OTHER_DEFINITION, OTHER_TYPE, Reading};
@@ -309,27 +310,41 @@ impl Ros2Port {
         let Some(source) = self.sources.get_mut(index) else {
             return false;
         };
-        source.announced = hash.or(current);
-        let same = |(a, b): (&Definition, &Definition)| a.hash == b.hash;
-        let Reading::Open { slot, .. } = source.reading else {
-            return true;
-        };
-        if !source
-            .definition
-            .as_ref()
-            .zip(found.as_ref())
-            .is_none_or(same)
+        let same = |(a, b): (&Definition, &Definition)| a.is_same(b);
+        let read = source.definition.as_ref().zip(found.as_ref());
+        if let Reading::Open { slot, .. } = source.reading
+            && !read.is_none_or(same)
         {
-            source.reading = Reading::Pending;
-            source.live = false;
-            drop(self.inbox.remove(slot));
-            // What was sent by the other definition is not to be repeated by this.
-            let unbound = source.values.iter();
-            self.events
-                .extend(unbound.map(|(topic, _)| PortEvent::Unbound { topic: *topic }));
-            info!(topic = source.dds_topic, message_type = %name, "its publishers have another definition of the type now");
+            // What it holds was sent by the definition that counted so far; of the new one it is misread.
+            source.meet(&writers);
+            for taken in self.inbox.drain(slot) {
+                self.taken(taken);
+            }
+            self.close_source(index, slot);
+        }
+        if let Some(source) = self.sources.get_mut(index) {
+            source.announced = hash.or(current);
         }
         true
+    }
+
+    /// Closes the reader of a source whose publishers have another definition of its type now.
+    fn close_source(&mut self, index: usize, slot: SlotId) {
+        drop(self.inbox.remove(slot));
+        let Some(source) = self.sources.get_mut(index) else {
+            return;
+        };
+        source.reading = Reading::Pending;
+        source.live = false;
+        // What was sent by the other definition is not to be repeated by this.
+        let unbound = source.values.iter();
+        self.events
+            .extend(unbound.map(|(topic, _)| PortEvent::Unbound { topic: *topic }));
+        info!(
+            topic = source.dds_topic,
+            message_type = %source.message_type,
+            "its publishers have another definition of the type now"
+        );
     }
 
     fn open_source(&mut self, index: usize, requested: Requested) {

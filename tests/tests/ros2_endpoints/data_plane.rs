@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use bridge_ros2::domain::Domain;
 use bridge_ros2::graph::Graph;
 use bridge_ros2::inbox::{Inbox, Taken};
+use bridge_ros2::limits::PATCHED;
 use bridge_ros2::outlet::Outlet;
 use bridge_ros2::qos::{Offered, Requested};
 use bridge_ros2::raw::Payload;
@@ -277,6 +278,35 @@ async fn a_replaced_reader_repeats_and_loses_nothing() {
             let reader = domain.reader(THEIRS.1, STRING, requested).unwrap();
             retired.push(inbox.replace(slot, reader).unwrap());
         }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn what_a_publisher_sent_before_it_left_is_read_after_it_has() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    if !PATCHED {
+        Cell::skip("RustDDS as published hands out nothing of a reliable writer that has left");
+        return;
+    }
+    let domain = join();
+    let more = ["--wait-readers", "1", "--numbered", "50", "--rate", "1000"];
+    let mut peer = writes(&cell, THEIRS.0, TEXT, &more);
+    let mut inbox = inbox(&domain, writers(&domain));
+    peer.wait_for_line("\"sent\"", SOON);
+    peer.tell("leave");
+    eventually("the publisher has left", SOON, || {
+        let graph = Graph::snapshot(domain.participant());
+        graph.writers(THEIRS.1).is_empty().then_some(())
+    });
+    for expected in 0..50 {
+        let (bytes, missing) = sample(&mut inbox).await;
+        assert_eq!(missing, 0, "before {expected}");
+        assert!(
+            is_string(&bytes, &expected.to_string()),
+            "{expected} is {bytes:?}"
+        );
     }
 }
 

@@ -5,10 +5,11 @@ use std::time::Duration;
 use bridge_node::{Delivery, Kept, Port, PortEvent};
 use bridge_ros2::domain::{Domain, DomainOptions, can_announce_type_hashes};
 use bridge_ros2::qos::{Offered, Requested};
+use bridge_ros2::raw::Payload;
 use mappings::Mapping;
 use messages::{Dialect, Registry};
 use serde_json::json;
-use system_tests::{Cell, Peer};
+use system_tests::{Cell, Peer, eventually};
 use uadp::BuiltinType;
 
 use crate::peer::{SOON, options, writes};
@@ -180,6 +181,93 @@ async fn a_publisher_with_another_definition_than_the_topics_is_dropped_and_coun
     })
     .await;
     assert_eq!((payload.len(), payload[4], payload[12]), (20, 7, 8));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn what_came_before_the_publisher_of_another_definition_is_read_as_it_was_written() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    if !can_announce_type_hashes() {
+        Cell::skip("RustDDS as published announces no type hashes");
+        return;
+    }
+    const FIELD_TYPE: &str = "type_description_interfaces::msg::dds_::FieldType_";
+    // What ROS 2 publishes.
+    const LONG: &str = "RIHS01_a70b6dd919645a03a3586f7f821defbc886ea3e531a1d95cc0f380a3973ccaa6";
+    let (mut port, short, of) = (port(), short(), topic("ua_2_2_7"));
+    // They tell both definitions.
+    let _long = cell.cyclone("ros2_describe.py", &["serve"]);
+    let other_topic = ["serve", "--topic", "/ua_2_2_8", "--name", "other"];
+    let _short = cell.cyclone(
+        "ros2_describe.py",
+        &[&other_topic[..], &["--short", &short]].concat(),
+    );
+    for _ in 0..2 {
+        event(&mut port, |event| {
+            matches!(event, PortEvent::Bound { .. }).then_some(())
+        })
+        .await;
+    }
+    let publishes = |node: &str, hash: &str| {
+        let domain = other(node);
+        domain.learn_type_hash(FIELD_TYPE, hash);
+        // RustDDS as published hands out nothing of a reliable writer that has left.
+        let mut best_effort = eventually("any writer is known", SOON, || {
+            domain.graph().writers("rt/ua_2_2_9").first().cloned()
+        });
+        (best_effort.reliable, best_effort.transient_local) = (false, false);
+        let offered = Requested::from_writers(&[best_effort]).policies();
+        let writer = domain.open_writer("rt/ua_2_2_7", FIELD_TYPE, &offered);
+        (domain, writer.unwrap())
+    };
+    let (old, writer) = publishes("old", LONG);
+    assert_eq!(bound(&mut port, of).await, UNKNOWN);
+    event(&mut port, |event| {
+        matches!(event, PortEvent::Live { topic, live: true } if topic == of).then_some(())
+    })
+    .await;
+    run_until(&mut port, "the reader is known", || {
+        let graph = old.graph();
+        let mut readers = graph.readers("rt/ua_2_2_7").iter();
+        readers.any(|reader| !reader.reliable)
+    })
+    .await;
+    // From here on nobody reads what comes.
+    let message = |number| {
+        let payload = [&[0, 1, 0, 0, number][..], &[0; 31]].concat();
+        Payload::to_write(payload.into()).unwrap()
+    };
+    let (new, _writer) = publishes("new", &short);
+    // Made after the other, so that who acknowledges what it writes knows of both.
+    let last = new.writer("rt/ua_2_2_8", FIELD_TYPE, Offered::KeepLatest);
+    let last = last.unwrap();
+    eventually("the readers are known", SOON, || {
+        let graph = new.graph();
+        let known = |topic| !graph.readers(topic).is_empty();
+        (known("rt/ua_2_2_7") && known("rt/ua_2_2_8")).then_some(())
+    });
+    last.write(message(0), None).unwrap();
+    assert!(last.wait_for_acknowledgments(SOON).unwrap());
+    for number in 0..50 {
+        writer.write(message(number), None).unwrap();
+    }
+    assert!(old.leave(writer).await);
+    eventually("the new publisher is alone", SOON, || {
+        let graph = new.graph();
+        graph.writers("rt/ua_2_2_7").is_empty().then_some(())
+    });
+    let mut read = Vec::new();
+    event(&mut port, |event| match event {
+        PortEvent::Sample { topic, payload, .. } if topic == of => {
+            read.push(payload[4]);
+            None
+        }
+        PortEvent::Unbound { topic } if topic == of => Some(()),
+        _ => None,
+    })
+    .await;
+    assert_eq!(read, (0..50).collect::<Vec<u8>>());
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
