@@ -122,7 +122,7 @@ pub const READER_DEPTH: i32 = 256;
 
 /// How many values a reader may leave unacknowledged. RustDDS as published prunes a history by a timer only, and to this
 /// window when there is a best-effort reader: so many old values, at most, reach a late joiner before the last one. The
-/// patched one keeps the depth and what is not acknowledged.
+/// patched one keeps the depth and what is not acknowledged, and gives a late joiner the depth.
 const KEEP_LATEST_WINDOW: i32 = 256;
 const DROP_OLDEST_DEPTH: i32 = 100;
 /// Ten seconds of lease at 1 kHz, and some: what a reader that vanished without a word leaves unacknowledged.

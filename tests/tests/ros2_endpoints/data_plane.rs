@@ -173,6 +173,35 @@ async fn a_late_joiner_gets_the_last_value_and_no_older_one() {
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_late_joiner_gets_no_old_value_that_another_reader_has_not_acknowledged() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    if !PATCHED {
+        Cell::skip("RustDDS as published gives late joiners all it has");
+        return;
+    }
+    let domain = join();
+    let mut out = outlet(&domain, Offered::KeepLatest);
+    let mut stopped = reads(&cell, OURS.0, TEXT, &LATCHED);
+    meet_readers(&domain, &mut out);
+    offer(&mut out, "before");
+    sent(&mut out).await;
+    stopped.wait_for_line("\"before\"", SOON);
+    stopped.signal(Signal::SIGSTOP);
+    for number in 0..50 {
+        offer(&mut out, &number.to_string());
+    }
+    sent(&mut out).await;
+    // Of a depth that has room for all of them.
+    let mut later = reads(&cell, OURS.0, TEXT, &LATCHED[..2]);
+    later.wait_for_line("\"49\"", SOON);
+    assert_eq!(heard(&later), ["49"]);
+    stopped.signal(Signal::SIGCONT);
+    stopped.wait_for_line("\"49\"", SOON);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_writer_that_is_replaced_repairs_what_its_reader_lacks() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
