@@ -264,6 +264,16 @@ impl Domain {
         graph
     }
 
+    /// Another number than before means that [`graph`](Self::graph) may be another. RustDDS as published does not say it.
+    #[must_use]
+    pub fn changes(&self) -> Option<u64> {
+        #[cfg(feature = "patched-dds")]
+        let changes = Some(self.participant.discovered_changes());
+        #[cfg(not(feature = "patched-dds"))]
+        let changes = None;
+        changes
+    }
+
     /// The services others offer, by their names, with the types they have, as `std_srvs/SetBool`; a name that is none of
     /// ROS as it is. Those that actions are made of are left out.
     #[must_use]

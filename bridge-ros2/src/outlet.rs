@@ -164,6 +164,12 @@ impl Outlet {
         !self.waiting.is_empty()
     }
 
+    /// Whether a writer that was replaced is still there; [`set_readers`](Self::set_readers) lets go of it.
+    #[must_use]
+    pub fn is_repairing(&self) -> bool {
+        !self.former.is_empty()
+    }
+
     /// Writes a sample, or queues it. Never waits.
     ///
     /// # Errors

@@ -496,6 +496,7 @@ impl Port for Ros2Port {
         if at_home || self.services.takes(topic) {
             return;
         }
+        self.schedule.look_next();
         if !self.sinks.contains_key(&topic) {
             if self.sinks.len() >= MAX_TOPICS {
                 self.tell_once("", "too many values", || {

@@ -216,8 +216,14 @@ fn five_thousand_routes_of_a_mapping_take_little_memory() {
         }
         (since.elapsed() > Duration::from_secs(2)).then_some(())
     });
-    println!("{ROUTES} routes: {} MB", memory / 1_000_000);
+    let idle = cpu_share(bridge.id(), Duration::from_secs(6));
+    println!(
+        "{ROUTES} routes: {} MB, {:.1} % of a processor when idle",
+        memory / 1_000_000,
+        idle * 100.0
+    );
     assert!(memory < 80_000_000, "{memory} bytes");
+    assert!(idle < 0.04, "{:.1} %", idle * 100.0);
     assert!(bridge.runs());
 }
 

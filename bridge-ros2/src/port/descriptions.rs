@@ -43,6 +43,11 @@ impl Descriptions {
             calls: Calls::default(),
         }
     }
+
+    /// Whether an answer may be there, or somebody is to be asked.
+    pub(super) fn is_asking(&self, now: Instant) -> bool {
+        self.calls.len() > 0 || self.asked.values().any(|inquiry| inquiry.is_open(now))
+    }
 }
 
 impl Calls {

@@ -72,6 +72,12 @@ impl Inquiry {
         }
     }
 
+    /// Whether it goes on, and somebody wanted to know lately.
+    pub(super) fn is_open(&self, now: Instant) -> bool {
+        let goes_on = matches!(self.state, State::Waiting { .. } | State::Asking { .. });
+        goes_on && now.saturating_duration_since(self.looked) <= OFFERED_WITHIN
+    }
+
     /// Takes note of the endpoints whose nodes could tell it. Somebody new is worth asking at once; where all others have
     /// left, or nobody wanted to know for a while, it begins anew, with the time that a node has to tell of its services.
     /// Where they leave and come before that time is over, again and again, nothing waits for it any longer.

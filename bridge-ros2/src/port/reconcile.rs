@@ -21,22 +21,26 @@ use crate::sink::Sink;
 use crate::source::{OTHER_DEFINITION, OTHER_TYPE, Reading};
 
 impl Ros2Port {
-    /// Makes what is open fit what the domain holds, at most [`MAX_BATCH`] endpoints at a time: RustDDS' discovery
+    /// Makes what is open fit what the domain holds, where either may be another by now; at most [`MAX_BATCH`] endpoints at a time: RustDDS' discovery
     /// takes commands from a bounded queue and drops what does not fit.
     pub(super) fn reconcile(&mut self, now: Instant) {
+        let domain = self.domain.changes();
+        let is_due = self.schedule.is_look_due(domain, now) || self.descriptions.is_asking(now);
         self.schedule.reconciled = now;
-        self.schedule.changed = false;
-        self.schedule.unfinished = false;
         self.budget = MAX_BATCH;
         while self.retired.front().is_some_and(|(until, _)| *until <= now) {
             self.retired.pop_front();
         }
         self.former.retain(|former| !former.is_done(now));
+        self.report_drops();
+        if !is_due {
+            return;
+        }
+        self.schedule.looks(domain, now);
         self.graph = self.domain.graph();
         let graph = &self.graph;
         self.incompatible.retain(|guid| graph.holds(*guid));
         self.misreading.retain(|guid| graph.holds(*guid));
-        self.report_drops();
         self.announce_anew(now);
         self.take_descriptions(now);
         self.find_topics(now);

@@ -16,6 +16,8 @@ pub(super) struct Schedule {
     pub(super) unfinished: bool,
     /// Samples wait in an outlet.
     pub(super) waiting: bool,
+    /// What the domain was like when all topics were looked at, and when that was; none where they are to be looked at again.
+    looked: Option<(u64, Instant)>,
 }
 
 impl Schedule {
@@ -26,7 +28,28 @@ impl Schedule {
             changed: true,
             unfinished: false,
             waiting: false,
+            looked: None,
         }
+    }
+
+    /// Whether all topics are to be looked at, in a domain like that; always where nobody says whether it is another.
+    pub(super) fn is_look_due(&self, domain: Option<u64>, now: Instant) -> bool {
+        let alike = self.looked.is_some_and(|(before, at)| {
+            domain == Some(before) && now.saturating_duration_since(at) < LOOK
+        });
+        self.changed || self.unfinished || self.waiting || !alike
+    }
+
+    /// They are being looked at.
+    pub(super) fn looks(&mut self, domain: Option<u64>, now: Instant) {
+        self.changed = false;
+        self.unfinished = false;
+        self.looked = domain.map(|domain| (domain, now));
+    }
+
+    /// Has them looked at the next time, although the domain may be what it was.
+    pub(super) fn look_next(&mut self) {
+        self.looked = None;
     }
 
     /// When the domain is to be looked at.
@@ -69,9 +92,44 @@ impl Schedule {
 
 /// How often the domain is looked at when nothing is reported.
 const POLL: Duration = Duration::from_millis(200);
+/// How often all topics are looked at when the domain is what it was: for what only time changes, and that may come late.
+/// More often than a type is taken to be of no interest any more (3 s).
+const LOOK: Duration = Duration::from_secs(2);
 /// After a change: how long to let further ones come.
 const SETTLE: Duration = Duration::from_millis(20);
 /// Between two batches of endpoints.
 const BATCH_PAUSE: Duration = Duration::from_millis(100);
 /// How often a full send window is tried again.
 const FLUSH: Duration = Duration::from_millis(2);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn topics_are_looked_at_when_something_is_another_and_now_and_then() {
+        let (mut schedule, now) = (Schedule::new(), Instant::now());
+        assert!(schedule.is_look_due(Some(1), now));
+        schedule.looks(Some(1), now);
+        let later = now + POLL;
+        assert!(!schedule.is_look_due(Some(1), later));
+        assert!(schedule.is_look_due(Some(2), later));
+        assert!(schedule.is_look_due(Some(1), now + LOOK));
+        for stir in [
+            |schedule: &mut Schedule| schedule.changed = true,
+            |schedule: &mut Schedule| schedule.unfinished = true,
+            |schedule: &mut Schedule| schedule.look_next(),
+        ] {
+            stir(&mut schedule);
+            assert!(schedule.is_look_due(Some(1), later));
+            schedule.looks(Some(1), now);
+            assert!(!schedule.is_look_due(Some(1), later));
+        }
+        schedule.waiting = true;
+        assert!(schedule.is_look_due(Some(1), later));
+        // RustDDS as published does not say it.
+        schedule.waiting = false;
+        schedule.looks(None, now);
+        assert!(schedule.is_look_due(None, later));
+    }
+}

@@ -42,6 +42,9 @@ impl Ros2Port {
                 Err(refusal) => self.events.push_back(lost(topic, refusal.label(), 1)),
             }
             self.schedule.waiting |= open.outlet.is_waiting();
+            if open.outlet.is_repairing() {
+                self.schedule.look_next();
+            }
             if open.outlet.is_stuck(now) {
                 self.replace_writer(topic, now);
                 return;
@@ -157,6 +160,7 @@ impl Ros2Port {
         {
             open.outlet.replace_writer(writer, now);
         }
+        self.schedule.look_next();
         Some(dds_topic)
     }
 
