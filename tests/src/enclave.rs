@@ -11,15 +11,69 @@ use std::{
 
 use socket2::{Domain, Protocol, Socket, Type};
 
-use crate::{Cell, GROUP, Host, Started, WIRE, peers::cyclone_uri};
+use crate::{Cell, GROUP, Host, Peer, Started, WIRE, peers::cyclone_uri, program};
 
 /// A keystore with one certificate authority for everything, and the enclaves `/bridge` and `/peer`, in which all may
 /// read and write all topics of all domains.
 pub struct Keystore(PathBuf);
 
+const ENCLAVES: [&str; 2] = ["bridge", "peer"];
+
+/// How a domain is governed: kinds of protection as DDS Security names them, `NONE`, `SIGN`, `ENCRYPT` and, but for
+/// `data`, the last two with `_WITH_ORIGIN_AUTHENTICATION`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Governance {
+    /// What tells of topics; `NONE` also leaves the topics' own out of the protected builtin ones.
+    pub discovery: &'static str,
+    /// What tells that participants live; `NONE` as with `discovery`.
+    pub liveliness: &'static str,
+    /// Datagrams as a whole.
+    pub rtps: &'static str,
+    /// Submessages of the topics.
+    pub metadata: &'static str,
+    /// What is in samples.
+    pub data: &'static str,
+}
+
+impl Governance {
+    /// As by `ros2 security create_keystore`: all is encrypted, discovery too, and datagrams are signed as a whole.
+    pub const SROS2: Self = Self {
+        rtps: "SIGN",
+        ..Self::all("ENCRYPT")
+    };
+
+    /// One kind for everything.
+    #[must_use]
+    pub const fn all(kind: &'static str) -> Self {
+        Self {
+            discovery: kind,
+            liveliness: kind,
+            rtps: kind,
+            metadata: kind,
+            data: kind,
+        }
+    }
+
+    fn text(&self) -> String {
+        let protected = |kind: &str| (kind != "NONE").to_string();
+        [
+            ("DISCOVERY", self.discovery),
+            ("LIVELINESS", self.liveliness),
+            ("RTPS", self.rtps),
+            ("METADATA", self.metadata),
+            ("DATA", self.data),
+            ("FOUND", &protected(self.discovery)),
+            ("LIVES", &protected(self.liveliness)),
+        ]
+        .iter()
+        .fold(GOVERNANCE.to_owned(), |text, (name, value)| {
+            text.replace(&format!(">{name}<"), &format!(">{value}<"))
+        })
+    }
+}
+
 impl Keystore {
-    /// Makes one in the cell's folder, its domain governed as by `ros2 security create_keystore`: all is encrypted,
-    /// discovery too, and datagrams are signed as a whole.
+    /// Makes one in the cell's folder, its domain governed by [`Governance::SROS2`].
     ///
     /// # Panics
     /// When `openssl` does not do it.
@@ -33,11 +87,23 @@ impl Keystore {
             "req -x509 -new -key ca.key.pem -sha256 -days 3650 -subj /CN=sros2CA \
              -addext basicConstraints=critical,CA:TRUE,pathlen:1 -out ca.cert.pem",
         );
-        keystore.sign("governance", GOVERNANCE);
-        for enclave in ["bridge", "peer"] {
+        for enclave in ENCLAVES {
             keystore.add(enclave);
         }
+        keystore.govern(&Governance::SROS2);
         keystore
+    }
+
+    /// Governs the domain anew, for programs that start from now on.
+    ///
+    /// # Panics
+    /// When `openssl` does not do it.
+    pub fn govern(&self, governance: &Governance) {
+        self.sign("governance", &governance.text());
+        for enclave in ENCLAVES {
+            let own = self.enclave(enclave).join("governance.p7s");
+            fs::copy(self.0.join("governance.p7s"), own).unwrap();
+        }
     }
 
     fn add(&self, name: &str) {
@@ -53,7 +119,6 @@ impl Keystore {
         for (from, to) in [
             ("ca.cert.pem", "identity_ca.cert.pem"),
             ("ca.cert.pem", "permissions_ca.cert.pem"),
-            ("governance.p7s", "governance.p7s"),
         ] {
             fs::copy(self.0.join(from), self.enclave(name).join(to)).unwrap();
         }
@@ -111,7 +176,33 @@ impl Keystore {
     }
 }
 
+/// Whether bridge-ros2 was built with DDS Security.
+///
+/// # Panics
+/// When it does not say so.
+#[must_use]
+pub fn has_security() -> bool {
+    let version = Command::new(program("bridge-ros2"))
+        .arg("--version")
+        .output();
+    let version = String::from_utf8(version.unwrap().stdout).unwrap();
+    let [with, without] =
+        ["with", "without"].map(|it| version.contains(&format!(", {it} DDS Security)")));
+    assert!(with != without, "{version}");
+    with
+}
+
 impl Cell {
+    /// As [`Self::with`], where bridge-ros2 was built with DDS Security.
+    #[must_use]
+    pub fn secured(peers: &[Peer]) -> Option<Self> {
+        if !has_security() {
+            Self::skip("bridge-ros2 is built without its feature `security`");
+            return None;
+        }
+        Self::with(peers)
+    }
+
     /// bridge-ros2 in domain 2 as the enclave `/bridge`, or not at all. Not started yet.
     #[must_use]
     pub fn secured_bridge(&self, keystore: &Keystore, args: &[&str]) -> Started {
@@ -230,18 +321,18 @@ const GOVERNANCE: &str = r#"<?xml version="1.0" encoding="utf-8"?>
       <domains><id_range><min>0</min><max>230</max></id_range></domains>
       <allow_unauthenticated_participants>false</allow_unauthenticated_participants>
       <enable_join_access_control>true</enable_join_access_control>
-      <discovery_protection_kind>ENCRYPT</discovery_protection_kind>
-      <liveliness_protection_kind>ENCRYPT</liveliness_protection_kind>
-      <rtps_protection_kind>SIGN</rtps_protection_kind>
+      <discovery_protection_kind>DISCOVERY</discovery_protection_kind>
+      <liveliness_protection_kind>LIVELINESS</liveliness_protection_kind>
+      <rtps_protection_kind>RTPS</rtps_protection_kind>
       <topic_access_rules>
         <topic_rule>
           <topic_expression>*</topic_expression>
-          <enable_discovery_protection>true</enable_discovery_protection>
-          <enable_liveliness_protection>true</enable_liveliness_protection>
+          <enable_discovery_protection>FOUND</enable_discovery_protection>
+          <enable_liveliness_protection>LIVES</enable_liveliness_protection>
           <enable_read_access_control>true</enable_read_access_control>
           <enable_write_access_control>true</enable_write_access_control>
-          <metadata_protection_kind>ENCRYPT</metadata_protection_kind>
-          <data_protection_kind>ENCRYPT</data_protection_kind>
+          <metadata_protection_kind>METADATA</metadata_protection_kind>
+          <data_protection_kind>DATA</data_protection_kind>
         </topic_rule>
       </topic_access_rules>
     </domain_rule>

@@ -31,7 +31,7 @@ pub use bare_node::{BareNode, BareSubscription, PATIENCE, string_frame};
 pub use capture::{Capture, Dissected, hex, is_true};
 pub use cell::{Cell, Distribution, Peer, without_data};
 pub use child::{Child, Started};
-pub use enclave::{Keystore, Wiretap};
+pub use enclave::{Governance, Keystore, Wiretap, has_security};
 pub use host::{HERE, Host, THERE, WIRE, Wire};
 pub use judge::Judge;
 pub use net::{

@@ -3,16 +3,18 @@
 //! What needs a bridge that has it is skipped where it was built without (`bridge-ros2 --version`); `cargo xtask` builds
 //! it with.
 
+#[path = "ros2_security/kinds.rs"]
+mod kinds;
+
 use std::{
     fs,
     os::unix::fs::PermissionsExt as _,
-    process::Command,
     time::{Duration, Instant},
 };
 
 use system_tests::{
-    Cell, Child, HERE, Keystore, METRICS_ROS2, Peer, Started, Triple, UaSide, Wire, Wiretap, drops,
-    eventually, metrics, program,
+    Cell, Child, Governance, HERE, Keystore, METRICS_ROS2, Peer, Started, Triple, UaSide, Wire,
+    Wiretap, drops, eventually, has_security, metrics,
 };
 use uadp::Scalar;
 
@@ -28,26 +30,6 @@ fn sends<'a>(topic: &'a str, text: &'a str) -> [&'a str; 9] {
     [
         "pub", topic, STRING, "--text", text, "--count", "0", "--rate", "10",
     ]
-}
-
-fn has_security() -> bool {
-    let version = Command::new(program("bridge-ros2"))
-        .arg("--version")
-        .output();
-    let version = String::from_utf8(version.unwrap().stdout).unwrap();
-    let [with, without] =
-        ["with", "without"].map(|it| version.contains(&format!(", {it} DDS Security)")));
-    assert!(with != without, "{version}");
-    with
-}
-
-/// The cell, if there is a bridge with DDS Security and the peers.
-fn secured_cell(peers: &[Peer]) -> Option<Cell> {
-    if !has_security() {
-        Cell::skip("bridge-ros2 is built without its feature `security`");
-        return None;
-    }
-    Cell::with(peers)
 }
 
 /// The value reaches the reader; it is written again until then.
@@ -80,7 +62,7 @@ fn is_in(packets: &[Vec<u8>], text: &str) -> bool {
 
 #[test]
 fn values_cross_both_ways_with_secured_peers_and_nothing_of_them_is_readable_on_the_wire() {
-    let Some(cell) = secured_cell(&[Peer::CycloneC, Peer::FastDds]) else {
+    let Some(cell) = Cell::secured(&[Peer::CycloneC, Peer::FastDds]) else {
         return;
     };
     let keystore = Keystore::make(&cell, "keystore");
@@ -126,7 +108,7 @@ variables:
   - {node: ns=2;i=3, name: Fan, type: Boolean, origin: 0, ros: {space: 2, call: /fan, type: std_srvs/SetBool, field: data}}
   - {node: ns=2;i=4, name: Turned, origin: 2, ros: {answer: ns=2;i=3, field: message}}
 ";
-    let Some(cell) = secured_cell(&[Peer::CycloneC, Peer::FastDds]) else {
+    let Some(cell) = Cell::secured(&[Peer::CycloneC, Peer::FastDds]) else {
         return;
     };
     let keystore = Keystore::make(&cell, "keystore");
@@ -149,7 +131,7 @@ variables:
 
 #[test]
 fn secured_peers_get_each_others_keys_although_datagrams_are_lost() {
-    let Some(cell) = secured_cell(&[Peer::CycloneC]) else {
+    let Some(cell) = Cell::secured(&[Peer::CycloneC]) else {
         return;
     };
     let host = cell.host(Wire {
@@ -171,7 +153,7 @@ fn secured_peers_get_each_others_keys_although_datagrams_are_lost() {
 
 #[test]
 fn who_is_not_of_the_enclave_gets_and_gives_nothing_and_is_told_of() {
-    let Some(cell) = secured_cell(&[Peer::CycloneC]) else {
+    let Some(cell) = Cell::secured(&[Peer::CycloneC]) else {
         return;
     };
     let keystore = Keystore::make(&cell, "keystore");
@@ -235,7 +217,7 @@ fn refusal(started: Started) -> (Option<i32>, String) {
 
 #[test]
 fn an_enclave_that_is_not_in_order_is_refused_with_the_file_to_mend() {
-    let Some(cell) = secured_cell(&[]) else {
+    let Some(cell) = Cell::secured(&[]) else {
         return;
     };
     let keystore = Keystore::make(&cell, "keystore");
@@ -299,6 +281,9 @@ fn an_enclave_that_is_not_in_order_is_refused_with_the_file_to_mend() {
     assert!(code == Some(78) && lines.contains("crl.pem"), "{lines}");
     fs::remove_file(revoked).unwrap();
 
+    keystore.govern(&Governance::all("SIGNED"));
+    refused(&["does not let the bridge into domain 2", "SIGNED"]);
+    keystore.govern(&Governance::SROS2);
     keystore.certify("bridge", -1);
     refused(&["cert.pem", "expired on"]);
     keystore.certify("bridge", 10);
@@ -308,7 +293,7 @@ fn an_enclave_that_is_not_in_order_is_refused_with_the_file_to_mend() {
 
 #[test]
 fn a_key_others_can_read_is_told_of() {
-    let Some(cell) = secured_cell(&[]) else {
+    let Some(cell) = Cell::secured(&[]) else {
         return;
     };
     let keystore = Keystore::make(&cell, "keystore");
