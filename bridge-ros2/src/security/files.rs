@@ -44,10 +44,14 @@ pub(super) fn check(folder: &Path) -> Result<Vec<String>, SecurityError> {
             "this key is not that of cert.pem: take both from one enclave",
         );
     }
-    for file in ["governance.p7s", "permissions.p7s"] {
-        signed_document(folder, file, &permissions_ca)?;
-    }
-    Ok(readable_by_others(folder).into_iter().collect())
+    let governance = signed_document(folder, GOVERNANCE, &permissions_ca)?;
+    signed_document(folder, "permissions.p7s", &permissions_ca)?;
+    let hidden =
+        not_found(&governance).map(|why| format!("{}: {why}", folder.join(GOVERNANCE).display()));
+    Ok(hidden
+        .into_iter()
+        .chain(readable_by_others(folder))
+        .collect())
 }
 
 fn read(folder: &Path, file: &str) -> Result<Vec<u8>, SecurityError> {
@@ -94,17 +98,20 @@ fn private_key(folder: &Path) -> Result<PKey<Private>, SecurityError> {
     PKey::private_key_from_pem(&pem).map_err(|error| fault(&format!("not a private key: {error}")))
 }
 
-/// A document in S/MIME whose signature is by that authority.
-fn signed_document(folder: &Path, file: &str, authority: &X509) -> Result<(), SecurityError> {
+/// What a document in S/MIME says, if its signature is by that authority.
+fn signed_document(folder: &Path, file: &str, authority: &X509) -> Result<String, SecurityError> {
     let text = read(folder, file)?;
-    let verify = || -> Result<(), ErrorStack> {
+    let verify = || -> Result<String, ErrorStack> {
         let (signature, content) = Pkcs7::from_smime(&text)?;
         let mut signers = Stack::new()?;
         signers.push(authority.clone())?;
         let nobody = X509StoreBuilder::new()?.build();
         // By this certificate and no other that came along; its own chain is of no matter (DDS Security 1.1, 9.4.1.1).
         let flags = Pkcs7Flags::NOINTERN | Pkcs7Flags::NOVERIFY;
-        signature.verify(&signers, &nobody, content.as_deref(), None, flags)
+        let mut said = Vec::new();
+        let content = content.as_deref();
+        signature.verify(&signers, &nobody, content, Some(&mut said), flags)?;
+        Ok(String::from_utf8_lossy(&said).into_owned())
     };
     verify().map_err(|error| {
         let why = error.errors().last().and_then(|last| last.reason());
@@ -119,6 +126,37 @@ fn signed_document(folder: &Path, file: &str, authority: &X509) -> Result<(), Se
     })
 }
 
+/// Why nodes of Cyclone DDS are not found, if that is so.
+///
+/// Where datagrams are protected as a whole, those that tell of topics have to be, too (DDS Security 1.1, 8.4.2.4, table
+/// 27). Cyclone DDS 0.10 to 11 protects none of them but where discovery is protected, and RustDDS lets none in, since
+/// anybody could have sent them.
+fn not_found(governance: &str) -> Option<String> {
+    governance.split("</domain_rule>").find_map(|rule| {
+        let rtps = values(rule, "rtps_protection_kind").find(|kind| *kind != "NONE")?;
+        let discovery = values(rule, "discovery_protection_kind").any(|kind| kind == "NONE");
+        let is_open = |on: &str| ["false", "0"].contains(&on.to_lowercase().as_str());
+        let topics = values(rule, "enable_discovery_protection").any(is_open);
+        let open = match (discovery, topics) {
+            (true, _) => "discovery_protection_kind NONE",
+            (false, true) => "topics whose enable_discovery_protection is false",
+            (false, false) => return None,
+        };
+        Some(format!(
+            "with rtps_protection_kind {rtps} and {open}, nodes of Cyclone DDS are not found: they tell of their topics \
+             in datagrams that are not protected, which are not let in. Protect discovery, or no datagrams as a whole"
+        ))
+    })
+}
+
+/// What stands in the elements of that name.
+fn values<'a>(xml: &'a str, element: &str) -> impl Iterator<Item = &'a str> {
+    let (start, end) = (format!("<{element}>"), format!("</{element}>"));
+    let parts: Vec<&str> = xml.split(&start).skip(1).collect();
+    let values = parts.into_iter();
+    values.filter_map(move |part| Some(part.split_once(&end)?.0.trim()))
+}
+
 /// Tells of a key that not only its owner can read.
 fn readable_by_others(folder: &Path) -> Option<String> {
     let path = folder.join("key.pem");
@@ -129,4 +167,37 @@ fn readable_by_others(folder: &Path) -> Option<String> {
             path.display()
         )
     })
+}
+
+const GOVERNANCE: &str = "governance.p7s";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_is_not_found_is_told_of_rule_by_rule() {
+        let rule = |rtps: &str, discovery: &str, topics: &str| {
+            format!(
+                "<domain_rule><discovery_protection_kind>{discovery}</discovery_protection_kind>
+                 <rtps_protection_kind> {rtps} </rtps_protection_kind>
+                 <topic_rule><enable_discovery_protection>{topics}</enable_discovery_protection></topic_rule>
+                 </domain_rule>"
+            )
+        };
+        assert_eq!(not_found(&rule("SIGN", "ENCRYPT", "true")), None);
+        assert_eq!(not_found(&rule("NONE", "NONE", "false")), None);
+        let two = rule("NONE", "NONE", "false") + &rule("ENCRYPT", "SIGN", "TRUE");
+        assert_eq!(not_found(&two), None);
+        let why = not_found(&rule("SIGN", "NONE", "true")).unwrap();
+        assert!(
+            why.contains("SIGN and discovery_protection_kind NONE"),
+            "{why}"
+        );
+        let why = not_found(&rule("SIGN", "SIGN", "FALSE")).unwrap();
+        assert!(
+            why.contains("enable_discovery_protection is false"),
+            "{why}"
+        );
+    }
 }

@@ -3,7 +3,7 @@
 use system_tests::{Cell, Child, Governance, Keystore, Peer, Triple, UaSide, Wiretap};
 use uadp::Scalar;
 
-use crate::{STRING, Secured, THERE, answering, is_in, reaches};
+use crate::{BACK, SOON, STRING, Secured, THERE, answering, is_in, reaches, sends};
 
 /// A maker, its name, and the value it writes.
 const MAKERS: [(Secured, &str, Triple, &str); 2] = [
@@ -91,4 +91,26 @@ fn values_cross_where_samples_and_submessages_have_different_keys() {
         data: "ENCRYPT",
         ..Governance::all("SIGN")
     });
+}
+
+/// Cyclone DDS then tells of its topics in datagrams anybody could have sent.
+#[test]
+fn open_discovery_in_protected_datagrams_is_warned_of_and_works_with_who_protects_them() {
+    let Some(cell) = Cell::secured(&[Peer::FastDds]) else {
+        return;
+    };
+    let keystore = Keystore::make(&cell, "keystore");
+    keystore.govern(&Governance {
+        discovery: "NONE",
+        ..Governance::SROS2
+    });
+    let mut ua = UaSide::join();
+    let mut bridge = answering(cell.secured_bridge(&keystore, &[]));
+    bridge.wait_for_line("nodes of Cyclone DDS are not found", SOON);
+    let reader = cell.secured_fastdds(&keystore, &["sub", THERE.1, STRING]);
+    reaches(&mut ua, "there", &reader.start());
+    let _writer = cell
+        .secured_fastdds(&keystore, &sends(BACK.1, "and back"))
+        .start();
+    ua.hear_scalar(BACK.0, Scalar::String(Some("and back")));
 }
