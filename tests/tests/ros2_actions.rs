@@ -8,6 +8,8 @@ mod fibonacci;
 mod graph;
 #[path = "ros2_actions/rclpy.rs"]
 mod rclpy;
+#[path = "ros2_actions/secured.rs"]
+mod secured;
 #[path = "ros2_actions/served.rs"]
 mod served;
 

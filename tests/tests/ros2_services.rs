@@ -4,6 +4,8 @@
 mod bindings;
 #[path = "ros2_services/peer.rs"]
 mod peer;
+#[path = "ros2_services/secured.rs"]
+mod secured;
 
 use std::time::Duration;
 

@@ -1,8 +1,10 @@
 // Cyclone DDS by its C library. Its message is std_msgs/String, its service std_srvs/SetBool; CYCLONEDDS_URI names the
 // interface, as everywhere.
+#include <algorithm>
 #include <atomic>
 #include <cstdio>
 #include <map>
+#include <vector>
 
 #include <dds/dds.h>
 
@@ -182,28 +184,208 @@ template <typename Kind, typename Heard> void take_all(dds_entity_t reader, cons
     }
 }
 
+// What one end of a service, or of a topic that goes one way, writes and reads.
+struct Ends {
+    dds_entity_t writer = 0;
+    dds_entity_t reader = 0;
+
+    bool matched() const {
+        dds_publication_matched_status_t there;
+        dds_subscription_matched_status_t back;
+        return dds_get_publication_matched_status(writer, &there) == DDS_RETCODE_OK && there.current_count > 0
+            && dds_get_subscription_matched_status(reader, &back) == DDS_RETCODE_OK && back.current_count > 0;
+    }
+};
+
+dds_entity_t writer_of(CycloneParticipant& participant, dds_entity_t topic, const Quality& quality = {}) {
+    dds_qos_t* qos = policies(quality);
+    const dds_entity_t writer = made(dds_create_writer(participant.entity(), topic, qos, nullptr), "writer");
+    dds_delete_qos(qos);
+    return writer;
+}
+
+dds_entity_t reader_of(CycloneParticipant& participant, dds_entity_t topic) {
+    dds_qos_t* qos = policies(Quality{});
+    const dds_entity_t reader = made(dds_create_reader(participant.entity(), topic, qos, nullptr), "reader");
+    dds_delete_qos(qos);
+    return reader;
+}
+
+Ends ends(CycloneParticipant& participant, const std::string& name, const dds_topic_descriptor_t& request,
+    const dds_topic_descriptor_t& reply, bool serves) {
+    const dds_entity_t requests = participant.topic_of(dds_topic("rq", name, "Request"), request);
+    const dds_entity_t replies = participant.topic_of(dds_topic("rr", name, "Reply"), reply);
+    return serves ? Ends{writer_of(participant, replies), reader_of(participant, requests)}
+                  : Ends{writer_of(participant, requests), reader_of(participant, replies)};
+}
+
+// Polls until told, or `done`.
+template <typename Done> void poll(const Done& done) {
+    while (!Lifetime::told() && !done()) {
+        std::this_thread::sleep_for(std::chrono::milliseconds(2));
+    }
+}
+
+void must_write(dds_entity_t writer, const void* sample) {
+    if (dds_write(writer, sample) != DDS_RETCODE_OK) {
+        Arguments::fail("a sample was not taken");
+    }
+}
+
+Ends set_bool(CycloneParticipant& participant, const std::string& name, bool serves) {
+    return ends(participant, name, std_srvs_srv_dds__SetBool_Request__desc, std_srvs_srv_dds__SetBool_Response__desc,
+        serves);
+}
+
 // A server of std_srvs/SetBool, which answers each request with what it says and --text.
 void serve(const Arguments& arguments) {
     const std::string name = arguments.position(1, "a service");
     std::string text = arguments.text("text", "served");
     CycloneParticipant participant(arguments);
-    const dds_entity_t requests
-        = participant.topic_of(dds_topic("rq", name, "Request"), std_srvs_srv_dds__SetBool_Request__desc);
-    const dds_entity_t replies
-        = participant.topic_of(dds_topic("rr", name, "Reply"), std_srvs_srv_dds__SetBool_Response__desc);
-    dds_qos_t* qos = policies(Quality{});
-    const dds_entity_t writer = made(dds_create_writer(participant.entity(), replies, qos, nullptr), "writer");
-    const dds_entity_t reader = made(dds_create_reader(participant.entity(), requests, qos, nullptr), "reader");
-    dds_delete_qos(qos);
+    const Ends own = set_bool(participant, name, true);
     Line().field("ready", name);
-    while (!Lifetime::told()) {
-        take_all<Request>(reader, [&](const Request& request) {
+    poll([&] {
+        take_all<Request>(own.reader, [&](const Request& request) {
             const Reply reply{request.client, request.count, request.data, text.data()};
-            const bool taken = dds_write(writer, &reply) == DDS_RETCODE_OK;
+            const bool taken = dds_write(own.writer, &reply) == DDS_RETCODE_OK;
             Line().field("request", request.data).field("replied", taken);
         });
-        std::this_thread::sleep_for(std::chrono::milliseconds(2));
+        return false;
+    });
+}
+
+// A client of std_srvs/SetBool that asks true --count times, one after the other.
+void call(const Arguments& arguments) {
+    const std::string name = arguments.position(1, "a service");
+    const auto count = static_cast<int64_t>(arguments.number("count", 1));
+    CycloneParticipant participant(arguments);
+    const Ends own = set_bool(participant, name, false);
+    dds_instance_handle_t client = 0;
+    dds_get_instance_handle(own.writer, &client);
+    Line().field("ready", name);
+    poll([&] { return own.matched(); });
+    for (int64_t seq = 1; seq <= count; ++seq) {
+        const Request request{client, seq, true};
+        must_write(own.writer, &request);
+        bool answered = false;
+        poll([&] {
+            take_all<Reply>(own.reader, [&](const Reply& reply) {
+                if (reply.client == client && reply.count == seq) {
+                    answered = true;
+                    Line().field("reply", reply.success).field("text", std::string(reply.message));
+                }
+            });
+            return answered;
+        });
     }
+    Line().field("done", true);
+    Lifetime::wait_until_told();
+}
+
+using Goal = demo_msgs_action_dds__Fibonacci_SendGoal_Request_;
+using Accepted = demo_msgs_action_dds__Fibonacci_SendGoal_Response_;
+using Wanted = demo_msgs_action_dds__Fibonacci_GetResult_Request_;
+using Result = demo_msgs_action_dds__Fibonacci_GetResult_Response_;
+using Feedback = demo_msgs_action_dds__Fibonacci_FeedbackMessage_;
+
+// The endpoints of one end of the action Fibonacci.
+struct Action {
+    Action(CycloneParticipant& participant, const std::string& name, bool serves)
+        : send(ends(participant, name + "/_action/send_goal", demo_msgs_action_dds__Fibonacci_SendGoal_Request__desc,
+            demo_msgs_action_dds__Fibonacci_SendGoal_Response__desc, serves))
+        , cancel(ends(participant, name + "/_action/cancel_goal", action_msgs_srv_dds__CancelGoal_Request__desc,
+              action_msgs_srv_dds__CancelGoal_Response__desc, serves))
+        , result(ends(participant, name + "/_action/get_result", demo_msgs_action_dds__Fibonacci_GetResult_Request__desc,
+              demo_msgs_action_dds__Fibonacci_GetResult_Response__desc, serves)) {
+        const dds_entity_t told = participant.topic_of(
+            dds_topic("rt", name, "/_action/feedback"), demo_msgs_action_dds__Fibonacci_FeedbackMessage__desc);
+        feedback = serves ? writer_of(participant, told) : reader_of(participant, told);
+        if (serves) {
+            Quality kept;
+            kept.transient_local = true;
+            writer_of(participant,
+                participant.topic_of(
+                    dds_topic("rt", name, "/_action/status"), action_msgs_msg_dds__GoalStatusArray__desc),
+                kept);
+        }
+    }
+
+    Ends send, cancel, result;
+    dds_entity_t feedback;
+};
+
+constexpr uint8_t SUCCEEDED = 4;
+
+std::vector<int32_t> fibonacci(int32_t order) {
+    std::vector<int32_t> numbers;
+    for (int32_t at = 0; at < order; ++at) {
+        numbers.push_back(at < 2 ? 1 : numbers[at - 1] + numbers[at - 2]);
+    }
+    return numbers;
+}
+
+dds_sequence_long borrowed(std::vector<int32_t>& numbers) {
+    const auto length = static_cast<uint32_t>(numbers.size());
+    return {length, length, numbers.data(), false};
+}
+
+// Rejects orders below 0, and else succeeds when the result is asked for, with the numbers as feedback before.
+void action_serve(const Arguments& arguments) {
+    const std::string name = arguments.position(1, "an action");
+    CycloneParticipant participant(arguments);
+    const Action own(participant, name, true);
+    std::map<std::string, int32_t> orders;
+    const auto key = [](const uint8_t (&id)[16]) { return std::string(id, id + 16); };
+    Line().field("ready", name);
+    poll([&] {
+        take_all<Goal>(own.send.reader, [&](const Goal& goal) {
+            const bool accepted = goal.order >= 0;
+            orders[key(goal.goal_id)] = goal.order;
+            const Accepted reply{goal.client, goal.count, accepted, 1, 0};
+            must_write(own.send.writer, &reply);
+            Line().field("goal", goal.order).field("accepted", accepted);
+        });
+        take_all<Wanted>(own.result.reader, [&](const Wanted& wanted) {
+            auto numbers = fibonacci(orders[key(wanted.goal_id)]);
+            Feedback told{};
+            std::copy(std::begin(wanted.goal_id), std::end(wanted.goal_id), told.goal_id);
+            told.numbers = borrowed(numbers);
+            must_write(own.feedback, &told);
+            const Result reply{wanted.client, wanted.count, SUCCEEDED, borrowed(numbers)};
+            must_write(own.result.writer, &reply);
+        });
+        return false;
+    });
+}
+
+// Sends a goal of --order, asks for its result when it is accepted, and tells what comes.
+void action_call(const Arguments& arguments) {
+    const std::string name = arguments.position(1, "an action");
+    CycloneParticipant participant(arguments);
+    const Action own(participant, name, false);
+    dds_instance_handle_t client = 0;
+    dds_get_instance_handle(own.send.writer, &client);
+    Line().field("ready", name);
+    poll([&] { return own.send.matched() && own.result.matched(); });
+    const Goal goal{client, 1, {7}, static_cast<int32_t>(arguments.number("order", 5))};
+    must_write(own.send.writer, &goal);
+    poll([&] {
+        take_all<Accepted>(own.send.reader, [&](const Accepted& answer) {
+            Line().field("order", goal.order).field("accepted", answer.accepted);
+            const Wanted wanted{client, 2, {7}};
+            must_write(own.result.writer, &wanted);
+        });
+        take_all<Feedback>(
+            own.feedback, [](const Feedback& told) { Line().field("feedback", told.numbers._length); });
+        take_all<Result>(own.result.reader, [](const Result& result) {
+            std::string numbers;
+            for (uint32_t at = 0; at < result.numbers._length; ++at) {
+                numbers += (at == 0 ? "" : ",") + std::to_string(result.numbers._buffer[at]);
+            }
+            Line().field("status", int(result.status)).put("result", "[" + numbers + "]");
+        });
+        return false;
+    });
 }
 
 } // namespace
@@ -218,6 +400,12 @@ int main(int count, char** words) {
     const std::string command = arguments.position(0, "a command; README.md lists them");
     if (command == "serve") {
         serve(arguments);
+    } else if (command == "call") {
+        call(arguments);
+    } else if (command == "action-serve") {
+        action_serve(arguments);
+    } else if (command == "action-call") {
+        action_call(arguments);
     } else if (!run_shared(command, arguments)) {
         Arguments::fail("there is no command " + command);
     }
