@@ -5,6 +5,8 @@
 
 #[path = "ros2_security/kinds.rs"]
 mod kinds;
+#[path = "ros2_security/node.rs"]
+mod node;
 
 use std::{
     fs,
