@@ -129,7 +129,7 @@ fn signed_document(folder: &Path, file: &str, authority: &X509) -> Result<String
 /// Why nodes of Cyclone DDS are not found, if that is so.
 ///
 /// Where datagrams are protected as a whole, those that tell of topics have to be, too (DDS Security 1.1, 8.4.2.4, table
-/// 27). Cyclone DDS 0.10 to 11 protects none of them but where discovery is protected, and RustDDS lets none in, since
+/// 27). Cyclone DDS 0.10 protects none of them but where discovery is protected, and RustDDS lets none in, since
 /// anybody could have sent them.
 fn not_found(governance: &str) -> Option<String> {
     governance.split("</domain_rule>").find_map(|rule| {
