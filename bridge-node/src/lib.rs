@@ -4,6 +4,7 @@
 //! serves (that is the port) nor how UADP bytes look (that is `bridge-core`).
 
 mod arguments;
+mod busy_poll;
 mod clock;
 mod definitions;
 mod exit;
@@ -19,6 +20,7 @@ mod status;
 
 pub use arguments::Arguments;
 pub use bridge_core::{Described, Kept, PublisherKey};
+pub use busy_poll::BusyPoll;
 pub use clock::{now, timestamp};
 pub use definitions::Definitions;
 pub use exit::{Failure, FailureKind};

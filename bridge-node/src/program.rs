@@ -3,6 +3,7 @@
 use std::net::SocketAddr;
 use std::process::ExitCode;
 use std::sync::Arc;
+use std::time::Duration;
 
 use bridge_core::{Local, Router, Settings};
 use clap::Parser;
@@ -16,6 +17,7 @@ use transport::{Options, Udp};
 use type_files::TypePaths;
 
 use crate::arguments::Arguments;
+use crate::busy_poll::BusyPoll;
 use crate::exit::{Failure, FailureKind};
 use crate::logging;
 use crate::mapping_file::{MappingFile, Running};
@@ -189,8 +191,19 @@ async fn prepare<P: Program>(
             interface: arguments.interface.is_none(),
         },
         restart: Vec::new(),
+        busy: BusyPoll::new(window(arguments.busy_poll)),
         dry_run: arguments.dry_run,
     })
+}
+
+/// How long to look for a sample before sleeping. On a single core whoever sends it would have to wait for that.
+fn window(asked: Option<u32>) -> Duration {
+    let alone = std::thread::available_parallelism().is_ok_and(|cores| cores.get() == 1);
+    match asked {
+        Some(micros) => Duration::from_micros(micros.into()),
+        None if alone => Duration::ZERO,
+        None => BusyPoll::WINDOW,
+    }
 }
 
 /// Ready when all are told to stop, or nobody is left to tell them.

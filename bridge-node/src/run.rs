@@ -15,6 +15,7 @@ use tokio::time::{Instant as TokioInstant, Sleep};
 use tracing::{debug, info, warn};
 use transport::{SendError, Udp};
 
+use crate::busy_poll::BusyPoll;
 use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
 use crate::mapping_file::Running;
@@ -34,6 +35,7 @@ pub(crate) struct Shell<P> {
     pub(crate) fixed: Fixed,
     /// What of the mapping waits for the next start.
     pub(crate) restart: Vec<String>,
+    pub(crate) busy: BusyPoll,
     pub(crate) dry_run: bool,
 }
 
@@ -88,9 +90,9 @@ impl<P: Port> Shell<P> {
         let mut more = false;
         loop {
             self.arm(timer.as_mut());
-            let yields = std::mem::take(&mut more);
+            let yields = std::mem::take(&mut more) || self.busy.looks(|| now().monotonic);
             tokio::select! {
-                // What is left of a long drain goes on after one more look at everything else.
+                // One more look at everything else: something is left of a long drain, or the next sample is near.
                 () = tokio::task::yield_now(), if yields => {}
                 () = &mut stop => return Ok(()),
                 heard = self.udp.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
@@ -190,7 +192,9 @@ impl<P: Port> Shell<P> {
         match heard {
             Ok((len, from)) => {
                 let datagram = buffer.get(..len).unwrap_or_default();
-                self.router.handle_datagram(datagram, from, now());
+                let now = now();
+                self.busy.arrived(now.monotonic);
+                self.router.handle_datagram(datagram, from, now);
             }
             // An ICMP answer to a unicast peer, at worst; the socket stays as it is.
             Err(error) => debug!(%error, "receiving failed"),
@@ -212,8 +216,10 @@ impl<P: Port> Shell<P> {
                     received,
                     latched_by,
                 };
+                let now = now();
+                self.busy.arrived(now.monotonic);
                 // Counted by the router, whatever it is.
-                let _verdict = self.router.handle_local(heard, now());
+                let _verdict = self.router.handle_local(heard, now);
             }
             PortEvent::Bound {
                 topic,

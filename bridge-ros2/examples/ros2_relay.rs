@@ -13,6 +13,7 @@ use std::num::NonZeroU16;
 use std::process::ExitCode;
 use std::time::Duration;
 
+use bridge_node::{BusyPoll, now};
 use bridge_ros2::domain::{Domain, DomainOptions};
 use bridge_ros2::graph::Endpoint;
 use bridge_ros2::inbox::{Inbox, Taken};
@@ -64,18 +65,22 @@ async fn relay(from: String, to: String, domain: u16) -> Result<(), Failure> {
         domain.reader(&from, TYPE, Requested::from_writers(&[]))?,
     );
     println!("{{\"ready\":\"{to}\"}}");
+    let mut busy = BusyPoll::new(BusyPoll::WINDOW);
     let mut look = tokio::time::interval(LOOK);
     loop {
         tokio::select! {
             biased;
             taken = inbox.recv() => match taken {
                 Taken::Sample { payload, .. } => {
+                    busy.arrived(now().monotonic);
                     if let Err(refusal) = outlet.offer(payload, None, Instant::now()) {
                         eprintln!("relay: {}", refusal.label());
                     }
                 }
                 Taken::Unreadable { why, .. } => eprintln!("relay: {why}"),
             },
+            // As the run loop of a bridge does.
+            () = tokio::task::yield_now(), if busy.looks(|| now().monotonic) => {}
             // More often only while samples wait for room.
             () = tokio::time::sleep(FLUSH), if outlet.is_waiting() => outlet.flush(Instant::now()).map_err(|r| r.label())?,
             _ = look.tick() => {
