@@ -26,7 +26,7 @@ cargo xtask <verb>
 
   demo [ARGS]                    build the programs and run the assembly line; ARGS go to it (--help lists them)
   test [--no-install] [FILTER..] install the peers of the tests (apt, pip), then run all tests whose name contains a FILTER
-  peers                          only install the peers
+  peers [--build]                only install the peers; of those only what the programs are built with
   lint                           formatting, clippy, licences and sources of dependencies, documentation
   dist                           build the programs that are handed out, with optimisation, into target/dist
   dds                            only patch RustDDS, which all verbs build with, and print the flags to do so by hand
@@ -58,6 +58,7 @@ fn run(arguments: &[&str]) -> anyhow::Result<Ended> {
         ["demo", rest @ ..] => demo::run(&Workspace::find()?, rest),
         ["test", rest @ ..] => test::run(&Workspace::find()?, rest),
         ["peers"] => Ok(peers::run(&Workspace::find()?)),
+        ["peers", "--build"] => peers::for_building(),
         ["dist"] => dist::run(&Workspace::find()?),
         ["dds"] => dds::run(&Workspace::find()?),
         ["lint"] => lint::run(&Workspace::find()?),

@@ -89,6 +89,14 @@ pub(crate) fn run(workspace: &Workspace) -> Ended {
     ended
 }
 
+/// `cargo xtask peers --build`: what is compiled needs nothing else of them.
+///
+/// # Errors
+/// When it cannot be installed.
+pub(crate) fn for_building() -> anyhow::Result<Ended> {
+    apt_install(APT_BUILD).map(|()| Ended::WELL)
+}
+
 /// The Python that has the peers of PyPI but ROS 2.
 pub(crate) fn python(workspace: &Workspace) -> PathBuf {
     python_of(&workspace.peers().join(PYTHON))
