@@ -34,8 +34,15 @@ pub struct Arguments {
     /// Serve counters and delays at this address: /metrics for Prometheus, /status as JSON
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
     pub metrics: Option<SocketAddr>,
-    /// Where samples follow each other closely, look for the next one for so long before sleeping; 0 always sleeps. Takes
-    /// up to one core while they do [default: 200, on a single core 0]
-    #[arg(long, value_name = "MICROSECONDS", env = "UA_BUSY_POLL", value_parser = clap::value_parser!(u32).range(..=10_000))]
-    pub busy_poll: Option<u32>,
+    /// Where samples follow each other closely, look for the next one for so long before sleeping, as 200. Takes up to one
+    /// core while they do: only for a closed loop, with cores to spare
+    #[arg(
+        long,
+        value_name = "MICROSECONDS",
+        env = "UA_BUSY_POLL",
+        default_value = "0",
+        hide_default_value = true,
+        value_parser = clap::value_parser!(u32).range(..=10_000)
+    )]
+    pub busy_poll: u32,
 }

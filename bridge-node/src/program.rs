@@ -191,19 +191,9 @@ async fn prepare<P: Program>(
             interface: arguments.interface.is_none(),
         },
         restart: Vec::new(),
-        busy: BusyPoll::new(window(arguments.busy_poll)),
+        busy: BusyPoll::new(Duration::from_micros(arguments.busy_poll.into())),
         dry_run: arguments.dry_run,
     })
-}
-
-/// How long to look for a sample before sleeping. On a single core whoever sends it would have to wait for that.
-fn window(asked: Option<u32>) -> Duration {
-    let alone = std::thread::available_parallelism().is_ok_and(|cores| cores.get() == 1);
-    match asked {
-        Some(micros) => Duration::from_micros(micros.into()),
-        None if alone => Duration::ZERO,
-        None => BusyPoll::WINDOW,
-    }
 }
 
 /// Ready when all are told to stop, or nobody is left to tell them.

@@ -1,7 +1,8 @@
 //! Repeats one topic of a DDS domain as another, by what the bridge reads and writes with: what the benchmarks hold
 //! against relays of Cyclone DDS and Fast DDS.
 //!
-//! `ros2_relay FROM TO [DOMAIN]`: topics of `std_msgs/msg/String`, on loopback, until SIGTERM.
+//! `ros2_relay FROM TO [DOMAIN]`: topics of `std_msgs/msg/String`, on loopback, until SIGTERM. `UA_BUSY_POLL` is what
+//! it is for a bridge.
 
 #![expect(
     clippy::print_stdout,
@@ -49,6 +50,12 @@ async fn main() -> ExitCode {
 }
 
 async fn relay(from: String, to: String, domain: u16) -> Result<(), Failure> {
+    let window = match std::env::var("UA_BUSY_POLL") {
+        Ok(micros) => micros
+            .parse()
+            .map_err(|e| format!("UA_BUSY_POLL={micros}: {e}"))?,
+        Err(_) => 0,
+    };
     let domain = Domain::join(&DomainOptions {
         domain,
         networks: vec![std::net::Ipv4Addr::LOCALHOST.into()],
@@ -65,7 +72,7 @@ async fn relay(from: String, to: String, domain: u16) -> Result<(), Failure> {
         domain.reader(&from, TYPE, Requested::from_writers(&[]))?,
     );
     println!("{{\"ready\":\"{to}\"}}");
-    let mut busy = BusyPoll::new(BusyPoll::WINDOW);
+    let mut busy = BusyPoll::new(Duration::from_micros(window));
     let mut look = tokio::time::interval(LOOK);
     loop {
         tokio::select! {
