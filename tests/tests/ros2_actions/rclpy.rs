@@ -462,8 +462,8 @@ async fn a_server_that_comes_back_serves_a_client_that_stayed(distribution: Dist
     drop(peers);
     assert!(domain.leave(()).await);
     let alone = json!({"participants": 1});
-    // The announcement that a participant leaves is best effort (RTPS 2.5, 8.5.3). Fast DDS 2.14 misses it now and then, and
-    // has the lease.
+    // The announcement that a participant leaves is best effort (RTPS 2.5, 8.5.3). Fast DDS 2.14 does not go by it each
+    // time, and then has the lease.
     let left = async { while asked(&mut client, "participants", "participants").await != alone {} };
     let left = timeout(LEASE + SOON, left).await;
     assert!(left.is_ok(), "the participant that left is still there");
