@@ -462,11 +462,7 @@ async fn a_server_that_comes_back_serves_a_client_that_stayed(distribution: Dist
     drop(peers);
     assert!(domain.leave(()).await);
     let alone = json!({"participants": 1});
-    // The announcement that a participant leaves is best effort (RTPS 2.5, 8.5.3). Fast DDS 2.14 does not go by it each
-    // time, and then has the lease.
-    let left = async { while asked(&mut client, "participants", "participants").await != alone {} };
-    let left = timeout(LEASE + SOON, left).await;
-    assert!(left.is_ok(), "the participant that left is still there");
+    comes_to(&mut client, "participants", "participants", &alone).await;
     let again = Ours::join();
     let _serving = serve_as(&again, &fibonacci(&again), brief);
     let answer = asked(&mut client, "back", "back").await;
@@ -484,9 +480,6 @@ async fn a_server_that_comes_back_serves_a_client_that_stayed(distribution: Dist
     said(&client, &json!({"list": []})).await;
     assert_eq!(asked(&mut client, "result 1", "result").await, unknown(1));
 }
-
-/// How long others take us to be there without a word.
-const LEASE: Duration = Duration::from_secs(50);
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_server_that_comes_back_serves_a_client_of_jazzy_that_stayed() {
