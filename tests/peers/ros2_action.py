@@ -25,7 +25,7 @@ from cyclonedds.topic import Topic
 import lifetime
 import ros2_service_types as types
 from ros2_service import Client, Server
-from ros2_types import Time
+from ros2_types import Time, matched
 
 SEND = types.SERVICES["demo_msgs/Fibonacci_SendGoal"]
 RESULT = types.SERVICES["demo_msgs/Fibonacci_GetResult"]
@@ -212,12 +212,9 @@ class ActionClient:
         """Until a server has matched all, as `rcl_action_server_is_available` says it; no longer."""
         end = time.monotonic() + seconds
         services = (self.send, self.cancel, self.result)
-        readers = [self.feedback, self.status] + [service.reader for service in services]
-        writers = [service.writer for service in services]
-        while not (
-            all(reader.get_matched_publications() for reader in readers)
-            and all(writer.get_matched_subscriptions() for writer in writers)
-        ):
+        endpoints = [self.feedback, self.status]
+        endpoints += [endpoint for service in services for endpoint in (service.reader, service.writer)]
+        while not all(matched(endpoint) for endpoint in endpoints):
             if time.monotonic() > end:
                 raise SystemExit("no server within the time")
             time.sleep(0.005)
@@ -339,7 +336,7 @@ def garbage(args, participant):
     sent = set()
     while True:
         for at, (writer, kind) in enumerate(writers):
-            if at not in sent and writer.get_matched_subscriptions():
+            if at not in sent and matched(writer):
                 time.sleep(0.2)
                 for _ in range(args.count):
                     writer.write(kind())

@@ -39,7 +39,7 @@ def main():
     topic = Topic(participant, ros2_types.dds_topic(args.topic), kind, qos=qos)
     writer = DataWriter(participant, topic, qos=qos)
     lifetime.say(ready=args.topic)
-    while len(writer.get_matched_subscriptions()) < args.wait_readers:
+    while ros2_types.matched(writer) < args.wait_readers:
         time.sleep(0.005)
 
     if args.warm_up is not None:

@@ -63,7 +63,7 @@ class Client(Ends):
     def wait(self, seconds):
         """Until a server has matched both topics."""
         end = time.monotonic() + seconds
-        while not (self.writer.get_matched_subscriptions() and self.reader.get_matched_publications()):
+        while not (ros2_types.matched(self.writer) and ros2_types.matched(self.reader)):
             if time.monotonic() > end:
                 raise SystemExit("no server within the time")
             time.sleep(0.005)
@@ -150,7 +150,7 @@ def garbage(args, participant, kinds):
     topic = Topic(participant, f"rq/{args.service.lstrip('/')}Request", strange, qos=qos)
     writer = DataWriter(participant, topic, qos=qos)
     lifetime.say(ready=args.service)
-    while not writer.get_matched_subscriptions():
+    while not ros2_types.matched(writer):
         time.sleep(0.005)
     for _ in range(args.count):
         writer.write(strange())

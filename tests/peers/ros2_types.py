@@ -7,6 +7,7 @@ from cyclonedds.core import Policy, Qos
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.annotations import final
 from cyclonedds.idl.types import float32, float64, int32, sequence, uint8, uint32
+from cyclonedds.pub import DataWriter
 from cyclonedds.util import duration
 
 
@@ -140,6 +141,21 @@ TYPES = {
     "rcl_interfaces/Log": Log,
     "nobody_msgs/Unheard": Unheard,
 }
+
+
+def matched(endpoint):
+    """How many readers a writer has matched, or writers a reader.
+
+    The wheel asks for the number, makes room for so many handles and asks again. It raises IndexError when one more has
+    been matched in between, so that is asked once more.
+    """
+    while True:
+        try:
+            if isinstance(endpoint, DataWriter):
+                return len(endpoint.get_matched_subscriptions())
+            return len(endpoint.get_matched_publications())
+        except IndexError:
+            continue
 
 
 def kind_of(type_name):
