@@ -52,9 +52,14 @@ private:
 void publish(const Arguments& arguments) {
     const Source source(arguments);
     const std::string topic = arguments.position(1, "a topic");
+    const std::string type = dds_type("msg", arguments.position(2, "a type"));
     const auto participant = join(arguments);
-    const auto writer = participant->writer(
-        dds_topic("rt", topic), dds_type("msg", arguments.position(2, "a type")), Quality::from(arguments));
+    std::unique_ptr<Writer> first;
+    if (const std::string before = arguments.text("after", ""); !before.empty()) {
+        first = participant->writer(dds_topic("rt", before), type, {});
+        wait([&] { return first->readers() > 0; });
+    }
+    const auto writer = participant->writer(dds_topic("rt", topic), type, Quality::from(arguments));
     Line().field("ready", topic);
     const int readers = static_cast<int>(arguments.number("wait-readers", 0));
     wait([&] { return writer->readers() >= readers; });

@@ -3,6 +3,7 @@
 
 #include <functional>
 #include <memory>
+#include <optional>
 #include <string>
 
 #include "body.hpp"
@@ -11,12 +12,17 @@ struct Quality {
     bool reliable = true;
     bool transient_local = false;
     int depth = 100;
+    // Whole seconds between HEARTBEATs. Cyclone DDS lets nobody choose.
+    std::optional<int32_t> heartbeat_period;
 
     static Quality from(const Arguments& arguments) {
         Quality quality;
         quality.reliable = arguments.text("reliability", "reliable") == "reliable";
         quality.transient_local = arguments.text("durability", "volatile") == "transient_local";
         quality.depth = static_cast<int>(arguments.number("depth", quality.depth));
+        if (arguments.has("heartbeat-period")) {
+            quality.heartbeat_period = static_cast<int32_t>(arguments.number("heartbeat-period", 0));
+        }
         return quality;
     }
 };

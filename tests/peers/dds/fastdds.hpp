@@ -99,6 +99,9 @@ public:
         set(qos, quality);
         qos.publish_mode().kind = fast::ASYNCHRONOUS_PUBLISH_MODE;
         qos.reliability().max_blocking_time = {10, 0};
+        if (quality.heartbeat_period) {
+            qos.reliable_writer_qos().times.heartbeatPeriod = {*quality.heartbeat_period, 0};
+        }
         writer_ = made(publisher->create_datawriter(topic, qos, this), "writer");
     }
 

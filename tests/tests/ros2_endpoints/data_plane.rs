@@ -130,6 +130,33 @@ async fn five_thousand_messages_at_1_khz_arrive_in_order_without_loss() {
     }
 }
 
+/// Writers of Fast DDS whose periodic HEARTBEAT never comes, made when the peer knows our reader: the HEARTBEAT they send at
+/// the match may come before we know of them, and then only the one we ask for tells that nothing is before the sample.
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn writers_of_fast_dds_are_heard_before_their_heartbeat_period_is_over() {
+    const EARLIER: (&str, &str) = ("/ua_2_1_2", "rt/ua_2_1_2");
+    /// Which end knows the other first is up to chance; either is about as likely.
+    const WRITERS: usize = 6;
+    let Some(cell) = Cell::with(&[Peer::FastDds]) else {
+        return;
+    };
+    let domain = join();
+    let reliable = Requested::from_writers(&[]);
+    let mut inbox = inbox(&domain, reliable);
+    // Announced after the other, so a peer that has matched it knows both.
+    let _known = domain.reader(EARLIER.1, STRING, reliable).unwrap();
+    for writer in 0..WRITERS {
+        let text = format!("of {writer}");
+        let writes = ["pub", THEIRS.0, TEXT, "--text", &text];
+        let when = ["--after", EARLIER.0, "--wait-readers", "1"];
+        let how = ["--heartbeat-period", "3600"];
+        let _peer = cell.fastdds(&[&writes[..], &when, &how].concat());
+        let (bytes, missing) = sample(&mut inbox).await;
+        assert!(is_string(&bytes, &text), "{bytes:?}");
+        assert_eq!(missing, 0);
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn five_thousand_messages_at_1_khz_are_written_without_loss() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
