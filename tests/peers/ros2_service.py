@@ -67,7 +67,6 @@ class Client(Ends):
             if time.monotonic() > end:
                 raise SystemExit("no server within the time")
             time.sleep(0.005)
-        time.sleep(0.2)
 
     def ask(self, request):
         self.count += 1
@@ -121,6 +120,8 @@ def call(args, participant, kinds):
     client = Client(participant, args.service, kinds)
     lifetime.say(ready=args.service)
     client.wait(args.wait)
+    # The server may learn of us later than we of it.
+    time.sleep(args.settle)
     values = [json.loads(value) for value in args.value]
     if args.at_once:
         open_calls = {client.ask(ros2_types.build(client.kind, value)) for value in values * args.at_once}
@@ -132,8 +133,12 @@ def call(args, participant, kinds):
             time.sleep(0.001)
         lifetime.say(unanswered=len(open_calls), strange=client.strange)
         return
+    clients = [client]
     for value in values:
-        lifetime.say(value=body(client.call(ros2_types.build(client.kind, value), args.wait)))
+        lifetime.say(value=body(clients[-1].call(ros2_types.build(client.kind, value), args.wait)))
+        if args.anew:
+            clients.append(Client(participant, args.service, kinds))
+            clients[-1].wait(args.wait)
     lifetime.say(unanswered=0, strange=client.strange)
 
 
@@ -172,6 +177,8 @@ def main():
     parser.add_argument("--value", action="append", default=[])
     parser.add_argument("--at-once", type=int, default=0, help="ask this many times before waiting for a reply")
     parser.add_argument("--wait", type=float, default=10.0)
+    parser.add_argument("--settle", type=float, default=0.2)
+    parser.add_argument("--anew", action="store_true", help="ask each time with one more client of the participant")
     parser.add_argument("--form", choices=["short", "bare"], default="short")
     parser.add_argument("--count", type=int, default=10)
     parser.add_argument("--limit", type=float, default=120.0)

@@ -328,6 +328,26 @@ async fn clients_of_both_vendors_are_answered_by_one_server_of_ours() {
     );
 }
 
+/// Requests of Cyclone DDS do not say which reader of their participant waits for the reply.
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn each_more_client_of_one_cyclone_participant_is_answered() {
+    const CLIENTS: usize = 20;
+    let Some(cell) = Cell::with(Vendor::Cyclone.needs()) else {
+        return;
+    };
+    let ours = Ours::join();
+    let server = server(&ours, ServiceOptions::default());
+    let how = ["--anew", "--settle", "0"];
+    let requests = [["--value", r#"{"data":true}"#]; CLIENTS].concat();
+    let clients = cyclone_calls(&cell, GRIP, &[&how[..], &requests].concat());
+    until("they are done", || {
+        Vendor::Cyclone.answers(&clients).is_some()
+    })
+    .await;
+    assert_eq!(Vendor::Cyclone.answers(&clients).unwrap().0, CLIENTS);
+    assert_eq!(server.counters().undelivered, 0);
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn servers_of_both_vendors_are_each_asked_in_their_way() {
     let Some(cell) = Cell::with(&[Peer::Python, Peer::FastDds]) else {

@@ -1,6 +1,7 @@
 //! The writer of an action's feedback, which never waits and goes to whoever listens.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
+use std::time::Duration;
 
 use rustdds::GUID;
 use rustdds::dds::WriteError;
@@ -8,12 +9,15 @@ use tokio::time::Instant;
 
 use crate::graph::Endpoint;
 use crate::raw::{Payload, Writer};
-use crate::service::Opening;
+use crate::service::{Audience, Opening};
 
-/// Feedback waits here while the send window is full, or a new reader is yet to have its first sample ([`Opening`]).
+/// Feedback waits here while the send window is full, a client of a goal is yet to be matched, or a new reader could
+/// miss it ([`Opening`]).
 pub(super) struct FeedbackWriter {
     writer: Writer,
-    readers: Vec<GUID>,
+    audience: Audience,
+    /// Clients whose participant is yet to have a reader that is matched, and until when that is waited for.
+    expected: BTreeMap<GUID, Instant>,
     opening: Opening,
     /// Oldest first.
     waiting: VecDeque<Payload>,
@@ -22,10 +26,11 @@ pub(super) struct FeedbackWriter {
 }
 
 impl FeedbackWriter {
-    pub(super) const fn new(writer: Writer) -> Self {
+    pub(super) fn new(writer: Writer) -> Self {
         Self {
             writer,
-            readers: Vec::new(),
+            audience: Audience::default(),
+            expected: BTreeMap::new(),
             opening: Opening::new(),
             waiting: VecDeque::new(),
             bytes: 0,
@@ -37,8 +42,15 @@ impl FeedbackWriter {
     }
 
     /// Takes note of the readers there are by now.
-    pub(super) fn meet(&mut self, readers: &[Endpoint]) {
-        self.readers = readers.iter().map(|reader| reader.guid).collect();
+    pub(super) fn meet(&mut self, readers: &[Endpoint], now: Instant) {
+        self.audience
+            .meet(readers.iter().map(|reader| reader.guid), now);
+    }
+
+    /// A client whose goal is accepted hears its feedback from the first on, if its participant has a reader for it.
+    pub(super) fn expect(&mut self, client: GUID, now: Instant) {
+        self.expected.retain(|_, until| now < *until);
+        self.expected.entry(client).or_insert(now + PATIENCE);
     }
 
     /// Writes a sample, or queues it. Returns how many older ones were dropped to make room.
@@ -57,10 +69,10 @@ impl FeedbackWriter {
     /// Sends what waits, as far as there is room. Returns how many were lost because RustDDS failed.
     pub(super) fn flush(&mut self, now: Instant) -> u64 {
         let mut lost = 0;
-        while !self.waiting.is_empty() && self.opening.is_over(&self.writer, now) {
+        while !self.waiting.is_empty() && self.is_heard(now) {
             let Some(sample) = self.pop() else { break };
             match self.writer.write(sample, None) {
-                Ok(()) => self.opening.written(self.readers.iter().copied(), now),
+                Ok(()) => self.opening.written(self.audience.readers(), now),
                 Err(WriteError::WouldBlock { data }) => {
                     self.bytes += data.len();
                     self.waiting.push_front(data);
@@ -75,6 +87,15 @@ impl FeedbackWriter {
             }
         }
         lost
+    }
+
+    /// Whether those who are to hear what is written now do.
+    fn is_heard(&mut self, now: Instant) -> bool {
+        self.audience.listen(&self.writer, now);
+        let audience = &self.audience;
+        self.expected
+            .retain(|client, until| now < *until && !audience.hears_one_of(*client, now));
+        self.expected.is_empty() && self.opening.is_over(&self.writer, now)
     }
 
     fn pop(&mut self) -> Option<Payload> {
@@ -92,6 +113,8 @@ impl std::fmt::Debug for FeedbackWriter {
     }
 }
 
+/// How long a client of a goal may be without a reader of feedback; nobody has to have one.
+const PATIENCE: Duration = Duration::from_millis(250);
 /// What may wait, beside the send window of RustDDS.
 const ROOM: usize = 512;
 const ROOM_BYTES: usize = 16 * 1024 * 1024;

@@ -254,6 +254,11 @@ impl Shared {
             Some(decision) => decision.await.ok(),
             None => None,
         };
+        if accepted.is_some()
+            && let Some(outputs) = &mut self.lock().outputs
+        {
+            outputs.feedback.expect(request.client, Instant::now());
+        }
         Ok(match accepted {
             Some(Acceptance { stamp, written }) => Answer {
                 bytes: wire::goal_answer(true, stamp),
@@ -417,7 +422,8 @@ impl Outputs {
     /// Takes note of who listens, looked at no longer than `age` ago, and sends the status that waits.
     fn meet(&mut self, action: &Action, now: Instant, age: Duration) -> Result<(), Refusal> {
         let seen = self.peers.look(now, age);
-        self.feedback.meet(seen.readers(&action.feedback_topic()));
+        self.feedback
+            .meet(seen.readers(&action.feedback_topic()), now);
         let readers = seen.readers(&action.status_topic());
         self.status.set_readers(readers, now)?;
         self.status.flush(now)

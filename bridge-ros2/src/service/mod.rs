@@ -4,6 +4,7 @@
 //! mapping to DDS"). Requests and replies are CDR with their encapsulation header; how they are tied together is
 //! [`ServiceMapping`].
 
+mod audience;
 mod client;
 mod error;
 mod mapping;
@@ -26,6 +27,7 @@ pub use self::mapping::ServiceMapping;
 pub use self::peers::ServicePeers;
 pub use self::server::{ServiceCounters, ServiceOptions, ServiceRequest, ServiceServer};
 
+pub(crate) use self::audience::Audience;
 pub(crate) use self::mapping::Received;
 pub(crate) use self::opening::Opening;
 pub(crate) use self::peers::offered;

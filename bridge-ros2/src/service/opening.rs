@@ -1,58 +1,141 @@
-//! The first sample to a new reader, which goes alone.
+//! The first sample to a new reader.
 
-use std::collections::BTreeSet;
 use std::time::Duration;
 
-use rustdds::GUID;
-use tokio::time::Instant;
-
-use crate::raw::Writer;
-
-/// Holds a writer up until new readers have had one sample.
-///
-/// A reader of Cyclone DDS takes what the first heartbeat it hears of a volatile writer announces for older than
-/// itself. RustDDS sends that heartbeat ahead of samples that wait to be sent, so of a burst some would be lost in its
-/// middle. With a single sample the heartbeat comes behind it.
-///
-/// RustDDS as published needs this. With the patches, of which `late-readers` is for the same reader, 20 of 20 bursts of 100
-/// requests were answered without it; it costs them one acknowledgement per new reader, which may be asked for 20 ms later.
-#[derive(Debug)]
-pub(crate) struct Opening {
-    known: BTreeSet<GUID>,
-    /// When a sample was written that some reader is yet to acknowledge as its first.
-    since: Option<Instant>,
-}
-
-impl Opening {
-    pub(crate) const fn new() -> Self {
-        Self {
-            known: BTreeSet::new(),
-            since: None,
-        }
-    }
-
-    /// Whether a sample may be written now.
-    pub(crate) fn is_over(&mut self, writer: &Writer, now: Instant) -> bool {
-        if let Some(since) = self.since
-            && now.saturating_duration_since(since) < PATIENCE
-            // The answer is immediate with a wait of zero.
-            && !matches!(writer.wait_for_acknowledgments(Duration::ZERO), Ok(true))
-        {
-            return false;
-        }
-        self.since = None;
-        true
-    }
-
-    /// To be called when a sample was written that all of `readers` get.
-    pub(crate) fn written(&mut self, readers: impl Iterator<Item = GUID>, now: Instant) {
-        let readers: BTreeSet<GUID> = readers.collect();
-        if !readers.is_subset(&self.known) {
-            self.since = Some(now);
-        }
-        self.known = readers;
-    }
-}
+#[cfg(not(feature = "patched-dds"))]
+pub(crate) use self::published::Opening;
 
 /// How long a reader may take; one that was killed never acknowledges.
 const PATIENCE: Duration = Duration::from_millis(250);
+
+#[cfg(feature = "patched-dds")]
+mod patched {
+    use rustdds::GUID;
+    use tokio::time::Instant;
+
+    use super::PATIENCE;
+    use crate::raw::Writer;
+
+    /// Holds a writer up until its readers have heard a HEARTBEAT of it.
+    ///
+    /// A reader of Cyclone DDS takes what the first HEARTBEAT it hears of a volatile writer announces for older than
+    /// itself, so it would miss what is written before that.
+    #[derive(Debug)]
+    pub(crate) struct Opening {
+        /// Readers that may not have heard one, when last asked.
+        new: usize,
+        /// When they became more.
+        since: Option<Instant>,
+    }
+
+    impl Opening {
+        pub(crate) const fn new() -> Self {
+            Self {
+                new: 0,
+                since: None,
+            }
+        }
+
+        /// Whether a sample may be written now.
+        pub(crate) fn is_over(&mut self, writer: &Writer, now: Instant) -> bool {
+            let readers = writer.matched_readers();
+            self.passes(readers.silent + readers.greeting, now)
+        }
+
+        fn passes(&mut self, new: usize, now: Instant) -> bool {
+            let before = std::mem::replace(&mut self.new, new);
+            if new > before {
+                self.since = Some(now);
+            }
+            new == 0
+                || self
+                    .since
+                    .is_none_or(|since| now.saturating_duration_since(since) >= PATIENCE)
+        }
+
+        /// The readers say themselves how far they are.
+        #[expect(
+            clippy::unused_self,
+            reason = "RustDDS as published has to be told, and is called in the same places"
+        )]
+        pub(crate) fn written(&self, _readers: impl Iterator<Item = GUID>, _now: Instant) {}
+    }
+
+    #[cfg(test)]
+    mod tests {
+        use super::*;
+
+        #[test]
+        fn a_new_reader_is_waited_for_and_one_that_says_nothing_only_once() {
+            let start = Instant::now();
+            let late = start + PATIENCE;
+            let mut opening = Opening::new();
+            assert!(opening.passes(0, start), "nobody is there");
+            assert!(!opening.passes(1, start));
+            assert!(opening.passes(0, start), "it has heard one");
+            assert!(!opening.passes(1, start));
+            assert!(opening.passes(1, late));
+            assert!(!opening.passes(2, late), "another one is new");
+            assert!(!opening.passes(1, late), "either may be the new one");
+            assert!(opening.passes(1, late + PATIENCE));
+        }
+    }
+}
+
+#[cfg(feature = "patched-dds")]
+pub(crate) use self::patched::Opening;
+
+#[cfg(not(feature = "patched-dds"))]
+mod published {
+    use std::collections::BTreeSet;
+    use std::time::Duration;
+
+    use rustdds::GUID;
+    use tokio::time::Instant;
+
+    use super::PATIENCE;
+    use crate::raw::Writer;
+
+    /// Holds a writer up until new readers have had one sample.
+    ///
+    /// A reader of Cyclone DDS takes what the first HEARTBEAT it hears of a volatile writer announces for older than
+    /// itself. RustDDS sends that HEARTBEAT ahead of samples that wait to be sent, so of a burst some would be lost in
+    /// its middle. With a single sample the HEARTBEAT comes behind it.
+    #[derive(Debug)]
+    pub(crate) struct Opening {
+        known: BTreeSet<GUID>,
+        /// When a sample was written that some reader is yet to acknowledge as its first.
+        since: Option<Instant>,
+    }
+
+    impl Opening {
+        pub(crate) const fn new() -> Self {
+            Self {
+                known: BTreeSet::new(),
+                since: None,
+            }
+        }
+
+        /// Whether a sample may be written now.
+        pub(crate) fn is_over(&mut self, writer: &Writer, now: Instant) -> bool {
+            if let Some(since) = self.since
+                && now.saturating_duration_since(since) < PATIENCE
+                // The answer is immediate with a wait of zero.
+                && !matches!(writer.wait_for_acknowledgments(Duration::ZERO), Ok(true))
+            {
+                return false;
+            }
+            self.since = None;
+            true
+        }
+
+        /// To be called when a sample was written that all of `readers` get.
+        pub(crate) fn written(&mut self, readers: impl Iterator<Item = GUID>, now: Instant) {
+            let readers: BTreeSet<GUID> = readers.collect();
+            if !readers.is_subset(&self.known) {
+                self.since = Some(now);
+            }
+            self.known = readers;
+        }
+    }
+}

@@ -1,6 +1,6 @@
 //! Offering a service: reading requests, running the handler, answering each client in its own way.
 
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -14,12 +14,12 @@ use tokio::task::{AbortHandle, JoinSet};
 use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, warn};
 
+use super::audience::Audience;
 use super::mapping::{self, Outgoing, Received, ReplyTo};
 use super::opening::Opening;
 use super::peers::ServicePeers;
 use super::{BUSY, IDLE, Service, next, policies};
 use crate::domain::{Domain, DomainError};
-use crate::graph::Endpoint;
 use crate::raw::{Payload, Reader, Writer};
 
 /// What a service does for its clients, at most.
@@ -152,7 +152,7 @@ impl ServiceServer {
             waiting: VecDeque::new(),
             handled: JoinSet::new(),
             replies: VecDeque::new(),
-            readers: BTreeMap::new(),
+            audience: Audience::default(),
             opening: Opening::new(),
         };
         let task = tokio::spawn(driver.run(reader)).abort_handle();
@@ -232,8 +232,7 @@ struct Driver {
     handled: JoinSet<(ReplyTo, Result<Answer, String>)>,
     /// Replies whose client is not matched yet, or that find the send window full, oldest first.
     replies: VecDeque<Reply>,
-    /// Readers of replies, and since when they are known.
-    readers: BTreeMap<GUID, Instant>,
+    audience: Audience,
     opening: Opening,
 }
 
@@ -352,6 +351,7 @@ impl Driver {
 
     /// Writes the replies whose clients can take them by now.
     fn send(&mut self, now: Instant) {
+        self.audience.listen(&self.writer, now);
         for reply in std::mem::take(&mut self.replies) {
             let kept = match self.targets(&reply.to, now) {
                 Some(targets) if self.opening.is_over(&self.writer, now) => {
@@ -378,18 +378,14 @@ impl Driver {
         let mut age = IDLE;
         loop {
             let snapshot = self.peers.look(now, age);
-            let readers = snapshot.readers(&topic);
-            self.meet(readers, now);
-            let known = |guid: &GUID| {
-                let since = self.readers.get(guid);
-                since.is_some_and(|since| now.saturating_duration_since(*since) >= MATCHED)
-            };
+            let readers = snapshot.readers(&topic).iter().map(|reader| reader.guid);
+            self.audience.meet(readers.clone(), now);
             let of_client = |guid: &GUID| match to.reader() {
                 Some(reader) => *guid == reader,
                 None => guid.prefix == to.client().prefix,
             };
-            let guids = readers.iter().map(|reader| reader.guid);
-            let found: Vec<GUID> = guids.filter(of_client).filter(known).collect();
+            let hears = |guid: &GUID| self.audience.hears(*guid, now);
+            let found: Vec<GUID> = readers.filter(of_client).filter(hears).collect();
             if !found.is_empty() {
                 return Some(found);
             }
@@ -397,21 +393,6 @@ impl Driver {
                 return None;
             }
             age = BUSY;
-        }
-    }
-
-    fn meet(&mut self, readers: &[Endpoint], now: Instant) {
-        if readers.len() == self.readers.len()
-            && readers
-                .iter()
-                .all(|peer| self.readers.contains_key(&peer.guid))
-        {
-            return;
-        }
-        self.readers
-            .retain(|guid, _| readers.iter().any(|peer| peer.guid == *guid));
-        for peer in readers {
-            self.readers.entry(peer.guid).or_insert(now);
         }
     }
 
@@ -437,7 +418,7 @@ impl Driver {
                 ) => count(&self.counters.undelivered),
             }
         }
-        self.opening.written(self.readers.keys().copied(), now);
+        self.opening.written(self.audience.readers(), now);
         None
     }
 }
@@ -448,5 +429,3 @@ fn count(counter: &AtomicU64) {
 
 /// How long a reply waits for its client's reader; rmw_fastrtps waits 0.1 s.
 const DELIVERY: Duration = Duration::from_secs(1);
-/// How long RustDDS takes at most from discovering a reader to writing to it.
-const MATCHED: Duration = Duration::from_millis(20);

@@ -341,13 +341,15 @@ async fn a_client_of_rclpy_sees_its_goals_end_in_every_way(distribution: Distrib
     let nested = client_of(&ours, &nested(&ours, distribution));
     let serving = serve_as(&ours, &fibonacci(&ours), options());
     let mut client = caller(&cell, distribution, &["--results", "--nested", NESTED]);
-    client.tell("send 5");
-    ends(&client, 0, "SUCCEEDED", &[1, 1, 2, 3, 5]).await;
-    said(&client, &json!({"state": 0, "status": "SUCCEEDED"})).await;
+    client.tell("send 55");
+    // Before the end: rclpy takes no notice of feedback for a goal once it has the result.
     until("all feedback is heard", || {
         of(&client.json_lines(), "feedback", 0).count() == 5
     })
     .await;
+    serving.end_a_goal();
+    ends(&client, 0, "SUCCEEDED", &[1, 1, 2, 3, 5]).await;
+    said(&client, &json!({"state": 0, "status": "SUCCEEDED"})).await;
     let lines = client.json_lines();
     for (count, heard) in of(&lines, "feedback", 0).enumerate() {
         assert_eq!(heard["sequence"], json!([1, 1, 2, 3, 5][..=count]));

@@ -1,6 +1,7 @@
 //! Our server, and clients of others.
 
 use std::collections::HashMap;
+use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_ros2::action::{
@@ -11,7 +12,7 @@ use bytes::Bytes;
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, Peer};
-use tokio::sync::watch;
+use tokio::sync::{Semaphore, watch};
 use tokio::task::JoinHandle;
 
 use crate::fibonacci::{self, ACTION, Ours, SOON, feedback, result, until};
@@ -19,6 +20,7 @@ use crate::fibonacci::{self, ACTION, Ours, SOON, feedback, result, until};
 /// A server at work, until dropped.
 pub(crate) struct Serving {
     counters: watch::Receiver<ServerCounters>,
+    ends: Arc<Semaphore>,
     task: JoinHandle<()>,
 }
 
@@ -38,13 +40,19 @@ impl Serving {
     pub(crate) fn counters(&self) -> ServerCounters {
         *self.counters.borrow()
     }
+
+    /// Ends a goal of an order of 50 to 99.
+    pub(crate) fn end_a_goal(&self) {
+        self.ends.add_permits(1);
+    }
 }
 
 pub(crate) fn options() -> ActionServerOptions {
     ActionServerOptions::new(Bytes::from(result(&[])))
 }
 
-/// What the peers do with goals, so does this.
+/// What the peers do with goals, so does this. One of an order of 50 and more it works on as on that of 50 less, but waits
+/// to be told before it ends.
 pub(crate) fn serve(ours: &Ours, options: ActionServerOptions) -> Serving {
     serve_as(ours, &fibonacci::action(), options)
 }
@@ -53,6 +61,8 @@ pub(crate) fn serve(ours: &Ours, options: ActionServerOptions) -> Serving {
 pub(crate) fn serve_as(ours: &Ours, action: &Action, options: ActionServerOptions) -> Serving {
     let mut server = ActionServer::open(&ours.domain, &ours.peers, action, options).unwrap();
     let (counters, heard) = watch::channel(server.counters());
+    let ends = Arc::new(Semaphore::new(0));
+    let told = Arc::clone(&ends);
     let task = tokio::spawn(async move {
         let mut orders = HashMap::new();
         let mut tick = tokio::time::interval(Duration::from_millis(20));
@@ -62,7 +72,7 @@ pub(crate) fn serve_as(ours: &Ours, action: &Action, options: ActionServerOption
                 event = server.recv() => match event {
                     ServerEvent::Goal(goal) => {
                         orders.insert(goal.id(), order(&goal));
-                        tokio::spawn(take(goal));
+                        tokio::spawn(take(goal, Arc::clone(&told)));
                     }
                     ServerEvent::Cancel(request) => match orders[&request.id()] % 2 {
                         0 => request.accept().unwrap(),
@@ -74,6 +84,7 @@ pub(crate) fn serve_as(ours: &Ours, action: &Action, options: ActionServerOption
     });
     Serving {
         counters: heard,
+        ends,
         task,
     }
 }
@@ -82,23 +93,27 @@ fn order(goal: &NewGoal) -> i32 {
     i32::from_le_bytes(goal.body()[4..8].try_into().unwrap())
 }
 
-async fn take(goal: NewGoal) {
+async fn take(goal: NewGoal, told: Arc<Semaphore>) {
     let order = order(&goal);
     if order == -1 {
         goal.reject();
         return;
     }
-    work(goal.accept().await.unwrap(), order).await;
+    work(goal.accept().await.unwrap(), order, &told).await;
 }
 
-async fn work(goal: ServerGoal, order: i32) {
+async fn work(goal: ServerGoal, order: i32, told: &Semaphore) {
     goal.execute().unwrap();
     if order == -2 {
         goal.abort(&result(&[])).unwrap();
         return;
     }
     let mut numbers: Vec<i32> = Vec::new();
-    let most = if order >= 100 { 3 } else { order };
+    let most = match order {
+        100.. => 3,
+        50.. => order - 50,
+        _ => order,
+    };
     for _ in 0..most {
         let next = numbers.iter().rev().take(2).sum::<i32>().max(1);
         numbers.push(next);
@@ -115,6 +130,9 @@ async fn work(goal: ServerGoal, order: i32) {
         // Or the server is no more.
         assert!(matches!(end, Ok(()) | Err(GoalError::Closed)), "{end:?}");
     } else {
+        if order >= 50 {
+            told.acquire().await.unwrap().forget();
+        }
         goal.succeed(&result(&numbers)).unwrap();
     }
 }
