@@ -16,8 +16,7 @@ use crate::service::{Audience, Opening};
 pub(super) struct FeedbackWriter {
     writer: Writer,
     audience: Audience,
-    /// Clients whose participant is yet to have a reader that is matched, and until when that is waited for.
-    expected: BTreeMap<GUID, Instant>,
+    expected: Expected,
     opening: Opening,
     /// Oldest first.
     waiting: VecDeque<Payload>,
@@ -30,7 +29,7 @@ impl FeedbackWriter {
         Self {
             writer,
             audience: Audience::default(),
-            expected: BTreeMap::new(),
+            expected: Expected::default(),
             opening: Opening::new(),
             waiting: VecDeque::new(),
             bytes: 0,
@@ -49,8 +48,7 @@ impl FeedbackWriter {
 
     /// A client whose goal is accepted hears its feedback from the first on, if its participant has a reader for it.
     pub(super) fn expect(&mut self, client: GUID, now: Instant) {
-        self.expected.retain(|_, until| now < *until);
-        self.expected.entry(client).or_insert(now + PATIENCE);
+        self.expected.add(client, now);
     }
 
     /// Writes a sample, or queues it. Returns how many older ones were dropped to make room.
@@ -92,16 +90,46 @@ impl FeedbackWriter {
     /// Whether those who are to hear what is written now do.
     fn is_heard(&mut self, now: Instant) -> bool {
         self.audience.listen(&self.writer, now);
-        let audience = &self.audience;
-        self.expected
-            .retain(|client, until| now < *until && !audience.hears_one_of(*client, now));
-        self.expected.is_empty() && self.opening.is_over(&self.writer, now)
+        let hears = |client| self.audience.hears_one_of(client, now);
+        self.expected.are_there(hears, now) && self.opening.is_over(&self.writer, now)
     }
 
     fn pop(&mut self) -> Option<Payload> {
         let sample = self.waiting.pop_front()?;
         self.bytes -= sample.len();
         Some(sample)
+    }
+}
+
+/// Clients whose participant is yet to have a reader that hears.
+#[derive(Debug, Default)]
+struct Expected {
+    /// And until when that is waited for.
+    clients: BTreeMap<GUID, Instant>,
+    /// Since when feedback waits for any of them.
+    held: Option<Instant>,
+}
+
+impl Expected {
+    fn add(&mut self, client: GUID, now: Instant) {
+        self.clients.retain(|_, until| now < *until);
+        self.clients.entry(client).or_insert(now + PATIENCE);
+    }
+
+    /// Whether none is waited for. Others that come do not prolong it: clients need not have a reader.
+    fn are_there(&mut self, hears: impl Fn(GUID) -> bool, now: Instant) -> bool {
+        self.clients
+            .retain(|client, until| now < *until && !hears(*client));
+        if self.clients.is_empty() {
+            self.held = None;
+            return true;
+        }
+        let held = *self.held.get_or_insert(now);
+        if now.saturating_duration_since(held) < PATIENCE {
+            return false;
+        }
+        *self = Self::default();
+        true
     }
 }
 
@@ -118,3 +146,41 @@ const PATIENCE: Duration = Duration::from_millis(250);
 /// What may wait, beside the send window of RustDDS.
 const ROOM: usize = 512;
 const ROOM_BYTES: usize = 16 * 1024 * 1024;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NOBODY: fn(GUID) -> bool = |_| false;
+
+    fn client(number: u8) -> GUID {
+        GUID::from_bytes([number; 16])
+    }
+
+    #[test]
+    fn feedback_waits_for_the_reader_of_a_client_but_not_for_ever() {
+        let start = Instant::now();
+        let mut expected = Expected::default();
+        assert!(expected.are_there(NOBODY, start));
+        expected.add(client(1), start);
+        expected.add(client(2), start);
+        assert!(!expected.are_there(NOBODY, start));
+        assert!(!expected.are_there(|one| one == client(1), start));
+        assert!(expected.are_there(|one| one == client(2), start));
+        expected.add(client(3), start);
+        assert!(!expected.are_there(NOBODY, start));
+        assert!(expected.are_there(NOBODY, start + PATIENCE));
+    }
+
+    #[test]
+    fn clients_that_keep_coming_without_a_reader_hold_up_nobody_for_ever() {
+        let start = Instant::now();
+        let mut expected = Expected::default();
+        let passed = (0..100_u8).filter(|number| {
+            let now = start + PATIENCE / 10 * u32::from(*number);
+            expected.add(client(*number), now);
+            expected.are_there(NOBODY, now)
+        });
+        assert_eq!(passed.count(), 9);
+    }
+}
