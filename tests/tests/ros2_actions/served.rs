@@ -51,8 +51,8 @@ pub(crate) fn options() -> ActionServerOptions {
     ActionServerOptions::new(Bytes::from(result(&[])))
 }
 
-/// What the peers do with goals, so does this. One of an order of 50 and more it works on as on that of 50 less, but waits
-/// to be told before it ends.
+/// What the peers do with goals, so does this. One of an order of 50 to 99 it works on as on that of 50 less, but waits to
+/// be told before it ends.
 pub(crate) fn serve(ours: &Ours, options: ActionServerOptions) -> Serving {
     serve_as(ours, &fibonacci::action(), options)
 }
