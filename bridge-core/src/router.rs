@@ -4,6 +4,7 @@ mod chunks;
 mod discovery;
 mod receive;
 mod reload;
+mod send;
 
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, HashMap, VecDeque};
@@ -20,13 +21,13 @@ use crate::fields;
 use crate::gate::{Gate, Passage, Waiting};
 use crate::hops::{Hop, Hops};
 use crate::loop_rule::{Side, may_cross};
-use crate::network::{chunk, data_set_header, encode, keep_alive, prepare_chunks};
+use crate::network::{data_set_header, encode, keep_alive, prepare_chunks};
 use crate::output::{Delivery, Heard, Kept, Notice, Output, PublisherKey};
 use crate::pace::Pace;
 use crate::plans::Plans;
 use crate::reader::{Held, Reader};
 use crate::settings::{Local, Now, Settings};
-use crate::topic::{Item, Role, Sending, Topic};
+use crate::topic::{Item, Role, Topic};
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Idle, MAX_KEPT, Message, Writer};
 use chunks::Chunks;
@@ -361,116 +362,9 @@ impl Router {
         [timer, pace, chunks, discovery].into_iter().flatten().min()
     }
 
-    /// The next thing to do, topic by topic in turn. `None`: nothing until the next `handle_*`.
-    pub fn poll_output(&mut self, now: Now) -> Option<Output> {
-        if let Some(told) = self.told.pop_front() {
-            return Some(told);
-        }
-        // One for one: among those that are ready it waits its turn again.
-        if !self.paced.is_empty() && self.pace.is_open(now.monotonic) {
-            self.ready.extend(self.paced.pop_front());
-        }
-        while let Some(topic) = self.ready.pop_front() {
-            if let Some(output) = self.take_turn(topic, now) {
-                return Some(output);
-            }
-        }
-        None
-    }
-
-    /// Takes one thing of a topic, and puts it back in line if it has more.
-    fn take_turn(&mut self, topic: TopicId, now: Now) -> Option<Output> {
-        let entry = self.topics.get_mut(&topic)?;
-        let item = if entry.sending.is_some() {
-            None
-        } else {
-            entry.queue.pop().or_else(|| {
-                let Role::Ours(writer) = &mut entry.role else {
-                    return None;
-                };
-                let again = writer.repeat(|| self.spare.pop().unwrap_or_default())?;
-                entry.counters.repeated += 1;
-                Some(Item::Message(again))
-            })
-        };
-        let output = match item {
-            Some(Item::Message(Message::Datagram(mut datagram))) => {
-                entry.counters.sent += 1;
-                datagram.stamp(now.utc);
-                Some(Output::Datagram {
-                    topic,
-                    bytes: datagram.bytes,
-                })
-            }
-            Some(Item::Delivery(delivery)) => {
-                entry.counters.delivered += 1;
-                Some(Output::Delivery(delivery))
-            }
-            Some(Item::Message(Message::Large(message))) => {
-                entry.sending = Some(Sending { message, offset: 0 });
-                None
-            }
-            None => None,
-        };
-        if entry.sending.is_some() && output.is_none() {
-            return self.send_chunk(topic, now);
-        }
-        entry.ready = entry.has_more();
-        if entry.ready {
-            self.ready.push_back(topic);
-        }
-        output
-    }
-
-    /// The next chunk of the topic's large message, if the pace lets it go.
-    fn send_chunk(&mut self, topic: TopicId, now: Now) -> Option<Output> {
-        if !self.pace.is_open(now.monotonic) {
-            self.paced.push_back(topic);
-            return None;
-        }
-        let (max_datagram, _) = self.sizes();
-        let mut bytes = self.buffer();
-        let entry = self.topics.get_mut(&topic)?;
-        let Sending { message, offset } = entry.sending.take()?;
-        let written = chunk(&mut bytes, topic, (&message, offset), max_datagram, now.utc);
-        if let Ok(offset) = written {
-            if offset < message.data_set_message().len() {
-                entry.sending = Some(Sending { message, offset });
-            } else {
-                entry.counters.sent += 1;
-            }
-        }
-        if let Role::Ours(writer) = &mut entry.role {
-            writer.spoke(now.monotonic);
-        }
-        entry.ready = entry.has_more();
-        if entry.ready {
-            self.ready.push_back(topic);
-        }
-        match written {
-            Ok(_) => {
-                self.pace.spend(bytes.len(), now.monotonic);
-                Some(Output::Datagram { topic, bytes })
-            }
-            Err(error) => {
-                self.count(About::topic(topic), Reason::TooBig, 1, || error.to_string());
-                None
-            }
-        }
-    }
-
     /// The local side took a delivery: its time in this program ends at `now`.
     pub fn published(&mut self, arrived: Timestamp, now: Now) {
         self.hops.record(Hop::In, arrived, now.utc);
-    }
-
-    /// A datagram could not be sent: counts it under `reason`, with what was said. What is left of a large message is
-    /// not sent either.
-    pub fn not_sent(&mut self, topic: TopicId, reason: Reason, detail: &str) {
-        if let Some(entry) = self.topics.get_mut(&topic) {
-            entry.sending = None;
-        }
-        self.count(About::topic(topic), reason, 1, || detail.to_owned());
     }
 
     /// The local side did not take a delivery, given by its topic and instance: its repetition is welcome.
