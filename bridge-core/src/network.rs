@@ -1,10 +1,10 @@
-//! The NetworkMessages a bridge sends: one DataSetMessage each, since common subscribers handle only the first of
-//! several.
+//! The NetworkMessages a bridge sends: one DataSetMessage each unless told otherwise, since common subscribers handle
+//! only the first of several.
 
 use mappings::{SpaceId, TopicId};
 use uadp::{
-    ChunkBudget, ChunkError, Chunks, DataSetHeader, Extras, GroupHeader, NetworkHeader,
-    NetworkMessage, NetworkMessageEncoder, NetworkMessageType, PublisherId, SecurityHeader,
+    ChunkBudget, ChunkError, Chunks, DataSetHeader, EncodeError, Extras, GroupHeader,
+    NetworkHeader, NetworkMessageEncoder, NetworkMessageType, PublisherId, SecurityHeader,
     Timestamp, Whole,
 };
 
@@ -20,29 +20,45 @@ pub(crate) fn encode(
     utc: Timestamp,
     sample: &fields::Payload<'_>,
 ) -> Result<(), (Reason, String)> {
-    let too_big = |error: uadp::EncodeError| (Reason::TooBig, error.to_string());
+    let too_big = |error: EncodeError| (Reason::TooBig, error.to_string());
     let (space, namespace, identifier) = topic.triple();
     let network = network_header(space, namespace, utc);
     let mut message = NetworkMessageEncoder::new(&mut encoded.bytes, &network, Some(&[identifier]))
         .map_err(too_big)?;
     let timestamp_at = message.timestamp_offset();
+    let payload_at = message.payload_offset();
     let mut frame = message.key_frame(header).map_err(too_big)?;
     let sequence_at = frame.sequence_offset();
     fields::read(sample, namespace, &mut frame)?;
     frame.finish().map_err(too_big)?;
     message.finish().map_err(too_big)?;
     encoded.timestamp_at = timestamp_at.unwrap_or(usize::MAX);
+    encoded.payload_at = payload_at;
     encoded.sequence_at = sequence_at.unwrap_or(usize::MAX);
     Ok(())
 }
 
-/// Finds the DataSetMessage in a NetworkMessage that is too big for a datagram, and holds it to `max_message` bytes.
-pub(crate) fn prepare_chunks(encoded: &mut Encoded, max_message: u32) -> Result<(), String> {
-    let message = NetworkMessage::decode(&encoded.bytes).map_err(|error| error.to_string())?;
-    let payload_at = message.payload_offset();
-    let size = message.payload().len();
+/// Writes one NetworkMessage with the DataSetMessages of several, all of one WriterGroup.
+pub(crate) fn join<'a>(
+    bytes: &mut Vec<u8>,
+    utc: Timestamp,
+    messages: impl Iterator<Item = (TopicId, &'a Encoded)> + Clone,
+) -> Result<(), EncodeError> {
+    let triples = messages.clone().map(|(topic, _)| topic.triple());
+    let (space, namespace, _) = triples.clone().next().unwrap_or_default();
+    let writer_ids: Vec<u16> = triples.map(|(_, _, identifier)| identifier).collect();
+    let network = network_header(space, namespace, utc);
+    let mut message = NetworkMessageEncoder::new(bytes, &network, Some(&writer_ids))?;
+    for (_, sample) in messages {
+        message.encoded(sample.data_set_message())?;
+    }
+    message.finish()
+}
+
+/// Holds a DataSetMessage that is too big for a datagram to `max_message` bytes.
+pub(crate) fn check_size(encoded: &Encoded, max_message: u32) -> Result<(), String> {
+    let size = encoded.data_set_message().len();
     if u32::try_from(size).is_ok_and(|size| size <= max_message) {
-        encoded.payload_at = payload_at;
         return Ok(());
     }
     Err(format!(
@@ -129,6 +145,7 @@ pub(crate) fn keep_alive(
     let network = network_header(space, namespace, utc);
     let mut message = NetworkMessageEncoder::new(&mut bytes, &network, Some(&[identifier])).ok()?;
     let timestamp_at = message.timestamp_offset().unwrap_or(usize::MAX);
+    let payload_at = message.payload_offset();
     let header = DataSetHeader {
         sequence_number: Some(expected_sequence),
         ..DataSetHeader::default()
@@ -138,7 +155,7 @@ pub(crate) fn keep_alive(
     Some(Encoded {
         bytes,
         timestamp_at,
-        payload_at: 0,
+        payload_at,
         sequence_at: usize::MAX,
     })
 }

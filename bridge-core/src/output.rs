@@ -17,6 +17,9 @@ pub enum Output {
     Datagram {
         /// The topic it carries.
         topic: TopicId,
+        /// The topics of its other DataSetMessages, in their order, where the mapping lets several share a datagram. One
+        /// that has several of them is here as often.
+        with: Vec<TopicId>,
         /// The whole UDP payload.
         bytes: Vec<u8>,
     },

@@ -45,6 +45,16 @@ impl<T> Queue<T> {
         Some(item)
     }
 
+    /// What [`pop`](Self::pop) gives next.
+    pub(crate) fn front(&self) -> Option<&T> {
+        self.items.front().map(|(item, _)| item)
+    }
+
+    /// Whether the next push makes an older sample give way, were it a small one.
+    pub(crate) fn is_full(&self) -> bool {
+        self.items.len() >= self.depth
+    }
+
     pub(crate) fn is_empty(&self) -> bool {
         self.items.is_empty()
     }

@@ -1,5 +1,6 @@
 //! The Router: verdicts on samples, queues per topic, repetitions and silences.
 
+mod batch;
 mod chunks;
 mod discovery;
 mod receive;
@@ -21,7 +22,7 @@ use crate::fields;
 use crate::gate::{Gate, Passage, Waiting};
 use crate::hops::{Hop, Hops};
 use crate::loop_rule::{Side, may_cross};
-use crate::network::{data_set_header, encode, keep_alive, prepare_chunks};
+use crate::network::{check_size, data_set_header, encode, keep_alive};
 use crate::output::{Delivery, Heard, Kept, Notice, Output, PublisherKey};
 use crate::pace::Pace;
 use crate::plans::Plans;
@@ -196,8 +197,7 @@ impl Router {
         let mut written = encode(&mut encoded, topic, &header, now.utc, &sample);
         let large = encoded.bytes.len() > usize::from(max_datagram);
         if written.is_ok() && large {
-            written = prepare_chunks(&mut encoded, max_message)
-                .map_err(|detail| (Reason::TooBig, detail));
+            written = check_size(&encoded, max_message).map_err(|detail| (Reason::TooBig, detail));
         }
         if let Err((reason, detail)) = written {
             self.recycle(encoded.bytes);

@@ -97,6 +97,44 @@ impl Topic {
         }
     }
 
+    /// The next thing of the queue, or of the round of repetitions, which are written into `spare` buffers.
+    pub(crate) fn take(&mut self, spare: &mut Vec<Vec<u8>>) -> Option<Item> {
+        if let Some(item) = self.queue.pop() {
+            return Some(item);
+        }
+        let Role::Ours(writer) = &mut self.role else {
+            return None;
+        };
+        let again = writer.repeat(|| spare.pop().unwrap_or_default())?;
+        self.counters.repeated += 1;
+        Some(Item::Message(again))
+    }
+
+    /// As [`take`](Self::take), if that is a datagram whose DataSetMessage has so many bytes at most.
+    pub(crate) fn take_within(&mut self, most: usize, spare: &mut Vec<Vec<u8>>) -> Option<Encoded> {
+        self.next_size().filter(|size| *size <= most)?;
+        match self.take(spare) {
+            Some(Item::Message(Message::Datagram(datagram))) => Some(datagram),
+            Some(_) | None => None,
+        }
+    }
+
+    /// Bytes of the DataSetMessage of what is taken next, if that is a datagram.
+    fn next_size(&self) -> Option<usize> {
+        if self.sending.is_some() {
+            return None;
+        }
+        let next = match (self.queue.front(), &self.role) {
+            (Some(Item::Message(message)), _) => message,
+            (None, Role::Ours(writer)) => writer.next_repeated()?,
+            (Some(Item::Delivery(_)), _) | (None, Role::Theirs(_)) => return None,
+        };
+        match next {
+            Message::Datagram(datagram) => Some(datagram.data_set_message().len()),
+            Message::Large(_) => None,
+        }
+    }
+
     /// Whether there is something to poll.
     pub(crate) fn has_more(&self) -> bool {
         !self.queue.is_empty()

@@ -242,6 +242,11 @@ impl Writer {
         self.next < self.kept.len()
     }
 
+    /// What the round repeats next, unless it is large and still on its way.
+    pub(crate) fn next_repeated(&self) -> Option<&Message> {
+        self.kept.get(self.next).map(|kept| &kept.message)
+    }
+
     /// The next sample of the round with a fresh sequence number. `buffer` gives one to write a datagram into.
     pub(crate) fn repeat(&mut self, buffer: impl FnOnce() -> Vec<u8>) -> Option<Message> {
         let sequence = self.sequence;

@@ -78,7 +78,7 @@ impl Pair {
     fn burst(&mut self) -> Vec<(TopicId, Vec<u8>)> {
         std::iter::from_fn(|| self.sender.poll_output(self.now))
             .filter_map(|output| match output {
-                Output::Datagram { topic, bytes } => Some((topic, bytes)),
+                Output::Datagram { topic, bytes, .. } => Some((topic, bytes)),
                 _ => None,
             })
             .collect()

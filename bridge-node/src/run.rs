@@ -129,12 +129,12 @@ impl<P: Port> Shell<P> {
         true
     }
 
-    /// As [`heard_all`](Self::heard_all), of what the port reports.
+    /// As [`heard_all`](Self::heard_all), of what the port reports. Where samples may share a datagram, those that wait
+    /// here are taken before any is sent.
     async fn port_events(&mut self, first: PortEvent) -> Result<bool, Failure> {
         let mut event = first;
         for _ in 0..TAKEN_AT_ONCE {
-            self.port_event(event)?;
-            if self.drain() {
+            if self.port_event_and_drain(event)? {
                 return Ok(true);
             }
             let next = poll_fn(|cx| {
@@ -147,8 +147,22 @@ impl<P: Port> Shell<P> {
             }
         }
         // Likewise.
-        self.port_event(event)?;
+        self.port_event_and_drain(event)?;
         Ok(true)
+    }
+
+    /// Says whether more than was carried out may wait; samples that are to share a datagram are left out of that.
+    fn port_event_and_drain(&mut self, event: PortEvent) -> Result<bool, Failure> {
+        if self.router.mapping().pubsub().messages_per_datagram == 1 {
+            self.port_event(event)?;
+            return Ok(self.drain());
+        }
+        // None is lost for having waited, and nothing overtakes what waits.
+        let joins =
+            matches!(&event, PortEvent::Sample { topic, .. } if !self.router.is_full(*topic));
+        let more = !joins && self.drain();
+        self.port_event(event)?;
+        Ok(more)
     }
 
     fn status(&self) -> Status {
@@ -257,10 +271,12 @@ impl<P: Port> Shell<P> {
                 return false;
             };
             match output {
-                Output::Datagram { topic, bytes } => {
+                Output::Datagram { topic, with, bytes } => {
                     if let Err(error) = self.send(&bytes) {
-                        self.router
-                            .not_sent(topic, not_sent(error), &error.to_string());
+                        let (reason, detail) = (not_sent(error), error.to_string());
+                        for topic in std::iter::once(topic).chain(with) {
+                            self.router.not_sent(topic, reason, &detail);
+                        }
                     }
                     self.router.recycle(bytes);
                 }

@@ -81,6 +81,11 @@ document! {
         /// MiB of the largest message sent or put together from chunks, 1 to 1024; default 64.
         #[schemars(range(min = 1, max = 1024))]
         max_message: u16,
+        /// The most DataSetMessages in one datagram, 1 (the default) to 255. Of what waits to be sent, as many values of one
+        /// namespace then share a datagram of at most 1472 bytes, which spares time where very many change. Leave it at 1
+        /// with subscribers that read only the first, as open62541 does.
+        #[schemars(range(min = 1, max = 255))]
+        messages_per_datagram: u16,
     }
 
     /// The OPC UA server of the cell.

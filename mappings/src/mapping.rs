@@ -284,6 +284,9 @@ pub struct PubSub {
     pub max_datagram: u16,
     /// Bytes of the largest DataSetMessage that is sent, or put together from chunks.
     pub max_message: u32,
+    /// The most DataSetMessages of one WriterGroup that share a NetworkMessage, as far as they are waiting to be sent and fit
+    /// [`max_datagram`](Self::max_datagram) and an Ethernet frame; 1 is each alone.
+    pub messages_per_datagram: u8,
 }
 
 impl PubSub {
@@ -329,6 +332,7 @@ impl Default for PubSub {
             metadata_period: Duration::from_secs(30),
             max_datagram: Self::LARGEST_DATAGRAM,
             max_message: 64 << 20,
+            messages_per_datagram: 1,
         }
     }
 }

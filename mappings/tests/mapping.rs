@@ -730,18 +730,21 @@ fn the_sizes_of_datagrams_and_messages_are_held_to_what_udp_and_chunks_carry() {
     let checked = |text: &str| Mapping::from_yaml(text, "cell.yaml").mapping;
     let sizes = |text: &str| {
         let pubsub = checked(text).unwrap().pubsub().clone();
-        (pubsub.max_datagram, pubsub.max_message)
+        let together = pubsub.messages_per_datagram;
+        (pubsub.max_datagram, pubsub.max_message, together)
     };
-    assert_eq!(sizes("pubsub: {}\n"), (65_507, 64 << 20));
+    assert_eq!(sizes("pubsub: {}\n"), (65_507, 64 << 20, 1));
     assert_eq!(
-        sizes("pubsub: {max_datagram: 1472, max_message: 8}\n"),
-        (1472, 8 << 20)
+        sizes("pubsub: {max_datagram: 1472, max_message: 8, messages_per_datagram: 255}\n"),
+        (1472, 8 << 20, 255)
     );
     for text in [
         "pubsub: {max_datagram: 511}\n",
         "pubsub: {max_datagram: 65508}\n",
         "pubsub: {max_message: 0}\n",
         "pubsub: {max_message: 1025}\n",
+        "pubsub: {messages_per_datagram: 0}\n",
+        "pubsub: {messages_per_datagram: 256}\n",
     ] {
         assert!(checked(text).is_none(), "{text}");
     }

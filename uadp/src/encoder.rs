@@ -248,6 +248,17 @@ impl<'b> NetworkMessageEncoder<'b> {
         self.progress.message_finished(self.buf)
     }
 
+    /// Appends a DataSetMessage that was encoded before, as another NetworkMessage has it.
+    ///
+    /// # Errors
+    /// [`EncodeError::MessageCount`] when all announced messages are written, [`EncodeError::TooBig`] when it is one of
+    /// several and longer than 65535 bytes.
+    pub fn encoded(&mut self, message: &[u8]) -> Result<(), EncodeError> {
+        self.begin_message()?;
+        self.buf.extend_from_slice(message);
+        self.progress.message_finished(self.buf)
+    }
+
     /// A key frame without FieldCount.
     fn raw_or_bare(
         &mut self,

@@ -240,6 +240,44 @@ fn the_number_of_messages_has_to_be_that_of_the_writer_ids() {
 }
 
 #[test]
+fn messages_encoded_before_are_put_together_as_if_written_at_once() {
+    let header = NetworkHeader::default();
+    let numbered = |number| DataSetHeader {
+        sequence_number: Some(number),
+        ..DataSetHeader::default()
+    };
+    let write = |message: &mut NetworkMessageEncoder<'_>, number: u16| {
+        let mut frame = message.key_frame(&numbered(number))?;
+        frame.scalar(Scalar::UInt16(number))?;
+        frame.finish()
+    };
+    let mut at_once = Vec::new();
+    let mut message = NetworkMessageEncoder::new(&mut at_once, &header, Some(&[7, 8])).unwrap();
+    write(&mut message, 1).unwrap();
+    write(&mut message, 2).unwrap();
+    message.finish().unwrap();
+
+    let alone = [1, 2].map(|number| {
+        let mut out = Vec::new();
+        let mut message = NetworkMessageEncoder::new(&mut out, &header, Some(&[7])).unwrap();
+        let start = message.payload_offset();
+        write(&mut message, number).unwrap();
+        message.finish().unwrap();
+        out.split_off(start)
+    });
+    let mut together = Vec::new();
+    let mut message = NetworkMessageEncoder::new(&mut together, &header, Some(&[7, 8])).unwrap();
+    for one in &alone {
+        message.encoded(one).unwrap();
+    }
+    let third = message.encoded(&alone[0]);
+    message.finish().unwrap();
+    assert_eq!(together, at_once);
+    let (announced, written) = (2, 3);
+    assert_eq!(third, Err(EncodeError::MessageCount { announced, written }));
+}
+
+#[test]
 fn a_key_frame_left_open_is_not_a_message() {
     let mut out = Vec::new();
     let mut message =

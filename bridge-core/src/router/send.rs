@@ -28,48 +28,44 @@ impl Router {
         None
     }
 
+    /// Whether so many samples of the topic wait to be polled that the next one makes the oldest give way.
+    #[must_use]
+    pub fn is_full(&self, topic: TopicId) -> bool {
+        let entry = self.topics.get(&topic);
+        entry.is_some_and(|entry| entry.queue.is_full())
+    }
+
     /// Takes one thing of a topic, and puts it back in line if it has more.
     fn take_turn(&mut self, topic: TopicId, now: Now) -> Option<Output> {
         let entry = self.topics.get_mut(&topic)?;
-        let item = if entry.sending.is_some() {
-            None
-        } else {
-            entry.queue.pop().or_else(|| {
-                let Role::Ours(writer) = &mut entry.role else {
-                    return None;
-                };
-                let again = writer.repeat(|| self.spare.pop().unwrap_or_default())?;
-                entry.counters.repeated += 1;
-                Some(Item::Message(again))
-            })
+        let item = match entry.sending {
+            Some(_) => None,
+            None => entry.take(&mut self.spare),
         };
-        let output = match item {
-            Some(Item::Message(Message::Datagram(mut datagram))) => {
+        let (datagram, delivery) = match item {
+            Some(Item::Message(Message::Datagram(datagram))) => {
                 entry.counters.sent += 1;
-                datagram.stamp(now.utc);
-                Some(Output::Datagram {
-                    topic,
-                    bytes: datagram.bytes,
-                })
+                (Some(datagram), None)
             }
             Some(Item::Delivery(delivery)) => {
                 entry.counters.delivered += 1;
-                Some(Output::Delivery(delivery))
+                (None, Some(delivery))
             }
             Some(Item::Message(Message::Large(message))) => {
                 entry.sending = Some(Sending { message, offset: 0 });
-                None
+                return self.send_chunk(topic, now);
             }
-            None => None,
+            None if entry.sending.is_some() => return self.send_chunk(topic, now),
+            None => (None, None),
         };
-        if entry.sending.is_some() && output.is_none() {
-            return self.send_chunk(topic, now);
-        }
         entry.ready = entry.has_more();
         if entry.ready {
             self.ready.push_back(topic);
         }
-        output
+        match datagram {
+            Some(datagram) => self.datagram(topic, datagram, now),
+            None => delivery.map(Output::Delivery),
+        }
     }
 
     /// The next chunk of the topic's large message, if the pace lets it go.
@@ -100,7 +96,11 @@ impl Router {
         match written {
             Ok(_) => {
                 self.pace.spend(bytes.len(), now.monotonic);
-                Some(Output::Datagram { topic, bytes })
+                Some(Output::Datagram {
+                    topic,
+                    with: Vec::new(),
+                    bytes,
+                })
             }
             Err(error) => {
                 self.count(About::topic(topic), Reason::TooBig, 1, || error.to_string());
@@ -109,8 +109,8 @@ impl Router {
         }
     }
 
-    /// A datagram could not be sent: counts it under `reason`, with what was said. What is left of a large message is
-    /// not sent either.
+    /// A datagram could not be sent: counts it under `reason`, with what was said, for one of its topics. What is left of
+    /// a large message is not sent either.
     pub fn not_sent(&mut self, topic: TopicId, reason: Reason, detail: &str) {
         if let Some(entry) = self.topics.get_mut(&topic) {
             entry.sending = None;

@@ -45,6 +45,7 @@ pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -
     let largest = PubSub::SMALLEST_DATAGRAM..=PubSub::LARGEST_DATAGRAM;
     let max_datagram = within(&entry.max_datagram, largest, "bytes", findings);
     let max_message = within(&entry.max_message, 1..=1024, "MiB", findings);
+    let together = within(&entry.messages_per_datagram, 1..=255, "messages", findings);
     let pubsub = PubSub {
         address: address.unwrap_or(default.address),
         interface,
@@ -57,6 +58,9 @@ pub(super) fn pubsub(entry: Option<&At<PubSubEntry>>, findings: &mut Findings) -
         max_datagram: max_datagram.unwrap_or(default.max_datagram),
         max_message: max_message
             .map_or(default.max_message, |mebibytes| u32::from(mebibytes) << 20),
+        messages_per_datagram: together
+            .and_then(|count| u8::try_from(count).ok())
+            .unwrap_or(default.messages_per_datagram),
     };
     timing(entry, &pubsub, findings);
     pubsub

@@ -8,7 +8,7 @@ use system_tests::{
     Cell, GROUP, METRICS_ROS2, UaSide, all_overflowed, drops, eventually, group_member, metrics,
     number, overflowed, per_message, processor_time,
 };
-use uadp::Scalar;
+use uadp::{NetworkMessage, Scalar};
 
 use crate::ends::{Meter, Pace, Pacer, Report, START};
 use crate::stamp::{Stamp, now};
@@ -22,7 +22,10 @@ pub(crate) fn measure(cell: &Cell, seconds: u64) {
     );
     println!("|---|---|---|---|---|---|---|---|---|---|");
     to_dds(cell, seconds);
-    to_uadp(cell, seconds);
+    to_uadp(cell, "DDS -> UADP", "", seconds);
+    let shared = format!("pubsub: {{messages_per_datagram: {SHARED}}}\n");
+    let way = format!("DDS -> UADP, {SHARED} messages a datagram at most");
+    to_uadp(cell, &way, &shared, seconds);
 }
 
 fn to_dds(cell: &Cell, seconds: u64) {
@@ -75,8 +78,8 @@ fn to_dds(cell: &Cell, seconds: u64) {
     );
 }
 
-fn to_uadp(cell: &Cell, seconds: u64) {
-    let mapping = cell.file("to-uadp.yaml", &mapping(2));
+fn to_uadp(cell: &Cell, way: &str, pubsub: &str, seconds: u64) {
+    let mapping = cell.file("to-uadp.yaml", &format!("{pubsub}{}", mapping(2)));
     let listener = group_member(GROUP);
     listener.set_read_timeout(Some(SILENCE)).unwrap();
     let bridge = cell.bridge_ros2(&[&mapping.to_string_lossy()]);
@@ -111,7 +114,7 @@ fn to_uadp(cell: &Cell, seconds: u64) {
         let mut last = now();
         while heard.report.distinct < sent && (!sender.is_finished() || now() - last < SILENCE) {
             if let Ok(length) = listener.recv(&mut buffer)
-                && heard.add(&buffer[..length]).is_some()
+                && !heard.add(&buffer[..length]).is_empty()
             {
                 last = now();
             }
@@ -121,7 +124,7 @@ fn to_uadp(cell: &Cell, seconds: u64) {
     let used = processor_time(bridge.id()) - before;
     let dropped = Dropped::so_far(full()).since(&dropped);
     row(
-        "DDS -> UADP",
+        way,
         Ran {
             sent,
             report: heard.report,
@@ -197,16 +200,27 @@ struct Heard {
 }
 
 impl Heard {
-    /// The topic, when the datagram ends with a text that was not heard before.
-    fn add(&mut self, datagram: &[u8]) -> Option<usize> {
-        let stamp = Stamp::of(datagram)?;
-        if !self.seen.insert((stamp.topic, stamp.number)) {
-            self.report.repeated += 1;
-            return None;
+    /// The topics of the datagram's texts that were not heard before.
+    fn add(&mut self, datagram: &[u8]) -> Vec<usize> {
+        let mut topics = Vec::new();
+        let Ok(message) = NetworkMessage::decode(datagram) else {
+            return topics;
+        };
+        let now = now();
+        for message in message.messages().flatten() {
+            // A message ends with its last field.
+            let Some(stamp) = Stamp::of(message.payload()) else {
+                continue;
+            };
+            if !self.seen.insert((stamp.topic, stamp.number)) {
+                self.report.repeated += 1;
+                continue;
+            }
+            self.report.distinct += 1;
+            self.report.times.add(now.saturating_sub(stamp.sent));
+            topics.push(stamp.topic);
         }
-        self.report.distinct += 1;
-        self.report.times.add(now().saturating_sub(stamp.sent));
-        Some(stamp.topic)
+        topics
     }
 }
 
@@ -233,6 +247,8 @@ fn id(topic: usize) -> u16 {
 pub(crate) const TOPICS: usize = 50;
 pub(crate) const FIRST: usize = 10;
 const SIZE: usize = 64;
+/// DataSetMessages of one datagram, where they share one; some ten of these texts fit.
+const SHARED: u8 = 32;
 /// What was sent in a second is there after this long.
 const SETTLES: Duration = Duration::from_secs(2);
 /// Nothing more comes after this long without a new text.

@@ -1,0 +1,171 @@
+//! Samples of many topics in shared datagrams, as other makers read them and as they come out of the other bridge.
+
+use std::collections::{BTreeMap, HashSet};
+use std::fmt::Write as _;
+use std::time::Duration;
+
+use serde_json::Value;
+use system_tests::{Capture, Cell, Child, Peer, UadpSocket, eventually};
+use uadp::NetworkMessage;
+
+const SOON: Duration = Duration::from_secs(30);
+const FIRST: u64 = 10;
+const TOPICS: u64 = 20;
+/// What each topic says, every 10 ms.
+const TICKS: u64 = 50;
+
+/// Events of ROS 2, of which none may give way.
+fn mapping(cell: &Cell) -> String {
+    let mut text = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:plant:line}\n\
+                    pubsub: {messages_per_datagram: 32}\nvariables:\n"
+        .to_owned();
+    for id in FIRST..FIRST + TOPICS {
+        writeln!(
+            text,
+            "  - {{node: ns=2;i={id}, name: v{id}, type: String, origin: 2, queue: {{drop_oldest: 1000}}}}"
+        )
+        .unwrap();
+    }
+    let path = cell.file("sharing.yaml", &text);
+    path.to_string_lossy().into_owned()
+}
+
+/// Sends stamped texts on all topics at once; which number was the first.
+fn send(pacer: &mut Child, ticks: u64) -> u64 {
+    let answer = pacer.ask(&format!("{ticks} 40 10000000 0 0"), SOON);
+    assert_eq!(answer["refused"], 0);
+    answer["first"].as_u64().unwrap()
+}
+
+fn pacer(cell: &Cell) -> Child {
+    let (topics, first) = (TOPICS.to_string(), FIRST.to_string());
+    cell.cyclone_c(&[
+        "pace", "/ua_2_2_", "--topics", &topics, "--first", &first, "--depth", "1000",
+    ])
+    .ready(SOON)
+}
+
+/// The number of a stamped text: the 12 digits behind the 8 of its topic.
+fn number(text: &str) -> Option<u64> {
+    text.get(text.len().checked_sub(28)?..text.len() - 16)?
+        .parse()
+        .ok()
+}
+
+/// What asyncua heard of each topic so far: writer, and numbers in their order.
+fn heard(listener: &Child) -> BTreeMap<u64, Vec<u64>> {
+    let mut heard: BTreeMap<u64, Vec<u64>> = BTreeMap::new();
+    for line in listener.json_lines() {
+        if line["kind"] == "key_frame"
+            && let (Some(writer), Some(number)) = (
+                line["writer"].as_u64(),
+                line["fields"][0]["value"].as_str().and_then(number),
+            )
+        {
+            heard.entry(writer).or_default().push(number);
+        }
+    }
+    heard
+}
+
+#[test]
+fn what_shares_datagrams_is_read_by_asyncua_and_shown_by_wireshark() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::CycloneC, Peer::Tshark]) else {
+        return;
+    };
+    let mapping = mapping(&cell);
+    let _bridge = cell.bridge_ros2(&[&mapping]);
+    let listener = cell.uadp_listener();
+    let group = UadpSocket::join();
+    let mut pacer = pacer(&cell);
+    let all = usize::try_from(TOPICS).unwrap();
+    eventually("all topics cross", SOON, || {
+        send(&mut pacer, 10);
+        (heard(&listener).len() == all).then_some(())
+    });
+
+    group.drain();
+    let first = send(&mut pacer, TICKS);
+    let numbers: Vec<u64> = (first..first + TICKS).collect();
+    let expected: BTreeMap<u64, Vec<u64>> = (FIRST..FIRST + TOPICS)
+        .map(|writer| (writer, numbers.clone()))
+        .collect();
+    let since_first = || {
+        let mut heard = heard(&listener);
+        for numbers in heard.values_mut() {
+            numbers.retain(|number| *number >= first);
+        }
+        heard
+    };
+    eventually("asyncua hears each sample", SOON, || {
+        let count: usize = since_first().values().map(Vec::len).sum();
+        (count >= numbers.len() * all).then_some(())
+    });
+    assert_eq!(since_first(), expected);
+
+    let datagrams = waiting(&group);
+    let mut shared = datagrams.iter().filter(|datagram| ids(datagram).len() > 1);
+    let one = shared.next().expect("no datagram was shared");
+    let shown = cell.dissect(&Capture::of([&one[..]]), &[]).remove(0);
+    assert!(!shown.has("uadp.malformed"), "{:?}", shown.expert_infos());
+    let topics: Vec<String> = ids(one).iter().map(|id| format!("ua_2_2_{id}")).collect();
+    assert_eq!(shown.all("uadp.topic"), topics);
+    assert_eq!(shown.all("uadp.field.string").len(), topics.len());
+    assert!(datagrams.iter().all(|datagram| datagram.len() <= 1472));
+}
+
+/// The datagrams that have come.
+fn waiting(group: &UadpSocket) -> Vec<Vec<u8>> {
+    std::iter::from_fn(|| group.receive(Duration::from_millis(1))).collect()
+}
+
+fn ids(datagram: &[u8]) -> Vec<u16> {
+    let message = NetworkMessage::decode(datagram).unwrap();
+    message
+        .messages()
+        .map(|message| message.unwrap().writer_id.unwrap())
+        .collect()
+}
+
+#[test]
+fn what_shares_datagrams_comes_out_of_the_other_bridge_in_order() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::CycloneC]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let mapping = mapping(&cell);
+    let _bridges = (cell.bridge_ros1(&[&mapping]), cell.bridge_ros2(&[&mapping]));
+    let topics = [FIRST, FIRST + TOPICS / 2, FIRST + TOPICS - 1];
+    let subscribers = topics.map(|id| {
+        let (topic, node) = (format!("/ua_2_2_{id}"), format!("hears_{id}"));
+        cell.rospy("ros1_sub.py", &[&topic, "std_msgs/String", "--node", &node])
+    });
+    let mut pacer = pacer(&cell);
+    let numbers = |subscriber: &Child| -> Vec<u64> {
+        let values = subscriber.values();
+        let text = |value: &Value| number(value["data"].as_str()?);
+        values.iter().filter_map(text).collect()
+    };
+    eventually("all subscribers hear something", SOON, || {
+        send(&mut pacer, 10);
+        let silent = subscribers.iter().find(|one| numbers(one).is_empty());
+        silent.is_none().then_some(())
+    });
+    let group = UadpSocket::join();
+    let first = send(&mut pacer, TICKS);
+    for subscriber in &subscribers {
+        let since_first = || {
+            let mut numbers = numbers(subscriber);
+            numbers.retain(|number| *number >= first);
+            numbers
+        };
+        eventually("the last sample", SOON, || {
+            since_first().contains(&(first + TICKS - 1)).then_some(())
+        });
+        let expected: Vec<u64> = (first..first + TICKS).collect();
+        assert_eq!(since_first(), expected);
+    }
+    let datagrams = waiting(&group);
+    let shared: HashSet<usize> = datagrams.iter().map(|one| ids(one).len()).collect();
+    assert!(shared.iter().any(|count| *count > 1), "{shared:?}");
+}
