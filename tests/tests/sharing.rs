@@ -119,12 +119,11 @@ fn waiting(group: &UadpSocket) -> Vec<Vec<u8>> {
     std::iter::from_fn(|| group.receive(Duration::from_millis(1))).collect()
 }
 
+/// The DataSetWriterIds of its messages, of which an announcement has none.
 fn ids(datagram: &[u8]) -> Vec<u16> {
     let message = NetworkMessage::decode(datagram).unwrap();
-    message
-        .messages()
-        .map(|message| message.unwrap().writer_id.unwrap())
-        .collect()
+    let messages = message.messages().flatten();
+    messages.filter_map(|message| message.writer_id).collect()
 }
 
 #[test]

@@ -11,9 +11,23 @@ use system_tests::{
     BareNode, Cell, GROUP, eventually, group_member, overflowed, per_message, processor_time,
     string_frame,
 };
+use uadp::NetworkMessage;
 
 pub(crate) fn measure(cell: &Cell, seconds: u64) {
-    let mapping = cell.file("fifty.yaml", &mapping());
+    println!(
+        "\n{TOPICS} topics of {SIZE} B at 1 kHz each through bridge-ros1 into UADP, {seconds} s:\n"
+    );
+    println!(
+        "| messages a datagram at most | sent | received | lost | of these in the receiver's socket | CPU share | CPU per message |"
+    );
+    println!("|---|---|---|---|---|---|---|");
+    for shared in [1, 32] {
+        row(cell, shared, seconds);
+    }
+}
+
+fn row(cell: &Cell, shared: u8, seconds: u64) {
+    let mapping = cell.file("fifty.yaml", &mapping(shared));
     let listener = group_member(GROUP);
     listener.set_read_timeout(Some(SILENCE)).unwrap();
     let bridge = cell.bridge_ros1(&[&mapping.to_string_lossy()]);
@@ -38,15 +52,7 @@ pub(crate) fn measure(cell: &Cell, seconds: u64) {
     let used = processor_time(bridge.id()) - before;
     let sent = ticks * TOPICS as u64;
     println!(
-        "\n{TOPICS} topics of {SIZE} B at 1 kHz each through bridge-ros1 into UADP, sent in {:.1} s:\n",
-        took.as_secs_f64()
-    );
-    println!(
-        "| sent | received | lost | of these in the receiver's socket | CPU share | CPU per message |"
-    );
-    println!("|---|---|---|---|---|---|");
-    println!(
-        "| {sent} | {received} | {} | {} | {:.0} % of one core | {:.1} us |",
+        "| {shared} | {sent} | {received} | {} | {} | {:.0} % of one core | {:.1} us |",
         sent - received,
         shown(overflowed(&listener)),
         used.as_secs_f64() / took.as_secs_f64() * 100.0,
@@ -59,9 +65,11 @@ fn shown(count: Option<u64>) -> String {
 }
 
 /// Events, of which none may give way.
-fn mapping() -> String {
-    let mut text =
-        "spaces:\n  - id: 1\nnamespaces:\n  2: urn:ua-bridge:bench\nvariables:\n".to_owned();
+fn mapping(shared: u8) -> String {
+    let mut text = format!(
+        "spaces:\n  - id: 1\nnamespaces:\n  2: urn:ua-bridge:bench\n\
+         pubsub: {{messages_per_datagram: {shared}}}\nvariables:\n"
+    );
     for topic in 0..TOPICS {
         write!(
             text,
@@ -84,7 +92,11 @@ fn carries_all(topics: &mut [TcpStream], listener: &UdpSocket) {
             }
         }
         while let Ok(length) = listener.recv(&mut buffer) {
-            crossed.extend(parsed(&buffer[..length]).map(|(topic, _)| topic));
+            crossed.extend(
+                parsed(&buffer[..length])
+                    .into_iter()
+                    .map(|(topic, _)| topic),
+            );
         }
         (crossed.len() == TOPICS).then_some(())
     });
@@ -114,18 +126,17 @@ fn receive(listener: &UdpSocket, done: &AtomicBool) -> u64 {
             }
             continue;
         };
-        let Some((topic, number)) = parsed(&buffer[..length]) else {
-            continue;
-        };
-        let Some(seen) = seen.get_mut(topic).filter(|_| number != HELLO) else {
-            continue;
-        };
-        let place = usize::try_from(number).unwrap();
-        if seen.len() <= place {
-            seen.resize(place + 1, false);
-        }
-        if !std::mem::replace(&mut seen[place], true) {
-            count += 1;
+        for (topic, number) in parsed(&buffer[..length]) {
+            let Some(seen) = seen.get_mut(topic).filter(|_| number != HELLO) else {
+                continue;
+            };
+            let place = usize::try_from(number).unwrap();
+            if seen.len() <= place {
+                seen.resize(place + 1, false);
+            }
+            if !std::mem::replace(&mut seen[place], true) {
+                count += 1;
+            }
         }
     }
 }
@@ -135,12 +146,20 @@ fn message(topic: usize, number: u64) -> Vec<u8> {
     string_frame(&format!("{:PADDING$}{topic:09}{number:09}", ""))
 }
 
-fn parsed(datagram: &[u8]) -> Option<(usize, u64)> {
-    let (rest, number) = datagram.split_last_chunk::<9>()?;
-    let (_, topic) = rest.split_last_chunk::<9>()?;
-    let topic = std::str::from_utf8(topic).ok()?.parse().ok()?;
-    let number = std::str::from_utf8(number).ok()?.parse().ok()?;
-    Some((topic, number))
+/// Topic and number of each text of a datagram.
+fn parsed(datagram: &[u8]) -> Vec<(usize, u64)> {
+    let message = NetworkMessage::decode(datagram).unwrap();
+    // An announcement has none. A message ends with its last field.
+    let messages = message.messages().flatten();
+    messages
+        .filter_map(|message| {
+            let (rest, number) = message.payload().split_last_chunk::<9>()?;
+            let (_, topic) = rest.split_last_chunk::<9>()?;
+            let topic = std::str::from_utf8(topic).ok()?.parse().ok()?;
+            let number = std::str::from_utf8(number).ok()?.parse().ok()?;
+            Some((topic, number))
+        })
+        .collect()
 }
 
 const TOPICS: usize = 50;
