@@ -5,24 +5,28 @@ use std::fmt::Write as _;
 use std::time::Duration;
 
 use serde_json::Value;
-use system_tests::{Capture, Cell, Child, Peer, UadpSocket, eventually};
-use uadp::NetworkMessage;
+use system_tests::{
+    Capture, Cell, Child, METRICS_ROS2, Peer, UadpSocket, eventually, metrics, number as number_of,
+};
+use uadp::{NetworkMessage, Scalar, Variant};
 
 const SOON: Duration = Duration::from_secs(30);
 const FIRST: u64 = 10;
 const TOPICS: u64 = 20;
 /// What each topic says, every 10 ms.
 const TICKS: u64 = 50;
+/// None may give way to another.
+const EVENTS: &str = "{drop_oldest: 1000}";
 
-/// Events of ROS 2, of which none may give way.
-fn mapping(cell: &Cell) -> String {
+/// Texts of ROS 2, with that rule for their queues.
+fn mapping(cell: &Cell, queue: &str) -> String {
     let mut text = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:plant:line}\n\
                     pubsub: {messages_per_datagram: 32}\nvariables:\n"
         .to_owned();
     for id in FIRST..FIRST + TOPICS {
         writeln!(
             text,
-            "  - {{node: ns=2;i={id}, name: v{id}, type: String, origin: 2, queue: {{drop_oldest: 1000}}}}"
+            "  - {{node: ns=2;i={id}, name: v{id}, type: String, origin: 2, queue: {queue}}}"
         )
         .unwrap();
     }
@@ -30,9 +34,13 @@ fn mapping(cell: &Cell) -> String {
     path.to_string_lossy().into_owned()
 }
 
-/// Sends stamped texts on all topics at once; which number was the first.
+/// Sends stamped texts on all topics at once, every 10 ms; which number was the first.
 fn send(pacer: &mut Child, ticks: u64) -> u64 {
-    let answer = pacer.ask(&format!("{ticks} 40 10000000 0 0"), SOON);
+    send_every(pacer, ticks, Duration::from_millis(10))
+}
+
+fn send_every(pacer: &mut Child, ticks: u64, period: Duration) -> u64 {
+    let answer = pacer.ask(&format!("{ticks} 40 {} 0 0", period.as_nanos()), SOON);
     assert_eq!(answer["refused"], 0);
     answer["first"].as_u64().unwrap()
 }
@@ -73,7 +81,7 @@ fn what_shares_datagrams_is_read_by_asyncua_and_shown_by_wireshark() {
     let Some(cell) = Cell::with(&[Peer::Python, Peer::CycloneC, Peer::Tshark]) else {
         return;
     };
-    let mapping = mapping(&cell);
+    let mapping = mapping(&cell, EVENTS);
     let _bridge = cell.bridge_ros2(&[&mapping]);
     let listener = cell.uadp_listener();
     let group = UadpSocket::join();
@@ -114,6 +122,56 @@ fn what_shares_datagrams_is_read_by_asyncua_and_shown_by_wireshark() {
     assert!(datagrams.iter().all(|datagram| datagram.len() <= 1472));
 }
 
+#[test]
+fn a_state_that_waits_to_share_a_datagram_gives_way_to_no_newer_one() {
+    let Some(cell) = Cell::with(&[Peer::CycloneC]) else {
+        return;
+    };
+    let _bridge = cell.bridge_ros2(&[&mapping(&cell, "keep_latest")]);
+    let group = UadpSocket::join();
+    let mut pacer = pacer(&cell);
+    let mut crossed: HashSet<(u16, u64)> = HashSet::new();
+    let mut hear = |datagrams: Vec<Vec<u8>>| {
+        crossed.extend(datagrams.iter().flat_map(|one| texts(one)));
+        crossed.clone()
+    };
+    let all = usize::try_from(TOPICS).unwrap();
+    eventually("all topics cross", SOON, || {
+        send(&mut pacer, 10);
+        let topics: HashSet<u16> = hear(waiting(&group)).iter().map(|one| one.0).collect();
+        (topics.len() == all).then_some(())
+    });
+    // As fast as the sender can, so that several of a topic come before the bridge looks.
+    let first = send_every(&mut pacer, 200, Duration::ZERO);
+    eventually("the last sample of each", SOON, || {
+        let crossed = hear(waiting(&group));
+        let last = crossed.iter().filter(|one| one.1 == first + 199);
+        (last.count() == all).then_some(())
+    });
+    let crossed = hear(Vec::new());
+    let since_first = crossed.iter().filter(|one| one.1 >= first).count();
+    let status = metrics(METRICS_ROS2).unwrap();
+    assert_eq!(
+        (since_first, number_of(&status, "overflow")),
+        (200 * all, 0)
+    );
+}
+
+/// The DataSetWriterId and the number of each text.
+fn texts(datagram: &[u8]) -> Vec<(u16, u64)> {
+    let message = NetworkMessage::decode(datagram).unwrap();
+    let messages = message.messages().flatten();
+    messages
+        .filter_map(|message| {
+            let text = match message.fields().ok()?.next()?.ok()? {
+                Variant::Scalar(Scalar::String(text)) => text?,
+                _ => return None,
+            };
+            Some((message.writer_id?, number(text)?))
+        })
+        .collect()
+}
+
 /// The datagrams that have come.
 fn waiting(group: &UadpSocket) -> Vec<Vec<u8>> {
     std::iter::from_fn(|| group.receive(Duration::from_millis(1))).collect()
@@ -132,7 +190,7 @@ fn what_shares_datagrams_comes_out_of_the_other_bridge_in_order() {
         return;
     };
     let _master = cell.roscore();
-    let mapping = mapping(&cell);
+    let mapping = mapping(&cell, EVENTS);
     let _bridges = (cell.bridge_ros1(&[&mapping]), cell.bridge_ros2(&[&mapping]));
     let topics = [FIRST, FIRST + TOPICS / 2, FIRST + TOPICS - 1];
     let subscribers = topics.map(|id| {
