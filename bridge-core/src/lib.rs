@@ -3,7 +3,8 @@
 //! The [`Router`] is sans-IO: time and bytes go in through `handle_*`, values come out of
 //! [`poll_output`](Router::poll_output), and [`poll_timeout`](Router::poll_timeout) says when to come back. There is
 //! no socket, clock or task in here. After every `handle_*` drain `poll_output`; when `poll_timeout` has passed, call
-//! [`handle_timeout`](Router::handle_timeout).
+//! [`handle_timeout`](Router::handle_timeout). Where samples may share datagrams, those that are there are handled first, but
+//! for one whose topic [is full](Router::is_full).
 //!
 //! The checks run in the order header, loop, route, payload, so that looped and unmapped traffic costs a header read
 //! and no allocation.
