@@ -21,6 +21,7 @@ mod numbered;
 mod peers;
 mod programs;
 mod rtps;
+mod stamp;
 mod times;
 mod ua_side;
 mod usage;
@@ -43,6 +44,7 @@ pub use programs::{
     METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, SERVER_ENDPOINT, drops, number, program,
 };
 pub use rtps::{Mutator, announced, claims_too_much, queued};
+pub use stamp::{Stamp, now};
 pub use times::{Times, micros, per_message, processor_time};
 pub use ua_side::{Triple, UaSide};
 pub use usage::{cpu_share, resident, threads};

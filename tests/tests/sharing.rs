@@ -6,9 +6,10 @@ use std::time::Duration;
 
 use serde_json::Value;
 use system_tests::{
-    Capture, Cell, Child, METRICS_ROS2, Peer, UadpSocket, eventually, metrics, number as number_of,
+    Capture, Cell, Child, METRICS_ROS2, Peer, Stamp, UadpSocket, eventually, metrics,
+    number as number_of,
 };
-use uadp::{NetworkMessage, Scalar, Variant};
+use uadp::{DataSetMessage, NetworkMessage};
 
 const SOON: Duration = Duration::from_secs(30);
 const FIRST: u64 = 10;
@@ -55,11 +56,8 @@ fn pacer(cell: &Cell) -> Child {
     .ready(SOON)
 }
 
-/// The number of a stamped text: the 12 digits behind the 8 of its topic.
 fn number(text: &str) -> Option<u64> {
-    text.get(text.len().checked_sub(28)?..text.len() - 16)?
-        .parse()
-        .ok()
+    Stamp::of(text.as_bytes()).map(|stamp| stamp.number)
 }
 
 /// What asyncua heard of each topic so far: writer, and numbers in their order.
@@ -133,24 +131,20 @@ fn a_state_that_waits_to_share_a_datagram_gives_way_to_no_newer_one() {
     let group = UadpSocket::join();
     let mut pacer = pacer(&cell);
     let mut crossed: HashSet<(u16, u64)> = HashSet::new();
-    let mut hear = |datagrams: Vec<Vec<u8>>| {
-        crossed.extend(datagrams.iter().flat_map(|one| texts(one)));
-        crossed.clone()
-    };
     let all = usize::try_from(TOPICS).unwrap();
     eventually("all topics cross", SOON, || {
         send(&mut pacer, 1);
-        let topics: HashSet<u16> = hear(waiting(&group)).iter().map(|one| one.0).collect();
+        crossed.extend(waiting(&group).iter().flat_map(|one| texts(one)));
+        let topics: HashSet<u16> = crossed.iter().map(|one| one.0).collect();
         (topics.len() == all).then_some(())
     });
     // As fast as the sender can, so that several of a topic come before the bridge looks.
     let first = send_every(&mut pacer, BURST, Duration::ZERO);
     eventually("the last sample of each", SOON, || {
-        let crossed = hear(waiting(&group));
+        crossed.extend(waiting(&group).iter().flat_map(|one| texts(one)));
         let last = crossed.iter().filter(|one| one.1 == first + BURST - 1);
         (last.count() == all).then_some(())
     });
-    let crossed = hear(Vec::new());
     let since_first = crossed.iter().filter(|one| one.1 >= first).count();
     let status = metrics(METRICS_ROS2).unwrap();
     let sent = usize::try_from(BURST).unwrap() * all;
@@ -161,15 +155,11 @@ fn a_state_that_waits_to_share_a_datagram_gives_way_to_no_newer_one() {
 fn texts(datagram: &[u8]) -> Vec<(u16, u64)> {
     let message = NetworkMessage::decode(datagram).unwrap();
     let messages = message.messages().flatten();
-    messages
-        .filter_map(|message| {
-            let text = match message.fields().ok()?.next()?.ok()? {
-                Variant::Scalar(Scalar::String(text)) => text?,
-                _ => return None,
-            };
-            Some((message.writer_id?, number(text)?))
-        })
-        .collect()
+    // A message ends with its last field.
+    let stamped = |message: DataSetMessage<'_>| {
+        Some((message.writer_id?, Stamp::of(message.payload())?.number))
+    };
+    messages.filter_map(stamped).collect()
 }
 
 /// The datagrams that have come.

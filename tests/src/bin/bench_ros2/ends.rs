@@ -6,9 +6,9 @@ use std::net::TcpStream;
 use std::time::Duration;
 
 use serde_json::Value;
-use system_tests::{BareNode, BareSubscription, Cell, Child, Times, eventually, string_frame};
-
-use crate::stamp::{Stamp, now};
+use system_tests::{
+    BareNode, BareSubscription, Cell, Child, Stamp, Times, eventually, now, string_frame,
+};
 
 /// Sends stamped texts on topics of DDS.
 pub(crate) struct Pacer(Child);

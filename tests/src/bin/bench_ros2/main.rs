@@ -9,7 +9,6 @@ mod idle;
 mod joining;
 mod many;
 mod relays;
-mod stamp;
 mod through;
 
 use std::process::ExitCode;

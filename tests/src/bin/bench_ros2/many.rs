@@ -5,13 +5,12 @@ use std::fmt::Write as _;
 use std::time::Duration;
 
 use system_tests::{
-    Cell, GROUP, METRICS_ROS2, UaSide, all_overflowed, drops, eventually, group_member, metrics,
-    number, overflowed, per_message, processor_time,
+    Cell, GROUP, METRICS_ROS2, Stamp, UaSide, all_overflowed, drops, eventually, group_member,
+    metrics, now, number, overflowed, per_message, processor_time,
 };
 use uadp::{NetworkMessage, Scalar};
 
 use crate::ends::{Meter, Pace, Pacer, Report, START};
-use crate::stamp::{Stamp, now};
 
 pub(crate) fn measure(cell: &Cell, seconds: u64) {
     println!(

@@ -4,24 +4,29 @@ use std::time::Duration;
 
 use nix::time::{ClockId, clock_gettime};
 
+/// Which text it is, and when it was sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Stamp {
-    pub(crate) topic: usize,
-    pub(crate) number: u64,
+pub struct Stamp {
+    /// The number of its topic among those of its sender, from 0.
+    pub topic: usize,
+    /// Counted by its sender.
+    pub number: u64,
     /// On the machine's monotonic clock.
-    pub(crate) sent: Duration,
+    pub sent: Duration,
 }
 
 impl Stamp {
     /// A text of `size` characters with a stamp of now.
-    pub(crate) fn text(topic: usize, number: u64, size: usize) -> String {
+    #[must_use]
+    pub fn text(topic: usize, number: u64, size: usize) -> String {
         let padding = size.saturating_sub(LENGTH);
         let sent = now().as_nanos();
         format!("{:.<padding$}{topic:08}{number:012}{sent:016}", "")
     }
 
     /// That of a text's end, if it has one.
-    pub(crate) fn of(text: &[u8]) -> Option<Self> {
+    #[must_use]
+    pub fn of(text: &[u8]) -> Option<Self> {
         let (_, stamp) = text.split_last_chunk::<LENGTH>()?;
         let stamp = std::str::from_utf8(stamp).ok()?;
         Some(Self {
@@ -33,7 +38,11 @@ impl Stamp {
 }
 
 /// The machine's monotonic clock, which all processes share.
-pub(crate) fn now() -> Duration {
+///
+/// # Panics
+/// When there is none.
+#[must_use]
+pub fn now() -> Duration {
     clock_gettime(ClockId::CLOCK_MONOTONIC).unwrap().into()
 }
 
