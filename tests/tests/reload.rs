@@ -22,6 +22,8 @@ use system_tests::{
 use uadp::{NetworkMessage, NetworkMessageType, Scalar, Variant};
 
 const SOON: Duration = Duration::from_secs(30);
+/// What a busy machine lost of 25 000 samples a second is repaired, which took 26 s beside nine busy loops on two cores.
+const REPAIRED: Duration = Duration::from_secs(60);
 const ROUTES: u16 = 500;
 /// How often each route is sent from DDS: at 50 Hz, for 8 s.
 const TICKS: u16 = 400;
@@ -496,7 +498,7 @@ fn of_500_routes_from_dds_at_50_hz_only_the_edited_one_notices_the_edit() {
     let other = first + 50 - 1;
     let ((first, _), mut sends) = sending.join().unwrap();
     let last = first + TICKS - 1;
-    eventually("the last are heard", SOON, || {
+    eventually("the last are heard", REPAIRED, || {
         let heard: std::sync::MutexGuard<'_, Heard> = heard.lock().unwrap();
         let is_last = |(route, of): (&u16, &Vec<(u16, u16)>)| {
             let last = if *route == 1 { other } else { last };
