@@ -6,6 +6,8 @@ mod fastdds;
 mod fibonacci;
 #[path = "ros2_actions/graph.rs"]
 mod graph;
+#[path = "ros2_actions/parts.rs"]
+mod parts;
 #[path = "ros2_actions/rclpy.rs"]
 mod rclpy;
 #[path = "ros2_actions/secured.rs"]

@@ -80,6 +80,7 @@ async fn a_server_of_theirs_answers(vendor: Vendor) {
     })
     .await;
     assert_eq!((client.servers(), client.ignored()), (1, 0));
+    until("it says that it knows us", || client.acquainted() == 1).await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
@@ -415,4 +416,18 @@ async fn more_calls_than_allowed_are_refused_and_others_go_on() {
         matches!(next, Err(ServiceError::Timeout { .. })),
         "{next:?}"
     );
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_server_of_ours_says_when_it_knows_a_client() {
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    let (ours, others) = (Ours::join(), Ours::join());
+    let client = client(&ours, within(SOON));
+    let server = server(&others, ServiceOptions::default());
+    until("it says that it knows us", || client.acquainted() == 1).await;
+    assert_eq!(client.servers(), 1);
+    drop(server);
+    until("it is gone", || client.servers() + client.acquainted() == 0).await;
 }

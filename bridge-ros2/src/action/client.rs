@@ -109,6 +109,7 @@ impl ActionClient {
                     feedback_bytes: options.feedback_bytes,
                 }),
                 tasks: BTreeMap::new(),
+                servers: BTreeMap::new(),
             }),
         });
         let task = tokio::spawn(listen(Arc::clone(&shared), status, feedback)).abort_handle();
@@ -203,6 +204,8 @@ pub(super) struct State {
     pub(super) goals: ClientGoals,
     /// Of goals that somebody holds.
     tasks: BTreeMap<GoalId, AbortHandle>,
+    /// An endpoint of the server that has accepted a goal, while it runs.
+    servers: BTreeMap<GoalId, GUID>,
 }
 
 impl Shared {
@@ -211,8 +214,13 @@ impl Shared {
     }
 
     pub(super) async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, ServiceError> {
-        let reply = self.cancel.call(wire::cancel_request(what)).await?;
-        match wire::read_cancel_answer(&reply) {
+        let server = match what {
+            CancelWhat::Goal(id) => self.lock().servers.get(&id).copied(),
+            _ => None,
+        };
+        let request = wire::cancel_request(what);
+        let answer = self.cancel.call_after(request, server).await?;
+        match wire::read_cancel_answer(&answer.reply) {
             Ok(answer) => Ok(answer.to(what)),
             Err(Malformed) => Err(ServiceError::Reply {
                 service: self.cancel.service().to_owned(),
@@ -224,6 +232,7 @@ impl Shared {
     pub(super) fn forget(&self, id: GoalId) {
         let mut state = self.lock();
         state.goals.forget(id);
+        state.servers.remove(&id);
         if let Some(task) = state.tasks.remove(&id) {
             task.abort();
         }
@@ -296,6 +305,7 @@ impl Shared {
         let outcome = self.outcome(id, request).await;
         let mut state = self.lock();
         state.goals.end(id, outcome);
+        state.servers.remove(&id);
         state.tasks.remove(&id);
     }
 
@@ -303,19 +313,27 @@ impl Shared {
         if let Err(none) = self.wait_for_server(self.options.server_timeout).await {
             return Outcome::Lost(none.into());
         }
-        let answer = match self.send.call(request).await {
+        let answer = match self.send.call_after(request, None).await {
             Ok(answer) => answer,
             Err(error) => return Outcome::Lost(LostReason::Unanswered(error)),
         };
-        match wire::read_goal_answer(&answer) {
+        match wire::read_goal_answer(&answer.reply) {
             Ok(None) => return Outcome::Rejected,
-            Ok(Some(stamp)) => self.lock().goals.accepted(id, stamp),
+            Ok(Some(stamp)) => {
+                let mut state = self.lock();
+                state.servers.insert(id, answer.writer);
+                state.goals.accepted(id, stamp);
+            }
             Err(Malformed) => {
                 return Outcome::Lost(LostReason::Malformed("answer to the goal"));
             }
         }
+        // After a restart the old server may still be known, while of the new one not all is: it is the one to ask.
+        let asked = self
+            .result
+            .call_after(wire::result_request(id), Some(answer.writer));
         let result = tokio::select! {
-            result = self.result.call(wire::result_request(id)) => result,
+            result = asked => result.map(|answer| answer.reply),
             () = self.wait_for_no_server() => {
                 let action = self.action.name().to_owned();
                 return Outcome::Lost(LostReason::ServerGone { action });

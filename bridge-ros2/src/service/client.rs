@@ -15,10 +15,11 @@ use tracing::debug;
 
 use super::error::{CallPhase, ServiceError};
 use super::mapping::{ClientId, Outgoing, Received, RequestKey};
+use super::met::{Acquaintance, Met, all_in_step};
 use super::opening::Opening;
 use super::pace::{Awaited, FRESH, Pace, may_ask};
 use super::peers::{ServicePeers, Snapshot};
-use super::{SETTLE, Service, ServiceMapping, next, policies};
+use super::{Service, ServiceMapping, next, policies};
 use crate::domain::{Domain, DomainError};
 use crate::raw::{Payload, Reader, Writer};
 
@@ -54,6 +55,7 @@ struct Shared {
     calls: mpsc::Sender<Call>,
     ignored: Arc<AtomicU64>,
     servers: Arc<AtomicU64>,
+    acquainted: Arc<AtomicU64>,
     task: AbortHandle,
 }
 
@@ -83,7 +85,7 @@ impl ServiceClient {
             &policies(),
         )?;
         let (calls, inbox) = mpsc::channel(QUEUE);
-        let (ignored, servers) = (Arc::default(), Arc::default());
+        let (ignored, servers, acquainted) = (Arc::default(), Arc::default(), Arc::default());
         let driver = Driver {
             id: ClientId {
                 writer: writer.guid(),
@@ -92,6 +94,7 @@ impl ServiceClient {
             service: service.clone(),
             peers: peers.clone(),
             writer,
+            reader,
             max_calls: options.max_calls,
             servers: BTreeMap::new(),
             other_type: None,
@@ -105,8 +108,9 @@ impl ServiceClient {
             opening: Opening::new(),
             ignored: Arc::clone(&ignored),
             ready: Arc::clone(&servers),
+            acquainted: Arc::clone(&acquainted),
         };
-        let task = tokio::spawn(driver.run(reader, inbox)).abort_handle();
+        let task = tokio::spawn(driver.run(inbox)).abort_handle();
         Ok(Self {
             shared: Arc::new(Shared {
                 service: service.clone(),
@@ -114,6 +118,7 @@ impl ServiceClient {
                 calls,
                 ignored,
                 servers,
+                acquainted,
                 task,
             }),
         })
@@ -131,6 +136,14 @@ impl ServiceClient {
         self.shared.servers.load(Ordering::Relaxed)
     }
 
+    /// Those of them whose HEARTBEATs name our reader (RTPS 2.5, 8.3.8.6): their replies will reach it. They are asked at
+    /// once; others get a while to find us, since what a server sends to readers it does not know yet is lost. None with
+    /// `RustDDS` as published, which does not tell.
+    #[must_use]
+    pub fn acquainted(&self) -> u64 {
+        self.shared.acquainted.load(Ordering::Relaxed)
+    }
+
     /// Replies so far that were for nobody here: to calls of other clients, to calls given up, or malformed.
     #[must_use]
     pub fn ignored(&self) -> u64 {
@@ -146,10 +159,22 @@ impl ServiceClient {
     /// # Errors
     /// [`ServiceError`].
     pub async fn call(&self, request: Bytes) -> Result<Bytes, ServiceError> {
+        let answer = self.call_after(request, None).await?;
+        Ok(answer.reply)
+    }
+
+    /// The same, but waits for a server of the participant that has `endpoint`, up to [`COMPANION`], before any is asked.
+    /// For what one service of a participant was told that another is to be asked of: that other may be found later.
+    pub(crate) async fn call_after(
+        &self,
+        request: Bytes,
+        endpoint: Option<GUID>,
+    ) -> Result<Answer, ServiceError> {
         let phase = Arc::new(AtomicU8::new(CallPhase::Queue.into()));
         let (done, reply) = oneshot::channel();
         let call = Call {
             request,
+            companion: endpoint.map(|endpoint| (endpoint, Instant::now() + COMPANION)),
             phase: Arc::clone(&phase),
             done,
         };
@@ -192,11 +217,20 @@ impl ServiceClient {
     }
 }
 
+/// What a server replied, and the writer it came from.
+#[derive(Debug)]
+pub(crate) struct Answer {
+    pub(crate) reply: Bytes,
+    pub(crate) writer: GUID,
+}
+
 #[derive(Debug)]
 struct Call {
     request: Bytes,
+    /// An endpoint of the participant that is to be among the servers, and until when that is waited for.
+    companion: Option<(GUID, Instant)>,
     phase: Arc<AtomicU8>,
-    done: oneshot::Sender<Result<Bytes, Failure>>,
+    done: oneshot::Sender<Result<Answer, Failure>>,
 }
 
 impl Call {
@@ -204,7 +238,17 @@ impl Call {
         self.phase.store(phase.into(), Ordering::Relaxed);
     }
 
-    fn end(self, result: Result<Bytes, Failure>) {
+    /// Whether to ask those servers now.
+    fn is_for(&self, servers: &BTreeMap<GUID, Met>, now: Instant) -> bool {
+        self.companion.is_none_or(|(endpoint, until)| {
+            now >= until
+                || servers
+                    .keys()
+                    .any(|server| server.prefix == endpoint.prefix)
+        })
+    }
+
+    fn end(self, result: Result<Answer, Failure>) {
         // Who gave the call up does not listen.
         drop(self.done.send(result));
     }
@@ -226,9 +270,10 @@ struct Driver {
     id: ClientId,
     peers: ServicePeers,
     writer: Writer,
+    reader: Reader,
     max_calls: usize,
-    /// By the reader of the requests; since when both halves are known.
-    servers: BTreeMap<GUID, Instant>,
+    /// By the reader of the requests.
+    servers: BTreeMap<GUID, Met>,
     /// A type that a server has instead of ours.
     other_type: Option<String>,
     /// Calls that wait for a server, for it to take what it was sent, or for the send window, oldest first.
@@ -244,6 +289,7 @@ struct Driver {
     opening: Opening,
     ignored: Arc<AtomicU64>,
     ready: Arc<AtomicU64>,
+    acquainted: Arc<AtomicU64>,
 }
 
 struct Asked {
@@ -254,12 +300,12 @@ struct Asked {
 }
 
 impl Driver {
-    async fn run(mut self, reader: Reader, mut calls: mpsc::Receiver<Call>) {
+    async fn run(mut self, mut calls: mpsc::Receiver<Call>) {
         loop {
             // Each branch is cancel-safe: nothing is taken but by the branch that completes.
             let tick = self.next_look().unwrap_or_else(Instant::now);
             tokio::select! {
-                reply = next(&reader) => self.replied(reply),
+                reply = next(&self.reader) => self.replied(reply),
                 call = calls.recv() => match call {
                     Some(call) => self.called(call),
                     None => return,
@@ -308,9 +354,9 @@ impl Driver {
         self.meet(&snapshot, now);
         self.pace.looked(self.awaited());
         self.give_up_lost();
-        let count = self.ready(now);
-        self.ready
-            .store(u64::try_from(count).unwrap_or(u64::MAX), Ordering::Relaxed);
+        let (ready, acquainted) = self.ready(now);
+        self.ready.store(ready, Ordering::Relaxed);
+        self.acquainted.store(acquainted, Ordering::Relaxed);
         self.ask_waiting(now);
         if self.servers.is_empty()
             && let Some(theirs) = &self.other_type
@@ -321,21 +367,28 @@ impl Driver {
         }
     }
 
-    /// How many servers know us by now.
-    fn ready(&self, now: Instant) -> usize {
-        let settled = |since: &&Instant| now.saturating_duration_since(**since) >= SETTLE;
-        self.servers.values().filter(settled).count()
+    /// How many servers are to be asked now, and how many of them tell that they know us.
+    fn ready(&self, now: Instant) -> (u64, u64) {
+        let in_step = all_in_step(&self.writer, self.servers.len());
+        let of = |(ready, acquainted): (u64, u64), met: &Met| {
+            let acquaintance = met.acquaintance(&self.reader, in_step);
+            (
+                ready + u64::from(met.is_ready(acquaintance, now)),
+                acquainted + u64::from(acquaintance == Acquaintance::Told),
+            )
+        };
+        self.servers.values().fold((0, 0), of)
     }
 
     fn ask_waiting(&mut self, now: Instant) {
-        if self.ready(now) == 0 {
+        if self.ready(now).0 == 0 {
             return;
         }
         // Those too that are new: the others may be dead, with their leases still running.
         let servers: Vec<GUID> = self.servers.keys().copied().collect();
         while self.opening.is_over(&self.writer, now)
             && may_ask(self.asked.values().rev().map(|asked| asked.since), now)
-            && let Some(call) = self.waiting.pop_front()
+            && let Some(call) = self.next_call(now)
         {
             if call.done.is_closed() {
                 // Whoever called has given it up.
@@ -350,25 +403,34 @@ impl Driver {
         }
     }
 
+    /// The call that has waited longest for the servers there are.
+    fn next_call(&mut self, now: Instant) -> Option<Call> {
+        let mut waiting = self.waiting.iter();
+        let at = waiting.position(|call| call.is_for(&self.servers, now))?;
+        self.waiting.remove(at)
+    }
+
     fn meet(&mut self, snapshot: &Snapshot, now: Instant) {
         let readers = snapshot.readers(&self.service.request_topic());
         let reply_topic = self.service.reply_topic();
         let writers = snapshot.writers(&reply_topic);
-        let answers = |server: &GUID| {
-            writers.iter().any(|writer| {
+        let repliers = |server: GUID| -> Vec<GUID> {
+            let own = writers.iter().filter(|writer| {
                 writer.guid.prefix == server.prefix
                     && writer.type_name == self.service.types.response
-            })
+            });
+            own.map(|writer| writer.guid).collect()
         };
-        let found: Vec<GUID> = readers
+        let found: BTreeMap<GUID, Vec<GUID>> = readers
             .iter()
             .filter(|reader| reader.type_name == self.service.types.request)
-            .map(|reader| reader.guid)
-            .filter(answers)
+            .map(|reader| (reader.guid, repliers(reader.guid)))
+            .filter(|(_, repliers)| !repliers.is_empty())
             .collect();
-        self.servers.retain(|guid, _| found.contains(guid));
-        for guid in found {
-            self.servers.entry(guid).or_insert(now);
+        self.servers.retain(|guid, _| found.contains_key(guid));
+        for (guid, repliers) in found {
+            let met = self.servers.entry(guid).or_insert_with(|| Met::new(now));
+            met.answer_from(repliers);
         }
         self.other_type = readers
             .iter()
@@ -448,14 +510,15 @@ impl Driver {
         // Ourselves as server, which no client here is for.
         let foreign = reply.filter(|reply| !self.peers.is_own(reply.writer));
         let opened = foreign.map(|reply| {
-            self.id
-                .open_reply(self.peers.mapping_of(reply.writer), reply)
+            let writer = reply.writer;
+            let opened = self.id.open_reply(self.peers.mapping_of(writer), reply);
+            (opened, writer)
         });
-        if let Some(Ok(Some((key, body)))) = opened
+        if let Some((Ok(Some((key, reply))), writer)) = opened
             && let Some(asked) = self.keys.get(&key).and_then(|id| self.asked.remove(id))
         {
             self.forget_keys(&asked.keys);
-            asked.call.end(Ok(body));
+            asked.call.end(Ok(Answer { reply, writer }));
             if !self.waiting.is_empty() {
                 self.ask_waiting(Instant::now());
             }
@@ -503,5 +566,7 @@ enum Unsent {
     Request(&'static str),
 }
 
+/// How long a call waits for a certain server. What the others know it asks them then.
+const COMPANION: Duration = Duration::from_secs(5);
 /// Calls that may wait to be taken; more wait in [`ServiceClient::call`].
 const QUEUE: usize = 64;

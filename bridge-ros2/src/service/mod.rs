@@ -8,6 +8,7 @@ mod audience;
 mod client;
 mod error;
 mod mapping;
+mod met;
 mod opening;
 mod pace;
 mod peers;
