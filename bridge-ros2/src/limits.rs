@@ -89,8 +89,6 @@ use sizes::{TO_FAST_DDS, TO_OTHERS};
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::fs;
-    use std::path::Path;
 
     #[test]
     fn the_text_names_the_version_that_is_locked() {
@@ -106,8 +104,9 @@ mod tests {
     #[cfg(feature = "patched-dds")]
     #[test]
     fn the_text_counts_the_patches() {
-        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../patches/rustdds-0.15.1");
-        let count = fs::read_dir(folder)
+        let own = std::path::Path::new(env!("CARGO_MANIFEST_DIR"));
+        let folder = own.join("../patches/rustdds-0.15.1");
+        let count = std::fs::read_dir(folder)
             .unwrap()
             .filter(|entry| {
                 entry

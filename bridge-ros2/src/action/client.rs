@@ -216,7 +216,7 @@ impl Shared {
     pub(super) async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, ServiceError> {
         let server = match what {
             CancelWhat::Goal(id) => self.lock().servers.get(&id).copied(),
-            _ => None,
+            CancelWhat::All | CancelWhat::Until(_) | CancelWhat::GoalAndUntil(..) => None,
         };
         let request = wire::cancel_request(what);
         let answer = self.cancel.call_after(request, server).await?;
