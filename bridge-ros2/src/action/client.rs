@@ -321,7 +321,10 @@ impl Shared {
             Ok(None) => return Outcome::Rejected,
             Ok(Some(stamp)) => {
                 let mut state = self.lock();
-                state.servers.insert(id, answer.writer);
+                // Unless nobody holds it any more.
+                if state.tasks.contains_key(&id) {
+                    state.servers.insert(id, answer.writer);
+                }
                 state.goals.accepted(id, stamp);
             }
             Err(Malformed) => {
