@@ -22,7 +22,7 @@ use system_tests::{
 use uadp::{NetworkMessage, NetworkMessageType, Scalar, Variant};
 
 const SOON: Duration = Duration::from_secs(30);
-/// What a busy machine lost of 25 000 samples a second is repaired, which took 26 s beside nine busy loops on two cores.
+/// What a busy machine lost of 25 000 samples a second is repaired, which took 25 to 30 s beside nine busy loops on two cores.
 const REPAIRED: Duration = Duration::from_secs(60);
 const ROUTES: u16 = 500;
 /// How often each route is sent from DDS: at 50 Hz, for 8 s.
