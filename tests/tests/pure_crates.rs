@@ -19,6 +19,8 @@ const IMPURE: &[&str] = &[
     "async-opcua-server",
     "async-opcua-client",
     "iceoryx2*",
+    "mdns-sd",
+    "oxigraph",
 ];
 
 fn does_not_reach(package: &str, banned: &[&str]) {
@@ -129,6 +131,17 @@ fn the_server_knows_no_ros_library() {
         "ua-server",
         &["tcpros", "ros2-client", "rustdds", "rosrust*"],
     );
+}
+
+#[test]
+fn what_the_plant_thinks_with_reaches_no_io_and_knows_no_space() {
+    for package in ["mtp", "program", "registry"] {
+        does_not_reach(package, IMPURE);
+        does_not_reach(
+            package,
+            &["uadp", "messages", "mappings", "bridge-*", "tcpros", "transport"],
+        );
+    }
 }
 
 #[test]

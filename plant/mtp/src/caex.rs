@@ -1,0 +1,238 @@
+//! CAEX (IEC 62424): the tree of elements in the file, without a word on what they mean.
+
+use std::borrow::Cow;
+
+use quick_xml::XmlVersion;
+use quick_xml::escape::resolve_predefined_entity;
+use quick_xml::events::{BytesStart, Event};
+use quick_xml::reader::Reader;
+use thiserror::Error;
+
+/// Why a file is no manifest.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum ManifestError {
+    /// More than this reads.
+    #[error("the file has {length} bytes, more than the {most} that are read")]
+    TooLarge {
+        /// What it has.
+        length: usize,
+        /// What is read.
+        most: usize,
+    },
+    /// It is not XML, or only half of it.
+    #[error("line {line}: {what}")]
+    Xml {
+        /// Where, counted from 1.
+        line: usize,
+        /// What is wrong.
+        what: String,
+    },
+    /// It is XML of something else.
+    #[error(
+        "there is no element with the role MTPSUCLib/ModuleTypePackage: this is no manifest of an MTP"
+    )]
+    NoModule,
+}
+
+/// An InternalElement, an ExternalInterface or an InstanceHierarchy.
+#[derive(Debug, Default)]
+pub(crate) struct Element {
+    pub(crate) name: String,
+    pub(crate) id: String,
+    /// RefBaseSystemUnitPath, or RefBaseClassPath of an interface.
+    pub(crate) path: String,
+    pub(crate) attributes: Vec<Attribute>,
+    pub(crate) children: Vec<Self>,
+}
+
+/// An Attribute of an element. Those inside others, which translate them, are left out.
+#[derive(Debug, Default)]
+pub(crate) struct Attribute {
+    pub(crate) name: String,
+    pub(crate) data_type: String,
+    pub(crate) value: String,
+}
+
+impl Element {
+    /// Reads a file.
+    pub(crate) fn read(file: &str) -> Result<Self, ManifestError> {
+        if file.len() > MAX_FILE {
+            return Err(ManifestError::TooLarge {
+                length: file.len(),
+                most: MAX_FILE,
+            });
+        }
+        let file = file.trim_start_matches('\u{feff}');
+        let mut reader = Reader::from_str(file);
+        reader.config_mut().expand_empty_elements = true;
+        let mut building = Building::default();
+        loop {
+            let event = reader.read_event();
+            let fault = |what: String| ManifestError::Xml {
+                line: line(file, reader.buffer_position()),
+                what,
+            };
+            match event.map_err(|error| fault(error.to_string()))? {
+                Event::Start(start) => building.open(&start).map_err(fault)?,
+                Event::End(_) => building.close(),
+                Event::Text(text) => building.text(&text.xml10_content()),
+                Event::CData(text) => building.text(&text.xml10_content()),
+                Event::GeneralRef(reference) => {
+                    let character = reference.resolve_char_ref().ok().flatten();
+                    let name = reference.xml10_content();
+                    match (character, resolve_predefined_entity(&name)) {
+                        (Some(character), _) => building.text(character.encode_utf8(&mut [0; 4])),
+                        (None, Some(text)) => building.text(text),
+                        (None, None) => return Err(fault(format!("XML has no entity &{name};"))),
+                    }
+                }
+                Event::DocType(_) => {
+                    let what = "a manifest has no document type; remove the <!DOCTYPE ..>";
+                    return Err(fault(what.to_owned()));
+                }
+                Event::Eof => break,
+                // An empty element is told as its start and its end.
+                Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
+            }
+        }
+        building.root().ok_or_else(|| ManifestError::Xml {
+            line: line(file, u64::MAX),
+            what: "the file ends in the middle".to_owned(),
+        })
+    }
+
+    /// Itself and all below it, each before what it holds.
+    pub(crate) fn all(&self) -> impl Iterator<Item = &Self> {
+        let mut waiting = vec![self];
+        std::iter::from_fn(move || {
+            let next = waiting.pop()?;
+            waiting.extend(next.children.iter().rev());
+            Some(next)
+        })
+    }
+
+    /// The last part of its path, as `Procedure` of `MTPServiceSUCLib/Service/Procedure`.
+    pub(crate) fn kind(&self) -> &str {
+        self.path.rsplit('/').next().unwrap_or_default()
+    }
+
+    /// The value of its attribute of one of these names, the first that is there.
+    pub(crate) fn value(&self, names: &[&str]) -> Option<&str> {
+        names
+            .iter()
+            .find_map(|name| {
+                self.attributes
+                    .iter()
+                    .find(|attribute| attribute.name == *name)
+            })
+            .map(|attribute| attribute.value.trim())
+            .filter(|value| !value.is_empty())
+    }
+}
+
+/// What is open while the file is read.
+#[derive(Debug, Default)]
+struct Building {
+    open: Vec<Part>,
+    elements: usize,
+    root: Option<Element>,
+}
+
+#[derive(Debug)]
+enum Part {
+    Element(Element),
+    Attribute(Attribute),
+    Value,
+    Other,
+}
+
+impl Building {
+    fn open(&mut self, start: &BytesStart<'_>) -> Result<(), String> {
+        if self.open.len() >= MAX_DEPTH {
+            return Err(format!("elements nest more than {MAX_DEPTH} deep"));
+        }
+        self.elements += 1;
+        if self.elements > MAX_ELEMENTS {
+            return Err(format!("there are more than {MAX_ELEMENTS} elements"));
+        }
+        let text = |name: &str| -> Result<String, String> {
+            let attribute = start
+                .try_get_attribute(name)
+                .map_err(|error| error.to_string())?;
+            let Some(attribute) = attribute else {
+                return Ok(String::new());
+            };
+            let value = attribute.normalized_value(XmlVersion::Implicit1_0);
+            value
+                .map(Cow::into_owned)
+                .map_err(|error| error.to_string())
+        };
+        let part = match start.local_name().into_inner() {
+            "CAEXFile" | "InstanceHierarchy" | "InternalElement" | "ExternalInterface" => {
+                let mut path = text("RefBaseSystemUnitPath")?;
+                if path.is_empty() {
+                    path = text("RefBaseClassPath")?;
+                }
+                Part::Element(Element {
+                    name: text("Name")?,
+                    id: text("ID")?,
+                    path,
+                    ..Element::default()
+                })
+            }
+            "Attribute" if matches!(self.open.last(), Some(Part::Element(_))) => {
+                Part::Attribute(Attribute {
+                    name: text("Name")?,
+                    data_type: text("AttributeDataType")?,
+                    value: String::new(),
+                })
+            }
+            "Value" if matches!(self.open.last(), Some(Part::Attribute(_))) => Part::Value,
+            _ => Part::Other,
+        };
+        self.open.push(part);
+        Ok(())
+    }
+
+    fn close(&mut self) {
+        // The reader has seen to it that what ends has begun.
+        let Some(part) = self.open.pop() else {
+            return;
+        };
+        let parent = self.open.iter_mut().rev().find_map(|part| match part {
+            Part::Element(element) => Some(element),
+            Part::Attribute(_) | Part::Value | Part::Other => None,
+        });
+        match (part, parent) {
+            (Part::Element(element), Some(parent)) => parent.children.push(element),
+            (Part::Element(element), None) => self.root = Some(element),
+            (Part::Attribute(attribute), Some(parent)) => parent.attributes.push(attribute),
+            (Part::Attribute(_), None) | (Part::Value | Part::Other, _) => {}
+        }
+    }
+
+    fn text(&mut self, text: &str) {
+        if let [.., Part::Attribute(attribute), Part::Value] = &mut *self.open {
+            attribute.value.push_str(text);
+        }
+    }
+
+    /// The whole, if it is one.
+    fn root(self) -> Option<Element> {
+        self.root.filter(|_| self.open.is_empty())
+    }
+}
+
+fn line(file: &str, position: u64) -> usize {
+    let position = usize::try_from(position)
+        .unwrap_or(usize::MAX)
+        .min(file.len());
+    let before = file.as_bytes().get(..position).unwrap_or_default();
+    before.iter().filter(|byte| **byte == b'\n').count() + 1
+}
+
+/// The largest of the manifests at hand has 0.8 MB.
+const MAX_FILE: usize = 64 << 20;
+const MAX_DEPTH: usize = 64;
+const MAX_ELEMENTS: usize = 1 << 20;

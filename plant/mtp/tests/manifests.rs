@@ -1,0 +1,299 @@
+//! Manifests of six makers, and what is wrong with some.
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::print_stderr,
+    reason = "a test may, and reads files that stand beside the checkout"
+)]
+
+use std::fs;
+use std::path::Path;
+
+use mtp::{Bound, Identifier, ManifestError, Module, Procedure, Role, Service, ValueKind};
+
+const MANIFESTS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../../shared/data/mtp");
+
+/// A manifest, or `None` where the manifests are not at hand.
+fn manifest(file: &str) -> Option<String> {
+    let path = Path::new(MANIFESTS).join(file);
+    match fs::read_to_string(&path) {
+        Ok(text) => Some(text),
+        Err(error) if std::env::var_os("CI").is_some_and(|ci| ci == "true") => {
+            panic!("{}: {error}", path.display())
+        }
+        Err(error) => {
+            eprintln!("skipped: {}: {error}", path.display());
+            None
+        }
+    }
+}
+
+fn service<'a>(module: &'a Module, name: &str) -> &'a Service {
+    module
+        .services
+        .iter()
+        .find(|service| service.name == name)
+        .unwrap()
+}
+
+fn procedure<'a>(service: &'a Service, name: &str) -> &'a Procedure {
+    service
+        .procedures
+        .iter()
+        .find(|procedure| procedure.name == name)
+        .unwrap()
+}
+
+const ALL: [(&str, &str, usize, usize, usize); 8] = [
+    // File, name, services, procedures, parameters, as another XML library counts them; one that two strategies require is
+    // counted with each.
+    (
+        "cps-edp-mixing-1.1.2/Manifest.aml",
+        "Mixing.(1.1.2)",
+        10,
+        23,
+        27,
+    ),
+    ("huber-v14.1/Manifest.aml", "Huber_Temperierer", 2, 3, 6),
+    (
+        "mtppy-recipe/example_recipe_manifest.aml",
+        "mtp_test",
+        1,
+        3,
+        8,
+    ),
+    ("p2o-bucket/Manifest.aml", "P2O-Bucket", 0, 0, 0),
+    (
+        "p2o-dosing-1.0.3/Manifest.aml",
+        "MTP_Dosiermodul_(1.0.3.0)_WAGO.(1.0.3.0)",
+        4,
+        5,
+        4,
+    ),
+    (
+        "pimad-core/PiMAd-core.0-0-1.aml",
+        "PiMAd-core:0.0.1",
+        2,
+        6,
+        0,
+    ),
+    (
+        "recipol-hc30-siemens/2026-05-18-HC30_Stirring_V8.aml",
+        "No Information",
+        1,
+        2,
+        1,
+    ),
+    (
+        "zvei-stirred-reactor-v1/Manifest.aml",
+        "Rührreaktor_V15",
+        4,
+        8,
+        10,
+    ),
+];
+
+#[test]
+fn every_service_procedure_and_parameter_of_eight_manifests_is_read() {
+    for (file, name, services, procedures, parameters) in ALL {
+        let Some(text) = manifest(file) else { return };
+        let module = Module::read(&text).unwrap();
+        let of_services = module
+            .services
+            .iter()
+            .map(|service| service.parameters.len());
+        let all: Vec<_> = module
+            .services
+            .iter()
+            .flat_map(|service| &service.procedures)
+            .collect();
+        let of_procedures = all.iter().map(|procedure| procedure.parameters.len());
+        let counts = (
+            &*module.name,
+            module.services.len(),
+            all.len(),
+            of_services.sum::<usize>() + of_procedures.sum::<usize>(),
+        );
+        assert_eq!(
+            counts,
+            (name, services, procedures, parameters),
+            "{file}: {:?}",
+            module.findings
+        );
+    }
+}
+
+#[test]
+fn each_service_can_be_commanded_and_watched_whatever_its_nodes_are_called() {
+    for (file, _, services, ..) in ALL {
+        let Some(text) = manifest(file) else { return };
+        let module = Module::read(&text).unwrap();
+        let roles = [
+            Role::Command,
+            Role::CommandEnabled,
+            Role::State,
+            Role::ProcedureWanted,
+        ];
+        let whole = module.services.iter().filter(|service| {
+            roles
+                .iter()
+                .all(|role| service.control.node(*role).is_some())
+        });
+        assert_eq!(whole.count(), services, "{file}: {:?}", module.findings);
+    }
+}
+
+#[test]
+fn a_node_is_found_by_endpoint_namespace_and_identifier() {
+    let Some(text) = manifest("pimad-core/PiMAd-core.0-0-1.aml") else {
+        return;
+    };
+    let module = Module::read(&text).unwrap();
+    assert_eq!(module.endpoints, ["opc.tcp://127.0.0.1:4840"]);
+    let state = service(&module, "HandInHand")
+        .control
+        .node(Role::State)
+        .unwrap();
+    assert_eq!(state.endpoint, "opc.tcp://127.0.0.1:4840");
+    assert_eq!(state.namespace, "http://www.PiMAd-core.com/instances");
+    assert!(
+        matches!(&state.identifier, Identifier::Text(text) if text.ends_with("StateCur")),
+        "{state:?}"
+    );
+    assert!(state.access.reads && !state.access.writes);
+    let command = service(&module, "HandInHand")
+        .control
+        .node(Role::Command)
+        .unwrap();
+    assert!(command.access.writes);
+}
+
+#[test]
+fn two_services_with_procedures_of_one_name_stay_apart() {
+    let Some(text) = manifest("pimad-core/PiMAd-core.0-0-1.aml") else {
+        return;
+    };
+    let module = Module::read(&text).unwrap();
+    let piano = |of: &str| procedure(service(&module, of), "Piano").clone();
+    assert_ne!(piano("HandInHand").id, piano("AtomicLove").id);
+    assert_eq!(
+        (piano("HandInHand").number, piano("HandInHand").is_default),
+        (1, true)
+    );
+    assert!(procedure(service(&module, "AtomicLove"), "Allegro").is_self_completing);
+}
+
+#[test]
+fn parameters_of_a_strategy_are_those_it_requires() {
+    let Some(text) = manifest("cps-edp-mixing-1.1.2/Manifest.aml") else {
+        return;
+    };
+    let module = Module::read(&text).unwrap();
+    let dosing = service(&module, "Dienste.DosingFromB1100");
+    let names = |name: &str| -> Vec<String> {
+        let parameters = &procedure(dosing, name).parameters;
+        parameters
+            .iter()
+            .map(|parameter| parameter.name.clone())
+            .collect()
+    };
+    assert_eq!(names("volume_based"), ["DoseVolume", "SetFlowRate"]);
+    assert_eq!(names("continuous"), ["SetFlowRate"]);
+    let volume = &procedure(dosing, "volume_based").parameters[0];
+    assert_eq!(volume.kind, ValueKind::Analog);
+    assert!(
+        volume.write.as_ref().is_some_and(|node| node.access.writes),
+        "{volume:?}"
+    );
+    assert!(matches!(volume.max, Some(Bound::Node(_))));
+}
+
+#[test]
+fn limits_that_the_file_tells_are_numbers() {
+    let Some(text) = manifest("huber-v14.1/Manifest.aml") else {
+        return;
+    };
+    let module = Module::read(&text).unwrap();
+    let parameters = module.services.iter().flat_map(|service| {
+        let own = service
+            .procedures
+            .iter()
+            .flat_map(|procedure| &procedure.parameters);
+        service.parameters.iter().chain(own)
+    });
+    let ramp: Vec<_> = parameters
+        .filter(|parameter| parameter.max == Some(Bound::Constant(180_000.0)))
+        .collect();
+    assert!(!ramp.is_empty());
+    assert!(
+        ramp.iter()
+            .all(|parameter| parameter.unit == Some(Bound::Constant(1054.0))),
+        "milliseconds"
+    );
+}
+
+#[test]
+fn a_manifest_cut_in_half_is_refused_with_its_line_and_never_panics() {
+    let Some(text) = manifest("pimad-core/PiMAd-core.0-0-1.aml") else {
+        return;
+    };
+    for part in 1..40 {
+        let mut end = text.len() * part / 40;
+        while !text.is_char_boundary(end) {
+            end -= 1;
+        }
+        let lines = text[..end].lines().count();
+        match Module::read(&text[..end]) {
+            Err(ManifestError::Xml { line, .. }) => {
+                assert!(line <= lines + 1, "{line} of {lines}");
+            }
+            other => panic!("{part}: {other:?}"),
+        }
+    }
+}
+
+#[test]
+fn what_is_no_manifest_is_told() {
+    assert_eq!(Module::read("<CAEXFile/>"), Err(ManifestError::NoModule));
+    let other = Module::read("a: yaml\n");
+    assert!(matches!(other, Err(ManifestError::Xml { .. })), "{other:?}");
+    let deep = "<InternalElement>".repeat(100);
+    let deep = Module::read(&deep).unwrap_err().to_string();
+    assert!(deep.contains("deep"), "{deep}");
+    let bomb = "<!DOCTYPE a [<!ENTITY b \"b\">]><CAEXFile/>";
+    assert!(matches!(
+        Module::read(bomb),
+        Err(ManifestError::Xml { line: 1, .. })
+    ));
+}
+
+#[test]
+fn what_does_not_hold_together_is_found_and_the_rest_counts() {
+    let text = r#"<CAEXFile><InstanceHierarchy Name="a">
+        <InternalElement Name="M" ID="1" RefBaseSystemUnitPath="MTPSUCLib/ModuleTypePackage"/>
+        <InternalElement Name="Stir &amp; heat" ID="2" RefBaseSystemUnitPath="MTPServiceSUCLib/Service">
+          <InternalElement Name="Slow" ID="3" RefBaseSystemUnitPath="MTPServiceSUCLib/ServiceProcedure">
+            <Attribute Name="ProcedureID"><Value>1</Value></Attribute>
+            <InternalElement Name="Speed" ID="5" RefBaseSystemUnitPath="MTPServiceSUCLib/ServiceParameter/ProcedureParameter"/>
+          </InternalElement>
+          <InternalElement Name="Fast" ID="4" RefBaseSystemUnitPath="MTPServiceSUCLib/ServiceProcedure"/>
+        </InternalElement></InstanceHierarchy></CAEXFile>"#;
+    let module = Module::read(text).unwrap();
+    assert_eq!(module.services.len(), 1);
+    assert_eq!(module.services[0].name, "Stir & heat");
+    let names: Vec<_> = module.services[0]
+        .procedures
+        .iter()
+        .map(|procedure| &*procedure.name)
+        .collect();
+    assert_eq!(names, ["Slow"]);
+    let about: Vec<_> = module
+        .findings
+        .iter()
+        .map(|finding| &*finding.about)
+        .collect();
+    assert_eq!(
+        about,
+        ["Stir & heat", "Stir & heat/Slow/Speed", "Stir & heat/Fast"]
+    );
+}

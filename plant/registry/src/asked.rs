@@ -1,0 +1,194 @@
+//! What a server asks for when it registers (OPC 10000-4, 5.5.5 and 5.5.6), and why it may be refused.
+
+use thiserror::Error;
+
+/// The ApplicationType of OPC 10000-4, 7.4.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ApplicationType {
+    /// Server.
+    Server,
+    /// Client, which never registers.
+    Client,
+    /// ClientAndServer.
+    ClientAndServer,
+    /// DiscoveryServer.
+    DiscoveryServer,
+}
+
+/// A RegisteredServer (OPC 10000-4, 7.32) with its MdnsDiscoveryConfiguration.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Asked {
+    /// The ApplicationUri.
+    pub server_uri: String,
+    /// The ProductUri; may be empty.
+    pub product_uri: String,
+    /// Names as (locale, text).
+    pub names: Vec<(String, String)>,
+    /// What it is.
+    pub application_type: ApplicationType,
+    /// Of a gateway; empty otherwise.
+    pub gateway_server_uri: String,
+    /// Where its endpoints are asked for.
+    pub discovery_urls: Vec<String>,
+    /// A file that is there while the server is installed; empty for none.
+    pub semaphore_file_path: String,
+    /// `false` takes the registration back.
+    pub is_online: bool,
+    /// How it wants to be announced on the network; RegisterServer alone has none.
+    pub mdns: Option<MdnsConfiguration>,
+}
+
+/// MdnsDiscoveryConfiguration of OPC 10000-4, 7.13.1.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct MdnsConfiguration {
+    /// The mDNS name it wants.
+    pub name: String,
+    /// Codes of OPC 10000-12, Annex D, as `DA`.
+    pub capabilities: Vec<String>,
+}
+
+/// How the request came.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Channel {
+    /// Whether the SecureChannel signs.
+    pub is_secured: bool,
+    /// The ApplicationUri in the client's certificate.
+    pub certificate_uri: Option<String>,
+}
+
+/// Why a registration is refused. Nothing of it was taken.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum RegisterFault {
+    /// BadSecurityModeInsufficient.
+    #[error("registering needs a secured channel")]
+    Unsecured,
+    /// BadServerUriInvalid.
+    #[error("the server URI is empty or too long")]
+    NoUri,
+    /// BadServerUriInvalid: what is registered is not who registers it.
+    #[error("the server URI is {asked}, the certificate is of {certificate}")]
+    OtherUri {
+        /// What it asked for.
+        asked: String,
+        /// What the certificate says.
+        certificate: String,
+    },
+    /// BadServerNameMissing.
+    #[error("the server has no name")]
+    NoName,
+    /// BadDiscoveryUrlMissing.
+    #[error("the server has no discovery URL")]
+    NoUrl,
+    /// BadSempahoreFileMissing.
+    #[error("the semaphore file is not there")]
+    NoSemaphore,
+    /// BadInvalidArgument: a client does not register, and no text or list is so long.
+    #[error("{what}")]
+    Invalid {
+        /// What it is.
+        what: &'static str,
+    },
+    /// BadResourceUnavailable.
+    #[error("{most} servers are registered, and there is no room for more")]
+    Full {
+        /// How many there may be.
+        most: usize,
+    },
+}
+
+impl RegisterFault {
+    /// The StatusCode of OPC 10000-6, Annex A.
+    #[must_use]
+    pub fn status(&self) -> u32 {
+        match self {
+            Self::Unsecured => 0x80E6_0000,
+            Self::NoUri | Self::OtherUri { .. } => 0x804F_0000,
+            Self::NoName => 0x8050_0000,
+            Self::NoUrl => 0x8051_0000,
+            Self::NoSemaphore => 0x8052_0000,
+            Self::Invalid { .. } => 0x80AB_0000,
+            Self::Full { .. } => 0x8004_0000,
+        }
+    }
+}
+
+impl Asked {
+    /// Holds a request against the rules, in the order of Part 4.
+    pub(crate) fn check(
+        &self,
+        channel: &Channel,
+        allow_unsecured: bool,
+    ) -> Result<(), RegisterFault> {
+        if !channel.is_secured && !allow_unsecured {
+            return Err(RegisterFault::Unsecured);
+        }
+        if self.server_uri.is_empty() || self.server_uri.len() > MAX_TEXT {
+            return Err(RegisterFault::NoUri);
+        }
+        if let Some(certificate) = &channel.certificate_uri
+            && *certificate != self.server_uri
+        {
+            return Err(RegisterFault::OtherUri {
+                asked: self.server_uri.clone(),
+                certificate: certificate.clone(),
+            });
+        }
+        if self.application_type == ApplicationType::Client {
+            let what = "a client does not register";
+            return Err(RegisterFault::Invalid { what });
+        }
+        if self.names.iter().all(|(_, text)| text.is_empty()) {
+            return Err(RegisterFault::NoName);
+        }
+        if self.discovery_urls.iter().all(String::is_empty) {
+            return Err(RegisterFault::NoUrl);
+        }
+        self.check_sizes()
+    }
+
+    fn check_sizes(&self) -> Result<(), RegisterFault> {
+        let lists = [
+            (
+                self.names.len(),
+                MAX_NAMES,
+                "more names than a server may have",
+            ),
+            (
+                self.discovery_urls.len(),
+                MAX_URLS,
+                "more discovery URLs than a server may have",
+            ),
+            (
+                self.mdns.as_ref().map_or(0, |mdns| mdns.capabilities.len()),
+                MAX_CAPABILITIES,
+                "more capabilities than a server may have",
+            ),
+        ];
+        let too_many = lists.into_iter().find(|(count, most, _)| count > most);
+        if let Some((_, _, what)) = too_many {
+            return Err(RegisterFault::Invalid { what });
+        }
+        let mdns = self.mdns.iter();
+        let texts = [
+            &self.product_uri,
+            &self.gateway_server_uri,
+            &self.semaphore_file_path,
+        ]
+        .into_iter()
+        .chain(self.names.iter().flat_map(|(locale, text)| [locale, text]))
+        .chain(&self.discovery_urls)
+        .chain(mdns.flat_map(|mdns| mdns.capabilities.iter().chain([&mdns.name])));
+        match texts.into_iter().any(|text| text.len() > MAX_TEXT) {
+            true => Err(RegisterFault::Invalid {
+                what: "a text that is longer than 1024 bytes",
+            }),
+            false => Ok(()),
+        }
+    }
+}
+
+const MAX_TEXT: usize = 1024;
+const MAX_NAMES: usize = 16;
+const MAX_URLS: usize = 16;
+const MAX_CAPABILITIES: usize = 32;

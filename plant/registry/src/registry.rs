@@ -1,0 +1,418 @@
+//! The registry itself: what is heard goes in, who is there comes out.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::time::{Duration, Instant};
+
+use crate::asked::{Asked, Channel, RegisterFault};
+use crate::network::{Announcement, Network, NetworkRecord};
+use crate::watch::{Outcome, Probe, Sign, Watch};
+
+/// How careful and how patient a registry is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Settings {
+    /// Whether a server may register over a channel that is not secured. The standard has it refused (OPC 10000-12, 4.2.2).
+    pub allow_unsecured: bool,
+    /// How long a registration without semaphore file counts: twice the period in which servers repeat it.
+    pub forget_after: Duration,
+    /// How often each endpoint is tried.
+    pub probe_every: Duration,
+    /// How long one that gives no answer at all still counts as there.
+    pub lost_after: Duration,
+    /// Servers that may be registered, and records of the network, each. What is more is refused or not taken in.
+    pub most: usize,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            allow_unsecured: false,
+            forget_after: Duration::from_secs(1200),
+            probe_every: Duration::from_secs(1),
+            lost_after: Duration::from_secs(2),
+            most: 1024,
+        }
+    }
+}
+
+/// What a registration was.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Registered {
+    /// Of a server that was not registered.
+    New,
+    /// Of one that was, with something else than before.
+    Changed,
+    /// A repetition.
+    Again,
+    /// The end of one, or of none.
+    Withdrawn,
+}
+
+/// Why a server is no longer there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Loss {
+    /// It took its registration back.
+    Unregistered,
+    /// It said so by mDNS, or its announcement ran out.
+    Goodbye,
+    /// It registered no more.
+    Expired,
+    /// Its semaphore file is gone.
+    SemaphoreGone,
+    /// It does not answer.
+    Unreachable,
+}
+
+/// What has happened.
+#[derive(Debug, Clone, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Event {
+    /// A server registered, or registered otherwise than before.
+    Registered {
+        /// Its ApplicationUri.
+        server_uri: String,
+        /// Where its endpoints are asked for.
+        discovery_urls: Vec<String>,
+    },
+    /// A server appeared on the network, or its record changed.
+    Seen(NetworkRecord),
+    /// The program behind a URL was started anew: what was learned of it counts no more.
+    Restarted {
+        /// The URL that was tried.
+        url: String,
+    },
+    /// A server that was registered is gone.
+    Gone {
+        /// Its ApplicationUri.
+        server_uri: String,
+        /// How that is known.
+        loss: Loss,
+    },
+    /// A server that was seen on the network is gone.
+    Vanished {
+        /// What was known of it.
+        record: NetworkRecord,
+        /// How that is known.
+        loss: Loss,
+    },
+    /// This server asks us to announce it.
+    Announce(Announcement),
+    /// What we announced is to be taken back: a goodbye.
+    Withdraw {
+        /// The instance name.
+        instance: String,
+    },
+}
+
+/// Who is there. See the crate's page for how it is driven.
+#[derive(Debug)]
+pub struct Registry {
+    settings: Settings,
+    servers: BTreeMap<String, Server>,
+    network: Network,
+    watch: Watch,
+    events: VecDeque<Event>,
+    refused: u64,
+}
+
+#[derive(Debug)]
+struct Server {
+    asked: Asked,
+    since: Instant,
+    forget_at: Instant,
+}
+
+impl Registry {
+    /// A registry that knows nobody.
+    #[must_use]
+    pub fn new(settings: Settings) -> Self {
+        Self {
+            settings,
+            servers: BTreeMap::new(),
+            network: Network::default(),
+            watch: Watch::default(),
+            events: VecDeque::new(),
+            refused: 0,
+        }
+    }
+
+    /// RegisterServer and RegisterServer2. Whether a semaphore file is there is the caller's to look up, `None` where the
+    /// request names none.
+    ///
+    /// # Errors
+    /// [`RegisterFault`], with the status to answer; what was registered before stays.
+    pub fn register(
+        &mut self,
+        asked: Asked,
+        channel: &Channel,
+        semaphore_is_there: Option<bool>,
+        now: Instant,
+    ) -> Result<Registered, RegisterFault> {
+        asked.check(channel, self.settings.allow_unsecured)?;
+        if !asked.is_online {
+            self.end(&asked.server_uri.clone(), Loss::Unregistered);
+            return Ok(Registered::Withdrawn);
+        }
+        if semaphore_is_there == Some(false) {
+            return Err(RegisterFault::NoSemaphore);
+        }
+        let most = self.settings.most;
+        let known = self.servers.get_mut(&asked.server_uri);
+        if known.is_none() && self.servers.len() >= most {
+            self.refused += 1;
+            return Err(RegisterFault::Full { most });
+        }
+        let forget_at = now + self.settings.forget_after;
+        let known = self.servers.get_mut(&asked.server_uri);
+        let (registered, since) = match known {
+            Some(server) if server.asked == asked => {
+                server.forget_at = forget_at;
+                return Ok(Registered::Again);
+            }
+            Some(server) => (Registered::Changed, server.since),
+            None => (Registered::New, now),
+        };
+        let server = Server {
+            asked,
+            since,
+            forget_at,
+        };
+        self.take(server, now);
+        Ok(registered)
+    }
+
+    /// Takes a server in, in the place of what it registered before.
+    fn take(&mut self, server: Server, now: Instant) {
+        let server_uri = server.asked.server_uri.clone();
+        let discovery_urls = server.asked.discovery_urls.clone();
+        let wished = server.asked.announcement();
+        let before = self.servers.insert(server_uri.clone(), server);
+        let before = before.map(|server| server.asked);
+        let announced = before.as_ref().and_then(Asked::announcement);
+        if let Some(old) =
+            announced.filter(|old| wished.as_ref().map(|new| &new.instance) != Some(&old.instance))
+        {
+            self.network.remove(&old.instance);
+            self.events.push_back(Event::Withdraw {
+                instance: old.instance,
+            });
+        }
+        for url in before.iter().flat_map(|asked| &asked.discovery_urls) {
+            self.unwatch(url);
+        }
+        for url in &discovery_urls {
+            self.watch.add(url, self.settings.probe_every, now);
+        }
+        self.events.push_back(Event::Registered {
+            server_uri,
+            discovery_urls,
+        });
+        if let Some(wished) = wished {
+            // A record of that name is ours by now, wherever it came from.
+            self.network.put(wished.clone());
+            self.events.push_back(Event::Announce(wished));
+        }
+    }
+
+    /// mDNS has told of a server, for the first time or again.
+    pub fn announced(&mut self, announcement: Announcement, now: Instant) {
+        let instance = &announcement.instance;
+        if self.is_ours(instance) {
+            // What comes back of our own announcements.
+            return;
+        }
+        let known = self.network.get(instance);
+        if known.is_some_and(|known| known.announcement == announcement) {
+            return;
+        }
+        if known.is_none() && self.network.len() >= self.settings.most {
+            self.refused += 1;
+            return;
+        }
+        let instance = instance.clone();
+        let url = announcement.url.clone();
+        if let Some(before) = self.network.put(announcement) {
+            self.unwatch(&before.announcement.url);
+        }
+        self.watch.add(&url, self.settings.probe_every, now);
+        let record = self.network.get(&instance).cloned();
+        self.events.extend(record.map(Event::Seen));
+    }
+
+    /// mDNS has told that a server leaves, or what it told has run out.
+    pub fn withdrawn(&mut self, instance: &str) {
+        if !self.is_ours(instance) {
+            self.vanish(instance, Loss::Goodbye);
+        }
+    }
+
+    /// The semaphore file of a registered server is gone.
+    pub fn semaphore_gone(&mut self, server_uri: &str) {
+        self.end(server_uri, Loss::SemaphoreGone);
+    }
+
+    /// The endpoint to try now, if any is due. To be asked until there is none.
+    pub fn poll_probe(&mut self, now: Instant) -> Option<Probe> {
+        self.watch.next(self.settings.probe_every, now)
+    }
+
+    /// What came of a try.
+    pub fn probed(&mut self, url: &str, outcome: Outcome, now: Instant) {
+        let lost_after = self.settings.lost_after;
+        match self.watch.probed(url, outcome, lost_after, now) {
+            Sign::Nothing => {}
+            Sign::Restarted => self.events.push_back(Event::Restarted {
+                url: url.to_owned(),
+            }),
+            Sign::Lost => self.lose(url),
+        }
+    }
+
+    /// Forgets who has not registered again.
+    pub fn handle_timeout(&mut self, now: Instant) {
+        let expired: Vec<String> = self
+            .servers
+            .iter()
+            .filter(|(_, server)| server.expires() && server.forget_at <= now)
+            .map(|(uri, _)| uri.clone())
+            .collect();
+        for uri in expired {
+            self.end(&uri, Loss::Expired);
+        }
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) and [`poll_probe`](Self::poll_probe) are wanted next.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<Instant> {
+        let expiring = self.servers.values().filter(|server| server.expires());
+        let expiry = expiring.map(|server| server.forget_at).min();
+        expiry.into_iter().chain(self.watch.due()).min()
+    }
+
+    /// What has happened, oldest first.
+    pub fn poll_event(&mut self) -> Option<Event> {
+        self.events.pop_front()
+    }
+
+    /// The registered servers, of all or of these URIs, with since when: FindServers.
+    pub fn find_servers(&self, uris: &[&str]) -> impl Iterator<Item = (&Asked, Instant)> {
+        self.servers
+            .values()
+            .filter(move |server| uris.is_empty() || uris.contains(&&*server.asked.server_uri))
+            .map(|server| (&server.asked, server.since))
+    }
+
+    /// Records from an id on that have all of the capabilities, at most so many (0: all): FindServersOnNetwork.
+    #[must_use]
+    pub fn find_servers_on_network(
+        &self,
+        from: u32,
+        most: u32,
+        capabilities: &[&str],
+    ) -> Vec<&NetworkRecord> {
+        self.network.find(from, most, capabilities)
+    }
+
+    /// How often a server was not taken in because [`Settings::most`] were there.
+    #[must_use]
+    pub fn refused(&self) -> u64 {
+        self.refused
+    }
+
+    /// Nobody answers at a URL: all that was said of it goes.
+    fn lose(&mut self, url: &str) {
+        self.watch.remove(url);
+        let has = |asked: &Asked| asked.discovery_urls.iter().any(|known| known == url);
+        let servers: Vec<String> = self
+            .servers
+            .values()
+            .filter(|server| has(&server.asked))
+            .map(|server| server.asked.server_uri.clone())
+            .collect();
+        let records: Vec<String> = self
+            .network
+            .iter()
+            .filter(|record| record.announcement.url == url)
+            .map(|record| record.announcement.instance.clone())
+            .collect();
+        for uri in servers {
+            // One that has another endpoint is looked after there.
+            let other = self.servers.get_mut(&uri).map(|server| {
+                server.asked.discovery_urls.retain(|known| known != url);
+                !server.asked.discovery_urls.is_empty()
+            });
+            if other == Some(false) {
+                self.end(&uri, Loss::Unreachable);
+            }
+        }
+        for instance in records {
+            if !self.is_ours(&instance) {
+                self.vanish(&instance, Loss::Unreachable);
+            }
+        }
+    }
+
+    fn end(&mut self, server_uri: &str, loss: Loss) {
+        let Some(server) = self.servers.remove(server_uri) else {
+            return;
+        };
+        if let Some(announcement) = server.asked.announcement() {
+            self.network.remove(&announcement.instance);
+            self.events.push_back(Event::Withdraw {
+                instance: announcement.instance,
+            });
+        }
+        for url in &server.asked.discovery_urls {
+            self.unwatch(url);
+        }
+        self.events.push_back(Event::Gone {
+            server_uri: server_uri.to_owned(),
+            loss,
+        });
+    }
+
+    fn vanish(&mut self, instance: &str, loss: Loss) {
+        if let Some(record) = self.network.remove(instance) {
+            self.unwatch(&record.announcement.url);
+            self.events.push_back(Event::Vanished { record, loss });
+        }
+    }
+
+    /// Looks no longer after a URL that nobody is known by any more.
+    fn unwatch(&mut self, url: &str) {
+        let registered = self.servers.values();
+        let mut urls = registered
+            .flat_map(|server| &server.asked.discovery_urls)
+            .chain(self.network.iter().map(|record| &record.announcement.url));
+        if !urls.any(|known| known == url) {
+            self.watch.remove(url);
+        }
+    }
+
+    /// Whether a registered server asked us to announce that name.
+    fn is_ours(&self, instance: &str) -> bool {
+        let mut wishes = self
+            .servers
+            .values()
+            .filter_map(|server| server.asked.mdns.as_ref());
+        wishes.any(|mdns| mdns.name == instance)
+    }
+}
+
+impl Server {
+    /// With a semaphore file it stays as long as the file does.
+    fn expires(&self) -> bool {
+        self.asked.semaphore_file_path.is_empty()
+    }
+}
+
+impl Asked {
+    /// How it is to be announced, if it is.
+    fn announcement(&self) -> Option<Announcement> {
+        let mdns = self.mdns.as_ref().filter(|mdns| !mdns.name.is_empty())?;
+        Some(Announcement {
+            instance: mdns.name.clone(),
+            url: self.discovery_urls.first()?.clone(),
+            capabilities: mdns.capabilities.clone(),
+        })
+    }
+}

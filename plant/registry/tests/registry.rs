@@ -1,0 +1,391 @@
+//! A registry told of servers by hand, on a clock of its own.
+#![expect(
+    clippy::disallowed_methods,
+    reason = "a test needs some instant to count from"
+)]
+
+use std::time::{Duration, Instant};
+
+use registry::{
+    Announcement, ApplicationType, Asked, Channel, Event, Loss, MdnsConfiguration, Outcome,
+    RegisterFault, Registered, Registry, Settings,
+};
+
+const SECOND: Duration = Duration::from_secs(1);
+
+fn secured(uri: &str) -> Channel {
+    Channel {
+        is_secured: true,
+        certificate_uri: Some(uri.to_owned()),
+    }
+}
+
+fn gripper() -> Asked {
+    Asked {
+        server_uri: "urn:cell:gripper".to_owned(),
+        product_uri: "urn:maker:2f85".to_owned(),
+        names: vec![("en".to_owned(), "Gripper".to_owned())],
+        application_type: ApplicationType::Server,
+        gateway_server_uri: String::new(),
+        discovery_urls: vec!["opc.tcp://127.0.0.1:4841".to_owned()],
+        semaphore_file_path: String::new(),
+        is_online: true,
+        mdns: Some(MdnsConfiguration {
+            name: "gripper-pc-4841".to_owned(),
+            capabilities: vec!["DA".to_owned()],
+        }),
+    }
+}
+
+fn robot() -> Announcement {
+    Announcement {
+        instance: "robot-pc-4842".to_owned(),
+        url: "opc.tcp://pc:4842/robot".to_owned(),
+        capabilities: vec!["NA".to_owned(), "Skills".to_owned()],
+    }
+}
+
+fn register(
+    registry: &mut Registry,
+    asked: &Asked,
+    now: Instant,
+) -> Result<Registered, RegisterFault> {
+    let channel = secured("urn:cell:gripper");
+    registry.register(asked.clone(), &channel, None, now)
+}
+
+fn events(registry: &mut Registry) -> Vec<Event> {
+    std::iter::from_fn(|| registry.poll_event()).collect()
+}
+
+fn start() -> (Registry, Instant) {
+    (Registry::new(Settings::default()), Instant::now())
+}
+
+#[test]
+fn a_server_that_registers_is_listed_announced_and_looked_after() {
+    let (mut registry, now) = start();
+    assert_eq!(
+        register(&mut registry, &gripper(), now),
+        Ok(Registered::New)
+    );
+    assert_eq!(
+        register(&mut registry, &gripper(), now),
+        Ok(Registered::Again)
+    );
+    let happened = events(&mut registry);
+    assert!(
+        matches!(&*happened, [Event::Registered { .. }, Event::Announce(wish)] if wish.instance == "gripper-pc-4841"),
+        "{happened:?}"
+    );
+    assert_eq!(registry.find_servers(&[]).count(), 1);
+    assert_eq!(registry.find_servers(&["urn:other"]).count(), 0);
+    assert_eq!(
+        registry.find_servers_on_network(0, 0, &["da"]).len(),
+        1,
+        "whatever the case"
+    );
+    assert_eq!(registry.poll_probe(now), None, "it has just been heard of");
+    let probe = registry.poll_probe(now + SECOND).unwrap();
+    assert_eq!(probe.url, "opc.tcp://127.0.0.1:4841");
+    assert_eq!(registry.poll_probe(now + SECOND), None, "one try at a time");
+}
+
+#[test]
+fn each_fault_has_its_status() {
+    let (mut registry, now) = start();
+    let mut fault = |change: &dyn Fn(&mut Asked), channel: &Channel, semaphore| {
+        let mut asked = gripper();
+        change(&mut asked);
+        registry
+            .register(asked, channel, semaphore, now)
+            .unwrap_err()
+            .status()
+    };
+    let channel = secured("urn:cell:gripper");
+    let open = Channel {
+        is_secured: false,
+        certificate_uri: None,
+    };
+    assert_eq!(
+        fault(&|_| {}, &open, None),
+        0x80E6_0000,
+        "BadSecurityModeInsufficient"
+    );
+    assert_eq!(
+        fault(&|_| {}, &secured("urn:other"), None),
+        0x804F_0000,
+        "BadServerUriInvalid"
+    );
+    assert_eq!(
+        fault(&|asked| asked.server_uri.clear(), &channel, None),
+        0x804F_0000
+    );
+    assert_eq!(
+        fault(&|asked| asked.names.clear(), &channel, None),
+        0x8050_0000,
+        "BadServerNameMissing"
+    );
+    assert_eq!(
+        fault(&|asked| asked.discovery_urls.clear(), &channel, None),
+        0x8051_0000,
+        "BadDiscoveryUrlMissing"
+    );
+    assert_eq!(
+        fault(&|_| {}, &channel, Some(false)),
+        0x8052_0000,
+        "BadSempahoreFileMissing"
+    );
+    let urls = vec!["opc.tcp://h:1".to_owned(); 768];
+    assert_eq!(
+        fault(&|asked| asked.discovery_urls = urls.clone(), &channel, None),
+        0x80AB_0000
+    );
+    let long = "x".repeat(2000);
+    assert_eq!(
+        fault(&|asked| asked.product_uri = long.clone(), &channel, None),
+        0x80AB_0000
+    );
+    assert_eq!(
+        fault(
+            &|asked| asked.application_type = ApplicationType::Client,
+            &channel,
+            None
+        ),
+        0x80AB_0000
+    );
+    assert_eq!(
+        registry.find_servers(&[]).count(),
+        0,
+        "nothing of it was taken"
+    );
+    assert_eq!(registry.poll_event(), None);
+}
+
+#[test]
+fn taking_the_registration_back_removes_it_at_once() {
+    let (mut registry, now) = start();
+    register(&mut registry, &gripper(), now).unwrap();
+    events(&mut registry);
+    let offline = Asked {
+        is_online: false,
+        ..gripper()
+    };
+    assert_eq!(
+        register(&mut registry, &offline, now),
+        Ok(Registered::Withdrawn)
+    );
+    let happened = events(&mut registry);
+    assert_eq!(
+        happened,
+        [
+            Event::Withdraw {
+                instance: "gripper-pc-4841".to_owned()
+            },
+            Event::Gone {
+                server_uri: "urn:cell:gripper".to_owned(),
+                loss: Loss::Unregistered
+            }
+        ]
+    );
+    assert!(registry.find_servers_on_network(0, 0, &[]).is_empty());
+    assert_eq!(registry.poll_timeout(), None, "nobody is looked after");
+}
+
+#[test]
+fn who_registers_no_more_is_forgotten_unless_a_semaphore_file_keeps_it() {
+    let (mut registry, now) = start();
+    register(&mut registry, &gripper(), now).unwrap();
+    let installed = Asked {
+        server_uri: "urn:cell:installed".to_owned(),
+        semaphore_file_path: "/run/installed".to_owned(),
+        mdns: None,
+        discovery_urls: vec!["opc.tcp://127.0.0.1:5000".to_owned()],
+        ..gripper()
+    };
+    let channel = secured("urn:cell:installed");
+    registry
+        .register(installed, &channel, Some(true), now)
+        .unwrap();
+    events(&mut registry);
+    let later = now + Settings::default().forget_after;
+    registry.handle_timeout(later - SECOND);
+    assert_eq!(registry.find_servers(&[]).count(), 2);
+    registry.handle_timeout(later);
+    let left: Vec<_> = registry
+        .find_servers(&[])
+        .map(|(asked, _)| &*asked.server_uri)
+        .collect();
+    assert_eq!(left, ["urn:cell:installed"]);
+    assert!(events(&mut registry).contains(&Event::Gone {
+        server_uri: "urn:cell:gripper".to_owned(),
+        loss: Loss::Expired
+    }));
+    registry.semaphore_gone("urn:cell:installed");
+    assert_eq!(registry.find_servers(&[]).count(), 0);
+}
+
+#[test]
+fn a_killed_server_is_lost_within_two_seconds_without_a_goodbye() {
+    let (mut registry, now) = start();
+    registry.announced(robot(), now);
+    assert!(matches!(&*events(&mut registry), [Event::Seen(_)]));
+    // Each second it is tried; it is killed right after the first answer, and its host is gone, too.
+    let mut lost_after = None;
+    for tenth in 1..100_u32 {
+        let time = now + SECOND / 10 * tenth;
+        while let Some(probe) = registry.poll_probe(time) {
+            let outcome = match time <= now + SECOND {
+                true => Outcome::Alive { start_time: None },
+                false => Outcome::Silent,
+            };
+            registry.probed(&probe.url, outcome, time);
+        }
+        if let Some(Event::Vanished { loss, .. }) = registry.poll_event() {
+            assert_eq!(loss, Loss::Unreachable);
+            lost_after.get_or_insert(time - now - SECOND);
+        }
+    }
+    assert_eq!(lost_after, Some(SECOND * 2));
+    assert!(registry.find_servers_on_network(0, 0, &[]).is_empty());
+}
+
+#[test]
+fn a_host_that_refuses_the_connection_tells_at_once() {
+    let (mut registry, now) = start();
+    register(&mut registry, &gripper(), now).unwrap();
+    registry.announced(robot(), now);
+    events(&mut registry);
+    registry.probed("opc.tcp://127.0.0.1:4841", Outcome::Refused, now);
+    let happened = events(&mut registry);
+    assert!(
+        happened.contains(&Event::Gone {
+            server_uri: "urn:cell:gripper".to_owned(),
+            loss: Loss::Unreachable
+        }),
+        "{happened:?}"
+    );
+    assert_eq!(
+        registry.find_servers_on_network(0, 0, &[]).len(),
+        1,
+        "the robot is still there"
+    );
+    assert_eq!(
+        register(&mut registry, &gripper(), now),
+        Ok(Registered::New),
+        "it came back"
+    );
+}
+
+#[test]
+fn a_server_with_two_endpoints_is_there_while_one_answers() {
+    let (mut registry, now) = start();
+    let urls = ["opc.tcp://10.0.0.1:4841", "opc.tcp://10.1.0.1:4841"];
+    let asked = Asked {
+        discovery_urls: urls.map(str::to_owned).to_vec(),
+        ..gripper()
+    };
+    register(&mut registry, &asked, now).unwrap();
+    registry.probed(urls[0], Outcome::Refused, now);
+    assert_eq!(registry.find_servers(&[]).count(), 1);
+    registry.probed(urls[1], Outcome::Refused, now);
+    assert_eq!(registry.find_servers(&[]).count(), 0);
+}
+
+#[test]
+fn another_start_time_is_a_restart() {
+    let (mut registry, now) = start();
+    registry.announced(robot(), now);
+    events(&mut registry);
+    let url = robot().url;
+    let alive = |start_time| Outcome::Alive { start_time };
+    registry.probed(&url, alive(Some(5)), now);
+    registry.probed(&url, alive(None), now);
+    registry.probed(&url, alive(Some(5)), now);
+    assert_eq!(registry.poll_event(), None);
+    registry.probed(&url, alive(Some(6)), now);
+    assert_eq!(registry.poll_event(), Some(Event::Restarted { url }));
+}
+
+#[test]
+fn goodbye_takes_a_record_away_and_ids_are_never_given_twice() {
+    let (mut registry, now) = start();
+    registry.announced(robot(), now);
+    registry.announced(robot(), now);
+    let first = registry.find_servers_on_network(0, 0, &[])[0].record_id;
+    registry.withdrawn(&robot().instance);
+    let happened = events(&mut registry);
+    assert!(
+        matches!(
+            &*happened,
+            [
+                Event::Seen(_),
+                Event::Vanished {
+                    loss: Loss::Goodbye,
+                    ..
+                }
+            ]
+        ),
+        "{happened:?}"
+    );
+    registry.announced(robot(), now);
+    let second = registry.find_servers_on_network(0, 0, &[])[0].record_id;
+    assert!(second > first);
+    assert!(
+        registry
+            .find_servers_on_network(second + 1, 0, &[])
+            .is_empty()
+    );
+    assert_eq!(
+        registry
+            .find_servers_on_network(0, 0, &["na", "SKILLS"])
+            .len(),
+        1
+    );
+    assert!(
+        registry
+            .find_servers_on_network(0, 0, &["na", "HD"])
+            .is_empty()
+    );
+}
+
+#[test]
+fn nobody_takes_back_on_the_network_what_a_registered_server_has_us_announce() {
+    let (mut registry, now) = start();
+    register(&mut registry, &gripper(), now).unwrap();
+    events(&mut registry);
+    let forged = Announcement {
+        instance: "gripper-pc-4841".to_owned(),
+        url: "opc.tcp://10.9.9.9:1".to_owned(),
+        capabilities: Vec::new(),
+    };
+    registry.announced(forged, now);
+    registry.withdrawn("gripper-pc-4841");
+    assert_eq!(registry.poll_event(), None);
+    let records = registry.find_servers_on_network(0, 0, &[]);
+    assert_eq!(records[0].announcement.url, "opc.tcp://127.0.0.1:4841");
+}
+
+#[test]
+fn made_up_servers_take_no_more_room_than_there_is() {
+    let settings = Settings {
+        most: 3,
+        ..Settings::default()
+    };
+    let (mut registry, now) = (Registry::new(settings), Instant::now());
+    register(&mut registry, &gripper(), now).unwrap();
+    for number in 0..10 {
+        let announcement = Announcement {
+            instance: format!("made-up-{number}"),
+            ..robot()
+        };
+        registry.announced(announcement, now);
+    }
+    assert_eq!(registry.find_servers_on_network(0, 0, &[]).len(), 3);
+    assert_eq!(registry.refused(), 8);
+    assert_eq!(
+        register(&mut registry, &gripper(), now),
+        Ok(Registered::Again),
+        "who is there stays"
+    );
+}
