@@ -11,7 +11,10 @@ use std::{
     },
 };
 
-use nix::sched::{CloneFlags, unshare};
+use nix::{
+    mount::{MsFlags, mount},
+    sched::{CloneFlags, unshare},
+};
 
 /// Software of other makers that a test needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -111,7 +114,8 @@ impl Cell {
         static COUNT: AtomicU32 = AtomicU32::new(0);
         // A test that failed with the lock has left nothing behind that the next one could trip over.
         let only = ONLY.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Err(error) = unshare(CloneFlags::CLONE_NEWNET) {
+        let parts = CloneFlags::CLONE_NEWNET | CloneFlags::CLONE_NEWNS;
+        if let Err(error) = unshare(parts).and_then(|()| own_shared_memory()) {
             panic!(
                 "this process may not make a network of its own ({error}): run `cargo xtask test`, \
                  which arranges for that"
@@ -160,6 +164,26 @@ impl Drop for Cell {
             eprintln!("{} stays: {error}", self.folder.display());
         }
     }
+}
+
+/// Fast DDS passes samples through files there, whose names are those of its ports: tests that run beside each other
+/// would hear one another.
+fn own_shared_memory() -> nix::Result<()> {
+    const NOTHING: Option<&str> = None;
+    mount(
+        NOTHING,
+        "/",
+        NOTHING,
+        MsFlags::MS_REC | MsFlags::MS_PRIVATE,
+        NOTHING,
+    )?;
+    mount(
+        NOTHING,
+        "/dev/shm",
+        Some("tmpfs"),
+        MsFlags::empty(),
+        NOTHING,
+    )
 }
 
 fn ip(args: &[&str]) {

@@ -139,7 +139,14 @@ fn what_the_plant_thinks_with_reaches_no_io_and_knows_no_space() {
         does_not_reach(package, IMPURE);
         does_not_reach(
             package,
-            &["uadp", "messages", "mappings", "bridge-*", "tcpros", "transport"],
+            &[
+                "uadp",
+                "messages",
+                "mappings",
+                "bridge-*",
+                "tcpros",
+                "transport",
+            ],
         );
     }
 }

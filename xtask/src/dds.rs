@@ -25,6 +25,8 @@ use crate::{
 pub(crate) struct Rustdds {
     folder: PathBuf,
     features: [&'static str; 2],
+    /// Names of the tests that the patches add to those of RustDDS.
+    tests: Vec<String>,
 }
 
 impl Rustdds {
@@ -47,8 +49,13 @@ impl Rustdds {
         let folder = patched.join(&name);
         let stamp = patched.join(format!("{name}.made-of"));
         let made_of = patches.text(&published.folder);
+        let tests = patches.tests();
         if folder.is_dir() && fs::read_to_string(&stamp).is_ok_and(|text| text == made_of) {
-            return Ok(Self { folder, features });
+            return Ok(Self {
+                folder,
+                features,
+                tests,
+            });
         }
         step(&format!(
             "patching RustDDS {} into {}",
@@ -60,7 +67,28 @@ impl Rustdds {
         copy(&published.folder, &folder)?;
         patches.apply(&folder)?;
         fs::write(&stamp, made_of).with_context(|| stamp.display().to_string())?;
-        Ok(Self { folder, features })
+        Ok(Self {
+            folder,
+            features,
+            tests,
+        })
+    }
+
+    /// A command of cargo that builds the unit tests of the patched source by itself, outside of the workspace.
+    pub(crate) fn build_of_own_tests(&self, workspace: &Workspace) -> Command {
+        let mut command = workspace.cargo(&["test", "--no-run", "--lib", "--locked"]);
+        command
+            .arg("--manifest-path")
+            .arg(self.folder.join("Cargo.toml"))
+            .arg("--target-dir")
+            .arg(workspace.target.join("patched/tests"))
+            .env("CARGO_PROFILE_DEV_DEBUG", "0");
+        command
+    }
+
+    /// The names of the tests that the patches add.
+    pub(crate) fn tests(&self) -> &[String] {
+        &self.tests
     }
 
     /// A command of cargo that compiles with the patched source, in the root. The verb, such as `build`, comes first in
@@ -199,6 +227,26 @@ impl Patches {
         format!("{}\n{texts}", published.display())
     }
 
+    /// The functions behind each `#[test]` that is added.
+    fn tests(&self) -> Vec<String> {
+        let mut tests = Vec::new();
+        for (_, text) in &self.0 {
+            let mut is_test = false;
+            for line in text.lines().filter_map(|line| line.strip_prefix('+')) {
+                let line = line.trim();
+                let name = line
+                    .strip_prefix("fn ")
+                    .and_then(|rest| rest.split('(').next());
+                match name {
+                    Some(name) if is_test => tests.push(name.to_owned()),
+                    _ => {}
+                }
+                is_test = line == "#[test]" || is_test && name.is_none();
+            }
+        }
+        tests
+    }
+
     fn apply(&self, folder: &Path) -> anyhow::Result<()> {
         for (path, _) in &self.0 {
             let mut git = Command::new("git");
@@ -253,4 +301,28 @@ fn copy(from: &Path, to: &Path) -> anyhow::Result<()> {
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_tests_that_patches_add_are_found() {
+        let text = "\
+ fn before() {}
++  fn helper() {}
++  #[test]
++  #[allow(dead_code)]
++  fn a_first_one() {
++    let inner = 1;
++  }
++  #[test]
++  fn a_second_one() -> io::Result<()> {
+-  #[test]
+-  fn gone() {
+";
+        let patches = Patches(vec![("0001.patch".into(), text.to_owned())]);
+        assert_eq!(patches.tests(), ["a_first_one", "a_second_one"]);
+    }
 }

@@ -49,6 +49,10 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
         ),
     )?;
     check(
+        "the workspace with RustDDS as published",
+        &mut workspace.cargo(&["check", "--workspace", "--locked"]),
+    )?;
+    check(
         "documentation",
         rustdds
             .cargo(workspace, &["doc", "--workspace", "--no-deps", "--locked"])

@@ -38,7 +38,22 @@ impl Namespaces {
             }
         }
     }
+
+    /// `program` in a network of its own, with nothing in it but a loopback that carries multicast.
+    pub(crate) fn alone(self, program: impl AsRef<OsStr>) -> Command {
+        let mut command = Command::new("unshare");
+        if self == Self::AsRootOfTheirOwn {
+            command.arg("--map-root-user");
+        }
+        command
+            .args(["--net", "--", "sh", "-c", LOOPBACK])
+            .arg(program);
+        command
+    }
 }
+
+const LOOPBACK: &str = "ip link set lo up && ip link set lo multicast on && ip route add 224.0.0.0/4 dev lo \
+    && exec \"$0\" \"$@\"";
 
 /// Why the tests that need a network of their own cannot run.
 pub(crate) const REFUSED: &str = "this user may make no network namespace, not even in a user namespace of their own \

@@ -1,10 +1,18 @@
 //! `cargo xtask test`: the peers, then every test there is.
+//!
+//! Tests of the package `system-tests` are processes of their own, some beside each other, since most of what they do
+//! is wait for peers. All other test programs run as `cargo test` runs them.
+
+mod job;
+mod outcome;
+mod programs;
 
 use std::{
     fs,
-    io::{BufRead as _, BufReader, ErrorKind},
+    io::ErrorKind,
     path::Path,
-    process::{Command, Stdio},
+    process::Command,
+    time::{Duration, Instant},
 };
 
 use anyhow::Context as _;
@@ -13,12 +21,22 @@ use crate::{
     dds::Rustdds,
     namespace::{Namespaces, REFUSED},
     peers,
-    shell::{Ended, is_ci, run as must, step},
+    shell::{Ended, is_ci, step},
     workspace::Workspace,
 };
+use job::{Job, Lanes, Report};
+use outcome::Outcome;
+use programs::Program;
 
-/// Every target of a test run. Both commands build these for the same packages, so that nothing is built twice.
+/// Every target of a test run. All commands build these for the same packages, so that nothing is built twice.
 const TARGETS: &[&str] = &["--workspace", "--locked"];
+const SYSTEM_TESTS: &str = "system-tests";
+/// Test programs that measure what the machine can carry, so that what runs beside them would be measured, too.
+const ALONE: &[&str] = &["large", "rate", "ros2_fuzz", "ros2_large", "sharing"];
+/// System tests at a time. With more of them than this the waits for peers of a small machine run out.
+const BESIDE: usize = 3;
+/// Peers of other makers fail now and then where nothing of ours takes part. More of it than this is no accident.
+const MOST_FLAKY: usize = 2;
 
 pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     let (options, filters): (Vec<&str>, Vec<&str>) = arguments
@@ -34,49 +52,136 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
         peers::install(workspace);
     }
     step("building the programs and the tests (some minutes the first time)");
-    let built = ["--bins", "--tests", "--examples"];
     let rustdds = Rustdds::prepare(workspace)?;
-    must(&mut rustdds.cargo(workspace, &[&["build"][..], TARGETS, &built].concat()))?;
+    let built = ["--bins", "--tests", "--examples"];
+    let build = rustdds.cargo(workspace, &[&["build"][..], TARGETS, &built].concat());
+    let programs = programs::build(build)?;
+    let of_patches = match filters.is_empty() {
+        true => programs::build(rustdds.build_of_own_tests(workspace))?,
+        false => Vec::new(),
+    };
 
     let skipped = workspace.target.join("skipped-tests.txt");
     remove(&skipped)?;
-    let mut tests = command(workspace, &rustdds, &filters, &skipped);
-    step("testing; tests with peers run one at a time, each in a network of its own");
-    let outcome = Outcome::of(&mut tests)?;
+    #[expect(clippy::disallowed_methods, reason = "how long it took is told")]
+    let start = Instant::now();
+    let report = Plan::of(
+        workspace,
+        &rustdds,
+        (&programs, &of_patches),
+        &filters,
+        &skipped,
+    )?
+    .run()?;
     let reasons = match fs::read_to_string(&skipped) {
         Ok(reasons) => reasons,
         Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
         Err(error) => return Err(error).with_context(|| format!("{}", skipped.display())),
     };
-    for reason in reasons.lines() {
-        println!("skipped: {reason}");
-    }
-    outcome.print(reasons.lines().count());
-    Ok(outcome.ended)
+    let outcome = Outcome::new(&report, reasons.lines().collect(), MOST_FLAKY);
+    step(&format!("tested in {}", minutes(start.elapsed())));
+    print!("{outcome}");
+    Ok(outcome.ended())
 }
 
-fn command(workspace: &Workspace, rustdds: &Rustdds, filters: &[&str], skipped: &Path) -> Command {
-    let namespaces = Namespaces::try_out();
-    let cargo = rustdds.cargo(workspace, &[&["test"][..], TARGETS].concat());
-    let mut command = namespaces.command(cargo.get_program());
-    command
-        .current_dir(&workspace.root)
-        .args(cargo.get_args())
-        .arg("--no-fail-fast")
-        .arg("--")
-        .args(filters)
-        .env("UA_BIN_DIR", workspace.target.join("debug"))
-        .env("UA_PEERS_PYTHON", peers::python(workspace))
-        .env("UA_PEERS", workspace.peers())
-        .env("UA_SKIPPED", skipped);
-    if namespaces == Namespaces::Refused {
-        eprintln!("xtask: {REFUSED}");
-        if is_ci() {
-            eprintln!("xtask: with CI=true no test is skipped, so the system tests fail");
+/// What runs, and what of it at the same time.
+struct Plan {
+    /// One after the other: they take all cores themselves.
+    programs: Vec<Job>,
+    /// [`BESIDE`] at a time.
+    beside: Vec<Job>,
+    alone: Vec<Job>,
+}
+
+impl Plan {
+    fn of(
+        workspace: &Workspace,
+        rustdds: &Rustdds,
+        (programs, of_patches): (&[Program], &[Program]),
+        filters: &[&str],
+        skipped: &Path,
+    ) -> anyhow::Result<Self> {
+        let namespaces = Namespaces::try_out();
+        if namespaces == Namespaces::Refused {
+            eprintln!("xtask: {REFUSED}");
+            if is_ci() {
+                eprintln!("xtask: with CI=true no test is skipped, so the system tests fail");
+            }
         }
-        command.env("UA_NO_NETWORK", REFUSED);
+        let surround = |mut command: Command| {
+            command
+                .env("UA_BIN_DIR", workspace.target.join("debug"))
+                .env("UA_PEERS_PYTHON", peers::python(workspace))
+                .env("UA_PEERS", workspace.peers())
+                .env("UA_SKIPPED", skipped);
+            if namespaces == Namespaces::Refused {
+                command.env("UA_NO_NETWORK", REFUSED);
+            }
+            command
+        };
+        let mut plan = Self {
+            programs: Vec::new(),
+            beside: Vec::new(),
+            alone: Vec::new(),
+        };
+        for program in programs {
+            let command = || surround(program.command(namespaces));
+            if program.package != SYSTEM_TESTS {
+                let mut command = command();
+                command.args(filters);
+                plan.programs.push(Job::new(program.label(), command));
+                continue;
+            }
+            for test in program.tests(filters)? {
+                let mut command = command();
+                command.args(["--exact", &test]);
+                let job = Job::new(format!("{}::{test}", program.name), command).with_peers();
+                match ALONE.contains(&program.name.as_str()) {
+                    true => plan.alone.push(job),
+                    false => plan.beside.push(job),
+                }
+            }
+        }
+        for program in of_patches {
+            let mut command = program.alone(namespaces);
+            command.args(rustdds.tests());
+            plan.programs
+                .push(Job::new("RustDDS, what patches/ adds".to_owned(), command));
+        }
+        let mut documents = surround(rustdds.cargo(workspace, &[&["test"][..], TARGETS].concat()));
+        documents.args(["--doc", "--"]).args(filters);
+        plan.programs.push(Job::new(
+            "examples in the documentation".to_owned(),
+            documents,
+        ));
+        Ok(plan)
     }
-    command
+
+    fn run(self) -> anyhow::Result<Report> {
+        let mut report = Report::default();
+        step("tests without peers");
+        report.take(Lanes(1).run(self.programs)?);
+        step(&format!(
+            "tests with peers, each in a network of its own, {BESIDE} at a time"
+        ));
+        report.take(Lanes(BESIDE).run(self.beside)?);
+        step("tests that take the machine for themselves");
+        report.take(Lanes(1).run(self.alone)?);
+        let again = report.failed_with_peers(MOST_RETRIED);
+        if !again.is_empty() {
+            step("tests with peers that failed, once more and alone");
+            report.retry(Lanes(1).run(again)?);
+        }
+        Ok(report)
+    }
+}
+
+/// More failures than this are no accident of a peer, and trying them all again would take CI's time.
+const MOST_RETRIED: usize = 10;
+
+fn minutes(time: Duration) -> String {
+    let seconds = time.as_secs();
+    format!("{} min {} s", seconds / 60, seconds % 60)
 }
 
 fn remove(file: &Path) -> anyhow::Result<()> {
@@ -85,108 +190,5 @@ fn remove(file: &Path) -> anyhow::Result<()> {
             Err(error).with_context(|| format!("{} cannot be removed", file.display()))
         }
         _ => Ok(()),
-    }
-}
-
-/// What the test programs said of themselves, summed.
-struct Outcome {
-    ended: Ended,
-    programs: usize,
-    passed: u64,
-    failed: u64,
-    ignored: u64,
-}
-
-impl Outcome {
-    /// Runs the tests, shows what they print as it comes, and counts.
-    fn of(tests: &mut Command) -> anyhow::Result<Self> {
-        let mut child = tests
-            .stdout(Stdio::piped())
-            .spawn()
-            .context("cargo does not start")?;
-        let mut outcome = Self {
-            ended: Ended::BADLY,
-            programs: 0,
-            passed: 0,
-            failed: 0,
-            ignored: 0,
-        };
-        if let Some(stdout) = child.stdout.take() {
-            for line in BufReader::new(stdout).split(b'\n') {
-                let line = line.context("what the tests print cannot be read")?;
-                let line = String::from_utf8_lossy(&line);
-                println!("{line}");
-                outcome.add(&line);
-            }
-        }
-        outcome.ended = child.wait()?.into();
-        Ok(outcome)
-    }
-
-    fn add(&mut self, line: &str) {
-        let Some(counts) = line.strip_prefix("test result: ") else {
-            return;
-        };
-        self.programs += 1;
-        for (count, what) in counts
-            .split([';', '.'])
-            .filter_map(|part| part.trim().split_once(' '))
-        {
-            let total = match what {
-                "passed" => &mut self.passed,
-                "failed" => &mut self.failed,
-                "ignored" => &mut self.ignored,
-                _ => continue,
-            };
-            *total += count.parse::<u64>().unwrap_or_default();
-        }
-    }
-
-    fn print(&self, skipped: usize) {
-        let word = if self.ended == Ended::WELL {
-            "ok"
-        } else {
-            "FAILED"
-        };
-        // A skipped test returns early, which the runner counts as passed.
-        let passed = self
-            .passed
-            .saturating_sub(skipped.try_into().unwrap_or(u64::MAX));
-        println!(
-            "\ntest result: {word}. {passed} passed; {} failed; {} ignored; {skipped} skipped, in {} test programs",
-            self.failed, self.ignored, self.programs
-        );
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_closing_lines_of_all_test_programs_are_summed() {
-        let mut outcome = Outcome {
-            ended: Ended::WELL,
-            programs: 0,
-            passed: 0,
-            failed: 0,
-            ignored: 0,
-        };
-        for line in [
-            "test a::b ... ok",
-            "test result: ok. 7 passed; 0 failed; 1 ignored; 0 measured; 0 filtered out; finished in 0.00s",
-            "test result: FAILED. 3 passed; 2 failed; 0 ignored; 0 measured; 9 filtered out; finished in 5.61s",
-        ] {
-            outcome.add(line);
-        }
-        assert_eq!(
-            (
-                outcome.programs,
-                outcome.passed,
-                outcome.failed,
-                outcome.ignored
-            ),
-            (2, 10, 2, 1)
-        );
     }
 }
