@@ -298,6 +298,47 @@ fn an_unanswered_reader_gives_up() {
     assert_eq!(probes.len(), 8);
 }
 
+/// What one probe costs that names as many DataSetWriters as a datagram has room for, while that many topics are missing.
+#[expect(clippy::disallowed_methods, reason = "what is tested is a cost")]
+fn cost_of_a_long_probe(missing: u16) -> Duration {
+    let (mut writer, mut reader, mut now) = (Bridge::new(1, ""), Bridge::new(2, ""), clock());
+    for id in 1..=missing {
+        let topic = format!("ua_1_5_{id}");
+        writer.bind(&topic, "std_msgs/UInt32", &Selection::Whole, now);
+        writer.say(&topic, &[7, 0, 0, 0], now);
+    }
+    let sent = writer.sent_within(Duration::ZERO, &mut now);
+    let values = sent.iter().filter(|bytes| {
+        NetworkMessage::decode(bytes).is_ok_and(|message| message.messages().next().is_some())
+    });
+    let values: Vec<Vec<u8>> = values.cloned().collect();
+    reader.hear(&writer, &values, now);
+    assert_eq!(reader.told(now).len(), usize::from(missing));
+    // Those that are missing come last.
+    let ids: Vec<u16> = (1..=32_000).rev().collect();
+    let mut probe = Vec::new();
+    let publisher = Some(PublisherId::UInt16(1));
+    Probe::DataSetMetaData(List::new(&ids))
+        .encode(publisher, SecurityHeader::NONE, &mut probe)
+        .unwrap();
+    let other = Bridge::new(3, "");
+    let costs = (0..5).map(|_| {
+        let start = Instant::now();
+        reader.hear(&other, std::slice::from_ref(&probe), now);
+        start.elapsed()
+    });
+    costs.min().unwrap()
+}
+
+#[test]
+fn a_long_probe_costs_as_much_as_it_is_long_however_many_topics_are_missing() {
+    let (one, many) = (cost_of_a_long_probe(1), cost_of_a_long_probe(200));
+    assert!(
+        many < one * 20,
+        "{one:?} with one missing, {many:?} with 200"
+    );
+}
+
 const MAPPED: &str = "
 spaces: [{id: 1}, {id: 2}]
 namespaces: {5: urn:a:b}

@@ -377,9 +377,14 @@ impl Router {
             let probe = Probe::DataSetMetaData(ids);
             discovery.announcer.handle_probe(&probe, since);
         } else if let Some(probing) = discovery.probing.get_mut(&asked) {
-            let named = |topic: &TopicId| ids.iter().any(|id| id == topic.triple().2);
-            if probing.topics.iter().all(named) {
-                probing.timer.handle_probe(since);
+            // One pass: a datagram has room for 32 000 ids, and each pass decodes all of them.
+            let mut missing: BTreeSet<u16> = probing.topics.iter().map(|t| t.triple().2).collect();
+            for id in ids {
+                missing.remove(&id);
+                if missing.is_empty() {
+                    probing.timer.handle_probe(since);
+                    break;
+                }
             }
         }
         discovery.reckon();
