@@ -64,9 +64,25 @@ pub(crate) fn hostname_unresolvable(hostname: &str, error: &dyn Display) {
 }
 
 pub(crate) fn shutdown_asked(reason: &str) {
+    warn!(reason, "told to shut down, as `rosnode kill` does");
+}
+
+/// `more`: how many of these lines were held back since the last.
+pub(crate) fn name_kept(name: &str, more: u64) {
     warn!(
-        reason,
-        "told by the ROS master to shut down; another node of the same name does that"
+        name,
+        more,
+        "another node with the same name has registered as well, and the name is this node's: going on"
+    );
+}
+
+/// `missing` registrations, of which `first` is one.
+pub(crate) fn registrations_lost(uri: &str, first: &str, missing: usize) {
+    warn!(
+        ROS_MASTER_URI = uri,
+        first,
+        missing,
+        "the ROS master no longer lists what this node has registered, as after `rosnode cleanup`: registering it again"
     );
 }
 

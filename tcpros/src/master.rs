@@ -155,18 +155,27 @@ impl Master {
     }
 
     pub(crate) async fn graph(&self) -> Result<Graph, MasterError> {
-        let state = self.call("getSystemState", vec![]).await?;
+        let state = self.registrations().await?;
         let types = self.call("getTopicTypes", vec![]).await?;
+        let text = |value: &Value| value.as_str().map(str::to_owned);
+        Ok(Graph {
+            types: pairs(&types, text).ok_or(MasterError::Shape("getTopicTypes"))?,
+            ..state
+        })
+    }
+
+    /// The graph without the types.
+    pub(crate) async fn registrations(&self) -> Result<Graph, MasterError> {
+        let state = self.call("getSystemState", vec![]).await?;
         let [publishers, subscribers, services, ..] = state.as_array().unwrap_or_default() else {
             return Err(MasterError::Shape("getSystemState"));
         };
         let by_topic = |value| pairs(value, strings).ok_or(MasterError::Shape("getSystemState"));
-        let text = |value: &Value| value.as_str().map(str::to_owned);
         Ok(Graph {
             publishers: by_topic(publishers)?,
             subscribers: by_topic(subscribers)?,
             services: by_topic(services)?,
-            types: pairs(&types, text).ok_or(MasterError::Shape("getTopicTypes"))?,
+            types: BTreeMap::new(),
         })
     }
 

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 use std::net::{IpAddr, SocketAddr};
-use std::sync::atomic::{AtomicI32, Ordering};
+use std::sync::atomic::{AtomicI32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
@@ -83,6 +83,8 @@ impl Node {
             changed: Notify::new(),
             master_state: watch::Sender::new(MasterState::Awaited),
             shutdown: watch::Sender::new(None),
+            contests: AtomicU64::new(0),
+            decided: AtomicU64::new(0),
             settled: watch::Sender::new(false),
             draining: watch::Sender::new(0),
             next_id: AtomicI32::new(1),
@@ -132,7 +134,7 @@ impl Node {
         self.inner.master_state.subscribe()
     }
 
-    /// Waits until the master tells this node to shut down, which it does when another node takes its name, and
+    /// Waits until this node is told to shut down, as by `rosnode kill`, or has lost its name to another node, and
     /// gives the reason. Cancel-safe, and free to outlive the borrow of the node.
     pub fn shutdown_requested(&self) -> impl Future<Output = String> + Send + use<> {
         let mut asked = self.inner.shutdown.subscribe();
@@ -386,6 +388,10 @@ pub(crate) struct Inner {
     pub(crate) master_state: watch::Sender<MasterState>,
     /// The reason once the master asked for it.
     shutdown: watch::Sender<Option<String>>,
+    /// How often the master said that another node has taken this node's name, and of how many of them it was found out
+    /// that the name is this node's.
+    contests: AtomicU64,
+    decided: AtomicU64,
     /// True once everything is closed and the master was told so.
     pub(crate) settled: watch::Sender<bool>,
     /// Connections to subscribers and clients, those of withdrawn topics and services included.
@@ -667,7 +673,30 @@ impl Inner {
         });
     }
 
-    pub(crate) fn is_asked_to_shut_down(&self) -> bool {
+    /// The master says that another node has taken this node's name: nothing is registered until it is clear whose it is.
+    pub(crate) fn name_is_contested(&self) {
+        self.contests.fetch_add(1, Ordering::AcqRel);
+        self.changed.notify_one();
+    }
+
+    /// Which of the contests for the name is open.
+    pub(crate) fn contest(&self) -> Option<u64> {
+        let last = self.contests.load(Ordering::Acquire);
+        let open = last != self.decided.load(Ordering::Acquire) && !self.is_asked_to_shut_down();
+        open.then_some(last)
+    }
+
+    /// The name was this node's when the master was asked after so many contests.
+    pub(crate) fn decided(&self, contest: u64) {
+        self.decided.store(contest, Ordering::Release);
+    }
+
+    /// Whether the name is this node's, as far as it knows.
+    pub(crate) fn may_register(&self) -> bool {
+        !self.is_asked_to_shut_down() && self.contest().is_none()
+    }
+
+    fn is_asked_to_shut_down(&self) -> bool {
         self.shutdown.borrow().is_some()
     }
 

@@ -27,6 +27,9 @@ pub(crate) async fn run(node: Arc<Inner>) {
         pid: None,
         found: None,
         checked: None,
+        compared: None,
+        contested: None,
+        contests: Throttle::new(Duration::from_secs(10)),
         refusals: Throttle::new(Duration::from_secs(30)),
     };
     let mut wait = TICK;
@@ -69,6 +72,11 @@ struct Registrar {
     /// `None` before the first try.
     found: Option<bool>,
     checked: Option<Instant>,
+    /// When what the master lists was compared with what it was told.
+    compared: Option<Instant>,
+    /// Since when it is open whose name this node's is.
+    contested: Option<Instant>,
+    contests: Throttle,
     refusals: Throttle,
 }
 
@@ -93,6 +101,9 @@ type Outcome = ((String, ResourceKind), Option<u64>, Result<(), MasterError>);
 
 impl Registrar {
     async fn turn(&mut self, closed: bool) -> Result<(), MasterError> {
+        if !closed && let Some(contest) = self.node.contest() {
+            self.decide(contest).await?;
+        }
         let due = self.checked.is_none_or(|at| at.elapsed() >= TICK) || self.found != Some(true);
         if due && !closed {
             self.check().await?;
@@ -116,6 +127,7 @@ impl Registrar {
         loop {
             while failure.is_none()
                 && running.len() < PARALLEL
+                && (closed || self.node.may_register())
                 && let Some(batch) = batches.next()
             {
                 running.spawn(perform(Arc::clone(&self.node), batch));
@@ -157,13 +169,7 @@ impl Registrar {
         if !other && known {
             match master.lookup_node(self.node.name()).await? {
                 None => forgotten = true,
-                Some(uri) if uri != self.node.uri => {
-                    let reason = format!(
-                        "another node with the name {} runs at {uri}",
-                        self.node.name()
-                    );
-                    self.node.ask_to_shut_down(&reason);
-                }
+                Some(uri) if uri != self.node.uri => self.lose_name(&uri),
                 Some(_) => {}
             }
         }
@@ -175,14 +181,85 @@ impl Registrar {
                 .values_mut()
                 .for_each(|told| told.confirmed = false);
             self.node.params.forget();
+        } else if self.compared.is_none_or(|at| at.elapsed() >= COMPARED) {
+            self.compare().await;
+            self.compared = Some(clock::now());
         }
         Ok(())
     }
 
+    /// Finds out what a master that knows this node no longer lists of it, as after `rosnode cleanup`: that is registered
+    /// again. A service that another node has taken over is that node's.
+    async fn compare(&mut self) {
+        if !self.told.values().any(|told| told.confirmed) {
+            return;
+        }
+        let listed = match self.node.master.registrations().await {
+            Ok(listed) => listed,
+            // The next check finds out whether the master is there.
+            Err(error) => {
+                tracing::debug!(%error, "the registrations at the master were not read");
+                return;
+            }
+        };
+        let name = self.node.name();
+        let is_listed = |resource: &str, kind| {
+            let listed = match kind {
+                ResourceKind::Published => listed.publishers.get(resource),
+                ResourceKind::Subscribed => listed.subscribers.get(resource),
+                ResourceKind::Service => return listed.services.contains_key(resource),
+            };
+            listed.is_some_and(|nodes| nodes.iter().any(|node| node == name))
+        };
+        let mut missing = Vec::new();
+        for ((resource, kind), told) in &mut self.told {
+            if told.confirmed && !is_listed(resource, *kind) {
+                told.confirmed = false;
+                missing.push(resource.as_str());
+            }
+        }
+        if let Some(first) = missing.first() {
+            events::registrations_lost(self.node.master.uri(), first, missing.len());
+        }
+    }
+
+    /// Asks the master whose this node's name is, as another has claimed it: of two nodes that start at once each may be
+    /// told to end, the one by a registration of the other that was on its way. Nothing is registered meanwhile, and
+    /// nothing of this node is on its way here, so the name stays with whom it belongs to now.
+    async fn decide(&mut self, contest: u64) -> Result<(), MasterError> {
+        let since = *self.contested.get_or_insert_with(clock::now);
+        let name = self.node.name();
+        match self.node.master.lookup_node(name).await {
+            Ok(Some(uri)) if uri != self.node.uri => self.lose_name(&uri),
+            Ok(_) => {
+                if let Some(more) = self.contests.admit(clock::now()) {
+                    events::name_kept(name, more);
+                }
+                // The other may have had the name for a while, with which all that was registered is lost.
+                self.compared = None;
+                self.node.params.forget();
+                self.node.decided(contest);
+                self.contested = None;
+            }
+            Err(error) if since.elapsed() < LONGEST_CONTEST => return Err(error),
+            Err(error) => self.node.ask_to_shut_down(&format!(
+                "another node has taken the name {name}, and the master does not say which: {error}"
+            )),
+        }
+        Ok(())
+    }
+
+    fn lose_name(&self, uri: &str) {
+        let name = self.node.name();
+        self.node.ask_to_shut_down(&format!(
+            "another node with the name {name} runs at {uri}; give one of them another name, as with __name:=other"
+        ));
+    }
+
     fn jobs(&mut self) -> Vec<Job> {
         let mut wanted = self.node.wanted_registrations();
-        if self.node.is_asked_to_shut_down() {
-            // The name belongs to another node now, which a registration would push out in turn.
+        if !self.node.may_register() {
+            // The name may belong to another node now, which a registration would push out in turn.
             wanted.retain(|registration| {
                 let key = (registration.name.clone(), registration.kind);
                 let told = self.told.get(&key);
@@ -394,6 +471,10 @@ async fn check_hostname(hostname: String) {
 
 const TICK: Duration = Duration::from_secs(1);
 const LONGEST_WAIT: Duration = Duration::from_secs(2);
+/// Between two comparisons with what the master lists, which is all of the graph.
+const COMPARED: Duration = Duration::from_secs(5);
+/// How long a master that does not answer is asked whose a name is.
+const LONGEST_CONTEST: Duration = Duration::from_secs(5);
 /// Registrations in one request.
 const BATCH: usize = 64;
 /// Requests at a time.

@@ -5,6 +5,7 @@
 use std::sync::atomic::Ordering;
 
 use crate::events;
+use crate::header::clipped;
 use crate::master::strings;
 use crate::node::Inner;
 use crate::outbox::lock;
@@ -75,9 +76,13 @@ fn request_topic(node: &Inner, params: &[Value]) -> Value {
 }
 
 fn shutdown(node: &Inner, params: &[Value]) -> Value {
-    let reason = params.get(1).and_then(Value::as_str).unwrap_or("");
-    events::shutdown_asked(reason);
-    node.ask_to_shut_down(reason);
+    let reason = clipped(params.get(1).and_then(Value::as_str).unwrap_or(""));
+    if reason.contains(NAME_TAKEN) {
+        node.name_is_contested();
+    } else {
+        events::shutdown_asked(reason);
+        node.ask_to_shut_down(reason);
+    }
     done(0)
 }
 
@@ -196,3 +201,6 @@ fn refused(message: &str) -> Value {
 fn triple(code: i32, message: &str, result: impl Into<Value>) -> Value {
     Value::Array(vec![code.into(), message.into(), result.into()])
 }
+
+/// What the master says to the node that had a name before (`rosmaster/registrations.py`).
+const NAME_TAKEN: &str = "new node registered with same name";

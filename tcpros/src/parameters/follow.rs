@@ -256,8 +256,8 @@ impl Params {
 pub(crate) async fn settle(node: &Inner, refusals: &mut Throttle) -> Result<(), MasterError> {
     let params = &node.params;
     for work in params.work() {
-        if node.is_asked_to_shut_down() && !matches!(work, Work::Unsubscribe(_)) {
-            // The name belongs to another node now, and so do its private parameters.
+        if !node.may_register() && !matches!(work, Work::Unsubscribe(_)) {
+            // The name may belong to another node now, and so do its private parameters.
             params.failed(&work);
             continue;
         }

@@ -4,7 +4,8 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use tcpros::{
-    Core, Inbox, InboxEvent, MasterState, Node, NodeError, Publisher, PublisherOptions, TopicType,
+    Core, Inbox, InboxEvent, MasterState, Node, NodeError, Publisher, PublisherOptions,
+    ServiceOptions, ServiceRequest, ServiceType, TopicType,
 };
 
 use crate::support::*;
@@ -67,6 +68,110 @@ async fn after_a_restart_of_the_master_all_is_registered_again_and_links_have_st
     assert_eq!((publisher.subscribers(), subscription.publishers()), (1, 1));
     assert_eq!(publisher.publish(Bytes::from_static(b"again")).sent_to, 1);
     assert_eq!(message(&mut inbox).await.bytes, b"again".as_slice());
+}
+
+/// Requirement: what `rosnode cleanup` takes out of the master while it still knows the node is registered again.
+#[tokio::test]
+async fn what_the_master_no_longer_lists_is_registered_again() {
+    let core = core();
+    let node = node("node", &core);
+    let inbox = Inbox::new();
+    let _subscription = subscribe(&node, "/heard", &inbox);
+    let _publisher = advertise(&node, "/said", PublisherOptions::default());
+    let _kept = advertise(&node, "/kept", PublisherOptions::default());
+    let service_type = ServiceType {
+        name: "std_srvs/Trigger".to_owned(),
+        md5sum: MD5.to_owned(),
+        request_type: "std_srvs/TriggerRequest".to_owned(),
+        response_type: "std_srvs/TriggerResponse".to_owned(),
+    };
+    let echo = |request: ServiceRequest| async move { Ok(request.bytes) };
+    let _service = node
+        .advertise_service("/done", service_type, ServiceOptions::default(), echo)
+        .unwrap();
+    let listed = async || {
+        let graph = node.graph().await.unwrap();
+        let own = ["/node".to_owned()];
+        let has = |of: Option<&Vec<String>>| of.is_some_and(|nodes| *nodes == own);
+        [
+            has(graph.publishers.get("/said")),
+            has(graph.subscribers.get("/heard")),
+            has(graph.services.get("/done")),
+            has(graph.publishers.get("/kept")),
+        ]
+    };
+    let all_listed = async || while listed().await != [true; 4] {};
+    within("the registrations", all_listed()).await;
+    let uri = node.uri();
+    call(core.uri(), "unregisterPublisher", &["/node", "/said", uri]).await;
+    call(
+        core.uri(),
+        "unregisterSubscriber",
+        &["/node", "/heard", uri],
+    )
+    .await;
+    let state = call(core.uri(), "lookupService", &["/node", "/done"]).await;
+    let at = state.find("rosrpc://").unwrap();
+    let service_uri = state[at..].split('<').next().unwrap();
+    call(
+        core.uri(),
+        "unregisterService",
+        &["/node", "/done", service_uri],
+    )
+    .await;
+    assert_eq!(listed().await, [false, false, false, true]);
+    within("the new registrations", async {
+        while listed().await != [true; 4] {
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    })
+    .await;
+}
+
+/// Requirement: of two nodes with one name that start in the same instant one ends, and the other has all it registers.
+#[tokio::test]
+async fn of_two_nodes_of_one_name_that_start_at_once_exactly_one_stays() {
+    let core = core();
+    for round in 0..10 {
+        let nodes = [node("twin", &core), node("twin", &core)];
+        let topics = |of: usize| (0..100).map(move |n| format!("/r{round}/n{of}/t{n}"));
+        let publishers = [0, 1].map(|of| {
+            let advertise = |topic: String| advertise(&nodes[of], &topic, Default::default());
+            topics(of).map(advertise).collect::<Vec<_>>()
+        });
+        let [a, b] = [nodes[0].shutdown_requested(), nodes[1].shutdown_requested()];
+        let first = within("the end of one", async {
+            tokio::select! { reason = a => (0, reason), reason = b => (1, reason) }
+        });
+        let (lost, reason) = first.await;
+        let stays = 1 - lost;
+        let [first, second] = nodes;
+        let (loser, winner) = if lost == 0 {
+            (first, second)
+        } else {
+            (second, first)
+        };
+        assert!(
+            reason.contains(&format!("/twin runs at {}", winner.uri())),
+            "{reason}"
+        );
+        within("the end", loser.shutdown()).await;
+        let all_listed = async {
+            loop {
+                let graph = winner.graph().await.unwrap();
+                if topics(stays).all(|topic| graph.publishers.contains_key(&topic)) {
+                    return;
+                }
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+        };
+        tokio::select! {
+            reason = winner.shutdown_requested() => panic!("the other ends as well: {reason}"),
+            () = within("all that it registers", all_listed) => {}
+        }
+        winner.shutdown().await;
+        drop(publishers);
+    }
 }
 
 #[tokio::test]

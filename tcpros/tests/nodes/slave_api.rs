@@ -58,10 +58,36 @@ async fn the_shutdown_call_reaches_the_program() {
     let core = core();
     let talker = node("talker", &core);
     let call = "<methodCall><methodName>shutdown</methodName><params><param><value>/master</value></param>\
-                <param><value>new node registered with same name</value></param></params></methodCall>";
+                <param><value>user request</value></param></params></methodCall>";
     slave_call(&talker, call).await;
     let reason = within("the request", talker.shutdown_requested()).await;
-    assert_eq!(reason, "new node registered with same name");
+    assert_eq!(reason, "user request");
+}
+
+/// Requirement: a node is not ended by the word that another has its name, if the name is its own.
+#[tokio::test]
+async fn a_node_that_has_its_name_still_goes_on_when_told_that_it_is_taken() {
+    let core = core();
+    let talker = node("talker", &core);
+    let _first = advertise(&talker, "/first", PublisherOptions::default());
+    registered(&talker).await;
+    let call = "<methodCall><methodName>shutdown</methodName><params><param><value>/master</value></param><param>\
+                <value>[/talker] Reason: new node registered with same name</value></param></params></methodCall>";
+    slave_call(&talker, call).await;
+    let _second = advertise(&talker, "/second", PublisherOptions::default());
+    let goes_on = async {
+        while !talker
+            .graph()
+            .await
+            .unwrap()
+            .publishers
+            .contains_key("/second")
+        {}
+    };
+    tokio::select! {
+        reason = talker.shutdown_requested() => panic!("it ends: {reason}"),
+        () = within("what it registers from then on", goes_on) => {}
+    }
 }
 
 /// Requirement: one HTTP connection serves several calls, as rospy and roscpp make them.

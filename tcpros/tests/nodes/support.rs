@@ -111,10 +111,23 @@ pub(crate) async fn topic_port(node: &Node, topic: &str) -> u16 {
 }
 
 pub(crate) async fn slave_call(node: &Node, body: &str) -> String {
-    let address = node
-        .uri()
-        .trim_start_matches("http://")
-        .trim_end_matches('/');
+    raw_call(node.uri(), body).await
+}
+
+/// Calls a method, all of whose parameters are texts.
+pub(crate) async fn call(uri: &str, method: &str, params: &[&str]) -> String {
+    let params: String = params
+        .iter()
+        .map(|text| format!("<param><value>{text}</value></param>"))
+        .collect();
+    let body = format!(
+        "<methodCall><methodName>{method}</methodName><params>{params}</params></methodCall>"
+    );
+    raw_call(uri, &body).await
+}
+
+async fn raw_call(uri: &str, body: &str) -> String {
+    let address = uri.trim_start_matches("http://").trim_end_matches('/');
     let mut stream = TcpStream::connect(address).await.unwrap();
     let head = "POST / HTTP/1.1\r\nHost: x\r\nConnection: close\r\nContent-Length:";
     stream
