@@ -13,6 +13,7 @@ use tokio::task::JoinSet;
 
 use self::parameters::{Tree, Update, parts};
 use crate::clock;
+use crate::crowd::Shares;
 use crate::header::clipped;
 use crate::names::{self, NameError};
 use crate::outbox::lock;
@@ -46,7 +47,10 @@ impl Core {
         });
         let mut tasks = JoinSet::new();
         let handler = Arc::clone(&shared);
-        tasks.spawn(async move { rpc::serve(listener, move |call| handler.answer(&call)).await });
+        let places = Shares::of_process().nodes;
+        tasks.spawn(async move {
+            rpc::serve(listener, places, move |call| handler.answer(&call)).await;
+        });
         tasks.spawn(notify(Arc::clone(&shared)));
         Ok(Self {
             address,

@@ -3,6 +3,7 @@
 //! DEBUG: something ended or was retried as it should. WARN: a peer or the set-up is wrong, and we go on.
 
 use std::fmt::Display;
+use std::net::IpAddr;
 use std::time::Duration;
 
 use tracing::{debug, info, warn};
@@ -115,14 +116,47 @@ pub(crate) fn publisher_joined(topic: &str, publisher: &str) {
     debug!(topic, publisher, "connected to a publisher");
 }
 
-pub(crate) fn link_failed(topic: &str, uri: &str, node: Option<&str>, error: &dyn Display) {
+/// `more`: how many of these lines were held back since the last.
+pub(crate) fn link_failed(
+    (topic, uri): (&str, &str),
+    node: Option<&str>,
+    error: &dyn Display,
+    more: u64,
+) {
     let node = node.unwrap_or("(unknown)");
     warn!(
         topic,
         node,
         uri,
         %error,
+        more,
         "no connection to a registered publisher, still trying: if that node is gone, `rosnode cleanup` removes it; if it runs, check that its host name resolves here"
+    );
+}
+
+pub(crate) fn links_not_told(period: Duration) {
+    warn!(
+        ?period,
+        "more registered publishers cannot be connected to: they are counted in the next line about one, not named"
+    );
+}
+
+pub(crate) fn link_waits(topic: &str, more: u64) {
+    warn!(
+        topic,
+        more,
+        "a publisher waits to be connected to: so many are already, and RLIMIT_NOFILE allows for no more"
+    );
+}
+
+/// `named`: how many publishers the topic has as the master says, or whoever called in its name.
+pub(crate) fn too_many_publishers(topic: &str, named: usize, limit: usize, more: u64) {
+    warn!(
+        topic,
+        named,
+        limit,
+        more,
+        "a topic has more publishers than are connected to: the rest is left alone"
     );
 }
 
@@ -161,7 +195,21 @@ impl Refusals {
         if let Some(more) = self.crowd.admit(clock::now()) {
             warn!(
                 server = self.server,
-                limit, more, "a connection was refused: too many are open"
+                limit,
+                more,
+                "a connection was refused: so many are open already, in all or from its address; RLIMIT_NOFILE decides how many may be"
+            );
+        }
+    }
+
+    /// A connection was ended for another's sake.
+    pub(crate) fn gave_way(&mut self, address: IpAddr) {
+        if let Some(more) = self.crowd.admit(clock::now()) {
+            warn!(
+                server = self.server,
+                %address,
+                more,
+                "a connection that was idle was closed: too many are open"
             );
         }
     }

@@ -19,6 +19,7 @@
 pub mod actionlib;
 mod clock;
 mod core;
+mod crowd;
 mod events;
 mod frame;
 mod header;

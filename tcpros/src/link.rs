@@ -1,17 +1,19 @@
 //! The way to one publisher of one topic: asking it for its address, connecting, reading, and all of it again.
 
 use std::os::fd::AsRawFd;
-use std::sync::Arc;
 use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use socket2::{SockRef, TcpKeepalive};
 use thiserror::Error;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
+use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio::time::{sleep, timeout};
 
 use crate::clock::{self, Throttle};
+use crate::crowd::Shares;
 use crate::events;
 use crate::frame::{FrameTooLong, Frames};
 use crate::header::{ConnectionHeader, HeaderError, clipped};
@@ -25,9 +27,59 @@ use crate::xmlrpc::Value;
 /// What all links of a node share.
 #[derive(Debug)]
 pub(crate) struct LinkContext {
-    pub(crate) caller_id: String,
-    pub(crate) max_message: usize,
+    caller_id: String,
+    max_message: usize,
     pub(crate) master: Master,
+    /// How many publishers one topic is connected to.
+    pub(crate) publishers_of_topic: usize,
+    /// One for each publisher that is connected or being connected.
+    places: Semaphore,
+    /// Lines of the log about publishers that cannot be reached.
+    failures: Mutex<Throttle>,
+    crowded: Mutex<Throttle>,
+}
+
+impl LinkContext {
+    pub(crate) fn new(
+        caller_id: String,
+        max_message: usize,
+        master: Master,
+        shares: &Shares,
+    ) -> Self {
+        Self {
+            caller_id,
+            max_message,
+            master,
+            publishers_of_topic: shares.publishers_of_topic,
+            places: Semaphore::new(shares.publishers),
+            failures: Mutex::new(Throttle::several(FAILURES_LOGGED, LOG_PERIOD)),
+            crowded: Mutex::new(Throttle::new(LOG_PERIOD)),
+        }
+    }
+
+    /// Waits for a connection to be allowed, in the order of those that want one.
+    async fn place(&self, topic: &str) -> Option<SemaphorePermit<'_>> {
+        if let Ok(place) = self.places.try_acquire() {
+            return Some(place);
+        }
+        if let Some(more) = lock(&self.crowded).admit(clock::now()) {
+            events::link_waits(topic, more);
+        }
+        // It is never closed.
+        self.places.acquire().await.ok()
+    }
+
+    /// Whether a line may be written about a publisher that cannot be reached, and how many were not before it.
+    fn may_tell(&self) -> Option<u64> {
+        let mut failures = lock(&self.failures);
+        let more = failures.admit(clock::now());
+        let first_held_back = more.is_none() && failures.suppressed() == 1;
+        drop(failures);
+        if first_held_back {
+            events::links_not_told(LOG_PERIOD);
+        }
+        more
+    }
 }
 
 /// Keeps a subscription connected to one publisher until the master no longer names it. A task of its own.
@@ -42,11 +94,13 @@ pub(crate) async fn run(
     let mut throttle = Throttle::new(LOG_PERIOD);
     loop {
         let before = state.messages.load(Ordering::Relaxed);
+        let place = context.place(&feed.topic).await;
         let started = clock::now();
         let error = match connect(&feed, &context, &uri).await {
             Ok((stream, peer)) => follow(stream, peer, &feed, &context, &state).await,
             Err(error) => error,
         };
+        drop(place);
         if matches!(error, LinkError::Ourselves) {
             // The entry stays, so that the next update does not try again.
             return;
@@ -61,9 +115,11 @@ pub(crate) async fn run(
         }
         failures += 1;
         if error.is_fault() || failures == PATIENCE {
-            if throttle.admit(clock::now()).is_some() {
+            if throttle.admit(clock::now()).is_some()
+                && let Some(more) = context.may_tell()
+            {
                 let node = context.master.name_of(&feed.topic, &uri).await;
-                events::link_failed(&feed.topic, &uri, node.as_deref(), &error);
+                events::link_failed((&feed.topic, &uri), node.as_deref(), &error, more);
             }
             failures = failures.min(PATIENCE - 1);
         } else {
@@ -303,6 +359,8 @@ const LAST_WAIT: Duration = Duration::from_secs(20);
 /// Failures in a row before the first warning: a publisher that just starts or ends is no news.
 const PATIENCE: u32 = 4;
 const LOG_PERIOD: Duration = Duration::from_secs(60);
+/// Publishers that cannot be reached and are named in the log per period; the others are counted.
+const FAILURES_LOGGED: u32 = 20;
 
 #[cfg(test)]
 mod tests {

@@ -344,7 +344,8 @@ mod tests {
         let asked = Arc::new(Mutex::new(Vec::new()));
         let noted = Arc::clone(&asked);
         let mut tasks = JoinSet::new();
-        tasks.spawn(rpc::serve(listener, move |call| {
+        let places = crate::crowd::Shares::of_process().nodes;
+        tasks.spawn(rpc::serve(listener, places, move |call| {
             noted.lock().unwrap().push(call.method.clone());
             answer(&call)
         }));

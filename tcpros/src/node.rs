@@ -14,6 +14,7 @@ use tokio::sync::{Notify, watch};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
+use crate::crowd::Shares;
 use crate::events;
 use crate::inbox::Inbox;
 use crate::link::LinkContext;
@@ -60,11 +61,8 @@ impl Node {
         let uri = format!("http://{}:{api_port}/", rpc::bracketed(&options.hostname));
         let caller_id = names.node().to_owned();
         let master = Master::new(endpoint, options.master_uri, caller_id.clone(), uri.clone());
-        let context = LinkContext {
-            caller_id,
-            max_message: options.max_message,
-            master: master.clone(),
-        };
+        let shares = Shares::of_process();
+        let context = LinkContext::new(caller_id, options.max_message, master.clone(), &shares);
         let inner = Arc::new(Inner {
             names,
             uri,
@@ -91,9 +89,14 @@ impl Node {
         });
         let mut tasks = JoinSet::new();
         let handler = Arc::clone(&inner);
-        tasks
-            .spawn(async move { rpc::serve(api, move |call| slave::answer(&handler, call)).await });
-        tasks.spawn(topic_server::serve(topics, Arc::clone(&inner)));
+        tasks.spawn(async move {
+            rpc::serve(api, shares.callers, move |call| {
+                slave::answer(&handler, call)
+            })
+            .await;
+        });
+        let served = topic_server::serve(topics, shares.subscribers, Arc::clone(&inner));
+        tasks.spawn(served);
         tasks.spawn(registrar::run(Arc::clone(&inner)));
         Ok(Self { inner, tasks })
     }
@@ -646,7 +649,9 @@ impl Inner {
             return;
         }
         entry.updates += 1;
-        entry.publishers = publishers.to_vec();
+        // Those that no subscription would be connected to need not be kept.
+        let most = self.links.publishers_of_topic;
+        entry.publishers = publishers.iter().take(most).cloned().collect();
         for feed in &entry.feeds {
             self.connect(feed, publishers);
         }

@@ -13,10 +13,10 @@ use hyper::{Method, Request, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use thiserror::Error;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
+use crate::crowd::{Admission, Crowd, Places};
 use crate::events;
 use crate::xmlrpc::{Call, Fault, Response, Value, XmlError, encode_response, parse_response};
 
@@ -145,12 +145,15 @@ pub(crate) async fn connect(host: &str, port: u16, ipv6_first: bool) -> std::io:
 }
 
 /// Answers calls on a listener until it is dropped. The handler must not wait: it runs in the connection's task.
-pub(crate) async fn serve<H>(listener: TcpListener, handler: H)
+///
+/// A call takes milliseconds, so who comes is always let in: where there are too many, the oldest connection gives way,
+/// whose caller makes a new one for its next call.
+pub(crate) async fn serve<H>(listener: TcpListener, places: Places, handler: H)
 where
     H: Fn(Call) -> Response + Send + Sync + 'static,
 {
     let handler = Arc::new(handler);
-    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    let mut crowd = Crowd::new(places);
     // Dropping the set ends the connections with the server.
     let mut connections = JoinSet::new();
     let mut refusals = events::Refusals::new("XML-RPC");
@@ -159,22 +162,22 @@ where
             accepted = listener.accept() => accepted,
             Some(_) = connections.join_next() => continue,
         };
-        let stream = match accepted {
-            Ok((stream, _)) => stream,
+        let (stream, peer) = match accepted {
+            Ok(accepted) => accepted,
             Err(error) => {
                 refusals.accept_failed(&error).await;
                 continue;
             }
         };
-        let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
-            refusals.too_many(MAX_CONNECTIONS);
-            continue;
-        };
         let handler = Arc::clone(&handler);
-        connections.spawn(async move {
-            answer_connection(stream, handler).await;
-            drop(place);
+        let admission = crowd.admit(peer.ip(), |_| {
+            connections.spawn(answer_connection(stream, handler))
         });
+        match admission {
+            Admission::Free => {}
+            Admission::InPlaceOf(address) => refusals.gave_way(address),
+            Admission::Full(limit) => refusals.too_many(limit),
+        }
     }
 }
 
@@ -273,8 +276,8 @@ pub enum RpcError {
 
 const XML: &str = "text/xml";
 const MAX_BODY: usize = 4 * 1024 * 1024;
-const MAX_CONNECTIONS: usize = 1024;
-const READ_LIMIT: Duration = Duration::from_secs(30);
+/// For the head of a call, from the one before on a connection that is kept, and for its body.
+const READ_LIMIT: Duration = Duration::from_secs(5);
 
 #[cfg(test)]
 mod tests {
@@ -286,7 +289,13 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let port = listener.local_addr().unwrap().port();
         let mut tasks = JoinSet::new();
-        tasks.spawn(serve(listener, |call| Ok(Value::Array(call.params))));
+        let places = Places {
+            total: 4,
+            per_address: 2,
+        };
+        tasks.spawn(serve(listener, places, |call| {
+            Ok(Value::Array(call.params))
+        }));
         (port, tasks)
     }
 
@@ -389,6 +398,21 @@ mod tests {
         assert_eq!(bracketed("::1"), "[::1]");
         assert_eq!(bracketed("127.0.0.1"), "127.0.0.1");
         assert_eq!(bracketed("robot"), "robot");
+    }
+
+    #[tokio::test]
+    async fn callers_that_say_nothing_keep_no_other_waiting() {
+        let (port, _tasks) = echo_server().await;
+        let mut silent = Vec::new();
+        for n in 0..20 {
+            let mut stream = TcpStream::connect(("127.0.0.1", port)).await.unwrap();
+            let half = "POST / HTTP/1.1\r\nContent-Length: 9\r\n\r\n<";
+            stream.write_all(&half.as_bytes()[..2 * n]).await.unwrap();
+            silent.push(stream);
+        }
+        let limit = Duration::from_secs(2);
+        let result = call(&endpoint(port), "echo", vec![Value::Int(1)], limit).await;
+        assert_eq!(result.unwrap(), Value::Array(vec![Value::Int(1)]));
     }
 
     #[tokio::test]

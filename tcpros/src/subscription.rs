@@ -4,10 +4,13 @@ use std::collections::{HashMap, HashSet};
 use std::fmt;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
+use std::time::Duration;
 
 use tokio::sync::Notify;
 use tokio::task::AbortHandle;
 
+use crate::clock::{self, Throttle};
+use crate::events;
 use crate::inbox::{Deliver, Message, Peer};
 use crate::link::{self, LinkContext};
 use crate::node::Inner;
@@ -90,6 +93,7 @@ pub(crate) struct Feed {
     links: Mutex<Links>,
     publishers: AtomicUsize,
     dropped: AtomicU64,
+    crowded: Mutex<Throttle>,
 }
 
 #[derive(Debug, Default)]
@@ -143,11 +147,13 @@ impl Feed {
             links: Mutex::default(),
             publishers: AtomicUsize::new(0),
             dropped: AtomicU64::new(0),
+            crowded: Mutex::new(Throttle::new(LOG_PERIOD)),
         }
     }
 
     /// Takes the master's list of publishers: links to new ones start, those to others end unless connected. One that
-    /// is named again may just have come back under its old address, so its link does not wait any longer.
+    /// is named again may just have come back under its old address, so its link does not wait any longer. There are
+    /// so many links at most; of more publishers those that come first in the list are followed.
     pub(crate) fn update(
         self: &Arc<Self>,
         uris: &[String],
@@ -169,15 +175,21 @@ impl Feed {
             }
             keep
         });
-        for uri in named {
+        let limit = context.publishers_of_topic;
+        let mut left_out = false;
+        for uri in uris {
             if links.by_uri.contains_key(uri) {
+                continue;
+            }
+            if links.by_uri.len() >= limit || uri.len() > MAX_URI {
+                left_out = true;
                 continue;
             }
             let state = Arc::new(LinkState::new(next_id()));
             let task = tokio::spawn(link::run(
                 Arc::clone(self),
                 Arc::clone(context),
-                uri.to_owned(),
+                uri.clone(),
                 Arc::clone(&state),
             ));
             let link = Link {
@@ -185,7 +197,11 @@ impl Feed {
                 state,
                 task: task.abort_handle(),
             };
-            links.by_uri.insert(uri.to_owned(), link);
+            links.by_uri.insert(uri.clone(), link);
+        }
+        drop(links);
+        if left_out && let Some(more) = lock(&self.crowded).admit(clock::now()) {
+            events::too_many_publishers(&self.topic, named.len(), limit, more);
         }
     }
 
@@ -278,3 +294,7 @@ impl Drop for Connected<'_> {
             .peer(false, publishers, Arc::clone(&self.peer));
     }
 }
+
+const LOG_PERIOD: Duration = Duration::from_secs(60);
+/// Bytes of a publisher's URI: a host name has 253 at most.
+const MAX_URI: usize = 1024;

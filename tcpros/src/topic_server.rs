@@ -14,10 +14,10 @@ use thiserror::Error;
 use tokio::io::{AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::tcp::ReadHalf;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
 use tokio::task::JoinSet;
 use tokio::time::{sleep, timeout};
 
+use crate::crowd::{Admission, Crowd, Places, Settled};
 use crate::events::{self, Refusals};
 use crate::header::{ConnectionHeader, HeaderError, clipped};
 use crate::link::{prepare, transport_info};
@@ -25,9 +25,10 @@ use crate::node::Inner;
 use crate::publisher::{Joined, Subscriber};
 use crate::service::{self, ClientFault};
 
-/// Serves the subscribers and clients of a node until it is dropped.
-pub(crate) async fn serve(listener: TcpListener, node: Arc<Inner>) {
-    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+/// Serves the subscribers and clients of a node until it is dropped. Where there are too many, those that have not
+/// shaken hands yet give way, and then who comes is turned away.
+pub(crate) async fn serve(listener: TcpListener, places: Places, node: Arc<Inner>) {
+    let mut crowd = Crowd::new(places);
     let mut connections: JoinSet<Result<(), (SocketAddr, Refused)>> = JoinSet::new();
     let mut refusals = Refusals::new("TCPROS");
     loop {
@@ -47,26 +48,27 @@ pub(crate) async fn serve(listener: TcpListener, node: Arc<Inner>) {
                 continue;
             }
         };
-        let Ok(place) = Arc::clone(&places).try_acquire_owned() else {
-            refusals.too_many(MAX_CONNECTIONS);
-            continue;
-        };
         let node = Arc::clone(&node);
-        connections.spawn(async move {
-            let served = serve_one(stream, &node)
-                .await
-                .map_err(|error| (peer, error));
-            drop(place);
-            served
+        let admission = crowd.admit(peer.ip(), |settled| {
+            connections.spawn(async move {
+                let served = serve_one(stream, &node, &settled).await;
+                served.map_err(|error| (peer, error))
+            })
         });
+        match admission {
+            Admission::Free => {}
+            Admission::InPlaceOf(address) => refusals.gave_way(address),
+            Admission::Full(limit) => refusals.too_many(limit),
+        }
     }
 }
 
-async fn serve_one(mut stream: TcpStream, node: &Inner) -> Result<(), Refused> {
+async fn serve_one(mut stream: TcpStream, node: &Inner, settled: &Settled) -> Result<(), Refused> {
     let handshake = timeout(HANDSHAKE_LIMIT, shake_hands(&mut stream, node));
     let admitted = handshake
         .await
         .map_err(|_| Refused::Silent(HANDSHAKE_LIMIT))??;
+    settled.settle();
     let joined = match admitted {
         Admitted::Subscriber(joined) => joined,
         Admitted::Service(service::Admitted::Client(session)) => {
@@ -262,7 +264,6 @@ pub(crate) enum Ended {
     Failed(std::io::Error),
 }
 
-const MAX_CONNECTIONS: usize = 4096;
 const HANDSHAKE_LIMIT: Duration = Duration::from_secs(5);
 pub(crate) const STALL_LIMIT: Duration = Duration::from_secs(10);
 /// How long what has been withdrawn may take to send what it still has.

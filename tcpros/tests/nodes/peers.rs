@@ -1,6 +1,6 @@
 //! Peers that are slow, silent, or break the protocol.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use bytes::Bytes;
@@ -317,4 +317,61 @@ async fn a_publisher_that_is_no_longer_named_is_left_alone() {
         tries += 1;
     }
     assert!(tries <= 1, "{tries} more tries");
+}
+
+/// Requirement: what a peer says costs a bounded number of connections and of lines in the log.
+#[tokio::test]
+async fn a_forged_list_of_publishers_is_followed_in_part_and_summed_up_in_the_log() {
+    let log = Log::default();
+    let to = log.clone();
+    let lines = tracing_subscriber::fmt()
+        .with_ansi(false)
+        .with_writer(move || to.clone());
+    let _guard = tracing::subscriber::set_default(lines.finish());
+    let core = core();
+    let listener = node("listener", &core);
+    let inbox = Inbox::new();
+    let _subscription = subscribe(&listener, "/t", &inbox);
+    registered(&listener).await;
+    // Nobody listens there, which each try finds out at once.
+    let uris: String = (0..3000)
+        .map(|n| format!("<value>http://127.0.0.1:1/{n}</value>"))
+        .collect();
+    let update = format!(
+        "<methodCall><methodName>publisherUpdate</methodName><params><param><value>/master</value></param><param>\
+         <value>/t</value></param><param><value><array><data>{uris}</data></array></value></param></params></methodCall>"
+    );
+    assert!(slave_call(&listener, &update).await.contains("<i4>1</i4>"));
+    let named = || log.count("no connection to a registered publisher");
+    eventually("the sum", || {
+        let summed_up = log.count("more registered publishers cannot be connected to") == 1;
+        summed_up && named() == 20
+    })
+    .await;
+    assert_eq!(
+        log.count("a topic has more publishers than are connected to"),
+        1
+    );
+}
+
+/// What is logged.
+#[derive(Clone, Default)]
+struct Log(Arc<Mutex<Vec<u8>>>);
+
+impl Log {
+    fn count(&self, part: &str) -> usize {
+        let written = self.0.lock().unwrap();
+        String::from_utf8_lossy(&written).matches(part).count()
+    }
+}
+
+impl std::io::Write for Log {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.lock().unwrap().extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
 }

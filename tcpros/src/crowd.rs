@@ -1,0 +1,246 @@
+//! Who is connected: how many connections there may be, in all and from one address, and who gives way.
+//!
+//! A process has so many file descriptors. What peers can take of them leaves enough for what the node needs itself, so
+//! that nobody who opens connections and says nothing keeps it from its master.
+
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use rustix::process::{Resource, getrlimit};
+use tokio::task::AbortHandle;
+
+/// How many connections a listener may have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Places {
+    pub(crate) total: usize,
+    pub(crate) per_address: usize,
+}
+
+impl Places {
+    const fn shared(total: usize) -> Self {
+        Self {
+            total,
+            per_address: total.div_ceil(2),
+        }
+    }
+}
+
+/// How the file descriptors of a process are divided up; what is left over is for calls to the master, for files, and
+/// for what else the program has open.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Shares {
+    /// Subscribers and clients of services.
+    pub(crate) subscribers: Places,
+    /// Callers of the slave API.
+    pub(crate) callers: Places,
+    /// Callers of a master in this process, all of which may be on one host.
+    pub(crate) nodes: Places,
+    /// Publishers that are connected or being connected.
+    pub(crate) publishers: usize,
+    /// Those of one topic.
+    pub(crate) publishers_of_topic: usize,
+}
+
+impl Shares {
+    /// By the limit of this process (`RLIMIT_NOFILE`).
+    pub(crate) fn of_process() -> Self {
+        let limit = getrlimit(Resource::Nofile).current;
+        // Without a limit there is the one of the system, which is no less than the most that is of use.
+        Self::of(limit.map_or(usize::MAX, |limit| {
+            usize::try_from(limit).unwrap_or(usize::MAX)
+        }))
+    }
+
+    const fn of(descriptors: usize) -> Self {
+        let eighth = descriptors / 8;
+        let publishers = at_most(eighth.saturating_mul(3), 8192);
+        let nodes = at_most(eighth.saturating_mul(4), 4096);
+        Self {
+            subscribers: Places::shared(at_most(eighth.saturating_mul(3), 4096)),
+            callers: Places::shared(at_most(eighth, 1024)),
+            nodes: Places {
+                total: nodes,
+                per_address: nodes,
+            },
+            publishers,
+            publishers_of_topic: at_most(publishers.div_ceil(2), 1024),
+        }
+    }
+}
+
+/// One place there is always: without descriptors nothing works anyway.
+const fn at_most(number: usize, most: usize) -> usize {
+    if number == 0 {
+        1
+    } else if number < most {
+        number
+    } else {
+        most
+    }
+}
+
+/// The connections of a listener in the order in which they came.
+#[derive(Debug)]
+pub(crate) struct Crowd {
+    places: Places,
+    open: Vec<Guest>,
+}
+
+#[derive(Debug)]
+struct Guest {
+    address: IpAddr,
+    settled: Settled,
+    task: AbortHandle,
+}
+
+/// Whether a connection has come to what it is for. Until then it gives way to another.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Settled(Arc<AtomicBool>);
+
+impl Settled {
+    pub(crate) fn settle(&self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+
+    fn is_settled(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
+/// What became of a connection.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Admission {
+    /// It is let in.
+    Free,
+    /// It is let in, and the oldest that had not come to anything was ended, which was from there.
+    InPlaceOf(IpAddr),
+    /// All there are have come to something, and so many there may be.
+    Full(usize),
+}
+
+impl Crowd {
+    pub(crate) const fn new(places: Places) -> Self {
+        Self {
+            places,
+            open: Vec::new(),
+        }
+    }
+
+    /// Begins a connection from an address, unless there is no place for it.
+    pub(crate) fn admit(
+        &mut self,
+        address: IpAddr,
+        begin: impl FnOnce(Settled) -> AbortHandle,
+    ) -> Admission {
+        self.open.retain(|guest| !guest.task.is_finished());
+        let from_there = self.open.iter().filter(|g| g.address == address).count();
+        let has_share = from_there >= self.places.per_address;
+        let mut admission = Admission::Free;
+        if has_share || self.open.len() >= self.places.total {
+            let gives_way = |guest: &Guest| {
+                !guest.settled.is_settled() && (!has_share || guest.address == address)
+            };
+            let Some(at) = self.open.iter().position(gives_way) else {
+                return Admission::Full(if has_share {
+                    self.places.per_address
+                } else {
+                    self.places.total
+                });
+            };
+            let guest = self.open.remove(at);
+            guest.task.abort();
+            admission = Admission::InPlaceOf(guest.address);
+        }
+        let settled = Settled::default();
+        let task = begin(settled.clone());
+        self.open.push(Guest {
+            address,
+            settled,
+            task,
+        });
+        admission
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::future::pending;
+
+    use tokio::task::JoinSet;
+
+    use super::*;
+
+    const A: IpAddr = IpAddr::V4(std::net::Ipv4Addr::new(10, 0, 0, 1));
+    const B: IpAddr = IpAddr::V4(std::net::Ipv4Addr::new(10, 0, 0, 2));
+
+    #[test]
+    fn what_peers_can_take_leaves_descriptors_for_the_node() {
+        for limit in [64, 256, 1024, 20_000, 1 << 20] {
+            let shares = Shares::of(limit);
+            let taken = shares.subscribers.total + shares.callers.total + shares.publishers;
+            assert!(taken <= limit - limit / 8, "{shares:?} of {limit}");
+            assert!(shares.nodes.total <= limit / 2, "{shares:?} of {limit}");
+        }
+        let usual = Shares::of(1024);
+        assert_eq!((usual.subscribers.total, usual.callers.total), (384, 128));
+        let plenty = Shares::of(usize::MAX);
+        assert_eq!(
+            (plenty.subscribers.total, plenty.callers.total),
+            (4096, 1024)
+        );
+    }
+
+    #[tokio::test]
+    async fn the_oldest_that_says_nothing_gives_way_and_others_stay() {
+        let mut tasks: JoinSet<()> = JoinSet::new();
+        let mut crowd = Crowd::new(Places {
+            total: 4,
+            per_address: 2,
+        });
+        let mut come = |address: IpAddr, settles: bool| {
+            let mut place = None;
+            let admission = crowd.admit(address, |settled| {
+                if settles {
+                    settled.settle();
+                }
+                place = Some(settled);
+                tasks.spawn(pending())
+            });
+            (admission, place)
+        };
+        assert_eq!(come(A, true).0, Admission::Free);
+        assert_eq!(come(B, false).0, Admission::Free);
+        let (_, silent) = come(A, false);
+        // The share of one address: its own silent one gives way, not that of another.
+        let (admission, second) = come(A, false);
+        assert_eq!(admission, Admission::InPlaceOf(A));
+        drop(silent);
+        second.unwrap().settle();
+        assert_eq!(come(A, false).0, Admission::Full(2));
+        assert_eq!(come(B, true).0, Admission::Free);
+        // All places are taken: the one that is left to say nothing gives way.
+        let c = IpAddr::V4(std::net::Ipv4Addr::new(10, 0, 0, 3));
+        assert_eq!(come(c, true).0, Admission::InPlaceOf(B));
+        assert_eq!(come(c, false).0, Admission::Full(4));
+    }
+
+    #[tokio::test]
+    async fn a_connection_that_has_ended_leaves_its_place() {
+        let mut crowd = Crowd::new(Places {
+            total: 1,
+            per_address: 1,
+        });
+        let mut tasks: JoinSet<()> = JoinSet::new();
+        let mut come = |tasks: &mut JoinSet<()>| {
+            crowd.admit(A, |settled| {
+                settled.settle();
+                tasks.spawn(async {})
+            })
+        };
+        assert_eq!(come(&mut tasks), Admission::Free);
+        assert_eq!(come(&mut tasks), Admission::Full(1));
+        tasks.join_next().await.unwrap().unwrap();
+        assert_eq!(come(&mut tasks), Admission::Free);
+    }
+}
