@@ -1,8 +1,9 @@
 //! Log lines for people (text) or for machines (one JSON object a line), on stderr; and what a program warns of, for
 //! whoever in it publishes that elsewhere.
 
+use std::borrow::Cow;
 use std::fmt::Write as _;
-use std::io::IsTerminal;
+use std::io::{self, IsTerminal, Write};
 use std::sync::{Arc, PoisonError, RwLock, Weak};
 
 use tracing::field::{Field, Visit};
@@ -26,9 +27,13 @@ pub enum LogFormat {
 pub(crate) fn start(format: LogFormat, quiet: &str) {
     let levels = std::env::var("UA_LOG").unwrap_or_else(|_| "info".to_owned());
     let filter = EnvFilter::builder().parse_lossy(format!("{quiet},{levels}"));
+    let colour = io::stderr().is_terminal();
     let lines = tracing_subscriber::fmt::layer()
-        .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal());
+        .with_writer(move || OneLine {
+            to: io::stderr(),
+            colour,
+        })
+        .with_ansi(colour);
     // Each line layer has its filter: what is hushed on stderr may still be of use elsewhere.
     let lines = match format {
         LogFormat::Text => lines.with_target(false).with_filter(filter).boxed(),
@@ -42,6 +47,51 @@ pub(crate) fn start(format: LogFormat, quiet: &str) {
     if let Err(error) = started {
         tracing::debug!(%error, "logging had been started before");
     }
+}
+
+/// Writes each event as one line, whatever its texts hold: names, reasons and errors come from peers, and a line break in
+/// one of them would make a line of their own.
+#[derive(Debug)]
+struct OneLine<W> {
+    to: W,
+    /// Whether events are coloured, by the control character that begins a sequence. Those in texts are escaped before.
+    colour: bool,
+}
+
+impl<W: Write> Write for OneLine<W> {
+    /// Takes a whole event, as `tracing-subscriber` hands it over.
+    fn write(&mut self, event: &[u8]) -> io::Result<usize> {
+        let line = event.strip_suffix(b"\n").unwrap_or(event);
+        let line = String::from_utf8_lossy(line);
+        let line = escaped(&line, |c| self.colour && c == '\x1b');
+        self.to.write_all(format!("{line}\n").as_bytes())?;
+        Ok(event.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.to.flush()
+    }
+}
+
+/// The text with its control characters, line breaks, and marks that turn the direction of what is around them escaped,
+/// but for those that `stay`.
+fn escaped(text: &str, stay: impl Fn(char) -> bool) -> Cow<'_, str> {
+    let breaks = |c: char| match c {
+        '\u{2028}' | '\u{2029}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => true,
+        c => c.is_control() && !stay(c),
+    };
+    if !text.contains(&breaks) {
+        return Cow::Borrowed(text);
+    }
+    let mut out = String::with_capacity(text.len() + 8);
+    for c in text.chars() {
+        if breaks(c) {
+            out.extend(c.escape_default());
+        } else {
+            out.push(c);
+        }
+    }
+    Cow::Owned(out)
 }
 
 /// A warning or an error of the program.
@@ -101,7 +151,8 @@ impl<S: Subscriber> Layer<S> for Warnings {
         for sink in sinks {
             sink.hear(LogRecord {
                 level: *metadata.level(),
-                message: format!("{}{}", text.message, text.fields),
+                message: escaped(&format!("{}{}", text.message, text.fields), |_| false)
+                    .into_owned(),
                 file: metadata.file(),
                 module: metadata.module_path(),
                 line: metadata.line(),
@@ -153,6 +204,53 @@ mod tests {
         }
     }
 
+    /// What a program writes that logs as `start` has it, without colours.
+    fn written(log: impl FnOnce()) -> String {
+        #[derive(Clone, Default)]
+        struct Written(Arc<Mutex<Vec<u8>>>);
+        impl Write for Written {
+            fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+                self.0.lock().unwrap().extend_from_slice(bytes);
+                Ok(bytes.len())
+            }
+            fn flush(&mut self) -> io::Result<()> {
+                Ok(())
+            }
+        }
+        let written = Written::default();
+        let to = written.clone();
+        let lines = tracing_subscriber::fmt::layer()
+            .with_writer(move || OneLine {
+                to: to.clone(),
+                colour: false,
+            })
+            .with_ansi(false);
+        tracing::subscriber::with_default(tracing_subscriber::registry().with(lines), log);
+        let bytes = written.0.lock().unwrap().clone();
+        String::from_utf8(bytes).unwrap()
+    }
+
+    #[test]
+    fn a_peer_cannot_write_a_line_of_its_own() {
+        let reason = "gone\n2026-01-01T00:00:00Z  INFO all is well\r\u{2028}\u{1b}[2J\u{202e}";
+        let lines = written(|| {
+            tracing::error!("told to shut down: {reason}");
+            tracing::warn!(%reason, "told to shut down");
+            tracing::warn!(reason, "told to shut down");
+        });
+        assert_eq!(lines.lines().count(), 3, "{lines}");
+        assert!(lines.contains(r"gone\n2026"), "{lines}");
+        let harmful = |c: char| (c.is_control() && c != '\n') || c == '\u{2028}' || c == '\u{202e}';
+        assert!(!lines.contains(harmful), "{lines:?}");
+    }
+
+    #[test]
+    fn colours_stay() {
+        let red = "\u{1b}[31mERROR\u{1b}[0m";
+        assert_eq!(escaped(red, |c| c == '\x1b'), red);
+        assert_eq!(escaped(red, |_| false), r"\u{1b}[31mERROR\u{1b}[0m");
+    }
+
     #[test]
     fn a_sink_hears_the_warnings_of_the_program_with_their_fields() {
         let heard = Arc::new(Heard::default());
@@ -161,11 +259,15 @@ mod tests {
         let ours = || tracing::warn!(topic = "rt/a", size = 7, "too large");
         let ordinary = || tracing::info!("ordinary");
         let foreign = || tracing::error!(target: "rustdds::network", "of a library");
-        let all: [&dyn Fn(); 3] = [&ours, &ordinary, &foreign];
+        let forged = || tracing::warn!(reason = %"a\nb", "forged\nline");
+        let all: [&dyn Fn(); 4] = [&ours, &ordinary, &foreign, &forged];
         tracing::subscriber::with_default(subscriber, || all.iter().for_each(|log| log()));
         assert_eq!(
             *heard.0.lock().unwrap(),
-            ["WARN too large topic=rt/a size=7"]
+            [
+                "WARN too large topic=rt/a size=7",
+                r"WARN forged\nline reason=a\nb"
+            ]
         );
     }
 }
