@@ -1,7 +1,8 @@
 //! The HTTP page with counters and delays.
 
+use std::collections::VecDeque;
 use std::convert::Infallible;
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -12,7 +13,8 @@ use hyper::service::service_fn;
 use hyper::{Request, Response, StatusCode};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{Semaphore, mpsc, oneshot};
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::AbortHandle;
 use tracing::{debug, info};
 
 use crate::exit::{Failure, FailureKind};
@@ -53,14 +55,11 @@ pub(crate) async fn serve(
 }
 
 async fn accept(listener: TcpListener, ask: Ask) {
-    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    let mut crowd = Crowd::default();
     loop {
-        let Ok(place) = Arc::clone(&places).acquire_owned().await else {
-            return;
-        };
-        let stream = tokio::select! {
+        let (stream, peer) = tokio::select! {
             accepted = listener.accept() => match accepted {
-                Ok((stream, _)) => stream,
+                Ok(accepted) => accepted,
                 // Out of descriptors, most likely: others may be closed by then.
                 Err(error) => {
                     debug!(%error, "a connection for metrics was not accepted");
@@ -71,15 +70,41 @@ async fn accept(listener: TcpListener, ask: Ask) {
             () = all_closed(&ask) => return,
         };
         let ask = Arc::clone(&ask);
-        tokio::spawn(async move {
+        let task = tokio::spawn(async move {
             if tokio::time::timeout(CONNECTION_TIME, answer(stream, ask))
                 .await
                 .is_err()
             {
                 debug!("a connection for metrics was closed for its age");
             }
-            drop(place);
         });
+        crowd.admit(peer.ip(), task.abort_handle());
+    }
+}
+
+/// The open connections in the order in which they came. Who comes is always let in: where there are too many, the
+/// oldest gives way, of the same address if that has its share. A request takes milliseconds, so what is old is idle.
+#[derive(Debug, Default)]
+struct Crowd {
+    open: VecDeque<(IpAddr, AbortHandle)>,
+}
+
+impl Crowd {
+    fn admit(&mut self, address: IpAddr, task: AbortHandle) {
+        self.open.retain(|(_, task)| !task.is_finished());
+        let same = |(from, _): &&(IpAddr, AbortHandle)| *from == address;
+        let has_share = self.open.iter().filter(same).count() >= MAX_PER_ADDRESS;
+        if has_share || self.open.len() >= MAX_CONNECTIONS {
+            let oldest = self
+                .open
+                .iter()
+                .position(|(from, _)| !has_share || *from == address);
+            if let Some((from, task)) = oldest.and_then(|at| self.open.remove(at)) {
+                debug!(%from, "a connection for metrics gave way to another");
+                task.abort();
+            }
+        }
+        self.open.push_back((address, task));
     }
 }
 
@@ -96,7 +121,7 @@ async fn answer(stream: TcpStream, ask: Ask) {
     });
     let served = hyper::server::conn::http1::Builder::new()
         .timer(TokioTimer::new())
-        .header_read_timeout(CONNECTION_TIME)
+        .header_read_timeout(HEADER_TIME)
         .serve_connection(TokioIo::new(stream), service)
         .await;
     if let Err(error) = served {
@@ -148,5 +173,74 @@ fn text(status: StatusCode, body: String) -> Response<Full<Bytes>> {
 }
 
 const MAX_CONNECTIONS: usize = 16;
-const CONNECTION_TIME: Duration = Duration::from_secs(30);
+const MAX_PER_ADDRESS: usize = 8;
+const HEADER_TIME: Duration = Duration::from_secs(5);
+const CONNECTION_TIME: Duration = Duration::from_secs(10);
 const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
+
+#[cfg(test)]
+mod tests {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    use tokio::net::TcpSocket;
+
+    use super::*;
+
+    /// A page without run loops behind it, and what keeps it open.
+    async fn served() -> (SocketAddr, Requests) {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap();
+        let (ask, requests) = mpsc::channel(1);
+        tokio::spawn(accept(listener, [ask].into()));
+        (address, requests)
+    }
+
+    async fn connect(from: &str, to: SocketAddr) -> TcpStream {
+        let socket = TcpSocket::new_v4().unwrap();
+        socket
+            .bind(SocketAddr::new(from.parse().unwrap(), 0))
+            .unwrap();
+        socket.connect(to).await.unwrap()
+    }
+
+    async fn status(stream: &mut TcpStream) -> String {
+        let asked = async {
+            stream
+                .write_all(b"GET /nothing HTTP/1.0\r\n\r\n")
+                .await
+                .unwrap();
+            let mut answer = String::new();
+            stream.read_to_string(&mut answer).await.unwrap();
+            answer.lines().next().unwrap_or_default().to_owned()
+        };
+        let limit = Duration::from_secs(3);
+        let answer = tokio::time::timeout(limit, asked).await;
+        answer.unwrap_or_else(|_| format!("no answer within {limit:?}"))
+    }
+
+    #[tokio::test]
+    async fn idle_connections_keep_nobody_waiting() {
+        let (address, _requests) = served().await;
+        let mut idle = Vec::new();
+        for _ in 0..3 * MAX_CONNECTIONS {
+            idle.push(connect("127.0.0.1", address).await);
+        }
+        let mut late = connect("127.0.0.1", address).await;
+        assert_eq!(status(&mut late).await, "HTTP/1.0 404 Not Found");
+    }
+
+    #[tokio::test]
+    async fn one_address_does_not_push_out_another() {
+        let (address, _requests) = served().await;
+        let mut early = connect("127.0.0.2", address).await;
+        let mut idle = Vec::new();
+        for _ in 0..3 * MAX_CONNECTIONS {
+            idle.push(connect("127.0.0.1", address).await);
+        }
+        // All of them have been taken in once the last is answered.
+        assert_eq!(
+            status(&mut idle.pop().unwrap()).await,
+            "HTTP/1.0 404 Not Found"
+        );
+        assert_eq!(status(&mut early).await, "HTTP/1.0 404 Not Found");
+    }
+}
