@@ -120,6 +120,23 @@ impl Reason {
         }
     }
 
+    /// Whether it leaves a topic of another space with an older value than its writer has sent.
+    pub(crate) const fn is_loss(self) -> bool {
+        matches!(
+            self,
+            Self::Malformed
+                | Self::Unsupported
+                | Self::Invalid
+                | Self::Mismatch
+                | Self::Duplicate
+                | Self::Stale
+                | Self::TooBig
+                | Self::Incomplete
+                | Self::NoRoom
+                | Self::NotPublished
+        )
+    }
+
     /// Whether it belongs to normal traffic, so that nobody needs to be told; or is told by who counts it.
     #[must_use]
     pub const fn is_routine(self) -> bool {

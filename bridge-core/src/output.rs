@@ -42,12 +42,16 @@ pub enum Output {
         /// What its writer says it is, if that is what the values are.
         described: Option<Arc<Described>>,
     },
-    /// The writer of a topic of another space fell silent, or speaks again.
+    /// A topic of another space has had no good value for `receive_timeout`, or has one again. Good is a sample that the
+    /// local side took ([`Router::published`](crate::Router::published)), its repetition, or a keep-alive with nothing dropped
+    /// before it.
     Silent {
         /// Which value.
         topic: TopicId,
         /// Whether it is silent now.
         silent: bool,
+        /// Why the last value was dropped, where the writer is heard all the same. Only a value ends such a silence.
+        dropped: Option<Reason>,
     },
     /// Of the values a topic of another space has side by side, one is no longer repeated: who comes late is not to
     /// get it any more.

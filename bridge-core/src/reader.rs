@@ -21,7 +21,11 @@ pub(crate) struct Reader {
     from: SocketAddr,
     /// When anything was last heard of the writer, keep-alives included.
     heard: Instant,
-    /// Whether the writer is held to be silent.
+    /// When the topic's value was last known to hold: the local side took one, or the writer repeated it or had nothing new.
+    good: Instant,
+    /// Why the newest message since then was dropped.
+    dropped: Option<Reason>,
+    /// Whether the topic is held to be silent.
     silent: bool,
     /// The samples that were handed on, in this order, as far as their stamps are fine enough to tell them apart; at
     /// most [`MAX_KNOWN`].
@@ -85,6 +89,8 @@ impl Reader {
             stamp: None,
             from,
             heard: now,
+            good: now,
+            dropped: None,
             silent: false,
             known: VecDeque::new(),
             several: None,
@@ -96,15 +102,39 @@ impl Reader {
         }
     }
 
-    /// Takes note that the writer lives, and says whether it was silent before.
-    pub(crate) fn heard(&mut self, now: Instant) -> bool {
+    /// Takes note that the writer lives.
+    pub(crate) const fn heard(&mut self, now: Instant) {
         self.heard = now;
+    }
+
+    /// Takes note that the topic has a good value, and says whether it was silent before.
+    pub(crate) fn is_good(&mut self, now: Instant) -> bool {
+        self.good = now;
+        self.dropped = None;
         std::mem::take(&mut self.silent)
     }
 
-    /// Whether what comes from there may be of the writer: of one that is silent nobody knows.
-    pub(crate) fn may_be(&self, from: SocketAddr) -> bool {
-        self.silent || self.from == from
+    /// Takes note that the writer lives and says nothing else: its last value holds, unless a newer one was dropped. Says
+    /// whether the topic was silent before and is not now.
+    pub(crate) fn lives(&mut self, now: Instant) -> bool {
+        match self.dropped {
+            // Those say nothing against the value there is.
+            None | Some(Reason::Duplicate | Reason::Stale) => self.is_good(now),
+            Some(_) => false,
+        }
+    }
+
+    /// Takes note that a message of the writer was dropped, if that leaves the topic with an old value.
+    pub(crate) const fn dropped(&mut self, reason: Reason) {
+        let says_nothing = matches!(reason, Reason::Duplicate | Reason::Stale);
+        if reason.is_loss() && !(says_nothing && self.dropped.is_some()) {
+            self.dropped = Some(reason);
+        }
+    }
+
+    /// Whether what comes from there may be of the writer: of one that was not heard for `timeout` nobody knows.
+    pub(crate) fn may_be(&self, from: SocketAddr, now: Instant, timeout: Duration) -> bool {
+        self.from == from || now.saturating_duration_since(self.heard) >= timeout
     }
 
     /// Takes note of the version of a message, and says whether what was known of the content is no longer true.
@@ -143,9 +173,9 @@ impl Reader {
         true
     }
 
-    /// Whether the writer has just been silent for `timeout`. True once per silence.
+    /// Whether the topic has just been without a good value for `timeout`. True once per silence.
     pub(crate) fn fell_silent(&mut self, now: Instant, timeout: Duration) -> bool {
-        let fell = !self.silent && now.saturating_duration_since(self.heard) >= timeout;
+        let fell = !self.silent && now.saturating_duration_since(self.good) >= timeout;
         self.silent |= fell;
         if fell {
             // Who comes back may send something else.
@@ -154,9 +184,14 @@ impl Reader {
         fell
     }
 
-    /// When silence is to be looked for again; `None` while the writer is silent.
+    /// Why the newest message since the last good value was dropped, if one was.
+    pub(crate) const fn loss(&self) -> Option<Reason> {
+        self.dropped
+    }
+
+    /// When silence is to be looked for again; `None` while the topic is silent.
     pub(crate) fn due(&self, timeout: Duration) -> Option<Instant> {
-        (!self.silent).then(|| self.heard + timeout)
+        (!self.silent).then(|| self.good + timeout)
     }
 
     /// Admits a key frame into the sequence, and gives the number of messages missing before it and what it is to the
@@ -525,12 +560,35 @@ mod tests {
     fn silence_is_told_once_and_ends_with_the_next_message() {
         let (mut reader, start) = reader();
         let timeout = Duration::from_secs(3);
-        assert!(!reader.fell_silent(start + Duration::from_millis(2999), timeout));
+        let early = start + Duration::from_millis(2999);
+        assert!(!reader.fell_silent(early, timeout));
         assert!(reader.fell_silent(start + timeout, timeout));
         assert!(!reader.fell_silent(start + timeout * 2, timeout));
         assert_eq!(reader.due(timeout), None);
-        assert!(reader.heard(start + timeout * 3));
-        assert!(!reader.heard(start + timeout * 3));
+        assert!(reader.lives(start + timeout * 3));
+        assert!(!reader.lives(start + timeout * 3));
         assert!(reader.fell_silent(start + timeout * 4, timeout));
+        assert_eq!(reader.loss(), None);
+    }
+
+    #[test]
+    fn who_only_repeats_itself_on_two_ways_lives_and_who_is_not_understood_does_not() {
+        let (mut reader, start) = reader();
+        let timeout = Duration::from_secs(3);
+        reader.dropped(Reason::Duplicate);
+        assert!(!reader.lives(start + timeout), "it never was silent");
+        assert!(!reader.fell_silent(start + timeout, timeout));
+        reader.dropped(Reason::Overflow);
+        assert!(!reader.lives(start + timeout * 2));
+        assert!(!reader.fell_silent(start + timeout * 2, timeout));
+        reader.dropped(Reason::Mismatch);
+        reader.dropped(Reason::Duplicate);
+        reader.heard(start + timeout * 3);
+        assert!(!reader.lives(start + timeout * 3));
+        assert!(reader.fell_silent(start + timeout * 3, timeout));
+        assert_eq!(reader.loss(), Some(Reason::Mismatch));
+        assert!(!reader.lives(start + timeout * 4));
+        assert!(!reader.may_be(address(2), start + timeout * 4, timeout * 2));
+        assert!(reader.is_good(start + timeout * 4));
     }
 }

@@ -362,9 +362,10 @@ impl Router {
         [timer, pace, chunks, discovery].into_iter().flatten().min()
     }
 
-    /// The local side took a delivery: its time in this program ends at `now`.
-    pub fn published(&mut self, arrived: Timestamp, now: Now) {
+    /// The local side took a delivery of the topic: its time in this program ends at `now`, and the value is good.
+    pub fn published(&mut self, topic: TopicId, arrived: Timestamp, now: Now) {
         self.hops.record(Hop::In, arrived, now.utc);
+        self.is_good(topic, now);
     }
 
     /// The local side did not take a delivery, given by its topic and instance: its repetition is welcome.
@@ -441,6 +442,7 @@ impl Router {
                     self.told.push_back(Output::Silent {
                         topic,
                         silent: true,
+                        dropped: reader.loss(),
                     });
                 }
             }
@@ -619,9 +621,15 @@ impl Router {
         count: u64,
         detail: impl FnOnce() -> String,
     ) {
-        let counters = topic
-            .and_then(|topic| self.topics.get_mut(&topic))
-            .map_or(&mut self.others, |entry| &mut entry.counters);
+        let counters = match topic.and_then(|topic| self.topics.get_mut(&topic)) {
+            Some(entry) => {
+                if let Role::Theirs(reader) = &mut entry.role {
+                    reader.dropped(reason);
+                }
+                &mut entry.counters
+            }
+            None => &mut self.others,
+        };
         let before = counters.dropped(reason);
         let total = counters.add(reason, count);
         let told = !reason.is_routine() && (before + 1..=total).take(MAX_TOLD_STEPS).any(is_told);

@@ -72,6 +72,16 @@ impl Bench {
             .collect()
     }
 
+    /// The local side takes what was handed to it.
+    fn take(&mut self, outputs: &[Output]) {
+        for output in outputs {
+            if let Output::Delivery(delivery) = output {
+                self.router
+                    .published(delivery.topic, delivery.arrived, self.now);
+            }
+        }
+    }
+
     fn deliveries(&mut self) -> Vec<Delivery> {
         let outputs = self.outputs().into_iter();
         outputs
@@ -702,10 +712,89 @@ fn a_silent_writer_is_told_once_and_keep_alives_prevent_it() {
     assert!(bench.outputs().is_empty());
     bench.hear(&Frame::new(10, 2, 43).bytes());
     let outputs = bench.outputs();
+    assert!(matches!(outputs[..], [Output::Delivery(_)]), "{outputs:?}");
+    bench.take(&outputs);
+    let outputs = bench.outputs();
+    assert!(
+        matches!(outputs[..], [Output::Silent { silent: false, .. }]),
+        "{outputs:?}"
+    );
+}
+
+#[test]
+fn a_value_that_keeps_being_dropped_falls_silent_though_its_writer_is_heard() {
+    let mut bench = Bench::new(1, Local::Fields);
+    bench.hear(&Frame::new(10, 1, 42).bytes());
+    let outputs = bench.outputs();
+    bench.take(&outputs);
+    let mut sequence = 1;
+    for _ in 0..3 {
+        bench.wait(SECOND);
+        sequence += 1;
+        let mut cut_off = Frame::new(10, sequence, 43).bytes();
+        cut_off.truncate(cut_off.len() - 2);
+        bench.hear(&cut_off);
+        bench.hear(&Frame::new(10, sequence + 1, 0).keep_alive());
+    }
+    bench.router.handle_timeout(bench.now);
+    let outputs = bench.outputs();
     assert!(
         matches!(
             outputs[..],
-            [Output::Silent { silent: false, .. }, Output::Delivery(_)]
+            [
+                Output::Notice(_),
+                Output::Silent {
+                    silent: true,
+                    dropped: Some(Reason::Malformed),
+                    ..
+                }
+            ]
+        ),
+        "{outputs:?}"
+    );
+    bench.hear(&Frame::new(10, sequence + 1, 0).keep_alive());
+    assert!(
+        bench.outputs().is_empty(),
+        "that it lives says nothing of a value that was not understood"
+    );
+    bench.hear(&Frame::new(10, sequence + 1, 44).bytes());
+    let outputs = bench.outputs();
+    assert!(matches!(outputs[..], [Output::Delivery(_)]), "{outputs:?}");
+    bench.take(&outputs);
+    let outputs = bench.outputs();
+    assert!(
+        matches!(outputs[..], [Output::Silent { silent: false, .. }]),
+        "{outputs:?}"
+    );
+}
+
+#[test]
+fn a_value_that_the_local_side_does_not_take_falls_silent_too() {
+    let mut bench = Bench::new(1, Local::Fields);
+    bench.hear(&Frame::new(10, 1, 42).bytes());
+    let outputs = bench.outputs();
+    bench.take(&outputs);
+    for sequence in 2..5 {
+        bench.wait(SECOND);
+        bench.hear(&Frame::new(10, sequence, 43).bytes());
+        for delivery in bench.deliveries() {
+            let Delivery {
+                topic, instance, ..
+            } = delivery;
+            bench.router.not_published(topic, instance, "another type");
+        }
+    }
+    bench.outputs();
+    bench.router.handle_timeout(bench.now);
+    let outputs = bench.outputs();
+    assert!(
+        matches!(
+            outputs[..],
+            [Output::Silent {
+                silent: true,
+                dropped: Some(Reason::NotPublished),
+                ..
+            }]
         ),
         "{outputs:?}"
     );
@@ -746,7 +835,9 @@ fn the_delays_of_a_sample_are_read_off_its_stamps() {
     reader.hear(&datagram);
     let delivery = reader.deliveries().remove(0);
     reader.wait(Duration::from_micros(50));
-    reader.router.published(delivery.arrived, reader.now);
+    reader
+        .router
+        .published(delivery.topic, delivery.arrived, reader.now);
     let max = |bench: &Bench, hop| bench.router.hops().of(hop).max_us().round();
     assert_eq!(max(&sender, Hop::Out), 30.0);
     assert_eq!(max(&reader, Hop::Origin), 30.0);

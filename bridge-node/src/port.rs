@@ -37,7 +37,8 @@ pub trait Port: Send + 'static {
         described: Option<&Described>,
     );
 
-    /// The writer of a topic of another space fell silent past its receive timeout, or speaks again.
+    /// A topic of another space has had no good value for its receive timeout, or has one again: its writer is not heard, or
+    /// all it sends is dropped, be it by [`publish`](Self::publish).
     fn silent(&mut self, topic: TopicId, silent: bool);
 
     /// Of the values a topic has side by side, one is no longer there for who comes late: the one delivered with that

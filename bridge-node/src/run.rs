@@ -293,7 +293,16 @@ impl<P: Port> Shell<P> {
                     shape,
                     described,
                 } => self.port.wanted(topic, &shape, described.as_deref()),
-                Output::Silent { topic, silent } => self.port.silent(topic, silent),
+                Output::Silent {
+                    topic,
+                    silent,
+                    dropped,
+                } => {
+                    if let Some(reason) = dropped {
+                        debug!(%topic, %reason, "its writer is heard, but its values are dropped");
+                    }
+                    self.port.silent(topic, silent);
+                }
                 Output::Retired { topic, instance } => self.port.retired(topic, instance),
                 Output::Notice(notice) => tell(&notice),
                 other => debug!(?other, "an output this program does not know"),
@@ -332,7 +341,7 @@ impl<P: Port> Shell<P> {
             kept,
         };
         match self.port.publish(sample) {
-            Ok(()) => self.router.published(arrived, now()),
+            Ok(()) => self.router.published(topic, arrived, now()),
             Err(why) => self.router.not_published(topic, instance, why),
         }
     }

@@ -13,7 +13,6 @@ use uadp::{
 use super::receive::{number_of, sent};
 use super::{About, MAX_TOPICS, Router};
 use crate::counters::Reason;
-use crate::output::Output;
 use crate::settings::Now;
 use crate::topic::{Role, Topic};
 
@@ -146,12 +145,9 @@ impl Router {
             });
             return false;
         };
-        if reader.heard(now.monotonic) {
-            self.told.push_back(Output::Silent {
-                topic,
-                silent: false,
-            });
-            self.schedule(topic);
+        reader.heard(now.monotonic);
+        if reader.lives(now.monotonic) {
+            self.tell_returned(topic);
         }
         true
     }

@@ -425,13 +425,14 @@ impl Router {
             topic: Some(topic),
             from: Some(from),
         };
+        let timeout = self.mapping.pubsub().receive_timeout;
         let mut shape = None;
         if let Some(Topic {
             role: Role::Theirs(reader),
             ..
         }) = self.topics.get(&topic)
         {
-            if !reader.may_be(from) {
+            if !reader.may_be(from, now.monotonic, timeout) {
                 self.count(about, Reason::MetaData, 1, || {
                     "another program than the one that sends its values says what they are"
                         .to_owned()

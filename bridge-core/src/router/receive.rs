@@ -140,7 +140,7 @@ impl Router {
             });
             return;
         };
-        let was_silent = reader.heard(now.monotonic);
+        reader.heard(now.monotonic);
         // A keep-alive says nothing of the content.
         let changed = message.kind != MessageKind::KeepAlive
             && reader.is_changed(message.header().major_version);
@@ -154,12 +154,13 @@ impl Router {
         if let Some(Ok((missing, _))) = admitted {
             counters.missing += u64::from(missing);
         }
-        if was_silent {
-            self.told.push_back(Output::Silent {
-                topic,
-                silent: false,
-            });
-            self.schedule(topic);
+        let returned = match admitted {
+            None => reader.lives(now.monotonic),
+            Some(Err(Reason::Repeat)) => reader.is_good(now.monotonic),
+            Some(_) => false,
+        };
+        if returned {
+            self.tell_returned(topic);
         }
         if changed {
             self.ask(topic, now);
@@ -192,6 +193,28 @@ impl Router {
                 Err(error) => self.drop_undecoded(Some(topic), from, &error),
             },
         }
+    }
+
+    /// The topic has a good value.
+    pub(super) fn is_good(&mut self, topic: TopicId, now: Now) {
+        if let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+            && reader.is_good(now.monotonic)
+        {
+            self.tell_returned(topic);
+        }
+    }
+
+    /// The silence of a topic has ended.
+    pub(super) fn tell_returned(&mut self, topic: TopicId) {
+        self.told.push_back(Output::Silent {
+            topic,
+            silent: false,
+            dropped: None,
+        });
+        self.schedule(topic);
     }
 
     /// Hands a sample on, or keeps it until its local type is known.
@@ -240,6 +263,7 @@ impl Router {
             self.tell_unbound(topic, shape, now);
         }
         // Not yet a loss: the newest one waits. It is not told, since the port names topics without a type.
+        self.is_good(topic, now);
         self.count(About::topic(topic), Reason::Untyped, 1, String::new);
     }
 
@@ -272,6 +296,8 @@ impl Router {
         }
         if let Err((reason, detail)) = written {
             self.recycle(payload);
+            // Its repetition is none of a value that the local side has.
+            self.forget(topic, sample.instance);
             self.count(About::topic(topic), reason, 1, || detail);
             return;
         }
