@@ -31,7 +31,8 @@ pub struct Arguments {
         default_value = "text"
     )]
     pub log: LogFormat,
-    /// Serve counters and delays at this address: /metrics for Prometheus, /status as JSON
+    /// Serve counters and delays at this address: /metrics for Prometheus, /status as JSON, and whether the program can
+    /// do its work: /readyz
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
     pub metrics: Option<SocketAddr>,
     /// Where samples follow each other closely, look for the next one for so long before sleeping, as 200. Takes up to one

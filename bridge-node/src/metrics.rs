@@ -1,4 +1,4 @@
-//! The HTTP page with counters and delays.
+//! The HTTP pages with counters, delays, and whether the program can do its work.
 
 use std::collections::VecDeque;
 use std::convert::Infallible;
@@ -49,7 +49,9 @@ pub(crate) async fn serve(
         )
     })?;
     let at = listener.local_addr().unwrap_or(address);
-    info!("metrics at http://{at}/metrics, status at http://{at}/status");
+    info!(
+        "metrics at http://{at}/metrics, status at http://{at}/status, readiness at http://{at}/readyz"
+    );
     tokio::spawn(accept(listener, ask.into()));
     Ok(requests)
 }
@@ -130,13 +132,14 @@ async fn answer(stream: TcpStream, ask: Ask) {
 }
 
 async fn page(request: &Request<Incoming>, ask: &Ask) -> Response<Full<Bytes>> {
-    let json = match request.uri().path() {
-        "/metrics" => false,
-        "/status" => true,
+    let page = match request.uri().path() {
+        "/metrics" => Page::Metrics,
+        "/status" => Page::Status,
+        "/readyz" => Page::Ready,
         _ => {
             return text(
                 StatusCode::NOT_FOUND,
-                "there are /metrics and /status here\n".into(),
+                "there are /metrics, /status and /readyz here\n".into(),
             );
         }
     };
@@ -149,21 +152,38 @@ async fn page(request: &Request<Incoming>, ask: &Ask) -> Response<Full<Bytes>> {
             all.push(status);
         }
     }
-    match all.as_slice() {
-        [] => text(
-            StatusCode::SERVICE_UNAVAILABLE,
-            "the program is ending\n".into(),
-        ),
-        all if !json => text(
+    if all.is_empty() || (page == Page::Ready && all.len() < ask.len()) {
+        let ending = "the program is ending\n".to_owned();
+        return text(StatusCode::SERVICE_UNAVAILABLE, ending);
+    }
+    match page {
+        Page::Metrics => text(
             StatusCode::OK,
             all.iter().map(Status::prometheus).collect::<String>(),
         ),
-        [only] if ask.len() == 1 => text(StatusCode::OK, only.json()),
-        all => {
-            let each: Vec<String> = all.iter().map(Status::json).collect();
-            text(StatusCode::OK, format!("[{}]", each.join(",")))
+        Page::Ready => {
+            let reasons: String = all.iter().flat_map(Status::not_ready).collect();
+            if reasons.is_empty() {
+                text(StatusCode::OK, "ready\n".to_owned())
+            } else {
+                text(StatusCode::SERVICE_UNAVAILABLE, reasons)
+            }
         }
+        Page::Status => match all.as_slice() {
+            [only] if ask.len() == 1 => text(StatusCode::OK, only.json()),
+            all => {
+                let each: Vec<String> = all.iter().map(Status::json).collect();
+                text(StatusCode::OK, format!("[{}]", each.join(",")))
+            }
+        },
     }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Page {
+    Metrics,
+    Status,
+    Ready,
 }
 
 fn text(status: StatusCode, body: String) -> Response<Full<Bytes>> {

@@ -1,5 +1,6 @@
 //! What a bridge program brings to the shell: its own side of the bridge.
 
+use std::net::IpAddr;
 use std::sync::Arc;
 
 use bridge_core::{Described, Kept, PublisherKey, Reason};
@@ -52,6 +53,17 @@ pub trait Port: Send + 'static {
     /// while the program runs, by its keys in the mapping and with the reason, for people. `types` are the definitions of
     /// its `type_paths`, which may be others although the mapping is the same.
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String>;
+
+    /// What keeps this side from doing its work now, such as a ROS master that does not answer: for people.
+    fn hindrance(&self) -> Option<String> {
+        None
+    }
+
+    /// The addresses of this host that this side has taken for good when it started, all there were where the list is
+    /// empty: its library cannot go over to others. `None` where it goes by itself.
+    fn addresses(&self) -> Option<&[IpAddr]> {
+        None
+    }
 
     /// Withdraws every registration and ends. Bounded by 2 s.
     fn shutdown(self) -> impl Future<Output = ()> + Send;

@@ -13,7 +13,7 @@ use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::watch;
 use tokio::task::{JoinError, JoinSet};
 use tracing::{Instrument, Span, error, info, info_span};
-use transport::{Options, Udp};
+use transport::{Held, Options, Udp};
 use type_files::TypePaths;
 
 use crate::arguments::Arguments;
@@ -177,11 +177,13 @@ async fn prepare<P: Program>(
         types,
         own,
     };
+    let port = program.start(context).await?;
     Ok(Shell {
         program: P::NAME,
         own,
         router,
-        port: program.start(context).await?,
+        held: port.addresses().and_then(Held::start),
+        port,
         udp,
         requests,
         changes: changes.clone(),

@@ -11,9 +11,9 @@ use bridge_core::{Heard, Notice, Output, Reason, Router};
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
 use tokio::sync::watch;
-use tokio::time::{Instant as TokioInstant, Sleep};
+use tokio::time::{Instant as TokioInstant, MissedTickBehavior, Sleep, interval};
 use tracing::{debug, info, warn};
-use transport::{SendError, Udp};
+use transport::{Change, Finding, Held, SendError, Udp};
 
 use crate::busy_poll::BusyPoll;
 use crate::clock::now;
@@ -21,7 +21,7 @@ use crate::exit::{Failure, FailureKind};
 use crate::mapping_file::Running;
 use crate::metrics::Requests;
 use crate::port::{Delivery, Port, PortEvent};
-use crate::status::Status;
+use crate::status::{Interfaces, Readiness, Status};
 
 /// A bridge in the middle: router, port and socket, and who asks for the status.
 pub(crate) struct Shell<P> {
@@ -30,6 +30,8 @@ pub(crate) struct Shell<P> {
     pub(crate) router: Router,
     pub(crate) port: P,
     pub(crate) udp: Udp,
+    /// The interfaces the port has taken for good.
+    pub(crate) held: Option<Held>,
     pub(crate) requests: Requests,
     pub(crate) changes: watch::Receiver<Running>,
     pub(crate) fixed: Fixed,
@@ -85,6 +87,8 @@ impl<P: Port> Shell<P> {
     async fn carry(&mut self, stop: impl Future<Output = ()> + Send) -> Result<(), Failure> {
         let mut stop = pin!(stop);
         let mut timer = pin!(tokio::time::sleep(FAR));
+        let mut looks = interval(transport::LOOK);
+        looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         // Any UDP datagram fits.
         let mut buffer = vec![0; 65_536];
         let mut more = false;
@@ -98,6 +102,7 @@ impl<P: Port> Shell<P> {
                 heard = self.udp.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
                 event = self.port.recv() => more = self.port_events(event).await?,
                 () = timer.as_mut() => self.router.handle_timeout(now()),
+                _ = looks.tick() => self.follow_interfaces()?,
                 Ok(()) = self.changes.changed() => self.reload(),
                 // Who asked may have gone; there is nobody else to tell.
                 Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
@@ -167,11 +172,62 @@ impl<P: Port> Shell<P> {
 
     fn status(&self) -> Status {
         let about = Arc::clone(&self.changes.borrow().about);
+        let lost = self.udp.lost().map(group_lost);
+        let interfaces = Interfaces {
+            pubsub: u8::from(lost.is_none()),
+            local: self
+                .held
+                .as_ref()
+                .map(|held| u8::from(held.lost().is_none())),
+        };
+        let side_lost = self.held.as_ref().and_then(Held::lost).map(side_lost);
         Status::of(
             (self.program, self.own),
             &self.router,
             (&about, &self.restart),
+            Readiness {
+                not_ready: [lost, side_lost, self.port.hindrance()]
+                    .into_iter()
+                    .flatten()
+                    .collect(),
+                interfaces,
+            },
         )
+    }
+
+    /// Goes with the network interfaces, whatever becomes of them; fails where the local side cannot.
+    fn follow_interfaces(&mut self) -> Result<(), Failure> {
+        match self.udp.follow() {
+            None => {}
+            Some(Change::Lost(why)) => {
+                let lost = group_lost(&why);
+                warn!("{lost}; it is waited for, and nothing crosses meanwhile");
+            }
+            Some(Change::Back(interface)) => {
+                self.router.set_source(self.udp.source());
+                info!(%interface, "the PubSub network is within reach: hearing and sending there again");
+            }
+        }
+        let findings = self.held.as_mut().map(Held::look);
+        for finding in findings.into_iter().flatten() {
+            match finding {
+                Finding::Lost(why) => warn!("{}", side_lost(why)),
+                Finding::Back(interface) => {
+                    info!(%interface, "the network interface of the ROS side is up again");
+                }
+                Finding::Late(interface) => warn!(
+                    %interface,
+                    "a network interface came after the start: the ROS side does not use it until the next start"
+                ),
+                Finding::Void(why) => {
+                    let message = format!(
+                        "{why}, and the ROS side cannot go over to it: ending, to be started again"
+                    );
+                    return Err(Failure::new(FailureKind::Unavailable, message));
+                }
+            }
+        }
+        Ok(())
     }
 
     /// Goes over to another mapping, where it is another.
@@ -345,6 +401,14 @@ impl<P: Port> Shell<P> {
             Err(why) => self.router.not_published(topic, instance, why),
         }
     }
+}
+
+fn group_lost(why: &str) -> String {
+    format!("the PubSub network is out of reach: {why}")
+}
+
+fn side_lost(why: String) -> String {
+    format!("the ROS side is out of reach: {why}")
 }
 
 fn not_sent(error: SendError) -> Reason {

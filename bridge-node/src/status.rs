@@ -14,11 +14,30 @@ use crate::mapping_file::About;
 pub(crate) struct Status {
     program: &'static str,
     space: u8,
+    #[serde(flatten)]
+    readiness: Readiness,
     mapping: MappingStatus,
     topics: BTreeMap<String, TopicStatus>,
     /// Datagrams and messages that belong to no topic.
     others: TopicStatus,
     hops: BTreeMap<&'static str, HopStatus>,
+}
+
+/// Whether it can do its work.
+#[derive(Debug, Clone, Serialize)]
+pub(crate) struct Readiness {
+    /// Why it cannot, for people; nothing where it can.
+    pub(crate) not_ready: Vec<String>,
+    pub(crate) interfaces: Interfaces,
+}
+
+/// For each side, 1 where the network interfaces are there that it is on, and 0 where not.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub(crate) struct Interfaces {
+    pub(crate) pubsub: u8,
+    /// `None` where the side is on none in particular.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) local: Option<u8>,
 }
 
 #[derive(Debug, Clone, Serialize)]
@@ -55,6 +74,7 @@ impl Status {
         (program, space): (&'static str, SpaceId),
         router: &Router,
         (about, restart): (&About, &[String]),
+        readiness: Readiness,
     ) -> Self {
         let topics = router
             .topics()
@@ -67,6 +87,7 @@ impl Status {
         Self {
             program,
             space: space.get(),
+            readiness,
             mapping: MappingStatus {
                 about: about.clone(),
                 restart_needed: restart.to_vec(),
@@ -88,6 +109,13 @@ impl Status {
         ]
     }
 
+    /// What keeps it from its work, a line each.
+    pub(crate) fn not_ready(&self) -> impl Iterator<Item = String> {
+        let (program, space) = (self.program, self.space);
+        let reasons = self.readiness.not_ready.iter();
+        reasons.map(move |why| format!("{program}, space {space}: {why}\n"))
+    }
+
     /// One JSON object.
     pub(crate) fn json(&self) -> String {
         // All keys are strings and no number is special, so there is nothing that could fail.
@@ -102,6 +130,17 @@ impl Status {
             let _written = writeln!(text, "ua_{name}{{{labels}}} {value}");
         };
         let own = format!("program=\"{}\",space=\"{}\"", self.program, self.space);
+        let Readiness {
+            not_ready,
+            interfaces: Interfaces { pubsub, local },
+        } = &self.readiness;
+        line("ready", &own, &u8::from(not_ready.is_empty()));
+        let sides = [("pubsub", Some(*pubsub)), ("local", *local)];
+        for (side, up) in sides {
+            if let Some(up) = up {
+                line("interface_up", &format!("{own},side=\"{side}\""), &up);
+            }
+        }
         for (name, value) in self.mapping.about.figures() {
             line(name, &own, &value);
         }

@@ -5,6 +5,7 @@
 mod reload;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -61,6 +62,11 @@ pub struct Ros1Port {
     events: VecDeque<PortEvent>,
     /// What was already told, so that it is told once.
     told: BTreeSet<(String, &'static str)>,
+    /// The address that other nodes are told, where it is one and no name.
+    address: Option<IpAddr>,
+    master: String,
+    /// Whether the master answered when it was last asked.
+    has_master: bool,
 }
 
 impl Ros1Port {
@@ -78,6 +84,7 @@ impl Ros1Port {
             packages,
         } = options;
         let master = node.master_uri.clone();
+        let address = node.hostname.parse().ok();
         let node = Node::start(node)?;
         info!(node = node.name(), uri = node.uri(), master, space = %own, "started the ROS 1 node");
         let mut definitions = Definitions::new(types, packages);
@@ -100,6 +107,9 @@ impl Ros1Port {
             sinks: HashMap::new(),
             events: bound.into(),
             told: BTreeSet::new(),
+            address,
+            master,
+            has_master: false,
         };
         port.take_bindings(&mapping)?;
         Ok(port)
@@ -318,6 +328,7 @@ impl Ros1Port {
 
     /// Compares the graph with what is open. `None`: there is no master, and all stays as it is.
     fn look(&mut self, graph: Option<Graph>) {
+        self.has_master = graph.is_some();
         if let Some(graph) = graph {
             self.graph = graph;
             self.find_sources();
@@ -722,6 +733,15 @@ impl Port for Ros1Port {
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
         self.go_over_to(mapping, types);
         Vec::new()
+    }
+
+    fn hindrance(&self) -> Option<String> {
+        (!self.has_master).then(|| format!("no ROS master answers at {}", self.master))
+    }
+
+    fn addresses(&self) -> Option<&[IpAddr]> {
+        // Connections end with an address of theirs, and the master has told it to all nodes.
+        self.address.as_ref().map(std::slice::from_ref)
     }
 
     async fn shutdown(self) {

@@ -16,6 +16,7 @@ mod writing;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::future::poll_fn;
+use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::task::{Context, Poll};
@@ -74,6 +75,8 @@ pub struct Ros2Port {
     strangers: Strangers,
     own: SpaceId,
     domain_id: u16,
+    /// The addresses RustDDS has its sockets on; all when empty.
+    networks: Vec<IpAddr>,
     mapping: Arc<Mapping>,
     definitions: Definitions,
     descriptions: Descriptions,
@@ -159,6 +162,7 @@ impl Ros2Port {
             presence,
             own,
             domain_id: domain_options.domain,
+            networks: domain_options.networks,
             mapping: Arc::clone(&mapping),
             definitions,
             descriptions: Descriptions::new(peers.clone()),
@@ -557,6 +561,11 @@ impl Port for Ros2Port {
         let restart = self.fixed(mapping);
         self.go_over_to(mapping, types);
         restart
+    }
+
+    fn addresses(&self) -> Option<&[IpAddr]> {
+        // RustDDS joins its groups and names its addresses to others when the participant is made, and never again.
+        Some(&self.networks)
     }
 
     async fn shutdown(self) {

@@ -16,7 +16,7 @@ use nix::sched::{CloneFlags, setns, unshare};
 use wire::Orders;
 pub use wire::Wire;
 
-use crate::{Cell, Started};
+use crate::{Cell, Started, UaSide, UadpSocket};
 
 /// The cell's end of the wire.
 pub const HERE: &str = "10.77.0.1";
@@ -60,6 +60,73 @@ impl Cell {
             orders,
             wire: Some(wire),
         }
+    }
+}
+
+/// A second host at the end of a plain cable. Pulling it takes the interfaces of both ends away.
+pub struct Cable {
+    here: Namespace,
+    there: Namespace,
+}
+
+impl Cell {
+    /// A second host, with no cable to it yet.
+    #[must_use]
+    pub fn cable(&self) -> Cable {
+        Cable {
+            here: Namespace::current(),
+            there: Namespace::fresh(),
+        }
+    }
+}
+
+impl Cable {
+    /// Makes [`WIRE`] here, with that address, and its end there, with [`THERE`].
+    ///
+    /// # Panics
+    /// When it is there already.
+    pub fn lay(&self, address: &str) {
+        self.here.join("far", &self.there, address);
+        let there = format!("{THERE}/24");
+        for args in [
+            &["link", "set", "far", "name", WIRE][..],
+            &["address", "add", &there, "dev", WIRE],
+            &["link", "set", WIRE, "multicast", "on", "up"],
+        ] {
+            self.there.ip(args);
+        }
+    }
+
+    /// Deletes both ends.
+    ///
+    /// # Panics
+    /// When there is none.
+    pub fn pull(&self) {
+        self.here.ip(&["link", "delete", WIRE]);
+    }
+
+    /// Has multicast without a named interface leave the cell by the cable, and no longer by loopback.
+    ///
+    /// # Panics
+    /// When there is no cable.
+    pub fn route(&self) {
+        let group = "224.0.0.0/4";
+        self.here.ip(&["route", "replace", group, "dev", WIRE]);
+    }
+
+    /// A member of the UADP group on the other host, for as long as the cable lies.
+    ///
+    /// # Panics
+    /// When there is no cable.
+    #[must_use]
+    pub fn ua_side(&self) -> UaSide {
+        std::thread::scope(|scope| {
+            let joined = scope.spawn(|| {
+                setns(&self.there.0, CloneFlags::CLONE_NEWNET).unwrap();
+                UaSide::on(UadpSocket::join_on(THERE.parse().unwrap()))
+            });
+            joined.join().unwrap()
+        })
     }
 }
 

@@ -33,10 +33,11 @@ pub use capture::{Capture, Dissected, hex, is_true};
 pub use cell::{Cell, Distribution, Peer, without_data};
 pub use child::{Child, Started};
 pub use enclave::{Governance, Keystore, Wiretap, has_security};
-pub use host::{HERE, Host, THERE, WIRE, Wire};
+pub use host::{Cable, HERE, Host, THERE, WIRE, Wire};
 pub use judge::Judge;
 pub use net::{
-    GROUP, UadpSocket, all_overflowed, group_member, http_get, metrics, overflowed, xml_rpc,
+    GROUP, UadpSocket, all_overflowed, group_member, http_answer, http_get, metrics, overflowed,
+    xml_rpc,
 };
 pub use numbered::{Numbered, numbered};
 pub use peers::MASTER;

@@ -25,9 +25,18 @@ impl UadpSocket {
     /// When the socket cannot be made.
     #[must_use]
     pub fn join() -> Self {
-        let socket = group_member(GROUP);
+        Self::join_on(Ipv4Addr::LOCALHOST)
+    }
+
+    /// Joins [`GROUP`] on the interface with that address.
+    ///
+    /// # Panics
+    /// When the socket cannot be made.
+    #[must_use]
+    pub fn join_on(interface: Ipv4Addr) -> Self {
+        let socket = member(GROUP, interface);
         let options = SockRef::from(&socket);
-        options.set_multicast_if_v4(&Ipv4Addr::LOCALHOST).unwrap();
+        options.set_multicast_if_v4(&interface).unwrap();
         options.set_multicast_loop_v4(true).unwrap();
         Self(socket)
     }
@@ -84,13 +93,15 @@ impl UadpSocket {
 /// When the socket cannot be made.
 #[must_use]
 pub fn group_member(group: SocketAddrV4) -> UdpSocket {
+    member(group, Ipv4Addr::LOCALHOST)
+}
+
+fn member(group: SocketAddrV4, interface: Ipv4Addr) -> UdpSocket {
     let socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP)).unwrap();
     socket.set_reuse_address(true).unwrap();
     socket.set_recv_buffer_size(4 << 20).unwrap();
     socket.bind(&group.into()).unwrap();
-    socket
-        .join_multicast_v4(group.ip(), &Ipv4Addr::LOCALHOST)
-        .unwrap();
+    socket.join_multicast_v4(group.ip(), &interface).unwrap();
     socket.into()
 }
 
@@ -133,6 +144,13 @@ pub fn http_get(address: &str, path: &str) -> Option<String> {
     exchange(address, &request)
 }
 
+/// The code and the body of any answer to an HTTP GET, or `None` where there is none.
+#[must_use]
+pub fn http_answer(address: &str, path: &str) -> Option<(u16, String)> {
+    let request = format!("GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n");
+    answer(address, &request)
+}
+
 /// The body of the answer to an XML-RPC call, or `None` while nobody answers. An argument is text, or XML of a value.
 #[must_use]
 pub fn xml_rpc(address: &str, method: &str, arguments: &[&str]) -> Option<String> {
@@ -155,6 +173,12 @@ pub fn xml_rpc(address: &str, method: &str, arguments: &[&str]) -> Option<String
 }
 
 fn exchange(address: &str, request: &str) -> Option<String> {
+    answer(address, request)
+        .filter(|(code, _)| *code == 200)
+        .map(|(_, body)| body)
+}
+
+fn answer(address: &str, request: &str) -> Option<(u16, String)> {
     let mut stream = TcpStream::connect_timeout(&address.parse().ok()?, PATIENCE).ok()?;
     stream.set_read_timeout(Some(PATIENCE)).ok()?;
     stream.write_all(request.as_bytes()).ok()?;
@@ -162,17 +186,16 @@ fn exchange(address: &str, request: &str) -> Option<String> {
     stream.read_to_end(&mut answer).ok()?;
     let answer = String::from_utf8_lossy(&answer);
     let (head, body) = answer.split_once("\r\n\r\n")?;
-    if !head.lines().next()?.contains(" 200 ") {
-        return None;
-    }
+    let code = head.split_whitespace().nth(1)?.parse().ok()?;
     let chunked = head
         .lines()
         .any(|line| line.eq_ignore_ascii_case("transfer-encoding: chunked"));
-    if chunked {
-        unchunk(body)
+    let body = if chunked {
+        unchunk(body)?
     } else {
-        Some(body.to_owned())
-    }
+        body.to_owned()
+    };
+    Some((code, body))
 }
 
 fn unchunk(mut body: &str) -> Option<String> {

@@ -28,8 +28,14 @@ impl UaSide {
     /// When the socket cannot be made.
     #[must_use]
     pub fn join() -> Self {
+        Self::on(UadpSocket::join())
+    }
+
+    /// By that socket.
+    #[must_use]
+    pub const fn on(socket: UadpSocket) -> Self {
         Self {
-            socket: UadpSocket::join(),
+            socket,
             sequence: 0,
         }
     }

@@ -12,6 +12,8 @@ pub struct Interface {
     pub index: u32,
     /// An IPv4 address it has.
     pub address: Ipv4Addr,
+    /// Whether it is up and has a link.
+    pub up: bool,
 }
 
 impl fmt::Display for Interface {
@@ -44,10 +46,9 @@ impl Interface {
     /// [`InterfaceError::Unknown`] lists what there is.
     pub fn find(wanted: &str) -> Result<Self, InterfaceError> {
         let present = interfaces().map_err(InterfaceError::List)?;
-        let address: Option<Ipv4Addr> = wanted.parse().ok();
         present
             .iter()
-            .find(|interface| interface.name == wanted || Some(interface.address) == address)
+            .find(|interface| interface.is(wanted))
             .cloned()
             .ok_or_else(|| InterfaceError::Unknown {
                 wanted: wanted.to_owned(),
@@ -62,9 +63,19 @@ impl Interface {
                 },
             })
     }
+
+    /// Whether that is its name or its address.
+    pub(crate) fn is(&self, wanted: &str) -> bool {
+        self.name == wanted || wanted.parse() == Ok(self.address)
+    }
+
+    /// Whether the kernel has kept what was made for `other`: one that was made anew has another index.
+    pub(crate) fn is_same(&self, other: &Self) -> bool {
+        (&self.name, self.index, self.address) == (&other.name, other.index, other.address)
+    }
 }
 
-/// The IPv4 addresses of this machine's interfaces that are up, in the system's order.
+/// The IPv4 addresses of this machine's interfaces, in the system's order.
 ///
 /// # Errors
 /// What the system answers when it will not list them.
@@ -74,6 +85,7 @@ pub fn interfaces() -> std::io::Result<Vec<Interface>> {
         .filter_map(|interface| match interface.ip() {
             IpAddr::V4(address) => Some(Interface {
                 index: interface.index.unwrap_or_default(),
+                up: interface.is_oper_up(),
                 name: interface.name,
                 address,
             }),

@@ -6,6 +6,8 @@
 
 mod interface;
 mod udp;
+mod watch;
 
 pub use interface::{Interface, InterfaceError, interfaces};
 pub use udp::{OpenError, Options, SendError, Udp};
+pub use watch::{Change, Finding, Held, LOOK};

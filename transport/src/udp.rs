@@ -7,7 +7,8 @@ use socket2::{Domain, Protocol, Socket, Type};
 use tokio::net::UdpSocket;
 use tracing::info;
 
-use crate::interface::{Interface, InterfaceError};
+use crate::interface::{Interface, InterfaceError, interfaces};
+use crate::watch::{Change, Wanted, Watch};
 
 /// A UDP socket that hears and sends the datagrams of one PubSub connection.
 #[derive(Debug)]
@@ -18,6 +19,9 @@ pub struct Udp {
     sender: UdpSocket,
     targets: Vec<SocketAddr>,
     local: SocketAddr,
+    options: Options,
+    /// The interface they are on; `None` where the system's choice needs no following.
+    watch: Option<Watch>,
 }
 
 /// Where to listen and send, and how.
@@ -66,6 +70,9 @@ pub enum OpenError {
         /// What the system said.
         source: io::Error,
     },
+    /// The unicast address to listen at is no longer one of this host.
+    #[error("the address to listen at, {0}, is on no network interface here")]
+    Gone(SocketAddr),
     /// Anything else the system refused.
     #[error("cannot {what} for {address}: {source}")]
     Socket {
@@ -129,7 +136,7 @@ impl Udp {
             .map(Interface::find)
             .transpose()?;
         let receiver = receiver(options, ip, interface.as_ref())?;
-        let sender = sender(options, interface.as_ref())?;
+        let (sender, local) = sender(options, interface.as_ref())?;
         let shown = interface
             .as_ref()
             .map_or_else(|| "the default interface".to_owned(), ToString::to_string);
@@ -138,11 +145,6 @@ impl Udp {
         } else {
             info!(address = %address, interface = %shown, "listening for unicast datagrams");
         }
-        let local = sender.local_addr().map_err(|source| OpenError::Socket {
-            what: "read the local address",
-            address,
-            source,
-        })?;
         let targets = if options.peers.is_empty() {
             vec![address]
         } else {
@@ -153,7 +155,34 @@ impl Udp {
             sender,
             targets,
             local,
+            options: options.clone(),
+            watch: options.wanted().and_then(Watch::start),
         })
+    }
+
+    /// Looks at the interface the sockets are on, and makes them anew where it was made anew, has another address, or is
+    /// back; to be called every [`LOOK`](crate::LOOK). The [`source`](Self::source) may be another then, and what was
+    /// received and not taken yet is lost.
+    pub fn follow(&mut self) -> Option<Change> {
+        let (options, receiver) = (&self.options, &self.receiver);
+        let mut made = None;
+        let change = self.watch.as_mut()?.look(|interface| {
+            made = Some(anew(options, receiver, interface).map_err(|error| error.to_string())?);
+            Ok(())
+        });
+        if let Some((receiver, (sender, local))) = made {
+            if let Some(receiver) = receiver {
+                self.receiver = receiver;
+            }
+            (self.sender, self.local) = (sender, local);
+        }
+        change
+    }
+
+    /// Why nothing is heard and sent now: what [`follow`](Self::follow) found of the interface.
+    #[must_use]
+    pub fn lost(&self) -> Option<&str> {
+        self.watch.as_ref()?.lost()
     }
 
     /// Waits for a datagram and gives its length and sender. Cancel-safe: nothing is lost when dropped.
@@ -198,6 +227,51 @@ impl Udp {
     pub const fn source(&self) -> SocketAddr {
         self.local
     }
+}
+
+impl Options {
+    /// The interface whose coming and going matters. Without a group and a name, nothing is bound to one.
+    fn wanted(&self) -> Option<Wanted> {
+        match &self.interface {
+            Some(wanted) => Some(Wanted::Named(wanted.clone())),
+            None if self.address.ip().is_multicast() => Some(Wanted::Towards(self.address)),
+            None => None,
+        }
+    }
+}
+
+type Sender = (UdpSocket, SocketAddr);
+
+/// The sockets as they are on an interface that is another by now. A receiver that is bound to what is still there is
+/// kept: no other could have its port.
+fn anew(
+    options: &Options,
+    receiver: &UdpSocket,
+    interface: &Interface,
+) -> Result<(Option<UdpSocket>, Sender), OpenError> {
+    let address = options.address;
+    let IpAddr::V4(ip) = address.ip() else {
+        return Err(OpenError::Ipv6(address));
+    };
+    // Without a name it is the system that chooses, and again for each datagram.
+    let interface = options.interface.is_some().then_some(interface);
+    let bound = receiver.local_addr().map(|bound| bound.ip()).ok();
+    let bound_to_own = bound == Some(address.ip());
+    let stays = bound_to_own
+        || bound.is_some_and(|bound| {
+            bound.is_unspecified() || interface.is_some_and(|interface| bound == interface.address)
+        });
+    let receiver = if stays && !ip.is_multicast() {
+        let present = interfaces().map_err(InterfaceError::List)?;
+        let is_here = ip.is_loopback() || present.iter().any(|interface| interface.address == ip);
+        if bound_to_own && !is_here {
+            return Err(OpenError::Gone(address));
+        }
+        None
+    } else {
+        Some(self::receiver(options, ip, interface)?)
+    };
+    Ok((receiver, sender(options, interface)?))
 }
 
 fn send_error(error: &io::Error) -> SendError {
@@ -309,7 +383,8 @@ fn join(socket: &Socket, group: Ipv4Addr, interface: Option<&Interface>) -> Resu
         })
 }
 
-fn sender(options: &Options, interface: Option<&Interface>) -> Result<UdpSocket, OpenError> {
+/// The sender, and the address it is bound to.
+fn sender(options: &Options, interface: Option<&Interface>) -> Result<Sender, OpenError> {
     let address = options.address;
     let at = |what| {
         move |source| OpenError::Socket {
@@ -342,7 +417,9 @@ fn sender(options: &Options, interface: Option<&Interface>) -> Result<UdpSocket,
     socket
         .bind(&SocketAddr::from((from, 0)).into())
         .map_err(at("bind the sender"))?;
-    UdpSocket::from_std(socket.into()).map_err(at("register the socket"))
+    let socket = UdpSocket::from_std(socket.into()).map_err(at("register the socket"))?;
+    let local = socket.local_addr().map_err(at("read the local address"))?;
+    Ok((socket, local))
 }
 
 /// Bytes the kernel may hold on their way out.

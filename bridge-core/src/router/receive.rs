@@ -89,6 +89,11 @@ impl Router {
         None
     }
 
+    /// Says from which address our own datagrams come by now: the network interface may be another.
+    pub fn set_source(&mut self, source: SocketAddr) {
+        self.settings.source = Some(source);
+    }
+
     /// Counts a datagram with our own PublisherId: our own, or that of a rival.
     pub(super) fn drop_own(&mut self, from: SocketAddr) {
         let own = self.settings.own;

@@ -1,0 +1,171 @@
+//! Network interfaces that are deleted and made again, or get another address, while the bridges run.
+
+use std::time::{Duration, Instant};
+
+use system_tests::{
+    BareNode, Cable, Cell, Child, HERE, METRICS_ROS1, METRICS_ROS2, Started, Triple, UaSide, WIRE,
+    eventually, http_answer, http_get, metrics, program, string_frame,
+};
+use tcpros::Core;
+use uadp::Scalar;
+
+/// Another address of this host on the cable.
+const ELSEWHERE: &str = "10.77.0.3";
+const START: Duration = Duration::from_secs(20);
+/// A look each second and a repetition each second, and a loaded machine.
+const SOON: Duration = Duration::from_secs(5);
+const OUT: (Triple, &str) = ((1, 2, 10), "/ua_1_2_10");
+const IN: (Triple, &str) = ((2, 2, 20), "ua_2_2_20");
+
+/// A ROS 1 graph on loopback with one topic that is published, for a bridge whose PubSub network is elsewhere.
+struct Graph {
+    _master: Core,
+    _runtime: tokio::runtime::Runtime,
+}
+
+impl Graph {
+    fn start() -> Self {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+            .unwrap();
+        let _inside = runtime.enter();
+        Self {
+            _master: Core::start(([127, 0, 0, 1], 11311).into()).unwrap(),
+            _runtime: runtime,
+        }
+    }
+}
+
+fn bridge_ros1(more: &[&str]) -> Child {
+    let bridge = Started::new("bridge-ros1", &program("bridge-ros1"))
+        .env("ROS_MASTER_URI", "http://127.0.0.1:11311")
+        .env("ROS_HOSTNAME", "127.0.0.1")
+        .args(["--metrics", METRICS_ROS1])
+        .args(more)
+        .start();
+    until_ready(METRICS_ROS1, START);
+    bridge
+}
+
+fn until_ready(metrics: &str, within: Duration) {
+    eventually("the bridge is ready", within, || {
+        (http_answer(metrics, "/readyz")?.0 == 200).then_some(())
+    });
+}
+
+/// Waits until the bridge says that it is not ready, and gives the reasons.
+fn until_not_ready(metrics: &str) -> String {
+    eventually("the bridge is not ready", SOON, || {
+        let (code, why) = http_answer(metrics, "/readyz")?;
+        (code == 503).then_some(why)
+    })
+}
+
+/// Whether the bridge has the interfaces of that side, by its gauge.
+fn has_interface(metrics: &str, side: &str) -> bool {
+    let side = format!("side=\"{side}\"}} ");
+    let text = http_get(metrics, "/metrics").unwrap();
+    let line = text
+        .lines()
+        .find(|line| line.starts_with("ua_interface_up{") && line.contains(&side));
+    line.unwrap().ends_with('1')
+}
+
+fn delivered() -> u64 {
+    metrics(METRICS_ROS1)
+        .and_then(|status| status["topics"][IN.1]["delivered"].as_u64())
+        .unwrap_or_default()
+}
+
+/// Values cross the cable in both directions, before long.
+fn cross(cable: &Cable, value: &str) {
+    let start = Instant::now();
+    let mut ua: UaSide = cable.ua_side();
+    // Repeated each second.
+    ua.hear_scalar(OUT.0, Scalar::String(Some("out")));
+    let before = delivered();
+    eventually("a value of the other host is delivered", SOON, || {
+        ua.write(IN.0, Scalar::String(Some(value)));
+        (delivered() > before).then_some(())
+    });
+    assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+}
+
+/// With the interface named, or left to the system.
+fn values_cross_again(arguments: &[&str]) {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let cable = cell.cable();
+    let lay = |address: &str| {
+        cable.lay(address);
+        cable.route();
+    };
+    lay(HERE);
+    let _graph = Graph::start();
+    let mut bridge = bridge_ros1(arguments);
+    let node = BareNode::start("/talker");
+    let mut out = node.publish(&[OUT.1.to_owned()]).remove(0);
+    std::io::Write::write_all(&mut out, &string_frame("out")).unwrap();
+    cross(&cable, "before");
+
+    for address in [HERE, ELSEWHERE] {
+        cable.pull();
+        let why = until_not_ready(METRICS_ROS1);
+        assert!(why.contains("network interface"), "{why}");
+        assert!(!has_interface(METRICS_ROS1, "pubsub"));
+        bridge.wait_for_line("the PubSub network is out of reach", SOON);
+        lay(address);
+        cross(&cable, address);
+        assert!(has_interface(METRICS_ROS1, "pubsub"));
+        until_ready(METRICS_ROS1, SOON);
+        bridge.wait_for_line("the PubSub network is within reach", SOON);
+    }
+    // So quickly that nobody saw it go.
+    cable.pull();
+    lay(ELSEWHERE);
+    cross(&cable, "at once");
+    // Its own datagrams are known by the address they have now.
+    let status = metrics(METRICS_ROS1).unwrap();
+    assert_eq!(
+        status["others"]["dropped"]["space_taken"],
+        serde_json::Value::Null
+    );
+}
+
+#[test]
+fn values_cross_again_when_the_interface_was_made_anew_or_has_another_address() {
+    values_cross_again(&["--interface", WIRE]);
+}
+
+#[test]
+fn values_cross_again_on_the_interface_the_system_chooses() {
+    values_cross_again(&[]);
+}
+
+#[test]
+fn a_bridge_whose_dds_is_bound_to_an_address_that_is_another_ends_to_be_started_again() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let cable = cell.cable();
+    cable.lay(HERE);
+    let start = || {
+        let bridge = cell.bridge_ros2_started(&["--ros-interface", WIRE]).start();
+        until_ready(METRICS_ROS2, START);
+        bridge
+    };
+    let mut bridge = start();
+    assert!(has_interface(METRICS_ROS2, "local"));
+    cable.pull();
+    let why = until_not_ready(METRICS_ROS2);
+    assert!(why.contains(&format!("{WIRE} ({HERE})")), "{why}");
+    assert!(!has_interface(METRICS_ROS2, "local"));
+    cable.lay(ELSEWHERE);
+    let ended = bridge.wait_for_end(SOON);
+    assert_eq!(ended.code(), Some(69));
+    bridge.wait_for_line("to be started again", SOON);
+    let _again = start();
+}

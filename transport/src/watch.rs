@@ -1,0 +1,436 @@
+//! Interfaces that come and go while a program runs.
+//!
+//! A multicast group is joined on an interface, by its index, and a sender is bound to an address: when the interface is
+//! deleted and made again, or gets another address, both are void, and the kernel says so to nobody. So it is looked at,
+//! each second: one list of the interfaces, which costs less than a tenth of a millisecond and needs no privilege.
+
+use std::io;
+use std::net::{IpAddr, Ipv4Addr, SocketAddr, UdpSocket};
+use std::time::Duration;
+
+use crate::interface::{Interface, interfaces};
+
+/// How often interfaces are to be looked at.
+pub const LOOK: Duration = Duration::from_secs(1);
+
+/// What became of an interface between two looks.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Change {
+    /// It cannot be used, for this reason.
+    Lost(String),
+    /// It can be used again, or is another one by now.
+    Back(Interface),
+}
+
+/// Which interface sockets are on.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Wanted {
+    /// That of this name or address.
+    Named(String),
+    /// The one by which the system reaches this multicast group.
+    Towards(SocketAddr),
+}
+
+/// The one interface that sockets of ours are on.
+#[derive(Debug)]
+pub(crate) struct Watch {
+    wanted: Wanted,
+    /// As it was when the sockets were made.
+    held: Interface,
+    /// Why it cannot be used now.
+    lost: Option<String>,
+}
+
+impl Watch {
+    /// Begins with what there is; `None` where nothing is to be followed.
+    pub(crate) fn start(wanted: Wanted) -> Option<Self> {
+        let held = wanted.find(&interfaces().ok()?, None).ok()?;
+        Some(Self {
+            wanted,
+            held,
+            lost: None,
+        })
+    }
+
+    pub(crate) fn lost(&self) -> Option<&str> {
+        self.lost.as_deref()
+    }
+
+    /// Looks at the interfaces. Where the wanted one is there and is not what it was, `take` makes the sockets anew; what
+    /// it cannot is tried again with the next look.
+    pub(crate) fn look(
+        &mut self,
+        take: impl FnOnce(&Interface) -> Result<(), String>,
+    ) -> Option<Change> {
+        // A system that lists nothing now says nothing of its interfaces.
+        self.see(&interfaces().ok()?, take)
+    }
+
+    fn see(
+        &mut self,
+        present: &[Interface],
+        take: impl FnOnce(&Interface) -> Result<(), String>,
+    ) -> Option<Change> {
+        let found = self.wanted.find(present, Some(&self.held));
+        let taken = found.and_then(|found| {
+            if !found.up {
+                return Err(format!("the network interface {found} is down"));
+            }
+            if self.lost.is_none() && found == self.held {
+                return Ok(None);
+            }
+            take(&found)?;
+            Ok(Some(found))
+        });
+        match taken {
+            Ok(None) => None,
+            Ok(Some(found)) => {
+                self.lost = None;
+                self.held = found.clone();
+                Some(Change::Back(found))
+            }
+            Err(why) => {
+                let told = self.lost.replace(why.clone()).is_some();
+                (!told).then_some(Change::Lost(why))
+            }
+        }
+    }
+}
+
+impl Wanted {
+    fn find(&self, present: &[Interface], held: Option<&Interface>) -> Result<Interface, String> {
+        let (fits, missing): (Box<dyn Fn(&Interface) -> bool>, String) = match self {
+            Self::Named(wanted) => (
+                Box::new(|interface| interface.is(wanted)),
+                format!("there is no network interface `{wanted}` with an IPv4 address here"),
+            ),
+            Self::Towards(group) => {
+                let source = source_towards(*group)
+                    .map_err(|error| format!("no network interface leads to {group}: {error}"))?;
+                (
+                    Box::new(move |interface| interface.address == source),
+                    format!("the address {source} towards {group} is on no network interface here"),
+                )
+            }
+        };
+        // As long as it has the address it had, others beside it do not matter.
+        let kept = held.and_then(|held| {
+            let kept = present.iter().find(|interface| interface.is_same(held));
+            kept.filter(|interface| fits(interface))
+        });
+        let found = kept.or_else(|| present.iter().find(|interface| fits(interface)));
+        found.cloned().ok_or(missing)
+    }
+}
+
+/// Which of our addresses datagrams to there have. Nothing is sent.
+fn source_towards(group: SocketAddr) -> io::Result<Ipv4Addr> {
+    let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
+    socket.connect(group)?;
+    match socket.local_addr()?.ip() {
+        IpAddr::V4(address) => Ok(address),
+        IpAddr::V6(_) => Err(io::ErrorKind::AddrNotAvailable.into()),
+    }
+}
+
+/// Interfaces whose addresses a library has taken for good: it cannot be told of others while it runs.
+#[derive(Debug)]
+pub struct Held {
+    held: Vec<Holding>,
+    /// Whether it took all there were.
+    all: bool,
+    /// Interfaces that came later and were told of.
+    late: Vec<String>,
+}
+
+#[derive(Debug)]
+struct Holding {
+    interface: Interface,
+    state: State,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum State {
+    There,
+    Down,
+    Gone,
+}
+
+/// What a look at held interfaces found.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Finding {
+    /// One cannot be used now, for this reason.
+    Lost(String),
+    /// One can be used again, as it was.
+    Back(Interface),
+    /// One is there that the library took nothing of.
+    Late(Interface),
+    /// What the library holds is void, while what it needs is there: only a new start takes it up.
+    Void(String),
+}
+
+impl Held {
+    /// Those of these addresses; all that are not loopback where none is given. Loopback needs no watching: without one of
+    /// other addresses, `None`.
+    #[must_use]
+    pub fn start(addresses: &[IpAddr]) -> Option<Self> {
+        let all = addresses.is_empty();
+        let held: Vec<Interface> = interfaces()
+            .ok()?
+            .into_iter()
+            .filter(|interface| !interface.address.is_loopback())
+            .filter(|interface| all || addresses.contains(&interface.address.into()))
+            .collect();
+        (all || !held.is_empty()).then(|| Self::of(held, all))
+    }
+
+    fn of(held: Vec<Interface>, all: bool) -> Self {
+        let holding = |interface: Interface| Holding {
+            state: if interface.up {
+                State::There
+            } else {
+                State::Down
+            },
+            interface,
+        };
+        Self {
+            held: held.into_iter().map(holding).collect(),
+            all,
+            late: Vec::new(),
+        }
+    }
+
+    /// Looks at the interfaces.
+    pub fn look(&mut self) -> Vec<Finding> {
+        interfaces().map_or_else(|_not_now| Vec::new(), |present| self.see(&present))
+    }
+
+    /// Why the library can do nothing now: each of what it holds is gone or down.
+    #[must_use]
+    pub fn lost(&self) -> Option<String> {
+        let first = self.held.first()?;
+        let none = self.held.iter().all(|held| held.state != State::There);
+        none.then(|| first.why())
+    }
+
+    fn see(&mut self, present: &[Interface]) -> Vec<Finding> {
+        let mut findings = Vec::new();
+        for holding in &mut self.held {
+            let now = present.iter().find(|one| one.is_same(&holding.interface));
+            let state = match now {
+                Some(now) if now.up => State::There,
+                Some(_) => State::Down,
+                None => State::Gone,
+            };
+            let before = std::mem::replace(&mut holding.state, state);
+            match (before, state) {
+                // What the kernel kept for it went with it.
+                (State::Gone, State::There | State::Down) => {
+                    findings.push(Finding::Void(format!(
+                        "the network interface {} is there anew",
+                        holding.interface
+                    )));
+                }
+                (State::Down, State::There) => {
+                    findings.push(Finding::Back(holding.interface.clone()));
+                }
+                (State::There, State::Down | State::Gone) => {
+                    findings.push(Finding::Lost(holding.why()));
+                }
+                _ => {}
+            }
+        }
+        findings.extend(self.changed(present));
+        findings
+    }
+
+    /// Of what is there, what takes the place of something held, or is beside it.
+    fn changed(&mut self, present: &[Interface]) -> Vec<Finding> {
+        let mut findings = Vec::new();
+        let usable = |one: &&Interface| one.up && !one.address.is_loopback();
+        for one in present.iter().filter(usable) {
+            let mut of_name = self.held.iter().filter(|h| h.interface.name == one.name);
+            if of_name.any(|h| h.interface.is_same(one)) {
+                continue;
+            }
+            let mut of_name = self.held.iter().filter(|h| h.interface.name == one.name);
+            if let Some(gone) = of_name.find(|h| h.state == State::Gone) {
+                findings.push(Finding::Void(if gone.interface.address == one.address {
+                    format!("the network interface {one} was made anew")
+                } else {
+                    format!(
+                        "the network interface {} has another address, {}",
+                        gone.interface, one.address
+                    )
+                }));
+            } else if self.all && self.held.is_empty() {
+                findings.push(Finding::Void(format!(
+                    "the network interface {one} is there now"
+                )));
+            } else if self.all && !self.late.contains(&one.name) && self.late.len() < MAX_LATE {
+                self.late.push(one.name.clone());
+                findings.push(Finding::Late(one.clone()));
+            }
+        }
+        findings
+    }
+}
+
+impl Holding {
+    fn why(&self) -> String {
+        let state = match self.state {
+            State::Gone => "gone, or has another address",
+            State::Down | State::There => "down",
+        };
+        format!("the network interface {} is {state}", self.interface)
+    }
+}
+
+/// Interfaces that came later and are told of; containers bring new names without end.
+const MAX_LATE: usize = 64;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn wire(index: u32, last: u8) -> Interface {
+        Interface {
+            name: "wire0".to_owned(),
+            index,
+            address: Ipv4Addr::new(10, 77, 0, last),
+            up: true,
+        }
+    }
+
+    fn down(interface: Interface) -> Interface {
+        Interface {
+            up: false,
+            ..interface
+        }
+    }
+
+    fn named(name: &str) -> Watch {
+        Watch {
+            wanted: Wanted::Named(name.to_owned()),
+            held: wire(3, 1),
+            lost: None,
+        }
+    }
+
+    /// One look, and whether the sockets were made anew.
+    fn look(watch: &mut Watch, present: &[Interface]) -> (Option<Change>, bool) {
+        let mut made = false;
+        let change = watch.see(present, |_| {
+            made = true;
+            Ok(())
+        });
+        (change, made)
+    }
+
+    #[test]
+    fn an_interface_that_is_what_it_was_is_left_alone() {
+        let mut watch = named("wire0");
+        assert_eq!(look(&mut watch, &[wire(3, 1)]), (None, false));
+        // Another address beside it, and in front of it, changes nothing.
+        assert_eq!(look(&mut watch, &[wire(3, 9), wire(3, 1)]), (None, false));
+    }
+
+    #[test]
+    fn an_interface_that_was_made_anew_or_has_another_address_is_taken_up() {
+        for anew in [wire(4, 1), wire(3, 2), wire(4, 2)] {
+            let mut watch = named("wire0");
+            let back = (Some(Change::Back(anew.clone())), true);
+            assert_eq!(look(&mut watch, std::slice::from_ref(&anew)), back);
+            assert_eq!(look(&mut watch, &[anew]), (None, false));
+        }
+    }
+
+    #[test]
+    fn a_loss_is_told_once_and_the_return_too_though_it_is_as_it_was() {
+        for without in [vec![], vec![down(wire(3, 1))]] {
+            let mut watch = named("wire0");
+            let (change, made) = look(&mut watch, &without);
+            assert!(matches!(&change, Some(Change::Lost(why)) if why.contains("wire0")));
+            assert!(!made && watch.lost().is_some());
+            assert_eq!(look(&mut watch, &without), (None, false));
+            let back = (Some(Change::Back(wire(3, 1))), true);
+            assert_eq!(look(&mut watch, &[wire(3, 1)]), back);
+            assert!(watch.lost().is_none());
+        }
+    }
+
+    #[test]
+    fn an_interface_wanted_by_its_address_is_not_followed_to_another() {
+        let mut watch = named("10.77.0.1");
+        assert!(matches!(
+            look(&mut watch, &[wire(4, 2)]).0,
+            Some(Change::Lost(_))
+        ));
+        let back = (Some(Change::Back(wire(5, 1))), true);
+        assert_eq!(look(&mut watch, &[wire(4, 2), wire(5, 1)]), back);
+    }
+
+    #[test]
+    fn sockets_that_cannot_be_made_are_tried_again() {
+        let mut watch = named("wire0");
+        let refuse = |_: &Interface| Err("no".to_owned());
+        let refused = watch.see(&[wire(4, 1)], refuse);
+        assert_eq!(refused, Some(Change::Lost("no".to_owned())));
+        assert_eq!(watch.see(&[wire(4, 1)], refuse), None);
+        let back = (Some(Change::Back(wire(4, 1))), true);
+        assert_eq!(look(&mut watch, &[wire(4, 1)]), back);
+    }
+
+    #[test]
+    fn what_a_library_holds_is_void_once_the_interface_is_another() {
+        for anew in [wire(4, 1), wire(3, 2), wire(4, 2)] {
+            // Between two looks, and with one in between.
+            for looks in [&[][..], &[&[][..]]] {
+                let mut held = Held::of(vec![wire(3, 1)], false);
+                for present in looks {
+                    assert!(matches!(held.see(present)[..], [Finding::Lost(_)]));
+                    assert!(held.lost().unwrap().contains("wire0 (10.77.0.1)"));
+                    assert_eq!(held.see(present), []);
+                }
+                let last = held.see(std::slice::from_ref(&anew)).pop();
+                assert!(matches!(last, Some(Finding::Void(_))), "{last:?}");
+            }
+        }
+        let mut held = Held::of(vec![wire(3, 1)], false);
+        held.see(&[]);
+        assert!(matches!(held.see(&[wire(3, 1)])[..], [Finding::Void(_)]));
+    }
+
+    #[test]
+    fn what_a_library_holds_stays_good_while_a_link_is_down() {
+        let mut held = Held::of(vec![wire(3, 1)], false);
+        assert!(matches!(
+            held.see(&[down(wire(3, 1))])[..],
+            [Finding::Lost(_)]
+        ));
+        assert!(held.lost().is_some());
+        assert_eq!(held.see(&[wire(3, 1)]), [Finding::Back(wire(3, 1))]);
+        assert_eq!(held.lost(), None);
+    }
+
+    #[test]
+    fn an_interface_that_comes_late_is_told_of_where_all_are_wanted() {
+        let other = Interface {
+            name: "wlan0".to_owned(),
+            ..wire(7, 9)
+        };
+        let both = [wire(3, 1), other.clone()];
+        let mut one = Held::of(vec![wire(3, 1)], false);
+        assert_eq!(one.see(&both), []);
+        let mut all = Held::of(vec![wire(3, 1)], true);
+        assert_eq!(all.see(&both), [Finding::Late(other)]);
+        assert_eq!(all.see(&both), []);
+        // One of several that is lost keeps nobody from working.
+        let mut two = Held::of(both.to_vec(), true);
+        assert!(matches!(two.see(&both[..1])[..], [Finding::Lost(_)]));
+        assert_eq!(two.lost(), None);
+        // With none at all there was nothing to work with.
+        let mut none = Held::of(Vec::new(), true);
+        assert!(matches!(none.see(&both[..1])[..], [Finding::Void(_)]));
+    }
+}
