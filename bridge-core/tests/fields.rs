@@ -68,6 +68,82 @@ fn random_messages_of_every_type_cross_and_return() {
     assert!(types > 250, "{types}");
 }
 
+/// The message types of `test_msgs` with arrays of messages without fields, and one that ends in such arrays.
+const WITH_EMPTY_ELEMENTS: [(&str, &str); 4] = [
+    ("nothing_msgs/Constants", "int32 ONE=1\n"),
+    (
+        "nothing_msgs/Arrays",
+        "nothing_msgs/Constants[3] three\nnothing_msgs/Constants[] many\n",
+    ),
+    (
+        "nothing_msgs/Nested",
+        "nothing_msgs/Arrays[2] fixed\nnothing_msgs/Arrays[] open\nnothing_msgs/Constants one\n",
+    ),
+    (
+        "nothing_msgs/MultiNested",
+        "int32 before\nnothing_msgs/Nested[] nested\nnothing_msgs/Nested one\n",
+    ),
+];
+
+#[test]
+fn arrays_of_messages_without_fields_cross_with_their_lengths() {
+    let mut runner = TestRunner::deterministic();
+    for (dialect, wire) in [(Dialect::Ros1, Wire::Ros1), (Dialect::Ros2, Wire::Cdr)] {
+        let mut registry = Registry::empty(dialect);
+        for (name, text) in WITH_EMPTY_ELEMENTS {
+            registry.add(&name.parse().unwrap(), text).unwrap();
+        }
+        for (name, _) in WITH_EMPTY_ELEMENTS {
+            let message = registry.get(&name.parse().unwrap()).unwrap();
+            let whole = Plan::compile(&message, &Selection::Whole, wire).unwrap();
+            for selection in [Selection::Whole, Selection::Structure(None)] {
+                let plan = Plan::compile(&message, &selection, wire).unwrap();
+                for _ in 0..20 {
+                    let (_, bytes) = inventor::invent(&whole, &runner.new_rng());
+                    let datagram = encode(&plan, &bytes);
+                    let mut back = Vec::new();
+                    decode_fields(&plan, fields(&datagram), &mut back)
+                        .unwrap_or_else(|error| panic!("{name} {selection:?} {wire:?}: {error}"));
+                    assert_eq!(back, bytes, "{name} {selection:?} {wire:?}");
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn what_one_datagram_claims_of_messages_without_fields_is_bounded() {
+    let mut registry = Registry::empty(Dialect::Ros2);
+    for (name, text) in WITH_EMPTY_ELEMENTS {
+        registry.add(&name.parse().unwrap(), text).unwrap();
+    }
+    let message = registry
+        .get(&"nothing_msgs/Arrays".parse().unwrap())
+        .unwrap();
+    let plan = Plan::compile(&message, &Selection::Structure(None), Wire::Cdr).unwrap();
+    let claim = |many: u32| {
+        let mut datagram = Vec::new();
+        let network = NetworkHeader::default();
+        let mut encoder = NetworkMessageEncoder::new(&mut datagram, &network, Some(&[1])).unwrap();
+        let mut frame = encoder.key_frame(&DataSetHeader::default()).unwrap();
+        let of = uadp::NodeId::string(2, "nothing_msgs/Arrays");
+        frame.begin_structure(of).unwrap();
+        for count in [3, many] {
+            frame.inline_structures(count as usize).unwrap();
+        }
+        frame.end_structure().unwrap();
+        frame.finish().unwrap();
+        encoder.finish().unwrap();
+        let mut out = Vec::new();
+        decode_fields(&plan, fields(&datagram), &mut out).map(|()| out.len())
+    };
+    // The fixed three, the count and the elements of a byte each, and the encapsulation, to a multiple of four.
+    assert_eq!(claim(5).unwrap(), 4 + 16);
+    assert_eq!(claim(65_533).unwrap(), 4 + 65_544);
+    claim(65_534).unwrap_err();
+    claim(i32::MAX as u32).unwrap_err();
+}
+
 #[test]
 fn a_field_of_another_type_among_numbers_is_named() {
     let message = Registry::bundle(Dialect::Ros1)

@@ -135,12 +135,6 @@ pub enum PlanError {
         /// The message type.
         name: TypeName,
     },
-    /// An array of messages that take no bytes on ROS 1: its count could say anything.
-    #[error("an array of `{name}`, which takes no bytes")]
-    EmptyElements {
-        /// The type of the elements.
-        name: TypeName,
-    },
 }
 
 /// What is wrong with the bytes of a message.
@@ -163,6 +157,9 @@ pub enum Fault {
         /// What the payload has.
         found: u32,
     },
+    /// More elements that take no bytes, such as `std_msgs/Empty` on ROS 1, than are believed of one message.
+    #[error("{0} more elements without bytes are too many")]
+    WithoutBytes(usize),
     /// Bytes after the last field of a ROS 1 message.
     #[error("{0} bytes left over")]
     TrailingBytes(usize),
@@ -280,6 +277,9 @@ pub enum WriteFault {
         /// What the value has.
         found: usize,
     },
+    /// More elements without a value, messages that are empty, than are believed of one message.
+    #[error("{0} more elements without a value are too many")]
+    WithoutValue(usize),
     /// Part of an array: what stands in the rest of it, nobody says.
     #[error("a part of an array is read and cannot be written")]
     Part,

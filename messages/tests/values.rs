@@ -57,27 +57,42 @@ fn scalar(value: Scalar<'_>) -> Event {
 }
 
 #[test]
-fn an_array_of_messages_without_bytes_is_refused_on_ros_1_and_counted_in_cdr() {
-    let ros1 = message(Dialect::Ros1, "std_msgs/Empty[] nothings");
-    let error = Plan::compile(&ros1, &Selection::Whole, Wire::Ros1).unwrap_err();
-    assert_eq!(
-        error,
-        PlanError::EmptyElements {
-            name: name("std_msgs/Empty")
-        }
-    );
+fn an_array_of_messages_without_fields_keeps_its_length() {
+    let events = [
+        "structures std_msgs/Empty 2",
+        "begin std_msgs/Empty",
+        "end",
+        "begin std_msgs/Empty",
+        "end",
+    ];
+    let ros1 = plan(Dialect::Ros1, "std_msgs/Empty[] nothings");
+    assert_eq!(read(&ros1, &[2, 0, 0, 0]).unwrap(), events);
+    let fixed = plan(Dialect::Ros1, "std_msgs/Empty[2] nothings");
+    assert_eq!(read(&fixed, &[]).unwrap(), events);
     let ros2 = plan(Dialect::Ros2, "std_msgs/Empty[] nothings");
-    let events = read(&ros2, &[0, 1, 0, 0, 2, 0, 0, 0, 9, 9]).unwrap();
-    assert_eq!(
-        events,
-        [
-            "structures std_msgs/Empty 2",
-            "begin std_msgs/Empty",
-            "end",
-            "begin std_msgs/Empty",
-            "end"
-        ]
+    let payload = [0, 1, 0, 0, 2, 0, 0, 0, 9, 9];
+    assert_eq!(read(&ros2, &payload).unwrap(), events);
+}
+
+#[test]
+fn elements_without_bytes_are_believed_up_to_a_number_all_arrays_together() {
+    let plan = plan(
+        Dialect::Ros1,
+        "std_msgs/Empty[] nothings\nstd_msgs/Empty[] more",
     );
+    let payload = |counts: [u32; 2]| counts.map(u32::to_le_bytes).concat();
+    assert!(read(&plan, &payload([65_535, 1])).is_ok());
+    for counts in [[u32::MAX, 0], [65_535, 2]] {
+        let error = read(&plan, &payload(counts)).unwrap_err();
+        let many = matches!(
+            error,
+            ReadError::Malformed {
+                fault: Fault::WithoutBytes(_),
+                ..
+            }
+        );
+        assert!(many, "{error:?}");
+    }
 }
 
 #[test]

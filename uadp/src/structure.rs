@@ -11,6 +11,9 @@ pub struct StructureReader<'a> {
 }
 
 impl<'a> StructureReader<'a> {
+    /// Structures without fields that one array may have.
+    pub const MAX_WITHOUT_FIELDS: usize = 65_536;
+
     /// Reads from the start of a body.
     #[must_use]
     pub const fn new(body: &'a [u8]) -> Self {
@@ -45,12 +48,16 @@ impl<'a> StructureReader<'a> {
 
     /// The length of the next field, an array of structures by value whose fields follow inline. `None` for null.
     ///
+    /// Structures without fields take no byte, so up to [`MAX_WITHOUT_FIELDS`](Self::MAX_WITHOUT_FIELDS) are believed
+    /// whatever follows: whoever reads many such arrays is to bound them together.
+    ///
     /// # Errors
-    /// Fails when it is negative, or above the number of bytes that follow: a structure without fields is not read.
+    /// Fails when it is negative or above that.
     pub fn length(&mut self) -> Result<Option<usize>, DecodeError> {
         let length = self.reader.length("array of structures")?;
+        let most = self.reader.remaining().max(Self::MAX_WITHOUT_FIELDS);
         match length {
-            Some(length) if length > self.reader.remaining() => Err(DecodeError::Limit {
+            Some(length) if length > most => Err(DecodeError::Limit {
                 field: "array of structures",
                 value: u32::try_from(length).unwrap_or(u32::MAX),
             }),
@@ -156,6 +163,13 @@ mod tests {
             structure.scalar(BuiltinType::Byte).is_err(),
             "nothing is left"
         );
+    }
+
+    #[test]
+    fn structures_without_fields_are_counted_though_nothing_follows() {
+        let mut structure = StructureReader::new(&[3, 0, 0, 0]);
+        assert_eq!(structure.length(), Ok(Some(3)));
+        assert_eq!(structure.remaining(), 0);
     }
 
     #[test]

@@ -539,7 +539,6 @@ fn told_fault(path: &str, error: PlanError) -> (String, Option<String>) {
             (message, Some(help))
         }
         PlanError::Wire { .. }
-        | PlanError::EmptyElements { .. }
         | PlanError::Shape { .. }
         | PlanError::Constant { .. }
         | PlanError::ConstantFault { .. }

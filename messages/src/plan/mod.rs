@@ -133,6 +133,9 @@ enum What {
     },
 }
 
+/// Elements of a message, all its arrays together, that take no byte: as many as the sender says, and nothing shows it.
+const MAX_WITHOUT_BYTES: usize = 65_536;
+
 #[derive(Clone, Copy, Debug)]
 enum Len {
     Fixed(u32),
@@ -485,11 +488,6 @@ impl Compiler<'_> {
         }) = self.ops.get_mut(head)
         {
             (*steps, *least) = (all, each);
-        }
-        if each == 0 {
-            self.fault.get_or_insert_with(|| PlanError::EmptyElements {
-                name: inner.name.clone(),
-            });
         }
         match len {
             Len::Fixed(count) => each.saturating_mul(usize::try_from(count).unwrap_or(usize::MAX)),

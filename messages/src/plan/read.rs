@@ -4,7 +4,7 @@ use std::marker::PhantomData;
 
 use uadp::{BuiltinType, Scalar};
 
-use super::{Len, Op, Plan, What, Wire};
+use super::{Len, MAX_WITHOUT_BYTES, Op, Plan, What, Wire};
 use crate::definition::{Clock, Number, Primitive};
 use crate::{Fault, ReadError, Sink, TypeName, duration_to_millis, time_to_date_time};
 
@@ -49,6 +49,8 @@ struct Reader<'p, 's, L, S> {
     sink: &'s mut S,
     /// Elements put right for the sink: swapped numbers, Booleans that are neither 0 nor 1.
     scratch: Vec<u8>,
+    /// Elements without bytes that may still come.
+    without_bytes: usize,
     layout: PhantomData<L>,
 }
 
@@ -115,6 +117,7 @@ fn run<L: Layout, S: Sink>(
         leaf: None,
         sink,
         scratch: Vec::new(),
+        without_bytes: MAX_WITHOUT_BYTES,
         layout: PhantomData,
     };
     let mut done = reader.steps(ops, inside);
@@ -388,8 +391,13 @@ impl<'p, L: Layout, S: Sink> Reader<'p, '_, L, S> {
         }
     }
 
-    /// Errs when `count` elements of at least `least` bytes cannot be there.
-    fn room(&self, count: usize, least: usize) -> Result<(), Fault> {
+    /// Errs when `count` elements of at least `least` bytes cannot be there, or are too many where they have none.
+    fn room(&mut self, count: usize, least: usize) -> Result<(), Fault> {
+        if least == 0 {
+            let left = self.without_bytes.checked_sub(count);
+            self.without_bytes = left.ok_or(Fault::WithoutBytes(count))?;
+            return Ok(());
+        }
         let left = self.data.len().saturating_sub(self.at);
         if product(count, least)? > left {
             Err(Fault::Truncated)

@@ -3,7 +3,7 @@
 use uadp::{BuiltinType, Scalar};
 
 use super::literal::Typed;
-use super::{Len, Op, Plan, What, Wire};
+use super::{Len, MAX_WITHOUT_BYTES, Op, Plan, What, Wire};
 use crate::definition::{Clock, Number, Primitive};
 use crate::{Source, SourceError, WriteError, WriteFault, date_time_to_time, millis_to_duration};
 
@@ -13,6 +13,8 @@ struct Writer<'o, 's, S> {
     origin: Option<usize>,
     leaf: Option<usize>,
     source: &'s mut S,
+    /// Elements without a value that may still come.
+    without_value: usize,
 }
 
 pub(super) fn write<'a, S: Source<'a>>(
@@ -51,6 +53,7 @@ fn message<'a, S: Source<'a>>(
         origin,
         leaf: None,
         source,
+        without_value: MAX_WITHOUT_BYTES,
     };
     let done = writer.body(ops, structure).and_then(|()| {
         writer.leaf = None;
@@ -89,6 +92,7 @@ fn constant_of(
         origin,
         leaf: None,
         source: &mut constant.source(),
+        without_value: MAX_WITHOUT_BYTES,
     };
     match &op.what {
         What::One(primitive) => writer.single(*primitive),
@@ -177,6 +181,11 @@ impl<'a, S: Source<'a>> Writer<'_, '_, S> {
             Some(false) => self.source.structures()?,
         };
         if carry.is_some() {
+            if body.iter().all(|op| matches!(op.what, What::Skip { .. })) {
+                // Inline they are not on the wire, whatever their number.
+                let left = self.without_value.checked_sub(count);
+                self.without_value = left.ok_or(WriteFault::WithoutValue(count))?;
+            }
             self.count(len, count)?;
         }
         for _ in 0..count {
