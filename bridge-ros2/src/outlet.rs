@@ -51,8 +51,9 @@ struct Sample {
 /// Who listens.
 #[derive(Debug)]
 enum Audience {
-    /// Nobody. A state topic holds its last value back: written to a writer without readers it would stay in RustDDS'
-    /// history, whose pruning spares what nobody acknowledged, and a late joiner would be given a trail of old values.
+    /// Nobody. A state topic holds its last value back: a volatile reader that comes would not be given what was written before,
+    /// and in the history of RustDDS as published what nobody acknowledged would become a trail of old values. The value
+    /// before it is no longer true and must not be in the history either.
     Nobody { held: Option<Sample> },
     /// Somebody, whom a sample of at most that size reaches.
     Present {
@@ -115,10 +116,12 @@ impl Outlet {
     }
 
     /// Whether another writer should take over ([`replace_writer`](Self::replace_writer)): a reader of a state topic
-    /// has acknowledged nothing for so long that the others see an old value. Events are worth waiting for instead.
+    /// has acknowledged nothing for so long that the others see an old value. Events are worth waiting for instead. The patched
+    /// RustDDS goes on without a reader that is silent, and one that is not is being served.
     #[must_use]
     pub fn is_stuck(&self, now: Instant) -> bool {
-        self.offered == Offered::KeepLatest
+        !limits::PATCHED
+            && self.offered == Offered::KeepLatest
             && self
                 .full_since
                 .is_some_and(|since| now.duration_since(since) >= STUCK_AFTER)
@@ -136,7 +139,8 @@ impl Outlet {
         if self.former.len() > MOST_FORMER {
             self.former.pop_front();
         }
-        if self.waiting.is_empty() {
+        // What is held back is newer than the last that was written.
+        if self.waiting.is_empty() && !matches!(self.audience, Audience::Nobody { held: Some(_) }) {
             self.waiting.extend(self.last.clone());
         }
         if let Audience::Present { settling, .. } = &mut self.audience {
@@ -186,7 +190,9 @@ impl Outlet {
         }
         match &mut self.audience {
             Audience::Nobody { held } if self.offered == Offered::KeepLatest => {
-                *held = Some(sample);
+                if held.replace(sample).is_none() {
+                    self.forget_written();
+                }
                 return Ok(());
             }
             Audience::Nobody { .. } => {}
@@ -243,7 +249,7 @@ impl Outlet {
         if readers.is_empty() {
             self.former.clear();
             if !matches!(self.audience, Audience::Nobody { .. }) {
-                self.audience = Audience::Nobody { held: None };
+                self.leave_alone();
             }
             return Ok(());
         }
@@ -287,6 +293,24 @@ impl Outlet {
     #[must_use]
     pub fn waiting(&self) -> u64 {
         u64::try_from(self.waiting.len()).unwrap_or(u64::MAX)
+    }
+
+    /// Nobody listens any more.
+    fn leave_alone(&mut self) {
+        let mut held = None;
+        if self.offered == Offered::KeepLatest {
+            held = self.waiting.drain(..).next_back();
+        }
+        if held.is_some() {
+            self.forget_written();
+        }
+        self.audience = Audience::Nobody { held };
+    }
+
+    /// Takes back what was written, for a newer value that is not.
+    fn forget_written(&self) {
+        #[cfg(feature = "patched-dds")]
+        self.writer.keep_last(0);
     }
 
     /// A reader may match between two snapshots; what comes after the match is for it.
@@ -342,25 +366,23 @@ impl Outlet {
     fn write(&mut self, sample: Sample, now: Instant) -> Result<Option<Sample>, Refusal> {
         let Sample { payload, source } = sample;
         let size = payload.len();
-        // Long before there is no room: readers acknowledge one sample in several, so that now all may be acknowledged and
-        // at the next sample not.
-        if self.in_flight > MAX_IN_FLIGHT / 2 {
-            // The answer is immediate with a wait of zero.
-            match self.writer.wait_for_acknowledgments(Duration::ZERO) {
-                Ok(true) => self.in_flight = 0,
-                Ok(false) if self.in_flight + size > MAX_IN_FLIGHT => {
-                    self.full_since.get_or_insert(now);
-                    return Ok(Some(Sample { payload, source }));
-                }
-                Ok(false) => {}
-                Err(_) => return Err(Refusal::Failed),
-            }
+        if !self.has_room(size) {
+            self.full_since.get_or_insert(now);
+            return Ok(Some(Sample { payload, source }));
         }
         let kept = (self.offered == Offered::KeepLatest).then(|| Sample {
             payload: payload.clone(),
             source,
         });
-        match self.writer.write(payload, source) {
+        let mut written = self.writer.write(payload, source);
+        if let Err(WriteError::WouldBlock { data }) = written {
+            written = if self.makes_room() {
+                self.writer.write(data, source)
+            } else {
+                Err(WriteError::WouldBlock { data })
+            };
+        }
+        match written {
             Ok(()) => {
                 self.full_since = None;
                 self.in_flight += size;
@@ -381,6 +403,53 @@ impl Outlet {
                 | WriteError::Internal { .. },
             ) => Err(Refusal::Failed),
         }
+    }
+
+    /// Whether there is memory for another sample of that size, or some is made.
+    #[cfg(feature = "patched-dds")]
+    fn has_room(&mut self, size: usize) -> bool {
+        while self.in_flight + size > MAX_IN_FLIGHT {
+            let lacked = self.writer.unacknowledged().bytes;
+            self.in_flight = lacked;
+            if lacked > 0 && lacked + size > MAX_IN_FLIGHT && !self.makes_room() {
+                return false;
+            }
+            if lacked == 0 {
+                break;
+            }
+        }
+        true
+    }
+
+    /// Whether there is memory for another sample of that size.
+    #[cfg(not(feature = "patched-dds"))]
+    fn has_room(&mut self, size: usize) -> bool {
+        // Long before there is none: readers acknowledge one sample in several, so that now all may be acknowledged and at
+        // the next sample not.
+        if self.in_flight > MAX_IN_FLIGHT / 2 {
+            // The answer is immediate with a wait of zero.
+            match self.writer.wait_for_acknowledgments(Duration::ZERO) {
+                Ok(true) => self.in_flight = 0,
+                Ok(false) => return self.in_flight + size <= MAX_IN_FLIGHT,
+                // Writing fails, too.
+                Err(_) => {}
+            }
+        }
+        true
+    }
+
+    /// Gives up the oldest value that a silent reader lacks, if it is a state's: the others must not see an old one because
+    /// of it. One that is only slow says so again and again, and gets what it has begun to receive.
+    fn makes_room(&self) -> bool {
+        #[cfg(feature = "patched-dds")]
+        if self.offered == Offered::KeepLatest {
+            let lacked = self.writer.unacknowledged();
+            if lacked.samples > 0 && lacked.silent_for >= STUCK_AFTER {
+                self.writer.keep_last(lacked.samples - 1);
+                return true;
+            }
+        }
+        false
     }
 }
 
@@ -452,8 +521,8 @@ const PATIENCE: Duration = Duration::from_secs(3);
 /// Samples that may wait for that, by what the topic carries.
 const SETTLING_STATES: usize = 128;
 const SETTLING_EVENTS: usize = 512;
-/// How long a state topic may lag behind for the sake of one reader. A reader that was killed, or lost its radio link,
-/// holds up RustDDS' writer until its lease ends, 10 to 20 s later.
+/// How long a state topic may lag behind for the sake of one reader that says nothing. A reader that was killed, or lost its
+/// radio link, holds up RustDDS' writer until its lease ends, 10 to 20 s later.
 const STUCK_AFTER: Duration = Duration::from_millis(500);
 /// How long a writer that was replaced stays for those that lack something. What it waits for is a repair or two; a reader
 /// that was killed acknowledges nothing.
