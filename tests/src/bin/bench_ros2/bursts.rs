@@ -2,13 +2,14 @@
 
 use std::time::Duration;
 
-use system_tests::{Cell, METRICS_ROS1, METRICS_ROS2, drops, metrics, number};
+use system_tests::Cell;
 
 use crate::ends::{Pace, Report};
-use crate::through::{NAMES, Ways};
+use crate::floods::bridges_dropped;
+use crate::through::{NAMES, WAITING, Ways};
 
 pub(crate) fn measure(cell: &Cell, bursts: u64) {
-    let mut ways = Ways::stand(cell);
+    let mut ways = Ways::stand(cell, WAITING);
     println!("\n{bursts} bursts of {BURST} messages of 1 KiB; microseconds:\n");
     println!(
         "| rate in a burst | way | sent | lost | repeated | out of order | dropped by the bridges | p50 | last of 100 |"
@@ -44,15 +45,6 @@ pub(crate) fn measure(cell: &Cell, bursts: u64) {
             );
         }
     }
-}
-
-/// What both bridges have counted as dropped or missing, but for their own datagrams, which the group brings back.
-fn bridges_dropped() -> u64 {
-    let bridges = [METRICS_ROS1, METRICS_ROS2];
-    let statuses = bridges.into_iter().filter_map(metrics);
-    statuses
-        .map(|status| drops(&status) - number(&status, "looped"))
-        .sum()
 }
 
 const BURST: u64 = 100;

@@ -196,4 +196,4 @@ pub(crate) const START: Duration = Duration::from_secs(30);
 /// For an answer that needs no time.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(30);
 /// Nothing more comes after so long without anything.
-const SILENCE_MS: u64 = 1000;
+pub(crate) const SILENCE_MS: u64 = 1000;

@@ -5,6 +5,7 @@
 
 mod bursts;
 mod ends;
+mod floods;
 mod idle;
 mod joining;
 mod many;
@@ -43,13 +44,19 @@ fn main() -> ExitCode {
     if plan.has("many") {
         many::measure(&cell, plan.seconds);
     }
-    if plan.has("through") || plan.has("bursts") {
+    if ["through", "bursts", "floods"]
+        .iter()
+        .any(|part| plan.has(part))
+    {
         let _core = cell.roscore();
         if plan.has("through") {
             through::measure(&cell, plan.seconds);
         }
         if plan.has("bursts") {
             bursts::measure(&cell, plan.turns);
+        }
+        if plan.has("floods") {
+            floods::measure(&cell, plan.turns.min(FLOODS));
         }
     }
     ExitCode::SUCCESS
@@ -107,7 +114,9 @@ impl Plan {
     }
 }
 
-const PARTS: [&str; 7] = [
+/// Each takes seconds.
+const FLOODS: u64 = 3;
+const PARTS: [&str; 8] = [
     "round-trip",
     "throughput",
     "joining",
@@ -115,6 +124,7 @@ const PARTS: [&str; 7] = [
     "many",
     "through",
     "bursts",
+    "floods",
 ];
 
 const HELP: &str = "\
@@ -123,5 +133,5 @@ bench-ros2 [--quick] [--seconds N] [--turn N] [PART..]
   --quick      a trial of a minute; its figures are no measurement
   --seconds N  how long each path gets messages at 1 kHz, 20 unless told
   --turn N     samples through one relay before the next has its turn, 50 unless told
-  PART         round-trip, throughput, joining, idle, many, through, bursts; all unless told
+  PART         round-trip, throughput, joining, idle, many, through, bursts, floods; all unless told
 ";

@@ -7,7 +7,7 @@ use system_tests::{BareNode, Cell, Child, eventually, per_message, processor_tim
 use crate::ends::{Listener, Meter, Pace, Pacer, Report, START, Talker};
 
 pub(crate) fn measure(cell: &Cell, seconds: u64) {
-    let mut ways = Ways::stand(cell);
+    let mut ways = Ways::stand(cell, WAITING);
     println!("\n1 kHz, {seconds} s for each way, in turns of {TURN} s; microseconds:\n");
     println!("| payload | way | sent | lost | p50 | p99 | p50 / relay | CPU per message |");
     println!("|---|---|---|---|---|---|---|---|");
@@ -53,9 +53,10 @@ pub(crate) struct Ways {
 }
 
 impl Ways {
-    /// Starts all and waits until each way carries.
-    pub(crate) fn stand(cell: &Cell) -> Self {
-        let mapping = cell.file("through.yaml", MAPPING);
+    /// Starts all, with topics in whose queues so many may wait, and waits until each way carries.
+    pub(crate) fn stand(cell: &Cell, waiting: u32) -> Self {
+        let mapping = MAPPING.replace("WAITING", &waiting.to_string());
+        let mapping = cell.file("through.yaml", &mapping);
         let mapping = mapping.to_string_lossy();
         let bridges = [cell.bridge_ros1(&[&mapping]), cell.bridge_ros2(&[&mapping])];
         let relay = cell.topic_tools_relay("/relay_in", "/relay_out");
@@ -145,6 +146,9 @@ pub(crate) const NAMES: [&str; 3] = [
     "both bridges, ROS 2 -> UADP -> ROS 1",
 ];
 
+/// Samples that may wait, unless a measurement wants more.
+pub(crate) const WAITING: u32 = 2000;
+
 const MAPPING: &str = "\
 spaces:
   - id: 1
@@ -152,8 +156,8 @@ spaces:
 namespaces:
   2: urn:ua-bridge:bench
 variables:
-  - {node: ns=2;i=10, name: there, type: String, origin: 1, queue: {drop_oldest: 2000}}
-  - {node: ns=2;i=11, name: back, type: String, origin: 2, queue: {drop_oldest: 2000}}
+  - {node: ns=2;i=10, name: there, type: String, origin: 1, queue: {drop_oldest: WAITING}}
+  - {node: ns=2;i=11, name: back, type: String, origin: 2, queue: {drop_oldest: WAITING}}
 ";
 
 #[derive(Default)]

@@ -1,0 +1,66 @@
+//! More than both bridges can carry, from ROS 1 to ROS 2.
+
+use std::time::Duration;
+
+use system_tests::{Cell, METRICS_ROS1, METRICS_ROS2, drops, metrics, now, number};
+
+use crate::ends::{Pace, SILENCE_MS};
+use crate::through::{NAMES, Ways};
+
+pub(crate) fn measure(cell: &Cell, floods: u64) {
+    let mut ways = Ways::stand(cell, WAITING);
+    let way = 1;
+    println!(
+        "\n{} of messages of 1 KiB, `drop_oldest: {WAITING}`, each rate {floods} times:\n",
+        NAMES[way]
+    );
+    println!(
+        "| offered | sent | lost | of these dropped by the bridges | taken/s | p50, ms | longest, ms |"
+    );
+    println!("|---|---|---|---|---|---|---|");
+    for (shown, ticks, rate) in RATES {
+        for _ in 0..floods {
+            let pace = Pace {
+                ticks,
+                size: 1024,
+                period: rate.map_or(Duration::ZERO, |rate| Duration::from_secs(1) / rate),
+                burst: 0,
+                pause: Duration::ZERO,
+            };
+            let before = bridges_dropped();
+            let start = now();
+            let mut report = ways.send(way, pace);
+            let mut took = now().saturating_sub(start);
+            if report.distinct < ticks {
+                // It was waited for what did not come.
+                took = took.saturating_sub(Duration::from_millis(SILENCE_MS));
+            }
+            #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
+            let taken = report.distinct as f64 / took.as_secs_f64();
+            println!(
+                "| {shown} | {ticks} | {} | {} | {taken:.0} | {:.1} | {:.1} |",
+                ticks - report.distinct,
+                bridges_dropped() - before,
+                report.times.at(0.5) / 1000.0,
+                report.times.at(1.0) / 1000.0
+            );
+        }
+    }
+}
+
+/// What both bridges have counted as dropped or missing, but for their own datagrams, which the group brings back.
+pub(crate) fn bridges_dropped() -> u64 {
+    let bridges = [METRICS_ROS1, METRICS_ROS2];
+    let statuses = bridges.into_iter().filter_map(metrics);
+    statuses
+        .map(|status| drops(&status) - number(&status, "looped"))
+        .sum()
+}
+
+const WAITING: u32 = 10_000;
+const RATES: [(&str, u64, Option<u32>); 4] = [
+    ("10 k/s", 20_000, Some(10_000)),
+    ("20 k/s", 40_000, Some(20_000)),
+    ("40 k/s", 60_000, Some(40_000)),
+    ("as fast as one can", 100_000, None),
+];
