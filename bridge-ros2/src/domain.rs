@@ -3,7 +3,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
+use std::pin::Pin;
 use std::sync::{Mutex, PoisonError};
+use std::task::{Context, Poll};
 use std::time::Duration;
 
 #[cfg(feature = "security")]
@@ -15,6 +17,7 @@ use rustdds::{
     QosPolicies, QosPolicyBuilder, RTPSEntity, Subscriber, Topic, TopicKind,
 };
 use thiserror::Error;
+use tokio::task::JoinHandle;
 use tokio::time::Instant;
 use tracing::warn;
 
@@ -165,6 +168,8 @@ pub struct Domain {
     publisher: Publisher,
     subscriber: Subscriber,
     participant: DomainParticipant,
+    /// The task that is the participant's traffic, until its end was told.
+    traffic: Option<JoinHandle<&'static str>>,
 }
 
 impl Domain {
@@ -193,7 +198,7 @@ impl Domain {
             domain: options.domain,
             source,
         };
-        let participant = join(options)?;
+        let (participant, traffic) = join(options)?;
         let none = QosPolicies::qos_none();
         let publisher = participant.create_publisher(&none).map_err(failed)?;
         let subscriber = participant.create_subscriber(&none).map_err(failed)?;
@@ -217,6 +222,7 @@ impl Domain {
             publisher,
             subscriber,
             participant,
+            traffic,
         };
         domain.serve()?;
         Ok(domain)
@@ -254,6 +260,21 @@ impl Domain {
     #[must_use]
     pub fn joined(&self) -> Instant {
         self.joined
+    }
+
+    /// Ready, once, when nothing is sent or heard any more, though the domain was not left: with the reason. It never is
+    /// where the domain's traffic has a thread of its own.
+    pub fn poll_end(&mut self, cx: &mut Context<'_>) -> Poll<String> {
+        let Some(traffic) = &mut self.traffic else {
+            return Poll::Pending;
+        };
+        let end = std::task::ready!(Pin::new(traffic).poll(cx));
+        self.traffic = None;
+        let why = end.map_or_else(|panic| panic.to_string(), str::to_owned);
+        Poll::Ready(format!(
+            "the DDS traffic of domain {} has ended: {why}",
+            self.domain
+        ))
     }
 
     /// What others have in the domain by now. Nodes of participants that are gone are forgotten with it.
@@ -298,6 +319,11 @@ impl Domain {
     #[must_use]
     pub fn owner(&self, endpoint: GUID) -> Option<String> {
         self.node.owner(endpoint)
+    }
+
+    /// Whether the node's own thread has ended, by a panic: nobody is told of our nodes any more.
+    pub(crate) fn is_mute(&self) -> bool {
+        self.node.is_mute()
     }
 
     /// How many lists of nodes, of those that others publish, could not be read.
@@ -462,7 +488,10 @@ impl std::fmt::Debug for Domain {
     }
 }
 
-fn join(options: &DomainOptions) -> Result<DomainParticipant, DomainError> {
+/// A participant, and its traffic where that is a task.
+type Joined = (DomainParticipant, Option<JoinHandle<&'static str>>);
+
+fn join(options: &DomainOptions) -> Result<Joined, DomainError> {
     let domain = options.domain;
     let builder = participant(options)?;
     let Some(enclave) = &options.enclave else {
@@ -497,20 +526,20 @@ fn secured(
 
 /// In a runtime, which needs its IO driver, the participant's traffic is a task of it; else a thread.
 #[cfg(feature = "patched-dds")]
-fn build(builder: DomainParticipantBuilder) -> Result<DomainParticipant, CreateError> {
+fn build(builder: DomainParticipantBuilder) -> Result<Joined, CreateError> {
     if tokio::runtime::Handle::try_current().is_err() {
-        return builder.build();
+        return Ok((builder.build()?, None));
     }
     let (participant, event_loop) = builder.build_with_event_loop()?;
-    driver::spawn(event_loop).map_err(|error| CreateError::OutOfResources {
+    let traffic = driver::spawn(event_loop).map_err(|error| CreateError::OutOfResources {
         reason: format!("the event loop cannot be watched: {error}"),
     })?;
-    Ok(participant)
+    Ok((participant, Some(traffic)))
 }
 
 #[cfg(not(feature = "patched-dds"))]
-fn build(builder: DomainParticipantBuilder) -> Result<DomainParticipant, CreateError> {
-    builder.build()
+fn build(builder: DomainParticipantBuilder) -> Result<Joined, CreateError> {
+    Ok((builder.build()?, None))
 }
 
 fn participant(options: &DomainOptions) -> Result<DomainParticipantBuilder, DomainError> {

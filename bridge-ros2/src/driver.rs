@@ -15,14 +15,15 @@ use futures_util::task::AtomicWaker;
 use rustdds::{EventLoop, Turned};
 use tokio::io::Interest;
 use tokio::io::unix::AsyncFd;
+use tokio::task::JoinHandle;
 use tokio::time::{Instant, Sleep};
-use tracing::debug;
 
-/// Gives the loop its turns, in a task of the current runtime, until its participant is gone.
+/// Gives the loop its turns, in a task of the current runtime, until its participant is gone. The task ends with the
+/// reason.
 ///
 /// # Errors
 /// When the runtime cannot watch the sockets.
-pub(crate) fn spawn(event_loop: EventLoop) -> std::io::Result<()> {
+pub(crate) fn spawn(event_loop: EventLoop) -> std::io::Result<JoinHandle<&'static str>> {
     let task = Arc::new(AtomicWaker::new());
     let sockets: Result<Vec<_>, std::io::Error> = event_loop
         .descriptors()
@@ -37,8 +38,7 @@ pub(crate) fn spawn(event_loop: EventLoop) -> std::io::Result<()> {
         task,
         event_loop,
     };
-    tokio::spawn(driver.run());
-    Ok(())
+    Ok(tokio::spawn(driver.run()))
 }
 
 #[expect(
@@ -97,7 +97,7 @@ impl Wake for Bell {
 }
 
 impl Driver {
-    async fn run(mut self) {
+    async fn run(mut self) -> &'static str {
         let mut timer = Box::pin(tokio::time::sleep(Duration::ZERO));
         loop {
             let due = Instant::now() + self.event_loop.timeout();
@@ -106,13 +106,15 @@ impl Driver {
                 timer.as_mut().reset(due);
             }
             if !poll_fn(|cx| self.poll_wake(timer.as_mut(), cx)).await {
-                return;
+                return "the runtime has ended";
             }
             let mut turns = 0_u32;
-            while let turned @ (Turned::Unfinished | Turned::Ended) = self.event_loop.turn() {
-                if turned == Turned::Ended {
-                    debug!("the DDS traffic of a participant has ended");
-                    return;
+            loop {
+                match self.event_loop.turn() {
+                    Turned::Done => break,
+                    Turned::Unfinished => {}
+                    Turned::Ended => return "the participant is gone",
+                    Turned::Failed(why) => return why,
                 }
                 turns = turns.saturating_add(1);
                 if turns == 1 {

@@ -271,6 +271,11 @@ impl Node {
             .map(NodeEntities::full_name)
     }
 
+    /// Whether its thread has ended, which it does not before it is dropped.
+    pub(crate) fn is_mute(&self) -> bool {
+        self.thread.as_ref().is_none_or(JoinHandle::is_finished)
+    }
+
     /// Takes note of endpoints of ours that were announced, and returns those that should have been by now.
     pub(crate) fn unannounced(&self, announced: &BTreeSet<GUID>) -> BTreeSet<GUID> {
         let mut own = lock(&self.shared.own);

@@ -253,7 +253,7 @@ impl Ros2Port {
             match self.inbox.poll_recv(cx) {
                 Poll::Ready(taken) => self.taken(taken),
                 Poll::Pending if self.noticed_change(cx) => {}
-                Poll::Pending => return Poll::Pending,
+                Poll::Pending => return self.domain.poll_end(cx).map(PortEvent::Ended),
             }
         }
     }
@@ -354,6 +354,10 @@ impl Ros2Port {
         self.tell_strangers(&overdue);
         if now >= self.schedule.next_reconcile() {
             self.reconcile(now);
+        }
+        if self.domain.is_mute() {
+            let why = "the thread of the ROS node has ended".to_owned();
+            self.events.push_back(PortEvent::Ended(why));
         }
         self.schedule.arm(now);
     }

@@ -106,6 +106,33 @@ fn values_flow_again_each_time_the_bridge_is_killed_and_started() {
     }
 }
 
+/// Ctrl-Z and `fg`, a debugger, a frozen container: the waits of all of its threads are interrupted.
+#[test]
+fn a_bridge_that_was_stopped_and_goes_on_finds_who_comes_and_is_found() {
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let mut ua = UaSide::join();
+    let mut bridge = cell.bridge_ros2(&[]);
+    bridge.signal(Signal::SIGSTOP);
+    let status = format!("/proc/{}/stat", bridge.id());
+    eventually("it is stopped", SOON, || {
+        let status = std::fs::read_to_string(&status).ok()?;
+        status.contains(") T ").then_some(())
+    });
+    bridge.signal(Signal::SIGCONT);
+    let mut readers = MAKERS.map(|peer| peer(&cell, &["sub", THERE.1, STRING]));
+    let [fast, cyclone] = &mut readers;
+    reaches(&mut ua, THERE.0, "there", &mut [fast, cyclone]);
+    for peer in MAKERS {
+        let writer = peer(&cell, &sends(BACK.1, "back"));
+        ua.hear_scalar(BACK.0, Scalar::String(Some("back")));
+        kill(writer);
+        ua.drain();
+    }
+    assert!(bridge.runs());
+}
+
 /// Hears texts of topics `2_3_k` until each of `count` has brought its k.
 fn hear_each(ua: &UaSide, count: u16) {
     for number in 1..=count {
