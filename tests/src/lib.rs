@@ -8,6 +8,7 @@
 //!
 //! A peer that this machine does not have skips the test with the reason; with `CI=true` that is a failure.
 
+mod announcer;
 mod arrows;
 mod bare_node;
 mod capture;
@@ -27,6 +28,7 @@ mod ua_side;
 mod usage;
 mod wait;
 
+pub use announcer::Announcer;
 pub use arrows::{forbidden, tree};
 pub use bare_node::{BareNode, BareSubscription, PATIENCE, string_frame};
 pub use capture::{Capture, Dissected, hex, is_true};

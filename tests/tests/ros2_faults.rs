@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 use system_tests::{
-    Cell, Child, METRICS_ROS2, Peer, Started, Triple, UaSide, cpu_share, eventually, metrics,
-    program, resident, threads,
+    Announcer, Cell, Child, METRICS_ROS2, Peer, Started, Triple, UaSide, cpu_share, eventually,
+    metrics, program, resident, threads,
 };
 use uadp::Scalar;
 
@@ -131,6 +131,25 @@ fn a_bridge_that_was_stopped_and_goes_on_finds_who_comes_and_is_found() {
         ua.drain();
     }
     assert!(bridge.runs());
+}
+
+/// E.g. the wire was cut for 30 s: a node of ROS 2 is lost after 20 s, and loses the bridge after 50 s. It goes on as
+/// before then, and Fast DDS drops an ACKNACK whose count is not above the one before.
+#[test]
+fn a_participant_that_was_lost_and_has_not_lost_us_is_asked_with_counts_that_go_on() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let _bridge = cell.bridge_ros2(&[]);
+    let node = Announcer::open();
+    node.announce();
+    // Meanwhile its lease of a second ends, which is looked after every two seconds.
+    let before = node.asked(Duration::from_secs(4), |_| false);
+    node.announce();
+    let after = node.asked(SOON, |counts| !counts.is_empty());
+    assert!(!before.is_empty(), "it is not asked");
+    let highest = before.iter().max();
+    assert!(after.first() > highest, "{after:?} after {before:?}");
 }
 
 /// Hears texts of topics `2_3_k` until each of `count` has brought its k.
