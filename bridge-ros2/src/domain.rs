@@ -26,7 +26,7 @@ use crate::discovery_info::{self, NodeEntities};
 #[cfg(feature = "patched-dds")]
 use crate::driver;
 use crate::graph::{BRIDGE_TYPE, Graph, bridge_topic};
-use crate::node::{Channels, Node, NodeOptions, Services};
+use crate::node::{Channels, Node, NodeOptions, ParticipantPrefix, Services};
 use crate::qos::{Offered, Requested};
 use crate::raw::{Opaque, Payload, RawReader, RawWriter, Reader, Writer};
 use crate::rosout;
@@ -319,6 +319,11 @@ impl Domain {
     #[must_use]
     pub fn owner(&self, endpoint: GUID) -> Option<String> {
         self.node.owner(endpoint)
+    }
+
+    /// The full names of the nodes a participant is, as it told.
+    pub(crate) fn nodes_of(&self, participant: &ParticipantPrefix) -> Vec<String> {
+        self.node.nodes_of(participant)
     }
 
     /// Whether the node's own thread has ended, by a panic: nobody is told of our nodes any more.

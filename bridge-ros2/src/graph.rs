@@ -6,6 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
+use mappings::SpaceId;
 use messages::TypeHash;
 use rustdds::discovery::{DiscoveredReaderData, DiscoveredWriterData};
 use rustdds::policy::{Durability, Reliability};
@@ -124,7 +125,7 @@ impl Graph {
         let mut note = |endpoint: &Endpoint| participants.extend(prefix(endpoint.guid));
         let mut writers = by_topic(writers.into_iter().inspect(|(topic, writer)| {
             note(writer);
-            bridges.extend(prefix(writer.guid).zip(bridge_of(topic)));
+            bridges.extend(prefix(writer.guid).zip(bridge_of(topic, &writer.type_name)));
         }));
         let readers = by_topic(readers.into_iter().inspect(|(_, reader)| note(reader)));
         if !bridges.is_empty() {
@@ -152,6 +153,11 @@ impl Graph {
     #[must_use]
     pub fn is_at_home(&self, space: u16) -> bool {
         self.bridges.values().any(|other| *other == space)
+    }
+
+    /// The other bridges, each with the space it says it serves.
+    pub fn bridges(&self) -> impl Iterator<Item = (ParticipantPrefix, u16)> {
+        self.bridges.iter().map(|(bridge, space)| (*bridge, *space))
     }
 
     /// The writers of a topic, in the order of their GUIDs.
@@ -218,8 +224,12 @@ pub fn bridge_topic(space: u16) -> String {
     format!("{BRIDGE_PREFIX}{space}")
 }
 
-fn bridge_of(dds_topic: &str) -> Option<u16> {
-    dds_topic.strip_prefix(BRIDGE_PREFIX)?.parse().ok()
+/// The space whose bridge says by such a writer that it is one. Values of OPC UA and of ROS 1 are at home in no domain.
+fn bridge_of(dds_topic: &str, dds_type: &str) -> Option<u16> {
+    let space = dds_topic.strip_prefix(BRIDGE_PREFIX)?.parse().ok()?;
+    let is_ros2 = SpaceId::new(space).is_some_and(SpaceId::is_ros2);
+    let is_said = is_ros2 && dds_type == BRIDGE_TYPE && dds_topic == bridge_topic(space);
+    is_said.then_some(space)
 }
 
 fn prefix(guid: GUID) -> Option<ParticipantPrefix> {
@@ -274,9 +284,15 @@ mod tests {
         (topic.to_owned(), endpoint)
     }
 
+    fn marker(topic: &str, participant: u8) -> (String, Endpoint) {
+        let (topic, mut endpoint) = writer(topic, participant);
+        endpoint.type_name = BRIDGE_TYPE.into();
+        (topic, endpoint)
+    }
+
     #[test]
     fn what_another_bridge_writes_is_no_source() {
-        let (marker, of_bridge) = (writer("ua_bridge_3", 7), writer("rt/ua_2_5_10", 7));
+        let (marker, of_bridge) = (marker("ua_bridge_3", 7), writer("rt/ua_2_5_10", 7));
         let of_robot = writer("rt/ua_2_5_10", 8);
         let all = [marker, of_bridge.clone(), of_robot.clone()];
         let graph = Graph::from_endpoints(all, []);
@@ -286,5 +302,25 @@ mod tests {
         );
         assert!(graph.is_bridge(of_bridge.1.guid) && !graph.is_bridge(of_robot.1.guid));
         assert!(graph.is_at_home(3) && !graph.is_at_home(2));
+    }
+
+    #[test]
+    fn a_writer_that_no_bridge_would_have_keeps_no_value_of_a_space_out() {
+        let markers = [
+            // No ROS 2 space.
+            marker("ua_bridge_0", 1),
+            marker("ua_bridge_1", 2),
+            marker("ua_bridge_233", 3),
+            // Not how bridges spell it.
+            marker("ua_bridge_+3", 4),
+            marker("ua_bridge_03", 5),
+            marker("rt/ua_bridge_3", 6),
+            // Another type.
+            writer("ua_bridge_3", 7),
+        ];
+        let guids = markers.clone().map(|(_, marker)| marker.guid);
+        let graph = Graph::from_endpoints(markers, []);
+        assert!((0..=u16::MAX).all(|space| !graph.is_at_home(space)));
+        assert!(guids.iter().all(|guid| !graph.is_bridge(*guid)));
     }
 }

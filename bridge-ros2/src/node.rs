@@ -271,6 +271,14 @@ impl Node {
             .map(NodeEntities::full_name)
     }
 
+    /// The full names of the nodes of a participant of others.
+    pub(crate) fn nodes_of(&self, participant: &ParticipantPrefix) -> Vec<String> {
+        let others = lock(&self.shared.others);
+        let told = others.participants.get(participant);
+        let nodes = told.into_iter().flat_map(|(_, nodes)| nodes);
+        nodes.map(NodeEntities::full_name).collect()
+    }
+
     /// Whether its thread has ended, which it does not before it is dropped.
     pub(crate) fn is_mute(&self) -> bool {
         self.thread.as_ref().is_none_or(JoinHandle::is_finished)

@@ -4,6 +4,7 @@
 //! [`reconcile`], which compares what the domain holds with what is open: every 200 ms, and soon
 //! after RustDDS reports a change.
 
+mod bridges;
 mod descriptions;
 mod drops;
 mod inquiry;
@@ -462,7 +463,7 @@ impl Port for Ros2Port {
             }
             return Ok(());
         }
-        if self.graph.is_at_home(topic.space.into()) {
+        if self.is_at_home(topic.space) {
             // Whoever listens here hears the node that produces it.
             return Err("at home in this domain");
         }
@@ -500,7 +501,7 @@ impl Port for Ros2Port {
         shape: &[(BuiltinType, bool)],
         described: Option<&Described>,
     ) {
-        let at_home = topic.space == self.own || self.graph.is_at_home(topic.space.into());
+        let at_home = topic.space == self.own || self.is_at_home(topic.space);
         if at_home || self.services.takes(topic) {
             return;
         }

@@ -41,6 +41,7 @@ impl Ros2Port {
         let graph = &self.graph;
         self.incompatible.retain(|guid| graph.holds(*guid));
         self.misreading.retain(|guid| graph.holds(*guid));
+        self.tell_of_bridges();
         self.announce_anew(now);
         self.take_descriptions(now);
         self.find_topics(now);

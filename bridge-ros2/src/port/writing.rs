@@ -17,10 +17,11 @@ use crate::sink::{Open, shortest_deadline};
 
 impl Ros2Port {
     pub(super) fn reconcile_sink(&mut self, topic: TopicId, now: Instant) {
+        let at_home = self.is_at_home(topic.space);
         let Some(sink) = self.sinks.get_mut(&topic) else {
             return;
         };
-        if self.graph.is_at_home(topic.space.into()) {
+        if at_home {
             // Another bridge serves its space in this domain. What was written would stand beside it, and grow old.
             let given_up = sink.open.take();
             let dds_topic = sink.dds_topic.clone();

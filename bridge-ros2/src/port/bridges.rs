@@ -1,0 +1,76 @@
+//! Other bridges of the domain, whose word keeps the values of their spaces out.
+
+use std::fmt::Write as _;
+
+use mappings::{Mapping, SpaceId};
+
+use super::Ros2Port;
+use crate::graph::bridge_topic;
+use crate::node::ParticipantPrefix;
+
+impl Ros2Port {
+    /// Whether another bridge serves that space in this domain. Anybody may say so; where the mapping has the space in
+    /// another domain it is not believed.
+    pub(super) fn is_at_home(&self, space: SpaceId) -> bool {
+        self.graph.is_at_home(space.into()) && is_possible(&self.mapping, space, self.domain_id)
+    }
+
+    /// Tells of other bridges of the domain, whose word keeps values out.
+    pub(super) fn tell_of_bridges(&mut self) {
+        for (bridge, number) in self.graph.bridges().collect::<Vec<_>>() {
+            let Some(space) = SpaceId::new(number) else {
+                continue;
+            };
+            let who = match self.domain.nodes_of(&bridge).as_slice() {
+                [] => format!("participant {}, no ROS node by now,", hex(&bridge)),
+                nodes => format!("participant {} ({})", hex(&bridge), nodes.join(", ")),
+            };
+            let domain = self.domain_id;
+            // By the space: a stranger may come under any number of names.
+            if is_possible(&self.mapping, space, domain) {
+                self.tell_once(&bridge_topic(number), "bridge", || {
+                    format!(
+                        "{who} says it is the bridge of space {space} in domain {domain}: its values are left to it"
+                    )
+                });
+            } else {
+                self.tell_once(&bridge_topic(number), "no bridge", || {
+                    format!(
+                        "{who} says it is the bridge of space {space}, which the mapping has in another domain than \
+                         {domain}: it is not believed"
+                    )
+                });
+            }
+        }
+    }
+}
+
+/// Whether a bridge may serve that space in that domain, for all the mapping says.
+fn is_possible(mapping: &Mapping, space: SpaceId, domain: u16) -> bool {
+    mapping
+        .space(space)
+        .is_none_or(|declared| declared.domain == Some(domain))
+}
+
+fn hex(participant: &ParticipantPrefix) -> String {
+    participant.iter().fold(String::new(), |mut text, byte| {
+        // Writing to a String does not fail.
+        write!(text, "{byte:02x}").unwrap_or_default();
+        text
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bridge_of_a_space_that_the_mapping_has_elsewhere_is_not_believed() {
+        let text = "spaces:\n  - {id: 2}\n  - {id: 3, domain: 7}\nvariables: []\n";
+        let mapping = Mapping::from_yaml(text, "cell.yaml").mapping.unwrap();
+        let space = |number| SpaceId::new(number).unwrap();
+        let told = [(2, 2), (2, 7), (3, 7), (3, 2), (3, 3), (4, 2), (4, 7)];
+        let believed = told.map(|(number, domain)| is_possible(&mapping, space(number), domain));
+        assert_eq!(believed, [true, false, true, false, false, true, true]);
+    }
+}
