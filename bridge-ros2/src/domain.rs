@@ -442,6 +442,8 @@ impl Domain {
         let qos = QosPolicyBuilder::new()
             .reliable(rustdds::Duration::ZERO)
             .build();
+        // It is no topic of ROS; rmw_cyclonedds looks for a hash nevertheless, and each node of it would warn.
+        let qos = with_hash(&qos, PRESENCE_HASH);
         let name = bridge_topic(space);
         create_topic(&self.participant, (&name, BRIDGE_TYPE), &qos)
             .and_then(|topic| -> Result<RawWriter, CreateError> {
@@ -640,6 +642,9 @@ const INFO_DEPTH: i32 = 256;
 const LOG_HASH: &str = "RIHS01_e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac";
 const CLOCK_HASH: &str = "RIHS01_692f7a66e93a3c83e71765d033b60349ba68023a8c689a79e48078bcb5c58564";
 const INFO_HASH: &str = "RIHS01_91a0593bacdcc50ea9bdcf849a938b128412cc1ea821245c663bcd26f83c295e";
+/// The hash of `ua_bridge/msg/Presence`, of which there is never a message: one without fields.
+const PRESENCE_HASH: &str =
+    "RIHS01_d26c7c581663814e80adf6b78455270594107240f359b8e34121972bd039d589";
 /// The highest domain whose ports fit into 16 bits.
 pub const MAX_DOMAIN: u16 = 232;
 /// How long [`Domain::leave`] takes at most.

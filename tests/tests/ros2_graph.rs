@@ -169,6 +169,43 @@ fn a_node_lists_the_readers_and_writers_the_domain_knows_and_no_odd_topics() {
     });
 }
 
+/// A node of rmw_cyclonedds warns of each that does not.
+#[test]
+fn each_reader_and_writer_of_the_bridge_says_the_hash_of_its_type() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let _bridge = cell.bridge_ros2(&[]);
+    let judge = join("judge".into());
+    let own = judge.guid().prefix;
+    let said = eventually("the bridge has told of itself", SOON, || {
+        let writers = judge.participant().discovered_writers().into_iter();
+        let writers = writers.map(|one| {
+            let guid = one.writer_proxy.remote_writer_guid;
+            (guid, one.publication_topic_data.topic_name, one.user_data)
+        });
+        let readers = judge.participant().discovered_readers().into_iter();
+        let readers = readers.map(|one| {
+            let guid = one.reader_proxy.remote_reader_guid;
+            let topic = one.subscription_topic_data.topic_name().clone();
+            (guid, topic, one.user_data)
+        });
+        let all: Vec<_> = writers
+            .chain(readers)
+            .filter(|(guid, ..)| guid.prefix != own)
+            .collect();
+        let is_there = |name: &str| all.iter().any(|(_, topic, _)| topic == name);
+        let described = "rr/ua_bridge_ros2/get_type_descriptionReply";
+        (is_there("ua_bridge_2") && is_there(described)).then_some(all)
+    });
+    let mute: Vec<_> = said
+        .iter()
+        .filter(|(.., user_data)| !String::from_utf8_lossy(user_data).contains("typehash=RIHS01_"))
+        .map(|(_, topic, _)| topic)
+        .collect();
+    assert_eq!(mute, [""; 0]);
+}
+
 fn names(domain: &Domain) -> BTreeSet<String> {
     domain.nodes().iter().map(NodeEntities::full_name).collect()
 }
