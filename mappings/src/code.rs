@@ -102,6 +102,7 @@ codes! {
     UnitUnknown = "M093", "A `unit` is one of those known by symbol (m/s), UNECE code (MTS) or name (metre per second), and goes with a value that is a number.";
     ValueRange = "M094", "A `range` is the lowest and the highest value, as [0, 1.5], of a value that is a number.";
     EnumTexts = "M095", "An `enum` says what the numbers of an integer value mean, as {0: idle, 1: moving}: at most 1000 texts that are not empty.";
+    UaField = "M096", "`ua_field` names the one field that is the value, out of several that a publisher sends that is none of the bridges. A variable that has several fields takes them all, and a bridge sends the value alone.";
     TypePath = "M100", "An entry of `type_paths` is a folder with ROS packages or a definition file (.msg, .srv, .action, .idl), relative to the mapping. One that is not there, or holds none, brings no types; on the host of another program of the cell that may be as it should.";
     DefinitionFile = "M101", "A definition file does not parse, in the ROS it is of. It counts as not there, and all others count.";
     DefinitionsDiffer = "M102", "A definition in a file differs from the one that is built in under its name. The file counts. Where peers have the other one, ROS 1 refuses the connection, and ROS 2 messages are misread unless type hashes are announced.";

@@ -6,6 +6,7 @@ use messages::Literal;
 use schemars::JsonSchema;
 
 use crate::code::Code;
+use crate::mapping::UaField;
 use crate::read::{At, Read, Reader, choice, document, short};
 use crate::tree::{Kind, Node, Place};
 
@@ -109,6 +110,10 @@ document! {
         name: String,
         /// OPC UA builtin type, as Boolean or Double[]. May be left out where a ROS type says it.
         r#type: String,
+        /// Of a publisher that is none of the bridges and sends several fields in the DataSetMessages of this value: the one
+        /// that is the value, by its place from 0 or by its name in the DataSetMetaData that the publisher announces. Left out:
+        /// the only field, or the one that is announced under the `name` of this variable.
+        ua_field: UaFieldEntry,
         /// Unit of the value in OPC UA, by its symbol as m/s, its UNECE code as MTS, or its name.
         unit: String,
         /// Lowest and highest value to be expected in OPC UA, as [0, 1.5].
@@ -407,6 +412,47 @@ impl JsonSchema for Request {
         schemars::json_schema!({ "type": "object" })
     }
 }
+
+/// A field of a DataSet, by its place or its name.
+#[derive(Clone, Debug)]
+pub(crate) struct UaFieldEntry(pub(crate) UaField);
+
+impl Read for UaFieldEntry {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+        let wanted = "the place of a field as 2, or its name as Temperature";
+        let text = reader.text(node, wanted)?;
+        if !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit()) {
+            return Some(Self(UaField::Place(u16::read(node, reader)?)));
+        }
+        if text.is_empty() || text.len() > MAX_FIELD_NAME {
+            let message = format!("expected {wanted}, found `{}`", short(text));
+            let note = reader.findings.error(Code::WrongValue, node.place, message);
+            note.help(format!("a name has 1 to {MAX_FIELD_NAME} bytes"));
+            return None;
+        }
+        Some(Self(UaField::Name(text.to_owned())))
+    }
+}
+
+impl JsonSchema for UaFieldEntry {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "UaFieldEntry".into()
+    }
+
+    fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        schemars::json_schema!({ "anyOf": [
+            { "type": "integer", "minimum": 0, "maximum": 65535 },
+            { "type": "string", "minLength": 1, "maxLength": MAX_FIELD_NAME }
+        ] })
+    }
+}
+
+/// Bytes of the longest name of a field that is kept of what writers announce.
+const MAX_FIELD_NAME: usize = 255;
 
 /// One path or a list of them.
 #[derive(Clone, Debug)]

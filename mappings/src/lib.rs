@@ -28,7 +28,7 @@ pub use difference::Difference;
 pub use environment::{Environment, LiveNode, LiveServer, LiveSpace, LiveTopic};
 pub use mapping::{
     Binding, Endpoint, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule,
-    SecurityPolicy, Server, ServiceBinding, ServiceRole, Space, Trigger, Variable,
+    SecurityPolicy, Server, ServiceBinding, ServiceRole, Space, Trigger, UaField, Variable,
 };
 pub use node_id::{Identifier, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};

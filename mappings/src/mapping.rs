@@ -443,6 +443,8 @@ pub struct Variable {
     pub value_type: Option<(BuiltinType, bool)>,
     /// One per DataSet field. Empty when nothing is known before a message or a type arrives.
     pub fields: Vec<Leaf>,
+    /// Which field of its DataSet is the value, where its writer is none of the bridges and sends several.
+    pub ua_field: Option<UaField>,
     /// At most one per space.
     pub bindings: Vec<Binding>,
     /// The service tied to it, in a space where no topic is.
@@ -453,6 +455,15 @@ pub struct Variable {
     pub publish: Publish,
     /// What its numbers mean.
     pub meaning: Meaning,
+}
+
+/// One field of a DataSet (OPC 10000-14, 6.2.3.2.3).
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum UaField {
+    /// By its place in the DataSetMessages, from 0.
+    Place(u16),
+    /// By its name in the DataSetMetaData that the writer announces.
+    Name(String),
 }
 
 /// What the numbers of a variable mean, as far as it is said.

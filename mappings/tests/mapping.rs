@@ -12,7 +12,7 @@ use std::time::Duration;
 
 use mappings::{
     Checked, Code, Mapping, Overflow, PubSub, PublisherIdRule, SecurityPolicy, ServiceRole,
-    SpaceId, TopicId, Trigger,
+    SpaceId, TopicId, Trigger, UaField,
 };
 use messages::{Conversion, Leaf, Literal, Part, Rank, Selected, Selection};
 use proptest::prelude::*;
@@ -766,4 +766,18 @@ fn a_binding_has_a_thousand_fields_at_most() {
     let told = |message: &str| vec![(Code::Fields, message.to_owned())];
     assert_eq!(with(1001), told("`fields` names 1001 fields"));
     assert_eq!(with(1000), told("`linear.x` is named twice"));
+}
+
+#[test]
+fn one_field_of_a_foreign_publisher_is_named_by_its_place_or_its_name() {
+    let field = |said: &str| {
+        let entry =
+            "{node: ns=2;i=10, name: A, origin: 0, type: Double, ros: {space: 2, topic: /a}";
+        let mapping = sound(&format!("{HEAD}  - {entry}{said}}}\n"));
+        mapping.variables()[0].ua_field.clone()
+    };
+    assert_eq!(field(""), None);
+    assert_eq!(field(", ua_field: 2"), Some(UaField::Place(2)));
+    let name = UaField::Name("Speed".to_owned());
+    assert_eq!(field(", ua_field: Speed"), Some(name));
 }

@@ -12,9 +12,9 @@ use super::services::Calls;
 use super::types::{self, Types, ValueType};
 use super::{Declared, meaning, required};
 use crate::code::Code;
-use crate::document::{PublishEntry, Queue, VariableEntry};
+use crate::document::{PublishEntry, Queue, UaFieldEntry, VariableEntry};
 use crate::findings::Findings;
-use crate::mapping::{Overflow, Publish, Space, Variable};
+use crate::mapping::{Binding, Overflow, Publish, ServiceBinding, Space, UaField, Variable};
 use crate::node_id::{Identifier, NodeIdText};
 use crate::read::{At, given, short};
 use crate::topic::{SpaceId, TopicId};
@@ -344,6 +344,12 @@ fn variable(
     let service = bound
         .service
         .map(|service| Box::new(service.settled(value_type, findings)));
+    let ua_field = ua_field(
+        draft,
+        &bound.bindings,
+        (service.as_deref(), fields.len()),
+        findings,
+    );
     let (node, _) = draft.node.clone()?;
     let topic = draft.topic()?;
     Some(Variable {
@@ -352,12 +358,47 @@ fn variable(
         name: name?,
         value_type,
         fields,
+        ua_field: ua_field?,
         bindings: bound.bindings,
         service,
         overflow,
         publish: publish?,
         meaning: meaning?,
     })
+}
+
+/// The field of a foreign publisher that is the value. `None` when it is faulty, which is noted.
+fn ua_field(
+    draft: &Draft<'_>,
+    bindings: &[Binding],
+    (service, fields): (Option<&ServiceBinding>, usize),
+    findings: &mut Findings,
+) -> Option<Option<UaField>> {
+    let Some(at) = &draft.entry.ua_field else {
+        return Some(None);
+    };
+    let UaFieldEntry(field) = at.value.as_ref()?;
+    let is_origin = |space: SpaceId| draft.origin == Some(space);
+    let produced = bindings.iter().any(|binding| is_origin(binding.space))
+        || service.is_some_and(|service| is_origin(service.space));
+    let fault = if fields > 1 {
+        Some((
+            format!("one field is named, and this variable has {fields}"),
+            "bind one `field` of the message, or leave `ua_field` out",
+        ))
+    } else if produced {
+        Some((
+            "the value comes from a bridge, which sends it alone".to_owned(),
+            "leave `ua_field` out; it is for publishers that are no bridges",
+        ))
+    } else {
+        None
+    };
+    if let Some((message, help)) = fault {
+        findings.error(Code::UaField, at.place, message).help(help);
+        return None;
+    }
+    Some(Some(field.clone()))
 }
 
 /// `None` when it is faulty, which is noted.
