@@ -41,6 +41,10 @@ pub enum Reason {
     TooManyTopics,
     /// More latched publishers of one topic than are kept for late joiners.
     TooManyPublishers,
+    /// A delta frame that cannot be put over a key frame of which nothing is missing.
+    NoKeyFrame,
+    /// A message that is read with the DataSetMetaData of its writer, which have not come.
+    Undescribed,
     /// No sample, but what a topic is announced to consist of: nothing that is believed, or nothing that can be announced.
     MetaData,
     /// The local side did not take it.
@@ -60,7 +64,7 @@ pub enum Reason {
 
 impl Reason {
     /// All of them, in the order of their counters.
-    pub const ALL: [Self; 25] = [
+    pub const ALL: [Self; 27] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -79,6 +83,8 @@ impl Reason {
         Self::NoRoom,
         Self::TooManyTopics,
         Self::TooManyPublishers,
+        Self::NoKeyFrame,
+        Self::Undescribed,
         Self::MetaData,
         Self::NotPublished,
         Self::NotSent,
@@ -110,6 +116,8 @@ impl Reason {
             Self::NoRoom => "no_room",
             Self::TooManyTopics => "too_many_topics",
             Self::TooManyPublishers => "too_many_publishers",
+            Self::NoKeyFrame => "no_key_frame",
+            Self::Undescribed => "undescribed",
             Self::MetaData => "metadata",
             Self::NotPublished => "not_published",
             Self::NotSent => "not_sent",
@@ -133,6 +141,8 @@ impl Reason {
                 | Self::TooBig
                 | Self::Incomplete
                 | Self::NoRoom
+                | Self::NoKeyFrame
+                | Self::Undescribed
                 | Self::NotPublished
         )
     }

@@ -21,6 +21,8 @@ use uadp::{
     SecurityHeader, StatusCode, Timestamp, Variant,
 };
 
+use crate::learned::Weight;
+
 /// What the DataSetMetaData of a writer of another space says of its topic.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Described {
@@ -97,9 +99,10 @@ impl Described {
             fields: fields.collect::<Result<_, _>>()?,
         }))
     }
+}
 
-    /// Roughly the bytes it takes up.
-    pub(crate) fn weight(&self) -> usize {
+impl Weight for Described {
+    fn weight(&self) -> usize {
         let names: usize = self.fields.iter().map(|field| field.path.len()).sum();
         names + self.fields.len() * size_of::<Leaf>() + MAX_NAME
     }
@@ -614,9 +617,9 @@ const AS_BYTES: &str = " as bytes";
 /// The one field of such a message.
 const MESSAGE: &str = "message";
 /// Bytes of a name that is believed.
-const MAX_NAME: usize = 255;
+pub(crate) const MAX_NAME: usize = 255;
 /// As many fields as a message may have.
-const MAX_FIELDS: usize = 4096;
+pub(crate) const MAX_FIELDS: usize = 4096;
 /// Of a higher index the list of namespaces would be long.
 const MAX_NAMESPACES: u16 = 64;
 /// Bytes of the largest announcement that is sent.

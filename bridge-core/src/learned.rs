@@ -6,20 +6,33 @@ use std::time::{Duration, Instant};
 
 use mappings::TopicId;
 
-use crate::description::Described;
-
 /// What is known of topics from their DataSetMetaData. Whoever sends to the group can announce, so what is kept is
 /// bounded in number and bytes, and forgotten when it is not announced again.
-#[derive(Debug, Default)]
-pub(crate) struct Learned {
-    known: HashMap<TopicId, Known>,
+#[derive(Debug)]
+pub(crate) struct Learned<T> {
+    known: HashMap<TopicId, Known<T>>,
     weight: usize,
 }
 
 #[derive(Debug)]
-struct Known {
-    described: Arc<Described>,
+struct Known<T> {
+    described: Arc<T>,
     until: Instant,
+}
+
+/// What takes up memory.
+pub(crate) trait Weight {
+    /// Roughly the bytes it takes up.
+    fn weight(&self) -> usize;
+}
+
+impl<T> Default for Learned<T> {
+    fn default() -> Self {
+        Self {
+            known: HashMap::new(),
+            weight: 0,
+        }
+    }
 }
 
 /// What is new about an announcement.
@@ -33,13 +46,13 @@ pub(crate) enum News {
     Full,
 }
 
-impl Learned {
+impl<T: Weight + PartialEq> Learned<T> {
     /// Takes note of what a topic is, for some time. Where there is no room, one that is read has precedence over all
     /// that are not.
     pub(crate) fn learn(
         &mut self,
         topic: TopicId,
-        described: Described,
+        described: T,
         (now, period): (Instant, Duration),
         is_read: impl Fn(TopicId) -> bool,
     ) -> News {
@@ -68,13 +81,13 @@ impl Learned {
     }
 
     /// What is known of a topic.
-    pub(crate) fn get(&self, topic: TopicId, now: Instant) -> Option<&Arc<Described>> {
+    pub(crate) fn get(&self, topic: TopicId, now: Instant) -> Option<&Arc<T>> {
         let known = self.known.get(&topic)?;
         (known.until > now).then_some(&known.described)
     }
 
     /// What was said of a topic last, be it long ago.
-    pub(crate) fn last(&self, topic: TopicId) -> Option<&Arc<Described>> {
+    pub(crate) fn last(&self, topic: TopicId) -> Option<&Arc<T>> {
         self.known.get(&topic).map(|known| &known.described)
     }
 
@@ -88,7 +101,7 @@ impl Learned {
         self.known.len() < MAX_TOPICS && self.weight.saturating_add(weight) <= MAX_WEIGHT
     }
 
-    fn retain(&mut self, is_kept: impl Fn(TopicId, &Known) -> bool) {
+    fn retain(&mut self, is_kept: impl Fn(TopicId, &Known<T>) -> bool) {
         let weight = &mut self.weight;
         self.known.retain(|topic, known| {
             let keep = is_kept(*topic, known);
@@ -111,6 +124,8 @@ const LEAST: Duration = Duration::from_secs(300);
 
 #[cfg(test)]
 mod tests {
+    use crate::description::Described;
+
     use super::*;
 
     fn described(name: &str) -> Described {

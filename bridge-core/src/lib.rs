@@ -9,11 +9,13 @@
 //! The checks run in the order header, loop, route, payload, so that looped and unmapped traffic costs a header read
 //! and no allocation.
 
+mod base;
 mod counters;
 mod description;
 mod fields;
 mod gate;
 mod hops;
+mod layout;
 mod learned;
 mod loop_rule;
 mod network;

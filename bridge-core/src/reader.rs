@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 
 use uadp::{BuiltinType, Timestamp};
 
+use crate::base::Base;
 use crate::counters::Reason;
 use crate::output::Kept;
 use crate::writer::MAX_KEPT;
@@ -35,6 +36,14 @@ pub(crate) struct Reader {
     several: Option<Instant>,
     /// A sample that waits for its local type.
     pub(crate) held: Option<Box<Held>>,
+    /// The state that delta frames change.
+    pub(crate) base: Option<Box<Base>>,
+    /// Whether the writer has sent a delta frame.
+    pub(crate) deltas: bool,
+    /// Whether the local side lacks the value: it was not handed on, or not taken.
+    pub(crate) owed: bool,
+    /// When the writer was last asked what the fields of its messages are.
+    pub(crate) asked_layout: Option<Instant>,
     /// When the port was last asked for the local type.
     pub(crate) asked: Option<Instant>,
     /// Builtin type of each field, and whether it is an array, of a sample of the present version.
@@ -95,6 +104,10 @@ impl Reader {
             known: VecDeque::new(),
             several: None,
             held: None,
+            base: None,
+            deltas: false,
+            owed: true,
+            asked_layout: None,
             asked: None,
             shape: None,
             major_version: None,
@@ -262,6 +275,7 @@ impl Reader {
         kept: Kept,
         now: Instant,
     ) -> Option<Timestamp> {
+        self.owed = false;
         let Some(stamp) = instance else {
             self.known.clear();
             return None;
@@ -330,11 +344,13 @@ impl Reader {
 
     /// Forgets that a sample was handed on: it was not after all, and its repetition is welcome.
     pub(crate) fn forget(&mut self, instance: Option<Timestamp>) {
+        self.owed = true;
         self.known.retain(|known| Some(known.stamp) != instance);
     }
 
     /// Forgets what was handed on: the local type changed, and the next repetition is wanted.
     pub(crate) fn forget_all(&mut self) {
+        self.owed = true;
         self.known.clear();
         self.several = None;
     }

@@ -2,6 +2,7 @@
 
 mod batch;
 mod chunks;
+mod content;
 mod discovery;
 mod receive;
 mod reload;
@@ -32,6 +33,7 @@ use crate::topic::{Item, Role, Topic};
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Idle, MAX_KEPT, Message, Writer};
 use chunks::Chunks;
+pub(crate) use content::Takes;
 use discovery::Discovery;
 use receive::Sample;
 
@@ -54,6 +56,8 @@ pub struct Router {
     /// What is told besides samples. Bounded by the topics and by [`is_told`].
     told: VecDeque<Output>,
     timers: BinaryHeap<Reverse<(Instant, TopicId)>>,
+    /// Bytes of the key frames kept for delta frames.
+    base_bytes: usize,
     /// Buffers given back by [`recycle`](Self::recycle).
     spare: Vec<Vec<u8>>,
     /// Datagrams and messages that belong to no topic.
@@ -77,6 +81,7 @@ impl Router {
             discovery: None,
             told: VecDeque::new(),
             timers: BinaryHeap::new(),
+            base_bytes: 0,
             spare: Vec::new(),
             others: Counters::default(),
             hops: Hops::new(),
@@ -444,6 +449,7 @@ impl Router {
                         silent: true,
                         dropped: reader.loss(),
                     });
+                    self.forget_base(topic);
                 }
             }
             Role::Ours(writer) => {
@@ -545,6 +551,7 @@ impl Router {
                 Role::Theirs(Box::new(Reader::new(from, now.monotonic)))
             };
             let mut entry = Topic::new(role, overflow);
+            entry.takes = Takes::of(self.mapping.variable(topic));
             entry.gate = match self.mapping.variable(topic) {
                 Some(variable) if topic.space == self.settings.own => Gate::new(variable.publish),
                 Some(_) | None => None,

@@ -12,6 +12,7 @@ use crate::gate::Gate;
 use crate::output::Delivery;
 use crate::queue::Queue;
 use crate::reader::Reader;
+use crate::router::Takes;
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Message, Writer};
 
@@ -30,6 +31,8 @@ pub(crate) struct Topic {
     /// A large message of which chunks are still to be sent, before anything of the queue.
     pub(crate) sending: Option<Sending>,
     pub(crate) overflow: Overflow,
+    /// What of the fields of messages of another space is taken.
+    pub(crate) takes: Takes,
     /// What holds samples of our own space back.
     pub(crate) gate: Option<Box<Gate>>,
     /// What is announced of it, if it is of our own space and its type is known.
@@ -88,6 +91,7 @@ impl Topic {
             queue: Queue::new(overflow),
             sending: None,
             overflow,
+            takes: Takes::default(),
             gate: None,
             description: None,
             announce_at: None,

@@ -8,8 +8,8 @@ use std::time::{Duration, Instant};
 use mappings::{SpaceId, TopicId};
 use messages::{MessageType, Selection};
 use uadp::discovery::{
-    AnnounceLimits, Announced, Announcement, Announcer, Included, List, Probe, ProbeLimits,
-    ProbeStep, ProbeTimer, Subject,
+    AnnounceLimits, Announced, Announcement, Announcer, DataSetMetaDataType, Included, List, Probe,
+    ProbeLimits, ProbeStep, ProbeTimer, Subject,
 };
 use uadp::{NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader};
 
@@ -17,6 +17,7 @@ use super::receive::DISCOVERY;
 use super::{About, Router};
 use crate::counters::Reason;
 use crate::description::{Described, Description, Source, mapped_leaves};
+use crate::layout::Layout;
 use crate::learned::{Learned, News};
 use crate::loop_rule::{Side, may_cross};
 use crate::network::announcement_chunks;
@@ -34,7 +35,9 @@ pub(super) struct Discovery {
     writers: BTreeMap<u16, Vec<TopicId>>,
     /// Publishers that are asked.
     probing: BTreeMap<SpaceId, Probing>,
-    learned: Learned,
+    learned: Learned<Described>,
+    /// What the fields are, as announced, for messages that do not say it.
+    layouts: Learned<Layout>,
     /// When there is something to do: looked up at every turn, and computed when something changes.
     due: Option<Instant>,
 }
@@ -59,8 +62,14 @@ impl Discovery {
             writers: BTreeMap::new(),
             probing: BTreeMap::new(),
             learned: Learned::default(),
+            layouts: Learned::default(),
             due: None,
         }
+    }
+
+    /// What the fields of a topic were last said to be.
+    pub(super) fn layout(&self, topic: TopicId) -> Option<&Arc<Layout>> {
+        self.layouts.last(topic)
     }
 
     fn since_start(&self, now: Now) -> Duration {
@@ -283,7 +292,7 @@ impl Router {
             sequence_number,
             announced: Announced::DataSetMetaData {
                 writer_id,
-                meta_data: uadp::discovery::DataSetMetaDataType::default(),
+                meta_data: DataSetMetaDataType::default(),
                 status: BAD_NOT_FOUND,
             },
         };
@@ -313,9 +322,28 @@ impl Router {
 
     /// Plans to ask what a topic of another space consists of.
     pub(super) fn ask(&mut self, topic: TopicId, now: Now) {
-        if !self.is_learned(topic) {
-            return;
+        if self.is_learned(topic) {
+            self.plan_probe(topic, now);
         }
+    }
+
+    /// Plans to ask what the fields of a topic are, whose messages cannot be read without; not for each of them.
+    pub(super) fn ask_layout(&mut self, topic: TopicId, now: Now) {
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        let before = reader.asked_layout;
+        if before.is_none_or(|asked| now.monotonic >= asked + ASK_LAYOUT_AGAIN) {
+            reader.asked_layout = Some(now.monotonic);
+            self.plan_probe(topic, now);
+        }
+    }
+
+    fn plan_probe(&mut self, topic: TopicId, now: Now) {
         let random = u32::try_from(now.utc.unix_nanos() & 0xFFFF_FFFF).unwrap_or_default();
         let discovery = self.discovery(now);
         let since = discovery.since_start(now);
@@ -418,9 +446,6 @@ impl Router {
             self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return;
         };
-        if !self.is_learned(topic) {
-            return;
-        }
         let about = About {
             topic: Some(topic),
             from: Some(from),
@@ -440,6 +465,14 @@ impl Router {
                 return;
             }
             shape = reader.shape.clone();
+        }
+        let fault = self.learn_layout(topic, meta_data, from, now).err();
+        if !self.is_learned(topic) {
+            self.discovery(now).answered(space, |other| other == topic);
+            if let Some(why) = fault {
+                self.count(about, Reason::MetaData, 1, || why);
+            }
+            return;
         }
         let described = match Described::read(meta_data) {
             Ok(described) => described,
@@ -471,6 +504,28 @@ impl Router {
                     self.tell_unbound(topic, shape, now);
                 }
             }
+        }
+    }
+
+    /// Keeps what the fields of a topic are said to be.
+    fn learn_layout(
+        &mut self,
+        topic: TopicId,
+        meta_data: &DataSetMetaDataType<'_>,
+        from: SocketAddr,
+        now: Now,
+    ) -> Result<(), String> {
+        let layout = Layout::read(meta_data, from)?;
+        let until = (now.monotonic, self.mapping.pubsub().metadata_period);
+        let own = self.settings.own;
+        let discovery = self
+            .discovery
+            .get_or_insert_with(|| Box::new(Discovery::new(own, now.monotonic)));
+        let topics = &self.topics;
+        let is_read = |topic: TopicId| topics.contains_key(&topic);
+        match discovery.layouts.learn(topic, layout, until, is_read) {
+            News::Full => Err("there is no room for what the fields of more topics are".to_owned()),
+            News::Same | News::Other => Ok(()),
         }
     }
 
@@ -569,5 +624,7 @@ impl Router {
 const STATUS_BAD: u32 = 0x8000_0000;
 /// Bad_NotFound (OPC 10000-6, A.2).
 const BAD_NOT_FOUND: uadp::StatusCode = uadp::StatusCode(0x803E_0000);
+/// How long a writer that has not said what the fields of its messages are is left alone.
+const ASK_LAYOUT_AGAIN: Duration = Duration::from_secs(10);
 /// Topics of one Publisher that are asked for at a time: those fit any datagram.
 const MAX_ASKED: usize = 200;

@@ -9,6 +9,7 @@ use uadp::{
     NetworkMessageType, PublisherId, Timestamp,
 };
 
+use super::content::Quality;
 use super::{About, MAX_TOPICS, Router};
 use crate::counters::Reason;
 use crate::fields;
@@ -133,7 +134,9 @@ impl Router {
             );
             return;
         }
-        let place = place(&message.header(), from);
+        let mut place = place(&message.header(), from);
+        // Only key frames are repeated.
+        place.fine &= message.kind == MessageKind::KeyFrame;
         let Some(Topic {
             role: Role::Theirs(reader),
             counters,
@@ -150,11 +153,11 @@ impl Router {
         let changed = message.kind != MessageKind::KeepAlive
             && reader.is_changed(message.header().major_version);
         let admitted = match message.kind {
-            MessageKind::KeyFrame => Some(reader.admit(place, now.monotonic)),
             // It says that the writer lives, and that is all.
             MessageKind::KeepAlive => None,
-            // Not carried, and told so below.
-            MessageKind::DeltaFrame | MessageKind::Event => Some(Ok((0, Kept::Alone))),
+            MessageKind::KeyFrame | MessageKind::DeltaFrame | MessageKind::Event => {
+                Some(reader.admit(place, now.monotonic))
+            }
         };
         if let Some(Ok((missing, _))) = admitted {
             counters.missing += u64::from(missing);
@@ -173,31 +176,69 @@ impl Router {
         self.retire(topic, now);
         match admitted {
             None => {}
-            Some(Err(reason)) => self.count(
-                About {
+            Some(Err(reason)) => {
+                if reason == Reason::Repeat {
+                    self.follow_again(topic, message, &place);
+                }
+                let about = About {
                     topic: Some(topic),
                     from: Some(from),
-                },
-                reason,
-                1,
-                String::new,
-            ),
-            Some(Ok((_, kept))) => match fields_of(message) {
-                Ok(fields) => {
-                    self.record_way(place.stamp, sent, now);
-                    let sample = Sample {
-                        fields,
-                        source: place.stamp,
-                        instance: place.instance(),
-                        kept,
-                        status: message.header().status.unwrap_or_default(),
-                        arrived: now.utc,
-                    };
-                    self.route(topic, &sample, now);
-                }
-                Err(error) => self.drop_undecoded(Some(topic), from, &error),
-            },
+                };
+                self.count(about, reason, 1, String::new);
+            }
+            Some(Ok((_, kept))) => self.take_in(topic, message, (&place, kept, sent), now),
         }
+    }
+
+    /// A message that is due in its sequence: on with its fields.
+    fn take_in(
+        &mut self,
+        topic: TopicId,
+        message: &DataSetMessage<'_>,
+        (place, kept, sent): (&Place, Kept, Option<Timestamp>),
+        now: Now,
+    ) {
+        let status = message.header().status.unwrap_or_default();
+        let sample = |fields, quality: Quality| Sample {
+            fields,
+            source: quality.source.or(place.stamp),
+            instance: place.instance(),
+            kept,
+            status: quality.status(status),
+            arrived: now.utc,
+        };
+        let takes = self.follow(topic, message, place);
+        match Self::plain(message, takes) {
+            Some(Ok(fields)) => {
+                self.record_way(place.stamp, sent, now);
+                self.route(topic, &sample(fields, Quality::default()), now);
+                return;
+            }
+            Some(Err(error)) => {
+                self.drop_undecoded(Some(topic), place.from, &error);
+                return;
+            }
+            None => {}
+        }
+        let mut content = self.buffer();
+        match self.content(topic, message, place, &mut content) {
+            Ok(Some(quality)) => {
+                let message = DataSetMessage::decode(None, &content);
+                match message.and_then(|message| message.fields()) {
+                    Ok(fields) => {
+                        self.record_way(place.stamp, sent, now);
+                        self.route(topic, &sample(fields, quality), now);
+                    }
+                    Err(error) => self.drop_undecoded(Some(topic), place.from, &error),
+                }
+            }
+            Ok(None) => {
+                self.lives(topic, now);
+                self.count(About::topic(topic), Reason::Repeat, 1, String::new);
+            }
+            Err(refusal) => self.refuse_content(topic, place.from, refusal, now),
+        }
+        self.recycle(content);
     }
 
     /// The topic has a good value.
@@ -207,6 +248,18 @@ impl Router {
             ..
         }) = self.topics.get_mut(&topic)
             && reader.is_good(now.monotonic)
+        {
+            self.tell_returned(topic);
+        }
+    }
+
+    /// The writer of a topic has nothing new to say.
+    fn lives(&mut self, topic: TopicId, now: Now) {
+        if let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+            && reader.lives(now.monotonic)
         {
             self.tell_returned(topic);
         }
@@ -377,7 +430,7 @@ impl Router {
     }
 }
 
-/// A key frame's content on its way to the local side.
+/// A message's content on its way to the local side.
 pub(super) struct Sample<'a> {
     pub(super) fields: Fields<'a>,
     pub(super) source: Option<Timestamp>,
@@ -415,16 +468,6 @@ fn place(header: &DataSetHeader, from: SocketAddr) -> Place {
         }),
         fine: header.picoseconds.is_some(),
         from,
-    }
-}
-
-/// The fields of a key frame. An event has Variants too, but no place in the sequence of a value's states.
-fn fields_of<'a>(message: &DataSetMessage<'a>) -> Result<Fields<'a>, DecodeError> {
-    match message.kind {
-        MessageKind::Event => Err(DecodeError::Misread("an event")),
-        MessageKind::KeyFrame | MessageKind::DeltaFrame | MessageKind::KeepAlive => {
-            message.fields()
-        }
     }
 }
 

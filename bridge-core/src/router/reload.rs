@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use mappings::{Mapping, Overflow, PubSub, TopicId};
 
-use super::{About, Router};
+use super::{About, Router, Takes};
 use crate::counters::Reason;
 use crate::gate::Gate;
 use crate::queue::Queue;
@@ -44,6 +44,9 @@ impl Router {
                 self.regate(topic, now);
             }
             let (was, is) = (before.variable(topic), self.mapping.variable(topic));
+            if let Some(entry) = self.topics.get_mut(&topic) {
+                entry.takes = Takes::of(is);
+            }
             let meant = was.map(|v| &v.meaning) != is.map(|v| &v.meaning);
             // Only there does the mapping alone say what the values are.
             let typed = self.settings.local == Local::Fields && was != is;

@@ -1,0 +1,130 @@
+//! What the fields of a writer's DataSet are: names, and what RawData is read with (OPC 10000-14, 7.2.4.5.11).
+
+use std::net::{Ipv4Addr, SocketAddr};
+
+use mappings::Variable;
+use messages::Rank;
+use uadp::discovery::{DataSetMetaDataType, VersionMatch};
+use uadp::{BuiltinType, ConfigurationVersion, DataSetHeader, RawField};
+
+use crate::description::{MAX_FIELDS, MAX_NAME};
+use crate::learned::Weight;
+
+/// The fields of a DataSet, as its writer announced them, or as the mapping has them.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Layout {
+    from: SocketAddr,
+    version: ConfigurationVersion,
+    fields: Vec<Field>,
+}
+
+#[derive(Debug, PartialEq, Eq)]
+struct Field {
+    name: String,
+    builtin: BuiltinType,
+    value_rank: i32,
+    array_dimensions: Vec<u32>,
+    max_string_length: u32,
+}
+
+impl Layout {
+    /// What the sender at that address announced.
+    ///
+    /// # Errors
+    /// In words, what makes it useless.
+    pub(crate) fn read(
+        meta_data: &DataSetMetaDataType<'_>,
+        from: SocketAddr,
+    ) -> Result<Self, String> {
+        if meta_data.fields.len() > MAX_FIELDS {
+            return Err(format!("more than {MAX_FIELDS} fields"));
+        }
+        let fields = meta_data.fields.iter().map(|field| {
+            let name = field.name.unwrap_or_default();
+            if name.len() > MAX_NAME {
+                return Err("the name of a field is too long".to_owned());
+            }
+            let Some(builtin) = field.builtin_type() else {
+                return Err(format!("{} is no builtin type", field.built_in_type));
+            };
+            if field.array_dimensions.len() > MAX_DIMENSIONS {
+                return Err(format!("a field of more than {MAX_DIMENSIONS} dimensions"));
+            }
+            Ok(Field {
+                name: name.to_owned(),
+                builtin,
+                value_rank: field.value_rank,
+                array_dimensions: field.array_dimensions.iter().collect(),
+                max_string_length: field.max_string_length,
+            })
+        });
+        Ok(Self {
+            from,
+            version: meta_data.configuration_version,
+            fields: fields.collect::<Result<_, _>>()?,
+        })
+    }
+
+    /// The fields of a mapped value: what has no length in ROS has none here.
+    pub(crate) fn mapped(variable: &Variable) -> Self {
+        let fields = variable.fields.iter().map(|leaf| {
+            let (value_rank, array_dimensions) = match leaf.rank {
+                Rank::Scalar => (-1, Vec::new()),
+                Rank::Array { fixed } => (1, fixed.into_iter().collect()),
+            };
+            let declared = variable.value_type.map(|(builtin, _)| builtin);
+            Field {
+                name: leaf.path.clone(),
+                builtin: declared.unwrap_or(leaf.builtin),
+                value_rank,
+                array_dimensions,
+                max_string_length: 0,
+            }
+        });
+        Self {
+            from: (Ipv4Addr::UNSPECIFIED, 0).into(),
+            version: ConfigurationVersion::default(),
+            fields: fields.collect(),
+        }
+    }
+
+    /// Whether the sender at that address announced it.
+    pub(crate) fn is_of(&self, from: SocketAddr) -> bool {
+        self.from == from
+    }
+
+    /// Whether messages with this header have these fields, as far as they say.
+    pub(crate) fn is_current(&self, header: &DataSetHeader) -> bool {
+        self.version.compare(header) != VersionMatch::Major
+    }
+
+    /// The place of the field of a name.
+    pub(crate) fn place_of(&self, name: &str) -> Option<u16> {
+        let at = self.fields.iter().position(|field| field.name == name)?;
+        u16::try_from(at).ok()
+    }
+
+    /// What RawData is read with. Structures are left out: what they are made of is not kept.
+    pub(crate) fn raw_fields(&self) -> Vec<RawField<'_>> {
+        let fields = self.fields.iter().map(|field| RawField {
+            value_rank: field.value_rank,
+            array_dimensions: &field.array_dimensions,
+            max_string_length: field.max_string_length,
+            ..RawField::new(field.builtin)
+        });
+        fields.collect()
+    }
+}
+
+impl Weight for Layout {
+    fn weight(&self) -> usize {
+        let inner = self
+            .fields
+            .iter()
+            .map(|field| field.name.len() + size_of_val(&*field.array_dimensions));
+        inner.sum::<usize>() + self.fields.len() * size_of::<Field>() + size_of::<Self>()
+    }
+}
+
+/// OPC UA sets no limit; nobody has more.
+const MAX_DIMENSIONS: usize = 16;

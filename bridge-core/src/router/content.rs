@@ -1,0 +1,508 @@
+//! Messages whose fields are not taken as they stand: DataValues, RawData, delta frames, and one field of several.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use mappings::{TopicId, UaField, Variable};
+use uadp::{
+    Array, DataSetHeader, DataSetMessage, DataValue, EncodeError, FieldEncoder, FieldEncoding,
+    Fields, MessageKind, NetworkHeader, NetworkMessageEncoder, RawDialect, RawLayout, RawValue,
+    Scalar, StatusCode, Timestamp, Variant,
+};
+
+use super::{About, Router};
+use crate::base::Base;
+use crate::counters::Reason;
+use crate::layout::Layout;
+use crate::reader::Place;
+use crate::settings::Now;
+use crate::topic::{Role, Topic};
+
+/// What of the fields of foreign messages a topic takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(crate) enum Takes {
+    /// All of them.
+    #[default]
+    All,
+    /// One, and the mapping does not say which.
+    One,
+    /// The one the mapping names.
+    Named,
+}
+
+impl Takes {
+    pub(crate) fn of(variable: Option<&Variable>) -> Self {
+        match variable {
+            Some(variable) if variable.ua_field.is_some() => Self::Named,
+            Some(variable) if variable.value_type.is_some() => Self::One,
+            Some(_) | None => Self::All,
+        }
+    }
+}
+
+/// What of the fields of a message is taken.
+enum Choice {
+    All,
+    /// The only one, or the one at that place.
+    One(Option<u16>),
+    Place(u16),
+}
+
+impl Choice {
+    /// The place of the one that is taken of so many.
+    fn place(&self, count: usize) -> Result<Option<usize>, Refusal> {
+        let place = match *self {
+            Self::All => return Ok(None),
+            Self::One(_) if count == 1 => 0,
+            Self::One(Some(place)) | Self::Place(place) => usize::from(place),
+            Self::One(None) => {
+                let detail = format!(
+                    "{count} fields where the mapping has one value: `ua_field` says which of them it is"
+                );
+                return Err((Reason::Mismatch, detail));
+            }
+        };
+        if place < count {
+            return Ok(Some(place));
+        }
+        let detail = format!("field {place} is wanted of a message that has {count}, from 0 on");
+        Err((Reason::Mismatch, detail))
+    }
+}
+
+/// Why a message is not taken, and in words.
+type Refusal = (Reason, String);
+
+/// What a DataValue that is the value says of it.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Quality {
+    pub(super) status: Option<StatusCode>,
+    pub(super) source: Option<Timestamp>,
+}
+
+impl Quality {
+    fn of(value: &DataValue<'_>) -> Self {
+        Self {
+            status: value.status,
+            source: value.source_timestamp.map(|time| Timestamp {
+                time,
+                picoseconds: value.source_picoseconds.unwrap_or_default(),
+            }),
+        }
+    }
+
+    /// The status of the sample: that of the message, or that of its value if that is worse. The upper half of a StatusCode,
+    /// whose two highest bits are the severity (OPC 10000-4, 7.39.1).
+    pub(super) fn status(self, message: u16) -> u16 {
+        let status = self.status.unwrap_or(StatusCode::GOOD);
+        let value = u16::try_from(status.0 >> 16).unwrap_or(u16::MAX);
+        match value >> 14 > message >> 14 {
+            true => value,
+            false => message,
+        }
+    }
+}
+
+impl Router {
+    /// Keeps a key frame for delta frames to come, and says what of its fields is taken.
+    pub(super) fn follow(
+        &mut self,
+        topic: TopicId,
+        message: &DataSetMessage<'_>,
+        place: &Place,
+    ) -> Takes {
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            takes,
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return Takes::All;
+        };
+        if message.kind != MessageKind::KeyFrame || message.encoding() == FieldEncoding::RawData {
+            return *takes;
+        }
+        let before = reader.base.as_ref().map_or(0, |base| base.weight());
+        let others = self.base_bytes.saturating_sub(before);
+        let payload = message.payload().len();
+        if payload == 0 {
+            // A heartbeat.
+        } else if payload > MAX_BASE || others + payload >= MAX_BASES {
+            reader.base = None;
+            self.base_bytes = others;
+        } else {
+            let base = match reader.base.take() {
+                Some(mut base) => {
+                    base.renew(message, place);
+                    base
+                }
+                None => Box::new(Base::new(message, place)),
+            };
+            self.base_bytes = others + base.weight();
+            reader.base = Some(base);
+        }
+        *takes
+    }
+
+    /// The fields of a message, where they are taken as they stand.
+    pub(super) fn plain<'a>(
+        message: &DataSetMessage<'a>,
+        takes: Takes,
+    ) -> Option<Result<Fields<'a>, uadp::DecodeError>> {
+        let has_fields = matches!(message.kind, MessageKind::KeyFrame | MessageKind::Event);
+        if !has_fields
+            || message.encoding() != FieldEncoding::Variant
+            || message.payload().is_empty()
+        {
+            return None;
+        }
+        let fields = message.fields();
+        let is_taken = match (takes, &fields) {
+            (Takes::All, _) | (_, Err(_)) => true,
+            (Takes::One, Ok(fields)) => fields.len() == 1,
+            (Takes::Named, Ok(_)) => false,
+        };
+        is_taken.then_some(fields)
+    }
+
+    /// Writes what is taken of a message, a key frame of Variants that stands alone, into an empty buffer. `None` where it
+    /// says nothing new.
+    pub(super) fn content(
+        &mut self,
+        topic: TopicId,
+        message: &DataSetMessage<'_>,
+        place: &Place,
+        out: &mut Vec<u8>,
+    ) -> Result<Option<Quality>, Refusal> {
+        if message.kind == MessageKind::KeyFrame && message.payload().is_empty() {
+            return Ok(None);
+        }
+        let choice = self.choice(topic, &message.header(), place.from)?;
+        match (message.kind, message.encoding()) {
+            (MessageKind::KeyFrame, FieldEncoding::RawData) => self
+                .raw(topic, (message, place.from), &choice, out)
+                .map(Some),
+            (_, FieldEncoding::RawData) => {
+                let detail = "RawData in a delta frame or an event".to_owned();
+                Err((Reason::Unsupported, detail))
+            }
+            (MessageKind::DeltaFrame, _) => self.delta(topic, (message, place), &choice, out),
+            (MessageKind::KeyFrame | MessageKind::Event | MessageKind::KeepAlive, _) => {
+                flatten(message, &choice, out).map(Some)
+            }
+        }
+    }
+
+    /// What of the fields of a message with this header is taken.
+    fn choice(
+        &self,
+        topic: TopicId,
+        header: &DataSetHeader,
+        from: SocketAddr,
+    ) -> Result<Choice, Refusal> {
+        let variable = self.mapping.variable(topic);
+        let Some(variable) = variable else {
+            return Ok(Choice::All);
+        };
+        let announced = || {
+            let layout = self.announced(topic, from);
+            layout.filter(|layout| layout.is_current(header))
+        };
+        match (Takes::of(Some(variable)), &variable.ua_field) {
+            (_, Some(UaField::Place(place))) => Ok(Choice::Place(*place)),
+            (_, Some(UaField::Name(name))) => {
+                let Some(layout) = announced() else {
+                    let detail = format!(
+                        "`ua_field: {name}` takes the DataSetMetaData of its writer, which have not come"
+                    );
+                    return Err((Reason::Undescribed, detail));
+                };
+                let place = layout.place_of(name).map(Choice::Place);
+                place.ok_or_else(|| {
+                    let detail = format!("its writer announces no field `{name}`");
+                    (Reason::Mismatch, detail)
+                })
+            }
+            (Takes::One, None) => {
+                let named = announced().and_then(|layout| layout.place_of(&variable.name));
+                Ok(Choice::One(named))
+            }
+            (Takes::All | Takes::Named, None) => Ok(Choice::All),
+        }
+    }
+
+    /// What the sender at that address announced of a topic.
+    fn announced(&self, topic: TopicId, from: SocketAddr) -> Option<&Arc<Layout>> {
+        let layout = self.discovery.as_ref()?.layout(topic)?;
+        Some(layout).filter(|layout| layout.is_of(from))
+    }
+
+    /// RawData, by what its writer announced, else by what the mapping says the fields are.
+    fn raw(
+        &self,
+        topic: TopicId,
+        (message, from): (&DataSetMessage<'_>, SocketAddr),
+        choice: &Choice,
+        out: &mut Vec<u8>,
+    ) -> Result<Quality, Refusal> {
+        let undescribed = |why: &str| Err((Reason::Undescribed, why.to_owned()));
+        let layout = match self.announced(topic, from) {
+            Some(layout) if layout.is_current(&message.header()) => Some(layout),
+            Some(_) => return undescribed("RawData of another version than its DataSetMetaData"),
+            None => None,
+        };
+        if let Some(layout) = layout {
+            return raw(message.payload(), layout, choice, out);
+        }
+        let Some(variable) = self
+            .mapping
+            .variable(topic)
+            .filter(|variable| variable.ua_field.is_none() && !variable.fields.is_empty())
+        else {
+            return undescribed("RawData whose DataSetMetaData have not come");
+        };
+        let layout = Layout::mapped(variable);
+        fits(message.payload(), &layout)?;
+        raw(message.payload(), &layout, choice, out)
+    }
+
+    /// A delta frame, put over the last key frame.
+    fn delta(
+        &mut self,
+        topic: TopicId,
+        delta: (&DataSetMessage<'_>, &Place),
+        choice: &Choice,
+        out: &mut Vec<u8>,
+    ) -> Result<Option<Quality>, Refusal> {
+        let mut merged = self.buffer();
+        let taken = self.merge(topic, delta, (choice, &mut merged), out);
+        self.recycle(merged);
+        taken
+    }
+
+    fn merge(
+        &mut self,
+        topic: TopicId,
+        (message, place): (&DataSetMessage<'_>, &Place),
+        (choice, merged): (&Choice, &mut Vec<u8>),
+        out: &mut Vec<u8>,
+    ) -> Result<Option<Quality>, Refusal> {
+        let no_key_frame = |why: &str| Err((Reason::NoKeyFrame, why.to_owned()));
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return Ok(None);
+        };
+        reader.deltas = true;
+        let owed = reader.owed;
+        let base = reader.base.as_mut();
+        let Some(base) = base.filter(|base| base.is_of(message, place.from)) else {
+            return no_key_frame("a delta frame, and the key frame it changes is not there");
+        };
+        let others = self.base_bytes.saturating_sub(base.weight());
+        let done = base.merge(message, place, merged);
+        self.base_bytes = others + base.weight();
+        let one = done
+            .as_ref()
+            .map_or(Ok(None), |done| choice.place(done.count));
+        let is_sure = one.as_ref().is_ok_and(|one| base.is_sure(*one));
+        if base.weight() > 2 * MAX_BASE || self.base_bytes > MAX_BASES {
+            reader.base = None;
+            self.base_bytes = others;
+        }
+        let (done, one) = (done?, one?);
+        if !is_sure {
+            return no_key_frame(
+                "a delta frame behind a lost message, which may have changed what this one leaves out",
+            );
+        }
+        let is_said = match one {
+            Some(one) => done.said.iter().any(|index| usize::from(*index) == one),
+            None => !done.said.is_empty(),
+        };
+        if !is_said && !owed {
+            return Ok(None);
+        }
+        let whole = DataSetMessage::decode(None, merged)
+            .map_err(|error| (Reason::Malformed, error.to_string()))?;
+        flatten(&whole, choice, out).map(Some)
+    }
+
+    /// Forgets the key frame of a silent writer that has never sent a delta frame.
+    pub(super) fn forget_base(&mut self, topic: TopicId) {
+        if let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+            && !reader.deltas
+            && let Some(base) = reader.base.take()
+        {
+            self.base_bytes = self.base_bytes.saturating_sub(base.weight());
+        }
+    }
+
+    /// A key frame came that the local side has: delta frames may follow it all the same.
+    pub(super) fn follow_again(
+        &mut self,
+        topic: TopicId,
+        message: &DataSetMessage<'_>,
+        place: &Place,
+    ) {
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
+        if reader.deltas {
+            self.follow(topic, message, place);
+        } else if let Some(base) = &mut reader.base {
+            base.repeated(place);
+        }
+    }
+
+    /// Counts a message whose content is not taken, and asks its writer what it is where that is what lacks.
+    pub(super) fn refuse_content(
+        &mut self,
+        topic: TopicId,
+        from: SocketAddr,
+        (reason, detail): Refusal,
+        now: Now,
+    ) {
+        if reason == Reason::Undescribed {
+            self.ask_layout(topic, now);
+        }
+        let about = About {
+            topic: Some(topic),
+            from: Some(from),
+        };
+        self.count(about, reason, 1, || detail);
+    }
+}
+
+/// Whether a payload is exactly what the layout of a mapping says. Nobody announced that layout, and a message of more fields
+/// could pass for a padded one.
+fn fits(payload: &[u8], layout: &Layout) -> Result<(), Refusal> {
+    let fields = layout.raw_fields();
+    let layout = raw_layout(&fields)?;
+    let values: Result<Vec<_>, _> = layout.read(payload, RawDialect::Standard).collect();
+    let mut again = Vec::new();
+    let same = values.is_ok_and(|values| {
+        let written = layout.write(&mut again, RawDialect::Standard, values);
+        written.is_ok() && again.len() == payload.len()
+    });
+    if same {
+        return Ok(());
+    }
+    let detail = format!(
+        "RawData of {} bytes, which are not the fields of the mapping, and no DataSetMetaData of its writer",
+        payload.len()
+    );
+    Err((Reason::Mismatch, detail))
+}
+
+fn raw_layout<'a>(fields: &'a [uadp::RawField<'a>]) -> Result<RawLayout<'a>, Refusal> {
+    RawLayout::new(fields).map_err(|error| (Reason::Unsupported, format!("RawData: {error}")))
+}
+
+fn raw(
+    payload: &[u8],
+    layout: &Layout,
+    choice: &Choice,
+    out: &mut Vec<u8>,
+) -> Result<Quality, Refusal> {
+    let fields = layout.raw_fields();
+    let layout = raw_layout(&fields)?;
+    let values = layout.read(payload, RawDialect::Standard);
+    let values: Vec<RawValue<'_>> = values
+        .collect::<Result<_, _>>()
+        .map_err(|error| (Reason::Malformed, format!("RawData: {error}")))?;
+    let one = choice.place(values.len())?;
+    write(out, |frame| {
+        for value in taken(&values, one) {
+            match value {
+                RawValue::Variant(variant) => frame.variant(variant)?,
+                RawValue::Array(array) if array.is_null() => {
+                    frame.variant(&Variant::Array(Array::null(array.element())))?;
+                }
+                RawValue::Array(array) => {
+                    // Of a matrix of texts the elements in row-major order, as ROS has them.
+                    frame.array(array.element(), array.len())?;
+                    for element in array {
+                        frame.element(element)?;
+                    }
+                }
+            }
+        }
+        Ok(())
+    })?;
+    Ok(Quality::default())
+}
+
+/// Variants or DataValues. Of a DataValue without a value, and of one of several that is bad, the status stands in its place,
+/// as a writer of Variants has it (OPC 10000-14, 7.2.4.5.5).
+fn flatten(
+    message: &DataSetMessage<'_>,
+    choice: &Choice,
+    out: &mut Vec<u8>,
+) -> Result<Quality, Refusal> {
+    let malformed = |error: uadp::DecodeError| (Reason::Malformed, error.to_string());
+    let values = message.values().map_err(malformed)?;
+    let values = values.map(|field| field.map(|field| field.value));
+    let values: Vec<DataValue<'_>> = values.collect::<Result<_, _>>().map_err(malformed)?;
+    let one = choice.place(values.len())?;
+    let taken = taken(&values, one);
+    let alone = taken.len() == 1;
+    write(out, |frame| {
+        for value in taken {
+            let status = value.status.unwrap_or(StatusCode::GOOD);
+            let is_bad = status.0 & STATUS_BAD != 0;
+            match value.value {
+                Some(variant) if alone || !is_bad => frame.variant(&variant)?,
+                Some(_) | None if is_bad => frame.scalar(Scalar::StatusCode(status))?,
+                Some(_) | None => frame.null()?,
+            }
+        }
+        Ok(())
+    })?;
+    Ok(match taken {
+        [one] => Quality::of(one),
+        _ => Quality::default(),
+    })
+}
+
+fn taken<T>(values: &[T], one: Option<usize>) -> &[T] {
+    match one {
+        Some(one) => values.get(one..=one).unwrap_or_default(),
+        None => values,
+    }
+}
+
+/// Writes a key frame of Variants that stands alone.
+fn write(
+    out: &mut Vec<u8>,
+    fields: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), EncodeError>,
+) -> Result<(), Refusal> {
+    let too_big = |error: EncodeError| (Reason::TooBig, error.to_string());
+    let mut message =
+        NetworkMessageEncoder::new(out, &NetworkHeader::default(), None).map_err(too_big)?;
+    let at = message.payload_offset();
+    let mut frame = message
+        .key_frame(&DataSetHeader::default())
+        .map_err(too_big)?;
+    fields(&mut frame).map_err(too_big)?;
+    frame.finish().map_err(too_big)?;
+    message.finish().map_err(too_big)?;
+    out.drain(..at);
+    Ok(())
+}
+
+/// The severity of a Bad StatusCode (OPC 10000-4, 7.39.1).
+const STATUS_BAD: u32 = 0x8000_0000;
+/// A key frame is kept for delta frames up to the size of a datagram.
+const MAX_BASE: usize = 1 << 16;
+/// And all of them up to this: whoever sends to the group can invent topics.
+const MAX_BASES: usize = 16 << 20;
