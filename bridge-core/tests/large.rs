@@ -315,6 +315,26 @@ fn a_writer_that_starts_over_in_the_midst_of_a_message_mixes_nothing() {
 }
 
 #[test]
+fn a_chunk_that_a_stranger_makes_up_costs_nobody_a_message() {
+    let mut pair = Pair::new(SMALL_DATAGRAMS);
+    let image = text(4_000, 0);
+    let _verdict = pair.say(CAMERA, &image);
+    let (datagrams, _) = pair.all();
+    let stranger = SocketAddr::new(PEER.ip(), 40_000);
+    let mut delivered = Vec::new();
+    for (_, bytes) in &datagrams {
+        delivered.extend(pair.hear(bytes));
+        let mut forged = bytes.clone();
+        *forged.last_mut().unwrap() ^= 1;
+        pair.reader.handle_datagram(&forged, stranger, pair.now);
+        forged.pop();
+        pair.reader.handle_datagram(&forged, stranger, pair.now);
+    }
+    assert_eq!(delivered.len(), 1);
+    assert!(delivered[0].payload == image);
+}
+
+#[test]
 fn a_message_that_would_be_too_big_is_refused_at_its_first_chunk() {
     let mut large = Pair::new("pubsub: {}\n");
     let _verdict = large.say(CAMERA, &text(2_000_000, 0));

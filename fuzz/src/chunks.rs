@@ -12,7 +12,9 @@ use crate::input::Input;
 const LIMITS: ReassemblyLimits = ReassemblyLimits {
     whole: 4096,
     total: 16_384,
+    total_per_sender: 12_288,
     open: 6,
+    open_per_sender: 5,
     open_per_writer: 3,
     pieces: 64,
     age: Duration::from_millis(200),

@@ -2,7 +2,7 @@
 
 mod open;
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use crate::publisher_id::OwnedPublisherId;
@@ -17,9 +17,13 @@ use open::{Done, Insertion, KeyRef, Open};
 /// how it is secured, so that nothing unsigned gets into what was signed. Chunks may come in any order and in uneven
 /// pieces, although the standard has all but the last equally long.
 ///
+/// Whoever can send to a group can make up chunks of any writer. With [`receive_from`](Self::receive_from) a whole is
+/// known by its sender as well, an address or whatever `S` is: nobody gets a chunk into what another sends. Each sender
+/// has limits of its own, and where all together reach one, the sender that holds most gives way.
+///
 /// Only what has arrived is held: TotalSize reserves nothing. A datagram makes it hold its own piece and about a
 /// hundred bytes, the last piece of a whole in addition one buffer for the whole, which is used again. When a limit
-/// is reached the whole that was begun first is given up. The same chunk once more is refused, for
+/// is reached the whole that was begun first is given up, of the sender that holds most. The same chunk once more is refused, for
 /// [`age`](ReassemblyLimits::age) also after the whole was complete. Other bytes in the same place begin a new whole,
 /// so that a publisher that starts over mixes nothing; another TotalSize is refused while the earlier whole is
 /// incomplete, for [`age`](ReassemblyLimits::age) at most.
@@ -31,19 +35,19 @@ use open::{Done, Insertion, KeyRef, Open};
 ///
 /// An example stands at [`Chunks`](crate::Chunks).
 #[derive(Debug)]
-pub struct Reassembler {
+pub struct Reassembler<S = ()> {
     limits: ReassemblyLimits,
     /// In the order they were begun.
-    open: VecDeque<Open>,
+    open: VecDeque<Open<S>>,
     /// Completed ones, whose chunks may come again; in the order they were completed.
-    done: VecDeque<Done>,
+    done: VecDeque<Done<S>>,
     /// Cost of all in `open` and `done`.
     held: usize,
     /// The whole that was completed last.
     whole: Vec<u8>,
     counters: ReassemblyCounters,
     /// What [`poll_given_up`](Self::poll_given_up) hands out.
-    given_up: VecDeque<GivenUp>,
+    given_up: VecDeque<GivenUp<S>>,
 }
 
 /// What a [`Reassembler`] may hold.
@@ -53,8 +57,12 @@ pub struct ReassemblyLimits {
     pub whole: u32,
     /// Bytes of all incomplete wholes, their bookkeeping included. Default 64 MiB.
     pub total: usize,
+    /// The same of one sender's. Default 64 MiB.
+    pub total_per_sender: usize,
     /// Incomplete wholes, and completed ones that are remembered. Default 64.
     pub open: usize,
+    /// Incomplete wholes of one sender. Default 64.
+    pub open_per_sender: usize,
     /// Incomplete wholes of one DataSetWriter, so that one that loses chunks does not push out the others'.
     /// Default 4.
     pub open_per_writer: usize,
@@ -132,9 +140,9 @@ pub struct ReassemblyCounters {
     pub too_many_pieces: u64,
     /// Wholes given up because of [`ReassemblyLimits::age`].
     pub expired: u64,
-    /// Wholes given up because of [`ReassemblyLimits::total`].
+    /// Wholes given up because of [`ReassemblyLimits::total`] or [`ReassemblyLimits::total_per_sender`].
     pub out_of_bytes: u64,
-    /// Wholes given up because of [`ReassemblyLimits::open`].
+    /// Wholes given up because of [`ReassemblyLimits::open`] or [`ReassemblyLimits::open_per_sender`].
     pub out_of_places: u64,
     /// Wholes given up because of [`ReassemblyLimits::open_per_writer`].
     pub superseded: u64,
@@ -145,8 +153,10 @@ pub struct ReassemblyCounters {
 
 /// A whole that did not become complete.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct GivenUp {
-    /// Who sent it.
+pub struct GivenUp<S = ()> {
+    /// Where its chunks came from.
+    pub sender: S,
+    /// Who sent it, as it says.
     pub publisher_id: Option<OwnedPublisherId>,
     /// The WriterGroup.
     pub writer_group_id: Option<u16>,
@@ -167,9 +177,11 @@ pub struct GivenUp {
 pub enum GiveUp {
     /// [`ReassemblyLimits::age`] had passed.
     Expired,
-    /// [`ReassemblyLimits::total`] was reached, and it was begun first.
+    /// Its sender held most when [`ReassemblyLimits::total`] was reached, or reached
+    /// [`ReassemblyLimits::total_per_sender`], and began it first.
     OutOfBytes,
-    /// [`ReassemblyLimits::open`] was reached, and it was begun first.
+    /// Its sender had most when [`ReassemblyLimits::open`] was reached, or reached
+    /// [`ReassemblyLimits::open_per_sender`], and began it first.
     OutOfPlaces,
     /// [`ReassemblyLimits::open_per_writer`] was reached, and it was the writer's oldest.
     Superseded,
@@ -191,7 +203,9 @@ impl Default for ReassemblyLimits {
         Self {
             whole: 16 << 20,
             total: 64 << 20,
+            total_per_sender: 64 << 20,
             open: 64,
+            open_per_sender: 64,
             open_per_writer: 4,
             pieces: 32768,
             age: Duration::from_secs(2),
@@ -199,15 +213,29 @@ impl Default for ReassemblyLimits {
     }
 }
 
-impl Default for Reassembler {
+impl<S> Default for Reassembler<S> {
     fn default() -> Self {
         Self::new(ReassemblyLimits::default())
     }
 }
 
 impl Reassembler {
-    /// Holds nothing. [`open`](ReassemblyLimits::open) and [`open_per_writer`](ReassemblyLimits::open_per_writer)
-    /// count as 1 when they are 0.
+    /// As [`receive_from`](Reassembler::receive_from), where all chunks come from one sender.
+    ///
+    /// # Errors
+    /// As there.
+    pub fn receive<'r>(
+        &'r mut self,
+        message: &NetworkMessage<'r>,
+        now: Duration,
+    ) -> Result<Option<Reassembled<'r>>, ChunkRefusal> {
+        self.receive_from((), message, now)
+    }
+}
+
+impl<S> Reassembler<S> {
+    /// Holds nothing. [`open`](ReassemblyLimits::open), [`open_per_sender`](ReassemblyLimits::open_per_sender) and
+    /// [`open_per_writer`](ReassemblyLimits::open_per_writer) count as 1 when they are 0.
     #[must_use]
     pub const fn new(limits: ReassemblyLimits) -> Self {
         Self {
@@ -235,40 +263,6 @@ impl Reassembler {
         }
     }
 
-    /// Takes a chunk; the whole when it was the last that was missing. `now` is the time since a start that is the
-    /// same for all calls.
-    ///
-    /// # Errors
-    /// [`ChunkRefusal`] when the chunk is not taken. It says nothing of the other chunks.
-    pub fn receive<'r>(
-        &'r mut self,
-        message: &NetworkMessage<'r>,
-        now: Duration,
-    ) -> Result<Option<Reassembled<'r>>, ChunkRefusal> {
-        self.expire(now);
-        let (chunk, step) = match self.take(message, now) {
-            Ok(taken) => taken,
-            Err(refusal) => {
-                self.counters.count(refusal);
-                return Err(refusal);
-            }
-        };
-        self.counters.chunks += 1;
-        let bytes = match step {
-            Step::Incomplete => return Ok(None),
-            Step::Alone => chunk.data,
-            Step::Complete => &self.whole,
-        };
-        self.counters.completed += 1;
-        Ok(Some(Reassembled {
-            header: message.header(),
-            message_type: message.message_type(),
-            writer_id: chunk.writer_id,
-            message_sequence_number: chunk.message_sequence_number,
-            bytes,
-        }))
-    }
-
     /// Gives up the wholes that are too old.
     pub fn expire(&mut self, now: Duration) {
         let age = self.limits.age;
@@ -288,9 +282,9 @@ impl Reassembler {
         Some(oldest.since.saturating_add(self.limits.age))
     }
 
-    /// The next whole that was given up; to be asked after each [`receive`](Self::receive) and
+    /// The next whole that was given up; to be asked after each [`receive_from`](Self::receive_from) and
     /// [`expire`](Self::expire) until there is none. No more than [`ReassemblyLimits::open`] are kept for who does not.
-    pub fn poll_given_up(&mut self) -> Option<GivenUp> {
+    pub fn poll_given_up(&mut self) -> Option<GivenUp<S>> {
         self.given_up.pop_front()
     }
 
@@ -313,8 +307,99 @@ impl Reassembler {
         std::mem::take(&mut self.whole)
     }
 
+    fn complete(&mut self, at: usize, now: Duration) -> Step {
+        let Some(open) = self.open.remove(at) else {
+            return Step::Incomplete;
+        };
+        self.held -= open.cost();
+        open.write(&mut self.whole);
+        self.remember(open.done(now));
+        Step::Complete
+    }
+
+    /// Refuses a chunk of the completed whole at `at`; else its number is in use again.
+    fn forget_unless_same(&mut self, at: usize, chunk: &Chunk<'_>) -> Result<(), ChunkRefusal> {
+        if self.done.get(at).is_some_and(|done| done.had(chunk)) {
+            return Err(ChunkRefusal::Duplicate);
+        }
+        if let Some(done) = self.done.remove(at) {
+            self.held -= done.cost();
+        }
+        Ok(())
+    }
+
+    fn remember(&mut self, done: Done<S>) {
+        if self.done.len() >= self.limits.open {
+            self.forget_oldest();
+        }
+        if self.held + done.cost() <= self.limits.total && self.done.len() < self.limits.open {
+            self.held += done.cost();
+            self.done.push_back(done);
+        }
+    }
+
+    /// Makes the place of the oldest completed whole free; false when there is none.
+    fn forget_oldest(&mut self) -> bool {
+        let Some(done) = self.done.pop_front() else {
+            return false;
+        };
+        self.held -= done.cost();
+        true
+    }
+
+    fn give_up(&mut self, at: usize, why: GiveUp) {
+        let Some(open) = self.open.remove(at) else {
+            return;
+        };
+        self.held -= open.cost();
+        self.counters.count_given_up(why);
+        // One call gives up no more than were open, so that nothing is lost to who asks after each.
+        if self.given_up.len() > self.limits.open {
+            self.given_up.pop_front();
+        }
+        self.given_up.push_back(open.given_up(why));
+    }
+}
+
+impl<S: Copy + Ord> Reassembler<S> {
+    /// Takes a chunk; the whole when it was the last that was missing. `now` is the time since a start that is the
+    /// same for all calls.
+    ///
+    /// # Errors
+    /// [`ChunkRefusal`] when the chunk is not taken. It says nothing of the other chunks.
+    pub fn receive_from<'r>(
+        &'r mut self,
+        sender: S,
+        message: &NetworkMessage<'r>,
+        now: Duration,
+    ) -> Result<Option<Reassembled<'r>>, ChunkRefusal> {
+        self.expire(now);
+        let (chunk, step) = match self.take(sender, message, now) {
+            Ok(taken) => taken,
+            Err(refusal) => {
+                self.counters.count(refusal);
+                return Err(refusal);
+            }
+        };
+        self.counters.chunks += 1;
+        let bytes = match step {
+            Step::Incomplete => return Ok(None),
+            Step::Alone => chunk.data,
+            Step::Complete => &self.whole,
+        };
+        self.counters.completed += 1;
+        Ok(Some(Reassembled {
+            header: message.header(),
+            message_type: message.message_type(),
+            writer_id: chunk.writer_id,
+            message_sequence_number: chunk.message_sequence_number,
+            bytes,
+        }))
+    }
+
     fn take<'r>(
         &mut self,
+        sender: S,
         message: &NetworkMessage<'r>,
         now: Duration,
     ) -> Result<(Chunk<'r>, Step), ChunkRefusal> {
@@ -324,7 +409,7 @@ impl Reassembler {
                 total_size: chunk.total_size,
             });
         }
-        let key = KeyRef::of(message, &chunk);
+        let key = KeyRef::of(message, &chunk, sender);
         if let Some(at) = self.done.iter().position(|done| key.is(&done.key)) {
             self.forget_unless_same(at, &chunk)?;
         }
@@ -340,7 +425,7 @@ impl Reassembler {
         let step = match self.open.get(at) {
             Some(open) if open.is_complete() => self.complete(at, now),
             _ => {
-                self.make_room();
+                self.make_room(sender);
                 Step::Incomplete
             }
         };
@@ -352,7 +437,7 @@ impl Reassembler {
         &mut self,
         at: usize,
         chunk: &Chunk<'_>,
-        key: &KeyRef<'_>,
+        key: &KeyRef<'_, S>,
         now: Duration,
     ) -> Result<usize, ChunkRefusal> {
         let pieces = self.limits.pieces;
@@ -384,7 +469,7 @@ impl Reassembler {
     /// Begins a whole with its first chunk; where it stands.
     fn begin(
         &mut self,
-        key: &KeyRef<'_>,
+        key: &KeyRef<'_, S>,
         chunk: &Chunk<'_>,
         now: Duration,
     ) -> Result<usize, ChunkRefusal> {
@@ -392,84 +477,65 @@ impl Reassembler {
         if let Insertion::TooMany = open.insert(chunk, self.limits.pieces) {
             return Err(ChunkRefusal::TooManyPieces);
         }
-        let of_writer = |other: &Open| key.is_writer_of(&other.key);
+        let of_writer = |other: &Open<S>| key.is_writer_of(&other.key);
         if self.open.iter().filter(|open| of_writer(open)).count() >= self.limits.open_per_writer
             && let Some(oldest) = self.open.iter().position(of_writer)
         {
             self.give_up(oldest, GiveUp::Superseded);
         }
-        if self.open.len() >= self.limits.open && !self.open.is_empty() {
-            self.give_up(0, GiveUp::OutOfPlaces);
+        let of_sender = |other: &Open<S>| other.key.sender == key.sender;
+        if self.open.iter().filter(|open| of_sender(open)).count() >= self.limits.open_per_sender
+            && let Some(oldest) = self.open.iter().position(of_sender)
+        {
+            self.give_up(oldest, GiveUp::OutOfPlaces);
+        }
+        if self.open.len() >= self.limits.open
+            && let Some(oldest) = self.oldest_of_greediest(key.sender, |_| 1)
+        {
+            self.give_up(oldest, GiveUp::OutOfPlaces);
         }
         self.held += open.cost();
         self.open.push_back(open);
         Ok(self.open.len() - 1)
     }
 
-    /// Forgets completed wholes, then gives up what was begun first, until the rest fits.
-    fn make_room(&mut self) {
+    /// Forgets completed wholes, then gives up what the sender that holds most began first, until the rest fits; before
+    /// that what `sender` began first, until what it holds is within its own limit.
+    fn make_room(&mut self, sender: S) {
+        let most = self.limits.total_per_sender;
+        while self.held > most {
+            let of_sender = |open: &&Open<S>| open.key.sender == sender;
+            let held: usize = self.open.iter().filter(of_sender).map(Open::cost).sum();
+            let oldest = self.open.iter().position(|open| of_sender(&open));
+            let Some(oldest) = oldest.filter(|_| held > most) else {
+                break;
+            };
+            self.give_up(oldest, GiveUp::OutOfBytes);
+        }
         while self.held > self.limits.total {
             if self.forget_oldest() {
                 continue;
             }
-            if self.open.is_empty() {
+            let Some(oldest) = self.oldest_of_greediest(sender, Open::cost) else {
                 return;
-            }
-            self.give_up(0, GiveUp::OutOfBytes);
+            };
+            self.give_up(oldest, GiveUp::OutOfBytes);
         }
     }
 
-    fn complete(&mut self, at: usize, now: Duration) -> Step {
-        let Some(open) = self.open.remove(at) else {
-            return Step::Incomplete;
-        };
-        self.held -= open.cost();
-        open.write(&mut self.whole);
-        self.remember(open.done(now));
-        Step::Complete
-    }
-
-    /// Refuses a chunk of the completed whole at `at`; else its number is in use again.
-    fn forget_unless_same(&mut self, at: usize, chunk: &Chunk<'_>) -> Result<(), ChunkRefusal> {
-        if self.done.get(at).is_some_and(|done| done.had(chunk)) {
-            return Err(ChunkRefusal::Duplicate);
+    /// What the sender began first of whose incomplete wholes `weight` gives the greatest sum. Of several it is `sender`:
+    /// nobody makes place for who holds as much.
+    fn oldest_of_greediest(&self, sender: S, weight: impl Fn(&Open<S>) -> usize) -> Option<usize> {
+        let mut sums: BTreeMap<S, usize> = BTreeMap::new();
+        for open in &self.open {
+            *sums.entry(open.key.sender).or_default() += weight(open);
         }
-        if let Some(done) = self.done.remove(at) {
-            self.held -= done.cost();
-        }
-        Ok(())
-    }
-
-    fn remember(&mut self, done: Done) {
-        if self.done.len() >= self.limits.open {
-            self.forget_oldest();
-        }
-        if self.held + done.cost() <= self.limits.total && self.done.len() < self.limits.open {
-            self.held += done.cost();
-            self.done.push_back(done);
-        }
-    }
-
-    /// Makes the place of the oldest completed whole free; false when there is none.
-    fn forget_oldest(&mut self) -> bool {
-        let Some(done) = self.done.pop_front() else {
-            return false;
-        };
-        self.held -= done.cost();
-        true
-    }
-
-    fn give_up(&mut self, at: usize, why: GiveUp) {
-        let Some(open) = self.open.remove(at) else {
-            return;
-        };
-        self.held -= open.cost();
-        self.counters.count_given_up(why);
-        // One call gives up no more than were open, so that nothing is lost to who asks after each.
-        if self.given_up.len() > self.limits.open {
-            self.given_up.pop_front();
-        }
-        self.given_up.push_back(open.given_up(why));
+        let most = sums.values().max()?;
+        let greediest = |open: &Open<S>| sums.get(&open.key.sender) == Some(most);
+        let own = |open: &Open<S>| open.key.sender == sender && greediest(open);
+        let mut open = self.open.iter();
+        let oldest = open.position(own);
+        oldest.or_else(|| self.open.iter().position(greediest))
     }
 }
 

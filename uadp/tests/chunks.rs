@@ -829,7 +829,9 @@ proptest! {
         let limits = ReassemblyLimits {
             whole: 50,
             total: 2500,
+            total_per_sender: 2500,
             open: 3,
+            open_per_sender: 3,
             open_per_writer: 2,
             pieces: 4,
             age: ms(1000),
@@ -863,5 +865,67 @@ proptest! {
         prop_assert_eq!(c.chunks + refused, given);
         reassembler.expire(now + ms(1000));
         prop_assert_eq!(reassembler.held(), 0);
+    }
+}
+
+/// As [`receive`], of several senders.
+fn receive_from(
+    reassembler: &mut Reassembler<u16>,
+    sender: u16,
+    datagram: &[u8],
+) -> Result<Option<Vec<u8>>, ChunkRefusal> {
+    let message = NetworkMessage::decode(datagram).unwrap();
+    let whole = reassembler.receive_from(sender, &message, START)?;
+    Ok(whole.map(|whole| whole.bytes.to_vec()))
+}
+
+#[test]
+fn nobody_gets_a_chunk_into_what_another_sends_or_ends_it() {
+    let mut reassembler = Reassembler::default();
+    let begun = receive_from(&mut reassembler, 1, &chunk(2, 1, 0, 4, &[0, 1]));
+    assert_eq!(begun, Ok(None));
+    // Other bytes in its place, another TotalSize, newer wholes of its writer, and the rest of it.
+    let other_bytes = chunk(2, 1, 0, 4, &[9, 9]);
+    let other_size = chunk(2, 1, 0, 7, &[0, 1]);
+    let newer = (2..20).map(|number| chunk(2, number, 0, 4, &[0, 1]));
+    let rest = chunk(2, 1, 2, 4, &[8, 8]);
+    for forged in [other_bytes, other_size].into_iter().chain(newer) {
+        let _refused_or_kept = receive_from(&mut reassembler, 7, &forged);
+    }
+    let _whole_of_its_own = receive_from(&mut reassembler, 7, &rest);
+    let whole = receive_from(&mut reassembler, 1, &chunk(2, 1, 2, 4, &[2, 3]));
+    assert_eq!(whole, Ok(Some(vec![0, 1, 2, 3])));
+    while let Some(given_up) = reassembler.poll_given_up() {
+        assert_eq!(given_up.sender, 7);
+    }
+}
+
+#[test]
+fn a_sender_that_leaves_wholes_unfinished_makes_place_only_for_its_own() {
+    let limits = ReassemblyLimits {
+        total: 20_000,
+        total_per_sender: 10_000,
+        open: 40,
+        open_per_sender: 20,
+        ..ReassemblyLimits::default()
+    };
+    let first = chunk(1, 1, 0, 9000, &[0; 4000]);
+    let last = chunk(1, 1, 4000, 9000, &[1; 5000]);
+    for (senders, bytes) in [(1, 4000), (1, 1), (9, 4000)] {
+        let mut reassembler = Reassembler::new(limits);
+        assert_eq!(receive_from(&mut reassembler, 0, &first), Ok(None));
+        for number in 0..600 {
+            let (sender, publisher) = (1 + number % senders, 100 + number);
+            let forged = chunk(publisher, 1, 0, 9000, &vec![0; bytes]);
+            assert_eq!(receive_from(&mut reassembler, sender, &forged), Ok(None));
+            assert!(reassembler.held() <= limits.total);
+        }
+        let whole = receive_from(&mut reassembler, 0, &last);
+        let given_up = *reassembler.counters();
+        assert_eq!(
+            whole.map(|whole| whole.map(|whole| whole.len())),
+            Ok(Some(9000)),
+            "{senders} others, {bytes} bytes each: {given_up:?}"
+        );
     }
 }

@@ -19,7 +19,7 @@ use crate::topic::{Role, Topic};
 /// The chunks of all topics.
 #[derive(Debug)]
 pub(super) struct Chunks {
-    reassembler: Reassembler,
+    reassembler: Reassembler<SocketAddr>,
     /// What its times count from.
     start: Instant,
 }
@@ -30,9 +30,12 @@ impl Chunks {
         let bytes = usize::try_from(whole).unwrap_or(usize::MAX);
         let limits = ReassemblyLimits {
             whole,
-            // Two of the largest at a time with their bookkeeping, or very many smaller ones.
-            total: bytes.saturating_mul(5) / 2,
-            open: MAX_OPEN,
+            // Of each sender two of the largest at a time with their bookkeeping, or very many smaller ones. Of all the
+            // double, so that one sender alone pushes out nothing of the others.
+            total: bytes.saturating_mul(5),
+            total_per_sender: bytes.saturating_mul(5) / 2,
+            open: 2 * MAX_OPEN,
+            open_per_sender: MAX_OPEN,
             // One in progress, and one of which a chunk was lost.
             open_per_writer: 2,
             pieces: bytes / LEAST_PIECE,
@@ -83,7 +86,7 @@ impl Router {
             .take()
             .unwrap_or_else(|| Box::new(Chunks::new(self.mapping.pubsub(), now.monotonic)));
         let since = chunks.since_start(now);
-        match chunks.reassembler.receive(message, since) {
+        match chunks.reassembler.receive_from(from, message, since) {
             Ok(None) => {}
             Ok(Some(whole)) if whole.message_type == NetworkMessageType::Announcement => {
                 match Announcement::decode_body(whole.bytes) {
@@ -152,7 +155,7 @@ impl Router {
         true
     }
 
-    fn count_given_up(&mut self, reassembler: &mut Reassembler) {
+    fn count_given_up(&mut self, reassembler: &mut Reassembler<SocketAddr>) {
         while let Some(given_up) = reassembler.poll_given_up() {
             let reason = match given_up.why {
                 GiveUp::Expired | GiveUp::Superseded | GiveUp::Contradicted => Reason::Incomplete,
@@ -160,7 +163,7 @@ impl Router {
             };
             let about = About {
                 topic: topic_of(&given_up),
-                from: None,
+                from: Some(given_up.sender),
             };
             self.count(about, reason, 1, || {
                 format!(
@@ -175,7 +178,7 @@ impl Router {
     }
 }
 
-fn topic_of(given_up: &GivenUp) -> Option<TopicId> {
+fn topic_of(given_up: &GivenUp<SocketAddr>) -> Option<TopicId> {
     let publisher = given_up.publisher_id.as_ref().map(OwnedPublisherId::as_id);
     let (number, _) = number_of(publisher);
     let space = u16::try_from(number).ok()?;
@@ -187,8 +190,8 @@ const fn why(why: GiveUp) -> &'static str {
         GiveUp::Expired => "waited for until receive_timeout",
         GiveUp::Superseded => "two newer ones of its writer were begun",
         GiveUp::Contradicted => "its writer started over",
-        GiveUp::OutOfBytes => "unfinished messages took up all the bytes for them",
-        GiveUp::OutOfPlaces => "too many messages were unfinished",
+        GiveUp::OutOfBytes => "unfinished messages of its sender took up all the bytes for them",
+        GiveUp::OutOfPlaces => "too many messages of its sender were unfinished",
     }
 }
 
@@ -214,7 +217,7 @@ fn told(refusal: ChunkRefusal, most: u32) -> String {
 }
 
 const CHUNK_IN_CHUNKS: DecodeError = DecodeError::Misread("a chunk in chunks");
-/// Messages unfinished at a time: datagrams of so many large topics may come in turn.
+/// Messages of one sender unfinished at a time: datagrams of so many large topics may come in turn.
 const MAX_OPEN: usize = 512;
 /// The least bytes a chunk carries on average: the smallest datagram less its headers.
 const LEAST_PIECE: usize = 256;

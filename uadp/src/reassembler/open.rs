@@ -10,7 +10,9 @@ use crate::{Chunk, NetworkMessage, NetworkMessageType, PublisherId};
 
 /// What tells one whole from another.
 #[derive(Debug)]
-pub(super) struct Key {
+pub(super) struct Key<S> {
+    /// Where its chunks come from.
+    pub(super) sender: S,
     publisher_id: Option<OwnedPublisherId>,
     writer: Writer,
     message_sequence_number: u16,
@@ -18,7 +20,8 @@ pub(super) struct Key {
 
 /// The same for looking up, without owning the PublisherId.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct KeyRef<'a> {
+pub(super) struct KeyRef<'a, S> {
+    pub(super) sender: S,
     publisher_id: Option<PublisherId<'a>>,
     writer: Writer,
     message_sequence_number: u16,
@@ -35,8 +38,8 @@ struct Writer {
 
 /// A whole in pieces.
 #[derive(Debug)]
-pub(super) struct Open {
-    pub(super) key: Key,
+pub(super) struct Open<S> {
+    pub(super) key: Key<S>,
     pub(super) total_size: u32,
     /// When its first chunk came.
     pub(super) since: Duration,
@@ -48,8 +51,8 @@ pub(super) struct Open {
 
 /// A whole that was complete, by what its chunks are known again.
 #[derive(Debug)]
-pub(super) struct Done {
-    pub(super) key: Key,
+pub(super) struct Done<S> {
+    pub(super) key: Key<S>,
     /// When it was complete.
     pub(super) at: Duration,
     total_size: u32,
@@ -70,11 +73,12 @@ pub(super) enum Insertion {
     TooMany,
 }
 
-impl<'a> KeyRef<'a> {
-    pub(super) fn of(message: &NetworkMessage<'a>, chunk: &Chunk<'_>) -> Self {
+impl<'a, S: Copy + Eq> KeyRef<'a, S> {
+    pub(super) fn of(message: &NetworkMessage<'a>, chunk: &Chunk<'_>, sender: S) -> Self {
         let header = message.header();
         let security = message.security().unwrap_or_default();
         Self {
+            sender,
             publisher_id: header.publisher_id,
             writer: Writer {
                 group_id: header.group.and_then(|group| group.writer_group_id),
@@ -87,17 +91,18 @@ impl<'a> KeyRef<'a> {
         }
     }
 
-    pub(super) fn is(&self, key: &Key) -> bool {
+    pub(super) fn is(&self, key: &Key<S>) -> bool {
         self.message_sequence_number == key.message_sequence_number && self.is_writer_of(key)
     }
 
-    pub(super) fn is_writer_of(&self, key: &Key) -> bool {
+    pub(super) fn is_writer_of(&self, key: &Key<S>) -> bool {
         let publisher_id = key.publisher_id.as_ref().map(OwnedPublisherId::as_id);
-        self.writer == key.writer && self.publisher_id == publisher_id
+        self.writer == key.writer && self.publisher_id == publisher_id && self.sender == key.sender
     }
 
-    pub(super) fn to_key(self) -> Key {
+    pub(super) fn to_key(self) -> Key<S> {
         Key {
+            sender: self.sender,
             publisher_id: self.publisher_id.map(Into::into),
             writer: self.writer,
             message_sequence_number: self.message_sequence_number,
@@ -105,7 +110,7 @@ impl<'a> KeyRef<'a> {
     }
 }
 
-impl Key {
+impl<S> Key<S> {
     /// Bytes it takes, roughly.
     pub(super) fn cost(&self) -> usize {
         let text = match &self.publisher_id {
@@ -118,12 +123,12 @@ impl Key {
             )
             | None => 0,
         };
-        text + KEY_COST
+        text + size_of::<S>() + KEY_COST
     }
 }
 
-impl Open {
-    pub(super) const fn new(key: Key, total_size: u32, since: Duration) -> Self {
+impl<S> Open<S> {
+    pub(super) const fn new(key: Key<S>, total_size: u32, since: Duration) -> Self {
         Self {
             key,
             total_size,
@@ -177,7 +182,7 @@ impl Open {
     }
 
     /// What is remembered of it.
-    pub(super) fn done(self, at: Duration) -> Done {
+    pub(super) fn done(self, at: Duration) -> Done<S> {
         let pieces = self.pieces.iter();
         Done {
             key: self.key,
@@ -188,8 +193,9 @@ impl Open {
     }
 
     /// What is told of it when it is not waited for any longer.
-    pub(super) fn given_up(self, why: GiveUp) -> GivenUp {
+    pub(super) fn given_up(self, why: GiveUp) -> GivenUp<S> {
         GivenUp {
+            sender: self.key.sender,
             publisher_id: self.key.publisher_id,
             writer_group_id: self.key.writer.group_id,
             writer_id: self.key.writer.writer_id,
@@ -206,9 +212,9 @@ impl Open {
     }
 }
 
-impl Done {
+impl<S> Done<S> {
     /// A whole of one piece.
-    pub(super) fn alone(key: Key, chunk: &Chunk<'_>, at: Duration) -> Self {
+    pub(super) fn alone(key: Key<S>, chunk: &Chunk<'_>, at: Duration) -> Self {
         Self {
             key,
             at,
