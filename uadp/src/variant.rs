@@ -69,9 +69,19 @@ impl<'a> Variant<'a> {
     #[inline]
     pub(crate) fn read_at(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
         let encoding = reader.u8("Variant")?;
-        let Some(builtin) = BuiltinType::from_id(encoding & TYPE_ID) else {
-            return Self::read_untyped(encoding);
-        };
+        match BuiltinType::from_id(encoding & TYPE_ID) {
+            Some(builtin) => Self::read_as(builtin, encoding, reader, depth),
+            None => Self::read_untyped(encoding, reader, depth),
+        }
+    }
+
+    #[inline]
+    fn read_as(
+        builtin: BuiltinType,
+        encoding: u8,
+        reader: &mut Reader<'a>,
+        depth: Depth,
+    ) -> Result<Self, DecodeError> {
         match encoding & !TYPE_ID {
             0 if builtin == BuiltinType::Variant => Err(VARIANT_IN_VARIANT),
             0 => Scalar::read_at(builtin, reader, depth).map(Self::Scalar),
@@ -100,13 +110,17 @@ impl<'a> Variant<'a> {
     }
 
     #[cold]
-    fn read_untyped(encoding: u8) -> Result<Self, DecodeError> {
+    fn read_untyped(
+        encoding: u8,
+        reader: &mut Reader<'a>,
+        depth: Depth,
+    ) -> Result<Self, DecodeError> {
         match encoding {
             0 => Ok(Self::Null),
-            // To be taken as ByteStrings of a type yet to come (OPC 10000-6, 5.2.2.16).
-            _ if matches!(encoding & TYPE_ID, 26..=31) => Err(DecodeError::Unsupported(
-                "Variant of an unassigned builtin type",
-            )),
+            // Types yet to come: decoders take what they hold for ByteStrings (OPC 10000-6, 5.2.2.16).
+            _ if matches!(encoding & TYPE_ID, 26..=31) => {
+                Self::read_as(BuiltinType::ByteString, encoding, reader, depth)
+            }
             _ => Err(DecodeError::Reserved {
                 field: "Variant encoding",
                 value: encoding.into(),

@@ -250,19 +250,36 @@ fn reserved_encodings_of_values_are_refused() {
 #[test]
 fn what_this_crate_does_not_read_is_named() {
     let unsupported = |what| Err(DecodeError::Unsupported(what));
-    for unassigned in 26..=31 {
-        for encoding in [unassigned, 0x80 | unassigned, 0xC0 | unassigned] {
-            assert_eq!(
-                field(&[encoding, 0, 0, 0, 0]),
-                unsupported("Variant of an unassigned builtin type"),
-                "encoding byte {encoding:#x}"
-            );
-        }
-    }
     assert_eq!(fields(&[0x81, 5]).map(|_| ()), unsupported("Action"));
     assert_eq!(fields(&[0x81, 6]).map(|_| ()), unsupported("Action"));
     let action_header = NetworkMessage::decode(&[0x81, 0x80, 0x20]).map(|_| ());
     assert_eq!(action_header, unsupported("Action"));
+}
+
+/// OPC 10000-6, 5.2.2.16: decoders take what types 26 to 31 hold for ByteStrings; encoders do not use them.
+#[test]
+fn a_variant_of_a_type_yet_to_come_is_read_as_its_bytes() {
+    let two = [2, 0, 0, 0, 7, 8];
+    let elements = [&two[..], &[0xFF; 4]].concat();
+    let array = [&[2, 0, 0, 0][..], &elements].concat();
+    let dimensions = [&[2, 0, 0, 0][..], &[1, 0, 0, 0], &[2, 0, 0, 0]].concat();
+    let matrix = [&array[..], &dimensions].concat();
+    for unassigned in 26..=31 {
+        for (form, body) in [(0, &two[..]), (0x80, &array), (0xC0, &matrix)] {
+            let of = |id: u8| [&[1, 0, id | form][..], body].concat();
+            let (unassigned, known) = (of(unassigned), of(BuiltinType::ByteString.id()));
+            let read = |bytes| Fields::parse(bytes).unwrap().next().unwrap().unwrap();
+            assert_eq!(read(&unassigned), read(&known));
+            assert!(field(&unassigned[2..unassigned.len() - 1]).is_err());
+        }
+        assert_eq!(
+            field(&[0x40 | unassigned, 0, 0, 0, 0]),
+            Err(DecodeError::Reserved {
+                field: "Variant encoding",
+                value: (0x40 | unassigned).into()
+            })
+        );
+    }
 }
 
 #[test]
