@@ -197,8 +197,30 @@ pub struct Counters {
     pub described: u64,
     /// Keep-alives sent.
     pub keep_alives: u64,
-    /// Of the reasons that occurred, in their order: most topics have few.
-    dropped: Vec<(Reason, u64)>,
+    /// How often values of another space came from another address than the one before.
+    pub sender_changed: u64,
+    /// Of the causes that occurred, in their order: most topics have few.
+    dropped: Vec<(Cause, u64)>,
+}
+
+/// Why something is dropped: the reason that is counted, and which case of it, where the log tells cases apart. A case
+/// that is frequent then does not hide one that is rare.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct Cause {
+    pub(crate) reason: Reason,
+    pub(crate) case: &'static str,
+}
+
+impl From<Reason> for Cause {
+    fn from(reason: Reason) -> Self {
+        Self { reason, case: "" }
+    }
+}
+
+impl From<(Reason, &'static str)> for Cause {
+    fn from((reason, case): (Reason, &'static str)) -> Self {
+        Self { reason, case }
+    }
 }
 
 impl Counters {
@@ -212,18 +234,24 @@ impl Counters {
 
     /// Every reason that occurred, with its count.
     pub fn drops(&self) -> impl Iterator<Item = (Reason, u64)> {
-        self.dropped.iter().copied()
+        let reasons = self.dropped.chunk_by(|(a, _), (b, _)| a.reason == b.reason);
+        reasons.filter_map(|cases| {
+            let (cause, _) = cases.first()?;
+            let count = cases
+                .iter()
+                .fold(0, |sum: u64, (_, count)| sum.saturating_add(*count));
+            Some((cause.reason, count))
+        })
     }
 
-    /// Adds `count` drops and says how many there are now.
-    pub(crate) fn add(&mut self, reason: Reason, count: u64) -> u64 {
-        let place = self
-            .dropped
-            .binary_search_by_key(&reason, |(each, _)| *each);
+    /// Adds `count` drops and says how many of that cause there are now.
+    pub(crate) fn add(&mut self, cause: impl Into<Cause>, count: u64) -> u64 {
+        let cause = cause.into();
+        let place = self.dropped.binary_search_by_key(&cause, |(each, _)| *each);
         if let Err(before) = place
             && count > 0
         {
-            self.dropped.insert(before, (reason, count));
+            self.dropped.insert(before, (cause, count));
             return count;
         }
         let known = place.ok().and_then(|found| self.dropped.get_mut(found));
@@ -231,6 +259,33 @@ impl Counters {
             *total = total.saturating_add(count);
             *total
         })
+    }
+
+    /// Takes over what was counted of a topic that is no longer followed.
+    pub(crate) fn absorb(&mut self, other: &Self) {
+        let Self {
+            sent,
+            delivered,
+            repeated,
+            missing,
+            announced,
+            described,
+            keep_alives,
+            sender_changed,
+            dropped,
+        } = other;
+        self.sent += sent;
+        self.delivered += delivered;
+        self.repeated += repeated;
+        self.missing += missing;
+        self.announced += announced;
+        self.described += described;
+        self.keep_alives += keep_alives;
+        self.sender_changed += sender_changed;
+        for (Cause { reason, .. }, count) in dropped {
+            // A case of its own: what is told of the others is not to be as late as if it were theirs.
+            self.add((*reason, "of a topic before"), *count);
+        }
     }
 }
 
@@ -260,6 +315,16 @@ mod tests {
         for (index, reason) in Reason::ALL.into_iter().enumerate() {
             assert_eq!(counters.dropped(reason), index as u64 + 1, "{reason}");
         }
+        counters.add((Reason::Overflow, "read too slowly"), 5);
+        let overflow = Reason::ALL.iter().position(|r| *r == Reason::Overflow);
+        let overflow = overflow.unwrap() as u64 + 1;
+        assert_eq!(counters.dropped(Reason::Overflow), overflow + 5);
+        assert_eq!(counters.drops().count(), Reason::ALL.len());
+        assert_eq!(
+            counters.add(Reason::Overflow, 1),
+            overflow + 1,
+            "of its own"
+        );
         let labels: std::collections::BTreeSet<_> =
             Reason::ALL.iter().map(|reason| reason.label()).collect();
         assert_eq!(labels.len(), Reason::ALL.len());

@@ -4,13 +4,15 @@
 //! [`FieldEncoder`] and the source that reads [`Fields`]. A message in an array of messages is an ExtensionObject with
 //! a binary body, its TypeId a string NodeId of the ROS type's name in the topic's namespace.
 
-use messages::{Plan, ReadError, Sink, Source, SourceError, TypeName, WriteError};
+use messages::{
+    Fault, Plan, ReadError, Sink, Source, SourceError, TypeName, ValueFault, WriteError, WriteFault,
+};
 use uadp::{
     Array, BuiltinType, DecodeError, Elements, EncodeError, ExtensionBody, FieldEncoder, Fields,
     NodeId, Scalar, StructureReader, Variant,
 };
 
-use crate::counters::Reason;
+use crate::counters::{Cause, Reason};
 
 /// A local payload, with what is needed to read it.
 pub(crate) enum Payload<'a> {
@@ -25,22 +27,27 @@ pub(crate) fn read(
     payload: &Payload<'_>,
     namespace: u16,
     frame: &mut FieldEncoder<'_>,
-) -> Result<(), (Reason, String)> {
+) -> Result<(), (Cause, String)> {
     match payload {
         Payload::Block(block) => {
             // Checked here, since a bad block would be an unreadable datagram for everybody.
             Fields::parse(block)
                 .and_then(|fields| fields.checked_bytes())
-                .map_err(|error| (Reason::Malformed, error.to_string()))?;
+                .map_err(undecodable)?;
             frame
                 .fields_block(block)
-                .map_err(|error| (Reason::TooBig, error.to_string()))
+                .map_err(|error| (Reason::TooBig.into(), error.to_string()))
         }
         Payload::Ros(plan, bytes) => {
             encode_fields(plan, bytes, namespace, frame).map_err(|error| match &error {
-                ReadError::Malformed { .. } => (Reason::Malformed, error.to_string()),
-                ReadError::Value { .. } => (Reason::Mismatch, error.to_string()),
-                ReadError::Sink { source, .. } => (Reason::TooBig, source.to_string()),
+                ReadError::Malformed { fault, .. } => {
+                    ((Reason::Malformed, case(*fault)).into(), error.to_string())
+                }
+                ReadError::Value { fault, .. } => (
+                    (Reason::Mismatch, value_case(fault)).into(),
+                    error.to_string(),
+                ),
+                ReadError::Sink { source, .. } => (Reason::TooBig.into(), source.to_string()),
             })
         }
     }
@@ -73,17 +80,62 @@ pub(crate) fn write(
     plan: &Plan,
     fields: Fields<'_>,
     out: &mut Vec<u8>,
-) -> Result<(), (Reason, String)> {
-    decode_fields(plan, fields, out).map_err(|error| (Reason::Mismatch, error.to_string()))
+) -> Result<(), (Cause, String)> {
+    decode_fields(plan, fields, out).map_err(|error| {
+        let cause = (Reason::Mismatch, write_case(&error.fault)).into();
+        (cause, error.to_string())
+    })
 }
 
 /// Appends the fields as they are, once it is sure that they can be read.
-pub(crate) fn copy(fields: &Fields<'_>, out: &mut Vec<u8>) -> Result<(), (Reason, String)> {
-    let block = fields
-        .checked_bytes()
-        .map_err(|error| (Reason::Malformed, error.to_string()))?;
+pub(crate) fn copy(fields: &Fields<'_>, out: &mut Vec<u8>) -> Result<(), (Cause, String)> {
+    let block = fields.checked_bytes().map_err(undecodable)?;
     out.extend_from_slice(block);
     Ok(())
+}
+
+pub(crate) fn undecodable(error: DecodeError) -> (Cause, String) {
+    let cause = (Reason::Malformed, error.subject()).into();
+    (cause, error.to_string())
+}
+
+const fn case(fault: Fault) -> &'static str {
+    match fault {
+        Fault::Truncated => "truncated",
+        Fault::Text => "text",
+        Fault::Terminator => "terminator",
+        Fault::Bound { .. } => "bound",
+        Fault::TrailingBytes(_) => "trailing bytes",
+        Fault::Encapsulation(_) => "encapsulation",
+        Fault::WithoutBytes(_) => "without bytes",
+    }
+}
+
+const fn value_case(fault: &ValueFault) -> &'static str {
+    match fault {
+        ValueFault::Absent { .. } => "absent",
+        ValueFault::NoName(_) => "no name",
+        ValueFault::OutOfRange { .. } => "out of range",
+        ValueFault::NoNumber => "no number",
+    }
+}
+
+const fn write_case(fault: &WriteFault) -> &'static str {
+    match fault {
+        WriteFault::Source(SourceError::Missing) => "missing",
+        WriteFault::Source(SourceError::Type { .. }) => "type",
+        WriteFault::Source(SourceError::LeftOver(_)) => "left over",
+        WriteFault::Source(SourceError::Malformed(_)) => "malformed",
+        WriteFault::Source(SourceError::Value(fault)) => value_case(fault),
+        WriteFault::Length { .. } => "length",
+        WriteFault::Bound { .. } => "bound",
+        WriteFault::Part => "part",
+        WriteFault::Order => "order",
+        WriteFault::Nul => "nul",
+        WriteFault::WithoutValue(_) => "without value",
+        WriteFault::Time => "time",
+        WriteFault::Duration => "duration",
+    }
 }
 
 /// Builtin type of a field, and whether it is an array.

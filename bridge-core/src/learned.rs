@@ -12,6 +12,19 @@ use mappings::TopicId;
 pub(crate) struct Learned<T> {
     known: HashMap<TopicId, Known<T>>,
     weight: usize,
+    /// When one of that rank found no room last: those that come soon after are not looked for room again.
+    full: Option<(Instant, Rank)>,
+}
+
+/// Which topics have precedence, the later ones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Rank {
+    /// Nobody sends its values, or does so no longer.
+    Stray,
+    /// Somebody sends its values.
+    Heard,
+    /// The mapping names it.
+    Mapped,
 }
 
 #[derive(Debug)]
@@ -31,6 +44,7 @@ impl<T> Default for Learned<T> {
         Self {
             known: HashMap::new(),
             weight: 0,
+            full: None,
         }
     }
 }
@@ -47,14 +61,14 @@ pub(crate) enum News {
 }
 
 impl<T: Weight + PartialEq> Learned<T> {
-    /// Takes note of what a topic is, for some time. Where there is no room, one that is read has precedence over all
-    /// that are not.
+    /// Takes note of what a topic is, for some time. Where there is no room, those of the lowest rank give way to one of a
+    /// higher.
     pub(crate) fn learn(
         &mut self,
         topic: TopicId,
         described: T,
         (now, period): (Instant, Duration),
-        is_read: impl Fn(TopicId) -> bool,
+        rank: impl Fn(TopicId) -> Rank,
     ) -> News {
         let until = now + period.saturating_mul(MISSED).max(LEAST);
         if let Some(known) = self.known.get_mut(&topic)
@@ -66,13 +80,20 @@ impl<T: Weight + PartialEq> Learned<T> {
         let weight = described.weight();
         self.forget(topic);
         if !self.has_room(weight) {
+            let own = rank(topic);
+            if matches!(self.full, Some((at, of)) if own <= of && now < at + LOOK_AGAIN) {
+                return News::Full;
+            }
             self.retain(|_, known| known.until > now);
-        }
-        if !self.has_room(weight) && is_read(topic) {
-            self.retain(|topic, _| is_read(topic));
-        }
-        if !self.has_room(weight) {
-            return News::Full;
+            for lower in [Rank::Stray, Rank::Heard] {
+                if lower < own && !self.has_room(weight) {
+                    self.retain(|topic, _| rank(topic) > lower);
+                }
+            }
+            if !self.has_room(weight) {
+                self.full = Some((now, own));
+                return News::Full;
+            }
         }
         self.weight += weight;
         let described = Arc::new(described);
@@ -117,6 +138,8 @@ impl<T: Weight + PartialEq> Learned<T> {
 const MAX_TOPICS: usize = 4096;
 /// Bytes of all descriptions.
 const MAX_WEIGHT: usize = 8 << 20;
+/// How long it stays full once it is.
+const LOOK_AGAIN: Duration = Duration::from_secs(1);
 /// Announcements that may be lost before what they say is forgotten.
 const MISSED: u32 = 3;
 /// Writers may announce more rarely than we do.
@@ -151,7 +174,9 @@ mod tests {
         let mut learned = Learned::default();
         let mut learn = |number: usize, at: Instant| {
             let what = described("std_msgs/Bool");
-            learned.learn(topic(number), what, (at, Duration::from_secs(30)), |_| true)
+            learned.learn(topic(number), what, (at, Duration::from_secs(30)), |_| {
+                Rank::Heard
+            })
         };
         for number in 0..MAX_TOPICS {
             assert_eq!(learn(number, start), News::Other);
@@ -174,20 +199,38 @@ mod tests {
         clippy::disallowed_methods,
         reason = "a test needs some instant to count from"
     )]
-    fn what_is_read_has_precedence_over_what_is_not() {
-        let at = (Instant::now(), Duration::from_secs(30));
+    fn what_is_heard_has_precedence_over_what_is_not_and_the_mapping_over_both() {
+        let start = Instant::now();
         let mut learned = Learned::default();
-        let read = [topic(0), topic(MAX_TOPICS)];
-        let mut learn = |number: usize| {
+        let mut learn = |number: usize, seconds: u64, heard: &[usize], mapped: &[usize]| {
+            let of = |numbers: &[usize], it| numbers.iter().any(|number| topic(*number) == it);
+            let rank = |it| match (of(mapped, it), of(heard, it)) {
+                (true, _) => Rank::Mapped,
+                (false, true) => Rank::Heard,
+                (false, false) => Rank::Stray,
+            };
             let what = described("std_msgs/Bool");
-            learned.learn(topic(number), what, at, |topic| read.contains(&topic))
+            let at = start + Duration::from_secs(seconds);
+            let news = learned.learn(topic(number), what, (at, Duration::from_secs(30)), rank);
+            (news, learned.known.len())
         };
-        for number in 0..MAX_TOPICS {
-            assert_eq!(learn(number), News::Other);
+        let all: Vec<usize> = (0..MAX_TOPICS).collect();
+        for number in &all {
+            assert_eq!(learn(*number, 0, &all, &[]), (News::Other, number + 1));
         }
-        assert_eq!(learn(MAX_TOPICS + 1), News::Full);
-        assert_eq!(learn(MAX_TOPICS), News::Other);
-        assert_eq!(learn(0), News::Same);
-        assert_eq!(learned.known.len(), 2);
+        let stranger = MAX_TOPICS;
+        assert_eq!(learn(stranger, 0, &all, &[]), (News::Full, MAX_TOPICS));
+        let mapped = MAX_TOPICS + 1;
+        assert_eq!(
+            learn(mapped, 0, &all, &[mapped]),
+            (News::Other, 1),
+            "of a higher rank it is looked for room at once"
+        );
+        for number in &all[1..] {
+            assert_eq!(learn(*number, 1, &[], &[mapped]).0, News::Other);
+        }
+        let heard = learn(stranger, 2, &[0, stranger], &[mapped]);
+        assert_eq!(heard, (News::Other, 2), "those that fell silent give way");
+        assert_eq!(learn(mapped, 2, &[], &[mapped]).0, News::Same);
     }
 }

@@ -8,7 +8,7 @@ use uadp::{
     Timestamp, Whole,
 };
 
-use crate::counters::Reason;
+use crate::counters::{Cause, Reason};
 use crate::fields;
 use crate::writer::Encoded;
 
@@ -19,8 +19,8 @@ pub(crate) fn encode(
     header: &DataSetHeader,
     utc: Timestamp,
     sample: &fields::Payload<'_>,
-) -> Result<(), (Reason, String)> {
-    let too_big = |error: EncodeError| (Reason::TooBig, error.to_string());
+) -> Result<(), (Cause, String)> {
+    let too_big = |error: EncodeError| (Reason::TooBig.into(), error.to_string());
     let (space, namespace, identifier) = topic.triple();
     let network = network_header(space, namespace, utc);
     let mut message = NetworkMessageEncoder::new(&mut encoded.bytes, &network, Some(&[identifier]))

@@ -18,8 +18,10 @@ pub(crate) struct Reader {
     sequence: Option<u16>,
     /// The Timestamp of the last one that was no repetition.
     stamp: Option<Timestamp>,
-    /// Who sent it.
-    from: SocketAddr,
+    /// Who sent it; `None` before the first.
+    from: Option<SocketAddr>,
+    /// How often that was another than before, since it was asked.
+    moved: u64,
     /// When anything was last heard of the writer, keep-alives included.
     heard: Instant,
     /// When the topic's value was last known to hold: the local side took one, or the writer repeated it or had nothing new.
@@ -52,6 +54,28 @@ pub(crate) struct Reader {
     major_version: Option<u32>,
     /// When what it is said to be was last taken, and how often it was another by then.
     renamed: Option<(Instant, u32)>,
+    /// What the port is to be told of the topic.
+    pub(crate) news: News,
+}
+
+/// What the port is to be told of a topic, in this order.
+#[derive(Debug, Default)]
+pub(crate) struct News {
+    /// Whether the topic stands in the Router's list of those with news.
+    pub(crate) queued: bool,
+    /// Whether its writer is silent has changed.
+    pub(crate) silence: bool,
+    /// It is to be asked for a local type.
+    pub(crate) ask: Option<Ask>,
+}
+
+/// When the port is asked for the local type of a topic.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Ask {
+    /// Where its writer says what it is: there is a type.
+    IfDescribed,
+    /// In any case: there is none.
+    Always,
 }
 
 /// A sample that was handed on.
@@ -81,6 +105,8 @@ pub(crate) struct Place {
     pub(crate) stamp: Option<Timestamp>,
     /// Whether the stamp has PicoSeconds, as all bridges send: two samples of one writer then never share it.
     pub(crate) fine: bool,
+    /// When its NetworkMessage was sent.
+    pub(crate) sent: Option<Timestamp>,
     pub(crate) from: SocketAddr,
 }
 
@@ -89,14 +115,23 @@ impl Place {
     pub(crate) fn instance(&self) -> Option<Timestamp> {
         self.stamp.filter(|_| self.fine)
     }
+
+    /// Whether the sample was taken just before it was sent, as no repetition is.
+    fn is_fresh(&self) -> bool {
+        let (Some(stamp), Some(sent)) = (self.stamp, self.sent) else {
+            return false;
+        };
+        (0..FRESH).contains(&(sent.unix_nanos() - stamp.unix_nanos()))
+    }
 }
 
 impl Reader {
-    pub(crate) const fn new(from: SocketAddr, now: Instant) -> Self {
+    pub(crate) const fn new(from: Option<SocketAddr>, now: Instant) -> Self {
         Self {
             sequence: None,
             stamp: None,
             from,
+            moved: 0,
             heard: now,
             good: now,
             dropped: None,
@@ -112,7 +147,27 @@ impl Reader {
             shape: None,
             major_version: None,
             renamed: None,
+            news: News {
+                queued: false,
+                silence: false,
+                ask: None,
+            },
         }
+    }
+
+    /// When anything was last heard of the writer.
+    pub(crate) const fn heard_at(&self) -> Instant {
+        self.heard
+    }
+
+    /// Whether the topic is held to be silent.
+    pub(crate) const fn is_silent(&self) -> bool {
+        self.silent
+    }
+
+    /// How often its values came from another address than before, since this was asked.
+    pub(crate) const fn take_moved(&mut self) -> u64 {
+        std::mem::replace(&mut self.moved, 0)
     }
 
     /// Takes note that the writer lives.
@@ -147,7 +202,7 @@ impl Reader {
 
     /// Whether what comes from there may be of the writer: of one that was not heard for `timeout` nobody knows.
     pub(crate) fn may_be(&self, from: SocketAddr, now: Instant, timeout: Duration) -> bool {
-        self.from == from || now.saturating_duration_since(self.heard) >= timeout
+        self.from.is_none_or(|known| known == from) || now.saturating_duration_since(self.heard) >= timeout
     }
 
     /// Takes note of the version of a message, and says whether what was known of the content is no longer true.
@@ -212,22 +267,33 @@ impl Reader {
     ///
     /// The arithmetic is that of OPC 10000-14 7.2.3: ahead by less than a quarter of the range is newer, behind by
     /// less than a quarter is old. A writer that starts over looks old by its numbers; its stamps or its new address
-    /// tell.
+    /// tell. One whose clock was set back looks by its stamps as if it repeated older values; that its numbers go on and
+    /// the sample is fresh tells.
     pub(crate) fn admit(&mut self, place: Place, now: Instant) -> Result<(u16, Kept), Reason> {
-        let restarted = place.from != self.from
-            || matches!((place.stamp, self.stamp), (Some(new), Some(last)) if new > last);
+        let moved = self.from.is_some_and(|from| from != place.from);
+        let restarted =
+            moved || matches!((place.stamp, self.stamp), (Some(new), Some(last)) if new > last);
+        let mut next = false;
         let missing = match (self.sequence, place.sequence) {
             (Some(last), Some(sequence)) => match sequence.wrapping_sub(last) {
                 0 if !restarted => return Err(Reason::Duplicate),
                 0 => 0,
-                ahead @ 1..=QUARTER => ahead - 1,
+                ahead @ 1..=QUARTER => {
+                    next = true;
+                    ahead - 1
+                }
                 OLD.. if !restarted => return Err(Reason::Stale),
                 _ => 0,
             },
             (_, _) => 0,
         };
         self.sequence = place.sequence;
-        self.from = place.from;
+        self.from = Some(place.from);
+        self.moved += u64::from(moved);
+        if next && self.is_set_back(place) {
+            self.forget_all();
+            self.stamp = None;
+        }
         let kept = match place.instance() {
             // Newer than all before, as nearly every sample is.
             Some(stamp) if self.several.is_none() && self.stamp.is_none_or(|last| stamp > last) => {
@@ -240,6 +306,17 @@ impl Reader {
             self.stamp = place.stamp.or(self.stamp);
         }
         Ok((missing, kept))
+    }
+
+    /// Whether a sample that follows the last one was taken before it, by a clock that was set back in between.
+    fn is_set_back(&self, place: Place) -> bool {
+        let older = matches!((place.stamp, self.stamp), (Some(new), Some(last)) if new < last);
+        let known = || {
+            self.known
+                .iter()
+                .any(|known| Some(known.stamp) == place.stamp)
+        };
+        older && place.is_fresh() && !known()
     }
 
     /// What a sample is that may be a repetition.
@@ -361,6 +438,9 @@ const MAX_KNOWN: usize = MAX_KEPT;
 /// How long the second other word on what a topic is has to wait for, and how often that is doubled.
 const RENAME_AFTER: Duration = Duration::from_secs(10);
 const MOST_DOUBLINGS: u32 = 8;
+/// How many nanoseconds after it was taken a sample is sent at most that is no repetition; those that a rate held back or
+/// that are long in their chunks are not among them.
+const FRESH: i128 = 100_000_000;
 /// A quarter of the sequence numbers' range.
 const QUARTER: u16 = 0x4000;
 /// From here on a number counts as behind the last one.
@@ -379,6 +459,7 @@ mod tests {
             sequence: Some(sequence),
             stamp: Some(Timestamp::from_unix_nanos(stamp)),
             fine: true,
+            sent: None,
             from: address(1),
         }
     }
@@ -389,7 +470,7 @@ mod tests {
     )]
     fn reader() -> (Reader, Instant) {
         let now = Instant::now();
-        (Reader::new(address(1), now), now)
+        (Reader::new(Some(address(1)), now), now)
     }
 
     #[test]
@@ -537,6 +618,32 @@ mod tests {
         assert_eq!(retired, [(6, 1000), (10, 2000)]);
         let next = hear(&mut reader, sequence + 1, 4000, start + PERIOD * 12);
         assert_eq!(next, Ok(Kept::Alone));
+    }
+
+    #[test]
+    fn a_clock_that_is_set_back_makes_no_older_value_of_a_newer_one() {
+        let (mut reader, now) = reader();
+        let sent_at = |sequence, stamp: i128, sent: i128| Place {
+            sent: Some(Timestamp::from_unix_nanos(sent)),
+            ..place(sequence, stamp)
+        };
+        let (second, soon) = (1_000_000_000, 50_000);
+        let mut hear = |place: Place| {
+            let (_, kept) = reader.admit(place, now)?;
+            reader.delivered(place.instance(), kept, now);
+            Ok(kept)
+        };
+        let first = hear(sent_at(1, 1000 * second, 1000 * second + soon));
+        assert_eq!(first, Ok(Kept::Alone));
+        let set_back = hear(sent_at(2, 900 * second, 900 * second + soon));
+        assert_eq!(set_back, Ok(Kept::Alone));
+        let next = hear(sent_at(3, 901 * second, 901 * second + soon));
+        assert_eq!(next, Ok(Kept::Alone));
+        let repeated = hear(sent_at(4, 901 * second, 902 * second));
+        assert_eq!(repeated, Err(Reason::Repeat));
+        // What was taken before and is sent only now is another value beside it, as of several latched publishers.
+        let beside = hear(sent_at(5, 890 * second, 903 * second));
+        assert_eq!(beside, Ok(Kept::Beside));
     }
 
     #[test]

@@ -4,13 +4,14 @@ mod batch;
 mod chunks;
 mod content;
 mod discovery;
+mod follow;
 mod receive;
 mod reload;
 mod send;
+mod told;
 
 use std::cmp::Reverse;
 use std::collections::{BinaryHeap, HashMap, VecDeque};
-use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -18,24 +19,26 @@ use mappings::{Mapping, Overflow, SpaceId, TopicId};
 use messages::{Dialect, MessageType, PlanError, Selection, Wire};
 use uadp::{Fields, Timestamp};
 
-use crate::counters::{Counters, Reason, Verdict, is_told};
+use crate::counters::{Cause, Counters, Reason, Verdict};
 use crate::fields;
-use crate::gate::{Gate, Passage, Waiting};
+use crate::gate::{Passage, Waiting};
 use crate::hops::{Hop, Hops};
 use crate::loop_rule::{Side, may_cross};
 use crate::network::{check_size, data_set_header, encode, keep_alive};
-use crate::output::{Delivery, Heard, Kept, Notice, Output, PublisherKey};
+use crate::output::{Delivery, Heard, Kept, Output, PublisherKey};
 use crate::pace::Pace;
 use crate::plans::Plans;
-use crate::reader::{Held, Reader};
+use crate::reader::Held;
+use crate::room::Room;
 use crate::settings::{Local, Now, Settings};
 use crate::topic::{Item, Role, Topic};
 use crate::transcoder::Transcoder;
-use crate::writer::{Encoded, Idle, MAX_KEPT, Message, Writer};
+use crate::writer::{Encoded, Idle, MAX_KEPT, Message};
 use chunks::Chunks;
 pub(crate) use content::Takes;
 use discovery::Discovery;
 use receive::Sample;
+use told::About;
 
 /// Decides what crosses between one space and UADP. See the crate's page for how it is driven.
 #[derive(Debug)]
@@ -43,6 +46,8 @@ pub struct Router {
     settings: Settings,
     mapping: Arc<Mapping>,
     topics: HashMap<TopicId, Topic>,
+    /// For topics that nobody here knows.
+    room: Room,
     plans: Plans,
     /// Topics with something in their queue, served in turn: a camera cannot starve a button.
     ready: VecDeque<TopicId>,
@@ -53,8 +58,12 @@ pub struct Router {
     chunks: Option<Box<Chunks>>,
     /// What topics consist of, announced and learned; `None` before there is any.
     discovery: Option<Box<Discovery>>,
-    /// What is told besides samples. Bounded by the topics and by [`is_told`].
+    /// What is told besides samples.
     told: VecDeque<Output>,
+    /// Topics of other spaces of which the port is to be told something, each once.
+    news: VecDeque<TopicId>,
+    /// Whether they have the next turn, before those that are ready.
+    news_first: bool,
     timers: BinaryHeap<Reverse<(Instant, TopicId)>>,
     /// Bytes of the key frames kept for delta frames.
     base_bytes: usize,
@@ -73,6 +82,7 @@ impl Router {
             settings,
             mapping,
             topics: HashMap::new(),
+            room: Room::new(follow::MAX_STRAYS),
             plans: Plans::default(),
             ready: VecDeque::new(),
             paced: VecDeque::new(),
@@ -80,6 +90,8 @@ impl Router {
             chunks: None,
             discovery: None,
             told: VecDeque::new(),
+            news: VecDeque::new(),
+            news_first: false,
             timers: BinaryHeap::new(),
             base_bytes: 0,
             spare: Vec::new(),
@@ -119,7 +131,7 @@ impl Router {
                 let (_, namespace, _) = topic.triple();
                 Box::new(Transcoder::compile(origin, message_type, namespace))
             });
-        let Some(entry) = self.entry(topic, None, now) else {
+        let Some(entry) = self.follow(topic, None, now) else {
             return Ok(());
         };
         entry.plan = Some(plan);
@@ -183,10 +195,10 @@ impl Router {
             gate,
             description,
             ..
-        }) = self.entry(topic, None, now)
+        }) = self.follow(topic, None, now)
         else {
-            let detail = format!("more than {MAX_TOPICS} topics are in the space");
-            return self.refuse(topic, Reason::TooManyTopics, detail);
+            // None of our own space.
+            return Verdict::Drop(Reason::Looped);
         };
         let sample = match (local, plan) {
             (Local::Fields, _) => fields::Payload::Block(payload),
@@ -202,11 +214,12 @@ impl Router {
         let mut written = encode(&mut encoded, topic, &header, now.utc, &sample);
         let large = encoded.bytes.len() > usize::from(max_datagram);
         if written.is_ok() && large {
-            written = check_size(&encoded, max_message).map_err(|detail| (Reason::TooBig, detail));
+            written = check_size(&encoded, max_message)
+                .map_err(|detail| ((Reason::TooBig, "max_message").into(), detail));
         }
-        if let Err((reason, detail)) = written {
+        if let Err((cause, detail)) = written {
             self.recycle(encoded.bytes);
-            return self.refuse(topic, reason, detail);
+            return self.refuse(topic, cause, detail);
         }
         let (passage, outpaced) = gate.as_mut().map_or((Passage::Passes, None), |gate| {
             gate.judge(&encoded, latched_by, now.monotonic)
@@ -255,7 +268,7 @@ impl Router {
             ..
         }) = self.topics.get_mut(&topic)
         else {
-            return Verdict::Drop(Reason::TooManyTopics);
+            return Verdict::Drop(Reason::Looped);
         };
         // The number is used up only by a message that goes out.
         encoded.number(writer.next_sequence());
@@ -316,7 +329,7 @@ impl Router {
         if let Some(Topic {
             role: Role::Ours(writer),
             ..
-        }) = self.entry(topic, None, now)
+        }) = self.follow(topic, None, now)
         {
             let revived = live && !writer.is_live();
             writer.set_live(live);
@@ -374,10 +387,15 @@ impl Router {
     }
 
     /// The local side did not take a delivery, given by its topic and instance: its repetition is welcome.
-    pub fn not_published(&mut self, topic: TopicId, instance: Option<Timestamp>, detail: &str) {
+    pub fn not_published(
+        &mut self,
+        topic: TopicId,
+        instance: Option<Timestamp>,
+        why: &'static str,
+    ) {
         self.forget(topic, instance);
-        self.count(About::topic(topic), Reason::NotPublished, 1, || {
-            detail.to_owned()
+        self.count(About::topic(topic), (Reason::NotPublished, why), 1, || {
+            why.to_owned()
         });
     }
 
@@ -395,9 +413,8 @@ impl Router {
 
     /// Samples that were lost before the Router saw them, in a queue of the port or the kernel.
     pub fn lost(&mut self, topic: Option<TopicId>, count: u64, why: &'static str) {
-        self.count(About { topic, from: None }, Reason::Overflow, count, || {
-            why.to_owned()
-        });
+        let about = About { topic, from: None };
+        self.count(about, (Reason::Overflow, why), count, || why.to_owned());
     }
 
     /// What a port dropped that belongs to no topic.
@@ -406,7 +423,7 @@ impl Router {
             topic: None,
             from: None,
         };
-        self.count(about, reason, count, || why.to_owned());
+        self.count(about, (reason, why), count, || why.to_owned());
     }
 
     /// Takes back the buffer of a datagram or payload that has been used, so that the next one needs no allocation.
@@ -444,11 +461,7 @@ impl Router {
         match &mut entry.role {
             Role::Theirs(reader) => {
                 if reader.fell_silent(now.monotonic, silence) {
-                    self.told.push_back(Output::Silent {
-                        topic,
-                        silent: true,
-                        dropped: reader.loss(),
-                    });
+                    self.tell_silence(topic);
                     self.forget_base(topic);
                 }
             }
@@ -534,36 +547,6 @@ impl Router {
         )
     }
 
-    /// The topic's entry, made when it is new and there is room.
-    fn entry(&mut self, topic: TopicId, from: Option<SocketAddr>, now: Now) -> Option<&mut Topic> {
-        if !self.topics.contains_key(&topic) {
-            if self.topics.len() >= MAX_TOPICS {
-                return None;
-            }
-            let overflow = self
-                .mapping
-                .variable(topic)
-                .map_or(Overflow::KeepLatest, |found| found.overflow);
-            let role = if topic.space == self.settings.own {
-                Role::Ours(Box::new(Writer::new(now.monotonic)))
-            } else {
-                let from = from.unwrap_or_else(|| SocketAddr::from(([0, 0, 0, 0], 0)));
-                Role::Theirs(Box::new(Reader::new(from, now.monotonic)))
-            };
-            let mut entry = Topic::new(role, overflow);
-            entry.takes = Takes::of(self.mapping.variable(topic));
-            entry.gate = match self.mapping.variable(topic) {
-                Some(variable) if topic.space == self.settings.own => Gate::new(variable.publish),
-                Some(_) | None => None,
-            };
-            self.topics.insert(topic, entry);
-            if from.is_some() {
-                self.schedule(topic);
-            }
-        }
-        self.topics.get_mut(&topic)
-    }
-
     /// Queues an item, and says whether the oldest one had to go for it.
     fn push(&mut self, topic: TopicId, item: Item) -> bool {
         let Some(entry) = self.topics.get_mut(&topic) else {
@@ -615,43 +598,10 @@ impl Router {
     }
 
     /// Counts a sample of the local side that does not cross.
-    fn refuse(&mut self, topic: TopicId, reason: Reason, detail: String) -> Verdict {
-        self.count(About::topic(topic), reason, 1, || detail);
-        Verdict::Drop(reason)
-    }
-
-    /// Counts drops, and tells of them at their 1st, 10th, 100th ... occurrence.
-    fn count(
-        &mut self,
-        About { topic, from }: About,
-        reason: Reason,
-        count: u64,
-        detail: impl FnOnce() -> String,
-    ) {
-        let counters = match topic.and_then(|topic| self.topics.get_mut(&topic)) {
-            Some(entry) => {
-                if let Role::Theirs(reader) = &mut entry.role {
-                    reader.dropped(reason);
-                }
-                &mut entry.counters
-            }
-            None => &mut self.others,
-        };
-        let before = counters.dropped(reason);
-        let total = counters.add(reason, count);
-        let told = !reason.is_routine() && (before + 1..=total).take(MAX_TOLD_STEPS).any(is_told);
-        if told {
-            let detail = detail();
-            if !detail.is_empty() {
-                self.told.push_back(Output::Notice(Notice {
-                    topic,
-                    from,
-                    reason,
-                    total,
-                    detail,
-                }));
-            }
-        }
+    fn refuse(&mut self, topic: TopicId, cause: impl Into<Cause>, detail: String) -> Verdict {
+        let cause = cause.into();
+        self.count(About::topic(topic), cause, 1, || detail);
+        Verdict::Drop(cause.reason)
     }
 
     fn buffer(&mut self) -> Vec<u8> {
@@ -659,33 +609,6 @@ impl Router {
     }
 }
 
-/// What a drop is about.
-#[derive(Clone, Copy)]
-struct About {
-    topic: Option<TopicId>,
-    from: Option<SocketAddr>,
-}
-
-impl About {
-    const fn topic(topic: TopicId) -> Self {
-        Self {
-            topic: Some(topic),
-            from: None,
-        }
-    }
-
-    const fn sender(from: SocketAddr) -> Self {
-        Self {
-            topic: None,
-            from: Some(from),
-        }
-    }
-}
-
-/// Topics followed at a time. Triples are free to invent for whoever sends to the group; memory is not.
-const MAX_TOPICS: usize = 16_384;
 /// Buffers kept for reuse, and how large each may have grown.
 const SPARE_BUFFERS: usize = 64;
 const SPARE_CAPACITY: usize = 128 * 1024;
-/// How far a sudden jump of a counter is searched for a decade to be told at.
-const MAX_TOLD_STEPS: usize = 1_000;

@@ -7,7 +7,7 @@ use uadp::{
     DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder, Scalar, Variant,
 };
 
-use crate::counters::Reason;
+use crate::counters::{Cause, Reason};
 use crate::fields::{self, Payload};
 
 /// Makes the bytes of a message of the other ROS those of the local type of the same name.
@@ -59,14 +59,14 @@ impl Transcoder {
         mut fields: Fields<'_>,
         scratch: &mut Vec<u8>,
         out: &mut Vec<u8>,
-    ) -> Result<(), (Reason, String)> {
+    ) -> Result<(), (Cause, String)> {
         let (Some(Ok(Variant::Scalar(Scalar::ByteString(bytes)))), None) =
             (fields.next(), fields.next())
         else {
             let detail = "a message as bytes is one ByteString, and this is something else";
-            return Err((Reason::Mismatch, detail.to_owned()));
+            return Err((Reason::Mismatch.into(), detail.to_owned()));
         };
-        let too_big = |error: uadp::EncodeError| (Reason::TooBig, error.to_string());
+        let too_big = |error: uadp::EncodeError| (Reason::TooBig.into(), error.to_string());
         let mut message = NetworkMessageEncoder::new(scratch, &NetworkHeader::default(), None)
             .map_err(too_big)?;
         let mut frame = message
@@ -76,13 +76,12 @@ impl Transcoder {
         fields::read(&payload, self.namespace, &mut frame)?;
         frame.finish().map_err(too_big)?;
         message.finish().map_err(too_big)?;
-        let malformed = |error: uadp::DecodeError| (Reason::Malformed, error.to_string());
-        let message = NetworkMessage::decode(scratch).map_err(malformed)?;
+        let message = NetworkMessage::decode(scratch).map_err(fields::undecodable)?;
         let message = message.messages().next();
         let fields = message
             .transpose()
             .and_then(|message| message.map(|message| message.fields()).transpose())
-            .map_err(malformed)?;
+            .map_err(fields::undecodable)?;
         fields.map_or(Ok(()), |fields| fields::write(&self.to, fields, out))
     }
 }

@@ -257,7 +257,7 @@ fn a_value_is_known_by_what_its_writer_says_and_the_port_is_told_at_once() {
     let sent = writer.sent_within(SECOND / 2, &mut now);
     reader.hear(&writer, &sent, now);
     let told = reader.told(now);
-    let [(topic, None), (_, Some(described))] = &told[..] else {
+    let [(topic, Some(described))] = &told[..] else {
         panic!("{told:?}")
     };
     assert_eq!(*topic, "ua_1_5_10".parse().unwrap());
@@ -285,6 +285,36 @@ fn a_reader_that_came_late_asks_and_stops_when_it_is_answered() {
     reader.hear(&writer, &answer, now);
     assert!(matches!(reader.told(now)[..], [(_, Some(_))]));
     assert!(reader.sent_within(SECOND * 60, &mut now).is_empty());
+}
+
+#[test]
+fn nobody_but_the_writer_says_that_there_is_no_such_writer() {
+    let (mut writer, mut reader, mut now) = (Bridge::new(1, ""), Bridge::new(2, ""), clock());
+    writer.bind("ua_1_5_10", "geometry_msgs/Twist", &Selection::Whole, now);
+    writer.say("ua_1_5_10", &TWIST, now);
+    let sent = writer.sent_within(Duration::ZERO, &mut now);
+    reader.hear(&writer, &sent, now);
+    assert!(matches!(reader.told(now)[..], [(_, None)]));
+    let mut denial = Vec::new();
+    let announcement = Announcement {
+        sequence_number: 0,
+        announced: Announced::DataSetMetaData {
+            writer_id: 10,
+            meta_data: DataSetMetaDataType::default(),
+            status: StatusCode(0x803E_0000),
+        },
+    };
+    announcement
+        .encode(PublisherId::UInt16(1), SecurityHeader::NONE, &mut denial)
+        .unwrap();
+    let stranger = SocketAddr::from(([127, 0, 0, 1], 40_000));
+    reader.router.handle_datagram(&denial, stranger, now);
+    assert_eq!(reader.refused(), 1);
+    let asked = reader.sent_within(SECOND / 2, &mut now);
+    assert_eq!(asked.len(), 1, "it asks all the same");
+    reader.router.handle_datagram(&denial, writer.address, now);
+    assert_eq!(reader.sent_within(SECOND * 3600, &mut now).len(), 0);
+    assert_eq!(reader.refused(), 1);
 }
 
 #[test]
@@ -365,7 +395,7 @@ fn who_does_not_send_the_values_does_not_say_what_they_are() {
     writer.say("ua_1_5_10", &TWIST, now);
     let sent = writer.sent_within(SECOND / 2, &mut now);
     reader.hear(&writer, &sent, now);
-    assert_eq!(reader.told(now).len(), 2);
+    assert_eq!(reader.told(now).len(), 1);
 
     let mut liar = Bridge::new(1, "");
     liar.address.set_port(40_000);

@@ -57,6 +57,7 @@ struct TopicStatus {
     described: u64,
     keep_alives: u64,
     missing: u64,
+    sender_changed: u64,
     dropped: BTreeMap<&'static str, u64>,
 }
 
@@ -161,6 +162,7 @@ impl Status {
             line("metadata_learned_total", &labels, &status.described);
             line("keep_alives_total", &labels, &status.keep_alives);
             line("messages_missing_total", &labels, &status.missing);
+            line("sender_changed_total", &labels, &status.sender_changed);
             for (reason, count) in &status.dropped {
                 line(
                     "samples_dropped_total",
@@ -191,6 +193,7 @@ impl From<&Counters> for TopicStatus {
             described: counters.described,
             keep_alives: counters.keep_alives,
             missing: counters.missing,
+            sender_changed: counters.sender_changed,
             dropped: counters
                 .drops()
                 .map(|(reason, count)| (reason.label(), count))

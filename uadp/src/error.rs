@@ -57,6 +57,22 @@ pub enum DecodeError {
     Text(&'static str),
 }
 
+impl DecodeError {
+    /// What it is about, as the standard's tables name it, whatever stood there: the same for all errors of a kind.
+    #[must_use]
+    pub const fn subject(&self) -> &'static str {
+        match self {
+            Self::Truncated { field, .. }
+            | Self::Reserved { field, .. }
+            | Self::Limit { field, .. } => field,
+            Self::Unsupported(what) | Self::Misread(what) | Self::Text(what) => what,
+            Self::Dimensions { .. } => "array dimensions",
+            Self::TooDeep => "nesting",
+            Self::TrailingBytes(_) => "trailing bytes",
+        }
+    }
+}
+
 /// Why a message could not be written. The buffer then holds an unfinished message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]

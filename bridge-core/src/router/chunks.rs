@@ -11,7 +11,7 @@ use uadp::{
 };
 
 use super::receive::{number_of, sent};
-use super::{About, MAX_TOPICS, Router};
+use super::{About, Router};
 use crate::counters::Reason;
 use crate::settings::Now;
 use crate::topic::{Role, Topic};
@@ -116,7 +116,8 @@ impl Router {
                     from: Some(from),
                 };
                 let most = self.mapping.pubsub().max_message >> 20;
-                self.count(about, reason_of(refusal), 1, || told(refusal, most));
+                let cause = (reason_of(refusal), case_of(refusal));
+                self.count(about, cause, 1, || told(refusal, most));
             }
         }
         self.count_given_up(&mut chunks.reassembler);
@@ -141,11 +142,8 @@ impl Router {
         let Some(Topic {
             role: Role::Theirs(reader),
             ..
-        }) = self.entry(topic, Some(from), now)
+        }) = self.entry(topic, from, now)
         else {
-            self.count(About::sender(from), Reason::TooManyTopics, 1, || {
-                format!("more than {MAX_TOPICS} topics are in the space; {topic} is not followed")
-            });
             return false;
         };
         reader.heard(now.monotonic);
@@ -165,7 +163,7 @@ impl Router {
                 topic: topic_of(&given_up),
                 from: Some(given_up.sender),
             };
-            self.count(about, reason, 1, || {
+            self.count(about, (reason, why(given_up.why)), 1, || {
                 format!(
                     "of a message of {} bytes only {} came ({}); a larger receive buffer may help, see \
                      net.core.rmem_max",
@@ -205,6 +203,18 @@ const fn reason_of(refusal: ChunkRefusal) -> Reason {
         Reason::Duplicate
     } else {
         Reason::Malformed
+    }
+}
+
+const fn case_of(refusal: ChunkRefusal) -> &'static str {
+    match refusal {
+        ChunkRefusal::Malformed(error) => error.subject(),
+        ChunkRefusal::TooBig { .. } => "total size",
+        ChunkRefusal::TotalSize { .. } => "another total size",
+        ChunkRefusal::Duplicate => "duplicate",
+        ChunkRefusal::Overlap => "overlap",
+        ChunkRefusal::TooManyPieces => "pieces",
+        _ => "chunk",
     }
 }
 

@@ -105,7 +105,7 @@ impl Quality {
 
 impl Router {
     /// Keeps a key frame for delta frames to come, and says what of its fields is taken.
-    pub(super) fn follow(
+    pub(super) fn take_base(
         &mut self,
         topic: TopicId,
         message: &DataSetMessage<'_>,
@@ -358,7 +358,7 @@ impl Router {
             return;
         };
         if reader.deltas {
-            self.follow(topic, message, place);
+            self.take_base(topic, message, place);
         } else if let Some(base) = &mut reader.base {
             base.repeated(place);
         }

@@ -1,11 +1,11 @@
 //! What topics consist of: announced for those of our own space, learned and asked for of the others.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use mappings::{SpaceId, TopicId};
+use mappings::{Mapping, SpaceId, TopicId};
 use messages::{MessageType, Selection};
 use uadp::discovery::{
     AnnounceLimits, Announced, Announcement, Announcer, DataSetMetaDataType, Included, List, Probe,
@@ -18,10 +18,11 @@ use super::{About, Router};
 use crate::counters::Reason;
 use crate::description::{Described, Description, Source, mapped_leaves};
 use crate::layout::Layout;
-use crate::learned::{Learned, News};
+use crate::learned::{Learned, News, Rank};
 use crate::loop_rule::{Side, may_cross};
 use crate::network::announcement_chunks;
 use crate::output::Output;
+use crate::reader::Ask;
 use crate::settings::{Local, Now};
 use crate::topic::{Role, Topic};
 
@@ -272,14 +273,15 @@ impl Router {
         let body_at = description.write(sequence_number, &mut bytes);
         counters.announced += 1;
         if bytes.len() <= usize::from(max_datagram) {
-            self.told.push_back(Output::Discovery { bytes });
+            self.tell(Output::Discovery { bytes });
             return;
         }
         let body = bytes.get(body_at..).unwrap_or_default();
         match announcement_chunks(topic.space, sequence_number, body, (max_datagram, now.utc)) {
             Ok(chunks) => {
-                let chunks = chunks.into_iter().map(|bytes| Output::Discovery { bytes });
-                self.told.extend(chunks);
+                for bytes in chunks {
+                    self.tell(Output::Discovery { bytes });
+                }
             }
             Err(error) => self.count(About::topic(topic), Reason::TooBig, 1, || error.to_string()),
         }
@@ -302,7 +304,7 @@ impl Router {
             .encode(publisher, SecurityHeader::NONE, &mut bytes)
             .is_ok()
         {
-            self.told.push_back(Output::Discovery { bytes });
+            self.tell(Output::Discovery { bytes });
         }
     }
 
@@ -316,7 +318,7 @@ impl Router {
             .encode(publisher, SecurityHeader::NONE, &mut bytes)
             .is_ok()
         {
-            self.told.push_back(Output::Discovery { bytes });
+            self.tell(Output::Discovery { bytes });
         }
     }
 
@@ -435,8 +437,7 @@ impl Router {
             return;
         };
         if status.0 & STATUS_BAD != 0 {
-            let is_it = |topic: TopicId| topic.triple().2 == *writer_id;
-            self.discovery(now).answered(space, is_it);
+            self.learn_of_none(*writer_id, (space, from), now);
             return;
         }
         let named = meta_data.name.and_then(|name| name.parse().ok());
@@ -458,7 +459,7 @@ impl Router {
         }) = self.topics.get(&topic)
         {
             if !reader.may_be(from, now.monotonic, timeout) {
-                self.count(about, Reason::MetaData, 1, || {
+                self.count(about, (Reason::MetaData, "sender"), 1, || {
                     "another program than the one that sends its values says what they are"
                         .to_owned()
                 });
@@ -477,7 +478,7 @@ impl Router {
         let described = match Described::read(meta_data) {
             Ok(described) => described,
             Err(why) => {
-                self.count(about, Reason::MetaData, 1, || why);
+                self.count(about, (Reason::MetaData, "useless"), 1, || why);
                 return;
             }
         };
@@ -486,22 +487,22 @@ impl Router {
             && shape.is_some()
             && !self.may_be_renamed(topic, described, now)
         {
-            self.count(about, Reason::MetaData, 1, || {
+            self.count(about, (Reason::MetaData, "too often"), 1, || {
                 "its writer says too often that it is something else".to_owned()
             });
             return;
         }
         match self.take_note(topic, described, now) {
             News::Same => {}
-            News::Full => self.count(about, Reason::MetaData, 1, || {
+            News::Full => self.count(about, (Reason::MetaData, "no room"), 1, || {
                 "there is no room for what more topics consist of".to_owned()
             }),
             News::Other => {
                 let counters = self.topics.get_mut(&topic);
                 let counters = counters.map_or(&mut self.others, |entry| &mut entry.counters);
                 counters.described += 1;
-                if let Some(shape) = shape {
-                    self.tell_unbound(topic, shape, now);
+                if shape.is_some() {
+                    self.tell_unbound(topic);
                 }
             }
         }
@@ -521,18 +522,43 @@ impl Router {
         let discovery = self
             .discovery
             .get_or_insert_with(|| Box::new(Discovery::new(own, now.monotonic)));
-        let topics = &self.topics;
-        let is_read = |topic: TopicId| topics.contains_key(&topic);
-        match discovery.layouts.learn(topic, layout, until, is_read) {
+        let rank = rank(&self.topics, &self.mapping, now.monotonic);
+        match discovery.layouts.learn(topic, layout, until, rank) {
             News::Full => Err("there is no room for what the fields of more topics are".to_owned()),
             News::Same | News::Other => Ok(()),
         }
     }
 
+    /// Takes in that a Publisher has no such DataSetWriter: its topics are no longer asked for, but for those whose values
+    /// somebody else sends.
+    fn learn_of_none(&mut self, writer_id: u16, (space, from): (SpaceId, SocketAddr), now: Now) {
+        let timeout = self.mapping.pubsub().receive_timeout;
+        let probing = self.discovery.as_ref();
+        let probing = probing.and_then(|discovery| discovery.probing.get(&space));
+        let asked = probing.into_iter().flat_map(|probing| &probing.topics);
+        let (denied, doubtful): (Vec<TopicId>, Vec<TopicId>) = asked
+            .filter(|topic| topic.triple().2 == writer_id)
+            .partition(|topic| match self.topics.get(topic).map(|of| &of.role) {
+                Some(Role::Theirs(reader)) => reader.may_be(from, now.monotonic, timeout),
+                Some(Role::Ours(_)) | None => true,
+            });
+        for topic in doubtful {
+            let about = About {
+                topic: Some(topic),
+                from: Some(from),
+            };
+            self.count(about, (Reason::MetaData, "sender"), 1, || {
+                "another program than the one that sends its values says that there is no such writer"
+                    .to_owned()
+            });
+        }
+        self.discovery(now)
+            .answered(space, |topic| denied.contains(&topic));
+    }
+
     /// Keeps what a topic is said to be; what is no type is not kept, and nothing else is.
     fn take_note(&mut self, topic: TopicId, described: Option<Described>, now: Now) -> News {
         let until = (now.monotonic, self.mapping.pubsub().metadata_period);
-        let topics = &self.topics;
         let Some(discovery) = &mut self.discovery else {
             return News::Same;
         };
@@ -540,8 +566,8 @@ impl Router {
             discovery.learned.forget(topic);
             return News::Same;
         };
-        let is_read = |topic: TopicId| topics.contains_key(&topic);
-        discovery.learned.learn(topic, described, until, is_read)
+        let rank = rank(&self.topics, &self.mapping, now.monotonic);
+        discovery.learned.learn(topic, described, until, rank)
     }
 
     /// Whether a topic that has values may be what it is said to be from now on: always what it is known as.
@@ -561,53 +587,37 @@ impl Router {
         }
     }
 
-    /// A topic that is open may have other values than before: has the port look at what its writer said of them.
-    pub(super) fn tell_described(
+    /// Has the port find the local type of a topic with values of that shape, with what is known of it; or, where it has a
+    /// type, look at what its writer says of them.
+    pub(super) fn asked(
         &mut self,
         topic: TopicId,
+        ask: Ask,
         shape: Vec<(uadp::BuiltinType, bool)>,
         now: Now,
-    ) {
+    ) -> Option<Output> {
         let learned = self.discovery.as_ref().map(|discovery| &discovery.learned);
         let described = learned.and_then(|learned| learned.get(topic, now.monotonic));
-        if let Some(described) = described.filter(|described| described.fits(&shape)) {
-            let described = Some(Arc::clone(described));
-            self.told.push_back(Output::Unbound {
-                topic,
-                shape,
-                described,
-            });
-        }
-    }
-
-    /// Has the port find the local type of a topic, with what is known of it.
-    pub(super) fn tell_unbound(
-        &mut self,
-        topic: TopicId,
-        shape: Vec<(uadp::BuiltinType, bool)>,
-        now: Now,
-    ) {
-        let described = self
-            .discovery
-            .as_ref()
-            .and_then(|discovery| discovery.learned.get(topic, now.monotonic))
-            .cloned();
-        if described.is_none() {
-            self.ask(topic, now);
-        }
+        let described = described.cloned();
         let fits = described
             .as_ref()
             .is_none_or(|described| described.fits(&shape));
+        if ask == Ask::IfDescribed && (described.is_none() || !fits) {
+            return None;
+        }
+        if described.is_none() {
+            self.ask(topic, now);
+        }
         if !fits {
-            self.count(About::topic(topic), Reason::MetaData, 1, || {
+            self.count(About::topic(topic), (Reason::MetaData, "values"), 1, || {
                 "its values are not what its writer says they are".to_owned()
             });
         }
-        self.told.push_back(Output::Unbound {
+        Some(Output::Unbound {
             topic,
             shape,
             described: described.filter(|_| fits),
-        });
+        })
     }
 
     /// An announcement or probe could not be sent.
@@ -616,7 +626,7 @@ impl Router {
             topic: None,
             from: None,
         };
-        self.count(about, reason, 1, || detail.to_owned());
+        self.count(about, (reason, "socket"), 1, || detail.to_owned());
     }
 }
 
@@ -628,3 +638,21 @@ const BAD_NOT_FOUND: uadp::StatusCode = uadp::StatusCode(0x803E_0000);
 const ASK_LAYOUT_AGAIN: Duration = Duration::from_secs(10);
 /// Topics of one Publisher that are asked for at a time: those fit any datagram.
 const MAX_ASKED: usize = 200;
+
+/// Which topics have precedence where there is no room for what is known of all.
+fn rank(
+    topics: &HashMap<TopicId, Topic>,
+    mapping: &Mapping,
+    now: Instant,
+) -> impl Fn(TopicId) -> Rank {
+    let timeout = mapping.pubsub().receive_timeout;
+    move |topic| match topics.get(&topic).map(|of| &of.role) {
+        _ if mapping.variable(topic).is_some() => Rank::Mapped,
+        Some(Role::Theirs(reader))
+            if now.saturating_duration_since(reader.heard_at()) < timeout =>
+        {
+            Rank::Heard
+        }
+        Some(_) | None => Rank::Stray,
+    }
+}

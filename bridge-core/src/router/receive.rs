@@ -10,7 +10,7 @@ use uadp::{
 };
 
 use super::content::Quality;
-use super::{About, MAX_TOPICS, Router};
+use super::{About, Router};
 use crate::counters::Reason;
 use crate::fields;
 use crate::hops::Hop;
@@ -134,18 +134,15 @@ impl Router {
             );
             return;
         }
-        let mut place = place(&message.header(), from);
+        let mut place = place(&message.header(), (from, sent));
         // Only key frames are repeated.
         place.fine &= message.kind == MessageKind::KeyFrame;
         let Some(Topic {
             role: Role::Theirs(reader),
             counters,
             ..
-        }) = self.entry(topic, Some(from), now)
+        }) = self.entry(topic, from, now)
         else {
-            self.count(About::sender(from), Reason::TooManyTopics, 1, || {
-                format!("more than {MAX_TOPICS} topics are in the space; {topic} is not followed")
-            });
             return;
         };
         reader.heard(now.monotonic);
@@ -162,6 +159,7 @@ impl Router {
         if let Some(Ok((missing, _))) = admitted {
             counters.missing += u64::from(missing);
         }
+        counters.sender_changed += reader.take_moved();
         let returned = match admitted {
             None => reader.lives(now.monotonic),
             Some(Err(Reason::Repeat)) => reader.is_good(now.monotonic),
@@ -207,7 +205,7 @@ impl Router {
             status: quality.status(status),
             arrived: now.utc,
         };
-        let takes = self.follow(topic, message, place);
+        let takes = self.take_base(topic, message, place);
         match Self::plain(message, takes) {
             Some(Ok(fields)) => {
                 self.record_way(place.stamp, sent, now);
@@ -267,11 +265,7 @@ impl Router {
 
     /// The silence of a topic has ended.
     pub(super) fn tell_returned(&mut self, topic: TopicId) {
-        self.told.push_back(Output::Silent {
-            topic,
-            silent: false,
-            dropped: None,
-        });
+        self.tell_silence(topic);
         self.schedule(topic);
     }
 
@@ -294,9 +288,8 @@ impl Router {
         }
         if typed || plan.is_some() {
             // Looked up once for each shape, and not for each sample.
-            let shape = if anew { reader.shape.clone() } else { None };
-            if let Some(shape) = shape {
-                self.tell_described(topic, shape, now);
+            if anew {
+                self.tell_described(topic);
             }
             self.deliver(topic, sample, now);
             return;
@@ -307,7 +300,6 @@ impl Router {
         if asks {
             reader.asked = Some(now.monotonic);
         }
-        let shape = reader.shape.clone().filter(|_| asks);
         let fields = sample.fields.bytes();
         let held = || Held {
             fields: fields.to_vec(),
@@ -317,8 +309,8 @@ impl Router {
             arrived: sample.arrived,
         };
         reader.held = (fields.len() <= MAX_HELD).then(|| Box::new(held()));
-        if let Some(shape) = shape {
-            self.tell_unbound(topic, shape, now);
+        if asks {
+            self.tell_unbound(topic);
         }
         // Not yet a loss: the newest one waits. It is not told, since the port names topics without a type.
         self.is_good(topic, now);
@@ -326,37 +318,42 @@ impl Router {
     }
 
     pub(super) fn deliver(&mut self, topic: TopicId, sample: &Sample<'_>, now: Now) {
-        let mut payload = self.buffer();
         let Some(Topic {
             role: Role::Theirs(reader),
-            plan,
-            transcoder,
             ..
         }) = self.topics.get_mut(&topic)
         else {
             return;
         };
         let evicted = reader.delivered(sample.instance, sample.kept, now.monotonic);
-        let retired = evicted.map(|instance| Output::Retired { topic, instance });
-        self.told.extend(retired);
+        if let Some(instance) = evicted {
+            self.tell(Output::Retired { topic, instance });
+        }
+        let mut payload = self.buffer();
+        let Some(Topic {
+            plan, transcoder, ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return;
+        };
         let mut scratch = None;
         let written = match (plan, transcoder.as_deref()) {
             (Some(_), Some(Ok(transcoder))) => {
                 let scratch = scratch.insert(self.spare.pop().unwrap_or_default());
                 transcoder.run(sample.fields.clone(), scratch, &mut payload)
             }
-            (Some(_), Some(Err(why))) => Err((Reason::Mismatch, why.clone())),
+            (Some(_), Some(Err(why))) => Err((Reason::Mismatch.into(), why.clone())),
             (Some(plan), None) => fields::write(plan, sample.fields.clone(), &mut payload),
             (None, _) => fields::copy(&sample.fields, &mut payload),
         };
         if let Some(scratch) = scratch {
             self.recycle(scratch);
         }
-        if let Err((reason, detail)) = written {
+        if let Err((cause, detail)) = written {
             self.recycle(payload);
             // Its repetition is none of a value that the local side has.
             self.forget(topic, sample.instance);
-            self.count(About::topic(topic), reason, 1, || detail);
+            self.count(About::topic(topic), cause, 1, || detail);
             return;
         }
         let Sample {
@@ -395,8 +392,10 @@ impl Router {
         else {
             return;
         };
-        while let Some(instance) = reader.retire(now.monotonic, after) {
-            self.told.push_back(Output::Retired { topic, instance });
+        let gone: Vec<Timestamp> =
+            std::iter::from_fn(|| reader.retire(now.monotonic, after)).collect();
+        for instance in gone {
+            self.tell(Output::Retired { topic, instance });
         }
     }
 
@@ -423,7 +422,7 @@ impl Router {
                 topic,
                 from: Some(from),
             },
-            reason_of(error),
+            (reason_of(error), error.subject()),
             1,
             || error.to_string(),
         );
@@ -459,7 +458,7 @@ pub(super) fn sent(header: &NetworkHeader<'_>) -> Option<Timestamp> {
     })
 }
 
-fn place(header: &DataSetHeader, from: SocketAddr) -> Place {
+fn place(header: &DataSetHeader, (from, sent): (SocketAddr, Option<Timestamp>)) -> Place {
     Place {
         sequence: header.sequence_number,
         stamp: header.timestamp.map(|time| Timestamp {
@@ -467,6 +466,7 @@ fn place(header: &DataSetHeader, from: SocketAddr) -> Place {
             picoseconds: header.picoseconds.unwrap_or_default(),
         }),
         fine: header.picoseconds.is_some(),
+        sent,
         from,
     }
 }

@@ -16,11 +16,27 @@ impl Router {
         if let Some(told) = self.told.pop_front() {
             return Some(told);
         }
+        // In turn, so that many topics nobody knows do not keep the values of the others waiting.
+        self.news_first = !self.news_first;
+        let next = if self.news_first {
+            self.next_news(now).or_else(|| self.next_item(now))
+        } else {
+            self.next_item(now).or_else(|| self.next_news(now))
+        };
+        next.or_else(|| self.told.pop_front())
+    }
+
+    /// The next thing of the queues.
+    fn next_item(&mut self, now: Now) -> Option<Output> {
         // One for one: among those that are ready it waits its turn again.
         if !self.paced.is_empty() && self.pace.is_open(now.monotonic) {
             self.ready.extend(self.paced.pop_front());
         }
         while let Some(topic) = self.ready.pop_front() {
+            if let Some(news) = self.news_of(topic, now) {
+                self.ready.push_front(topic);
+                return Some(news);
+            }
             if let Some(output) = self.take_turn(topic, now) {
                 return Some(output);
             }
@@ -115,6 +131,8 @@ impl Router {
         if let Some(entry) = self.topics.get_mut(&topic) {
             entry.sending = None;
         }
-        self.count(About::topic(topic), reason, 1, || detail.to_owned());
+        self.count(About::topic(topic), (reason, "socket"), 1, || {
+            detail.to_owned()
+        });
     }
 }

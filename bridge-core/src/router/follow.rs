@@ -1,0 +1,114 @@
+//! Which topics are followed: those of our own space, of the mapping and of the port whatever there is, others while there
+//! is room.
+
+use std::net::SocketAddr;
+use std::time::Instant;
+
+use mappings::{Overflow, TopicId};
+
+use super::content::Takes;
+use super::{About, Router};
+use crate::counters::Reason;
+use crate::gate::Gate;
+use crate::reader::Reader;
+use crate::settings::Now;
+use crate::topic::{Role, Topic};
+use crate::writer::Writer;
+
+impl Router {
+    /// The topic's entry, made when it is new; `None` of one that nobody here knows, when there is no room for more such.
+    pub(super) fn entry(
+        &mut self,
+        topic: TopicId,
+        from: SocketAddr,
+        now: Now,
+    ) -> Option<&mut Topic> {
+        let is_stray = topic.space != self.settings.own && self.mapping.variable(topic).is_none();
+        if is_stray && !self.topics.contains_key(&topic) && !self.take_place(now) {
+            self.count(About::sender(from), Reason::TooManyTopics, 1, || {
+                format!(
+                    "{topic} is not followed: more than {MAX_STRAYS} topics speak that the mapping does not name and \
+                     nobody here takes"
+                )
+            });
+            return None;
+        }
+        self.follow(topic, Some(from), now)
+    }
+
+    /// The topic's entry, made when it is new: for those that are bounded by the mapping or the port.
+    pub(super) fn follow(
+        &mut self,
+        topic: TopicId,
+        from: Option<SocketAddr>,
+        now: Now,
+    ) -> Option<&mut Topic> {
+        if !self.topics.contains_key(&topic) {
+            let variable = self.mapping.variable(topic);
+            let overflow = variable.map_or(Overflow::KeepLatest, |found| found.overflow);
+            let role = if topic.space == self.settings.own {
+                Role::Ours(Box::new(Writer::new(now.monotonic)))
+            } else {
+                Role::Theirs(Box::new(Reader::new(from, now.monotonic)))
+            };
+            let mut entry = Topic::new(role, overflow);
+            entry.takes = Takes::of(variable);
+            entry.gate = match variable {
+                Some(variable) if topic.space == self.settings.own => Gate::new(variable.publish),
+                Some(_) | None => None,
+            };
+            self.topics.insert(topic, entry);
+            if from.is_some() {
+                self.schedule(topic);
+            }
+        }
+        self.topics.get_mut(&topic)
+    }
+
+    fn take_place(&mut self, now: Now) -> bool {
+        if self.room.wants_look(now.monotonic) {
+            let strays = self.let_strays_go(now.monotonic);
+            self.room.looked(strays, now.monotonic);
+        }
+        self.room.take()
+    }
+
+    /// Forgets topics of other spaces that fell silent, that the mapping does not name and the port has no type for, those
+    /// first that are silent longest; says how many such topics there are then. What was counted of them stays.
+    fn let_strays_go(&mut self, now: Instant) -> usize {
+        let (_, _, silence) = self.periods();
+        let mut strays = 0_usize;
+        let mut silent: Vec<(Instant, TopicId)> = Vec::new();
+        for (topic, entry) in &self.topics {
+            if let Role::Theirs(reader) = &entry.role
+                && entry.plan.is_none()
+                && self.mapping.variable(*topic).is_none()
+            {
+                strays += 1;
+                let told = !reader.news.queued && !entry.ready;
+                let heard = reader.heard_at();
+                if told && now.saturating_duration_since(heard) >= silence {
+                    silent.push((heard, *topic));
+                }
+            }
+        }
+        silent.sort_unstable();
+        silent.truncate(MOST_LET_GO);
+        for (_, topic) in &silent {
+            if let Some(entry) = self.topics.remove(topic) {
+                self.others.absorb(&entry.counters);
+                if let Role::Theirs(reader) = entry.role
+                    && let Some(base) = reader.base
+                {
+                    self.base_bytes = self.base_bytes.saturating_sub(base.weight());
+                }
+            }
+        }
+        strays - silent.len()
+    }
+}
+
+/// Topics of other spaces that nobody here knows. Triples are free to invent for whoever sends to the group; memory is not.
+pub(super) const MAX_STRAYS: usize = 16_384;
+/// Of them, how many go at a time.
+const MOST_LET_GO: usize = MAX_STRAYS / 8;
