@@ -17,6 +17,8 @@ pub struct Definitions {
     files: TypeFiles,
     /// Who brought those that are from peers.
     peers: BTreeMap<TypeName, String>,
+    /// How many names that are not known are still compared with those that are.
+    suggestions: u32,
 }
 
 impl Definitions {
@@ -27,11 +29,13 @@ impl Definitions {
             library: Library::new(Registry::bundle(dialect)),
             files: TypeFiles::new(types, environment),
             peers: BTreeMap::new(),
+            suggestions: MOST_SUGGESTIONS,
         }
     }
 
     /// Takes what the `type_paths` have by now. What peers brought stays.
     pub fn replace(&mut self, types: &Arc<TypePaths>) {
+        self.suggestions = MOST_SUGGESTIONS;
         if self.files.paths().is_none() && types.is_none() {
             return;
         }
@@ -68,6 +72,28 @@ impl Definitions {
         let found = self.library.service(name, &mut self.files);
         self.tell();
         found
+    }
+
+    /// What people are to be told of an error of [`find`](Self::find), or of [`find_service`](Self::find_service) for the
+    /// kind of services: with the known name that may be meant. Only for what is shown, as it compares all names; of many
+    /// unknown ones, which peers can make up, only the first are compared.
+    pub fn explain(&mut self, kind: TextKind, error: &DefinitionError) -> String {
+        let DefinitionError::Unknown { name, needed_by } = error else {
+            return error.to_string();
+        };
+        let Some(left) = self.suggestions.checked_sub(1) else {
+            return error.to_string();
+        };
+        self.suggestions = left;
+        let registry = self.library.registry();
+        let near = match kind {
+            TextKind::Service if needed_by.is_none() => registry.suggest_service(name),
+            TextKind::Service | TextKind::Message | TextKind::Action => registry.suggest(name),
+        };
+        match near {
+            Some(near) => format!("{error}; did you mean `{near}`?"),
+            None => error.to_string(),
+        }
     }
 
     /// Notes that a peer brought the definition that counts, as `type description of /camera`.
@@ -121,5 +147,28 @@ fn tell_differing(name: &TypeName, file: &str, only_file: &[String], only_built_
     );
 }
 
+/// Unknown names that are compared with the known ones, from one change of the definitions to the next.
+const MOST_SUGGESTIONS: u32 = 64;
 /// Types of peers whose origin is kept in mind.
 const MOST_PEERS: usize = 4096;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_may_be_meant_is_told_of_the_first_unknown_names() {
+        let types = Arc::default();
+        let mut known = Definitions::new(Dialect::Ros2, types, Environment::default());
+        let name: TypeName = "geometry_msgs/Twists".parse().unwrap();
+        let error = known.find(&name).unwrap_err();
+        let mut explained = || known.explain(TextKind::Message, &error);
+        let first = explained();
+        assert_eq!(
+            first,
+            "no definition of `geometry_msgs/Twists`; did you mean `geometry_msgs/Twist`?"
+        );
+        let told = (1..1000).filter(|_| explained() == first).count();
+        assert_eq!(told + 1, 64);
+    }
+}

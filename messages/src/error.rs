@@ -21,16 +21,13 @@ impl NameError {
 /// A message type cannot be made of the definitions at hand.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DefinitionError {
-    /// No definition of that name.
-    #[error("no definition of `{name}`{}{}", needed_by.as_ref().map(|by| format!(", which `{by}` needs")).unwrap_or_default(),
-        suggestion.as_ref().map(|name| format!("; did you mean `{name}`?")).unwrap_or_default())]
+    /// No definition of that name; [`Registry::suggest`](crate::Registry::suggest) has what may be meant.
+    #[error("no definition of `{name}`{}", needed_by.as_ref().map(|by| format!(", which `{by}` needs")).unwrap_or_default())]
     Unknown {
         /// The missing type.
         name: TypeName,
         /// The type with a field of it; none when it was asked for itself.
         needed_by: Option<TypeName>,
-        /// The known type with the nearest name, if there is one.
-        suggestion: Option<TypeName>,
     },
     /// The type contains itself.
     #[error("`{name}` contains itself")]

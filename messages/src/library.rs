@@ -275,6 +275,11 @@ impl Library {
                     return;
                 };
                 budget = left;
+                if self.asked.len() >= MOST_ASKED {
+                    // Peers can make up names without end; those there is no text of are asked for again.
+                    let files = &self.files;
+                    self.asked.retain(|asked| files.contains_key(asked));
+                }
                 self.asked.insert((kind, name.clone()));
                 if let Some(text) = texts.find(self.registry.dialect(), kind, &name) {
                     self.take(kind, &name, text);
@@ -415,5 +420,7 @@ const ACTION_MESSAGES: [&str; 7] = [
     "Result",
     "Feedback",
 ];
+/// Names that were asked for and are remembered, beside those there is a text of.
+const MOST_ASKED: usize = 16_384;
 /// Texts looked for in one go: more types than any message needs.
 const MOST_TEXTS: usize = 512;

@@ -154,7 +154,6 @@ impl Registry {
             return Err(DefinitionError::Unknown {
                 name: name.clone(),
                 needed_by: None,
-                suggestion: self.suggest_service(name),
             });
         };
         let own = definition.messages();
@@ -247,7 +246,7 @@ impl Registry {
     /// The name there is that is most like `name`, if one is near: the same name in another package, or at most a third
     /// of its letters different.
     pub fn suggest(&self, name: &TypeName) -> Option<TypeName> {
-        Resolver::new(self.dialect, &[&self.definitions]).suggest(name)
+        resolve::suggest(name, self.definitions.keys())
     }
 }
 

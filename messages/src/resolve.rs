@@ -187,7 +187,6 @@ impl<'r> Resolver<'r> {
             .ok_or_else(|| DefinitionError::Unknown {
                 name: name.clone(),
                 needed_by: needed_by.cloned(),
-                suggestion: self.suggest(name),
             })
     }
 
@@ -311,10 +310,6 @@ impl<'r> Resolver<'r> {
         }
         Ok(())
     }
-
-    pub(crate) fn suggest(&self, name: &TypeName) -> Option<TypeName> {
-        suggest(name, self.sets.iter().flat_map(|set| set.keys()))
-    }
 }
 
 /// The known name that is most like `name`, if one is near.
@@ -324,20 +319,20 @@ pub(crate) fn suggest<'k>(
 ) -> Option<TypeName> {
     let wanted = name.to_string();
     let furthest = name.name().len() / 3;
-    let (distance, nearest) = known
-        .map(|known| {
-            let same = known.name().eq_ignore_ascii_case(name.name());
-            (
-                if same {
-                    1
-                } else {
-                    distance(&wanted, &known.to_string())
-                },
-                known,
-            )
+    let (_, nearest) = known
+        .filter_map(|known| {
+            if known.name().eq_ignore_ascii_case(name.name()) {
+                return Some((1, known));
+            }
+            let known_text = known.to_string();
+            // As many letters differ at least.
+            let longer = known_text.len().abs_diff(wanted.len());
+            let distance = (longer <= furthest).then(|| distance(&wanted, &known_text))?;
+            Some((distance, known))
         })
+        .filter(|(distance, _)| *distance <= furthest)
         .min_by_key(|(distance, _)| *distance)?;
-    (distance <= furthest).then(|| nearest.clone())
+    Some(nearest.clone())
 }
 
 /// Lower case digits.

@@ -206,7 +206,6 @@ impl<'r> Described<'r> {
             None => Err(DefinitionError::Unknown {
                 name: name.clone(),
                 needed_by: None,
-                suggestion: self.registry.suggest(name),
             }),
         }
     }

@@ -342,7 +342,16 @@ impl<'c> Bindings<'c> {
             )
         };
         let types = &mut *self.types;
-        note.help_with(|| match types.suggest(dialect, TextKind::Message, name) {
+        // The one that is not known may be inside of the one that is asked for.
+        let unknown = match &*error {
+            DefinitionError::Unknown { name, .. } => name,
+            DefinitionError::Cyclic { .. }
+            | DefinitionError::TooDeep { .. }
+            | DefinitionError::TooBig { .. }
+            | DefinitionError::OtherHash { .. }
+            | DefinitionError::Syntax { .. } => name,
+        };
+        note.help_with(|| match types.suggest(dialect, TextKind::Message, unknown) {
             Some(near) => format!("did you mean `{near}`? If not: {why}{looked}"),
             None => format!("{why}{looked}"),
         });
