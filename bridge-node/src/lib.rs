@@ -19,7 +19,7 @@ mod stamp;
 mod status;
 
 pub use arguments::Arguments;
-pub use bridge_core::{Described, Kept, PublisherKey};
+pub use bridge_core::{Described, Kept, PublisherKey, Reason, Room};
 pub use busy_poll::BusyPoll;
 pub use clock::{now, timestamp};
 pub use definitions::Definitions;

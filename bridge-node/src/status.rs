@@ -220,3 +220,53 @@ const HOPS: [(Hop, &str); 4] = [
     (Hop::Network, "network"),
     (Hop::In, "in"),
 ];
+
+#[cfg(test)]
+mod tests {
+    use std::net::SocketAddr;
+
+    use bridge_core::{Local, Settings};
+    use uadp::{
+        DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar,
+    };
+
+    use super::*;
+
+    #[test]
+    fn a_topic_that_changes_hands_stands_in_both_pages() {
+        let settings = Settings {
+            own: SpaceId::ROS1,
+            local: Local::Fields,
+            source: None,
+        };
+        let mut router = Router::new(settings, std::sync::Arc::default());
+        let network = NetworkHeader {
+            publisher_id: Some(PublisherId::UInt16(2)),
+            group: Some(GroupHeader {
+                writer_group_id: Some(5),
+                ..GroupHeader::default()
+            }),
+            ..NetworkHeader::default()
+        };
+        let mut datagram = Vec::new();
+        let mut message = NetworkMessageEncoder::new(&mut datagram, &network, Some(&[10])).unwrap();
+        let mut frame = message.key_frame(&DataSetHeader::default()).unwrap();
+        frame.scalar(Scalar::Boolean(true)).unwrap();
+        frame.finish().unwrap();
+        message.finish().unwrap();
+        for port in [50_001, 50_002, 50_002] {
+            let from = SocketAddr::from(([127, 0, 0, 1], port));
+            router.handle_datagram(&datagram, from, crate::clock::now());
+        }
+        let status = Status::of(("bridge", SpaceId::ROS1), &router, (&About::default(), &[]));
+        let line =
+            "ua_sender_changed_total{program=\"bridge\",space=\"1\",topic=\"ua_2_5_10\"} 1\n";
+        assert!(
+            status.prometheus().contains(line),
+            "{}",
+            status.prometheus()
+        );
+        let json: serde_json::Value = serde_json::from_str(&status.json()).unwrap();
+        assert_eq!(json["topics"]["ua_2_5_10"]["sender_changed"], 1);
+    }
+}

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use bridge_node::{Environment, TypePaths};
-use messages::{DefinitionError, Dialect, MessageType, NameError, ServiceType, TypeName};
+use messages::{DefinitionError, Dialect, MessageType, NameError, ServiceType, TextKind, TypeName};
 use tcpros::ConnectionHeader;
 use uadp::BuiltinType;
 
@@ -85,6 +85,11 @@ impl Definitions {
     /// The type of that name with all it needs. One that is not known yet is looked for in the packages.
     pub(crate) fn get(&mut self, name: &TypeName) -> Result<Arc<MessageType>, DefinitionError> {
         self.known.find(name)
+    }
+
+    /// What people are to be told of an error of [`get`](Self::get), or of [`service`](Self::service).
+    pub(crate) fn explain(&mut self, kind: TextKind, error: &DefinitionError) -> String {
+        self.known.explain(kind, error)
     }
 
     /// The service of that name, looked for likewise.

@@ -3,6 +3,7 @@
 //! One task owns everything; [`Ros1Port::recv`](Port::recv) is its only wait.
 
 mod reload;
+mod strays;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::net::IpAddr;
@@ -10,9 +11,11 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, TypePaths, timestamp};
+use bridge_node::{
+    Delivery, Described, Kept, Port, PortEvent, Room, Services, TypePaths, timestamp,
+};
 use mappings::{Mapping, SpaceId, TopicId, Variable};
-use messages::{MessageType, Selection, TypeName};
+use messages::{DefinitionError, MessageType, Selection, TextKind, TypeName};
 use tcpros::{
     Graph, Inbox, InboxEvent, Latched, Message, Node, NodeError, NodeOptions, Peer,
     SubscriberOptions, TopicType, Wanted,
@@ -56,6 +59,8 @@ pub struct Ros1Port {
     inbox: Inbox<usize>,
     /// Topics we write.
     sinks: HashMap<TopicId, Sink>,
+    /// For those nobody here knows.
+    room: Room,
     /// Services that are called for values.
     services: Services,
     /// What `recv` hands out next; filled by one message or by one pass over the topics.
@@ -105,6 +110,7 @@ impl Ros1Port {
             source_of: BTreeMap::new(),
             inbox: Inbox::new(),
             sinks: HashMap::new(),
+            room: Room::new(MAX_TOPICS),
             events: bound.into(),
             told: BTreeSet::new(),
             address,
@@ -497,11 +503,11 @@ impl Ros1Port {
                     found = Some(message_type);
                     break;
                 }
-                Err(error) => {
-                    self.tell_once(&ros_topic, "unknown type", || {
-                        format!("no value can be written in the type asked for: {error}")
-                    });
-                }
+                Err(error) => self.tell_unknown(
+                    &ros_topic,
+                    "no value can be written in the type asked for",
+                    &error,
+                ),
             }
         }
         let Some(message_type) = found else { return };
@@ -561,9 +567,8 @@ impl Ros1Port {
                 Some((name.clone(), selection?))
             }
             Err(error) => {
-                self.tell_once(&topic.to_string(), "unknown type", || {
-                    format!("its writer says what it is, but {error}")
-                });
+                let said = "its writer says what it is, and that is of no use";
+                self.tell_unknown(&topic.to_string(), said, &error);
                 None
             }
         }
@@ -578,6 +583,14 @@ impl Ros1Port {
                     if *other == topic
             )
         })
+    }
+
+    /// Logs of a topic, once, that a type is not known.
+    fn tell_unknown(&mut self, topic: &str, what: &str, error: &DefinitionError) {
+        if self.told.len() < MAX_TOLD && self.told.insert((topic.to_owned(), "unknown type")) {
+            let why = self.definitions.explain(TextKind::Message, error);
+            warn!(topic, "{what}: {why}");
+        }
     }
 
     /// Logs something about a topic the first time it happens.
@@ -666,15 +679,8 @@ impl Port for Ros1Port {
         if topic.space == self.own || self.mapping.variable(topic).is_some_and(for_service) {
             return;
         }
-        if !self.sinks.contains_key(&topic) {
-            if self.sinks.len() >= MAX_TOPICS {
-                self.tell_once("", "too many values", || {
-                    format!("more than {MAX_TOPICS} values of other spaces: the rest is left alone")
-                });
-                return;
-            }
-            let sink = Sink::by_name(topic, self.mapping.variable(topic));
-            self.sinks.insert(topic, sink);
+        if !self.take_in(topic) {
+            return;
         }
         let standard = match shape {
             [(builtin, array)] => self.definitions.standard_type(*builtin, *array),
@@ -719,6 +725,9 @@ impl Port for Ros1Port {
     fn silent(&mut self, topic: TopicId, silent: bool) {
         // ROS 1 has no word for it; the last value stays with its subscribers.
         tracing::debug!(%topic, silent, "the writer in the space");
+        if let Some(sink) = self.sinks.get_mut(&topic) {
+            sink.silent = silent.then(|| bridge_node::now().monotonic);
+        }
     }
 
     fn retired(&mut self, topic: TopicId, instance: Timestamp) {
@@ -777,7 +786,8 @@ fn latch_key(instance: Timestamp) -> u64 {
 const TYPE_CHANGES: &str = "type changes";
 /// The severity bit of a Bad StatusCode (OPC 10000-4, 7.39.1) in its upper 16 bits.
 const STATUS_BAD: u16 = 0x8000;
-/// Topics of the space that are read, and likewise written: anybody in the graph can invent names.
+/// Topics of the space that are read: anybody in the graph can invent names. Likewise those that are written, of values
+/// nobody here knows.
 const MAX_TOPICS: usize = 4096;
 /// Peculiarities told; a graph with more of them is told about no further ones.
 const MAX_TOLD: usize = 4096;

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use bridge_node::{CallFault, ServiceCall, ServiceGraph};
 use bytes::Bytes;
-use messages::{MessageType, ServiceType, TypeName, Wire};
+use messages::{MessageType, ServiceType, TextKind, TypeName, Wire};
 use tcpros::{Node, ServiceClient, ServiceClientOptions, ServiceError};
 use uadp::BuiltinType;
 
@@ -24,6 +24,7 @@ impl ServiceGraph for Ros1Graph<'_> {
 
     fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String> {
         self.definitions.service(name).map_err(|error| {
+            let error = self.definitions.explain(TextKind::Service, &error);
             format!(
                 "{error}; the connection to a service does not bring its definition, so a folder below \
                  ROS_PACKAGE_PATH must have {}/srv/{}.srv",

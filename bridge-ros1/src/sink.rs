@@ -1,6 +1,7 @@
 //! A topic of the graph that we write values of other spaces to.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use bytes::{Bytes, BytesMut};
 use mappings::{Overflow, TopicId, Variable};
@@ -19,6 +20,8 @@ pub(crate) struct Sink {
     pub(crate) standard: Option<TypeName>,
     /// The topic as it is written.
     pub(crate) open: Option<Open>,
+    /// Since when its writer in the space is silent.
+    pub(crate) silent: Option<Instant>,
     latch: bool,
 }
 
@@ -80,6 +83,7 @@ impl Sink {
             learned: None,
             standard: None,
             open: None,
+            silent: None,
             latch,
         }
     }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use bridge_node::{Environment, TypePaths};
 use messages::{
     DefinitionError, DescribedType, Dialect, MessageType, Registry, ServiceType, ServiceTypeHashes,
-    TypeHash, TypeName,
+    TextKind, TypeHash, TypeName,
 };
 use uadp::BuiltinType;
 
@@ -183,6 +183,11 @@ impl Definitions {
             Some(told) => Ok(told.types.clone()),
             None => self.known.registry().describe(name),
         }
+    }
+
+    /// What people are to be told of such an error, or of one of [`service`](Self::service).
+    pub(crate) fn explain(&mut self, kind: TextKind, error: &DefinitionError) -> String {
+        self.known.explain(kind, error)
     }
 
     /// The service of that name, found likewise.

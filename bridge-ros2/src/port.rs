@@ -13,6 +13,7 @@ mod reload;
 mod schedule;
 mod services;
 mod strangers;
+mod strays;
 mod writing;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
@@ -22,10 +23,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, TypePaths, now};
+use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Room, Services, TypePaths, now};
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{Selection, TypeName};
+use messages::{DefinitionError, Selection, TextKind, TypeName};
 use rustdds::{DomainParticipantStatusEvent, DomainParticipantStatusListener, GUID, StatusEvented};
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
@@ -100,6 +101,8 @@ pub struct Ros2Port {
     /// Topics we write.
     /// In Boxes, because the table has room for up to twice as many as there are.
     sinks: HashMap<TopicId, Box<Sink>>,
+    /// For those nobody here knows.
+    room: Room,
     /// Readers that were replaced; they hear on until their successor is matched.
     retired: VecDeque<(Instant, Reader)>,
     /// Writers that were given up, while their readers may lack something.
@@ -176,6 +179,7 @@ impl Ros2Port {
             source_of: BTreeMap::new(),
             inbox: Inbox::new(),
             sinks: HashMap::new(),
+            room: Room::new(MAX_TOPICS),
             retired: VecDeque::new(),
             former: VecDeque::new(),
             events: bound.into(),
@@ -397,9 +401,8 @@ impl Ros2Port {
                     .iter()
                     .any(|r| r.type_name == dds_type && r.type_hash.is_some())
                 {
-                    self.tell_once(&topic.to_string(), "unknown type", || {
-                        format!("its writer says what it is, but {error}")
-                    });
+                    let said = "its writer says what it is, and that is of no use";
+                    self.tell_unknown_type(&topic.to_string(), said, &error);
                 }
                 None
             }
@@ -415,6 +418,16 @@ impl Ros2Port {
                     if *other == topic
             )
         })
+    }
+
+    /// Logs of a topic, once, that a type is not known; says whether it was.
+    fn tell_unknown_type(&mut self, topic: &str, what: &str, error: &DefinitionError) -> bool {
+        if self.told.len() >= MAX_TOLD || !self.told.insert((topic.to_owned(), "unknown type")) {
+            return false;
+        }
+        let why = self.definitions.explain(TextKind::Message, error);
+        warn!(topic, "{what}: {why}");
+        true
     }
 
     /// Logs something about a topic the first time it happens; says whether it was.
@@ -506,15 +519,8 @@ impl Port for Ros2Port {
             return;
         }
         self.schedule.look_next();
-        if !self.sinks.contains_key(&topic) {
-            if self.sinks.len() >= MAX_TOPICS {
-                self.tell_once("", "too many values", || {
-                    format!("more than {MAX_TOPICS} values of other spaces: the rest is left alone")
-                });
-                return;
-            }
-            let sink = Sink::by_name(topic, self.mapping.variable(topic));
-            self.sinks.insert(topic, Box::new(sink));
+        if !self.take_in(topic) {
+            return;
         }
         let standard = match shape {
             [(builtin, array)] => self.definitions.standard_type(*builtin, *array),
@@ -560,6 +566,9 @@ impl Port for Ros2Port {
     fn silent(&mut self, topic: TopicId, silent: bool) {
         // DDS has no word for it; the last value stays with its subscribers.
         debug!(%topic, silent, "the writer in the space");
+        if let Some(sink) = self.sinks.get_mut(&topic) {
+            sink.silent = silent.then(|| now().monotonic);
+        }
     }
 
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
@@ -651,7 +660,8 @@ const NANOS: u64 = 1_000_000_000;
 const TYPE_CHANGES: &str = "type changes";
 /// The severity bit of a Bad StatusCode (OPC 10000-4, 7.39.1) in its upper 16 bits.
 const STATUS_BAD: u16 = 0x8000;
-/// Topics of the space that are read, and likewise written: anybody in the domain can invent names.
+/// Topics of the space that are read: anybody in the domain can invent names. Likewise those that are written, of values
+/// nobody here knows.
 const MAX_TOPICS: usize = 4096;
 /// Peculiarities told; a domain with more of them is told about no further ones.
 const MAX_TOLD: usize = 4096;

@@ -1,5 +1,7 @@
 //! A topic of the domain that we write values of other spaces to.
 
+use std::time::Instant;
+
 use bridge_node::Described;
 use bytes::{Bytes, BytesMut};
 use mappings::{Overflow, TopicId, Variable};
@@ -28,6 +30,8 @@ pub(crate) struct Sink {
     pub(crate) standard: Option<TypeName>,
     /// The topic as it is written.
     pub(crate) open: Option<Open>,
+    /// Since when its writer in the space is silent.
+    pub(crate) silent: Option<Instant>,
 }
 
 /// A writer and its type.
@@ -91,6 +95,7 @@ impl Sink {
             learned: None,
             standard: None,
             open: None,
+            silent: None,
         }
     }
 
@@ -109,6 +114,7 @@ impl Sink {
             learned: None,
             standard: None,
             open: None,
+            silent: None,
         }
     }
 

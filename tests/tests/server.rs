@@ -285,3 +285,35 @@ fn a_topic_the_mapping_does_not_name_appears_under_unmapped() {
         (&json!("Double"), &json!(4.5))
     );
 }
+
+#[test]
+fn made_up_topics_under_unmapped_give_way_when_they_fall_silent() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _server = server(&cell);
+    let group = UadpSocket::join();
+    let folder = [SERVER_ENDPOINT, "--children", "ns=1;s=UaSpace.Unmapped"];
+    let children = || cell.asyncua_once("opcua_read.py", &folder)[0]["children"].clone();
+    let count = || children().as_array().map_or(0, Vec::len);
+    for id in 1..=1000 {
+        group.send(&key_frame((9, 1, id), 1, 4.5, DataSetHeader::default()));
+    }
+    eventually("all that are made up are shown", SOON, || {
+        (count() == 1000).then_some(())
+    });
+    let mut sequence = 0;
+    eventually("one that speaks is shown", SOON, || {
+        sequence += 1;
+        group.send(&key_frame(
+            (2, 7, 77),
+            sequence,
+            4.5,
+            DataSetHeader::default(),
+        ));
+        let shown = children();
+        let shown = shown.as_array()?;
+        shown.contains(&json!("ns=1;s=ua_2_7_77")).then_some(())
+    });
+    assert!(count() < 1000);
+}

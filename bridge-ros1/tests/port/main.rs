@@ -4,6 +4,7 @@
 
 mod reload;
 mod services;
+mod strays;
 
 use std::future::Future;
 use std::net::SocketAddr;

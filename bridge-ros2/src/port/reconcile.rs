@@ -361,9 +361,7 @@ impl Ros2Port {
             Ok(definition) => definition,
             Err(error) => {
                 let values: Vec<_> = source.values.iter().map(|(topic, _)| *topic).collect();
-                let first = self.tell_once(&topic, "unknown type", || {
-                    format!("the topic cannot cross: {error}")
-                });
+                let first = self.tell_unknown_type(&topic, "the topic cannot cross", &error);
                 if first {
                     let uncrossed = values.into_iter();
                     self.events

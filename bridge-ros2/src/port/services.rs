@@ -6,7 +6,7 @@ use std::time::Duration;
 use bridge_node::{CallFault, ServiceCall, ServiceGraph};
 use bytes::Bytes;
 use mappings::SpaceId;
-use messages::{MessageType, ServiceType, TypeName, Wire};
+use messages::{MessageType, ServiceType, TextKind, TypeName, Wire};
 use uadp::BuiltinType;
 
 use crate::definitions::Definitions;
@@ -28,6 +28,7 @@ impl ServiceGraph for Ros2Graph<'_> {
 
     fn service_type(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, String> {
         self.definitions.service(name).map_err(|error| {
+            let error = self.definitions.explain(TextKind::Service, &error);
             format!(
                 "{error}; discovery does not bring the definition of a service, so a prefix in AMENT_PREFIX_PATH must \
                  have share/{}/srv/{}.srv",

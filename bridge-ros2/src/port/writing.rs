@@ -194,9 +194,8 @@ impl Ros2Port {
                     break;
                 }
                 Err(error) => {
-                    self.tell_once(&dds_topic, "unknown type", || {
-                        format!("no value can be written in the type asked for: {error}")
-                    });
+                    let what = "no value can be written in the type asked for";
+                    self.tell_unknown_type(&dds_topic, what, &error);
                 }
             }
         }

@@ -351,10 +351,12 @@ impl<'c> Bindings<'c> {
             | DefinitionError::OtherHash { .. }
             | DefinitionError::Syntax { .. } => name,
         };
-        note.help_with(|| match types.suggest(dialect, TextKind::Message, unknown) {
-            Some(near) => format!("did you mean `{near}`? If not: {why}{looked}"),
-            None => format!("{why}{looked}"),
-        });
+        note.help_with(
+            || match types.suggest(dialect, TextKind::Message, unknown) {
+                Some(near) => format!("did you mean `{near}`? If not: {why}{looked}"),
+                None => format!("{why}{looked}"),
+            },
+        );
         None
     }
 

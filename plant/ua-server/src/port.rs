@@ -1,6 +1,6 @@
 //! The server as the local side of the bridge shell.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -17,7 +17,7 @@ use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 use tokio::time::{Interval, MissedTickBehavior};
 use tracing::{info, warn};
-use uadp::{BuiltinType, Timestamp};
+use uadp::BuiltinType;
 
 use crate::endpoint::{self, EndpointUrl};
 use crate::layout::Layout;
@@ -37,8 +37,6 @@ pub(crate) struct Setup {
 /// The OPC UA side of the space.
 pub(crate) struct ServerPort {
     space: Space,
-    /// When the values shown were taken; as many as there are nodes.
-    newest: HashMap<TopicId, Option<Timestamp>>,
     handle: ServerHandle,
     /// The server's own threads: signing for a client takes longer than a value should wait. Taken at the end.
     runtime: Option<Runtime>,
@@ -133,7 +131,6 @@ impl ServerPort {
             described: described.clone(),
             mapped_url: setup.mapped_url,
             space: Space::new(&layout, manager, subscriptions),
-            newest: HashMap::new(),
             handle,
             runtime: Some(runtime),
             serving: Some(serving),
@@ -172,16 +169,16 @@ impl Port for ServerPort {
             return Ok(());
         }
         // Of several values side by side, who comes late hears an older one after the last.
-        let newest = self.newest.entry(sample.topic).or_default();
-        if sample.kept == Kept::Beside && sample.source < *newest {
+        if sample.kept == Kept::Beside && sample.source < self.space.shown(sample.topic) {
             return Ok(());
         }
-        *newest = sample.source;
-        self.space.update(
+        let gave_way = self.space.update(
             sample.topic,
             &sample.payload,
             (sample.source, sample.status),
-        )
+        )?;
+        self.unbound.extend(gave_way);
+        Ok(())
     }
 
     fn wanted(
@@ -216,7 +213,6 @@ impl Port for ServerPort {
             Ok((layout, namespaces)) => {
                 restart.extend(namespaces);
                 let (gone, new) = self.space.exchange(&layout);
-                self.newest.retain(|topic, _| !gone.contains(topic));
                 self.live.retain(|topic| !gone.contains(topic));
                 self.unbound.extend(gone);
                 self.live.extend(written(new.into_iter()));

@@ -2,7 +2,9 @@
 
 use std::collections::HashMap;
 use std::sync::Arc;
+use std::time::Instant;
 
+use bridge_node::{Room, now};
 use mappings::TopicId;
 use opcua::server::SubscriptionCache;
 use opcua::types::{Array, DateTime, StatusCode, Variant, VariantScalarTypeId};
@@ -17,7 +19,8 @@ pub(crate) struct Space {
     manager: Arc<SpaceManager>,
     subscriptions: Arc<SubscriptionCache>,
     topics: HashMap<TopicId, Known>,
-    unmapped: usize,
+    /// For those that nobody mapped.
+    room: Room,
     /// Topics whose writer speaks again, without a sample so far.
     returned: Vec<TopicId>,
 }
@@ -28,7 +31,8 @@ struct Known {
     mapped: bool,
     /// The last sample's fields and stamp.
     last: Option<(Vec<Variant>, Stamp)>,
-    silent: bool,
+    /// Since when its writer is silent.
+    silent: Option<Instant>,
     /// The statuses of the nodes as they are in the address space.
     statuses: Vec<StatusCode>,
 }
@@ -48,7 +52,7 @@ impl Space {
             manager,
             subscriptions,
             topics,
-            unmapped: 0,
+            room: Room::new(MOST_UNMAPPED),
             returned: Vec::new(),
         }
     }
@@ -63,7 +67,7 @@ impl Space {
             .collect();
         let is_gone = |topic: &TopicId, known: &mut Known| match wanted.get(topic) {
             Some(node) => !known.mapped || known.node != **node,
-            // Those that nobody mapped are there as long as the server.
+            // Those that nobody mapped stay.
             None => known.mapped,
         };
         let gone: Vec<Known> = self
@@ -71,7 +75,6 @@ impl Space {
             .extract_if(is_gone)
             .map(|(_, known)| known)
             .collect();
-        self.unmapped -= gone.iter().filter(|known| !known.mapped).count();
         let gone: Vec<TopicNode> = gone.into_iter().map(|known| known.node).collect();
         let new = layout.topics.iter();
         let new: Vec<TopicNode> = new
@@ -91,7 +94,8 @@ impl Space {
         (topics(gone), topics(new))
     }
 
-    /// Takes in a sample: the fields of its DataSet as a key frame carries them.
+    /// Takes in a sample: the fields of its DataSet as a key frame carries them. Returns the topics whose nodes had to go
+    /// for its own.
     ///
     /// # Errors
     /// Why it is not shown: fields that are malformed or not those of the mapping, or too many unmapped topics.
@@ -100,7 +104,7 @@ impl Space {
         topic: TopicId,
         block: &[u8],
         (source, status): (Option<Timestamp>, u16),
-    ) -> Result<(), &'static str> {
+    ) -> Result<Vec<TopicId>, &'static str> {
         let fields = Fields::parse(block)
             .and_then(|fields| {
                 fields
@@ -108,9 +112,10 @@ impl Space {
                     .collect::<Result<Vec<_>, _>>()
             })
             .map_err(|_| "malformed fields")?;
-        if !self.topics.contains_key(&topic) {
-            self.add_unmapped(topic, &fields)?;
-        }
+        let gave_way = match self.topics.contains_key(&topic) {
+            true => Vec::new(),
+            false => self.add_unmapped(topic, &fields)?,
+        };
         let Some(known) = self.topics.get_mut(&topic) else {
             return Err("unknown topic");
         };
@@ -123,14 +128,20 @@ impl Space {
             source,
             server: DateTime::now(),
         };
-        known.silent = false;
+        known.silent = None;
         self.returned.retain(|returned| *returned != topic);
         known.last = Some((fields.clone(), stamp));
         let values = known.stored(fields, stamp);
         self.manager
             .inner()
             .store(self.manager.address_space(), &self.subscriptions, values);
-        Ok(())
+        Ok(gave_way)
+    }
+
+    /// When the value shown of a topic was taken.
+    pub(crate) fn shown(&self, topic: TopicId) -> Option<Timestamp> {
+        let (_, stamp) = self.topics.get(&topic)?.last.as_ref()?;
+        stamp.source
     }
 
     /// Marks the last value of a topic as no longer kept up, or as kept up again. The value and its source timestamp
@@ -139,10 +150,10 @@ impl Space {
         let Some(known) = self.topics.get_mut(&topic) else {
             return;
         };
-        if known.silent == silent {
+        if known.silent.is_some() == silent {
             return;
         }
-        known.silent = silent;
+        known.silent = silent.then(|| now().monotonic);
         if silent {
             self.set_status(topic, Some(StatusCode::UncertainLastUsableValue));
         } else {
@@ -154,7 +165,8 @@ impl Space {
     /// Gives the last values their own status back where a writer speaks again but has nothing new to say.
     pub(crate) fn settle(&mut self) {
         for topic in std::mem::take(&mut self.returned) {
-            if self.topics.get(&topic).is_some_and(|known| !known.silent) {
+            let known = self.topics.get(&topic);
+            if known.is_some_and(|known| known.silent.is_none()) {
                 self.set_status(topic, None);
             }
         }
@@ -182,12 +194,44 @@ impl Space {
             .store(self.manager.address_space(), &self.subscriptions, values);
     }
 
-    /// A topic nobody mapped gets a node of its own when its first value comes.
-    fn add_unmapped(&mut self, topic: TopicId, fields: &[Variant]) -> Result<(), &'static str> {
-        if self.unmapped >= MOST_UNMAPPED {
+    /// Takes out the nodes of topics that nobody mapped and whose writers fell silent, of those first that are silent
+    /// longest, when it is time to look for room. Returns their topics.
+    fn let_unmapped_go(&mut self) -> Vec<TopicId> {
+        let now = now().monotonic;
+        if !self.room.wants_look(now) {
+            return Vec::new();
+        }
+        let unmapped = self.topics.iter().filter(|(_, known)| !known.mapped);
+        let there = unmapped.clone().count();
+        let mut silent: Vec<(Instant, TopicId)> = unmapped
+            .filter_map(|(topic, known)| known.silent.map(|since| (since, *topic)))
+            .collect();
+        silent.sort_unstable();
+        silent.truncate(MOST_LET_GO);
+        let topics: Vec<TopicId> = silent.into_iter().map(|(_, topic)| topic).collect();
+        let gone = topics.iter().filter_map(|topic| self.topics.remove(topic));
+        let gone: Vec<TopicNode> = gone.map(|known| known.node).collect();
+        if !gone.is_empty() {
+            self.manager.inner().exchange(
+                self.manager.address_space(),
+                &self.subscriptions,
+                (&gone, &[]),
+            );
+        }
+        self.room.looked(there - topics.len(), now);
+        topics
+    }
+
+    /// A topic nobody mapped gets a node of its own when its first value comes. Returns the topics that gave way to it.
+    fn add_unmapped(
+        &mut self,
+        topic: TopicId,
+        fields: &[Variant],
+    ) -> Result<Vec<TopicId>, &'static str> {
+        let gave_way = self.let_unmapped_go();
+        if !self.room.take() {
             return Err("too many unmapped topics");
         }
-        self.unmapped += 1;
         let name = topic.to_string();
         let shape = match fields {
             [only] => shape_of(only),
@@ -205,7 +249,7 @@ impl Space {
             &nodes::unmapped_folder(),
         );
         self.topics.insert(topic, Known::new(node, false));
-        Ok(())
+        Ok(gave_way)
     }
 }
 
@@ -215,7 +259,7 @@ impl Known {
             node,
             mapped,
             last: None,
-            silent: false,
+            silent: None,
             statuses: Vec::new(),
         }
     }
@@ -300,3 +344,5 @@ fn shape_of(value: &Variant) -> Shape {
 
 /// How many topics without a mapping are shown. Anyone who reaches the group can make them up.
 const MOST_UNMAPPED: usize = 1_000;
+/// Of them, how many go at a time.
+const MOST_LET_GO: usize = MOST_UNMAPPED / 8;

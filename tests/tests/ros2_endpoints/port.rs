@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bridge_node::{Delivery, Kept, Port, PortEvent, TypePaths};
+use bridge_node::{Delivery, Kept, Port, PortEvent, Reason, TypePaths};
 use bridge_ros2::{PortOptions, Ros2Port};
 use mappings::{Mapping, SpaceId, TopicId};
 use nix::sys::signal::Signal;
@@ -390,4 +390,40 @@ async fn a_subscriber_that_is_killed_does_not_keep_the_newest_value_from_the_oth
     }
     assert!(refused > 0, "the writer never stopped");
     run_until(&mut port, "the newest value", || last_is(&other, "999")).await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn made_up_values_keep_out_none_that_speaks_when_they_have_fallen_silent() {
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    let mut port = port();
+    let made_up = |number: u16| TopicId::new(9, 1, number + 1).unwrap();
+    // Two values have no standard type, and their topic costs the domain nothing.
+    let no_type = [(BuiltinType::Double, false); 2];
+    for number in 0..4096 {
+        port.wanted(made_up(number), &no_type, None);
+    }
+    let (robot, boolean) = (topic("ua_9_2_1"), [(BuiltinType::Boolean, false)]);
+    port.wanted(robot, &boolean, None);
+    let refused = event(&mut port, |event| match event {
+        PortEvent::Dropped { reason, .. } => Some(reason),
+        _ => None,
+    });
+    assert_eq!(refused.await, Reason::TooManyTopics);
+    port.silent(made_up(7), true);
+    let deadline = tokio::time::Instant::now() + SOON;
+    let mut gone = Vec::new();
+    loop {
+        // The Router asks again while values come.
+        port.wanted(robot, &boolean, None);
+        let soon = tokio::time::Instant::now() + Duration::from_millis(50);
+        match tokio::time::timeout_at(soon, port.recv()).await {
+            Ok(PortEvent::Bound { topic, .. }) if topic == robot => break,
+            Ok(PortEvent::Unbound { topic }) => gone.push(topic),
+            Ok(_) | Err(_) => {}
+        }
+        assert!(tokio::time::Instant::now() < deadline, "it is not written");
+    }
+    assert_eq!(gone, [made_up(7)]);
 }
