@@ -1,5 +1,6 @@
 //! Other bridges of the domain, whose word keeps the values of their spaces out.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use mappings::{Mapping, SpaceId};
@@ -15,9 +16,13 @@ impl Ros2Port {
         self.graph.is_at_home(space.into()) && is_possible(&self.mapping, space, self.domain_id)
     }
 
-    /// Tells of other bridges of the domain, whose word keeps values out.
+    /// Tells of bridges of other spaces in the domain, whose word keeps values out.
     pub(super) fn tell_of_bridges(&mut self) {
-        for (bridge, number) in self.graph.bridges().collect::<Vec<_>>() {
+        let own = u16::from(self.own);
+        let others = self.graph.bridges().filter(|(_, space)| *space != own);
+        // By the space: a stranger may come under any number of names.
+        let others: BTreeMap<_, _> = others.map(|(bridge, space)| (space, bridge)).collect();
+        for (number, bridge) in others {
             let Some(space) = SpaceId::new(number) else {
                 continue;
             };
@@ -26,7 +31,6 @@ impl Ros2Port {
                 nodes => format!("participant {} ({})", hex(&bridge), nodes.join(", ")),
             };
             let domain = self.domain_id;
-            // By the space: a stranger may come under any number of names.
             if is_possible(&self.mapping, space, domain) {
                 self.tell_once(&bridge_topic(number), "bridge", || {
                     format!(
