@@ -102,7 +102,10 @@ impl<P: Port> Shell<P> {
                 heard = self.udp.recv(&mut buffer) => more = self.heard_all(heard, &mut buffer),
                 event = self.port.recv() => more = self.port_events(event).await?,
                 () = timer.as_mut() => self.router.handle_timeout(now()),
-                _ = looks.tick() => self.follow_interfaces()?,
+                _ = looks.tick() => {
+                    self.follow_group();
+                    self.look_at_held()?;
+                }
                 Ok(()) = self.changes.changed() => self.reload(),
                 // Who asked may have gone; there is nobody else to tell.
                 Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
@@ -195,8 +198,8 @@ impl<P: Port> Shell<P> {
         )
     }
 
-    /// Goes with the network interfaces, whatever becomes of them; fails where the local side cannot.
-    fn follow_interfaces(&mut self) -> Result<(), Failure> {
+    /// Goes with the network interface of the group, whatever becomes of it.
+    fn follow_group(&mut self) {
         match self.udp.follow() {
             None => {}
             Some(Change::Lost(why)) => {
@@ -208,24 +211,30 @@ impl<P: Port> Shell<P> {
                 info!(%interface, "the PubSub network is within reach: hearing and sending there again");
             }
         }
+    }
+
+    /// Looks at the network interfaces of the local side; fails where it cannot go with them.
+    fn look_at_held(&mut self) -> Result<(), Failure> {
         let findings = self.held.as_mut().map(Held::look);
         for finding in findings.into_iter().flatten() {
-            match finding {
-                Finding::Lost(why) => warn!("{}", side_lost(why)),
+            let told = match finding {
+                Finding::Lost(why) => side_lost(why),
+                Finding::Late(interface) => format!(
+                    "the network interface {interface} came after the start: the ROS side does not use it until the \
+                     next start"
+                ),
                 Finding::Back(interface) => {
                     info!(%interface, "the network interface of the ROS side is up again");
+                    continue;
                 }
-                Finding::Late(interface) => warn!(
-                    %interface,
-                    "a network interface came after the start: the ROS side does not use it until the next start"
-                ),
                 Finding::Void(why) => {
                     let message = format!(
                         "{why}, and the ROS side cannot go over to it: ending, to be started again"
                     );
                     return Err(Failure::new(FailureKind::Unavailable, message));
                 }
-            }
+            };
+            warn!("{told}");
         }
         Ok(())
     }

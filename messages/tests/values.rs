@@ -7,8 +7,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use messages::{
-    Dialect, Fault, Leaf, Literal, MessageType, Plan, PlanError, ReadError, Registry, Selected,
-    Selection, SourceError, TypeName, Wire, WriteError, WriteFault,
+    Dialect, Fault, Leaf, Literal, MessageType, Plan, ReadError, Registry, Selected, Selection,
+    SourceError, TypeName, Wire, WriteError, WriteFault,
 };
 use support::{Event, Player, Recorder, Value};
 use uadp::{BuiltinType, DateTime, Scalar};

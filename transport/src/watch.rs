@@ -99,16 +99,16 @@ impl Watch {
 
 impl Wanted {
     fn find(&self, present: &[Interface], held: Option<&Interface>) -> Result<Interface, String> {
-        let (fits, missing): (Box<dyn Fn(&Interface) -> bool>, String) = match self {
+        let (wanted, missing) = match self {
             Self::Named(wanted) => (
-                Box::new(|interface| interface.is(wanted)),
+                wanted.clone(),
                 format!("there is no network interface `{wanted}` with an IPv4 address here"),
             ),
             Self::Towards(group) => {
                 let source = source_towards(*group)
                     .map_err(|error| format!("no network interface leads to {group}: {error}"))?;
                 (
-                    Box::new(move |interface| interface.address == source),
+                    source.to_string(),
                     format!("the address {source} towards {group} is on no network interface here"),
                 )
             }
@@ -116,9 +116,9 @@ impl Wanted {
         // As long as it has the address it had, others beside it do not matter.
         let kept = held.and_then(|held| {
             let kept = present.iter().find(|interface| interface.is_same(held));
-            kept.filter(|interface| fits(interface))
+            kept.filter(|interface| interface.is(&wanted))
         });
-        let found = kept.or_else(|| present.iter().find(|interface| fits(interface)));
+        let found = kept.or_else(|| present.iter().find(|interface| interface.is(&wanted)));
         found.cloned().ok_or(missing)
     }
 }
@@ -248,6 +248,7 @@ impl Held {
     fn changed(&mut self, present: &[Interface]) -> Vec<Finding> {
         let mut findings = Vec::new();
         let usable = |one: &&Interface| one.up && !one.address.is_loopback();
+        let none_is_there = self.held.iter().all(|held| held.state != State::There);
         for one in present.iter().filter(usable) {
             let mut of_name = self.held.iter().filter(|h| h.interface.name == one.name);
             if of_name.any(|h| h.interface.is_same(one)) {
@@ -263,7 +264,7 @@ impl Held {
                         gone.interface, one.address
                     )
                 }));
-            } else if self.all && self.held.is_empty() {
+            } else if self.all && none_is_there {
                 findings.push(Finding::Void(format!(
                     "the network interface {one} is there now"
                 )));
@@ -423,14 +424,16 @@ mod tests {
         let mut one = Held::of(vec![wire(3, 1)], false);
         assert_eq!(one.see(&both), []);
         let mut all = Held::of(vec![wire(3, 1)], true);
-        assert_eq!(all.see(&both), [Finding::Late(other)]);
+        assert_eq!(all.see(&both), [Finding::Late(other.clone())]);
         assert_eq!(all.see(&both), []);
         // One of several that is lost keeps nobody from working.
         let mut two = Held::of(both.to_vec(), true);
         assert!(matches!(two.see(&both[..1])[..], [Finding::Lost(_)]));
         assert_eq!(two.lost(), None);
-        // With none at all there was nothing to work with.
-        let mut none = Held::of(Vec::new(), true);
-        assert!(matches!(none.see(&both[..1])[..], [Finding::Void(_)]));
+        // With none at all, or one that is down as that of containers, there was nothing to work with.
+        for nothing in [vec![], vec![down(other)]] {
+            let mut none = Held::of(nothing, true);
+            assert!(matches!(none.see(&both[..1])[..], [.., Finding::Void(_)]));
+        }
     }
 }
