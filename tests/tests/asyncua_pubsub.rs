@@ -4,7 +4,7 @@ use std::future::Future;
 use std::time::{Duration, SystemTime};
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, GROUP, Peer};
+use system_tests::{Cell, Child, GROUP, Peer, SERVER_ENDPOINT, eventually};
 use transport::{Options, Udp};
 use uadp::{
     Array, BuiltinType, DataSetHeader, DataSetMessage, DataValue, DateTime, EncodeError,
@@ -526,4 +526,28 @@ fn asyncua_takes_our_messages_by_publisher_group_and_writer() {
     assert_eq!(fields, json!([{"type": "Byte", "value": 6}]));
     let lines = subscriber.json_lines();
     assert_eq!(lines.len(), 2, "ready and one DataSetMessage: {lines:?}");
+}
+
+#[test]
+fn one_of_several_data_values_of_asyncua_is_shown_by_the_server_with_its_quality() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mapping = cell.file(
+        "values.yaml",
+        "spaces: [{id: 2}]\nnamespaces: {6: 'urn:ua-bridge:system-tests'}\nvariables:\n  \
+         - {node: ns=6;i=20, name: Temperature, type: Double, origin: 2, ua_field: 0}\n",
+    );
+    let url = format!("opc.udp://{GROUP}");
+    let publisher = cell.asyncua_started("uadp_publish.py", &[&url]);
+    let _publisher = publisher.start();
+    let _server = cell.ua_server(&[mapping.to_str().unwrap()]);
+    eventually("the server answers clients", SOON, || {
+        cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
+    });
+    let mut watch = cell.asyncua("opcua_subscribe.py", &[SERVER_ENDPOINT, "ns=6;i=20"]);
+    watch.wait_for_json("the value of asyncua", SOON, |line| {
+        let shown = line.get("status")? == "UncertainSubNormal" && line["value"] == json!(21.5);
+        shown.then_some(())
+    });
 }
