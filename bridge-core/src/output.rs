@@ -102,13 +102,15 @@ pub struct Delivery {
     pub topic: TopicId,
     /// Its bytes in the local encoding.
     pub payload: Vec<u8>,
-    /// The DataSetMessage Timestamp: when the producer's bridge took the sample.
+    /// When the producer's bridge took the sample: the DataSetMessage Timestamp, or the SourceTimestamp of the DataValue that
+    /// is the value.
     pub source: Option<Timestamp>,
-    /// The DataSetMessage Status: the upper 16 bits of an OPC UA StatusCode, 0 is Good.
+    /// The DataSetMessage Status, or that of the DataValue that is the value if that is worse: the upper 16 bits of an OPC UA
+    /// StatusCode, 0 is Good.
     pub status: u16,
     /// When its datagram arrived here.
     pub arrived: Timestamp,
-    /// `source`, where it tells this value from all others of the topic.
+    /// The DataSetMessage Timestamp, where it tells this value from all others of the topic.
     pub instance: Option<Timestamp>,
     /// What it is to the others.
     pub kept: Kept,

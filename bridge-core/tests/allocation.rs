@@ -1,10 +1,17 @@
 //! Messages move between ROS bytes and fields without an allocation, once the buffers were used.
 #![expect(clippy::unwrap_used, reason = "test code")]
 
+use std::sync::Arc;
+use std::time::Instant;
+
 use allocation_counter::measure;
-use bridge_core::{decode_fields, encode_fields};
+use bridge_core::{Local, Now, Output, Router, Settings, decode_fields, encode_fields};
+use mappings::{Mapping, SpaceId};
 use messages::{Dialect, NoFields, Plan, Registry, Selection, Wire};
-use uadp::{DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder};
+use uadp::{
+    DataSetHeader, Fields, GroupHeader, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
+    PublisherId, Scalar, Timestamp,
+};
 
 fn encode(plan: &Plan, message: &[u8], datagram: &mut Vec<u8>) {
     datagram.clear();
@@ -59,4 +66,67 @@ fn messages_move_both_ways_without_an_allocation() {
             assert_eq!(back, bytes, "{name} {wire:?}");
         }
     }
+}
+
+#[test]
+#[expect(clippy::disallowed_methods, reason = "some instant to count from")]
+fn a_key_frame_of_another_space_is_handed_on_without_an_allocation() {
+    let settings = Settings {
+        own: SpaceId::new(1).unwrap(),
+        local: Local::Ros1,
+        source: None,
+    };
+    let mut router = Router::new(settings, Arc::new(Mapping::default()));
+    let now = Now {
+        monotonic: Instant::now(),
+        utc: Timestamp::from_unix_nanos(1_700_000_000_000_000_000),
+    };
+    let message = Registry::bundle(Dialect::Ros1)
+        .get(&"geometry_msgs/Twist".parse().unwrap())
+        .unwrap();
+    let topic = "ua_2_5_10".parse().unwrap();
+    router
+        .bind(topic, &message, &Selection::Whole, now)
+        .unwrap();
+    let header = NetworkHeader {
+        publisher_id: Some(PublisherId::UInt16(2)),
+        group: Some(GroupHeader {
+            writer_group_id: Some(5),
+            ..GroupHeader::default()
+        }),
+        ..NetworkHeader::default()
+    };
+    let datagrams: Vec<Vec<u8>> = (0..20)
+        .map(|sequence| {
+            let mut datagram = Vec::new();
+            let mut message =
+                NetworkMessageEncoder::new(&mut datagram, &header, Some(&[10])).unwrap();
+            let header = DataSetHeader {
+                sequence_number: Some(sequence),
+                ..DataSetHeader::default()
+            };
+            let mut frame = message.key_frame(&header).unwrap();
+            for _ in 0..6 {
+                frame.scalar(Scalar::Double(f64::from(sequence))).unwrap();
+            }
+            frame.finish().unwrap();
+            message.finish().unwrap();
+            datagram
+        })
+        .collect();
+    let mut delivered = 0;
+    let mut hear = |datagram: &[u8]| {
+        router.handle_datagram(datagram, ([127, 0, 0, 1], 50_001).into(), now);
+        while let Some(output) = router.poll_output(now) {
+            if let Output::Delivery(delivery) = output {
+                router.published(delivery.topic, delivery.arrived, now);
+                router.recycle(delivery.payload);
+                delivered += 1;
+            }
+        }
+    };
+    let (first, rest) = datagrams.split_at(10);
+    first.iter().for_each(|datagram| hear(datagram));
+    let counted = measure(|| rest.iter().for_each(|datagram| hear(datagram)));
+    assert_eq!((counted.count_total, delivered), (0, 20));
 }

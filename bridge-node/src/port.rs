@@ -76,11 +76,12 @@ pub struct Delivery {
     pub topic: TopicId,
     /// Its bytes in the port's encoding.
     pub payload: Bytes,
-    /// When its producer's bridge took it (the DataSetMessage Timestamp), where the writer says so.
+    /// When its producer's bridge took it (the DataSetMessage Timestamp, or the SourceTimestamp of a DataValue), where the writer
+    /// says so.
     pub source: Option<Timestamp>,
-    /// The DataSetMessage Status: the upper 16 bits of an OPC UA StatusCode, 0 for Good.
+    /// The status of the message or of its DataValue: the upper 16 bits of an OPC UA StatusCode, 0 for Good.
     pub status: u16,
-    /// `source`, where it tells this value from all others of the topic.
+    /// The DataSetMessage Timestamp, where it tells this value from all others of the topic.
     pub instance: Option<Timestamp>,
     /// What the value is to the others of its topic.
     pub kept: Kept,

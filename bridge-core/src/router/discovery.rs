@@ -459,10 +459,13 @@ impl Router {
         }) = self.topics.get(&topic)
         {
             if !reader.may_be(from, now.monotonic, timeout) {
-                self.count(about, (Reason::MetaData, "sender"), 1, || {
-                    "another program than the one that sends its values says what they are"
-                        .to_owned()
-                });
+                // Where the mapping has the say, who begins anew at another port is not worth a word.
+                if self.is_learned(topic) {
+                    self.count(about, (Reason::MetaData, "sender"), 1, || {
+                        "another program than the one that sends its values says what they are"
+                            .to_owned()
+                    });
+                }
                 return;
             }
             shape = reader.shape.clone();

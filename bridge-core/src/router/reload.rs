@@ -44,8 +44,14 @@ impl Router {
                 self.regate(topic, now);
             }
             let (was, is) = (before.variable(topic), self.mapping.variable(topic));
-            if let Some(entry) = self.topics.get_mut(&topic) {
+            if let Some(entry) = self.topics.get_mut(&topic)
+                && was != is
+            {
                 entry.takes = Takes::of(is);
+                if let Role::Theirs(reader) = &mut entry.role {
+                    // Another field may be the value now.
+                    reader.owed = true;
+                }
             }
             let meant = was.map(|v| &v.meaning) != is.map(|v| &v.meaning);
             // Only there does the mapping alone say what the values are.
