@@ -362,18 +362,20 @@ impl<P: Port> Shell<P> {
                     topic,
                     silent,
                     dropped,
-                } => {
-                    if let Some(reason) = dropped {
-                        debug!(%topic, %reason, "its writer is heard, but its values are dropped");
-                    }
-                    self.port.silent(topic, silent);
-                }
+                } => self.silent(topic, silent, dropped),
                 Output::Retired { topic, instance } => self.port.retired(topic, instance),
                 Output::Notice(notice) => tell(&notice),
                 other => debug!(?other, "an output this program does not know"),
             }
         }
         true
+    }
+
+    fn silent(&mut self, topic: TopicId, silent: bool, dropped: Option<Reason>) {
+        if let Some(reason) = dropped {
+            debug!(%topic, %reason, "its writer is heard, but its values are dropped");
+        }
+        self.port.silent(topic, silent);
     }
 
     fn send(&self, datagram: &[u8]) -> Result<(), SendError> {

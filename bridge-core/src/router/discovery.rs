@@ -451,25 +451,13 @@ impl Router {
             topic: Some(topic),
             from: Some(from),
         };
-        let timeout = self.mapping.pubsub().receive_timeout;
-        let mut shape = None;
-        if let Some(Topic {
-            role: Role::Theirs(reader),
-            ..
-        }) = self.topics.get(&topic)
-        {
-            if !reader.may_be(from, now.monotonic, timeout) {
-                // Where the mapping has the say, who begins anew at another port is not worth a word.
-                if self.is_learned(topic) {
-                    self.count(about, (Reason::MetaData, "sender"), 1, || {
-                        "another program than the one that sends its values says what they are"
-                            .to_owned()
-                    });
-                }
-                return;
-            }
-            shape = reader.shape.clone();
+        if !self.may_say(topic, from, now) {
+            return;
         }
+        let shape = match self.topics.get(&topic).map(|entry| &entry.role) {
+            Some(Role::Theirs(reader)) => reader.shape.clone(),
+            Some(Role::Ours(_)) | None => None,
+        };
         let fault = self.learn_layout(topic, meta_data, from, now).err();
         if !self.is_learned(topic) {
             self.discovery(now).answered(space, |other| other == topic);
@@ -509,6 +497,32 @@ impl Router {
                 }
             }
         }
+    }
+
+    /// Whether what is said of a topic from there may be the word of its writer.
+    fn may_say(&mut self, topic: TopicId, from: SocketAddr, now: Now) -> bool {
+        let timeout = self.mapping.pubsub().receive_timeout;
+        let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get(&topic)
+        else {
+            return true;
+        };
+        if reader.may_be(from, now.monotonic, timeout) {
+            return true;
+        }
+        // Where the mapping has the say, who begins anew at another port is not worth a word.
+        if self.is_learned(topic) {
+            let about = About {
+                topic: Some(topic),
+                from: Some(from),
+            };
+            self.count(about, (Reason::MetaData, "sender"), 1, || {
+                "another program than the one that sends its values says what they are".to_owned()
+            });
+        }
+        false
     }
 
     /// Keeps what the fields of a topic are said to be.
