@@ -103,6 +103,11 @@ impl Definitions {
         }
     }
 
+    /// A definition that a peer brought is no longer kept.
+    pub fn forgotten(&mut self, name: &TypeName) {
+        self.peers.remove(name);
+    }
+
     /// Where the definition of a type is from, for people.
     #[must_use]
     pub fn source(&self, name: &TypeName) -> &str {

@@ -5,14 +5,20 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use bridge_node::{Environment, TypePaths};
-use messages::{DefinitionError, Dialect, MessageType, NameError, ServiceType, TextKind, TypeName};
+use messages::{
+    DefinitionError, Dialect, MessageType, NameError, PeerDefinitions, ServiceType, TextKind,
+    TypeName,
+};
 use tcpros::ConnectionHeader;
 use uadp::BuiltinType;
 
-/// Finds message types by name; a type once found stays.
+use crate::brought::{Brought, MAX_BYTES, Room};
+
+/// Finds message types by name; a type once found stays, but for those of publishers that have gone.
 #[derive(Debug)]
 pub(crate) struct Definitions {
     known: bridge_node::Definitions,
+    brought: Brought,
 }
 
 impl Definitions {
@@ -24,6 +30,7 @@ impl Definitions {
         };
         Self {
             known: bridge_node::Definitions::new(Dialect::Ros1, types, environment),
+            brought: Brought::default(),
         }
     }
 
@@ -32,10 +39,12 @@ impl Definitions {
         self.known.replace(types);
     }
 
-    /// The type a publisher has: by the text in its header, else the known type of that name and checksum.
+    /// The type a publisher has: by the text in its header, else the known type of that name and checksum. Those texts
+    /// are kept as far as there is room; one of a `mapped` topic always is.
     pub(crate) fn of_publisher(
         &mut self,
         header: &ConnectionHeader,
+        mapped: bool,
     ) -> Result<Arc<MessageType>, Unusable> {
         let name: TypeName = header.type_name().unwrap_or_default().parse()?;
         let md5sum = header.md5sum().unwrap_or("*");
@@ -44,8 +53,9 @@ impl Definitions {
         if !text.trim().is_empty() || md5sum == EMPTY {
             // What files have under that name is not to be taken for what this publisher sends, and stays what is written.
             let before = self.known.find(&name).is_ok();
-            match self.known.registry_mut().add_ros1_definition(&name, text) {
-                Ok(found) if fits(&found) => {
+            match self.known.registry().read_ros1_definition(&name, text) {
+                Ok((found, definitions)) if fits(&found) => {
+                    let found = self.keep(found, definitions, mapped)?;
                     if !before {
                         self.known
                             .learned(&name, || "a connection header".to_owned());
@@ -59,7 +69,7 @@ impl Definitions {
                         .registry()
                         .get(&name)
                         .is_ok_and(|known| fits(&known)) => {}
-                Ok(found) => {
+                Ok((found, _)) => {
                     return Err(Unusable::Checksum {
                         name,
                         theirs: md5sum.to_owned(),
@@ -80,6 +90,33 @@ impl Definitions {
                 ours,
             })
         }
+    }
+
+    /// Keeps what a publisher brought, in the place of what nobody publishes any more.
+    fn keep(
+        &mut self,
+        found: Arc<MessageType>,
+        definitions: PeerDefinitions,
+        mapped: bool,
+    ) -> Result<Arc<MessageType>, Unusable> {
+        let gone = match self.brought.room_for(&found, definitions.len(), mapped) {
+            Room::Known(known) => return Ok(known),
+            Room::After(gone) => gone,
+            Room::None => return Err(Unusable::Full),
+        };
+        for entry in &gone {
+            self.known.registry_mut().forget(&entry.definitions);
+            self.known.forgotten(&entry.name);
+        }
+        if !gone.is_empty() {
+            // What one of those brought another may need, which brought it as well.
+            for kept in self.brought.definitions() {
+                self.known.registry_mut().keep(kept);
+            }
+        }
+        self.known.registry_mut().keep(&definitions);
+        self.brought.take(&found, definitions);
+        Ok(found)
     }
 
     /// The type of that name with all it needs. One that is not known yet is looked for in the packages.
@@ -115,6 +152,12 @@ pub(crate) enum Unusable {
     Name(#[from] NameError),
     #[error(transparent)]
     Definition(#[from] DefinitionError),
+    #[error(
+        "{} MiB of definitions of other publishers are in use, which is all there is room for; a mapping that names the \
+         topic has room for it in any case",
+        MAX_BYTES >> 20
+    )]
+    Full,
     #[error("{name} has checksum {theirs} there and {ours} by its definition")]
     Checksum {
         name: TypeName,
@@ -144,7 +187,7 @@ mod tests {
             ================================================================================\n\
             MSG: robot_msgs/Joint\nstring name\nfloat64 angle\n";
         let found = definitions
-            .of_publisher(&header("robot_msgs/Arm", "*", text))
+            .of_publisher(&header("robot_msgs/Arm", "*", text), false)
             .unwrap();
         assert_eq!(found.leaves()[0].path, "joints");
         let joint = definitions
@@ -158,10 +201,11 @@ mod tests {
         let mut definitions = Definitions::new(Arc::default(), vec![]);
         let string = "992ce8a1687cec8c8bd883ec73ca41d1";
         let found = definitions
-            .of_publisher(&header("std_msgs/String", string, ""))
+            .of_publisher(&header("std_msgs/String", string, ""), false)
             .unwrap();
         assert_eq!(found.md5(), string);
-        let other = definitions.of_publisher(&header("std_msgs/String", &"0".repeat(32), ""));
+        let other =
+            definitions.of_publisher(&header("std_msgs/String", &"0".repeat(32), ""), false);
         assert!(matches!(other, Err(Unusable::Checksum { .. })));
     }
 
@@ -170,25 +214,71 @@ mod tests {
         let mut definitions = Definitions::new(Arc::default(), vec![]);
         let lie = header("robot_msgs/Arm", &"0".repeat(32), "int32 a\n");
         assert!(matches!(
-            definitions.of_publisher(&lie),
+            definitions.of_publisher(&lie, false),
             Err(Unusable::Checksum { .. })
         ));
         let bool = definitions.get(&"std_msgs/Bool".parse().unwrap()).unwrap();
         let wrong_text = header("std_msgs/Bool", bool.md5(), "int32 a\n");
         assert_eq!(
-            definitions.of_publisher(&wrong_text).unwrap().definition(),
+            definitions
+                .of_publisher(&wrong_text, false)
+                .unwrap()
+                .definition(),
             bool.definition()
         );
     }
 
     #[test]
     fn a_message_without_fields_has_a_type() {
-        let found = Definitions::new(Arc::default(), vec![]).of_publisher(&header(
-            "std_msgs/Empty",
-            EMPTY,
-            "",
-        ));
+        let found = Definitions::new(Arc::default(), vec![])
+            .of_publisher(&header("std_msgs/Empty", EMPTY, ""), false);
         assert_eq!(found.unwrap().leaves().len(), 0);
+    }
+
+    /// A connection header of a type of that number, with as many other types as fit into half a MiB.
+    fn bulky(number: usize) -> ConnectionHeader {
+        let rule = "=".repeat(80);
+        let mut text = String::new();
+        for part in 0..2000 {
+            text += &format!("bulk_msgs/N{number}P{part} p{part}\n");
+        }
+        for part in 0..2000 {
+            text += &format!(
+                "{rule}\nMSG: bulk_msgs/N{number}P{part}\nint8 a # {:100}\n",
+                ""
+            );
+        }
+        header(&format!("bulk_msgs/N{number}"), "*", &text)
+    }
+
+    #[test]
+    fn publishers_that_come_and_go_with_ever_new_types_leave_no_more_than_has_room() {
+        let mut definitions = Definitions::new(Arc::default(), vec![]);
+        let built_in = definitions.known.registry().names().count();
+        for number in 0..20 {
+            drop(definitions.of_publisher(&bulky(number), false).unwrap());
+        }
+        let kept = definitions.known.registry().names().count() - built_in;
+        assert!(kept <= 4096, "{kept} names");
+        assert!(definitions.brought.len() <= 2);
+        let last = definitions.get(&"bulk_msgs/N19".parse().unwrap());
+        assert!(last.is_ok(), "the newest is known");
+    }
+
+    #[test]
+    fn types_in_use_stay_and_only_the_mapping_has_room_beside_them() {
+        let mut definitions = Definitions::new(Arc::default(), vec![]);
+        let first = definitions.of_publisher(&bulky(0), false).unwrap();
+        let _second = definitions.of_publisher(&bulky(1), false).unwrap();
+        let refused = definitions.of_publisher(&bulky(2), false);
+        assert!(matches!(refused, Err(Unusable::Full)));
+        assert!(definitions.of_publisher(&bulky(2), true).is_ok());
+        // A publisher of the same type comes back, or another one of it comes.
+        let again = definitions.of_publisher(&bulky(0), false).unwrap();
+        assert!(Arc::ptr_eq(&first, &again));
+        drop((first, again));
+        assert!(definitions.of_publisher(&bulky(3), false).is_ok());
+        assert!(definitions.get(&"bulk_msgs/N0".parse().unwrap()).is_err());
     }
 
     #[test]

@@ -3,10 +3,12 @@
 //! One task owns everything; [`Ros1Port::recv`](Port::recv) is its only wait.
 
 mod reload;
+mod found;
 mod strays;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::net::IpAddr;
+use std::ops::Bound;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -23,10 +25,11 @@ use tcpros::{
 use tracing::{info, warn};
 use uadp::{BuiltinType, Timestamp};
 
+use self::found::{MAX_NAME, Refused};
 use crate::definitions::Definitions;
 use crate::services::Ros1Graph;
 use crate::sink::{Open, Sink};
-use crate::source::{Met, Source};
+use crate::source::{MAX_LATCHED, Met, Source};
 use crate::watcher::{Seen, Watcher};
 
 /// What a [`Ros1Port`] is started with.
@@ -53,8 +56,10 @@ pub struct Ros1Port {
     definitions: Definitions,
     watcher: Watcher,
     graph: Graph,
-    /// Topics we read; a source never goes away, so that its index names it.
+    /// Topics we read. Their indices name them; the place of one that was given up is taken by another.
     sources: Vec<Source>,
+    /// Such places.
+    vacant: Vec<usize>,
     source_of: BTreeMap<String, usize>,
     inbox: Inbox<usize>,
     /// Topics we write.
@@ -65,6 +70,8 @@ pub struct Ros1Port {
     services: Services,
     /// What `recv` hands out next; filled by one message or by one pass over the topics.
     events: VecDeque<PortEvent>,
+    /// The topic of the graph that was taken in last: the next look goes on behind it, so that each has its turn.
+    taken_last: String,
     /// What was already told, so that it is told once.
     told: BTreeSet<(String, &'static str)>,
     /// The address that other nodes are told, where it is one and no name.
@@ -72,6 +79,8 @@ pub struct Ros1Port {
     master: String,
     /// Whether the master answered when it was last asked.
     has_master: bool,
+    /// Topics of the graph that there was no room for, and when that was told last.
+    refused: Refused,
 }
 
 impl Ros1Port {
@@ -107,15 +116,18 @@ impl Ros1Port {
             services,
             graph: Graph::default(),
             sources: Vec::new(),
+            vacant: Vec::new(),
             source_of: BTreeMap::new(),
             inbox: Inbox::new(),
             sinks: HashMap::new(),
             room: Room::new(MAX_TOPICS),
             events: bound.into(),
+            taken_last: String::new(),
             told: BTreeSet::new(),
             address,
             master,
             has_master: false,
+            refused: Refused::default(),
         };
         port.take_bindings(&mapping)?;
         Ok(port)
@@ -147,12 +159,21 @@ impl Ros1Port {
 
     /// The index of the source of that topic, made when there is none.
     fn source(&mut self, ros_topic: String, expected: Option<TypeName>) -> usize {
-        let next = self.sources.len();
-        let index = *self.source_of.entry(ros_topic.clone()).or_insert(next);
-        if index == next {
-            self.sources
-                .push(Source::new(ros_topic, expected, Vec::new()));
+        if let Some(index) = self.source_of.get(&ros_topic) {
+            return *index;
         }
+        let source = Source::new(ros_topic.clone(), expected, Vec::new());
+        let index = match self.vacant.pop() {
+            Some(index) if index < self.sources.len() => index,
+            _ => {
+                self.sources.push(Source::vacant());
+                self.sources.len() - 1
+            }
+        };
+        if let Some(place) = self.sources.get_mut(index) {
+            *place = source;
+        }
+        self.source_of.insert(ros_topic, index);
         index
     }
 
@@ -216,7 +237,16 @@ impl Ros1Port {
         let Some(source) = self.sources.get_mut(index) else {
             return;
         };
+        if let Some(publisher) = source.make_room(&peer) {
+            self.events
+                .extend(source.values.iter().map(|(topic, _)| PortEvent::Left {
+                    topic: *topic,
+                    publisher,
+                }));
+        }
         let latched_by = source.latched_by(&peer, &bytes);
+        let unlatched = peer.header.latching() && latched_by.is_none();
+        let ros_topic = unlatched.then(|| source.ros_topic.clone());
         for (topic, _) in &source.values {
             let payload = bytes.clone();
             self.events.push_back(PortEvent::Sample {
@@ -224,6 +254,14 @@ impl Ros1Port {
                 payload,
                 received,
                 latched_by,
+            });
+        }
+        if let Some(ros_topic) = ros_topic {
+            self.tell_once(&ros_topic, "too many latched", || {
+                format!(
+                    "more than {MAX_LATCHED} latched publishers are connected: the last message of {} does not reach late joiners",
+                    peer.caller_id
+                )
             });
         }
     }
@@ -237,8 +275,8 @@ impl Ros1Port {
         else {
             return false;
         };
-        let ros_topic = source.ros_topic.clone();
-        let found = self.definitions.of_publisher(&peer.header);
+        let (ros_topic, mapped) = (source.ros_topic.clone(), !source.found);
+        let found = self.definitions.of_publisher(&peer.header, mapped);
         if let Err(error) = &found {
             self.tell_once(&ros_topic, "unreadable type", || {
                 format!("messages of {} are dropped: {error}", peer.caller_id)
@@ -337,7 +375,11 @@ impl Ros1Port {
         self.has_master = graph.is_some();
         if let Some(graph) = graph {
             self.graph = graph;
+            for source in &mut self.sources {
+                source.looked_at();
+            }
             self.find_sources();
+            self.tell_refused();
         }
         for source in &mut self.sources {
             let named = self.graph.publishers.get(&source.ros_topic);
@@ -359,10 +401,20 @@ impl Ros1Port {
     /// nobody does.
     fn find_sources(&mut self) {
         let mut found = Vec::new();
-        for (ros_topic, publishers) in &self.graph.publishers {
+        self.refused.topics = 0;
+        // Each topic has its turn, also where there are more than there is room for.
+        let after = (Bound::Excluded(self.taken_last.clone()), Bound::Unbounded);
+        let before = ..=self.taken_last.clone();
+        let publishers = &self.graph.publishers;
+        let topics = publishers.range(after).chain(publishers.range(before));
+        for (ros_topic, publishers) in topics {
             if self.source_of.contains_key(ros_topic)
                 || publishers.iter().all(|name| name == self.node.name())
             {
+                continue;
+            }
+            if ros_topic.len() > MAX_NAME {
+                self.refused.topics += 1;
                 continue;
             }
             let named = ros_topic
@@ -386,9 +438,10 @@ impl Ros1Port {
                 (None, _) => {}
             }
         }
+        let mut places = self.places();
         for (ros_topic, made) in found {
             match made {
-                Ok(value) => self.add_source(ros_topic, value),
+                Ok(value) => self.add_found(ros_topic, value, &mut places),
                 Err(fault) => self.tell_once(&ros_topic, "pattern", || fault),
             }
         }
@@ -417,36 +470,6 @@ impl Ros1Port {
                 .resolve(&sink.ros_topic)
                 .is_ok_and(|name| name == ros_topic)
         })
-    }
-
-    /// Takes in a topic the mapping does not name, unless another one is that value already.
-    fn add_source(
-        &mut self,
-        ros_topic: String,
-        (topic, expected, selection): (TopicId, Option<TypeName>, Selection),
-    ) {
-        // Those that were given up leave their place behind.
-        let read = self.sources.iter().filter(|s| !s.values.is_empty());
-        if read.count() >= MAX_TOPICS {
-            self.tell_once("", "too many topics", || {
-                format!("more than {MAX_TOPICS} topics of this space: the rest is left alone")
-            });
-            return;
-        }
-        let same = |source: &&Source| source.values.iter().any(|(other, _)| *other == topic);
-        if let Some(other) = self.sources.iter().find(same) {
-            let other = other.ros_topic.clone();
-            self.tell_once(&ros_topic, "pattern", || {
-                format!("it would be {topic}, which {other} is already: it does not cross")
-            });
-            return;
-        }
-        let index = self.source(ros_topic, expected);
-        if let Some(source) = self.sources.get_mut(index) {
-            source.values.push((topic, selection));
-            source.found = true;
-        }
-        self.resubscribe(index);
     }
 
     /// Subscribes a topic that was found in the graph, if somebody publishes it and it is not subscribed.
@@ -597,6 +620,11 @@ impl Ros1Port {
     fn tell_once(&mut self, topic: &str, what: &'static str, message: impl FnOnce() -> String) {
         if self.told.len() < MAX_TOLD && self.told.insert((topic.to_owned(), what)) {
             warn!(topic, "{}", message());
+            if self.told.len() == MAX_TOLD {
+                warn!(
+                    "so many peculiarities were told that no further ones are, until the mapping is read again"
+                );
+            }
         }
     }
 }
@@ -786,8 +814,8 @@ fn latch_key(instance: Timestamp) -> u64 {
 const TYPE_CHANGES: &str = "type changes";
 /// The severity bit of a Bad StatusCode (OPC 10000-4, 7.39.1) in its upper 16 bits.
 const STATUS_BAD: u16 = 0x8000;
-/// Topics of the space that are read: anybody in the graph can invent names. Likewise those that are written, of values
-/// nobody here knows.
+/// Topics of the space that the mapping does not name and that are read: anybody in the graph can invent names. Likewise those
+/// that are written, of values nobody here knows.
 const MAX_TOPICS: usize = 4096;
 /// Peculiarities told; a graph with more of them is told about no further ones.
 const MAX_TOLD: usize = 4096;

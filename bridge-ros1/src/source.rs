@@ -30,6 +30,8 @@ pub(crate) struct Source {
     latched: Vec<LatchedPeer>,
     /// The key for the next of them.
     next_key: u32,
+    /// For how many looks at the graph nobody has published it.
+    silent: u32,
 }
 
 /// A publisher that latches.
@@ -60,10 +62,48 @@ impl Source {
             strangers: Vec::new(),
             latched: Vec::new(),
             next_key: 0,
+            silent: 0,
         }
     }
 
-    /// What the publisher of a message is called to the Router, if it latches. It keeps that name over a lost connection.
+    /// A place without a topic.
+    pub(crate) const fn vacant() -> Self {
+        Self::new(String::new(), None, Vec::new())
+    }
+
+    /// The graph has been looked at again.
+    pub(crate) const fn looked_at(&mut self) {
+        self.silent = if self.is_live() {
+            0
+        } else {
+            self.silent.saturating_add(1)
+        };
+    }
+
+    /// Whether another topic may have its place: it was found in the graph, and nobody has published it for a while,
+    /// whatever the master says.
+    pub(crate) const fn gives_way(&self) -> bool {
+        self.found && !self.is_live() && (self.silent > MAX_LOOKS || self.subscription.is_none())
+    }
+
+    /// Of too many latched publishers, one that is not connected gives way to another that latches. Returns its key.
+    pub(crate) fn make_room(&mut self, peer: &Peer) -> Option<PublisherKey> {
+        let known = |latched: &LatchedPeer| latched.caller_id == peer.caller_id;
+        if self.latched.len() < MAX_LATCHED
+            || !peer.header.latching()
+            || self.latched.iter().any(known)
+        {
+            return None;
+        }
+        let peers = &self.peers;
+        let connected =
+            |latched: &LatchedPeer| peers.iter().any(|peer| peer.caller_id == latched.caller_id);
+        let gone = self.latched.iter().position(|latched| !connected(latched));
+        gone.map(|at| self.latched.remove(at).key)
+    }
+
+    /// What the publisher of a message is called to the Router, if it latches and there is room for it. It keeps that name
+    /// over a lost connection.
     pub(crate) fn latched_by(&mut self, peer: &Peer, message: &Bytes) -> Option<PublisherKey> {
         if !peer.header.latching() {
             return None;
@@ -72,6 +112,9 @@ impl Source {
         if let Some(known) = latched.find(|l| l.caller_id == peer.caller_id) {
             known.last.clone_from(message);
             return Some(known.key);
+        }
+        if self.latched.len() >= MAX_LATCHED {
+            return None;
         }
         let key = PublisherKey(self.next_key);
         self.next_key = self.next_key.wrapping_add(1);
@@ -165,6 +208,9 @@ impl Source {
 
 /// About ten seconds: a publisher that died without a word to the master is not waited for any longer.
 const MAX_LOOKS: u32 = 20;
+
+/// Latched publishers of a topic that are told apart.
+pub(crate) const MAX_LATCHED: usize = 256;
 
 /// What a publisher is to a source.
 #[derive(Debug)]
@@ -274,6 +320,36 @@ mod tests {
         source.part(&b, 0);
         let looks = (0..100).position(|_| source.gone_for_good(&named) == [keys[1]]);
         assert_eq!(looks, Some(20), "it died without a word to the master");
+    }
+
+    #[test]
+    fn of_too_many_latched_publishers_those_that_have_gone_give_way() {
+        let mut source = source(None);
+        let message = Bytes::new();
+        let connected: Vec<_> = (1..MAX_LATCHED)
+            .map(|n| latching(&format!("/p{n}")))
+            .collect();
+        for peer in &connected {
+            source.meet(peer, of("std_msgs/Bool"));
+            assert!(source.latched_by(peer, &message).is_some());
+        }
+        // Publishers that are made up and leave at once.
+        let mut gave_way = Vec::new();
+        for n in 0..10 {
+            let made_up = latching(&format!("/made_up{n}"));
+            gave_way.extend(source.make_room(&made_up));
+            assert!(source.latched_by(&made_up, &message).is_some());
+        }
+        assert_eq!(gave_way.len(), 9);
+        assert_eq!(source.latched().count(), MAX_LATCHED);
+        let last = latching("/last");
+        source.meet(&last, of("std_msgs/Bool"));
+        assert!(source.make_room(&last).is_some());
+        assert!(source.latched_by(&last, &message).is_some());
+        let one_more = latching("/one_more");
+        assert_eq!(source.make_room(&one_more), None, "all are connected");
+        assert_eq!(source.latched_by(&one_more, &message), None);
+        assert!(source.latched_by(&last, &message).is_some(), "it is known");
     }
 
     #[test]

@@ -84,7 +84,7 @@ pub use name::{Dialect, TypeName};
 pub use plan::{
     Conversion, Literal, Part, Plan, Selected, Selection, Wire, is_lossless, is_number,
 };
-pub use registry::Registry;
+pub use registry::{PeerDefinitions, Registry};
 pub use service::{ActionMessages, ActionType, ServiceType};
 pub use structure::{MemberKind, Structure, StructureMember};
 pub use type_hash::{ActionTypeHashes, NoTypeHash, ServiceTypeHashes, TypeHash};

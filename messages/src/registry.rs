@@ -98,6 +98,21 @@ impl Registry {
         name: &TypeName,
         text: &str,
     ) -> Result<Arc<MessageType>, DefinitionError> {
+        let (found, definitions) = self.read_ros1_definition(name, text)?;
+        self.keep(&definitions);
+        Ok(found)
+    }
+
+    /// As [`add_ros1_definition`](Self::add_ros1_definition), but nothing is kept. The definitions are for
+    /// [`keep`](Self::keep): those of the text that the type needs.
+    ///
+    /// # Errors
+    /// [`DefinitionError`].
+    pub fn read_ros1_definition(
+        &self,
+        name: &TypeName,
+        text: &str,
+    ) -> Result<(Arc<MessageType>, PeerDefinitions), DefinitionError> {
         let mut peers = BTreeMap::new();
         for (name, text) in sections(name, text)? {
             let definition = Arc::new(Definition::parse(self.dialect, &name, text)?);
@@ -105,10 +120,35 @@ impl Registry {
         }
         let found = Resolver::new(self.dialect, &[&peers, &self.definitions])
             .message_type(name, Some(text))?;
-        for (name, definition) in peers {
-            self.definitions.entry(name).or_insert(definition);
+        let mut needed = Vec::new();
+        let mut wanted = vec![name.clone()];
+        while let Some(name) = wanted.pop() {
+            if let Some(definition) = peers.remove(&name) {
+                wanted.extend(definition.needs().cloned());
+                needed.push((name, definition));
+            }
         }
-        Ok(Arc::new(found))
+        Ok((Arc::new(found), PeerDefinitions { needed }))
+    }
+
+    /// Adds the definitions of a peer, but for names that there are already.
+    pub fn keep(&mut self, definitions: &PeerDefinitions) {
+        for (name, definition) in &definitions.needed {
+            if !self.definitions.contains_key(name) {
+                self.definitions
+                    .insert(name.clone(), Arc::clone(definition));
+            }
+        }
+    }
+
+    /// Takes away the definitions of a peer, but for those that were not kept or have been replaced.
+    pub fn forget(&mut self, definitions: &PeerDefinitions) {
+        for (name, definition) in &definitions.needed {
+            let known = self.definitions.get(name);
+            if known.is_some_and(|known| Arc::ptr_eq(known, definition)) {
+                self.definitions.remove(name);
+            }
+        }
     }
 
     /// The type of that name with all it needs.
@@ -247,6 +287,21 @@ impl Registry {
     /// of its letters different.
     pub fn suggest(&self, name: &TypeName) -> Option<TypeName> {
         resolve::suggest(name, self.definitions.keys())
+    }
+}
+
+/// What a peer says its type is: definitions by name, the type itself first.
+#[derive(Clone, Debug)]
+pub struct PeerDefinitions {
+    needed: Vec<(TypeName, Arc<Definition>)>,
+}
+
+impl PeerDefinitions {
+    /// How many there are, at least one.
+    #[expect(clippy::len_without_is_empty, reason = "the type itself is among them")]
+    #[must_use]
+    pub const fn len(&self) -> usize {
+        self.needed.len()
     }
 }
 

@@ -263,6 +263,26 @@ fn a_connection_header_brings_its_own_definition() {
 }
 
 #[test]
+fn of_a_connection_header_only_what_its_type_needs_is_kept_and_can_be_forgotten() {
+    let mut registry = Registry::bundle(Dialect::Ros1);
+    let before = registry.names().count();
+    let rule = "=".repeat(80);
+    let padded = format!("{PEER}{rule}\nMSG: mine/Unneeded\nint8 x\n");
+    let things = name("mine/Things");
+    let (_, first) = registry.read_ros1_definition(&things, &padded).unwrap();
+    assert_eq!((registry.names().count(), first.len()), (before, 3));
+    registry.keep(&first);
+    // Header is built in.
+    assert_eq!(registry.names().count(), before + 2);
+    let (_, second) = registry.read_ros1_definition(&things, PEER).unwrap();
+    registry.keep(&second);
+    registry.forget(&second);
+    assert!(registry.get(&things).is_ok(), "it is the first one's");
+    registry.forget(&first);
+    assert_eq!(registry.names().count(), before);
+}
+
+#[test]
 fn a_peer_cannot_replace_a_definition() {
     let mut registry = Registry::bundle(Dialect::Ros1);
     let before = registry.get(&name("geometry_msgs/Point")).unwrap();

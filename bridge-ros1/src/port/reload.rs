@@ -88,14 +88,8 @@ impl Ros1Port {
         let gone = gone.map(|(topic, _)| PortEvent::Unbound { topic });
         self.events.extend(gone);
         source.found &= !named;
-        if source.values.is_empty() {
-            // Its index stays, by which the inbox names it; its name is free for another.
-            let ros_topic = source.ros_topic.clone();
-            *source = Source::new(ros_topic.clone(), None, Vec::new());
-            // That of one given up before may be taken by now.
-            if self.source_of.get(&ros_topic) == Some(&index) {
-                self.source_of.remove(&ros_topic);
-            }
+        if source.values.is_empty() && !source.ros_topic.is_empty() {
+            self.vacate(index);
         }
     }
 

@@ -1,0 +1,209 @@
+//! Topics of the graph that the mapping does not name: they are read while there is room, since anybody can invent some.
+//!
+//! What the mapping names is never refused. Of the rest, what nobody publishes gives way to what comes, and what there is
+//! no room for is told of for as long as that lasts.
+
+use std::time::{Duration, Instant};
+
+use bridge_node::PortEvent;
+use mappings::TopicId;
+use messages::{Selection, TypeName};
+use tracing::warn;
+
+use super::{MAX_TOPICS, Ros1Port};
+use crate::source::Source;
+
+impl Ros1Port {
+    /// Gives up a source, whose place may be taken by another.
+    pub(super) fn vacate(&mut self, index: usize) {
+        let Some(place) = self.sources.get_mut(index) else {
+            return;
+        };
+        // Nothing that was queued for it comes out of the inbox any more.
+        let source = std::mem::replace(place, Source::vacant());
+        self.source_of.remove(&source.ros_topic);
+        self.vacant.push(index);
+        let gone = source.values.into_iter();
+        let gone = gone.map(|(topic, _)| PortEvent::Unbound { topic });
+        self.events.extend(gone);
+    }
+
+    /// What room there is for topics that the mapping does not name.
+    pub(super) fn places(&self) -> Places {
+        let found = self.sources.iter().filter(|source| source.found);
+        let places = self.sources.iter().enumerate();
+        let silent = places.filter(|(_, source)| source.gives_way());
+        Places {
+            free: MAX_TOPICS.saturating_sub(found.count()),
+            silent: silent.map(|(index, _)| index).collect(),
+        }
+    }
+
+    /// Takes in a topic the mapping does not name, unless there is no room or another one is that value already.
+    pub(super) fn add_found(
+        &mut self,
+        ros_topic: String,
+        (topic, expected, selection): (TopicId, Option<TypeName>, Selection),
+        places: &mut Places,
+    ) {
+        if places.free == 0 {
+            let Some(silent) = places.silent.pop() else {
+                self.refused.topics += 1;
+                return;
+            };
+            self.vacate(silent);
+            places.free += 1;
+        }
+        let same = |source: &&Source| source.values.iter().any(|(other, _)| *other == topic);
+        if let Some(other) = self.sources.iter().find(same) {
+            let other = other.ros_topic.clone();
+            self.tell_once(&ros_topic, "pattern", || {
+                format!("it would be {topic}, which {other} is already: it does not cross")
+            });
+            return;
+        }
+        self.taken_last.clone_from(&ros_topic);
+        let index = self.source(ros_topic, expected);
+        if let Some(source) = self.sources.get_mut(index) {
+            source.values.push((topic, selection));
+            source.found = true;
+            places.free -= 1;
+        }
+        self.resubscribe(index);
+    }
+
+    /// Tells of what there is no room for, at the first time and then every minute.
+    pub(super) fn tell_refused(&mut self) {
+        let Refused { topics, told } = self.refused;
+        let now = bridge_node::now().monotonic;
+        let due = told.is_none_or(|told| now.duration_since(told) >= REFUSED_AGAIN);
+        if due && topics > 0 {
+            warn!(
+                topics,
+                limit = MAX_TOPICS,
+                "there is no room for more topics that the mapping does not name: these are left alone; a mapping that \
+                 names them has room for them in any case"
+            );
+            self.refused.told = Some(now);
+        }
+    }
+}
+
+/// Room for topics that the mapping does not name.
+#[derive(Debug)]
+pub(super) struct Places {
+    free: usize,
+    /// Sources that give way where nothing is free.
+    silent: Vec<usize>,
+}
+
+/// What there was no room for.
+#[derive(Debug, Default)]
+pub(super) struct Refused {
+    pub(super) topics: usize,
+    told: Option<Instant>,
+}
+
+/// Bytes of the name of such a topic.
+pub(super) const MAX_NAME: usize = 512;
+/// Between two lines about what there is no room for.
+const REFUSED_AGAIN: Duration = Duration::from_secs(60);
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use bridge_node::Port as _;
+    use mappings::{Mapping, SpaceId};
+    use tcpros::{Graph, NodeOptions};
+
+    use super::*;
+    use crate::port::PortOptions;
+
+    fn port(mapping: &str) -> Ros1Port {
+        let mut node = NodeOptions::from_env("n");
+        // Nothing listens there.
+        "http://127.0.0.1:1".clone_into(&mut node.master_uri);
+        node.advertise_as("127.0.0.1");
+        let mapping = if mapping.is_empty() {
+            Mapping::default()
+        } else {
+            Mapping::from_yaml(mapping, "cell.yaml").mapping.unwrap()
+        };
+        Ros1Port::start(PortOptions {
+            node,
+            own: SpaceId::ROS1,
+            mapping: Arc::new(mapping),
+            types: Arc::default(),
+            packages: Vec::new(),
+        })
+        .unwrap()
+    }
+
+    /// A graph in which somebody publishes so many topics of the namespace 1, and one of the namespace 9.
+    fn graph(made_up: usize, honest: bool) -> Option<Graph> {
+        let made_up = (1..=made_up).map(|id| format!("/ua_1_1_{id}"));
+        let topics = made_up.chain(honest.then(|| HONEST.to_owned()));
+        Some(Graph {
+            publishers: topics.map(|topic| (topic, vec!["/p".to_owned()])).collect(),
+            ..Graph::default()
+        })
+    }
+
+    fn unbound(port: &mut Ros1Port) -> Vec<TopicId> {
+        let events = std::mem::take(&mut port.events).into_iter();
+        events
+            .filter_map(|event| match event {
+                PortEvent::Unbound { topic } => Some(topic),
+                _ => None,
+            })
+            .collect()
+    }
+
+    const HONEST: &str = "/ua_1_9_9";
+
+    #[tokio::test]
+    async fn topics_that_nobody_publishes_any_more_leave_their_place_to_a_new_one() {
+        let mut port = port("");
+        port.look(graph(5000, false));
+        assert_eq!(port.source_of.len(), MAX_TOPICS);
+        assert_eq!(port.refused.topics, 5000 - MAX_TOPICS);
+        assert!(port.refused.told.is_some(), "the operator is told");
+        // Gone from the graph, and the next look finds that out.
+        port.look(graph(0, true));
+        port.look(graph(0, true));
+        assert!(port.source_of.contains_key(HONEST));
+        assert_eq!(unbound(&mut port).len(), 1);
+        assert_eq!((port.sources.len(), port.refused.topics), (MAX_TOPICS, 0));
+    }
+
+    #[tokio::test]
+    async fn topics_that_only_the_master_says_are_published_give_way_in_turn() {
+        let mut port = port("");
+        let mut looks = 0;
+        while !port.source_of.contains_key(HONEST) {
+            port.look(graph(6000, true));
+            assert!(port.source_of.len() <= MAX_TOPICS);
+            looks += 1;
+            // Ten seconds for each turn, and two turns for 6000 topics.
+            assert!(looks <= 50, "it never has its turn");
+        }
+        assert_eq!(port.sources.len(), MAX_TOPICS);
+    }
+
+    const MAPPED: &str = "
+spaces: [{id: 1}, {id: 2}]
+namespaces: {5: urn:a:b}
+variables:
+  - {node: ns=5;i=11, name: Turn, origin: 1, ros: {space: 1, topic: /turn, type: geometry_msgs/Twist}}
+";
+
+    #[tokio::test]
+    async fn what_the_mapping_names_has_room_beside_all_the_rest() {
+        let mut port = port("");
+        port.look(graph(5000, false));
+        let mapping = Mapping::from_yaml(MAPPED, "cell.yaml").mapping.unwrap();
+        port.reload(&Arc::new(mapping), &Arc::default());
+        assert!(port.source_of.contains_key("/turn"));
+    }
+}
