@@ -7,6 +7,7 @@ mod arguments;
 mod busy_poll;
 mod clock;
 mod definitions;
+mod descriptors;
 mod exit;
 mod logging;
 mod mapping_file;

@@ -18,6 +18,7 @@ use type_files::TypePaths;
 
 use crate::arguments::Arguments;
 use crate::busy_poll::BusyPoll;
+use crate::descriptors;
 use crate::exit::{Failure, FailureKind};
 use crate::logging;
 use crate::mapping_file::{MappingFile, Running};
@@ -81,6 +82,7 @@ pub fn run<P: Program>() -> ExitCode {
         }
     };
     logging::start(program.arguments().log, P::QUIET);
+    descriptors::raise();
     let arguments = program.arguments();
     let ended = match MappingFile::open(arguments.mapping.as_deref(), arguments.check) {
         Ok(Some(mapping)) => serve(program, mapping),

@@ -1,0 +1,38 @@
+//! How many files and connections the program may have open.
+
+use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+use tracing::debug;
+
+/// Raises the limit as far as the system lets the program, within reason: a shell has 1024,
+/// for the sake of programs that use `select`, and a graph of 500 topics takes more.
+pub(crate) fn raise() {
+    let limit = getrlimit(Resource::Nofile);
+    let most = limit.maximum.map_or(MOST, |maximum| maximum.min(MOST));
+    if limit.current.is_none_or(|current| current >= most) {
+        return;
+    }
+    let raised = Rlimit {
+        current: Some(most),
+        maximum: limit.maximum,
+    };
+    if let Err(error) = setrlimit(Resource::Nofile, raised) {
+        debug!(%error, "the limit of open files stays as it is");
+    }
+}
+
+const MOST: u64 = 65_536;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_limit_is_raised_to_what_the_system_allows() {
+        let Rlimit { maximum, .. } = getrlimit(Resource::Nofile);
+        let most = maximum.map_or(MOST, |maximum| maximum.min(MOST));
+        let current = Some(most - 1);
+        setrlimit(Resource::Nofile, Rlimit { current, maximum }).unwrap();
+        raise();
+        assert_eq!(getrlimit(Resource::Nofile).current, Some(most));
+    }
+}
