@@ -9,12 +9,14 @@
 //! - Every queue is bounded in messages and in bytes, drops its oldest messages and counts them. A slow peer costs
 //!   nobody but itself.
 //! - What peers send is checked; a peer that breaks the protocol loses its connection, with a line in the log.
+//! - What peers can open leaves file descriptors for the node itself: of `RLIMIT_NOFILE` subscribers and clients have three
+//!   eighths, callers of the slave API one, and publishers three. A process with several nodes needs a limit for all.
 //! - It runs on a `current_thread` runtime as well as on several threads. A consumer on a `current_thread` runtime
 //!   is served fastest when it is a spawned task: waking the future given to `block_on` costs a system call.
 //!
 //! To read the code: `node` has the state, `registrar` the master's side of it, `publisher` and `topic_server` what
 //! goes out, `subscription` and `link` what comes in, `inbox` where it is taken, `service` what is called,
-//! `parameters` what the master keeps. [`actionlib`] stands on topics alone.
+//! `crowd` who may be connected, `parameters` what the master keeps. [`actionlib`] stands on topics alone.
 
 pub mod actionlib;
 mod clock;

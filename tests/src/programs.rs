@@ -33,9 +33,15 @@ impl Cell {
     /// bridge-ros1, not started yet.
     #[must_use]
     pub fn bridge_ros1_started(&self, args: &[&str]) -> Started {
+        self.bridge_ros1_at(args, METRICS_ROS1)
+    }
+
+    /// bridge-ros1 that answers about itself at another address, not started yet.
+    #[must_use]
+    pub fn bridge_ros1_at(&self, args: &[&str], metrics: &str) -> Started {
         self.with_ros1(Started::new("bridge-ros1", &program("bridge-ros1")))
             .args(args)
-            .args(["--interface", "lo", "--metrics", METRICS_ROS1])
+            .args(["--interface", "lo", "--metrics", metrics])
     }
 
     /// The example of tcpros that repeats the first topic of each pair as the second. It says nothing when it is ready.

@@ -9,6 +9,8 @@
 //! - A publisher is tried again until the master no longer names it: `peers`.
 //! - A node does not hear itself, whatever it is called: `delivery`.
 //! - The master may come late, go and come back: `master`.
+//! - What the master loses of a node is registered again, and a name has one node: `master`, `slave_api`.
+//! - What peers claim costs a bounded number of connections and log lines: `peers`, and the unit tests of `crowd` and `rpc`.
 //! - The end of a node leaves nothing behind: `master`.
 //! - The slave API answers everything, on every kind of HTTP connection: `slave_api`, and the unit tests of `rpc`.
 //! - The last message of a latched topic reaches late subscribers: `delivery`.

@@ -15,6 +15,8 @@
 //!   `faults::twenty_restarts_of_the_master_cost_no_message`.
 //! - The end of a program leaves nothing behind: `faults::a_bridge_ends_in_time_with_and_without_a_master` and the two
 //!   tests after it.
+//! - A name has one node, also where two take it at once: `faults::a_bridge_whose_name_is_taken_ends_and_says_so` and
+//!   `of_two_bridges_that_start_at_once_exactly_one_stays` there.
 //! - The slave API serves the tools: `tools::the_tools_of_ros_see_and_hear_a_node`.
 //! - Latching and definition are told: `tools::a_bag_has_all_a_topic_says_and_plays_it_back`.
 //! - Nothing is left of what has gone: `churn`.
