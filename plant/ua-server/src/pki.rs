@@ -1,7 +1,7 @@
 //! The application's own certificate, and the certificates of clients that were refused.
 
 use std::collections::BTreeSet;
-use std::fs;
+use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -72,11 +72,13 @@ impl Pki {
     }
 
     /// Makes the application instance certificate and its key when neither is there, naming the application and
-    /// the hosts it is reached under (OPC 10000-6, 6.2.2), and warns when those there do not fit any more.
+    /// the hosts it is reached under (OPC 10000-6, 6.2.2), and warns when those there do not fit any more. Of several
+    /// servers that start at once in one store the first makes the pair, and the others take it.
     ///
     /// # Errors
     /// Files that cannot be read or written, or half a pair.
     pub(crate) fn ensure_own(&self, application_uri: &str, host: &str) -> Result<(), PkiError> {
+        let _alone = self.lock()?;
         let certificate = self.root.join(OWN_CERTIFICATE);
         let key = self.root.join(OWN_KEY);
         match (certificate.exists(), key.exists()) {
@@ -97,6 +99,17 @@ impl Pki {
                 Ok(())
             }
         }
+    }
+
+    /// Waits until no other server is making its certificate here, and keeps others from it until the file is dropped.
+    fn lock(&self) -> Result<File, PkiError> {
+        let path = self.root.join(LOCK);
+        let locked = File::create(&path).and_then(|file| match file.lock() {
+            // Some network file systems have no locks; two servers that start at once there are left to chance.
+            Err(error) if error.kind() != io::ErrorKind::Unsupported => Err(error),
+            Ok(()) | Err(_) => Ok(file),
+        });
+        locked.map_err(|source| PkiError::Directory { path, source })
     }
 
     /// Says how to trust each client certificate refused since the last call, and keeps the newest
@@ -209,6 +222,8 @@ fn owner_only(_path: &Path) -> io::Result<()> {
 
 const OWN_CERTIFICATE: &str = "own/cert.der";
 const OWN_KEY: &str = "private/private.pem";
+/// Held while the pair is looked for and made.
+const LOCK: &str = "private/lock";
 /// Five years, as other stacks make them: clients trust this very file, so a new one is work for people.
 const CERTIFICATE_DAYS: u32 = 1826;
 /// How many refused client certificates are kept.
@@ -241,6 +256,28 @@ mod tests {
             before,
             fs::read(root.join(OWN_CERTIFICATE)).unwrap(),
             "a certificate that is there is kept"
+        );
+        fs::remove_dir_all(root).unwrap();
+    }
+
+    #[test]
+    fn servers_that_start_at_once_in_one_store_have_one_certificate() {
+        let root = scratch("at-once");
+        let start = std::sync::Barrier::new(3);
+        let begin = || {
+            let pki = Pki::open(root.clone()).unwrap();
+            start.wait();
+            pki.ensure_own("urn:cell:server", "localhost")
+                .map(|()| fs::read(root.join(OWN_CERTIFICATE)).unwrap())
+        };
+        let made: Vec<Vec<u8>> = std::thread::scope(|scope| {
+            let servers: Vec<_> = (0..3).map(|_| scope.spawn(begin)).collect();
+            let ended = servers.into_iter().map(|server| server.join().unwrap());
+            ended.collect::<Result<_, _>>().unwrap()
+        });
+        assert!(
+            made.iter().all(|one| *one == made[0]),
+            "each has the same certificate"
         );
         fs::remove_dir_all(root).unwrap();
     }
