@@ -17,7 +17,7 @@ async def run(args):
                 found = await node.get_children()
                 lifetime.say(node=text, children=[child.nodeid.to_string() for child in found])
                 continue
-            wanted = ua.ReadValueId(node.nodeid, ua.AttributeIds.Value)
+            wanted = ua.ReadValueId(node.nodeid, ua.AttributeIds.Value, args.range)
             parameters = ua.ReadParameters()
             parameters.TimestampsToReturn = ua.TimestampsToReturn.Both
             parameters.NodesToRead = [wanted]
@@ -29,6 +29,7 @@ def main():
     parser = argparse.ArgumentParser()
     opcua_session.add_arguments(parser)
     parser.add_argument("--children", action="store_true", help="the nodes below, instead of the values")
+    parser.add_argument("--range", help="IndexRange: 0:9")
     parser.add_argument("node", nargs="+", help="as OPC UA writes it: ns=2;i=10")
     args = parser.parse_args()
     lifetime.bound(args.limit)

@@ -13,7 +13,8 @@ import opcua_session
 
 async def run(args):
     async with await opcua_session.client_of(args) as client:
-        variant = ua.Variant(json.loads(args.value), ua.VariantType[args.type])
+        value = bytes(args.zeros) if args.zeros else json.loads(args.value)
+        variant = ua.Variant(value, ua.VariantType[args.type])
         try:
             await client.get_node(args.node).write_value(ua.DataValue(variant))
             status = "Good"
@@ -27,7 +28,8 @@ def main():
     opcua_session.add_arguments(parser)
     parser.add_argument("node")
     parser.add_argument("type", help="the builtin type's name: Boolean")
-    parser.add_argument("value", help="JSON")
+    parser.add_argument("value", help="JSON", nargs="?")
+    parser.add_argument("--zeros", type=int, help="so many bytes, instead of a value")
     args = parser.parse_args()
     lifetime.bound(args.limit)
     asyncio.run(run(args))

@@ -23,6 +23,15 @@ pub fn resident(process: u32) -> u64 {
     status(process, "VmRSS:") * 1024
 }
 
+/// The most memory of a process that was ever in RAM, in bytes.
+///
+/// # Panics
+/// When it is gone.
+#[must_use]
+pub fn peak(process: u32) -> u64 {
+    status(process, "VmHWM:") * 1024
+}
+
 /// The share of one processor that a process takes within `window`.
 ///
 /// # Panics

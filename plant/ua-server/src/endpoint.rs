@@ -194,12 +194,13 @@ pub(crate) fn server(described: &Server, url: &EndpointUrl, port: u16) -> Server
 
 fn limits() -> Limits {
     Limits {
-        // No value of the space is larger than a datagram; a Read of many of them is.
-        max_array_length: 65_535,
-        max_string_length: 65_535,
-        max_byte_string_length: 65_535,
-        max_message_size: 16 * 1024 * 1024,
-        max_chunk_count: 260,
+        // Any value of the space, and what can be read of an array at once.
+        max_array_length: LARGEST_ARRAY,
+        max_string_length: LARGEST_VALUE,
+        max_byte_string_length: LARGEST_VALUE,
+        max_message_size: LARGEST_VALUE + (1 << 20),
+        // With room for clients that send chunks of half the usual size.
+        max_chunk_count: 2_100,
         subscriptions: SubscriptionLimits {
             max_subscriptions_per_session: 50,
             // 0 is what a client gets that asks for exception-based reporting: every change, as it comes.
@@ -218,6 +219,10 @@ fn limits() -> Limits {
     }
 }
 
+/// The largest message of the space.
+const LARGEST_VALUE: usize = 64 << 20;
+/// Each element takes up 24 bytes and more while a message is read.
+const LARGEST_ARRAY: usize = 4 << 20;
 const APPLICATION_NAME: &str = "UA bridge server";
 const PRODUCT_URI: &str = "urn:ua-bridge:server";
 /// The port of OPC UA Connection Protocol registered with IANA.

@@ -3,9 +3,11 @@
 use std::collections::{BTreeMap, HashSet};
 
 use mappings::{Mapping, Meaning, NodeIdText, SpaceId, TopicId, Variable};
-use messages::Rank;
+use messages::{Leaf, Rank};
 use opcua::types::{ByteString, DataTypeId, Identifier, NodeId, Variant, VariantTypeId};
 use uadp::BuiltinType;
+
+use crate::structures::{Structure, Structures, Types};
 
 /// The nodes of the mapped topics and the namespaces they are in.
 #[derive(Debug)]
@@ -13,6 +15,8 @@ pub(crate) struct Layout {
     /// The NamespaceArray: index 0 is OPC UA's, index 1 the application's (OPC 10000-5, 6.3.1).
     pub(crate) namespaces: Vec<String>,
     pub(crate) topics: Vec<TopicNode>,
+    /// The DataTypes that the topics' fields have.
+    pub(crate) structures: Vec<Structure>,
 }
 
 /// The nodes of one topic.
@@ -35,6 +39,8 @@ pub(crate) struct FieldNode {
     pub(crate) node: NodeId,
     pub(crate) name: String,
     pub(crate) shape: Shape,
+    /// The DataType of the structure it is, or of those in its array, as far as known.
+    pub(crate) structure: Option<NodeId>,
 }
 
 /// What values a variable takes; nothing is known of those a mapping leaves open.
@@ -76,13 +82,19 @@ impl Layout {
     ///
     /// # Errors
     /// As [`new`](Self::new).
-    pub(crate) fn of(mapping: &Mapping) -> Result<Self, LayoutError> {
-        let topics = mapping.variables().iter().map(TopicNode::of).collect();
-        Self::new(
+    pub(crate) fn of(mapping: &Mapping, types: &mut Types) -> Result<Self, LayoutError> {
+        let mut structures = Structures::default();
+        let topics = mapping.variables().iter();
+        let topics = topics.map(|variable| TopicNode::of(variable, types, &mut structures));
+        let layout = Self::new(
             &mapping.server().application_uri,
             mapping.namespaces(),
-            topics,
-        )
+            topics.collect(),
+        )?;
+        Ok(Self {
+            structures: structures.into_vec(),
+            ..layout
+        })
     }
 
     /// The nodes of another mapping in a server that runs with these namespaces; and what of it a server only takes when it
@@ -93,19 +105,29 @@ impl Layout {
     pub(crate) fn within(
         running: &[String],
         mapping: &Mapping,
+        types: &mut Types,
     ) -> Result<(Self, Vec<String>), LayoutError> {
         let others = mapping
             .namespaces()
             .iter()
             .filter(|(index, uri)| running.get(usize::from(**index)) != Some(*uri));
         let others: Vec<u16> = others.map(|(index, _)| *index).collect();
-        let topics = mapping.variables().iter().map(TopicNode::of);
+        let mut structures = Structures::default();
+        let topics = mapping.variables().iter();
+        let topics = topics.map(|variable| TopicNode::of(variable, types, &mut structures));
         let is_here = |topic: &TopicNode| !others.contains(&topic.node.namespace);
         let layout = Self {
             namespaces: running.to_vec(),
             topics: topics.filter(is_here).collect(),
+            structures: Vec::new(),
         };
         layout.check()?;
+        let mut structures = structures.into_vec();
+        structures.retain(|one| !others.contains(&one.namespace));
+        let layout = Self {
+            structures,
+            ..layout
+        };
         let restart = others
             .iter()
             .map(|index| format!("namespaces ({index} and its nodes)"));
@@ -126,6 +148,7 @@ impl Layout {
         let layout = Self {
             namespaces: namespace_array(application_uri, wanted)?,
             topics,
+            structures: Vec::new(),
         };
         layout.check()?;
         Ok(layout)
@@ -198,7 +221,7 @@ fn namespace_array(
 }
 
 impl TopicNode {
-    fn of(variable: &Variable) -> Self {
+    fn of(variable: &Variable, types: &mut Types, structures: &mut Structures) -> Self {
         let leaves = variable.fields.iter().map(|leaf| {
             let array = match leaf.rank {
                 Rank::Scalar => false,
@@ -216,10 +239,23 @@ impl TopicNode {
             variable.name.clone(),
             fields,
         );
-        Self {
+        let mut node = Self {
             meaning: variable.meaning.clone(),
             ..node
+        };
+        let is_structure = |leaf: &Leaf| leaf.builtin == BuiltinType::ExtensionObject;
+        if !variable.fields.iter().any(is_structure) {
+            return node;
         }
+        if let Some(message_type) = types.of(variable) {
+            let namespace = variable.topic.namespace.get();
+            for (field, leaf) in node.fields.iter_mut().zip(&variable.fields) {
+                if is_structure(leaf) {
+                    field.structure = structures.add(&message_type, &leaf.path, namespace);
+                }
+            }
+        }
+        node
     }
 
     /// A topic whose DataSet has `fields`, in order: the path of each in the message, and its shape. None or one is
@@ -238,6 +274,7 @@ impl TopicNode {
                     node: component(&node, &path),
                     name: path,
                     shape,
+                    structure: None,
                 })
                 .collect()
         } else {
@@ -246,6 +283,7 @@ impl TopicNode {
                 node: node.clone(),
                 name: name.clone(),
                 shape,
+                structure: None,
             }]
         };
         Self {
@@ -265,12 +303,19 @@ impl TopicNode {
 
     /// Every node of the topic, its own first.
     pub(crate) fn nodes(&self) -> impl Iterator<Item = &NodeId> {
+        self.places().map(|(node, _)| node)
+    }
+
+    /// Every node of the topic, its own first, with the place of the field it is of.
+    pub(crate) fn places(&self) -> impl Iterator<Item = (&NodeId, Option<usize>)> {
         let components = if self.compound {
             self.fields.as_slice()
         } else {
             &[]
         };
-        std::iter::once(&self.node).chain(components.iter().map(|field| &field.node))
+        let components = components.iter().enumerate();
+        std::iter::once((&self.node, None))
+            .chain(components.map(|(at, field)| (&field.node, Some(at))))
     }
 }
 
@@ -300,6 +345,14 @@ pub(crate) fn component(parent: &NodeId, path: &str) -> NodeId {
     NodeId::new(parent.namespace, format!("{identifier}.{path}"))
 }
 
+impl FieldNode {
+    /// The DataType attribute.
+    pub(crate) fn data_type(&self) -> NodeId {
+        let structure = self.structure.clone();
+        structure.unwrap_or_else(|| self.shape.data_type())
+    }
+}
+
 impl Shape {
     /// The DataType attribute: the builtin types have the numbers of their encoding ids (OPC 10000-6, 5.1.2).
     pub(crate) fn data_type(self) -> NodeId {
@@ -315,6 +368,18 @@ impl Shape {
             Some((_, false)) => -1,
             Some((_, true)) => 1,
             None => -2,
+        }
+    }
+
+    /// Whether a variable of this shape may have this value, as it stands in a DataSet.
+    pub(crate) fn fits(self, value: &uadp::Variant<'_>) -> bool {
+        let Some(wanted) = self.0 else {
+            return true;
+        };
+        match value {
+            uadp::Variant::Null | uadp::Variant::Matrix(_) => false,
+            uadp::Variant::Scalar(scalar) => wanted == (scalar.builtin_type(), false),
+            uadp::Variant::Array(array) => wanted == (array.element(), true),
         }
     }
 

@@ -3,9 +3,13 @@
 //! It is the citizen of the space with origin 0. Values of the other spaces come by UADP and are read here; what
 //! clients write to the variables of origin 0 goes out by UADP. It knows no ROS.
 //!
-//! Reading order: `layout` (which nodes), `nodes` (the node manager), `space` (values in), `port` (the shell's side),
+//! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show),
+//! `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in), `port` (the shell's side),
 //! `endpoint` and `pki` (how clients get in), `value` (between the two codecs).
 
+mod address;
+mod browse;
+mod budget;
 mod endpoint;
 mod layout;
 mod nodes;
@@ -13,7 +17,9 @@ mod pki;
 mod port;
 mod properties;
 mod space;
+mod structures;
 mod value;
+mod values;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -24,6 +30,7 @@ use mappings::{Mapping, SpaceId};
 use crate::endpoint::EndpointUrl;
 use crate::pki::Pki;
 use crate::port::{ServerPort, Setup};
+use crate::structures::Types;
 
 /// The OPC UA server of the cell: every value of the space as a variable, and a way in for those of origin 0.
 #[derive(Debug, clap::Parser)]
@@ -86,6 +93,7 @@ impl Program for UaServer {
             url,
             pki,
             trust_any_client: self.trust_any_client_certificate,
+            types: Types::new(&context.types),
             mapped_url: self.endpoint.is_none(),
         };
         ServerPort::start(&context.mapping, setup)

@@ -1,34 +1,39 @@
-//! The node manager of the space: the mapped topics as nodes, what clients may write, and who watches.
+//! The node manager of the space: what the nodes show, what clients may write, and who watches.
 //!
-//! The address space's lock is taken before the subscriptions' lock and never across an await. Nothing here calls out
-//! while it is held but the subscriptions: a write leaves through a bounded channel.
+//! Locks are taken in this order and never across an await: the address space, the places, the values, the
+//! subscriptions, the watched items. Nothing here calls out while one is held but the subscriptions: a write leaves through a
+//! bounded channel.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::sync::Arc;
-use std::time::Duration;
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
+use std::time::{Duration, Instant};
 
 use async_trait::async_trait;
 use bytes::Bytes;
-use mappings::{SpaceId, TopicId};
-use opcua::nodes::{NodeType, ObjectBuilder, VariableBuilder};
-use opcua::server::address_space::{AccessLevel, AddressSpace};
+use mappings::TopicId;
+use opcua::server::address_space::AddressSpace;
 use opcua::server::diagnostics::NamespaceMetadata;
 use opcua::server::node_manager::memory::{InMemoryNodeManager, InMemoryNodeManagerImpl};
 use opcua::server::node_manager::{
-    MonitoredItemRef, ParsedWriteValue, RequestContext, ServerContext, WriteNode,
+    MonitoredItemRef, MonitoredItemUpdateRef, ParsedReadValueId, ParsedWriteValue, RequestContext,
+    ServerContext, WriteNode,
 };
 use opcua::server::{CreateMonitoredItem, MonitoredItemHandle, SubscriptionCache};
 use opcua::sync::{Mutex, RwLock};
 use opcua::types::{
-    AttributeId, DataEncoding, DataValue, DateTime, LocalizedText, NodeId, NumericRange, ObjectId,
-    QualifiedName, StatusCode, TimestampsToReturn, VariableTypeId, Variant,
+    AttributeId, DataValue, DateTime, NodeId, NumericRange, StatusCode, TimestampsToReturn, Variant,
 };
-use tokio::sync::mpsc;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tracing::warn;
 use uadp::Timestamp;
 
-use crate::layout::{FieldNode, Layout, Shape, TopicNode};
+use crate::address;
+use crate::budget::{Answers, LARGEST, SMALL, Watched};
+use crate::layout::{FieldNode, Layout, TopicNode};
 use crate::properties;
 use crate::value;
+use crate::values::{self, Shown, Stamp, Values, View};
 
 /// The node manager as the server has it.
 pub(crate) type SpaceManager = InMemoryNodeManager<SpaceNodes>;
@@ -36,12 +41,22 @@ pub(crate) type SpaceManager = InMemoryNodeManager<SpaceNodes>;
 /// Serves the nodes of the space.
 pub(crate) struct SpaceNodes {
     namespaces: Vec<NamespaceMetadata>,
-    /// Whose value a node has, and the place of the field, if it is a component.
     places: RwLock<Places>,
+    /// Where each node is among those with its parent.
+    order: RwLock<HashMap<NodeId, usize>>,
+    values: RwLock<Values>,
+    watched: Mutex<Watched>,
+    answers: Mutex<Answers>,
     exits: Exits,
-    unfiltered: Mutex<HashSet<MonitoredItemHandle>>,
+    /// One client writes at a time.
+    writing: Mutex<()>,
+    /// Bytes of the largest value that may be written.
+    largest_write: AtomicUsize,
+    /// How often a client was refused a value for its size.
+    refused: AtomicU64,
 }
 
+/// Whose value a node has, and the place of the field, if it is a component.
 type Places = HashMap<NodeId, (Arc<TopicNode>, Option<usize>)>;
 
 /// What leaves the node manager.
@@ -49,6 +64,8 @@ type Places = HashMap<NodeId, (Arc<TopicNode>, Option<usize>)>;
 pub(crate) struct Exits {
     /// Values clients wrote. A client is told when there is no room.
     pub(crate) writes: mpsc::Sender<ClientWrite>,
+    /// Room for the bytes of those values, in KiB.
+    pub(crate) room: Arc<Semaphore>,
     /// Monitored items as they are made, to be looked at once more. Without room a look is missed.
     pub(crate) created: mpsc::Sender<(NodeId, MonitoredItemHandle)>,
 }
@@ -60,6 +77,8 @@ pub(crate) struct ClientWrite {
     /// The fields of the DataSet as a key frame carries them.
     pub(crate) block: Bytes,
     pub(crate) source: Timestamp,
+    /// Given back when it has left.
+    pub(crate) room: OwnedSemaphorePermit,
 }
 
 impl SpaceNodes {
@@ -83,17 +102,30 @@ impl SpaceNodes {
                 });
             }
         }
-        add_folders(layout, address_space);
+        address::add_folders(layout, address_space);
+        for structure in &layout.structures {
+            structure.insert(address_space);
+        }
         let mut places = Places::new();
         for topic in &layout.topics {
-            add_topic(address_space, topic, &origin_folder(topic.topic.space));
+            address::add_topic(
+                address_space,
+                topic,
+                &address::origin_folder(topic.topic.space),
+            );
             put(&mut places, topic);
         }
         Self {
             namespaces,
             places: RwLock::new(places),
+            order: RwLock::new(address::order(layout)),
+            values: RwLock::new(Values::new(MOST_HELD)),
+            watched: Mutex::new(Watched::default()),
+            answers: Mutex::new(Answers::default()),
             exits,
-            unfiltered: Mutex::new(HashSet::new()),
+            writing: Mutex::new(()),
+            largest_write: AtomicUsize::new(usize::MAX),
+            refused: AtomicU64::new(0),
         }
     }
 
@@ -106,6 +138,10 @@ impl SpaceNodes {
     ) {
         let mut address_space = address_space.write();
         let mut places = self.places.write();
+        let mut values = self.values.write();
+        for topic in gone {
+            values.remove(topic.topic);
+        }
         for node in gone.iter().flat_map(TopicNode::nodes) {
             drop(address_space.delete(node, true));
             places.remove(node);
@@ -117,27 +153,52 @@ impl SpaceNodes {
             }
         }
         for topic in new {
-            let folder = origin_folder(topic.topic.space);
+            let folder = address::origin_folder(topic.topic.space);
             if !address_space.node_exists(&folder) {
-                add_folder(
+                address::add_folder(
                     &folder,
-                    &origin_name(topic.topic.space),
-                    root(),
+                    &address::origin_name(topic.topic.space),
+                    address::root(),
                     &mut address_space,
                 );
             }
-            add_topic(&mut address_space, topic, &folder);
+            address::add_topic(&mut address_space, topic, &folder);
             put(&mut places, topic);
         }
-        drop(places);
+        let mut notifier = subscriptions.data_notifier();
         for node in gone.iter().flat_map(TopicNode::nodes) {
-            let value = current_data_value(&address_space, node).unwrap_or_else(|| DataValue {
-                status: Some(StatusCode::BadNodeIdUnknown),
-                server_timestamp: Some(DateTime::now()),
-                ..DataValue::default()
-            });
-            self.notify(subscriptions, node, value, false);
+            let status = match places.get(node) {
+                Some(_) => StatusCode::BadWaitingForInitialData,
+                None => StatusCode::BadNodeIdUnknown,
+            };
+            let value = values::data_value(Some(Variant::Empty), Shown::nothing(status).stamp);
+            notifier.notify(node, AttributeId::Value, value);
         }
+    }
+
+    /// Takes note of the nodes of a topic that was not there, or has another type now.
+    pub(crate) fn know(&self, topic: &TopicNode) {
+        put(&mut self.places.write(), topic);
+    }
+
+    /// Has the nodes in the order of `layout` from now on.
+    pub(crate) fn set_order(&self, layout: &Layout) {
+        *self.order.write() = address::order(layout);
+    }
+
+    /// Where a node is among those with its parent; 0 for one that has no place.
+    pub(crate) fn rank(&self, node: &NodeId) -> usize {
+        self.order.read().get(node).copied().unwrap_or_default()
+    }
+
+    /// Whether what is below a node has an order.
+    pub(crate) fn has_order(&self, node: &NodeId) -> bool {
+        self.order.read().contains_key(node)
+    }
+
+    /// How large a value may be that clients write, in bytes.
+    pub(crate) fn limit_writes(&self, largest: usize) {
+        self.largest_write.store(largest, Ordering::Relaxed);
     }
 
     /// The namespaces of these nodes with the indexes the server gave them.
@@ -147,27 +208,34 @@ impl SpaceNodes {
             .map(|ns| (ns.namespace_index, ns.namespace_uri.as_str()))
     }
 
-    /// Stores `values` and tells who watches them.
-    pub(crate) fn store(
+    /// What the topic shows.
+    pub(crate) fn shown(&self, topic: TopicId) -> Shown {
+        let shown = self.values.read().get(topic).cloned();
+        shown.unwrap_or_else(|| Shown::nothing(StatusCode::BadWaitingForInitialData))
+    }
+
+    /// Shows something else for a topic, and tells who watches its nodes.
+    ///
+    /// # Errors
+    /// `BadOutOfMemory` where there is no room for the value; the nodes show that then.
+    pub(crate) fn show(
         &self,
-        address_space: &RwLock<AddressSpace>,
         subscriptions: &SubscriptionCache,
-        values: Vec<Stored>,
-    ) {
-        let mut address_space = address_space.write();
-        for Stored {
-            node,
-            value,
-            flipped,
-        } in values
-        {
-            let flipped = flipped
-                && value.value == current_data_value(&address_space, &node).and_then(|v| v.value);
-            if let Some(NodeType::Variable(variable)) = address_space.find_mut(&node) {
-                variable.set_data_value(value.clone());
-                self.notify(subscriptions, &node, value, flipped);
-            }
+        topic: &TopicNode,
+        shown: Shown,
+    ) -> Result<(), StatusCode> {
+        // Until all are told, so that nobody is told in another order.
+        let mut values = self.values.write();
+        let (before, kept) = values.put(topic.topic, shown);
+        let Some(shown) = values.get(topic.topic) else {
+            return kept;
+        };
+        for (node, field) in topic.places() {
+            let view = shown.view(topic, field);
+            let before = before.as_ref().map(|before| before.view(topic, field));
+            self.notify(subscriptions, node, &view, before.as_ref());
         }
+        kept
     }
 
     /// The server compares values alone for an item without filter, though a status that changed is to be reported
@@ -177,43 +245,137 @@ impl SpaceNodes {
         &self,
         subscriptions: &SubscriptionCache,
         node: &NodeId,
-        value: DataValue,
-        flipped: bool,
+        view: &View<'_>,
+        before: Option<&View<'_>>,
     ) {
         let mut notifier = subscriptions.data_notifier();
         let Some(mut items) = notifier.notify_for(node, AttributeId::Value) else {
             return;
         };
-        if flipped {
-            let unfiltered = self.unfiltered.lock();
-            for (handle, _) in items.entries() {
-                if unfiltered.contains(handle) {
-                    let between = DataValue {
-                        value: Some(Variant::Empty),
-                        ..value
-                    };
-                    items.data_value_to_item(between, handle);
+        let flipped = before.is_some_and(|before| {
+            before.stamp().status != view.stamp().status && before.has_value_of(view)
+        });
+        let weight = view.weight();
+        if weight <= SMALL {
+            if flipped {
+                let watched = self.watched.lock();
+                for (handle, _) in items.entries() {
+                    if watched.is_unfiltered(*handle) {
+                        items.data_value_to_item(view.refused(view.stamp().status), handle);
+                    }
                 }
             }
+            items.data_value(view.data_value(&NumericRange::None));
+            return;
         }
-        items.data_value(value);
+        let mut decoded = None;
+        for (handle, _) in items.entries() {
+            let (value, unfiltered) = self.for_item(*handle, view, &mut decoded);
+            if flipped && unfiltered {
+                items.data_value_to_item(view.refused(view.stamp().status), handle);
+            }
+            items.data_value_to_item(value, handle);
+        }
+    }
+
+    /// The value for one monitored item, or why it gets none, and whether it has no filter. It is decoded once for all.
+    fn for_item(
+        &self,
+        handle: MonitoredItemHandle,
+        view: &View<'_>,
+        decoded: &mut Option<DataValue>,
+    ) -> (DataValue, bool) {
+        let weight = view.weight();
+        let (status, unfiltered) = {
+            let mut watched = self.watched.lock();
+            let status = match weight {
+                LARGEST.. => Some(StatusCode::BadResponseTooLarge),
+                _ if watched.take(handle, weight) => None,
+                _ => Some(StatusCode::BadOutOfMemory),
+            };
+            (status, watched.is_unfiltered(handle))
+        };
+        let value = match status {
+            Some(status) => self.refuse(view, weight, status),
+            None => decoded
+                .get_or_insert_with(|| view.data_value(&NumericRange::None))
+                .clone(),
+        };
+        (value, unfiltered)
+    }
+
+    /// A value a client does not get, told at the 1st, 10th, 100th ... time.
+    fn refuse(&self, view: &View<'_>, weight: usize, status: StatusCode) -> DataValue {
+        let total = self.refused.fetch_add(1, Ordering::Relaxed) + 1;
+        if 10_u64.pow(total.ilog10()) == total {
+            warn!(
+                total,
+                "a client gets {status} in place of a value that takes up {} MiB for it; an IndexRange of fewer \
+                 elements can be read",
+                weight >> 20
+            );
+        }
+        view.refused(status)
+    }
+
+    /// The value of a node for a client, or why it does not get it; `None` for nodes without a place.
+    fn answer(&self, node: &NodeId, range: &NumericRange) -> Option<DataValue> {
+        let (topic, field) = self.place(node)?;
+        let shown = self.shown(topic.topic);
+        let (view, range) = shown.view(&topic, field).narrowed(range);
+        let weight = view.weight();
+        let refused = match weight {
+            ..=SMALL => None,
+            LARGEST.. => Some(StatusCode::BadResponseTooLarge),
+            _ if self.answers.lock().take(weight, now()) => None,
+            _ => Some(StatusCode::BadOutOfMemory),
+        };
+        Some(match refused {
+            Some(status) => self.refuse(&view, weight, status),
+            None => view.data_value(&range),
+        })
+    }
+
+    /// Gives one monitored item what its node shows.
+    fn look_at(
+        &self,
+        subscriptions: &SubscriptionCache,
+        node: &NodeId,
+        handle: MonitoredItemHandle,
+    ) {
+        let Some((topic, field)) = self.place(node) else {
+            return;
+        };
+        // Held until it is told, as for any value.
+        let values = self.values.read();
+        if let Some(shown) = values.get(topic.topic) {
+            let (value, _) = self.for_item(handle, &shown.view(&topic, field), &mut None);
+            let mut notifier = subscriptions.data_notifier();
+            if let Some(mut batch) = notifier.notify_for(node, AttributeId::Value) {
+                batch.data_value_to_item(value, &handle);
+            }
+        }
+    }
+
+    /// The value of a node for one monitored item.
+    fn answer_item(&self, node: &NodeId, handle: MonitoredItemHandle) -> Option<DataValue> {
+        let (topic, field) = self.place(node)?;
+        let shown = self.shown(topic.topic);
+        let view = shown.view(&topic, field);
+        Some(self.for_item(handle, &view, &mut None).0)
     }
 
     fn write_one(
         &self,
-        address_space: &mut AddressSpace,
+        address_space: &AddressSpace,
         subscriptions: &SubscriptionCache,
         write: &ParsedWriteValue,
     ) -> Result<(), StatusCode> {
-        if write.attribute_id != AttributeId::Value {
-            let exists = address_space.node_exists(&write.node_id);
-            return Err(if exists {
-                StatusCode::BadNotWritable
-            } else {
-                StatusCode::BadNodeIdUnknown
-            });
-        }
-        let Some((topic, field)) = self.place(&write.node_id) else {
+        let place = match write.attribute_id {
+            AttributeId::Value => self.place(&write.node_id),
+            _ => None,
+        };
+        let Some((topic, field)) = place else {
             let exists = address_space.node_exists(&write.node_id);
             return Err(if exists {
                 StatusCode::BadNotWritable
@@ -236,45 +398,42 @@ impl SpaceNodes {
             .value
             .as_ref()
             .ok_or(StatusCode::BadTypeMismatch)?;
+        // What is not written stays as it is: nobody else may write in between.
+        let _alone = self.writing.lock();
+        let shown = self.shown(topic.topic);
         let field = field.and_then(|field| topic.fields.get(field));
-        let fields = new_fields(address_space, &topic, field, (value, &write.index_range))?;
-        let now = DateTime::now();
-        let (time, picoseconds) = match write.value.source_timestamp {
-            Some(time) => (
-                time,
-                write
-                    .value
-                    .source_picoseconds
-                    .unwrap_or_default()
-                    .min(9_999),
-            ),
-            None => (now, 0),
-        };
+        let fields = new_fields(&shown, &topic, field, (value, &write.index_range))?;
         let block = Bytes::from(value::fields_block(&fields)?);
-        let source = Timestamp {
-            time: value::ticks(time),
-            picoseconds,
-        };
-        self.exits
-            .writes
-            .try_send(ClientWrite {
-                topic: topic.topic,
-                block,
-                source,
-            })
-            .map_err(|_| StatusCode::BadResourceUnavailable)?;
+        drop(fields);
+        let source = source_of(&write.value);
+        self.send(&topic, block.clone(), source)?;
         let stamp = Stamp {
             status: StatusCode::Good,
             source: Some(source),
-            server: now,
+            server: DateTime::now(),
         };
-        for (node, value) in topic_values(&topic, fields, stamp) {
-            if let Some(NodeType::Variable(variable)) = address_space.find_mut(&node) {
-                variable.set_data_value(value.clone());
-                self.notify(subscriptions, &node, value, false);
-            }
-        }
+        let block = Some(block);
+        // It has been sent, whether there is room to show it or not.
+        let _shown = self.show(subscriptions, &topic, Shown { block, stamp });
         Ok(())
+    }
+
+    /// Hands a written value to the run loop.
+    fn send(&self, topic: &TopicNode, block: Bytes, source: Timestamp) -> Result<(), StatusCode> {
+        if block.len() > self.largest_write.load(Ordering::Relaxed) {
+            return Err(StatusCode::BadRequestTooLarge);
+        }
+        let full = StatusCode::BadResourceUnavailable;
+        let size = u32::try_from(block.len() >> 10).map_err(|_| full)?;
+        let room = Arc::clone(&self.exits.room);
+        let room = room.try_acquire_many_owned(size).map_err(|_| full)?;
+        let write = ClientWrite {
+            topic: topic.topic,
+            block,
+            source,
+            room,
+        };
+        self.exits.writes.try_send(write).map_err(|_| full)
     }
 
     fn place(&self, node: &NodeId) -> Option<(Arc<TopicNode>, Option<usize>)> {
@@ -282,15 +441,24 @@ impl SpaceNodes {
     }
 }
 
+/// When a client says its value is of, or now.
+fn source_of(value: &DataValue) -> Timestamp {
+    let picoseconds = value.source_picoseconds.unwrap_or_default().min(9_999);
+    let (time, picoseconds) = match value.source_timestamp {
+        Some(time) => (time, picoseconds),
+        None => (DateTime::now(), 0),
+    };
+    Timestamp {
+        time: value::ticks(time),
+        picoseconds,
+    }
+}
+
 /// Notes where the values of a topic's nodes are.
 fn put(places: &mut Places, topic: &TopicNode) {
     let topic = Arc::new(topic.clone());
-    places.insert(topic.node.clone(), (Arc::clone(&topic), None));
-    if topic.compound {
-        let fields = topic.fields.iter().enumerate();
-        let fields = fields.map(|(at, field)| (field.node.clone(), (Arc::clone(&topic), Some(at))));
-        places.extend(fields);
-    }
+    let all = topic.places();
+    places.extend(all.map(|(node, field)| (node.clone(), (Arc::clone(&topic), field))));
 }
 
 /// Whether a monitored item has no filter. The server keeps the filter's type to itself; it can be printed.
@@ -298,82 +466,25 @@ fn unfiltered(item: &CreateMonitoredItem) -> bool {
     format!("{:?}", item.filter()) == "None"
 }
 
-/// A value on its way into the address space.
-pub(crate) struct Stored {
-    pub(crate) node: NodeId,
-    pub(crate) value: DataValue,
-    /// Its status is another than that of the value before.
-    pub(crate) flipped: bool,
-}
-
-/// What all values of one sample have in common.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Stamp {
-    pub(crate) status: StatusCode,
-    pub(crate) source: Option<Timestamp>,
-    pub(crate) server: DateTime,
-}
-
-/// The values of a topic's nodes, its own first, from the values of its fields.
-///
-/// A field that is a StatusCode where another type is due has no value but that status (OPC 10000-14, 7.2.4.5.5).
-pub(crate) fn topic_values(
-    topic: &TopicNode,
-    fields: Vec<Variant>,
-    stamp: Stamp,
-) -> Vec<(NodeId, DataValue)> {
-    let mut values = Vec::with_capacity(1 + fields.len());
-    if topic.compound {
-        let whole = fields
-            .iter()
-            .map(|field| Variant::Variant(Box::new(field.clone())))
-            .collect();
-        let array = opcua::types::Array {
-            value_type: opcua::types::VariantScalarTypeId::Variant,
-            values: whole,
-            dimensions: None,
-        };
-        values.push((
-            topic.node.clone(),
-            data_value(Variant::Array(Box::new(array)), stamp),
-        ));
-    }
-    for (field, value) in topic.fields.iter().zip(fields) {
-        let value = if let Variant::StatusCode(status) = value
-            && !field.shape.accepts(&value)
-        {
-            data_value(Variant::Empty, Stamp { status, ..stamp })
-        } else {
-            data_value(value, stamp)
-        };
-        values.push((field.node.clone(), value));
-    }
-    values
-}
-
-fn data_value(value: Variant, stamp: Stamp) -> DataValue {
-    DataValue {
-        value: Some(value),
-        status: Some(stamp.status),
-        source_timestamp: stamp.source.map(|source| value::date_time(source.time)),
-        // asyncua takes the picoseconds for the first bytes of the server timestamp (its order of the fields is not
-        // that of OPC 10000-6, 5.2.2.17), so there are none: 100 ns are left, and clients read right times.
-        source_picoseconds: None,
-        server_timestamp: Some(stamp.server),
-        server_picoseconds: None,
-    }
-}
-
 /// All fields of a topic after a write to it or to one of its fields.
 fn new_fields(
-    address_space: &AddressSpace,
+    shown: &Shown,
     topic: &TopicNode,
     field: Option<&FieldNode>,
     (value, range): (&Variant, &NumericRange),
 ) -> Result<Vec<Variant>, StatusCode> {
-    let target = field.map_or(&topic.node, |field| &field.node);
+    let current = |field: Option<usize>| {
+        let view = shown.view(topic, field);
+        let weight = view.weight();
+        // What is written is as large as that, and was taken in.
+        (weight <= LARGEST).then(|| view.data_value(&NumericRange::None).value)?
+    };
+    let current = |field| current(field).filter(|value| !matches!(value, Variant::Empty));
+    let at = |field: &FieldNode| topic.fields.iter().position(|one| one.node == field.node);
     let value = if range.has_range() {
-        let mut whole = current(address_space, target).ok_or(StatusCode::BadIndexRangeNoData)?;
+        let place = field.and_then(at);
+        let mut whole =
+            current(place.filter(|_| topic.compound)).ok_or(StatusCode::BadIndexRangeNoData)?;
         whole.set_range_of(range, value)?;
         whole
     } else {
@@ -385,7 +496,8 @@ fn new_fields(
         (Some(written), _) => topic
             .fields
             .iter()
-            .map(|other| match current(address_space, &other.node) {
+            .enumerate()
+            .map(|(at, other)| match current(Some(at)) {
                 _ if other.node == written.node => value.clone(),
                 Some(known) => known,
                 None => value::zero(other.shape.0),
@@ -423,22 +535,21 @@ fn members(value: Variant) -> Result<Vec<Variant>, StatusCode> {
         .collect())
 }
 
-/// The value a node has, if it has one.
-pub(crate) fn current(address_space: &AddressSpace, node: &NodeId) -> Option<Variant> {
-    let value = current_data_value(address_space, node)?.value?;
-    (!matches!(value, Variant::Empty)).then_some(value)
-}
-
-fn current_data_value(address_space: &AddressSpace, node: &NodeId) -> Option<DataValue> {
-    let NodeType::Variable(variable) = address_space.find(node)? else {
-        return None;
-    };
-    Some(variable.value(
-        TimestampsToReturn::Both,
-        &NumericRange::None,
-        &DataEncoding::Binary,
-        0.0,
-    ))
+/// Without the timestamps that were not asked for.
+fn stamped(mut value: DataValue, wanted: TimestampsToReturn) -> DataValue {
+    if !matches!(
+        wanted,
+        TimestampsToReturn::Both | TimestampsToReturn::Source
+    ) {
+        value.source_timestamp = None;
+    }
+    if !matches!(
+        wanted,
+        TimestampsToReturn::Both | TimestampsToReturn::Server
+    ) {
+        value.server_timestamp = None;
+    }
+    value
 }
 
 #[async_trait]
@@ -453,6 +564,32 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         self.namespaces.clone()
     }
 
+    async fn read_values(
+        &self,
+        context: &RequestContext,
+        address_space: &RwLock<AddressSpace>,
+        nodes: &[&ParsedReadValueId],
+        max_age: f64,
+        timestamps_to_return: TimestampsToReturn,
+    ) -> Vec<DataValue> {
+        let address_space = address_space.read();
+        nodes
+            .iter()
+            .map(|node| {
+                if let Err(status) = address_space.validate_node_read(context, node) {
+                    return DataValue {
+                        status: Some(status),
+                        ..DataValue::default()
+                    };
+                }
+                match self.answer(&node.node_id, &node.index_range) {
+                    Some(value) => stamped(value, timestamps_to_return),
+                    None => address_space.read(context, node, max_age, timestamps_to_return),
+                }
+            })
+            .collect()
+    }
+
     async fn create_value_monitored_items(
         &self,
         context: &RequestContext,
@@ -461,12 +598,18 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
     ) {
         let address_space = address_space.read();
         for item in items {
-            let value = address_space.read(
-                context,
-                item.item_to_monitor(),
-                0.0,
-                TimestampsToReturn::Both,
-            );
+            let handle = item.handle();
+            let queue = item.queue_size();
+            let unfiltered = unfiltered(item);
+            self.watched.lock().insert(handle, unfiltered, queue);
+            let node = item.item_to_monitor();
+            let value = match address_space.validate_node_read(context, node) {
+                Ok(_) => self.answer_item(&node.node_id, handle),
+                Err(_) => None,
+            };
+            let value = value.unwrap_or_else(|| {
+                address_space.read(context, node, 0.0, TimestampsToReturn::Both)
+            });
             if value.status() != StatusCode::BadAttributeIdInvalid {
                 item.set_initial_value(value);
             }
@@ -476,24 +619,30 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
             if item.sampling_interval() > 0.0 {
                 item.revise_sampling_interval(AS_IT_COMES_MS);
             }
-            if unfiltered(item) {
-                let mut unfiltered = self.unfiltered.lock();
-                if unfiltered.len() < MOST_UNFILTERED {
-                    unfiltered.insert(item.handle());
-                }
-            }
             // A value that comes between this look and the item's being there is only seen by a second look.
             let _missed = self
                 .exits
                 .created
-                .try_send((item.item_to_monitor().node_id.clone(), item.handle()));
+                .try_send((item.item_to_monitor().node_id.clone(), handle));
+        }
+    }
+
+    async fn modify_monitored_items(
+        &self,
+        _context: &RequestContext,
+        items: &[&MonitoredItemUpdateRef],
+    ) {
+        let mut watched = self.watched.lock();
+        for item in items {
+            let queue = usize::try_from(item.update().revised_queue_size);
+            watched.resize(item.handle(), queue.unwrap_or(usize::MAX));
         }
     }
 
     async fn delete_monitored_items(&self, _context: &RequestContext, items: &[&MonitoredItemRef]) {
-        let mut unfiltered = self.unfiltered.lock();
+        let mut watched = self.watched.lock();
         for item in items {
-            unfiltered.remove(&item.handle());
+            watched.remove(item.handle());
         }
     }
 
@@ -503,9 +652,9 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         address_space: &RwLock<AddressSpace>,
         nodes_to_write: &mut [&mut WriteNode],
     ) -> Result<(), StatusCode> {
-        let mut address_space = address_space.write();
+        let address_space = address_space.read();
         for write in nodes_to_write {
-            let result = self.write_one(&mut address_space, &context.subscriptions, write.value());
+            let result = self.write_one(&address_space, &context.subscriptions, write.value());
             write.set_status(result.err().unwrap_or(StatusCode::Good));
         }
         Ok(())
@@ -521,156 +670,24 @@ pub(crate) async fn look_again(
     let mut items = Vec::new();
     while created.recv_many(&mut items, 1_000).await > 0 {
         tokio::time::sleep(SECOND_LOOK).await;
-        let address_space = manager.address_space().read();
-        let mut notifier = subscriptions.data_notifier();
         for (node, handle) in items.drain(..) {
-            let Some(value) = current_data_value(&address_space, &node) else {
-                continue;
-            };
-            if let Some(mut batch) = notifier.notify_for(&node, AttributeId::Value) {
-                batch.data_value_to_item(value, &handle);
-            }
+            manager.inner().look_at(&subscriptions, &node, handle);
         }
     }
 }
 
-/// Adds a variable for each of a topic's nodes under `folder`, without a value.
-pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, folder: &NodeId) {
-    let writable = topic.writable();
-    let name = |node: &NodeId, text: &str| QualifiedName::new(node.namespace, text);
-    let (type_, rank) = if topic.compound {
-        (Shape(None).data_type(), 1)
-    } else {
-        let shape = topic
-            .fields
-            .first()
-            .map_or(Shape(None), |field| field.shape);
-        (shape.data_type(), shape.value_rank())
-    };
-    VariableBuilder::new(
-        &topic.node,
-        name(&topic.node, &topic.name),
-        LocalizedText::from(topic.name.as_str()),
-    )
-    .description(LocalizedText::from(topic.topic.to_string()))
-    .data_type(type_)
-    .value_rank(rank)
-    .access_level(access(writable))
-    .user_access_level(access(writable))
-    .has_type_definition(VariableTypeId::BaseDataVariableType)
-    .organized_by(folder.clone())
-    .insert(address_space);
-    wait_for_data(address_space, &topic.node);
-    if !topic.compound {
-        properties::add(address_space, topic);
-        return;
-    }
-    for field in &topic.fields {
-        VariableBuilder::new(
-            &field.node,
-            name(&field.node, &field.name),
-            LocalizedText::from(field.name.as_str()),
-        )
-        .data_type(field.shape.data_type())
-        .value_rank(field.shape.value_rank())
-        .access_level(access(writable))
-        .user_access_level(access(writable))
-        .has_type_definition(VariableTypeId::BaseDataVariableType)
-        .component_of(topic.node.clone())
-        .insert(address_space);
-        wait_for_data(address_space, &field.node);
-    }
-}
-
-/// Changes what a variable is said to hold.
-pub(crate) fn retype(address_space: &mut AddressSpace, node: &NodeId, shape: Shape) {
-    if let Some(NodeType::Variable(variable)) = address_space.find_mut(node) {
-        variable.set_data_type(shape.data_type());
-        variable.set_value_rank(shape.value_rank());
-    }
-}
-
-fn wait_for_data(address_space: &mut AddressSpace, node: &NodeId) {
-    if let Some(NodeType::Variable(variable)) = address_space.find_mut(node) {
-        // A null value, not none: the server forgets the status of a variable that has no value at all.
-        variable.set_data_value(DataValue {
-            value: Some(Variant::Empty),
-            status: Some(StatusCode::BadWaitingForInitialData),
-            server_timestamp: Some(DateTime::now()),
-            ..DataValue::default()
-        });
-    }
-}
-
-fn access(writable: bool) -> AccessLevel {
-    if writable {
-        AccessLevel::CURRENT_READ | AccessLevel::CURRENT_WRITE
-    } else {
-        AccessLevel::CURRENT_READ
-    }
-}
-
-fn add_folders(layout: &Layout, address_space: &mut AddressSpace) {
-    let objects = ObjectId::ObjectsFolder.into();
-    add_folder(&root(), "UaSpace", objects, address_space);
-    add_folder(&unmapped_folder(), "Unmapped", root(), address_space);
-    let spaces: HashSet<SpaceId> = layout
-        .topics
-        .iter()
-        .map(|topic| topic.topic.space)
-        .collect();
-    for space in spaces {
-        add_folder(
-            &origin_folder(space),
-            &origin_name(space),
-            root(),
-            address_space,
-        );
-    }
-}
-
-fn add_folder(node: &NodeId, name: &str, parent: NodeId, address_space: &mut AddressSpace) {
-    ObjectBuilder::new(
-        node,
-        QualifiedName::new(node.namespace, name),
-        LocalizedText::from(name),
-    )
-    .is_folder()
-    .organized_by(parent)
-    .insert(address_space);
-}
-
-fn root() -> NodeId {
-    NodeId::new(APPLICATION, "UaSpace")
-}
-
-fn origin_name(space: SpaceId) -> String {
-    match space {
-        SpaceId::UA => "OPC UA".to_owned(),
-        SpaceId::ROS1 => "ROS 1".to_owned(),
-        other => format!("ROS 2 space {other}"),
-    }
-}
-
-fn origin_folder(space: SpaceId) -> NodeId {
-    NodeId::new(APPLICATION, format!("UaSpace.{space}"))
-}
-
-pub(crate) fn unmapped_folder() -> NodeId {
-    NodeId::new(APPLICATION, "UaSpace.Unmapped")
-}
-
-/// The node of a topic that the mapping does not name.
-pub(crate) fn unmapped_node(topic: TopicId) -> NodeId {
-    NodeId::new(APPLICATION, topic.to_string())
+#[expect(
+    clippy::disallowed_methods,
+    reason = "answers to clients are given now"
+)]
+fn now() -> Instant {
+    Instant::now()
 }
 
 /// The node manager's name in the server's log.
 const NAME: &str = "space";
-/// The namespace index of the application's own URI.
-const APPLICATION: u16 = 1;
 /// Counts as no interval at all, yet is above the 0 that the server takes for "not asked for".
 const AS_IT_COMES_MS: f64 = 0.000_1;
-/// How many items without filter are kept in mind; further ones are not told of a status alone.
-const MOST_UNFILTERED: usize = 100_000;
 const SECOND_LOOK: Duration = Duration::from_millis(100);
+/// Bytes of all values that are shown.
+const MOST_HELD: usize = 512 << 20;

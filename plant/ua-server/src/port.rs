@@ -13,23 +13,26 @@ use opcua::server::node_manager::memory::{
     CoreNodeManagerBuilder, InMemoryNodeManagerBuilder, InMemoryNodeManagerImplBuilder,
 };
 use tokio::runtime::Runtime;
-use tokio::sync::mpsc;
+use tokio::sync::{Semaphore, mpsc};
 use tokio::task::JoinHandle;
 use tokio::time::{Interval, MissedTickBehavior};
 use tracing::{info, warn};
 use uadp::BuiltinType;
 
+use crate::browse::Ordered;
 use crate::endpoint::{self, EndpointUrl};
 use crate::layout::Layout;
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
 use crate::pki::Pki;
 use crate::space::Space;
+use crate::structures::Types;
 
 /// What [`ServerPort::start`] needs besides the mapping.
 pub(crate) struct Setup {
     pub(crate) url: EndpointUrl,
     pub(crate) pki: Pki,
     pub(crate) trust_any_client: bool,
+    pub(crate) types: Types,
     /// Whether the mapping says the endpoint; else the command line does.
     pub(crate) mapped_url: bool,
 }
@@ -50,6 +53,7 @@ pub(crate) struct ServerPort {
     namespaces: Vec<String>,
     described: Server,
     mapped_url: bool,
+    types: Types,
     pki: Pki,
     look: Interval,
 }
@@ -65,7 +69,9 @@ impl ServerPort {
         let configuration = |error: String| Failure::new(FailureKind::Configuration, error);
         let io = |error: String| Failure::new(FailureKind::Io, error);
 
-        let layout = Layout::of(mapping).map_err(|error| configuration(error.to_string()))?;
+        let mut types = setup.types;
+        let layout =
+            Layout::of(mapping, &mut types).map_err(|error| configuration(error.to_string()))?;
         let described = mapping.server();
         setup
             .pki
@@ -84,6 +90,7 @@ impl ServerPort {
         let (created, created_items) = mpsc::channel(MOST_CREATED);
         let exits = Exits {
             writes: writes_in,
+            room: Arc::new(Semaphore::new(ROOM_FOR_WRITES)),
             created,
         };
         if setup.trust_any_client {
@@ -98,16 +105,18 @@ impl ServerPort {
             .pki_dir(setup.pki.root())
             .trust_client_certs(setup.trust_any_client)
             .with_node_manager(InMemoryNodeManagerBuilder::new(CoreNodeManagerBuilder))
-            .with_node_manager(InMemoryNodeManagerBuilder::new(nodes))
+            .with_node_manager(Ordered::around(nodes))
             .build()
             .map_err(configuration)?;
         let manager = handle
             .node_managers()
-            .get_of_type::<SpaceManager>()
+            .get_of_type::<Ordered>()
+            .and_then(|ordered| ordered.space())
             .ok_or_else(|| {
                 configuration("the server has no node manager for the space".to_owned())
             })?;
         check_namespaces(&layout, &manager).map_err(configuration)?;
+        manager.inner().limit_writes(largest_write(mapping));
 
         let (runtime, listener) = threads(listener).map_err(|error| io(error.to_string()))?;
         let serving = runtime.spawn(server.run_with(listener));
@@ -136,6 +145,7 @@ impl ServerPort {
             serving: Some(serving),
             writes,
             live: written(layout.topics.iter().map(|node| node.topic)).collect(),
+            types,
             pki: setup.pki,
             look,
         })
@@ -154,7 +164,8 @@ impl Port for ServerPort {
         loop {
             tokio::select! {
                 Some(write) = self.writes.recv() => {
-                    let ClientWrite { topic, block, source } = write;
+                    let ClientWrite { topic, block, source, room } = write;
+                    drop(room);
                     return PortEvent::Sample { topic, payload: block, received: source, latched_by: None };
                 }
                 ended = ended(&mut self.serving) => return PortEvent::Ended(ended),
@@ -174,7 +185,7 @@ impl Port for ServerPort {
         }
         let gave_way = self.space.update(
             sample.topic,
-            &sample.payload,
+            sample.payload,
             (sample.source, sample.status),
         )?;
         self.unbound.extend(gave_way);
@@ -194,7 +205,7 @@ impl Port for ServerPort {
         self.space.set_silent(topic, silent);
     }
 
-    fn reload(&mut self, mapping: &Arc<Mapping>, _: &Arc<TypePaths>) -> Vec<String> {
+    fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
         let (was, is) = (&self.described, mapping.server());
         let endpoint = self.mapped_url && was.endpoint != is.endpoint;
         let mut restart: Vec<String> = [
@@ -209,7 +220,9 @@ impl Port for ServerPort {
         .filter(|(_, differs)| *differs)
         .map(|(key, _)| key.to_owned())
         .collect();
-        match Layout::within(&self.namespaces, mapping) {
+        self.space.limit_writes(largest_write(mapping));
+        self.types.replace(types);
+        match Layout::within(&self.namespaces, mapping, &mut self.types) {
             Ok((layout, namespaces)) => {
                 restart.extend(namespaces);
                 let (gone, new) = self.space.exchange(&layout);
@@ -242,6 +255,12 @@ impl Drop for ServerPort {
             runtime.shutdown_background();
         }
     }
+}
+
+/// Bytes of fields that fit a DataSetMessage beside its header.
+fn largest_write(mapping: &Mapping) -> usize {
+    let message = usize::try_from(mapping.pubsub().max_message).unwrap_or(usize::MAX);
+    message.saturating_sub(MESSAGE_HEADER)
 }
 
 /// Those topics that clients can write.
@@ -310,6 +329,10 @@ fn check_namespaces(layout: &Layout, manager: &SpaceManager) -> Result<(), Strin
 const SERVER_THREADS: usize = 2;
 /// How many values clients wrote wait for the run loop; a client is refused when that many do.
 const MOST_WRITES: usize = 1_024;
+/// How many KiB all of these may have together.
+const ROOM_FOR_WRITES: usize = 128 << 10;
+/// Bytes that a DataSetMessage has beside its fields, at most.
+const MESSAGE_HEADER: usize = 64;
 /// How many monitored items wait for their second look.
 const MOST_CREATED: usize = 10_000;
 const LOOK_AT_REJECTED: Duration = Duration::from_secs(1);

@@ -88,12 +88,12 @@ mod tests {
     use std::collections::BTreeMap;
 
     use mappings::TopicId;
-    use opcua::types::ReferenceTypeId;
+    use opcua::nodes::NodeType;
+    use opcua::types::{DataEncoding, NumericRange, ReferenceTypeId, TimestampsToReturn};
     use uadp::BuiltinType;
 
     use super::*;
     use crate::layout::Shape;
-    use crate::nodes::current;
 
     fn topic(number: i64, text: &str) -> TopicNode {
         let mut topic = TopicNode::new(
@@ -124,9 +124,17 @@ mod tests {
             };
             assert_eq!(*property, component(&topic.node, name));
             assert!(space.has_reference(&topic.node, property, ReferenceTypeId::HasProperty));
-            let value = current(&space, property);
-            assert!(value.is_some() && value != before, "{value:?}");
-            before = value;
+            let Some(NodeType::Variable(variable)) = space.find(property) else {
+                unreachable!("{property}");
+            };
+            let value = variable.value(
+                TimestampsToReturn::Neither,
+                &NumericRange::None,
+                &DataEncoding::Binary,
+                0.0,
+            );
+            assert!(value.value.is_some() && value.value != before, "{value:?}");
+            before = value.value;
             drop(space.delete(property, true));
         }
     }

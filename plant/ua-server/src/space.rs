@@ -5,20 +5,24 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use bridge_node::{Room, now};
+use bytes::Bytes;
 use mappings::TopicId;
 use opcua::server::SubscriptionCache;
-use opcua::types::{Array, DateTime, StatusCode, Variant, VariantScalarTypeId};
-use uadp::{Fields, Timestamp};
+use opcua::types::{DateTime, StatusCode};
+use uadp::{Fields, Scalar, Timestamp};
 
+use crate::address;
 use crate::layout::{Layout, Shape, TopicNode};
-use crate::nodes::{self, SpaceManager, Stamp, Stored};
-use crate::value;
+use crate::nodes::SpaceManager;
+use crate::structures::Structure;
+use crate::values::{self, Shown, Stamp};
 
 /// The writing end of the address space for values that come from the space.
 pub(crate) struct Space {
     manager: Arc<SpaceManager>,
     subscriptions: Arc<SubscriptionCache>,
     topics: HashMap<TopicId, Known>,
+    structures: Vec<Structure>,
     /// For those that nobody mapped.
     room: Room,
     /// Topics whose writer speaks again, without a sample so far.
@@ -29,12 +33,10 @@ pub(crate) struct Space {
 struct Known {
     node: TopicNode,
     mapped: bool,
-    /// The last sample's fields and stamp.
-    last: Option<(Vec<Variant>, Stamp)>,
+    /// The status of the last sample.
+    status: StatusCode,
     /// Since when its writer is silent.
     silent: Option<Instant>,
-    /// The statuses of the nodes as they are in the address space.
-    statuses: Vec<StatusCode>,
 }
 
 impl Space {
@@ -52,6 +54,7 @@ impl Space {
             manager,
             subscriptions,
             topics,
+            structures: layout.structures.clone(),
             room: Room::new(MOST_UNMAPPED),
             returned: Vec::new(),
         }
@@ -60,6 +63,8 @@ impl Space {
     /// Goes over to the nodes of another layout: those that are the same in both keep their values. Returns the topics
     /// that are gone or other ones now, and those that are new or other ones.
     pub(crate) fn exchange(&mut self, layout: &Layout) -> (Vec<TopicId>, Vec<TopicId>) {
+        self.exchange_structures(&layout.structures);
+        self.manager.inner().set_order(layout);
         let wanted: HashMap<TopicId, &TopicNode> = layout
             .topics
             .iter()
@@ -67,7 +72,7 @@ impl Space {
             .collect();
         let is_gone = |topic: &TopicId, known: &mut Known| match wanted.get(topic) {
             Some(node) => !known.mapped || known.node != **node,
-            // Those that nobody mapped stay.
+            // Those that nobody mapped are there as long as the server.
             None => known.mapped,
         };
         let gone: Vec<Known> = self
@@ -94,54 +99,80 @@ impl Space {
         (topics(gone), topics(new))
     }
 
-    /// Takes in a sample: the fields of its DataSet as a key frame carries them. Returns the topics whose nodes had to go
-    /// for its own.
+    /// DataTypes that no variable has any more stay: clients may have read them.
+    fn exchange_structures(&mut self, wanted: &[Structure]) {
+        let mut address_space = self.manager.address_space().write();
+        for structure in wanted {
+            if !self.structures.contains(structure) {
+                structure.insert(&mut address_space);
+            }
+        }
+        self.structures = wanted.to_vec();
+    }
+
+    /// How large a value may be that clients write, in bytes.
+    pub(crate) fn limit_writes(&self, largest: usize) {
+        self.manager.inner().limit_writes(largest);
+    }
+
+    /// Takes in a sample: the fields of its DataSet as a key frame carries them. One that cannot be shown leaves a status
+    /// that says why in the place of the value before it, which is no longer true either. Returns the topics whose nodes had
+    /// to go for its own.
     ///
     /// # Errors
-    /// Why it is not shown: fields that are malformed or not those of the mapping, or too many unmapped topics.
+    /// Why it is not shown: fields that are malformed or not those of the mapping, no memory, or too many unmapped
+    /// topics.
     pub(crate) fn update(
         &mut self,
         topic: TopicId,
-        block: &[u8],
+        payload: Bytes,
         (source, status): (Option<Timestamp>, u16),
     ) -> Result<Vec<TopicId>, &'static str> {
-        let fields = Fields::parse(block)
-            .and_then(|fields| {
-                fields
-                    .map(|field| Ok(value::from_field(&field?)))
-                    .collect::<Result<Vec<_>, _>>()
-            })
-            .map_err(|_| "malformed fields")?;
+        let block = values::compact(payload);
         let gave_way = match self.topics.contains_key(&topic) {
             true => Vec::new(),
-            false => self.add_unmapped(topic, &fields)?,
+            false => self.add_unmapped(topic, &block)?,
         };
         let Some(known) = self.topics.get_mut(&topic) else {
             return Err("unknown topic");
         };
-        let fields = known.fit(fields)?;
-        if !known.mapped {
-            known.retype(&fields, &self.manager);
-        }
+        let status = StatusCode::from(uadp::StatusCode::from_status(status).0);
+        let (shown, why) = match known.fit(&block) {
+            Ok(()) => (Some(block), None),
+            Err((refused, why)) => (None, Some((refused, why))),
+        };
         let stamp = Stamp {
-            status: StatusCode::from(uadp::StatusCode::from_status(status).0),
+            status: why.map_or(status, |(refused, _)| refused),
             source,
             server: DateTime::now(),
         };
+        if let Some(block) = &shown
+            && !known.mapped
+        {
+            known.retype(block, &self.manager);
+        }
         known.silent = None;
+        known.status = stamp.status;
         self.returned.retain(|returned| *returned != topic);
-        known.last = Some((fields.clone(), stamp));
-        let values = known.stored(fields, stamp);
-        self.manager
+        let shown = Shown {
+            block: shown,
+            stamp,
+        };
+        let kept = self
+            .manager
             .inner()
-            .store(self.manager.address_space(), &self.subscriptions, values);
-        Ok(gave_way)
+            .show(&self.subscriptions, &known.node, shown);
+        match why {
+            Some((_, why)) => Err(why),
+            None => kept
+                .map(|()| gave_way)
+                .map_err(|_| "the values take up all the memory there is for them"),
+        }
     }
 
     /// When the value shown of a topic was taken.
     pub(crate) fn shown(&self, topic: TopicId) -> Option<Timestamp> {
-        let (_, stamp) = self.topics.get(&topic)?.last.as_ref()?;
-        stamp.source
+        self.manager.inner().shown(topic).stamp.source
     }
 
     /// Marks the last value of a topic as no longer kept up, or as kept up again. The value and its source timestamp
@@ -165,8 +196,10 @@ impl Space {
     /// Gives the last values their own status back where a writer speaks again but has nothing new to say.
     pub(crate) fn settle(&mut self) {
         for topic in std::mem::take(&mut self.returned) {
-            let known = self.topics.get(&topic);
-            if known.is_some_and(|known| known.silent.is_none()) {
+            if self
+                .topics
+                .get(&topic)
+                .is_some_and(|known| known.silent.is_none()) {
                 self.set_status(topic, None);
             }
         }
@@ -174,24 +207,18 @@ impl Space {
 
     /// Shows the last sample anew, under another status than its own or, without one, under its own.
     fn set_status(&mut self, topic: TopicId, status: Option<StatusCode>) {
-        let Some(known) = self.topics.get_mut(&topic) else {
+        let Some(known) = self.topics.get(&topic) else {
             return;
         };
-        let Some((fields, stamp)) = known.last.clone() else {
+        let nodes = self.manager.inner();
+        let mut shown = nodes.shown(topic);
+        if shown.block.is_none() {
             return;
-        };
-        let status = status.unwrap_or(stamp.status);
-        let values = known.stored(
-            fields,
-            Stamp {
-                status,
-                server: DateTime::now(),
-                ..stamp
-            },
-        );
-        self.manager
-            .inner()
-            .store(self.manager.address_space(), &self.subscriptions, values);
+        }
+        shown.stamp.status = status.unwrap_or(known.status);
+        shown.stamp.server = DateTime::now();
+        // It is there already, so there is room for it.
+        let _kept = nodes.show(&self.subscriptions, &known.node, shown);
     }
 
     /// Takes out the nodes of topics that nobody mapped and whose writers fell silent, of those first that are silent
@@ -223,31 +250,24 @@ impl Space {
     }
 
     /// A topic nobody mapped gets a node of its own when its first value comes. Returns the topics that gave way to it.
-    fn add_unmapped(
-        &mut self,
-        topic: TopicId,
-        fields: &[Variant],
-    ) -> Result<Vec<TopicId>, &'static str> {
+    fn add_unmapped(&mut self, topic: TopicId, block: &[u8]) -> Result<Vec<TopicId>, &'static str> {
         let gave_way = self.let_unmapped_go();
         if !self.room.take() {
             return Err("too many unmapped topics");
         }
         let name = topic.to_string();
-        let shape = match fields {
-            [only] => shape_of(only),
-            _ => Shape(None),
-        };
         let node = TopicNode::new(
             topic,
-            nodes::unmapped_node(topic),
+            address::unmapped_node(topic),
             name.clone(),
-            vec![(name, shape)],
+            vec![(name, shape_of(block))],
         );
-        nodes::add_topic(
+        address::add_topic(
             &mut self.manager.address_space().write(),
             &node,
-            &nodes::unmapped_folder(),
+            &address::unmapped_folder(),
         );
+        self.manager.inner().know(&node);
         self.topics.insert(topic, Known::new(node, false));
         Ok(gave_way)
     }
@@ -258,91 +278,101 @@ impl Known {
         Self {
             node,
             mapped,
-            last: None,
+            status: StatusCode::Good,
             silent: None,
-            statuses: Vec::new(),
         }
     }
 
-    /// The fields as the topic's nodes take them. A topic of which nothing is known beforehand takes several as one
-    /// Variant array.
-    fn fit(&self, mut fields: Vec<Variant>) -> Result<Vec<Variant>, &'static str> {
+    /// Whether the topic's nodes take the fields. A topic of which nothing is known beforehand takes any.
+    fn fit(&self, block: &[u8]) -> Result<(), (StatusCode, &'static str)> {
+        let malformed = |_| (StatusCode::BadDecodingError, "malformed fields");
+        let fields = Fields::parse(block).map_err(malformed)?;
         let open = !self.mapped
             || matches!(self.node.fields.as_slice(), [field] if field.shape == Shape(None));
-        if open && fields.len() != 1 {
-            let values = fields
-                .drain(..)
-                .map(|field| Variant::Variant(Box::new(field)))
-                .collect();
-            let array = Array {
-                value_type: VariantScalarTypeId::Variant,
-                values,
-                dimensions: None,
-            };
-            fields.push(Variant::Array(Box::new(array)));
+        if !open && fields.len() != self.node.fields.len() {
+            return Err((StatusCode::BadTypeMismatch, "other fields than mapped"));
         }
-        if open {
-            return Ok(fields);
+        for (at, value) in fields.enumerate() {
+            let value = value.map_err(malformed)?;
+            let in_place_of_a_value = matches!(
+                value,
+                uadp::Variant::Null | uadp::Variant::Scalar(Scalar::StatusCode(_))
+            );
+            let field = self.node.fields.get(at).filter(|_| !open);
+            if !in_place_of_a_value && field.is_some_and(|field| !field.shape.fits(&value)) {
+                return Err((StatusCode::BadTypeMismatch, "another type than mapped"));
+            }
         }
-        if fields.len() != self.node.fields.len() {
-            return Err("other fields than mapped");
-        }
-        let fits = self.node.fields.iter().zip(&fields).all(|(field, value)| {
-            let in_place_of_a_value = matches!(value, Variant::Empty | Variant::StatusCode(_));
-            in_place_of_a_value || field.shape.accepts(value)
-        });
-        if fits {
-            Ok(fields)
-        } else {
-            Err("another type than mapped")
-        }
+        Ok(())
     }
 
     /// The node of an unmapped topic has the type of what came last.
-    fn retype(&mut self, fields: &[Variant], manager: &SpaceManager) {
-        let (Some(field), [value]) = (self.node.fields.first_mut(), fields) else {
+    fn retype(&mut self, block: &[u8], manager: &SpaceManager) {
+        let Some(field) = self.node.fields.first_mut() else {
             return;
         };
-        let shape = shape_of(value);
+        let shape = shape_of(block);
         if shape != field.shape {
             field.shape = shape;
-            nodes::retype(&mut manager.address_space().write(), &field.node, shape);
+            address::retype(&mut manager.address_space().write(), &field.node, shape);
+            manager.inner().know(&self.node);
         }
-    }
-
-    /// The values of the topic's nodes, with those marked whose status changes.
-    fn stored(&mut self, fields: Vec<Variant>, stamp: Stamp) -> Vec<Stored> {
-        let values = nodes::topic_values(&self.node, fields, stamp);
-        let before = std::mem::take(&mut self.statuses);
-        self.statuses = values.iter().map(|(_, value)| value.status()).collect();
-        values
-            .into_iter()
-            .enumerate()
-            .map(|(at, (node, value))| {
-                let flipped = before
-                    .get(at)
-                    .is_some_and(|status| *status != value.status());
-                Stored {
-                    node,
-                    value,
-                    flipped,
-                }
-            })
-            .collect()
     }
 }
 
-fn shape_of(value: &Variant) -> Shape {
-    use opcua::types::VariantTypeId;
-    let (scalar, array) = match value.type_id() {
-        VariantTypeId::Empty => return Shape(None),
-        VariantTypeId::Scalar(scalar) => (scalar, false),
-        VariantTypeId::Array(scalar, _) => (scalar, true),
+/// The shape of the only field; of several, none.
+fn shape_of(block: &[u8]) -> Shape {
+    let only = match Fields::parse(block) {
+        Ok(mut fields) if fields.len() == 1 => fields.next(),
+        Ok(_) | Err(_) => None,
     };
-    Shape(uadp::BuiltinType::from_id(scalar.encoding_mask()).map(|builtin| (builtin, array)))
+    Shape(match only {
+        Some(Ok(uadp::Variant::Scalar(scalar))) => Some((scalar.builtin_type(), false)),
+        Some(Ok(uadp::Variant::Array(array))) => Some((array.element(), true)),
+        Some(Ok(uadp::Variant::Matrix(_) | uadp::Variant::Null) | Err(_)) | None => None,
+    })
 }
 
 /// How many topics without a mapping are shown. Anyone who reaches the group can make them up.
 const MOST_UNMAPPED: usize = 1_000;
 /// Of them, how many go at a time.
 const MOST_LET_GO: usize = MOST_UNMAPPED / 8;
+
+#[cfg(test)]
+mod tests {
+    use opcua::types::{NodeId, Variant};
+    use uadp::BuiltinType;
+
+    use super::*;
+    use crate::value;
+
+    fn fit(fields: &[Variant]) -> Result<(), &'static str> {
+        let shapes = [
+            ("name", (BuiltinType::String, false)),
+            ("positions", (BuiltinType::Double, true)),
+        ]
+        .map(|(path, shape)| (path.to_owned(), Shape(Some(shape))));
+        let topic = TopicId::new(1, 2, 10).unwrap();
+        let node = TopicNode::new(topic, NodeId::new(2, 10), "x".to_owned(), shapes.to_vec());
+        let block = value::fields_block(fields).unwrap();
+        let fits = Known::new(node, true).fit(&block);
+        fits.map_err(|(status, why)| {
+            assert_eq!(status, StatusCode::BadTypeMismatch);
+            why
+        })
+    }
+
+    #[test]
+    fn fields_of_other_types_or_another_number_do_not_fit_and_what_stands_for_a_value_does() {
+        let (name, positions) = (Variant::from("elbow"), Variant::from(vec![1.5, 2.5]));
+        assert_eq!(fit(&[name.clone(), positions.clone()]), Ok(()));
+        let absent = Variant::StatusCode(StatusCode::BadNoData);
+        assert_eq!(fit(&[absent, Variant::Empty]), Ok(()));
+        let other = Err("another type than mapped");
+        assert_eq!(fit(&[positions.clone(), name.clone()]), other);
+        assert_eq!(fit(&[name.clone(), Variant::from(1.5)]), other);
+        let others = Err("other fields than mapped");
+        assert_eq!(fit(std::slice::from_ref(&name)), others);
+        assert_eq!(fit(&[name.clone(), positions, name]), others);
+    }
+}

@@ -1,0 +1,147 @@
+//! The nodes as they stand in the address space: folders, variables, and what says what they are. Values are elsewhere.
+
+use std::collections::{HashMap, HashSet};
+
+use mappings::{SpaceId, TopicId};
+use opcua::nodes::{NodeType, ObjectBuilder, VariableBuilder};
+use opcua::server::address_space::{AccessLevel, AddressSpace};
+use opcua::types::{LocalizedText, NodeId, ObjectId, QualifiedName, VariableTypeId};
+
+use crate::layout::{Layout, Shape, TopicNode};
+use crate::properties;
+
+/// Adds a variable for each of a topic's nodes under `folder`, without a value.
+pub(crate) fn add_topic(address_space: &mut AddressSpace, topic: &TopicNode, folder: &NodeId) {
+    let writable = topic.writable();
+    let name = |node: &NodeId, text: &str| QualifiedName::new(node.namespace, text);
+    let (type_, rank) = if topic.compound {
+        (Shape(None).data_type(), 1)
+    } else {
+        let open = (Shape(None).data_type(), Shape(None).value_rank());
+        let only = topic.fields.first();
+        only.map_or(open, |field| (field.data_type(), field.shape.value_rank()))
+    };
+    VariableBuilder::new(
+        &topic.node,
+        name(&topic.node, &topic.name),
+        LocalizedText::from(topic.name.as_str()),
+    )
+    .description(LocalizedText::from(topic.topic.to_string()))
+    .data_type(type_)
+    .value_rank(rank)
+    .access_level(access(writable))
+    .user_access_level(access(writable))
+    .has_type_definition(VariableTypeId::BaseDataVariableType)
+    .organized_by(folder.clone())
+    .insert(address_space);
+    if !topic.compound {
+        properties::add(address_space, topic);
+        return;
+    }
+    for field in &topic.fields {
+        VariableBuilder::new(
+            &field.node,
+            name(&field.node, &field.name),
+            LocalizedText::from(field.name.as_str()),
+        )
+        .data_type(field.data_type())
+        .value_rank(field.shape.value_rank())
+        .access_level(access(writable))
+        .user_access_level(access(writable))
+        .has_type_definition(VariableTypeId::BaseDataVariableType)
+        .component_of(topic.node.clone())
+        .insert(address_space);
+    }
+}
+
+/// Changes what a variable is said to hold.
+pub(crate) fn retype(address_space: &mut AddressSpace, node: &NodeId, shape: Shape) {
+    if let Some(NodeType::Variable(variable)) = address_space.find_mut(node) {
+        variable.set_data_type(shape.data_type());
+        variable.set_value_rank(shape.value_rank());
+    }
+}
+
+fn access(writable: bool) -> AccessLevel {
+    if writable {
+        AccessLevel::CURRENT_READ | AccessLevel::CURRENT_WRITE
+    } else {
+        AccessLevel::CURRENT_READ
+    }
+}
+
+pub(crate) fn add_folders(layout: &Layout, address_space: &mut AddressSpace) {
+    let objects = ObjectId::ObjectsFolder.into();
+    add_folder(&root(), "UaSpace", objects, address_space);
+    add_folder(&unmapped_folder(), "Unmapped", root(), address_space);
+    let spaces: HashSet<SpaceId> = layout
+        .topics
+        .iter()
+        .map(|topic| topic.topic.space)
+        .collect();
+    for space in spaces {
+        add_folder(
+            &origin_folder(space),
+            &origin_name(space),
+            root(),
+            address_space,
+        );
+    }
+}
+
+/// Where each node is among those with its parent: the spaces by their numbers, variables as in the mapping, and fields
+/// as in the message.
+pub(crate) fn order(layout: &Layout) -> HashMap<NodeId, usize> {
+    let mut order = HashMap::from([(root(), 1), (unmapped_folder(), usize::MAX)]);
+    for (at, topic) in (1..).zip(&layout.topics) {
+        let space = topic.topic.space;
+        order.insert(origin_folder(space), usize::from(space.get()) + 1);
+        let places = topic.places();
+        order.extend(places.map(|(node, field)| (node.clone(), field.map_or(at, |at| at + 1))));
+    }
+    order
+}
+
+pub(crate) fn add_folder(
+    node: &NodeId,
+    name: &str,
+    parent: NodeId,
+    address_space: &mut AddressSpace,
+) {
+    ObjectBuilder::new(
+        node,
+        QualifiedName::new(node.namespace, name),
+        LocalizedText::from(name),
+    )
+    .is_folder()
+    .organized_by(parent)
+    .insert(address_space);
+}
+
+pub(crate) fn root() -> NodeId {
+    NodeId::new(APPLICATION, "UaSpace")
+}
+
+pub(crate) fn origin_name(space: SpaceId) -> String {
+    match space {
+        SpaceId::UA => "OPC UA".to_owned(),
+        SpaceId::ROS1 => "ROS 1".to_owned(),
+        other => format!("ROS 2 space {other}"),
+    }
+}
+
+pub(crate) fn origin_folder(space: SpaceId) -> NodeId {
+    NodeId::new(APPLICATION, format!("UaSpace.{space}"))
+}
+
+pub(crate) fn unmapped_folder() -> NodeId {
+    NodeId::new(APPLICATION, "UaSpace.Unmapped")
+}
+
+/// The node of a topic that the mapping does not name.
+pub(crate) fn unmapped_node(topic: TopicId) -> NodeId {
+    NodeId::new(APPLICATION, topic.to_string())
+}
+
+/// The namespace index of the application's own URI.
+const APPLICATION: u16 = 1;

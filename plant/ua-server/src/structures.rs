@@ -1,0 +1,256 @@
+//! The DataTypes of messages that are structures: those in arrays, those that a mapping has `as: structure`, and those
+//! nested in them.
+//!
+//! On the wire an ExtensionObject has the name of its message type as TypeId, in the namespace of its topic, and a TypeId
+//! is the NodeId of an encoding (OPC 10000-6, 5.2.2.15): so that is the encoding's, and the DataType has one of its own.
+
+use std::sync::Arc;
+
+use bridge_node::{Definitions, Environment, TypePaths};
+use mappings::{Binding, SpaceId, Variable};
+use messages::{Dialect, MemberKind, MessageType, Rank};
+use opcua::nodes::{DataTypeBuilder, ObjectBuilder, ReferenceDirection};
+use opcua::server::address_space::AddressSpace;
+use opcua::types::{
+    DataTypeDefinition, DataTypeId, LocalizedText, NodeId, ObjectTypeId, QualifiedName,
+    ReferenceTypeId, StructureDefinition, StructureField, StructureType,
+};
+use tracing::warn;
+use uadp::BuiltinType;
+
+/// The definitions of message types that the mapping names, of either ROS.
+pub(crate) struct Types {
+    ros1: Definitions,
+    ros2: Definitions,
+}
+
+impl Types {
+    pub(crate) fn new(types: &Arc<TypePaths>) -> Self {
+        let of = |dialect| Definitions::new(dialect, Arc::clone(types), Environment::from_env());
+        Self {
+            ros1: of(Dialect::Ros1),
+            ros2: of(Dialect::Ros2),
+        }
+    }
+
+    /// Takes what the `type_paths` have by now.
+    pub(crate) fn replace(&mut self, types: &Arc<TypePaths>) {
+        self.ros1.replace(types);
+        self.ros2.replace(types);
+    }
+
+    /// The message type that the values of a variable are of, if it is known.
+    pub(crate) fn of(&mut self, variable: &Variable) -> Option<Arc<MessageType>> {
+        let origin = variable.binding(variable.topic.space);
+        let Binding {
+            space,
+            message_type,
+            ..
+        } = origin.or_else(|| variable.bindings.first())?;
+        let definitions = match *space {
+            SpaceId::ROS1 => &mut self.ros1,
+            _ => &mut self.ros2,
+        };
+        // What is wrong with it was told with the mapping.
+        definitions.find(message_type).ok()
+    }
+}
+
+/// A message type as the address space has it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Structure {
+    pub(crate) namespace: u16,
+    pub(crate) name: String,
+    fields: Vec<Member>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Member {
+    name: String,
+    kind: Kind,
+    rank: Rank,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Kind {
+    Value(BuiltinType),
+    /// A message, by its name.
+    Structure(String),
+}
+
+/// The structures of all variables, each once.
+#[derive(Debug, Default)]
+pub(crate) struct Structures(Vec<Structure>);
+
+impl Structures {
+    /// Takes in the message at a path of a message type, with those nested in it, and gives its DataType. `None` where
+    /// there is none, or where another definition has its name in this namespace.
+    pub(crate) fn add(&mut self, of: &MessageType, path: &str, namespace: u16) -> Option<NodeId> {
+        let found: Vec<Structure> = of
+            .structures(path)
+            .iter()
+            .map(|one| Structure::new(one, namespace))
+            .collect();
+        let name = found.first()?.name.clone();
+        let other = |one: &&Structure| {
+            self.0
+                .iter()
+                .any(|known| known.is_same(one) && known != *one)
+        };
+        if let Some(other) = found.iter().find(other) {
+            warn!(
+                "{} is defined in two ways among the variables of namespace {namespace}: the DataType of {name} is \
+                 left open for some",
+                other.name
+            );
+            return None;
+        }
+        for one in found {
+            if !self.0.contains(&one) {
+                self.0.push(one);
+            }
+        }
+        Some(data_type(namespace, &name))
+    }
+
+    pub(crate) fn into_vec(self) -> Vec<Structure> {
+        self.0
+    }
+}
+
+impl Structure {
+    fn new(of: &messages::Structure<'_>, namespace: u16) -> Self {
+        let member = |field: &messages::StructureMember<'_>| Member {
+            name: field.name.to_owned(),
+            kind: match field.kind {
+                MemberKind::Value(builtin) => Kind::Value(builtin),
+                MemberKind::Message(name) => Kind::Structure(name.to_string()),
+            },
+            rank: field.rank,
+        };
+        Self {
+            namespace,
+            name: of.name.to_string(),
+            fields: of.fields.iter().map(member).collect(),
+        }
+    }
+
+    /// Whether it has the same nodes.
+    fn is_same(&self, other: &Self) -> bool {
+        (self.namespace, &self.name) == (other.namespace, &other.name)
+    }
+
+    fn definition(&self) -> StructureDefinition {
+        let field = |member: &Member| StructureField {
+            name: member.name.as_str().into(),
+            description: LocalizedText::null(),
+            data_type: match &member.kind {
+                Kind::Value(builtin) => NodeId::new(0, u32::from(builtin.id())),
+                Kind::Structure(name) => data_type(self.namespace, name),
+            },
+            value_rank: match member.rank {
+                Rank::Scalar => -1,
+                Rank::Array { .. } => 1,
+            },
+            array_dimensions: match member.rank {
+                Rank::Scalar => None,
+                Rank::Array { fixed } => Some(vec![fixed.unwrap_or(0)]),
+            },
+            max_string_length: 0,
+            is_optional: false,
+        };
+        StructureDefinition {
+            default_encoding_id: encoding(self.namespace, &self.name),
+            base_data_type: DataTypeId::Structure.into(),
+            structure_type: StructureType::Structure,
+            fields: Some(self.fields.iter().map(field).collect()),
+        }
+    }
+
+    /// Puts the DataType and its encoding into the address space, in the place of one of the same name.
+    pub(crate) fn insert(&self, address_space: &mut AddressSpace) {
+        let id = data_type(self.namespace, &self.name);
+        let encoding = encoding(self.namespace, &self.name);
+        for node in [&id, &encoding] {
+            drop(address_space.delete(node, true));
+        }
+        DataTypeBuilder::new(
+            &id,
+            QualifiedName::new(self.namespace, self.name.as_str()),
+            LocalizedText::from(self.name.as_str()),
+        )
+        .data_type_definition(DataTypeDefinition::Structure(self.definition()))
+        .subtype_of(DataTypeId::Structure)
+        .insert(address_space);
+        ObjectBuilder::new(
+            &encoding,
+            QualifiedName::new(0, DEFAULT_BINARY),
+            LocalizedText::from(DEFAULT_BINARY),
+        )
+        .has_type_definition(ObjectTypeId::DataTypeEncodingType)
+        .reference(
+            id,
+            ReferenceTypeId::HasEncoding,
+            ReferenceDirection::Inverse,
+        )
+        .insert(address_space);
+    }
+}
+
+fn data_type(namespace: u16, name: &str) -> NodeId {
+    NodeId::new(namespace, format!("DataType.{name}"))
+}
+
+fn encoding(namespace: u16, name: &str) -> NodeId {
+    NodeId::new(namespace, name)
+}
+
+/// The BrowseName of an encoding (OPC 10000-5, 7.1).
+const DEFAULT_BINARY: &str = "Default Binary";
+
+#[cfg(test)]
+mod tests {
+    use messages::Registry;
+
+    use super::*;
+
+    #[test]
+    fn an_array_of_messages_has_a_data_type_for_each_message_in_it_once() {
+        let registry = Registry::bundle(Dialect::Ros2);
+        let mut structures = Structures::default();
+        let array = registry
+            .get(&"geometry_msgs/PoseArray".parse().unwrap())
+            .unwrap();
+        let pose = registry
+            .get(&"geometry_msgs/Pose".parse().unwrap())
+            .unwrap();
+        let id = NodeId::new(2, "DataType.geometry_msgs/Pose");
+        assert_eq!(structures.add(&array, "poses", 2), Some(id.clone()));
+        assert_eq!(structures.add(&pose, "", 2), Some(id));
+        let all = structures.into_vec();
+        let names: Vec<&str> = all.iter().map(|one| one.name.as_str()).collect();
+        assert_eq!(
+            names,
+            [
+                "geometry_msgs/Pose",
+                "geometry_msgs/Point",
+                "geometry_msgs/Quaternion"
+            ]
+        );
+        let definition = all[0].definition();
+        assert_eq!(
+            definition.default_encoding_id,
+            NodeId::new(2, "geometry_msgs/Pose"),
+            "the TypeId on the wire"
+        );
+        let fields = definition.fields.unwrap();
+        let types: Vec<String> = fields.iter().map(|one| one.data_type.to_string()).collect();
+        assert_eq!(
+            types,
+            [
+                "ns=2;s=DataType.geometry_msgs/Point",
+                "ns=2;s=DataType.geometry_msgs/Quaternion"
+            ]
+        );
+    }
+}

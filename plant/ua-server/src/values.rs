@@ -1,0 +1,495 @@
+//! The last value of each topic in the form it came in: the fields of its DataSet, encoded.
+//!
+//! The server's own Variants take up many times that (24 bytes for each byte of an array), so they are made when a
+//! client wants them, of the part it wants, and live as long as its answer takes.
+
+use std::collections::HashMap;
+
+use bytes::Bytes;
+use mappings::TopicId;
+use opcua::types::{
+    Array, DataValue, DateTime, NumericRange, StatusCode, Variant, VariantScalarTypeId,
+};
+use uadp::{BuiltinType, Fields, Scalar, Timestamp};
+
+use crate::layout::TopicNode;
+use crate::value;
+
+/// What the topics show, within a bound for all of them together.
+#[derive(Debug)]
+pub(crate) struct Values {
+    topics: HashMap<TopicId, Shown>,
+    bytes: usize,
+    most: usize,
+}
+
+/// What the nodes of one topic show.
+#[derive(Debug, Clone)]
+pub(crate) struct Shown {
+    /// FieldCount and a Variant for each field, all of them readable; `None` where there is nothing to be used.
+    pub(crate) block: Option<Bytes>,
+    pub(crate) stamp: Stamp,
+}
+
+/// What all values of one sample have in common.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Stamp {
+    pub(crate) status: StatusCode,
+    pub(crate) source: Option<Timestamp>,
+    pub(crate) server: DateTime,
+}
+
+impl Values {
+    /// None yet, and never more than `most` bytes.
+    pub(crate) fn new(most: usize) -> Self {
+        Self {
+            topics: HashMap::new(),
+            bytes: 0,
+            most,
+        }
+    }
+
+    pub(crate) fn get(&self, topic: TopicId) -> Option<&Shown> {
+        self.topics.get(&topic)
+    }
+
+    /// Shows something else, and gives what was shown before. A value there is no room for is not kept: its place takes
+    /// `BadOutOfMemory`, and it is given back as the error.
+    pub(crate) fn put(
+        &mut self,
+        topic: TopicId,
+        mut shown: Shown,
+    ) -> (Option<Shown>, Result<(), StatusCode>) {
+        let before = self.remove(topic);
+        let size = shown.size();
+        let room = self.most.saturating_sub(self.bytes);
+        let kept = if size <= room {
+            self.bytes += size;
+            Ok(())
+        } else {
+            shown.block = None;
+            shown.stamp.status = StatusCode::BadOutOfMemory;
+            Err(StatusCode::BadOutOfMemory)
+        };
+        self.topics.insert(topic, shown);
+        (before, kept)
+    }
+
+    pub(crate) fn remove(&mut self, topic: TopicId) -> Option<Shown> {
+        let shown = self.topics.remove(&topic)?;
+        self.bytes -= shown.size();
+        Some(shown)
+    }
+}
+
+impl Shown {
+    /// No value, for that reason.
+    pub(crate) fn nothing(status: StatusCode) -> Self {
+        Self {
+            block: None,
+            stamp: Stamp {
+                status,
+                source: None,
+                server: DateTime::now(),
+            },
+        }
+    }
+
+    fn size(&self) -> usize {
+        self.block.as_ref().map_or(0, Bytes::len)
+    }
+
+    /// What the topic's own node has, or the field at that place.
+    pub(crate) fn view(&self, topic: &TopicNode, field: Option<usize>) -> View<'_> {
+        let Some(fields) = self.fields() else {
+            return View::One(uadp::Variant::Null, self.stamp);
+        };
+        let place = match field {
+            None if topic.compound || fields.len() != 1 => return View::All(fields, self.stamp),
+            None => 0,
+            Some(place) => place,
+        };
+        let value = fields.clone().nth(place).and_then(Result::ok);
+        let value = value.unwrap_or(uadp::Variant::Null);
+        // In place of a value of another type it says why there is none (OPC 10000-14, 7.2.4.5.5).
+        if let uadp::Variant::Scalar(Scalar::StatusCode(status)) = value
+            && let Some(field) = topic.fields.get(place)
+            && !field.shape.fits(&value)
+        {
+            let status = StatusCode::from(status.0);
+            let stamp = Stamp {
+                status,
+                ..self.stamp
+            };
+            return View::One(uadp::Variant::Null, stamp);
+        }
+        View::One(value, self.stamp)
+    }
+
+    /// The fields, if there are values.
+    pub(crate) fn fields(&self) -> Option<Fields<'_>> {
+        Fields::parse(self.block.as_ref()?).ok()
+    }
+}
+
+/// The value of one node, not decoded.
+#[derive(Debug, Clone)]
+pub(crate) enum View<'a> {
+    One(uadp::Variant<'a>, Stamp),
+    /// All fields, which are shown as a Variant array.
+    All(Fields<'a>, Stamp),
+}
+
+impl<'a> View<'a> {
+    pub(crate) const fn stamp(&self) -> Stamp {
+        match self {
+            Self::One(_, stamp) | Self::All(_, stamp) => *stamp,
+        }
+    }
+
+    /// Whether the value is the same, whatever its status.
+    pub(crate) fn has_value_of(&self, other: &View<'_>) -> bool {
+        match (self, other) {
+            (Self::One(value, _), View::One(other, _)) => value == other,
+            (Self::All(fields, _), View::All(others, _)) => fields.bytes() == others.bytes(),
+            (Self::One(..), View::All(..)) | (Self::All(..), View::One(..)) => false,
+        }
+    }
+
+    /// What an IndexRange leaves of an array whose elements are all of one size, still not decoded; else, all.
+    pub(crate) fn narrowed(self, range: &NumericRange) -> (Self, NumericRange) {
+        if let Self::One(uadp::Variant::Array(array), stamp) = self
+            && let Some((first, last)) = bounds(range)
+            && let Some(part) = part(array, first, last)
+        {
+            return (
+                Self::One(uadp::Variant::Array(part), stamp),
+                NumericRange::None,
+            );
+        }
+        (self, range.clone())
+    }
+
+    /// About how many bytes the decoded value takes up.
+    pub(crate) fn weight(&self) -> usize {
+        match self {
+            Self::One(value, _) => weight(value),
+            Self::All(fields, _) => fields
+                .clone()
+                .flatten()
+                .map(|field| weight(&field) + BOXED)
+                .sum(),
+        }
+    }
+
+    /// The value with its stamps, decoded; the status is that of the range where that cannot be had.
+    pub(crate) fn data_value(&self, range: &NumericRange) -> DataValue {
+        let value = match self {
+            Self::One(value, _) => value::from_field(value),
+            Self::All(fields, _) => Variant::Array(Box::new(Array {
+                value_type: VariantScalarTypeId::Variant,
+                values: fields
+                    .clone()
+                    .flatten()
+                    .map(|field| Variant::Variant(Box::new(value::from_field(&field))))
+                    .collect(),
+                dimensions: None,
+            })),
+        };
+        let stamp = self.stamp();
+        // Where there is no value its status says more than that nothing is in the range.
+        if matches!(value, Variant::Empty) {
+            return data_value(Some(value), stamp);
+        }
+        match value.range_of_owned(range) {
+            Ok(value) => data_value(Some(value), stamp),
+            Err(status) => data_value(None, Stamp { status, ..stamp }),
+        }
+    }
+
+    /// In place of the value, why it is not given.
+    pub(crate) fn refused(&self, status: StatusCode) -> DataValue {
+        let stamp = self.stamp();
+        data_value(Some(Variant::Empty), Stamp { status, ..stamp })
+    }
+}
+
+/// A value of a sample.
+pub(crate) fn data_value(value: Option<Variant>, stamp: Stamp) -> DataValue {
+    DataValue {
+        value,
+        status: Some(stamp.status),
+        source_timestamp: stamp.source.map(|source| value::date_time(source.time)),
+        // asyncua takes the picoseconds for the first bytes of the server timestamp (its order of the fields is not
+        // that of OPC 10000-6, 5.2.2.17), so there are none: 100 ns are left, and clients read right times.
+        source_picoseconds: None,
+        server_timestamp: Some(stamp.server),
+        server_picoseconds: None,
+    }
+}
+
+/// The bytes without the room behind them, which may be many times as much: buffers of the Router are used again.
+pub(crate) fn compact(payload: Bytes) -> Bytes {
+    match payload.try_into_mut() {
+        Ok(buffer) if buffer.capacity() - buffer.len() <= SLACK => buffer.freeze(),
+        Ok(buffer) => Bytes::copy_from_slice(&buffer),
+        Err(shared) => shared,
+    }
+}
+
+/// First and last element of a range of one dimension.
+fn bounds(range: &NumericRange) -> Option<(usize, usize)> {
+    let (first, last) = match range {
+        NumericRange::Index(at) => (*at, *at),
+        NumericRange::Range(first, last) => (*first, *last),
+        NumericRange::None | NumericRange::MultipleRanges(_) => return None,
+    };
+    Some((usize::try_from(first).ok()?, usize::try_from(last).ok()?))
+}
+
+/// `None` for elements of various sizes, and where nothing is in the range.
+fn part(array: uadp::Array<'_>, first: usize, last: usize) -> Option<uadp::Array<'_>> {
+    let size = array.element().fixed_size()?;
+    let last = last.min(array.len().checked_sub(1)?);
+    let count = last.checked_sub(first)? + 1;
+    let at = first.checked_mul(size)?;
+    let bytes = array.bytes().get(at..at + count.checked_mul(size)?)?;
+    uadp::Array::new(array.element(), count, bytes).ok()
+}
+
+fn weight(value: &uadp::Variant<'_>) -> usize {
+    let elements = |array: &uadp::Array<'_>| match array.element() {
+        BuiltinType::Variant | BuiltinType::DataValue => {
+            array.iter().map(|element| scalar_weight(&element)).sum()
+        }
+        element if element.fixed_size().is_some() && !is_boxed(element) => array.len() * VARIANT,
+        _ => array.len() * (VARIANT + BOXED) + array.bytes().len(),
+    };
+    match value {
+        uadp::Variant::Null => VARIANT,
+        uadp::Variant::Scalar(scalar) => scalar_weight(scalar),
+        uadp::Variant::Array(array) => VARIANT + elements(array),
+        uadp::Variant::Matrix(matrix) => VARIANT + elements(&matrix.elements()),
+    }
+}
+
+fn scalar_weight(value: &Scalar<'_>) -> usize {
+    let inner = match value {
+        Scalar::Variant(inner) => inner.get().as_ref().map_or(0, weight),
+        Scalar::DataValue(inner) => {
+            let inner = inner.get().unwrap_or_default();
+            inner.value.as_ref().map_or(0, weight)
+        }
+        Scalar::String(text) | Scalar::XmlElement(text) => text.map_or(0, str::len),
+        Scalar::ByteString(bytes) => bytes.map_or(0, <[u8]>::len),
+        Scalar::ExtensionObject(object) => match object.body {
+            uadp::ExtensionBody::None => 0,
+            uadp::ExtensionBody::Binary(bytes) => bytes.len(),
+            uadp::ExtensionBody::Xml(text) => text.len(),
+        },
+        _ => {
+            return VARIANT
+                + if is_boxed(value.builtin_type()) {
+                    BOXED
+                } else {
+                    0
+                };
+        }
+    };
+    VARIANT + BOXED + inner
+}
+
+/// Whether the server's Variant has such a value elsewhere.
+const fn is_boxed(builtin: BuiltinType) -> bool {
+    !matches!(
+        builtin,
+        BuiltinType::Boolean
+            | BuiltinType::SByte
+            | BuiltinType::Byte
+            | BuiltinType::Int16
+            | BuiltinType::UInt16
+            | BuiltinType::Int32
+            | BuiltinType::UInt32
+            | BuiltinType::Int64
+            | BuiltinType::UInt64
+            | BuiltinType::Float
+            | BuiltinType::Double
+            | BuiltinType::StatusCode
+    )
+}
+
+const VARIANT: usize = size_of::<Variant>();
+/// About what a value takes up that is not in its Variant, with its allocation.
+const BOXED: usize = 2 * size_of::<DataValue>();
+/// Room behind a value that is not worth a copy.
+const SLACK: usize = 64;
+
+#[cfg(test)]
+mod tests {
+    use opcua::types::NodeId;
+
+    use super::*;
+    use crate::layout::Shape;
+
+    fn id(identifier: u16) -> TopicId {
+        TopicId::new(1, 2, identifier).unwrap()
+    }
+
+    /// A topic of that many SByte arrays.
+    fn topic(fields: usize) -> TopicNode {
+        let shape = Shape(Some((BuiltinType::SByte, true)));
+        let fields = (0..fields).map(|at| (format!("f{at}"), shape)).collect();
+        TopicNode::new(id(10), NodeId::new(2, 10), "x".to_owned(), fields)
+    }
+
+    fn bytes(values: &[i8]) -> Variant {
+        Variant::from(values.to_vec())
+    }
+
+    fn shown(fields: &[Variant]) -> Shown {
+        Shown {
+            block: Some(Bytes::from(value::fields_block(fields).unwrap())),
+            stamp: Stamp {
+                status: StatusCode::Good,
+                source: None,
+                server: DateTime::now(),
+            },
+        }
+    }
+
+    fn read(shown: &Shown, topic: &TopicNode, field: Option<usize>, range: &str) -> DataValue {
+        let range: NumericRange = range.parse().unwrap();
+        let (view, range) = shown.view(topic, field).narrowed(&range);
+        view.data_value(&range)
+    }
+
+    #[test]
+    fn no_more_is_kept_than_there_is_room_for_and_what_gives_way_makes_room() {
+        let mut values = Values::new(100);
+        let sized = |size| Shown {
+            block: Some(Bytes::from(vec![0; size])),
+            ..Shown::nothing(StatusCode::Good)
+        };
+        assert_eq!(values.put(id(1), sized(60)).1, Ok(()));
+        let (before, kept) = values.put(id(2), sized(41));
+        assert!(before.is_none());
+        assert_eq!(kept, Err(StatusCode::BadOutOfMemory));
+        let refused = values.get(id(2)).unwrap();
+        assert_eq!(refused.stamp.status, StatusCode::BadOutOfMemory);
+        assert!(refused.block.is_none());
+        assert_eq!(
+            values.put(id(1), sized(100)).1,
+            Ok(()),
+            "its own room counts"
+        );
+        values.remove(id(1));
+        assert_eq!(values.put(id(2), sized(100)).1, Ok(()));
+        assert_eq!(values.bytes, 100);
+    }
+
+    #[test]
+    fn a_node_has_its_field_and_that_of_the_topic_all_of_them() {
+        let (topic, fields) = (topic(2), [bytes(&[1, 2]), bytes(&[3])]);
+        let shown = shown(&fields);
+        assert_eq!(
+            read(&shown, &topic, Some(1), "").value.as_ref(),
+            Some(&fields[1])
+        );
+        let all = Array {
+            value_type: VariantScalarTypeId::Variant,
+            values: fields
+                .map(|field| Variant::Variant(Box::new(field)))
+                .to_vec(),
+            dimensions: None,
+        };
+        let all = Variant::Array(Box::new(all));
+        assert_eq!(read(&shown, &topic, None, "").value, Some(all));
+    }
+
+    #[test]
+    fn an_index_range_of_a_large_array_takes_up_no_more_than_itself() {
+        let topic = topic(1);
+        let mut elements = vec![0; 10_000_000];
+        elements[9_000_000..9_000_003].copy_from_slice(&[7, 8, 9]);
+        let block = {
+            let mut block = vec![1, 0, 0x82];
+            block.extend_from_slice(&10_000_000_u32.to_le_bytes());
+            block.extend_from_slice(&elements);
+            Bytes::from(block)
+        };
+        let mut shown = shown(&[]);
+        shown.block = Some(block);
+        assert!(shown.view(&topic, None).weight() > 200_000_000);
+        let range: NumericRange = "9000000:9000002".parse().unwrap();
+        let (view, _) = shown.view(&topic, None).narrowed(&range);
+        assert!(view.weight() < 200);
+        for (range, wanted) in [
+            ("9000000:9000002", Ok(bytes(&[7, 8, 9]))),
+            ("9999999:20000000", Ok(bytes(&[0]))),
+            ("9000001", Ok(bytes(&[8]))),
+        ] {
+            let found = read(&shown, &topic, None, range);
+            assert_eq!(found.value.ok_or(found.status), wanted, "{range}");
+        }
+    }
+
+    #[test]
+    fn an_index_range_is_the_same_of_the_encoded_value_as_of_the_decoded_one() {
+        let topic = topic(1);
+        let open = TopicNode::new(id(10), NodeId::new(2, 10), "x".to_owned(), vec![]);
+        let text = Variant::from("four");
+        let strings = Variant::from(vec!["a".to_owned(), "b".to_owned(), "c".to_owned()]);
+        for (topic, whole) in [
+            (&topic, bytes(&[1, 2, 3, 4])),
+            (&topic, bytes(&[])),
+            (&open, text),
+            (&open, strings),
+            (&open, Variant::from(3.5)),
+        ] {
+            for range in ["", "0", "1:2", "2:9", "4", "7:8", "1:2,0:1"] {
+                let parsed: NumericRange = range.parse().unwrap();
+                let found = read(&shown(std::slice::from_ref(&whole)), topic, None, range);
+                match whole.range_of(&parsed) {
+                    Ok(value) => assert_eq!(found.value, Some(value), "{whole:?} {range}"),
+                    Err(status) => {
+                        assert_eq!((found.value, found.status), (None, Some(status)), "{range}");
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_status_in_the_place_of_a_value_is_the_nodes_and_an_empty_topic_has_its_own() {
+        let topic = topic(2);
+        let shown = shown(&[Variant::StatusCode(StatusCode::BadNoData), bytes(&[3])]);
+        let found = read(&shown, &topic, Some(0), "0:1");
+        assert_eq!(found.value, Some(Variant::Empty));
+        assert_eq!(found.status, Some(StatusCode::BadNoData));
+        assert_eq!(
+            read(&shown, &topic, Some(1), "").status,
+            Some(StatusCode::Good)
+        );
+        let nothing = Shown::nothing(StatusCode::BadTypeMismatch);
+        let found = read(&nothing, &topic, None, "");
+        assert_eq!(found.value, Some(Variant::Empty));
+        assert_eq!(found.status, Some(StatusCode::BadTypeMismatch));
+    }
+
+    #[test]
+    fn the_room_behind_a_small_value_is_not_kept() {
+        let mut buffer = Vec::with_capacity(100_000);
+        buffer.extend_from_slice(&[1, 2, 3]);
+        let before = buffer.as_ptr();
+        let kept = compact(Bytes::from(buffer));
+        assert_eq!(kept[..], [1, 2, 3]);
+        assert_ne!(kept.as_ptr(), before, "it is where the large buffer was");
+        let large = Bytes::from(vec![7; 100_000]);
+        let before = large.as_ptr();
+        assert_eq!(
+            compact(large).as_ptr(),
+            before,
+            "a value that fits is not copied"
+        );
+    }
+}
