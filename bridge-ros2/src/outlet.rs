@@ -444,7 +444,8 @@ impl Outlet {
         #[cfg(feature = "patched-dds")]
         if self.offered == Offered::KeepLatest {
             let lacked = self.writer.unacknowledged();
-            if lacked.samples > 0 && lacked.silent_for >= STUCK_AFTER {
+            let given_up = lacked.silent_for >= STUCK_AFTER || lacked.stalled_for >= SLOWEST;
+            if lacked.samples > 0 && given_up {
                 self.writer.keep_last(lacked.samples - 1);
                 return true;
             }
@@ -524,6 +525,9 @@ const SETTLING_EVENTS: usize = 512;
 /// How long a state topic may lag behind for the sake of one reader that says nothing. A reader that was killed, or lost its
 /// radio link, holds up RustDDS' writer until its lease ends, 10 to 20 s later.
 const STUCK_AFTER: Duration = Duration::from_millis(500);
+/// How long it may lag behind for the sake of one that is heard, and takes nothing: its program may have no room for more.
+#[cfg(feature = "patched-dds")]
+const SLOWEST: Duration = Duration::from_secs(10);
 /// How long a writer that was replaced stays for those that lack something. What it waits for is a repair or two; a reader
 /// that was killed acknowledges nothing.
 const REPAIRED_WITHIN: Duration = Duration::from_secs(1);

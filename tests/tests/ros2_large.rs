@@ -166,6 +166,34 @@ async fn all_thirty_samples_of_5_mb_reach_fast_dds_and_cyclone() {
     all_thirty_arrive(5 * MEGA).await;
 }
 
+/// It takes longer for what is on its way to it than a reader may be silent.
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_reader_that_is_slow_for_large_states_is_not_given_up_as_a_silent_one() {
+    const COUNT: u32 = 7;
+    if !patched() {
+        return;
+    }
+    let Some(cell) = Cell::with(&[Peer::FastDds]) else {
+        return;
+    };
+    let mut reader = cell.fastdds(&["sub", TOPIC.0, TEXT, "--counts"]);
+    let domain = join("127.0.0.1");
+    let mut outlet = outlet(&domain, Offered::KeepLatest, 1);
+    // One more than there is memory for.
+    for number in 0..COUNT {
+        let large = payload(&numbered(number, 10 * MEGA));
+        outlet.offer(large, None, now()).unwrap();
+    }
+    let deadline = now() + SOON;
+    while outlet.is_waiting() {
+        assert!(now() < deadline, "still waiting");
+        assert!(!outlet.is_stuck(now()), "to be advertised anew");
+        tokio::time::sleep(Duration::from_millis(1)).await;
+        outlet.flush(now()).unwrap();
+    }
+    have_all(&mut reader, COUNT as usize);
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn the_first_sample_arrives_even_when_it_is_large() {
     if !patched() {
