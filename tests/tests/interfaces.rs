@@ -38,10 +38,11 @@ impl Graph {
     }
 }
 
-fn bridge_ros1(more: &[&str]) -> Child {
+/// Other nodes are told that address of it.
+fn bridge_ros1(address: &str, more: &[&str]) -> Child {
     let bridge = Started::new("bridge-ros1", &program("bridge-ros1"))
         .env("ROS_MASTER_URI", "http://127.0.0.1:11311")
-        .env("ROS_HOSTNAME", "127.0.0.1")
+        .env("ROS_IP", address)
         .args(["--metrics", METRICS_ROS1])
         .args(more)
         .start();
@@ -105,7 +106,7 @@ fn values_cross_again(arguments: &[&str]) {
     };
     lay(HERE);
     let _graph = Graph::start();
-    let mut bridge = bridge_ros1(arguments);
+    let mut bridge = bridge_ros1("127.0.0.1", arguments);
     let node = BareNode::start("/talker");
     let mut out = node.publish(&[OUT.1.to_owned()]).remove(0);
     std::io::Write::write_all(&mut out, &string_frame("out")).unwrap();
@@ -168,4 +169,21 @@ fn a_bridge_whose_dds_is_bound_to_an_address_that_is_another_ends_to_be_started_
     assert_eq!(ended.code(), Some(69));
     bridge.wait_for_line("to be started again", SOON);
     let _again = start();
+}
+
+#[test]
+fn a_bridge_whose_ros_1_address_is_another_ends_to_be_started_again() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let cable = cell.cable();
+    cable.lay(HERE);
+    let _graph = Graph::start();
+    let mut bridge = bridge_ros1(HERE, &["--interface", "lo"]);
+    cable.pull();
+    let why = until_not_ready(METRICS_ROS1);
+    assert!(why.contains(&format!("{WIRE} ({HERE})")), "{why}");
+    cable.lay(ELSEWHERE);
+    assert_eq!(bridge.wait_for_end(SOON).code(), Some(69));
+    bridge.wait_for_line("to be started again", SOON);
 }
