@@ -11,7 +11,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use mappings::{
-    Checked, Code, Diagnostic, Mapping, Readers, Severity, Surroundings, TypeOrigin, TypeUse,
+    Checked, Code, Diagnostic, Mapping, Readers, Severity, SpaceId, Surroundings, TypeOrigin,
+    TypeUse,
 };
 use messages::{Dialect, TextKind, TypeName};
 use serde::Serialize;
@@ -76,8 +77,6 @@ impl About {
 #[derive(Debug)]
 struct Reading {
     checked: Checked,
-    /// As rustc tells it.
-    rendered: String,
     hash: String,
     /// Of what the `type_paths` have.
     fingerprint: u64,
@@ -137,7 +136,6 @@ fn read(file: &Path, running: &TypePaths, known: &Known) -> Result<Reading, Stri
     let defined = defined.filter(|used| matches!(used.source, TypeOrigin::File(_)));
     let defined = defined.map(key).collect();
     Ok(Reading {
-        rendered: checked.render_all(),
         checked,
         hash,
         fingerprint: types.fingerprint(),
@@ -220,16 +218,23 @@ pub(crate) struct MappingFile {
     told: BTreeSet<String>,
     /// Whether it was told that the file is gone.
     gone: bool,
+    /// Those the program serves: what only others need stops it from nothing.
+    spaces: Vec<SpaceId>,
     running: Running,
 }
 
 impl MappingFile {
-    /// Reads the mapping for the first time and prints its findings. Without a file: zero configuration. `None`: with
-    /// `only_check`, it was checked and can run.
+    /// Reads the mapping for the first time and prints its findings, as they are for a program of the `spaces` it says of a
+    /// mapping. Without a file: zero configuration. `None`: with `only_check`, it was checked and can run; where it does not
+    /// say which spaces the program serves, for everybody.
     ///
     /// # Errors
     /// A file that cannot be read, or a mapping that cannot run.
-    pub(crate) fn open(file: Option<&Path>, only_check: bool) -> Result<Option<Self>, Failure> {
+    pub(crate) fn open(
+        file: Option<&Path>,
+        only_check: bool,
+        spaces: impl FnOnce(&Mapping) -> Result<Vec<SpaceId>, Failure>,
+    ) -> Result<Option<Self>, Failure> {
         let Some(file) = file else {
             let running = Running {
                 mapping: Arc::default(),
@@ -244,17 +249,27 @@ impl MappingFile {
                 known: Arc::default(),
                 told: BTreeSet::new(),
                 gone: false,
+                spaces: Vec::new(),
                 running,
             };
             return Ok((!only_check).then_some(without));
         };
         let mut reading = read(file, &TypePaths::default(), &Known::new())
             .map_err(|error| Failure::new(FailureKind::Io, error))?;
-        if !only_check && reading.checked.mapping.is_some() && reading.leave_to_the_run(file) {
-            reading.rendered = reading.checked.render_all();
+        let spaces = reading.checked.outline().map(spaces).transpose();
+        let mut own = Vec::new();
+        if let Ok(Some(spaces)) = &spaces {
+            own.clone_from(spaces);
+            reading.checked = reading.checked.for_spaces(&own);
+        }
+        if !only_check && reading.checked.mapping.is_some() {
+            let _rendered_no_more = reading.leave_to_the_run(file);
         }
         // A closed stderr is no reason not to run.
-        let _printed = std::io::stderr().write_all(reading.rendered.as_bytes());
+        let _printed = std::io::stderr().write_all(reading.checked.render_all().as_bytes());
+        if !only_check {
+            spaces?;
+        }
         match reading.checked.mapping {
             Some(_) if only_check => {
                 info!("{} can run", file.display());
@@ -276,6 +291,7 @@ impl MappingFile {
                     known: Arc::new(reading.known),
                     told: BTreeSet::new(),
                     gone: false,
+                    spaces: own,
                     running: Running {
                         mapping: Arc::new(mapping),
                         types: reading.types,
@@ -401,6 +417,7 @@ impl MappingFile {
 
     /// Adopts what was read if it can run.
     fn judge(&mut self, file: &Path, mut reading: Reading) {
+        reading.checked = reading.checked.for_spaces(&self.spaces);
         if reading.checked.mapping.is_some() {
             // What is doubted was told at the start.
             let _rendered_no_more = reading.leave_to_the_run(file);
@@ -509,6 +526,7 @@ fn is_left_to_the_run(finding: &Diagnostic) -> bool {
     let help = finding.help.as_ref();
     let doubtful = help.is_some_and(|help| help.starts_with("did you mean"));
     finding.severity != Severity::Error
+        && finding.needed_by.is_empty()
         && !doubtful
         && matches!(
             finding.code,
@@ -541,7 +559,9 @@ mod tests {
         write("types/my_msgs/msg/Arm.msg", "bool x\n");
         write("cell.yaml", "spaces: [{id: 1}]\ntype_paths: [types]\n");
         let file = folder.join("cell.yaml");
-        let mut mapping = MappingFile::open(Some(&file), false).unwrap().unwrap();
+        let mut mapping = MappingFile::open(Some(&file), false, |_| Ok(vec![SpaceId::ROS1]))
+            .unwrap()
+            .unwrap();
         let mut take = || {
             let reading = read(&file, &mapping.running.types, &mapping.known);
             assert!(mapping.take(reading, false));
@@ -555,6 +575,41 @@ mod tests {
         assert_eq!(take(), (1, 1, true));
         write("types/my_msgs/msg/Arm.msg", "bool y\n");
         assert_eq!(take(), (2, 1, false));
+        std::fs::remove_dir_all(&folder).unwrap();
+    }
+
+    #[test]
+    fn a_mapping_runs_where_only_another_space_needs_what_is_not_here_and_goes_on_when_it_is_saved()
+    {
+        let folder = std::env::temp_dir().join(format!("bridge-part-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let file = folder.join("cell.yaml");
+        let cell = |topic: &str| {
+            let text = format!(
+                "spaces: [{{id: 1}}, {{id: 2}}]\nnamespaces: {{2: urn:x}}\nvariables:\n\
+                 - {{node: ns=2;i=1, name: Arm, origin: 1, ros: [{{topic: {topic}, type: std_msgs/Bool}}, \
+                 {{space: 2, topic: /arm, type: their_msgs/Arm}}]}}\n"
+            );
+            std::fs::write(&file, text).unwrap();
+        };
+        cell("/arm");
+        let open = |number: u16| {
+            let serves = |_: &Mapping| Ok(vec![SpaceId::new(number).unwrap_or(SpaceId::UA)]);
+            MappingFile::open(Some(&file), false, serves)
+        };
+        let stopped = open(2).unwrap_err();
+        assert_eq!(stopped.kind(), FailureKind::Configuration);
+        open(0).unwrap().unwrap();
+        let mut mapping = open(1).unwrap().unwrap();
+        cell("/other");
+        let reading = read(&file, &mapping.running.types, &mapping.known);
+        assert!(mapping.take(reading, false));
+        let about = &mapping.running.about;
+        assert_eq!((about.reloads, about.refused), (1, 0));
+        // Where nobody can say which space is served, the whole cell is checked.
+        let nobody = |_: &Mapping| Err(Failure::new(FailureKind::Usage, "which?"));
+        let checked = MappingFile::open(Some(&file), true, nobody).unwrap_err();
+        assert_eq!(checked.kind(), FailureKind::Configuration);
         std::fs::remove_dir_all(&folder).unwrap();
     }
 }

@@ -84,7 +84,9 @@ pub fn run<P: Program>() -> ExitCode {
     logging::start(program.arguments().log, P::QUIET);
     descriptors::raise();
     let arguments = program.arguments();
-    let ended = match MappingFile::open(arguments.mapping.as_deref(), arguments.check) {
+    let mapping = arguments.mapping.as_deref();
+    let spaces = |mapping: &Mapping| program.spaces(mapping);
+    let ended = match MappingFile::open(mapping, arguments.check, spaces) {
         Ok(Some(mapping)) => serve(program, mapping),
         Ok(None) => Ok(()),
         Err(failure) => Err(failure),

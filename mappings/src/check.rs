@@ -14,6 +14,7 @@ mod shaping;
 mod types;
 mod variables;
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -27,6 +28,7 @@ use crate::include::Loader;
 use crate::mapping::Mapping;
 use crate::read::{At, Field};
 use crate::surroundings::{Alone, Surroundings};
+use crate::topic::SpaceId;
 use crate::tree::Place;
 
 use self::types::Types;
@@ -42,6 +44,10 @@ pub struct Checked {
     pub types: Vec<TypeUse>,
     /// What was read.
     pub sources: Vec<Source>,
+    /// By whom the errors are minded; nobody stands for everybody.
+    errors: BTreeSet<Vec<SpaceId>>,
+    /// The mapping for those who mind none of them, where there are errors.
+    in_parts: Option<Mapping>,
 }
 
 /// A message or service type that a mapping names.
@@ -108,6 +114,44 @@ pub struct Source {
 }
 
 impl Checked {
+    /// The mapping, if it can run for somebody: enough to tell which spaces a program serves.
+    #[must_use]
+    pub fn outline(&self) -> Option<&Mapping> {
+        self.mapping.as_ref().or(self.in_parts.as_ref())
+    }
+
+    /// What it comes to for a program that serves these spaces, and no other. An error in what is known here of the types
+    /// that only others need is a warning, as their definitions may be where they are needed.
+    #[must_use]
+    pub fn for_spaces(mut self, spaces: &[SpaceId]) -> Self {
+        let minds = |needed_by: &[SpaceId]| needed_by.iter().all(|space| spaces.contains(space));
+        for found in &mut self.findings {
+            if found.severity == Severity::Error && !minds(&found.needed_by) {
+                found.severity = Severity::Warning;
+                let whom: Vec<String> = found.needed_by.iter().map(ToString::to_string).collect();
+                let whom = match whom.as_slice() {
+                    [one] => format!("only the program that serves space {one} is stopped by it"),
+                    all => format!(
+                        "only a program that serves the spaces {} is stopped by it",
+                        all.join(" and ")
+                    ),
+                };
+                found.help = Some(match found.help.take() {
+                    Some(help) => format!("{help}; {whom}"),
+                    None => whom,
+                });
+            }
+        }
+        if !self.errors.iter().any(|needed_by| minds(needed_by)) {
+            self.mapping = self.mapping.take().or_else(|| self.in_parts.take());
+            // What is left tells how many are not shown.
+            for found in &mut self.findings {
+                found.severity = Severity::Warning;
+            }
+        }
+        self
+    }
+
     /// Every finding with its source line, then how many there are; empty when there is none. `source` is the text that
     /// was checked, of a document that includes no other.
     #[must_use]
@@ -169,11 +213,19 @@ impl Mapping {
         let (document, sources) = Loader::new(around, &mut findings).load(text, file);
         let mut used = Vec::new();
         let mapping = document.map(|document| compile(document, around, &mut findings, &mut used));
+        let errors = findings.errors().clone();
+        let for_everybody = errors.is_empty();
+        let (mapping, in_parts) = match mapping {
+            Some(mapping) if for_everybody => (Some(mapping), None),
+            other => (None, other.filter(|_| !errors.iter().any(Vec::is_empty))),
+        };
         Checked {
-            mapping: mapping.filter(|_| !findings.has_errors()),
+            mapping,
             findings: findings.into_sorted(),
             types: used,
             sources,
+            errors,
+            in_parts,
         }
     }
 }
@@ -256,12 +308,26 @@ fn compile(
     let mapping = Mapping::new(pubsub, spaces.known, namespaces.known, server, variables);
     *used = types.used();
     let mapping = mapping.with_patterns(patterns).with_type_paths(paths);
+    let minded_by_all = findings.errors().iter().any(Vec::is_empty);
     if let Some(environment) = around.environment()
-        && !findings.has_errors()
+        && !minded_by_all
+        && document.has_all_of(&mapping)
     {
         environment::check(&document, &mapping, environment, findings);
     }
     mapping
+}
+
+impl Document {
+    /// Whether each entry is there in what the document came to.
+    fn has_all_of(&self, mapping: &Mapping) -> bool {
+        fn count<T>(entries: &Field<Vec<T>>) -> usize {
+            let entries = entries.as_ref().and_then(|at| at.value.as_ref());
+            entries.map_or(0, Vec::len)
+        }
+        count(&self.variables) == mapping.variables().len()
+            && count(&self.patterns) == mapping.patterns().len()
+    }
 }
 
 /// Most entries of `type_paths`.

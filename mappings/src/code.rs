@@ -121,6 +121,28 @@ codes! {
     LiveNodeDiffers = "M126", "The variable is there in the server with another data type. Only `ua-space check --environment` asks for that.";
 }
 
+impl Code {
+    /// Whether it depends on what is known of a type on this host: on another one its definition may be another, or
+    /// there.
+    pub(crate) const fn lies_in_definitions(self) -> bool {
+        matches!(
+            self,
+            Self::UnknownMessageType
+                | Self::UnknownField
+                | Self::TypeDiffers
+                | Self::BindingsDiffer
+                | Self::UnknownServiceType
+                | Self::RequestConstant
+                | Self::When
+                | Self::FieldPart
+                | Self::Conversion
+                | Self::LossyConversion
+                | Self::FieldOrder
+                | Self::StructureOf
+        )
+    }
+}
+
 impl fmt::Display for Code {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.as_str())

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use crate::code::Code;
 use crate::secret::masked;
+use crate::topic::SpaceId;
 
 /// One finding. Its `Display` is one line without the source: `error[M003]: <message> (cell.yaml:14:3)`.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -21,6 +22,9 @@ pub struct Diagnostic {
     pub label: Option<String>,
     /// What to do about it.
     pub help: Option<String>,
+    /// Of an error that lies in what is known here of a type: the spaces whose programs need it, all of them together. A
+    /// program that does not serve them all can run with it. Empty where everybody is stopped.
+    pub needed_by: Vec<SpaceId>,
 }
 
 /// Whether a document with the finding can run.
@@ -163,6 +167,7 @@ mod tests {
             message: "`ua_2_5_10` is mapped twice".to_owned(),
             label: Some("also mapped at line 6".to_owned()),
             help: Some("give one of them another identifier".to_owned()),
+            needed_by: Vec::new(),
         }
     }
 

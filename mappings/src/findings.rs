@@ -1,12 +1,13 @@
 //! What has been found so far.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::sync::Arc;
 
 use crate::code::Code;
 use crate::diagnostic::{Diagnostic, Severity, Span};
 use crate::read::short;
 use crate::secret;
+use crate::topic::SpaceId;
 use crate::tree::Place;
 
 /// Most findings that are kept; the rest is counted.
@@ -22,7 +23,10 @@ pub(crate) struct Findings {
     unknown: HashSet<Place>,
     /// Values out of the environment, which are nobody's to read, and what stands for them.
     secrets: BTreeMap<String, String>,
-    errors: usize,
+    /// The spaces whose part of the document is looked at.
+    part: Vec<SpaceId>,
+    /// By whom the errors are minded.
+    errors: BTreeSet<Vec<SpaceId>>,
     left_out: usize,
 }
 
@@ -34,7 +38,8 @@ impl Findings {
             seen: HashSet::new(),
             unknown: HashSet::new(),
             secrets: BTreeMap::new(),
-            errors: 0,
+            part: Vec::new(),
+            errors: BTreeSet::new(),
             left_out: 0,
         }
     }
@@ -94,8 +99,13 @@ impl Findings {
     }
 
     fn push(&mut self, code: Code, severity: Severity, place: Place, message: String) -> Note<'_> {
-        if severity == Severity::Error {
-            self.errors += 1;
+        let needed_by = if severity == Severity::Error && code.lies_in_definitions() {
+            self.part.clone()
+        } else {
+            Vec::new()
+        };
+        if severity == Severity::Error && !self.errors.contains(&needed_by) {
+            self.errors.insert(needed_by.clone());
         }
         if self.unknown.contains(&place) {
             return Note(None);
@@ -126,13 +136,23 @@ impl Findings {
             message,
             label: None,
             help: None,
+            needed_by,
         };
         self.found.push((file, found));
         Note(self.found.last_mut().map(|(_, found)| found))
     }
 
-    pub(crate) const fn has_errors(&self) -> bool {
-        self.errors > 0
+    /// What is found from now on about types is about those of these spaces, all together: of one host's part of the
+    /// cell. Without any, everybody minds.
+    pub(crate) fn of_part(&mut self, spaces: impl IntoIterator<Item = SpaceId>) {
+        self.part = spaces.into_iter().collect();
+        self.part.sort_unstable();
+        self.part.dedup();
+    }
+
+    /// The spaces that mind the errors; of those that everybody minds there are none.
+    pub(crate) const fn errors(&self) -> &BTreeSet<Vec<SpaceId>> {
+        &self.errors
     }
 
     /// In the order of the files and their texts.
@@ -161,7 +181,7 @@ impl Findings {
                 column,
                 len,
             };
-            let severity = if self.errors > 0 {
+            let severity = if !self.errors.is_empty() {
                 Severity::Error
             } else {
                 Severity::Warning
@@ -174,6 +194,7 @@ impl Findings {
                 message,
                 label,
                 help,
+                needed_by: Vec::new(),
             });
         }
         all

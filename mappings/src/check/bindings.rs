@@ -122,6 +122,7 @@ impl<'c> Bindings<'c> {
                 space,
                 subject,
             };
+            findings.of_part(space);
             match services::kind(entry, at.place, findings) {
                 Some(Kind::Topic) => found.extend(self.binding(entry, &site, findings)),
                 Some(kind) => {
@@ -136,6 +137,7 @@ impl<'c> Bindings<'c> {
             }
         }
         differences(&found, findings);
+        findings.of_part(None);
         for one in &found {
             self.note_use(one, subject);
         }
@@ -146,7 +148,10 @@ impl<'c> Bindings<'c> {
         let topics = own.chain(&found).find_map(|one| one.fields.clone());
         let services = service.as_ref().and_then(|service| service.fields.clone());
         if let (Some(topics), Some(services), Some(service)) = (&topics, &services, &service) {
+            let spaces = found.iter().map(|one| one.binding.space);
+            findings.of_part(spaces.chain([service.binding.space]));
             service.compare(topics, services, findings);
+            findings.of_part(None);
         }
         let fields = match &service {
             Some(service) if Some(service.binding.space) == subject.origin => services.or(topics),
@@ -551,6 +556,7 @@ fn differences(found: &[Found], findings: &mut Findings) {
     let shape =
         |fields: &[Leaf]| -> Vec<ValueType> { fields.iter().map(types::value_type).collect() };
     for (other, others) in known {
+        findings.of_part([first.binding.space, other.binding.space]);
         let line = findings.line(first.place, other.place);
         if differ_as_bytes(&first.binding, &other.binding) {
             let (a, b) = (&first.binding, &other.binding);

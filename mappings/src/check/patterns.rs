@@ -41,7 +41,9 @@ pub(super) fn check(
         let origin = required(&entry.origin, "origin", "the pattern", at.place, findings);
         let origin = origin.and_then(|(number, place)| origin_of(*number, place, spaces, findings));
         let texts = texts(entry, at.place, namespaces, findings);
+        findings.of_part(origin);
         let kind = kind((entry, at.place), origin, types, findings);
+        findings.of_part(None);
         let (Some(origin), Some(texts), Some((message_type, selection))) = (origin, texts, kind)
         else {
             continue;

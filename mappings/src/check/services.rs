@@ -97,7 +97,9 @@ impl Service {
             *when = match (self.when, value_type) {
                 (Some((text, place)), value_type) => {
                     if let Some(value_type) = value_type {
+                        findings.of_part([self.binding.space]);
                         check_when(&text, value_type, (self.binding.space, place), findings);
+                        findings.of_part(None);
                     }
                     Trigger::Equals(text)
                 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use mappings::Code;
+use mappings::{Code, SpaceId};
 
 /// Looks into the space: mappings and what is wrong with them, datagrams of OPC UA PubSub as JSON and back.
 #[derive(Debug, Parser)]
@@ -21,7 +21,7 @@ pub(crate) enum Verb {
     /// a code. Definitions of messages are those of its type_paths, of ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, and those
     /// built in. Nothing is asked of the network without --environment.
     ///
-    /// Exit codes: 0 all can run, with or without warnings, 64 usage, 69 somebody of the environment is not there, 74 a
+    /// Exit codes: 0 all can run (with --for: there), with or without warnings, 64 usage, 69 somebody of the environment is not there, 74 a
     /// file that cannot be read or an output that cannot be written, 78 one of them cannot run.
     Check(Check),
     /// Write a mapping of what is there
@@ -74,6 +74,10 @@ pub(crate) struct Check {
     /// One JSON object a file, with its findings
     #[arg(long)]
     pub(crate) json: bool,
+    /// For the host whose program serves this space, or these as 2,3; 0 is ua-server. What is wrong with types that only
+    /// others need is a warning, as it is for that program. Without it all of a mapping counts
+    #[arg(long = "for", value_name = "SPACE", value_delimiter = ',', value_parser = space)]
+    pub(crate) spaces: Vec<SpaceId>,
     /// Ask whether the topics, services, types, namespaces and nodes are there: the ROS 1 master (ROS_MASTER_URI), the DDS
     /// domains of the spaces and the OPC UA server, or some of them
     #[arg(
@@ -89,6 +93,13 @@ pub(crate) struct Check {
     /// How many seconds to listen in a DDS domain at most
     #[arg(long, value_name = "SECONDS", default_value_t = 5, value_parser = clap::value_parser!(u16).range(1..=600))]
     pub(crate) wait: u16,
+}
+
+fn space(text: &str) -> Result<SpaceId, &'static str> {
+    let number = text.trim().parse().ok();
+    number
+        .and_then(SpaceId::new)
+        .ok_or("a space is 0 (the OPC UA side), 1 (ROS 1) or 2 to 232")
 }
 
 /// Whom of its environment to ask.

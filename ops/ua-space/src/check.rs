@@ -5,8 +5,8 @@ use std::io::{self, BufWriter, Write as _};
 use std::path::PathBuf;
 
 use mappings::{
-    Checked, Diagnostic, Environment, Mapping, Readers, Surroundings, TypeFiles, TypeOrigin,
-    TypeUse,
+    Checked, Diagnostic, Environment, Mapping, Readers, SpaceId, Surroundings, TypeFiles,
+    TypeOrigin, TypeUse,
 };
 use messages::Dialect;
 use serde::Serialize;
@@ -23,7 +23,11 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
     for file in &arguments.files {
         let text = read(file)?;
         let name = if file == "-" { "<stdin>" } else { file };
-        let mut checked = Mapping::from_text(&text, name, &Around::default());
+        let part = |checked: Checked| match arguments.spaces.as_slice() {
+            [] => checked,
+            spaces => checked.for_spaces(spaces),
+        };
+        let mut checked = part(Mapping::from_text(&text, name, &Around::default()));
         all_can_run &= checked.mapping.is_some();
         let mut seen = None;
         if !arguments.environment.is_empty()
@@ -33,13 +37,13 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
             let around = Around {
                 environment: Some(&found.environment),
             };
-            checked = Mapping::from_text(&text, name, &around);
+            checked = part(Mapping::from_text(&text, name, &around));
             all_there &= found.is_whole();
             seen = Some(found);
         }
         let asked = seen.as_ref().map(|seen| seen.asked.as_slice());
         if arguments.json {
-            let line = serde_json::to_string(&Told::of(name, &checked, asked))
+            let line = serde_json::to_string(&Told::of(name, &checked, asked, &arguments.spaces))
                 .map_err(|error| Failure::Data(format!("{name}: {error}")))?;
             writeln!(out, "{line}")?;
         } else {
@@ -50,7 +54,7 @@ pub(crate) fn check(arguments: &Check) -> Result<(), Failure> {
                     Some(why) => warn(&format!("error: {why}")),
                 }
             }
-            writeln!(out, "{}", sum(name, &checked))?;
+            writeln!(out, "{}", sum(name, &checked, &arguments.spaces))?;
         }
     }
     out.flush()?;
@@ -107,9 +111,15 @@ impl Surroundings for Around<'_> {
 }
 
 /// What there is, in a line.
-fn sum(name: &str, checked: &Checked) -> String {
+fn sum(name: &str, checked: &Checked, spaces: &[SpaceId]) -> String {
+    let numbers: Vec<String> = spaces.iter().map(ToString::to_string).collect();
+    let part = match spaces.len() {
+        0 => String::new(),
+        1 => format!(" for space {}", numbers.join("")),
+        _ => format!(" for the spaces {}", numbers.join(", ")),
+    };
     let Some(mapping) = &checked.mapping else {
-        return format!("{name} cannot run");
+        return format!("{name} cannot run{part}");
     };
     let several = |count: usize, what: &str| match count {
         1 => format!("1 {what}"),
@@ -120,7 +130,7 @@ fn sum(name: &str, checked: &Checked) -> String {
         several(mapping.patterns().len(), "pattern"),
         several(mapping.spaces().len(), "ROS space"),
     ];
-    format!("{name} can run: {}", parts.join(", "))
+    format!("{name} can run{part}: {}", parts.join(", "))
 }
 
 #[derive(Serialize)]
@@ -128,6 +138,9 @@ fn sum(name: &str, checked: &Checked) -> String {
 struct Told<'a> {
     file: &'a str,
     can_run: bool,
+    /// The spaces of the host it was asked for.
+    #[serde(rename = "for", skip_serializing_if = "Vec::is_empty")]
+    spaces: Vec<u8>,
     findings: Vec<Finding<'a>>,
     /// The message and service types it names.
     types: Vec<Type<'a>>,
@@ -175,13 +188,22 @@ struct Finding<'a> {
     label: Option<&'a str>,
     #[serde(skip_serializing_if = "Option::is_none")]
     help: Option<&'a str>,
+    /// The spaces whose programs it stops, where it does not stop all.
+    #[serde(rename = "neededBy", skip_serializing_if = "Vec::is_empty")]
+    needed_by: Vec<u8>,
 }
 
 impl<'a> Told<'a> {
-    fn of(file: &'a str, checked: &'a Checked, environment: Option<&'a [Asked]>) -> Self {
+    fn of(
+        file: &'a str,
+        checked: &'a Checked,
+        environment: Option<&'a [Asked]>,
+        spaces: &[SpaceId],
+    ) -> Self {
         Self {
             file,
             can_run: checked.mapping.is_some(),
+            spaces: spaces.iter().map(|space| space.get()).collect(),
             findings: checked
                 .findings
                 .iter()
@@ -205,6 +227,7 @@ impl<'a> Finding<'a> {
             message: &found.message,
             label: found.label.as_deref(),
             help: found.help.as_deref(),
+            needed_by: found.needed_by.iter().map(|space| space.get()).collect(),
         }
     }
 }

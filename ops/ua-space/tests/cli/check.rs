@@ -74,6 +74,38 @@ fn a_program_gets_the_same_as_json() {
     assert_eq!(minimal["canRun"], true);
 }
 
+/// A ROS 2 robot of a make whose definitions are on its own host only.
+const FOREIGN: &str = "spaces: [{id: 1}, {id: 2}]\nnamespaces: {2: urn:x}\nvariables:\n\
+    - {node: ns=2;i=1, name: Arm, origin: 1, ros: [{topic: /arm, type: std_msgs/Bool}, \
+    {space: 2, topic: /arm, type: their_msgs/Arm}]}\n";
+
+#[test]
+fn each_host_has_its_part_checked() {
+    let path = file("foreign.yaml", FOREIGN);
+    for (spaces, code, severity, sum) in [
+        ("1", 0, "warning[M063]", "can run for space 1: 1 variable"),
+        ("0", 0, "warning[M063]", "can run for space 0: 1 variable"),
+        ("2", 78, "error[M063]", "cannot run for space 2"),
+        ("1,2", 78, "error[M063]", "cannot run for the spaces 1, 2"),
+    ] {
+        let ended = run(&["check", "--for", spaces, &path]);
+        assert_eq!(ended.code, code, "{}", ended.stdout);
+        for wanted in [severity, sum] {
+            assert!(ended.stdout.contains(wanted), "{}", ended.stdout);
+        }
+    }
+    assert_eq!(run(&["check", &path]).code, 78);
+    assert_eq!(run(&["check", "--for", "233", &path]).code, 64);
+    let told = run(&["check", "--json", "--for", "1", &path]).quiet();
+    let told: Value = serde_json::from_str(&told).unwrap();
+    assert_eq!((&told["for"], &told["canRun"]), (&json!([1]), &json!(true)));
+    let finding = &told["findings"][0];
+    assert_eq!(
+        (&finding["severity"], &finding["neededBy"]),
+        (&json!("warning"), &json!([2]))
+    );
+}
+
 #[test]
 fn each_type_is_told_with_where_it_is_from() {
     let folder = std::env::temp_dir().join(format!("ua-space-types-{}", std::process::id()));
