@@ -274,6 +274,7 @@ fn write_headers(
     let form = Form {
         message_type: whole.message_type,
         chunk: true,
+        action: false,
         extras,
     };
     let writer_id = whole

@@ -125,7 +125,7 @@ impl<'a> DataSetMessage<'a> {
     ) -> Result<Self, DecodeError> {
         let flags1 = reader.u8("DataSetFlags1")?;
         let valid = flags1 & VALID != 0;
-        let (head, kind) = match Head::read(flags1, &mut reader) {
+        let (head, kind) = match Head::read(flags1, &mut reader, read_kind) {
             Ok(read) => read,
             // Nothing behind a cleared valid bit means anything, not even the flags.
             Err(_) if !valid => (Head::INVALID, MessageKind::KeyFrame),
@@ -411,7 +411,7 @@ impl std::iter::FusedIterator for Fields<'_> {}
 
 /// The flags and the header fields they announce, checked to be there.
 #[derive(Debug, Clone, Copy)]
-struct Head<'a> {
+pub(crate) struct Head<'a> {
     flags1: u8,
     flags2: u8,
     fields: &'a [u8],
@@ -424,8 +424,13 @@ impl<'a> Head<'a> {
         fields: &[],
     };
 
+    /// Reads what follows DataSetFlags1; `read_kind` makes the type of message of DataSetFlags2.
     #[inline]
-    fn read(flags1: u8, reader: &mut Reader<'a>) -> Result<(Self, MessageKind), DecodeError> {
+    pub(crate) fn read<K>(
+        flags1: u8,
+        reader: &mut Reader<'a>,
+        read_kind: impl FnOnce(u8) -> Result<K, DecodeError>,
+    ) -> Result<(Self, K), DecodeError> {
         let flags2 = match flags1 & FLAGS2 {
             0 => 0,
             _ => reader.u8("DataSetFlags2")?,
@@ -436,7 +441,14 @@ impl<'a> Head<'a> {
                 value: 3,
             });
         }
-        let kind = read_kind(flags2)?;
+        let reserved = flags2 & FLAGS2_RESERVED;
+        if reserved != 0 {
+            return Err(DecodeError::Reserved {
+                field: "DataSetFlags2",
+                value: reserved.into(),
+            });
+        }
+        let kind = read_kind(flags2 & KIND)?;
         let sizes = [
             (flags1 & SEQUENCE_NUMBER, 2),
             (flags2 & TIMESTAMP, 8),
@@ -466,7 +478,7 @@ impl<'a> Head<'a> {
     }
 
     #[inline]
-    fn fields(&self) -> DataSetHeader {
+    pub(crate) fn fields(&self) -> DataSetHeader {
         match self.read_fields() {
             Ok(fields) => fields,
             // Only of an invalid message, which has nothing to read.
@@ -526,20 +538,15 @@ const RAW_DATA: DecodeError =
     DecodeError::Misread("encoded as RawData, to be read with its DataSetMetaData");
 
 #[inline]
-fn read_kind(flags2: u8) -> Result<MessageKind, DecodeError> {
-    let reserved = flags2 & FLAGS2_RESERVED;
-    if reserved != 0 {
-        return Err(DecodeError::Reserved {
-            field: "DataSetFlags2",
-            value: reserved.into(),
-        });
-    }
-    match flags2 & KIND {
+fn read_kind(kind: u8) -> Result<MessageKind, DecodeError> {
+    match kind {
         KIND_KEY_FRAME => Ok(MessageKind::KeyFrame),
         KIND_DELTA_FRAME => Ok(MessageKind::DeltaFrame),
         KIND_EVENT => Ok(MessageKind::Event),
         KIND_KEEP_ALIVE => Ok(MessageKind::KeepAlive),
-        5 | 6 => Err(DecodeError::Unsupported("Action")),
+        KIND_ACTION_REQUEST | KIND_ACTION_RESPONSE => Err(DecodeError::Misread(
+            "an Action, to be read with its ActionHeader",
+        )),
         kind => Err(DecodeError::Reserved {
             field: "DataSetMessage type",
             value: kind.into(),
@@ -549,7 +556,7 @@ fn read_kind(flags2: u8) -> Result<MessageKind, DecodeError> {
 
 /// What stands behind the end of a message may only be the zero padding to its ConfiguredSize.
 #[inline]
-fn check_padding(rest: &[u8]) -> Result<(), DecodeError> {
+pub(crate) fn check_padding(rest: &[u8]) -> Result<(), DecodeError> {
     match rest.iter().all(|byte| *byte == 0) {
         true => Ok(()),
         false => Err(DecodeError::TrailingBytes(rest.len())),
@@ -557,7 +564,7 @@ fn check_padding(rest: &[u8]) -> Result<(), DecodeError> {
 }
 
 pub(crate) const VALID: u8 = 0x01;
-const FIELD_ENCODING: u8 = 0x06;
+pub(crate) const FIELD_ENCODING: u8 = 0x06;
 pub(crate) const SEQUENCE_NUMBER: u8 = 0x08;
 pub(crate) const STATUS: u8 = 0x10;
 pub(crate) const MAJOR_VERSION: u8 = 0x20;
@@ -573,6 +580,8 @@ pub(crate) const KIND_KEY_FRAME: u8 = 0;
 pub(crate) const KIND_DELTA_FRAME: u8 = 1;
 pub(crate) const KIND_EVENT: u8 = 2;
 pub(crate) const KIND_KEEP_ALIVE: u8 = 3;
+pub(crate) const KIND_ACTION_REQUEST: u8 = 5;
+pub(crate) const KIND_ACTION_RESPONSE: u8 = 6;
 pub(crate) const TIMESTAMP: u8 = 0x10;
 pub(crate) const PICOSECONDS: u8 = 0x20;
 const FLAGS2_RESERVED: u8 = 0xC0;

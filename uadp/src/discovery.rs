@@ -150,6 +150,7 @@ fn write_headers(
     let form = Form {
         message_type,
         chunk: false,
+        action: false,
         extras: &Extras {
             promoted_fields: None,
             security: Some(security),

@@ -1,5 +1,6 @@
 //! Writing a NetworkMessage: headers first, then one DataSetMessage after the other, in one pass.
 
+use crate::action::ActionHeader;
 use crate::data_set_message as message;
 use crate::field_encoder::{DataValueEncoder, DeltaEncoder, FieldEncoder};
 use crate::header_writer::{self, Extras, Form, PayloadHeader};
@@ -12,8 +13,8 @@ use crate::{DataSetHeader, EncodeError, NetworkHeader, NetworkMessageType, Seal,
 #[derive(Debug)]
 #[must_use = "a message is complete with `finish`"]
 pub struct NetworkMessageEncoder<'b> {
-    buf: &'b mut Vec<u8>,
-    progress: Progress,
+    pub(crate) buf: &'b mut Vec<u8>,
+    pub(crate) progress: Progress,
     timestamp_at: Option<usize>,
     /// Where the NetworkMessage and its payload start in the buffer.
     start: usize,
@@ -99,6 +100,18 @@ impl<'b> NetworkMessageEncoder<'b> {
         writer_ids: Option<&[u16]>,
         extras: &Extras<'_>,
     ) -> Result<Self, EncodeError> {
+        Self::with_action(buf, header, writer_ids, extras, None)
+    }
+
+    /// As [`with`](Self::with); the payload starts with an ActionHeader where there is one.
+    #[inline]
+    pub(crate) fn with_action(
+        buf: &'b mut Vec<u8>,
+        header: &NetworkHeader<'_>,
+        writer_ids: Option<&[u16]>,
+        extras: &Extras<'_>,
+        action: Option<&ActionHeader<'_>>,
+    ) -> Result<Self, EncodeError> {
         let start = buf.len();
         let ids = writer_ids.map_or(PayloadHeader::None, PayloadHeader::Count);
         let timestamp_at = header_writer::write(
@@ -108,14 +121,19 @@ impl<'b> NetworkMessageEncoder<'b> {
             Form {
                 message_type: NetworkMessageType::DataSet,
                 chunk: false,
+                action: action.is_some(),
                 extras,
             },
         )?;
         let payload_at = buf.len();
+        if let Some(action) = action {
+            action.write(buf)?;
+        }
         let announced = writer_ids.map_or(1, <[u16]>::len);
         let sizes_at = (announced > 1).then(|| {
-            buf.resize(payload_at + announced * 2, 0);
-            payload_at
+            let sizes_at = buf.len();
+            buf.resize(sizes_at + announced * 2, 0);
+            sizes_at
         });
         let progress = Progress {
             announced,
@@ -342,7 +360,7 @@ impl<'b> NetworkMessageEncoder<'b> {
         Ok(())
     }
 
-    /// Position in the buffer of the payload: of the Sizes with several DataSetMessages, else of the DataSetMessage.
+    /// Position in the buffer of the payload: of the ActionHeader where there is one, of the Sizes with several DataSetMessages, else of the DataSetMessage.
     #[must_use]
     pub const fn payload_offset(&self) -> usize {
         self.payload_at
@@ -355,7 +373,7 @@ impl<'b> NetworkMessageEncoder<'b> {
     }
 
     #[inline]
-    fn begin_message(&mut self) -> Result<(), EncodeError> {
+    pub(crate) fn begin_message(&mut self) -> Result<(), EncodeError> {
         let Progress {
             announced,
             written,
@@ -382,7 +400,7 @@ pub(crate) struct Offsets {
 
 /// Appends the header of a DataSetMessage and, where it has one, room for the FieldCount.
 #[inline]
-fn write_data_set_header(
+pub(crate) fn write_data_set_header(
     buf: &mut Vec<u8>,
     header: &DataSetHeader,
     kind: u8,

@@ -123,8 +123,9 @@ fn read_extended_flags2(reader: &mut Reader<'_>) -> Result<u8, DecodeError> {
     if message_type > ANNOUNCEMENT {
         return Err(reserved("NetworkMessage type", message_type >> 2));
     }
-    if flags & ACTION_HEADER != 0 {
-        return Err(DecodeError::Unsupported("Action"));
+    // Requests and responses are DataSetMessages (OPC 10000-14, 7.2.4.2).
+    if flags & ACTION_HEADER != 0 && message_type != 0 {
+        return Err(reserved("ActionHeader of a discovery message", flags));
     }
     Ok(flags)
 }
@@ -299,7 +300,7 @@ pub(crate) const PROMOTED_FIELDS: u8 = 0x02;
 const MESSAGE_TYPE: u8 = 0x1C;
 pub(crate) const PROBE: u8 = 1 << 2;
 pub(crate) const ANNOUNCEMENT: u8 = 2 << 2;
-const ACTION_HEADER: u8 = 0x20;
+pub(crate) const ACTION_HEADER: u8 = 0x20;
 const EXTENDED2_RESERVED: u8 = 0xC0;
 
 pub(crate) const WRITER_GROUP_ID: u8 = 0x01;

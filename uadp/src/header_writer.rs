@@ -31,6 +31,8 @@ pub(crate) enum PayloadHeader<'a> {
 pub(crate) struct Form<'a> {
     pub(crate) message_type: NetworkMessageType,
     pub(crate) chunk: bool,
+    /// An ActionHeader stands at the start of the payload.
+    pub(crate) action: bool,
     pub(crate) extras: &'a Extras<'a>,
 }
 
@@ -149,6 +151,7 @@ fn write_flags(
     form: Form<'_>,
 ) {
     let extended2 = flag(form.chunk, header::CHUNK)
+        | flag(form.action, header::ACTION_HEADER)
         | flag(
             form.extras.promoted_fields.is_some(),
             header::PROMOTED_FIELDS,

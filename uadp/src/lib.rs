@@ -1,7 +1,7 @@
 //! UADP, the binary message mapping of OPC UA PubSub: NetworkMessages to and from bytes.
 //!
-//! Everything in OPC 10000-14, 7.2.4 but Actions, in the versions 1.04 and 1.05, with the readings of the standard that
-//! peers differ in:
+//! Everything in OPC 10000-14, 7.2.4, in the versions 1.04 and 1.05, with the readings of the standard that peers differ
+//! in:
 //!
 //! | what | where |
 //! |---|---|
@@ -13,9 +13,11 @@
 //! | chunks | [`Chunks`], [`Reassembler`] |
 //! | message security: PubSub-Aes128-CTR and PubSub-Aes256-CTR | [`Opener`], [`Sealer`] |
 //! | probes and announcements, DataSetMetaData | [`discovery`] |
+//! | requests and responses of Actions | [`action`] |
 //! | sequence numbers, timeouts and states | [`DataSetReaderState`], [`ReaderTable`], [`DataSetWriterState`] |
 //!
-//! Actions and Variants of the builtin types 26 to 31, which are not assigned yet, are [`DecodeError::Unsupported`].
+//! Variants of the builtin types 26 to 31, which are not assigned yet, and chunks with an ActionHeader are
+//! [`DecodeError::Unsupported`].
 //!
 //! No sockets, no clock, no thread, no randomness: bytes, times and random numbers are parameters. Reading borrows from
 //! the datagram and allocates nothing; decrypting and reassembling use buffers that stay. Counts and lengths are held
@@ -64,6 +66,7 @@
 //! # Ok::<(), uadp::EncodeError>(())
 //! ```
 
+pub mod action;
 mod builtin;
 mod chunk;
 mod configuration_version;

@@ -1,5 +1,6 @@
 //! NetworkMessage: the header of a datagram, and where its DataSetMessages lie.
 
+use crate::action::{ActionDialect, Actions};
 use crate::header::{self, Flags};
 use crate::reader::Reader;
 use crate::{
@@ -10,7 +11,7 @@ use crate::{
 /// A datagram whose headers were read (OPC 10000-14, 7.2.4.4.2). What follows them is read on demand.
 ///
 /// The payload of a signed or encrypted message is readable once it was opened with the keys of its SecurityGroup,
-/// that of a chunk once it was reassembled. Actions are [`DecodeError::Unsupported`].
+/// that of a chunk once it was reassembled. What an Action message holds is read by [`actions`](Self::actions).
 #[derive(Debug, Clone)]
 pub struct NetworkMessage<'a> {
     datagram: &'a [u8],
@@ -30,6 +31,7 @@ pub struct NetworkMessage<'a> {
 struct Rest<'a> {
     message_type: NetworkMessageType,
     chunk: bool,
+    action: bool,
     promoted: Option<&'a [u8]>,
     security: Option<SecurityHeader<'a>>,
     /// Signed or encrypted, and not opened yet.
@@ -222,6 +224,13 @@ impl<'a> NetworkMessage<'a> {
         self.rest.is_some_and(|rest| rest.chunk)
     }
 
+    /// True for requests or responses of Actions: read them with [`actions`](Self::actions).
+    #[inline]
+    #[must_use]
+    pub fn is_action(&self) -> bool {
+        self.rest.is_some_and(|rest| rest.action)
+    }
+
     /// The SecurityHeader. Only what it says of `signed` and `encrypted` tells whether the message is secured.
     #[must_use]
     pub fn security(&self) -> Option<SecurityHeader<'a>> {
@@ -250,7 +259,8 @@ impl<'a> NetworkMessage<'a> {
         })
     }
 
-    /// What stands behind the headers. Of a sealed message that is the ciphertext, the footer and the signature.
+    /// What stands behind the headers. Of a sealed message that is the ciphertext, the footer and the signature; the
+    /// ActionHeader of an Action message belongs to it.
     #[must_use]
     pub const fn payload(&self) -> &'a [u8] {
         self.payload.rest()
@@ -287,14 +297,18 @@ impl<'a> NetworkMessage<'a> {
     /// The piece of a chunk NetworkMessage.
     ///
     /// # Errors
-    /// [`DecodeError::Misread`] when it is no chunk or still sealed. Else fails when the header of the chunk is cut off,
-    /// the piece is empty, or reaches past the end of the whole.
+    /// [`DecodeError::Misread`] when it is no chunk or still sealed, [`DecodeError::Unsupported`] for one with an
+    /// ActionHeader. Else fails when the header of the chunk is cut off, the piece is empty, or reaches past the end of
+    /// the whole.
     pub fn chunk(&self) -> Result<Chunk<'a>, DecodeError> {
         if self.is_sealed() {
             return Err(DecodeError::Misread(SEALED));
         }
         if !self.is_chunk() {
             return Err(DecodeError::Misread("no chunk"));
+        }
+        if self.is_action() {
+            return Err(DecodeError::Unsupported("a chunk with an ActionHeader"));
         }
         let mut payload = self.payload;
         let message_sequence_number = payload.u16("MessageSequenceNumber")?;
@@ -322,7 +336,7 @@ impl<'a> NetworkMessage<'a> {
     /// The DataSetMessages. Without payload header that is one, without a DataSetWriterId; where several are
     /// configured without one, see [`data_set_message_at`](Self::data_set_message_at).
     ///
-    /// A chunk, a discovery message and a sealed message give one [`DecodeError::Misread`].
+    /// A chunk, a discovery message, an Action message and a sealed message give one [`DecodeError::Misread`].
     #[inline]
     #[must_use]
     pub fn messages(&self) -> Messages<'a> {
@@ -365,6 +379,25 @@ impl<'a> NetworkMessage<'a> {
         DataSetMessage::read(None, Reader::new(message))
     }
 
+    /// The requests or responses of an Action message (OPC 10000-14, 7.2.4.5.9 and 7.2.4.5.10), laid out as the peer
+    /// does it.
+    ///
+    /// # Errors
+    /// [`DecodeError::Misread`] when it is no Action message, a chunk, or still sealed; [`DecodeError::Reserved`] when it
+    /// does not name its responder, with a PublisherId and a payload header; else as the ActionHeader is cut off or
+    /// malformed.
+    pub fn actions(&self, dialect: ActionDialect) -> Result<Actions<'a>, DecodeError> {
+        match self.rest.as_ref() {
+            Some(rest) if rest.sealed => Err(DecodeError::Misread(SEALED)),
+            Some(rest) if rest.chunk => Err(DecodeError::Misread(CHUNK)),
+            Some(rest) if rest.action => {
+                let header = self.header();
+                Actions::read(&header, self.writer_ids, self.payload, dialect)
+            }
+            Some(_) | None => Err(DecodeError::Misread("no Action message")),
+        }
+    }
+
     #[inline]
     fn misread(&self) -> Option<&'static str> {
         self.rest.as_ref().and_then(Rest::misread)
@@ -394,6 +427,7 @@ impl<'a> Rest<'a> {
         Ok(Self {
             message_type: flags.message_type(),
             chunk: flags.extended2 & header::CHUNK != 0,
+            action: flags.extended2 & header::ACTION_HEADER != 0,
             promoted,
             security,
             sealed,
@@ -407,7 +441,10 @@ impl<'a> Rest<'a> {
             return Some(SEALED);
         }
         if self.chunk {
-            return Some("a chunk, to be reassembled first");
+            return Some(CHUNK);
+        }
+        if self.action {
+            return Some("an Action message");
         }
         match self.message_type {
             NetworkMessageType::DataSet => None,
@@ -418,6 +455,7 @@ impl<'a> Rest<'a> {
 }
 
 const SEALED: &str = "secured, to be opened with its keys first";
+const CHUNK: &str = "a chunk, to be reassembled first";
 
 impl<'a> Iterator for Messages<'a> {
     type Item = Result<DataSetMessage<'a>, DecodeError>;

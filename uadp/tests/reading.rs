@@ -247,15 +247,6 @@ fn reserved_encodings_of_values_are_refused() {
     );
 }
 
-#[test]
-fn what_this_crate_does_not_read_is_named() {
-    let unsupported = |what| Err(DecodeError::Unsupported(what));
-    assert_eq!(fields(&[0x81, 5]).map(|_| ()), unsupported("Action"));
-    assert_eq!(fields(&[0x81, 6]).map(|_| ()), unsupported("Action"));
-    let action_header = NetworkMessage::decode(&[0x81, 0x80, 0x20]).map(|_| ());
-    assert_eq!(action_header, unsupported("Action"));
-}
-
 /// OPC 10000-6, 5.2.2.16: decoders take what types 26 to 31 hold for ByteStrings; encoders do not use them.
 #[test]
 fn a_variant_of_a_type_yet_to_come_is_read_as_its_bytes() {

@@ -1,0 +1,47 @@
+//! Actions: bytes by the tables, what is written comes back, and who asks and who answers understand each other.
+
+#![expect(clippy::unwrap_used, clippy::indexing_slicing, reason = "test code")]
+
+mod codec;
+mod secured;
+mod vectors;
+
+use uadp::action::{ActionDialect, ActionEncoder, ActionMessage, ActionStart};
+use uadp::{EncodeError, Extras, NetworkMessage};
+
+const STANDARD: ActionDialect = ActionDialect::Standard;
+
+/// The messages of a datagram, all of them readable.
+fn read(datagram: &[u8], dialect: ActionDialect) -> Vec<ActionMessage<'_>> {
+    let network = NetworkMessage::decode(datagram).unwrap();
+    network
+        .actions(dialect)
+        .unwrap()
+        .map(Result::unwrap)
+        .collect()
+}
+
+/// A datagram once more from what was read of it.
+fn rewrite(datagram: &[u8], dialect: ActionDialect) -> Result<Vec<u8>, EncodeError> {
+    let network = NetworkMessage::decode(datagram).unwrap();
+    let actions = network.actions(dialect).unwrap();
+    let start = ActionStart {
+        network: network.header(),
+        action: *actions.header(),
+        dialect,
+        extras: Extras {
+            security: network.security(),
+            ..Extras::default()
+        },
+    };
+    let ids: Vec<u16> = network.writer_ids().unwrap().collect();
+    // Not from the start of the buffer: every position in it is relative.
+    let mut out = vec![0xAA; 3];
+    let mut encoder = ActionEncoder::new(&mut out, &start, &ids)?;
+    for message in actions {
+        let message = message.unwrap();
+        encoder.fields(&message.header(), message.call(), message.fields)?;
+    }
+    encoder.finish()?;
+    Ok(out.split_off(3))
+}
