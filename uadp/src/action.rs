@@ -7,6 +7,11 @@
 //!
 //! There are two readings of the standard, an [`ActionDialect`] each. Nothing on the wire tells them apart.
 //!
+//! [`Requestor`] and [`Responder`] are what makes calls of messages that may get lost: the one repeats, acknowledges and
+//! gives up, the other executes once and remembers what it answered. Both take times and messages in and give messages
+//! out, and have no socket, clock or randomness of their own. How a Responder's states change
+//! follows here from the table of the Requestor's (OPC 10000-14, 6.2.11.2.2); the table of its own was not at hand.
+//!
 //! # Chunks
 //! A request or response has to fit in one NetworkMessage. One in chunks is not read, since the requests of all
 //! Requestors carry the PublisherId of the Responder: only the ActionHeader tells whose piece it is, which a
@@ -68,9 +73,24 @@
 mod encoder;
 mod header;
 mod message;
+mod outcome;
+mod requestor;
+mod responder;
+mod sending;
+mod timers;
 
 pub use encoder::{ActionCall, ActionEncoder, ActionStart};
 pub use header::{ActionHeader, ActionKind};
 pub use message::{
     ActionDialect, ActionEncoding, ActionFields, ActionMessage, ActionState, Actions,
 };
+pub use outcome::{Outcome, Refusal, Unknown};
+pub use requestor::{
+    ActionRequest, CallId, CallRefusal, Heard, Requestor, RequestorCounters, RequestorSettings,
+    ResponseDrop,
+};
+pub use responder::{
+    ExecutionId, FinishRefusal, RequestDrop, Requested, Responder, ResponderCounters,
+    ResponderSettings,
+};
+pub use sending::{ActionAddress, ActionToSend};

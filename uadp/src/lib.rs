@@ -14,6 +14,7 @@
 //! | message security: PubSub-Aes128-CTR and PubSub-Aes256-CTR | [`Opener`], [`Sealer`] |
 //! | probes and announcements, DataSetMetaData | [`discovery`] |
 //! | requests and responses of Actions | [`action`] |
+//! | calls over a network that loses messages | [`action::Requestor`], [`action::Responder`] |
 //! | sequence numbers, timeouts and states | [`DataSetReaderState`], [`ReaderTable`], [`DataSetWriterState`] |
 //!
 //! Variants of the builtin types 26 to 31, which are not assigned yet, and chunks with an ActionHeader are

@@ -1,8 +1,17 @@
 //! Actions: bytes by the tables, what is written comes back, and who asks and who answers understand each other.
 
-#![expect(clippy::unwrap_used, clippy::indexing_slicing, reason = "test code")]
+#![expect(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    clippy::panic,
+    reason = "test code"
+)]
 
 mod codec;
+mod link;
+mod peers;
+mod requestor;
+mod responder;
 mod secured;
 mod vectors;
 

@@ -1,0 +1,565 @@
+//! The answering side: each request executed at most once, and answered as often as it is asked for.
+
+mod entry;
+mod settings;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::time::Duration;
+
+use super::sending::KeptFields;
+use super::timers::Timers;
+use super::{
+    ActionDialect, ActionFields, ActionHeader, ActionKind, ActionMessage, ActionState,
+    ActionToSend, Outcome, Refusal,
+};
+use crate::{OwnedPublisherId, StatusCode};
+use entry::{Entry, Key, Phase};
+pub use settings::{
+    ExecutionId, FinishRefusal, RequestDrop, Requested, ResponderCounters, ResponderSettings,
+};
+
+/// Answers requests that come over a network that may lose, double, delay and reorder them
+/// (OPC 10000-14, 6.2.11.2.2).
+///
+/// A request is known by RequestorId, CorrelationData and RequestId, and executed at most once: whoever owns the
+/// Responder executes what [`handle_request`](Self::handle_request) says, and tells what came out by
+/// [`finish`](Self::finish) or [`refuse`](Self::refuse). Until then the Responder says Executing at every publishing
+/// interval, afterwards Done, until the Requestor wants Idle or it was said
+/// [`done_repeats`](ResponderSettings::done_repeats). A repetition is answered once more, at most once an interval.
+///
+/// What was asked is remembered for [`remember`](ResponderSettings::remember) after it was heard of last, refusals and
+/// acknowledged answers too: a request that the network doubles and delays for longer than that is executed again, as is
+/// one repeated to a Responder that started anew. With message security [`Opener`](crate::Opener) lets no message
+/// through twice, however late. While there is no room to remember one more, new requests are dropped and not answered:
+/// a refusal that is forgotten could be executed by a repetition after all.
+///
+/// Where answers go is the owner's matter: `P` is whatever it takes to send there, given with the request. To answer
+/// where a request asks to be answered lets everybody send the answers to others.
+///
+/// A peer of [`ActionDialect::UaNetStandard`] is answered once, without repetition. Its messages have no place for a
+/// status, so an outcome that needs one is not told at all.
+///
+/// `now` counts from any fixed time.
+/// ```
+/// use std::time::Duration;
+/// use uadp::action::{
+///     ActionAddress, ActionDialect, ActionFields, ActionRequest, Heard, Outcome, Requested, Requestor,
+///     RequestorSettings, Responder, ResponderSettings,
+/// };
+/// use uadp::{Extras, NetworkHeader, NetworkMessage, OwnedPublisherId, StatusCode};
+///
+/// const STANDARD: ActionDialect = ActionDialect::Standard;
+/// let mut requestor = Requestor::new(OwnedPublisherId::UInt16(1), [7; 16], RequestorSettings::default());
+/// let mut responder = Responder::new(ResponderSettings::default());
+/// let address = ActionAddress {
+///     publisher_id: OwnedPublisherId::UInt16(2),
+///     writer_group_id: Some(5),
+///     writer_id: 61,
+///     target_id: 1,
+/// };
+/// let now = Duration::ZERO;
+/// let request = ActionRequest {
+///     address,
+///     dialect: STANDARD,
+///     fields: ActionFields::NONE,
+///     timeout: Duration::from_secs(3),
+/// };
+/// let call = requestor.call(request, now)?;
+///
+/// let mut datagram = Vec::new();
+/// let request = requestor.poll_transmit(now).unwrap();
+/// request.encode(&mut datagram, &NetworkHeader::default(), &Extras::default())?.finish()?;
+///
+/// let received = NetworkMessage::decode(&datagram)?;
+/// let request = received.actions(STANDARD)?.next().unwrap()?;
+/// let Requested::Execute(execution) = responder.handle_request(&request, "the group", now)? else {
+///     panic!("a new request");
+/// };
+/// let answer = Outcome::Answered { status: StatusCode::GOOD, fields: ActionFields::NONE };
+/// responder.finish(execution, answer, now)?;
+///
+/// datagram.clear();
+/// let (to, response) = responder.poll_transmit(now).unwrap();
+/// assert_eq!(*to, "the group");
+/// response.encode(&mut datagram, &NetworkHeader::default(), &Extras::default())?.finish()?;
+///
+/// let received = NetworkMessage::decode(&datagram)?;
+/// let response = received.actions(STANDARD)?.next().unwrap()?;
+/// assert_eq!(requestor.handle_response(&response, now)?, Heard::Done(call, answer));
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
+#[derive(Debug)]
+pub struct Responder<P> {
+    settings: ResponderSettings,
+    next: u64,
+    entries: BTreeMap<u64, Entry<P>>,
+    ids: BTreeMap<Key, u64>,
+    timers: Timers,
+    /// What each Requestor takes up.
+    usage: BTreeMap<Option<OwnedPublisherId>, Usage>,
+    total: Usage,
+    executing: usize,
+    /// Executions past their deadline that were not told yet.
+    overdue: BTreeSet<u64>,
+    counters: ResponderCounters,
+}
+
+/// Room that is taken up.
+#[derive(Debug, Clone, Copy, Default)]
+struct Usage {
+    requests: usize,
+    bytes: usize,
+}
+
+impl<P> Responder<P> {
+    /// A Responder that was not asked anything.
+    #[must_use]
+    pub fn new(settings: ResponderSettings) -> Self {
+        Self {
+            settings,
+            next: 0,
+            entries: BTreeMap::new(),
+            ids: BTreeMap::new(),
+            timers: Timers::new(),
+            usage: BTreeMap::new(),
+            total: Usage::default(),
+            executing: 0,
+            overdue: BTreeSet::new(),
+            counters: ResponderCounters::default(),
+        }
+    }
+
+    /// Takes a request, whose answer goes to `reply_to`; a repetition is answered where the first one was.
+    ///
+    /// # Errors
+    /// It is not taken, for the reason given, and not answered.
+    pub fn handle_request(
+        &mut self,
+        request: &ActionMessage<'_>,
+        reply_to: P,
+        now: Duration,
+    ) -> Result<Requested, RequestDrop> {
+        self.handle_timeout(now);
+        let requested = self.hear(request, reply_to, now);
+        match requested {
+            Ok(Requested::Execute(_)) => self.counters.executed += 1,
+            Ok(Requested::Refused(..)) => self.counters.refused += 1,
+            Ok(Requested::Repeated(_)) => self.counters.repeated += 1,
+            Ok(Requested::Abandoned(_)) => self.counters.abandoned += 1,
+            Ok(Requested::Closed(_)) => self.counters.closed += 1,
+            Err(_) => self.counters.dropped += 1,
+        }
+        requested
+    }
+
+    /// Says what came out of an execution, for it to be answered.
+    ///
+    /// # Errors
+    /// The outcome is not told, for the reason given.
+    pub fn finish(
+        &mut self,
+        execution: ExecutionId,
+        outcome: Outcome<'_>,
+        now: Duration,
+    ) -> Result<(), FinishRefusal> {
+        self.handle_timeout(now);
+        let id = execution.0;
+        let entry = self.entries.get(&id).ok_or(FinishRefusal::Forgotten)?;
+        let Phase::Executing { abandoned, .. } = entry.phase else {
+            return Err(FinishRefusal::Finished);
+        };
+        let dialect = entry.dialect;
+        let (mut status, mut fields) = outcome.to_response();
+        let mut told = Ok(());
+        if abandoned {
+            (status, fields) = (StatusCode::GOOD, ActionFields::NONE);
+            told = Err(FinishRefusal::Abandoned);
+        } else if !is_written_in(dialect, fields) {
+            (status, fields) = (BAD_ENCODING_ERROR, ActionFields::NONE);
+            told = Err(FinishRefusal::Encoding);
+        } else if !self.has_room_for(id, fields.bytes().len()) {
+            (status, fields) = (BAD_RESPONSE_TOO_LARGE, ActionFields::NONE);
+            told = Err(FinishRefusal::TooBig);
+        }
+        if told.is_ok() && dialect != ActionDialect::Standard && status != StatusCode::GOOD {
+            told = Err(FinishRefusal::NoStatus);
+        }
+        self.conclude(id, status, fields, now);
+        told
+    }
+
+    /// Says that a request is not executed.
+    ///
+    /// # Errors
+    /// As [`finish`](Self::finish).
+    pub fn refuse(
+        &mut self,
+        execution: ExecutionId,
+        refusal: Refusal,
+        now: Duration,
+    ) -> Result<(), FinishRefusal> {
+        self.finish(execution, Outcome::Refused(refusal), now)
+    }
+
+    /// Forgets what is too old, and notes which executions are past their deadline.
+    pub fn handle_timeout(&mut self, now: Duration) {
+        while let Some(id) = self.timers.due(now) {
+            let Some(entry) = self.entries.get_mut(&id) else {
+                return;
+            };
+            if now >= entry.expires(self.settings.remember) {
+                if let Phase::Executing { .. } = entry.phase {
+                    self.counters.lost += 1;
+                }
+                self.forget(id);
+                continue;
+            }
+            if entry.is_overdue(now) {
+                self.overdue.insert(id);
+            }
+            if entry.next_send.is_some_and(|at| at <= now) {
+                return;
+            }
+            self.schedule(id);
+        }
+    }
+
+    /// The next response that is due to be sent, and where to.
+    pub fn poll_transmit(&mut self, now: Duration) -> Option<(&P, ActionToSend<'_>)> {
+        self.handle_timeout(now);
+        let id = self.timers.due(now)?;
+        let interval = self.interval();
+        self.entries.get_mut(&id)?.sent(now, interval);
+        self.schedule(id);
+        self.counters.sent += 1;
+        let entry = self.entries.get(&id)?;
+        let (state, status, fields) = match &entry.phase {
+            Phase::Executing { .. } => (ActionState::Executing, None, ActionFields::NONE),
+            Phase::Done { status, fields, .. } => {
+                (ActionState::Done, Some(status.status()), fields.as_fields())
+            }
+            Phase::Closed => (ActionState::Idle, None, ActionFields::NONE),
+        };
+        let response = ActionToSend {
+            address: &entry.address,
+            action: ActionHeader {
+                correlation_data: entry.key.correlation_data.as_deref(),
+                requestor_id: entry.key.requestor_id.as_ref().map(OwnedPublisherId::as_id),
+                ..ActionHeader::new(ActionKind::Response)
+            },
+            request_id: entry.key.request_id,
+            state,
+            status: match entry.dialect {
+                ActionDialect::Standard => status,
+                ActionDialect::UaNetStandard(_) => None,
+            },
+            fields,
+            dialect: entry.dialect,
+        };
+        Some((&entry.reply_to, response))
+    }
+
+    /// An execution that is past its deadline: its Requestor does not wait any more. It is told once, and may still be
+    /// finished.
+    pub fn poll_overdue(&mut self) -> Option<ExecutionId> {
+        self.overdue.pop_first().map(ExecutionId)
+    }
+
+    /// When [`poll_transmit`](Self::poll_transmit) is to be called next.
+    #[must_use]
+    pub fn poll_timeout(&self) -> Option<Duration> {
+        self.timers.next()
+    }
+
+    /// Requests that are remembered, and bytes they take up.
+    #[must_use]
+    pub const fn held(&self) -> (usize, usize) {
+        (self.total.requests, self.total.bytes)
+    }
+
+    /// What was counted so far.
+    #[must_use]
+    pub const fn counters(&self) -> &ResponderCounters {
+        &self.counters
+    }
+
+    fn hear(
+        &mut self,
+        request: &ActionMessage<'_>,
+        reply_to: P,
+        now: Duration,
+    ) -> Result<Requested, RequestDrop> {
+        if request.action.kind == ActionKind::Response {
+            return Err(RequestDrop::Response);
+        }
+        let correlation_data = request.action.correlation_data.unwrap_or_default();
+        if correlation_data.len() > self.settings.max_correlation_data {
+            return Err(RequestDrop::CorrelationData(correlation_data.len()));
+        }
+        let key = Key::of(request);
+        let known = self.ids.get(&key).copied();
+        match (request.state, known) {
+            (ActionState::Done, _) => Err(RequestDrop::State),
+            (ActionState::Idle, _) if request.dialect != ActionDialect::Standard => {
+                Err(RequestDrop::State)
+            }
+            (ActionState::Executing, Some(id)) => self.repeated(id, request, now),
+            (ActionState::Idle, Some(id)) => self.acknowledged(id, request, now),
+            (ActionState::Executing | ActionState::Idle, None) => {
+                self.admit(key, request, reply_to, now)
+            }
+        }
+    }
+
+    /// A request that was not heard before.
+    fn admit(
+        &mut self,
+        key: Key,
+        request: &ActionMessage<'_>,
+        reply_to: P,
+        now: Duration,
+    ) -> Result<Requested, RequestDrop> {
+        let settings = &self.settings;
+        let used = self
+            .usage
+            .get(&key.requestor_id)
+            .copied()
+            .unwrap_or_default();
+        let cost = key.cost();
+        if used.requests >= settings.max_requests_per_requestor
+            || used.bytes + cost > settings.max_bytes_per_requestor
+        {
+            return Err(RequestDrop::RequestorFull);
+        }
+        if self.total.requests >= settings.max_requests
+            || self.total.bytes + cost > settings.max_bytes
+        {
+            return Err(RequestDrop::Full);
+        }
+        let id = self.next;
+        self.next += 1;
+        let execution = ExecutionId(id);
+        let (phase, requested) = match request.state {
+            // The request it takes back is lost or still under way: it is not executed any more.
+            ActionState::Idle | ActionState::Done => (Phase::Closed, Requested::Closed(execution)),
+            ActionState::Executing if self.executing >= settings.max_executing => {
+                let busy = Refusal::Busy;
+                let phase = Phase::done(busy.status_code(), ActionFields::NONE, settings);
+                (phase, Requested::Refused(execution, busy))
+            }
+            ActionState::Executing => {
+                let hint = request.action.timeout();
+                let timeout = hint.map_or(settings.timeout, |hint| hint.min(settings.max_timeout));
+                let phase = Phase::Executing {
+                    deadline: now.saturating_add(timeout),
+                    abandoned: false,
+                    overdue: false,
+                };
+                (phase, Requested::Execute(execution))
+            }
+        };
+        self.executing += usize::from(matches!(phase, Phase::Executing { .. }));
+        let interval = self.interval();
+        let mut entry = Entry {
+            key: key.clone(),
+            address: request.into(),
+            dialect: request.dialect,
+            reply_to,
+            arguments: fingerprint(request),
+            next_send: None,
+            phase,
+            touched: now,
+            last_sent: None,
+            answer_bytes: 0,
+            wake: now,
+        };
+        entry.answer(now, interval);
+        self.account(&key.requestor_id, |usage| {
+            usage.requests += 1;
+            usage.bytes += cost;
+        });
+        self.ids.insert(key, id);
+        self.entries.insert(id, entry);
+        self.schedule(id);
+        Ok(requested)
+    }
+
+    /// A request that was heard before.
+    fn repeated(
+        &mut self,
+        id: u64,
+        request: &ActionMessage<'_>,
+        now: Duration,
+    ) -> Result<Requested, RequestDrop> {
+        let interval = self.interval();
+        let entry = self.entries.get_mut(&id).ok_or(RequestDrop::Full)?;
+        let arguments = fingerprint(request);
+        // Of one that was taken back before it came, nothing is known.
+        let same = entry.arguments == arguments || matches!(entry.phase, Phase::Closed);
+        if !entry.address.is_of(request) || entry.dialect != request.dialect || !same {
+            return Err(RequestDrop::Reused);
+        }
+        entry.touched = now;
+        match entry.phase {
+            Phase::Executing { .. } | Phase::Done { .. } => entry.answer(now, interval),
+            // Late: it was acknowledged, or taken back.
+            Phase::Closed => {}
+        }
+        self.schedule(id);
+        Ok(Requested::Repeated(ExecutionId(id)))
+    }
+
+    /// The Requestor has the answer, or does not want it any more.
+    fn acknowledged(
+        &mut self,
+        id: u64,
+        request: &ActionMessage<'_>,
+        now: Duration,
+    ) -> Result<Requested, RequestDrop> {
+        let interval = self.interval();
+        let entry = self.entries.get_mut(&id).ok_or(RequestDrop::Full)?;
+        if !entry.address.is_of(request) || entry.dialect != request.dialect {
+            return Err(RequestDrop::Reused);
+        }
+        entry.touched = now;
+        let execution = ExecutionId(id);
+        let requested = match &mut entry.phase {
+            Phase::Executing { abandoned, .. } => {
+                let first = !std::mem::replace(abandoned, true);
+                entry.answer(now, interval);
+                match first {
+                    true => Requested::Abandoned(execution),
+                    false => Requested::Repeated(execution),
+                }
+            }
+            Phase::Done { .. } => {
+                entry.phase = Phase::Closed;
+                entry.last_sent = None;
+                entry.next_send = None;
+                entry.answer(now, interval);
+                self.drop_answer(id);
+                Requested::Closed(execution)
+            }
+            Phase::Closed => {
+                entry.answer(now, interval);
+                Requested::Repeated(execution)
+            }
+        };
+        self.schedule(id);
+        Ok(requested)
+    }
+
+    /// The execution is over, with this to say of it.
+    fn conclude(&mut self, id: u64, status: StatusCode, fields: ActionFields<'_>, now: Duration) {
+        let Some(entry) = self.entries.get_mut(&id) else {
+            return;
+        };
+        self.executing -= 1;
+        self.overdue.remove(&id);
+        entry.touched = now;
+        let Phase::Executing { abandoned, .. } = entry.phase else {
+            return;
+        };
+        if abandoned {
+            entry.phase = Phase::Closed;
+            entry.next_send = None;
+        } else {
+            let bytes = fields.bytes().len();
+            entry.answer_bytes = bytes;
+            entry.phase = Phase::done(status, fields, &self.settings);
+            // Executing was said a moment ago, maybe; the answer does not wait for that.
+            entry.last_sent = None;
+            entry.next_send = None;
+            entry.answer(now, Duration::ZERO);
+            let requestor = entry.key.requestor_id.clone();
+            self.account(&requestor, |usage| usage.bytes += bytes);
+        }
+        self.schedule(id);
+    }
+
+    fn has_room_for(&self, id: u64, bytes: usize) -> bool {
+        let Some(entry) = self.entries.get(&id) else {
+            return false;
+        };
+        let used = self.usage.get(&entry.key.requestor_id);
+        let used = used.map_or(0, |usage| usage.bytes);
+        bytes <= self.settings.max_answer
+            && self.total.bytes + bytes <= self.settings.max_bytes
+            && used + bytes <= self.settings.max_bytes_per_requestor
+    }
+
+    /// Frees the bytes of an answer nobody will ask for again.
+    fn drop_answer(&mut self, id: u64) {
+        if let Some(entry) = self.entries.get_mut(&id) {
+            let bytes = std::mem::take(&mut entry.answer_bytes);
+            let requestor = entry.key.requestor_id.clone();
+            self.account(&requestor, |usage| usage.bytes -= bytes);
+        }
+    }
+
+    fn forget(&mut self, id: u64) {
+        let Some(entry) = self.entries.remove(&id) else {
+            return;
+        };
+        self.timers.remove(id, entry.wake);
+        self.ids.remove(&entry.key);
+        self.overdue.remove(&id);
+        self.executing -= usize::from(matches!(entry.phase, Phase::Executing { .. }));
+        let bytes = entry.key.cost() + entry.answer_bytes;
+        self.account(&entry.key.requestor_id, |usage| {
+            usage.requests -= 1;
+            usage.bytes -= bytes;
+        });
+    }
+
+    fn account(&mut self, requestor: &Option<OwnedPublisherId>, change: impl Fn(&mut Usage)) {
+        change(&mut self.total);
+        let usage = self.usage.entry(requestor.clone()).or_default();
+        change(usage);
+        if usage.requests == 0 {
+            self.usage.remove(requestor);
+        }
+    }
+
+    fn schedule(&mut self, id: u64) {
+        let remember = self.settings.remember;
+        if let Some(entry) = self.entries.get_mut(&id) {
+            let next = entry.next_wake(remember);
+            self.timers.move_to(id, &mut entry.wake, next);
+        }
+    }
+
+    fn interval(&self) -> Duration {
+        self.settings.publishing_interval.max(LEAST_INTERVAL)
+    }
+}
+
+/// Tells other arguments under the same ids.
+fn fingerprint(request: &ActionMessage<'_>) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    request.fields.hash(&mut hasher);
+    hasher.finish()
+}
+
+/// The fields can be written in the dialect.
+fn is_written_in(dialect: ActionDialect, fields: ActionFields<'_>) -> bool {
+    use super::ActionEncoding::{RawData, Variant};
+    match (dialect, fields) {
+        (
+            ActionDialect::Standard | ActionDialect::UaNetStandard(Variant),
+            ActionFields::Variants(block),
+        ) => block.len() >= 2,
+        (ActionDialect::Standard, ActionFields::RawData { count, .. }) => count.is_some(),
+        (ActionDialect::UaNetStandard(RawData), ActionFields::RawData { .. }) => true,
+        // What has no fields has no encoding.
+        (ActionDialect::UaNetStandard(RawData), ActionFields::Variants(block)) => block == [0, 0],
+        (ActionDialect::UaNetStandard(Variant), ActionFields::RawData { .. }) => false,
+    }
+}
+
+const BAD_ENCODING_ERROR: StatusCode = StatusCode(0x8006_0000);
+const BAD_RESPONSE_TOO_LARGE: StatusCode = StatusCode(0x80B9_0000);
+
+/// What keeps a publishing interval of 0 from sending without end.
+const LEAST_INTERVAL: Duration = Duration::from_millis(1);

@@ -1,0 +1,389 @@
+//! Who answers: executes once, remembers, and holds no more than it may.
+
+use std::time::Duration;
+
+use uadp::action::{
+    ActionDialect, ActionEncoding, ActionFields, ActionRequest, ActionState, ExecutionId,
+    FinishRefusal, Outcome, Refusal, RequestDrop, Requested, Requestor, RequestorSettings,
+    Responder, ResponderSettings,
+};
+use uadp::{OwnedPublisherId, StatusCode};
+
+use super::STANDARD;
+use super::peers::{
+    ask, at, block, message, number, request, requestor, requests, responder, responses,
+};
+
+/// One request, as bytes.
+fn asked(arguments: i32) -> Vec<u8> {
+    let mut requestor = requestor();
+    let arguments = block(arguments);
+    requestor
+        .call(request(&arguments, at(5000)), at(0))
+        .unwrap();
+    requests(&mut requestor, at(0)).remove(0)
+}
+
+/// The request with ActionState Idle: the state stands in front of the fields.
+fn idle(asked: &[u8]) -> Vec<u8> {
+    let mut idle = asked.to_vec();
+    let state = idle.len() - block(0).len() - 1;
+    assert_eq!(idle[state], 1);
+    idle[state] = 0;
+    idle
+}
+
+fn execute(requested: Result<Requested, RequestDrop>) -> ExecutionId {
+    match requested {
+        Ok(Requested::Execute(execution)) => execution,
+        other => unreachable!("{other:?}"),
+    }
+}
+
+/// States of the responses that are due.
+fn due(responder: &mut Responder<u16>, now: u64) -> Vec<ActionState> {
+    responses(responder, at(now))
+        .iter()
+        .map(|datagram| message(datagram, STANDARD, |response| response.state))
+        .collect()
+}
+
+fn answered(fields: &[u8]) -> Outcome<'_> {
+    Outcome::Answered {
+        status: StatusCode::GOOD,
+        fields: ActionFields::Variants(fields),
+    }
+}
+
+const EXECUTING: ActionState = ActionState::Executing;
+const DONE: ActionState = ActionState::Done;
+const IDLE: ActionState = ActionState::Idle;
+
+#[test]
+fn a_repetition_is_not_executed_but_answered_from_memory() {
+    let mut responder = responder();
+    let asked = asked(1);
+    let execution = execute(ask(&mut responder, &asked, at(0)));
+    assert_eq!(due(&mut responder, 0), [EXECUTING]);
+    let again = ask(&mut responder, &asked, at(10));
+    assert_eq!(again, Ok(Requested::Repeated(execution)));
+    assert_eq!(due(&mut responder, 10), [], "at most once an interval");
+    assert_eq!(due(&mut responder, 100), [EXECUTING]);
+
+    responder
+        .finish(execution, answered(&block(42)), at(110))
+        .unwrap();
+    assert_eq!(due(&mut responder, 110), [DONE], "at once");
+    ask(&mut responder, &asked, at(5000)).unwrap();
+    let last = responses(&mut responder, at(5000)).remove(0);
+    message(&last, STANDARD, |response| {
+        assert_eq!(number(response.fields), 42);
+        assert_eq!(response.header().status, Some(0));
+        assert_eq!(response.request_id, 0);
+        assert_eq!(response.action.correlation_data.unwrap()[..16], [7; 16]);
+        assert_eq!(
+            response.action.requestor_id,
+            Some(uadp::PublisherId::UInt16(1))
+        );
+    });
+    assert_eq!(responder.counters().executed, 1);
+}
+
+#[test]
+fn an_answer_is_said_until_it_is_acknowledged() {
+    let mut responder = responder();
+    let asked = asked(1);
+    let execution = execute(ask(&mut responder, &asked, at(0)));
+    responder
+        .finish(execution, answered(&block(42)), at(0))
+        .unwrap();
+    for now in [0, 100, 200] {
+        assert_eq!(due(&mut responder, now), [DONE]);
+    }
+    let closed = ask(&mut responder, &idle(&asked), at(250));
+    assert_eq!(closed, Ok(Requested::Closed(execution)));
+    assert_eq!(due(&mut responder, 250), [IDLE]);
+    assert_eq!(due(&mut responder, 5000), []);
+    let late = ask(&mut responder, &asked, at(5000));
+    assert_eq!(
+        late,
+        Ok(Requested::Repeated(execution)),
+        "not executed again"
+    );
+    assert_eq!(due(&mut responder, 5000), []);
+}
+
+#[test]
+fn an_answer_nobody_acknowledges_is_not_said_for_ever() {
+    let mut responder = responder();
+    let execution = execute(ask(&mut responder, &asked(1), at(0)));
+    responder
+        .finish(execution, answered(&block(42)), at(0))
+        .unwrap();
+    let mut said = 0;
+    for now in (0..20_000).step_by(50) {
+        said += due(&mut responder, now).len();
+    }
+    assert_eq!(said, 21, "once, and 20 repetitions");
+    assert_eq!((responder.held(), responder.poll_timeout()), ((0, 0), None));
+}
+
+#[test]
+fn a_request_is_forgotten_when_it_is_old() {
+    let mut responder = responder();
+    let asked = asked(1);
+    let execution = execute(ask(&mut responder, &asked, at(0)));
+    responder
+        .finish(execution, answered(&block(42)), at(0))
+        .unwrap();
+    ask(&mut responder, &idle(&asked), at(10)).unwrap();
+    assert_eq!(due(&mut responder, 10), [IDLE]);
+    assert_eq!(responder.poll_timeout(), Some(at(10_010)));
+    responder.handle_timeout(at(10_009));
+    assert_eq!(responder.held().0, 1);
+    responder.handle_timeout(at(10_010));
+    assert_eq!(responder.held(), (0, 0));
+}
+
+#[test]
+fn what_is_executed_past_its_deadline_is_told_once_and_freed_by_age() {
+    let mut responder = responder();
+    let asked = asked(1); // waits for 5 s
+    let execution = execute(ask(&mut responder, &asked, at(0)));
+    for now in (0..5000).step_by(100) {
+        assert_eq!(due(&mut responder, now), [EXECUTING]);
+    }
+    assert_eq!(responder.poll_overdue(), None);
+    assert_eq!(due(&mut responder, 5000), []);
+    assert_eq!(responder.poll_overdue(), Some(execution));
+    assert_eq!(responder.poll_overdue(), None);
+    responder.handle_timeout(at(15_000));
+    assert_eq!((responder.held(), responder.counters().lost), ((0, 0), 1));
+    let late = responder.finish(execution, answered(&block(42)), at(15_001));
+    assert_eq!(late, Err(FinishRefusal::Forgotten));
+}
+
+#[test]
+fn an_execution_the_requestor_gives_up_is_told_and_its_end_is_not() {
+    let mut responder = responder();
+    let asked = asked(1);
+    let execution = execute(ask(&mut responder, &asked, at(0)));
+    assert_eq!(due(&mut responder, 0), [EXECUTING]);
+    let abandoned = ask(&mut responder, &idle(&asked), at(150));
+    assert_eq!(abandoned, Ok(Requested::Abandoned(execution)));
+    assert_eq!(
+        due(&mut responder, 150),
+        [EXECUTING],
+        "which is what it does"
+    );
+    assert_eq!(due(&mut responder, 1000), []);
+    let ended = responder.finish(execution, answered(&block(42)), at(1000));
+    assert_eq!(ended, Err(FinishRefusal::Abandoned));
+    assert_eq!(due(&mut responder, 1000), []);
+    let again = ask(&mut responder, &asked, at(1001));
+    assert_eq!(again, Ok(Requested::Repeated(execution)));
+}
+
+#[test]
+fn a_request_taken_back_before_it_came_is_not_executed() {
+    let mut responder = responder();
+    let asked = asked(1);
+    let closed = ask(&mut responder, &idle(&asked), at(0));
+    assert!(matches!(closed, Ok(Requested::Closed(_))));
+    assert_eq!(due(&mut responder, 0), [IDLE]);
+    let late = ask(&mut responder, &asked, at(10));
+    assert!(matches!(late, Ok(Requested::Repeated(_))));
+}
+
+#[test]
+fn a_refusal_is_remembered() {
+    let mut responder = responder();
+    let asked = asked(1);
+    let execution = execute(ask(&mut responder, &asked, at(0)));
+    responder
+        .refuse(execution, Refusal::NotAllowed, at(0))
+        .unwrap();
+    let twice = responder.refuse(execution, Refusal::NotAllowed, at(0));
+    assert_eq!(twice, Err(FinishRefusal::Finished));
+    let said = responses(&mut responder, at(0)).remove(0);
+    let status = message(&said, STANDARD, |response| response.header().status);
+    assert_eq!(status, Some(0x801F), "Bad_UserAccessDenied");
+    let again = ask(&mut responder, &asked, at(500));
+    assert_eq!(again, Ok(Requested::Repeated(execution)));
+}
+
+#[test]
+fn the_ids_of_one_request_do_not_get_the_answer_of_another() {
+    let mut responder = responder();
+    execute(ask(&mut responder, &asked(1), at(0)));
+    assert_eq!(
+        ask(&mut responder, &asked(2), at(0)),
+        Err(RequestDrop::Reused)
+    );
+    let mut elsewhere = asked(1);
+    let target = elsewhere.len() - block(0).len() - 5;
+    elsewhere[target] = 9;
+    assert_eq!(
+        ask(&mut responder, &elsewhere, at(0)),
+        Err(RequestDrop::Reused)
+    );
+}
+
+#[test]
+fn what_a_requestor_cannot_want_is_dropped() {
+    let mut responder = responder();
+    let asked = asked(1);
+    let state = asked.len() - block(0).len() - 1;
+    let mut done = asked.clone();
+    done[state] = 2;
+    assert_eq!(ask(&mut responder, &done, at(0)), Err(RequestDrop::State));
+    ask(&mut responder, &asked, at(0)).unwrap();
+    let response = responses(&mut responder, at(0)).remove(0);
+    assert_eq!(
+        ask(&mut responder, &response, at(0)),
+        Err(RequestDrop::Response)
+    );
+    assert_eq!(responder.counters().dropped, 2);
+}
+
+/// Requests of a Requestor, each as bytes.
+fn many(requestor_id: u16, count: i32) -> Vec<Vec<u8>> {
+    let mut requestor = Requestor::new(
+        OwnedPublisherId::UInt16(requestor_id),
+        [7; 16],
+        RequestorSettings::default(),
+    );
+    for number in 0..count {
+        requestor
+            .call(request(&block(number), at(5000)), at(0))
+            .unwrap();
+    }
+    requests(&mut requestor, at(0))
+}
+
+#[test]
+fn requests_beyond_the_memory_are_dropped_by_reason_and_not_answered() {
+    let mut responder = Responder::new(ResponderSettings {
+        max_requests: 5,
+        max_requests_per_requestor: 3,
+        ..ResponderSettings::default()
+    });
+    let (one, two) = (many(1, 4), many(2, 3));
+    for asked in &one[..3] {
+        execute(ask(&mut responder, asked, at(0)));
+    }
+    assert_eq!(
+        ask(&mut responder, &one[3], at(0)),
+        Err(RequestDrop::RequestorFull)
+    );
+    for asked in &two[..2] {
+        execute(ask(&mut responder, asked, at(0)));
+    }
+    assert_eq!(ask(&mut responder, &two[2], at(0)), Err(RequestDrop::Full));
+    assert_eq!(due(&mut responder, 0).len(), 5);
+    // It is heard once there is room again.
+    responder.handle_timeout(at(20_000));
+    execute(ask(&mut responder, &two[2], at(20_000)));
+}
+
+#[test]
+fn requests_beyond_what_can_be_executed_are_refused_as_busy() {
+    let mut responder = Responder::new(ResponderSettings {
+        max_executing: 1,
+        ..ResponderSettings::default()
+    });
+    let asked = many(1, 3);
+    let first = execute(ask(&mut responder, &asked[0], at(0)));
+    let second = ask(&mut responder, &asked[1], at(0));
+    assert!(matches!(second, Ok(Requested::Refused(_, Refusal::Busy))));
+    responder.finish(first, answered(&block(1)), at(0)).unwrap();
+    execute(ask(&mut responder, &asked[2], at(0)));
+    let again = ask(&mut responder, &asked[1], at(0));
+    assert!(
+        matches!(again, Ok(Requested::Repeated(_))),
+        "once refused, for good"
+    );
+}
+
+#[test]
+fn bytes_are_bounded_for_each_requestor_and_in_all() {
+    let mut responder = Responder::new(ResponderSettings {
+        max_bytes: 3000,
+        max_bytes_per_requestor: 2000,
+        max_answer: 1500,
+        ..ResponderSettings::default()
+    });
+    let (one, two) = (many(1, 3), many(2, 2));
+    let big = |bytes: usize| [&[1, 0][..], &vec![0; bytes]].concat();
+    let first = execute(ask(&mut responder, &one[0], at(0)));
+    let second = execute(ask(&mut responder, &one[1], at(0)));
+    let too_big = responder.finish(first, answered(&big(1600)), at(0));
+    assert_eq!(too_big, Err(FinishRefusal::TooBig), "max_answer");
+    let said = responses(&mut responder, at(0));
+    let status = message(&said[0], STANDARD, |response| response.header().status);
+    assert_eq!(status, Some(0x80B9), "Bad_ResponseTooLarge");
+    responder
+        .finish(second, answered(&big(900)), at(0))
+        .unwrap();
+    assert_eq!(
+        ask(&mut responder, &one[2], at(0)),
+        Err(RequestDrop::RequestorFull)
+    );
+    let third = execute(ask(&mut responder, &two[0], at(0)));
+    let too_big = responder.finish(third, answered(&big(1000)), at(0));
+    assert_eq!(too_big, Err(FinishRefusal::TooBig), "max_bytes");
+    assert!(responder.held().1 <= 3000);
+    responder.handle_timeout(at(60_000));
+    while responder.poll_transmit(at(60_000)).is_some() {}
+    assert_eq!(responder.held(), (0, 0));
+}
+
+#[test]
+fn long_correlation_data_are_refused() {
+    let mut responder = Responder::new(ResponderSettings {
+        max_correlation_data: 19,
+        ..ResponderSettings::default()
+    });
+    let refused = ask(&mut responder, &asked(1), at(0));
+    assert_eq!(refused, Err(RequestDrop::CorrelationData(20)));
+}
+
+#[test]
+fn a_one_shot_requestor_is_answered_once_and_never_without_its_status() {
+    let dialect = ActionDialect::UaNetStandard(ActionEncoding::Variant);
+    let mut responder = responder();
+    let mut requestor = requestor();
+    let arguments = block(1);
+    for _ in 0..2 {
+        let request = ActionRequest {
+            dialect,
+            ..request(&arguments, at(5000))
+        };
+        requestor.call(request, at(0)).unwrap();
+    }
+    let asked = requests(&mut requestor, at(0));
+    let mut hear = |asked: &[u8], now: Duration| {
+        message(asked, dialect, |request| {
+            execute(responder.handle_request(request, 3, now))
+        })
+    };
+    let (good, bad) = (hear(&asked[0], at(0)), hear(&asked[1], at(0)));
+    assert!(responder.poll_transmit(at(0)).is_none(), "no Executing");
+    responder.finish(good, answered(&block(42)), at(1)).unwrap();
+    let (reply_to, response) = responder.poll_transmit(at(1)).unwrap();
+    assert_eq!(
+        (*reply_to, response.state, response.status),
+        (3, DONE, None)
+    );
+    assert_eq!(response.dialect, dialect);
+    let untold = responder.refuse(bad, Refusal::NotAllowed, at(1));
+    assert_eq!(untold, Err(FinishRefusal::NoStatus));
+    for now in (0..9000).step_by(100) {
+        assert!(responder.poll_transmit(at(now)).is_none());
+    }
+    let again = message(&asked[1], dialect, |request| {
+        responder.handle_request(request, 3, at(9000))
+    });
+    assert_eq!(again, Ok(Requested::Repeated(bad)));
+    assert!(responder.poll_transmit(at(9000)).is_none());
+}
