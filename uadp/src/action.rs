@@ -9,8 +9,8 @@
 //!
 //! [`Requestor`] and [`Responder`] are what makes calls of messages that may get lost: the one repeats, acknowledges and
 //! gives up, the other executes once and remembers what it answered. Both take times and messages in and give messages
-//! out, and have no socket, clock or randomness of their own. How a Responder's states change
-//! follows here from the table of the Requestor's (OPC 10000-14, 6.2.11.2.2); the table of its own was not at hand.
+//! out, and have no socket, clock or randomness of their own. How a Responder's states change follows here from the table
+//! of the Requestor's (OPC 10000-14, 6.2.11.2.2); the table of its own was not at hand.
 //!
 //! # Chunks
 //! A request or response has to fit in one NetworkMessage. One in chunks is not read, since the requests of all
@@ -22,8 +22,10 @@
 //!
 //! # Announcing
 //! What an Action takes and gives, and what it can be called on, is an
-//! [`ActionMetaData`](crate::discovery::ActionMetaData) announcement. The standard has no probe for it: a Responder sends
-//! it unasked when it changes (OPC 10000-14, 7.2.4.6.11).
+//! [`ActionMetaData`](crate::discovery::ActionMetaData) announcement, and which connections answer Actions is another
+//! ([`Announced::ActionResponder`](crate::discovery::Announced)). The standard has no probe for either: a Responder sends
+//! the first unasked when it changes (OPC 10000-14, 7.2.4.6.11). What an [`Announcer`](crate::discovery::Announcer)
+//! answers beyond that stands at [`set_actions`](crate::discovery::Announcer::set_actions).
 //!
 //! # Asking
 //! ```

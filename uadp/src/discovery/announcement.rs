@@ -102,7 +102,7 @@ structure! {
         request: DataSetMetaDataType<'a> = "Request",
         /// Content of responses, with the name and ConfigurationVersion of the request.
         response: DataSetMetaDataType<'a> = "Response",
-        /// The Methods behind the targets, in their order; may be left out.
+        /// The Methods behind the targets, one for each in their order, or none at all.
         action_methods: List<'a, ActionMethodDataType<'a>> = "ActionMethods",
     }
 
@@ -239,7 +239,7 @@ impl<'a> Announced<'a> {
             PUB_SUB_CONNECTIONS => Self::read_connections(reader)?,
             APPLICATION_INFORMATION => Self::read_application_information(reader)?,
             ACTION_RESPONDER => Self::ActionResponder(List::read(reader, "ActionResponder")?),
-            ACTION_META_DATA => Self::ActionMetaData(Structure::read(reader, "ActionMetaData")?),
+            ACTION_META_DATA => Self::read_action_meta_data(reader)?,
             unknown => {
                 return Err(DecodeError::Reserved {
                     field: "AnnouncementType",
@@ -287,6 +287,17 @@ impl<'a> Announced<'a> {
             connection: Structure::read(reader, CONNECTIONS)?,
             status: Structure::read(reader, STATUS_CODE)?,
         })
+    }
+
+    fn read_action_meta_data(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
+        let action: ActionMetaData<'a> = Structure::read(reader, "ActionMetaData")?;
+        match action.has_its_methods() {
+            true => Ok(Self::ActionMetaData(action)),
+            false => Err(DecodeError::Reserved {
+                field: "number of ActionMethods",
+                value: u32::try_from(action.action_methods.len()).unwrap_or(u32::MAX),
+            }),
+        }
     }
 
     fn read_application_information(reader: &mut Reader<'a>) -> Result<Self, DecodeError> {
@@ -367,8 +378,37 @@ impl<'a> Announced<'a> {
                     None => Ok(()),
                 }
             }
+            Self::ActionMetaData(action) if !action.has_its_methods() => Err(
+                EncodeError::Misplaced("another number of ActionMethods than of ActionTargets"),
+            ),
             Self::ActionMetaData(action) => action.write(out, "ActionMetaData"),
         }
+    }
+}
+
+impl<'a> ActionMetaData<'a> {
+    /// The target of an ActionTargetId, and the Method behind it where one is named.
+    #[must_use]
+    pub fn target(
+        &self,
+        target_id: u16,
+    ) -> Option<(ActionTargetDataType<'a>, Option<ActionMethodDataType<'a>>)> {
+        let mut targets = self.action_targets.iter().enumerate();
+        let (index, target) = targets.find(|(_, target)| target.action_target_id == target_id)?;
+        Some((target, self.action_methods.get(index)))
+    }
+
+    /// Name of the Action; `None` without one, and when request and response are not of one Action: their names and
+    /// ConfigurationVersions have to be equal.
+    #[must_use]
+    pub fn name(&self) -> Option<&'a str> {
+        let of = |data: &DataSetMetaDataType<'a>| (data.name, data.configuration_version);
+        let one = of(&self.request) == of(&self.response);
+        self.request.name.filter(|_| one)
+    }
+
+    fn has_its_methods(&self) -> bool {
+        self.action_methods.is_empty() || self.action_methods.len() == self.action_targets.len()
     }
 }
 

@@ -33,6 +33,8 @@ pub struct Announcer {
     /// WriterGroupId of each DataSetWriterId.
     writers: BTreeMap<u16, u16>,
     groups: BTreeSet<u16>,
+    /// DataSetWriters of Actions.
+    actions: BTreeSet<u16>,
     /// What is to be announced, or was too short a time ago to be announced again.
     entries: BTreeMap<Subject, Entry>,
     /// How many of the entries are of subjects the Publisher does not have.
@@ -71,6 +73,10 @@ pub enum Subject {
     DataSetWriterConfiguration(u16),
     /// The content of the DataSet of a DataSetWriter, as [`Announced::DataSetMetaData`](super::Announced).
     DataSetMetaData(u16),
+    /// The connections that answer Actions, as [`Announced::ActionResponder`](super::Announced).
+    ActionResponder,
+    /// The Action of a DataSetWriter, as [`Announced::ActionMetaData`](super::Announced).
+    ActionMetaData(u16),
 }
 
 /// What an announcement of connections or of a WriterGroup has in it.
@@ -137,6 +143,7 @@ impl Announcer {
             limits,
             writers: BTreeMap::new(),
             groups: BTreeSet::new(),
+            actions: BTreeSet::new(),
             entries: BTreeMap::new(),
             unknown: 0,
             sent: VecDeque::new(),
@@ -166,6 +173,16 @@ impl Announcer {
         self.groups.insert(group);
     }
 
+    /// Changes which DataSetWriters are those of Actions; none at first. They may be among the
+    /// [`set_writers`](Self::set_writers), to have their configuration announced too.
+    ///
+    /// The standard has no probe for Actions. Here the connections that answer Actions are announced to who asks for
+    /// connections, whose settings the announcement follows (OPC 10000-14, 7.2.4.6.10), and an Action to who asks for
+    /// the DataSetMetaData of its DataSetWriter, which has no other.
+    pub fn set_actions(&mut self, writers: impl IntoIterator<Item = u16>) {
+        self.actions = writers.into_iter().collect();
+    }
+
     /// Plans the answers to a probe, which the caller found to be for this Publisher: by the PublisherId in its
     /// header, and for connections by the TransportProfileUris. The [`counters`](Self::counters) say what was refused.
     pub fn handle_probe(&mut self, probe: &Probe<'_>, now: Duration) {
@@ -175,7 +192,11 @@ impl Announcer {
             Probe::PublisherEndpoints => self.ask(Subject::PublisherEndpoints, now),
             Probe::DataSetMetaData(writer_ids) => {
                 for id in writer_ids {
-                    self.ask(Subject::DataSetMetaData(id), now);
+                    let subject = match self.actions.contains(&id) {
+                        true => Subject::ActionMetaData(id),
+                        false => Subject::DataSetMetaData(id),
+                    };
+                    self.ask(subject, now);
                 }
             }
             Probe::DataSetWriterConfiguration(writer_ids) => {
@@ -209,6 +230,10 @@ impl Announcer {
                 };
                 let planned = self.plan(Subject::PubSubConnections, included, now);
                 self.count(planned);
+                if !self.actions.is_empty() {
+                    let planned = self.plan(Subject::ActionResponder, included, now);
+                    self.count(planned);
+                }
             }
         }
     }
@@ -241,7 +266,9 @@ impl Announcer {
             | Subject::PublisherEndpoints
             | Subject::PubSubConnections
             | Subject::WriterGroupConfiguration(_)
-            | Subject::DataSetMetaData(_) => Vec::new(),
+            | Subject::DataSetMetaData(_)
+            | Subject::ActionResponder
+            | Subject::ActionMetaData(_) => Vec::new(),
         };
         let included = self.finish(subject, now);
         for id in &writer_ids {
@@ -325,6 +352,8 @@ impl Announcer {
             Subject::DataSetWriterConfiguration(writer) | Subject::DataSetMetaData(writer) => {
                 self.writers.contains_key(&writer)
             }
+            Subject::ActionResponder => !self.actions.is_empty(),
+            Subject::ActionMetaData(writer) => self.actions.contains(&writer),
         }
     }
 
@@ -352,7 +381,9 @@ impl Announcer {
                 | Subject::PublisherEndpoints
                 | Subject::PubSubConnections
                 | Subject::WriterGroupConfiguration(_)
-                | Subject::DataSetMetaData(_) => None,
+                | Subject::DataSetMetaData(_)
+                | Subject::ActionResponder
+                | Subject::ActionMetaData(_) => None,
             })
             .filter(|id| self.writers.get(id) == group)
             .collect()
@@ -441,6 +472,38 @@ mod tests {
         std::iter::from_fn(|| announcer.poll(now))
             .map(|due| (due.subject, due.writer_ids))
             .collect()
+    }
+
+    #[test]
+    fn actions_are_announced_to_who_asks_for_their_connections_or_metadata() {
+        let connections = Probe::PubSubConnections {
+            transport_profile_uris: List::new(&[]),
+            include_writer_groups: true,
+            include_data_set_writers: false,
+        };
+        let mut announcer = Announcer::new([(5, 10)], AnnounceLimits::default());
+        announcer.handle_probe(&connections, Duration::ZERO);
+        let only = [(Subject::PubSubConnections, vec![])];
+        assert_eq!(due(&mut announcer, Duration::from_secs(1)), only);
+
+        announcer.set_actions([61]);
+        let now = Duration::from_secs(2);
+        announcer.handle_probe(&connections, now);
+        announcer.handle_probe(&Probe::DataSetMetaData(List::new(&[10, 61])), now);
+        let mut subjects = due(&mut announcer, now + Duration::from_secs(1));
+        subjects.sort();
+        let expected = [
+            (Subject::PubSubConnections, vec![]),
+            (Subject::DataSetMetaData(10), vec![]),
+            (Subject::ActionResponder, vec![]),
+            (Subject::ActionMetaData(61), vec![]),
+        ];
+        assert_eq!(subjects, expected);
+
+        let changed = Subject::ActionMetaData(61);
+        let now = Duration::from_secs(9);
+        let planned = announcer.announce(changed, Included::default(), now);
+        assert_eq!(planned, Ok(()), "unasked, after a change");
     }
 
     #[test]

@@ -6,8 +6,8 @@ use uadp::discovery::{
     WriterGroupDataType,
 };
 use uadp::{
-    DataSetHeader, DateTime, DecodeError, EncodeError, NetworkMessage, PublisherId, SecurityHeader,
-    StatusCode,
+    DataSetHeader, DateTime, DecodeError, EncodeError, NetworkMessage, NodeId, PublisherId,
+    SecurityHeader, StatusCode,
 };
 
 use crate::{body, probe_body};
@@ -296,4 +296,74 @@ fn announced(announced: Announced<'_>) -> Vec<u8> {
     let bytes = body(&announcement);
     assert_eq!(Announcement::decode_body(&bytes), Ok(announcement));
     bytes
+}
+
+/// An ActionMetaData announcement by its table (OPC 10000-14, 7.2.4.6.11), with so many ActionMethods.
+fn action_meta_data(methods: i32) -> Vec<u8> {
+    let null = [0xFF; 4];
+    let meta_data = [
+        &null[..],
+        &null,
+        &null,
+        &null,                                 // DataTypeSchemaHeader
+        &[4, 0, 0, 0, b'h', b'o', b'm', b'e'], // Name
+        &[0],                                  // Description
+        &null,                                 // Fields
+        &[0; 16],                              // DataSetClassId
+        &[1, 0, 0, 0, 2, 0, 0, 0],             // ConfigurationVersion
+    ]
+    .concat();
+    let target = |id| [&[id, 0][..], &[1, 0, 0, 0, b'a' + id], &[0]].concat();
+    let method = [0, 85, 1, 2, 0x59, 0x1B]; // ObjectId i=85, MethodId ns=2;i=7001
+    let mut body = vec![7, 3, 0]; // ActionMetaData, SequenceNumber 3
+    body.extend([61, 0]); // DataSetWriterId
+    body.extend([2, 0, 0, 0]);
+    body.extend([target(1), target(2)].concat());
+    body.extend([&meta_data[..], &meta_data].concat());
+    body.extend(methods.to_le_bytes());
+    for _ in 0..methods {
+        body.extend(method);
+    }
+    body
+}
+
+#[test]
+fn an_action_is_announced_with_a_method_for_each_target_or_none() {
+    for methods in [-1, 0, 2] {
+        let bytes = action_meta_data(methods);
+        let announcement = Announcement::decode_body(&bytes).unwrap();
+        let Announced::ActionMetaData(action) = announcement.announced else {
+            unreachable!("{announcement:?}")
+        };
+        assert_eq!((action.writer_id, action.name()), (61, Some("home")));
+        let (target, method) = action.target(2).unwrap();
+        assert_eq!(target.name, Some("c"));
+        let method_id = method.map(|method| method.method_id);
+        assert_eq!(
+            method_id,
+            (methods == 2).then_some(NodeId::numeric(2, 7001))
+        );
+        assert_eq!(action.target(3), None);
+        assert_eq!(body(&announcement), bytes);
+    }
+    let fault = DecodeError::Reserved {
+        field: "number of ActionMethods",
+        value: 1,
+    };
+    assert_eq!(Announcement::decode_body(&action_meta_data(1)), Err(fault));
+
+    let bytes = action_meta_data(2);
+    let announcement = Announcement::decode_body(&bytes).unwrap();
+    let Announced::ActionMetaData(mut action) = announcement.announced else {
+        unreachable!("{announcement:?}")
+    };
+    action.response.configuration_version.major += 1;
+    assert_eq!(action.name(), None, "not of one Action");
+    action.action_targets = List::new(&[]);
+    let refused = Announcement {
+        announced: Announced::ActionMetaData(action),
+        ..announcement
+    }
+    .encode_body(&mut Vec::new());
+    assert!(matches!(refused, Err(EncodeError::Misplaced(_))));
 }

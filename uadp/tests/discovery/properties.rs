@@ -394,20 +394,24 @@ fn action() -> impl Strategy<Value = ActionMetaData<'static>> {
     });
     (
         any::<u16>(),
-        list(target),
+        vec((target, method), 0..3),
         meta_data(),
         meta_data(),
-        list(method),
+        any::<bool>(),
     )
-        .prop_map(
-            |(writer_id, action_targets, request, response, action_methods)| ActionMetaData {
+        .prop_map(|(writer_id, targets, request, response, with_methods)| {
+            let (targets, methods): (Vec<_>, Vec<_>) = targets.into_iter().unzip();
+            ActionMetaData {
                 writer_id,
-                action_targets,
+                action_targets: List::new(leak(targets)),
                 request,
                 response,
-                action_methods,
-            },
-        )
+                action_methods: match with_methods {
+                    true => List::new(leak(methods)),
+                    false => List::null(),
+                },
+            }
+        })
 }
 
 fn announced() -> impl Strategy<Value = Announced<'static>> {
