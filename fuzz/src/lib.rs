@@ -2,6 +2,8 @@
 //!
 //! `libfuzzer/` feeds them with inputs that reach new code; `corpus/` holds those found, and the tests run them all.
 
+mod action;
+mod calls;
 mod chunks;
 mod decode;
 mod definition;
@@ -14,6 +16,8 @@ mod secured;
 #[path = "../../messages/tests/support/mod.rs"]
 mod tape;
 
+pub use action::action;
+pub use calls::calls;
 pub use chunks::chunks;
 pub use decode::decode;
 pub use definition::definition;
@@ -28,6 +32,8 @@ pub type Target = fn(&[u8]);
 
 /// The targets by their names, which are also those of their folders under `corpus/`.
 pub const TARGETS: &[(&str, Target)] = &[
+    ("action", action),
+    ("calls", calls),
     ("chunks", chunks),
     ("decode", decode),
     ("definition", definition),
