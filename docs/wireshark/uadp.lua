@@ -2,7 +2,7 @@
 -- values in it (OPC 10000-6, 5.2.2). How to install and use it: README.md beside this file.
 --
 -- What it does not do: decrypt, verify signatures, and read what cannot be read without configuration (RawData,
--- several DataSetMessages without payload header) or is shown as bytes (Actions, most discovery bodies).
+-- several DataSetMessages without payload header) or is shown as bytes (most discovery bodies).
 --
 -- No datagram makes it fail: every read goes through a Cursor, which raises a Problem at the byte that is wrong, and
 -- every Problem becomes an expert info there. Runs on Lua 5.2 (Wireshark 4.0) and newer.
@@ -14,6 +14,8 @@ uadp.prefs.heuristic = Pref.bool("Look for UADP on all UDP ports", true,
     "Takes datagrams of other ports that are flawless UADP from PublisherId to the last field")
 uadp.prefs.reassemble = Pref.bool("Reassemble chunks", true, "Puts chunked messages together, across frames")
 uadp.prefs.max_total = Pref.uint("Largest reassembled message", 16777216, "Bytes; larger ones stay chunks")
+uadp.prefs.one_shot_actions = Pref.bool("Actions as UA-.NETStandard has them", false,
+    "Requests and responses without DataSetMessage header, their fields as Variants")
 uadp.prefs.max_items = Pref.uint("Most items shown of a datagram", 50000,
     "Values behind so many items are read and checked but not shown")
 
@@ -23,7 +25,7 @@ local PUBLISHER_ID_TYPES = { [0] = "Byte", "UInt16", "UInt32", "UInt64", "String
 local MESSAGE_TYPES = { [0] = "DataSetMessage payload", "discovery probe", "discovery announcement" }
 local FIELD_ENCODINGS = { [0] = "Variant", "RawData", "DataValue" }
 local KINDS = {
-    [0] = "key frame", "delta frame", "event", "keep-alive", "action request", "action response",
+    [0] = "key frame", "delta frame", "event", "keep-alive", [5] = "action request", [6] = "action response",
 }
 local PROBES = { "Publisher information", "FindApplications" }
 local INFORMATION = {
@@ -42,7 +44,8 @@ local BUILTIN = {
 }
 local NODE_ID_ENCODINGS = { [0] = "two byte", "four byte", "numeric", "String", "Guid", "ByteString" }
 local BODIES = { [0] = "no body", "binary", "XML" }
-local KEY_FRAME, DELTA_FRAME, EVENT, KEEP_ALIVE, ACTION_RESPONSE = 0, 1, 2, 3, 5
+local ACTION_STATES = { [0] = "Idle", "Executing", "Done" }
+local KEY_FRAME, DELTA_FRAME, EVENT, KEEP_ALIVE, ACTION_REQUEST, ACTION_RESPONSE = 0, 1, 2, 3, 5, 6
 local DATA, PROBE, ANNOUNCEMENT = 0, 1, 2
 
 -- Upper half of StatusCodes (OPC 10000-6, A.2): those that publishers are likely to send.
@@ -169,6 +172,26 @@ field("uint16", "security.footer_size", "SecurityFooterSize", base.DEC)
 field("bytes", "security.footer", "SecurityFooter")
 field("bytes", "security.signature", "Signature")
 field("bytes", "encrypted_payload", "Encrypted payload")
+
+field("none", "action", "ActionHeader")
+flags("action.flags", "ActionFlags", {
+    { "action.flags.request", "Request", 0 },
+    { "action.flags.response_address", "ResponseAddress", 1 },
+    { "action.flags.correlation_data", "CorrelationData", 2 },
+    { "action.flags.requestor_id", "RequestorId", 3 },
+    { "action.flags.timeout_hint", "TimeoutHint", 4 },
+    { "action.flags.reserved", "Reserved", 5, 3 },
+})
+field("string", "action.response_address", "ResponseAddress")
+field("bytes", "action.correlation_data", "CorrelationData")
+field("uint64", "action.requestor_id", "RequestorId", base.DEC)
+field("string", "action.requestor_id.string", "RequestorId")
+field("double", "action.timeout_hint", "TimeoutHint (ms)")
+field("uint16", "action.target_id", "ActionTargetId", base.DEC)
+field("string", "action.target_name", "Name")
+field("uint16", "action.request_id", "RequestId", base.DEC)
+field("uint8", "action.state", "ActionState", base.DEC, ACTION_STATES)
+field("string", "action.method", "ObjectId and MethodId")
 
 field("none", "chunk", "Chunk")
 field("uint16", "chunk.message_sequence_number", "MessageSequenceNumber", base.DEC)
@@ -1129,14 +1152,38 @@ local function count_of_fields(count)
     return count == 1 and " (1 field)" or string.format(" (%d fields)", count)
 end
 
+-- Actions (OPC 10000-14, 7.2.4.5.9 and 7.2.4.5.10): "4660 of target 7, Executing (2 fields)".
+local function read_action(ctx, cur, tree, head, sized)
+    local target = u16(ctx, cur, tree, "action.target_id", "ActionTargetId")
+    local request = u16(ctx, cur, tree, "action.request_id", "RequestId")
+    local state = u8(ctx, cur, tree, "action.state", "ActionState")
+    if not ACTION_STATES[state] then
+        cur:problem(cur.pos - 1, 1, "ActionState " .. state .. " is reserved")
+    end
+    local words = string.format(" %d of target %d, %s", request, target, ACTION_STATES[state])
+    if head.encoding == 1 then
+        local count = u16(ctx, cur, tree, "dataset.field_count", "FieldCount")
+        put(ctx, tree, "dataset.raw_data", cur:rest("RawData"))
+        return words .. count_of_fields(count)
+    end
+    local count = read_fields(ctx, cur, tree, head.kind, head.encoding)
+    read_padding(ctx, cur, tree, sized)
+    return words .. count_of_fields(count)
+end
+
 local function read_payload(ctx, cur, tree, head, sized)
-    if head.kind > ACTION_RESPONSE then
+    if not KINDS[head.kind] then
         cur:problem(head.at + 1, 1, string.format("DataSetMessage type %d is reserved", head.kind))
+    elseif ctx.action and head.kind ~= ctx.action then
+        cur:problem(head.at, 2, string.format("a %s under the ActionHeader of an %s", KINDS[head.kind],
+            KINDS[ctx.action]))
     elseif head.kind > KEEP_ALIVE then
-        local at, left = cur.pos, cur:left()
-        put(ctx, tree, "undissected", cur:rest("Action"))
-        note(ctx, tree, E.undecoded, cur, at, left, "Actions are not dissected")
-        return ""
+        if not ctx.action then
+            cur:problem(head.at, 2, KINDS[head.kind] .. " without ActionHeader")
+        elseif head.encoding == 2 then
+            cur:problem(head.at, 1, "DataValues in an Action")
+        end
+        return read_action(ctx, cur, tree, head, sized)
     elseif head.kind == KEEP_ALIVE then
         read_padding(ctx, cur, tree, sized)
         return ""
@@ -1207,13 +1254,19 @@ local function dissect_dataset_message(ctx, cur, tree, writer_id, sized)
     if writer_id then
         say(item, " of DataSetWriterId " .. writer_id)
     end
+    local one_shot = ctx.action and uadp.prefs.one_shot_actions
     local flags = captured(cur.tvb, start, math.min(start + 1, cur.stop))
-    ctx.invalid = flags:len() == 1 and not bit(flags:uint(), 0)
+    ctx.invalid = not one_shot and flags:len() == 1 and not bit(flags:uint(), 0)
     if ctx.invalid then
         note(ctx, item, E.invalid, cur, start, 1, "the valid bit is cleared, receivers skip this DataSetMessage")
     end
     guarded(ctx, item, cur, function()
-        read_dataset_header(ctx, cur, item, head)
+        if one_shot then
+            head.kind = ctx.action
+            put(ctx, item, "dataset.kind", nil, head.kind)
+        else
+            read_dataset_header(ctx, cur, item, head)
+        end
         payload = read_payload(ctx, cur, item, head, sized)
     end, ctx.invalid and "dataset.ignored" or nil)
     ctx.invalid = false
@@ -1399,6 +1452,27 @@ local BODY = {
     end,
     [3] = function(ctx, cur, tree)
         return " of " .. read_writer_ids(ctx, cur, tree)
+    end,
+    [7] = function(ctx, cur, tree)
+        local writer_id = u16(ctx, cur, tree, "dataset_writer_id", "DataSetWriterId")
+        local targets = 0
+        each(ctx, cur, "ActionTargets", 7, function()
+            u16(ctx, cur, tree, "action.target_id", "ActionTargetId")
+            text(ctx, cur, tree, "action.target_name", "Name")
+            skip_localized_text(ctx, cur)
+            targets = targets + 1
+        end)
+        local name = read_metadata(ctx, cur, tree)
+        read_metadata(ctx, cur, tree)
+        local at = cur.pos
+        local methods = cur:count("ActionMethods", 4) or 0
+        if methods ~= 0 and methods ~= targets then
+            cur:problem(at, 4, string.format("%d ActionMethods for %d ActionTargets", methods, targets))
+        end
+        for _ = 1, 2 * methods do
+            node_id(ctx, cur, tree, "action.method")
+        end
+        return string.format(" of %d %s", writer_id, name)
     end,
     [5] = function(ctx, cur, tree)
         local kind = u16(ctx, cur, tree, "announcement.application_information_type", "ApplicationInformationType")
@@ -1619,6 +1693,8 @@ local function read_flags(ctx, cur, tree, head)
         cur:problem(cur.pos - 1, 1, string.format("ExtendedFlags2 0x%02x has reserved bits", extended2))
     elseif not MESSAGE_TYPES[head.message_type] then
         cur:problem(cur.pos - 1, 1, "NetworkMessage type " .. head.message_type .. " is reserved")
+    elseif bit(extended2, 5) and head.message_type ~= DATA then
+        cur:problem(cur.pos - 1, 1, "ActionHeader of a discovery message")
     end
     put(ctx, tree, "message_type", nil, head.message_type)
 end
@@ -1801,14 +1877,78 @@ local function dissect_encrypted(ctx, cur, tree, head)
         nonce)
 end
 
-local function dissect_body(ctx, cur, tree, head)
-    if bit(head.extended2, 5) then
+-- Bytes of a RequestorId by its builtin type.
+local REQUESTOR_ID_SIZE = { [3] = 1, [5] = 2, [7] = 4, [9] = 8 }
+
+local function read_requestor_id(ctx, cur, tree)
+    local at = cur.pos
+    local builtin = math.floor(cur:take(1, "RequestorId"):uint())
+    local size = REQUESTOR_ID_SIZE[builtin]
+    if size then
+        local range = cur:take(size, "RequestorId")
+        local value = range:le_uint64()
+        put(ctx, tree, "action.requestor_id", range, value)
+        return tostring(value)
+    elseif builtin ~= 12 then
+        cur:problem(at, 1, string.format("Variant encoding 0x%02x is none of a RequestorId", builtin))
+    end
+    local id = text(ctx, cur, tree, "action.requestor_id.string", "RequestorId")
+    if not id then
+        cur:problem(at, 5, "RequestorId is the null String")
+    end
+    return '"' .. shortened(id) .. '"'
+end
+
+-- ActionHeader, which stands in front of the payload and is encrypted with it (OPC 10000-14, 7.2.4.4.2). The numbering
+-- of the flags is that of UA-.NETStandard.
+local function read_action_header(ctx, cur, tree)
+    within(ctx, tree, "action", cur, function(item)
+        local flags = put_flags(ctx, item, "action.flags", cur:take(1, "ActionFlags"))
+        if flags > 31 then
+            cur:problem(cur.pos - 1, 1, string.format("ActionFlags 0x%02x has reserved bits", flags))
+        end
+        ctx.action = bit(flags, 0) and ACTION_REQUEST or ACTION_RESPONSE
+        local words = bit(flags, 0) and "request" or "response"
+        if bit(flags, 1) and not text(ctx, cur, item, "action.response_address", "ResponseAddress") then
+            cur:problem(cur.pos - 4, 4, "ResponseAddress is null")
+        end
+        if bit(flags, 2) then
+            local data = cur:byte_string("CorrelationData")
+            if not data then
+                cur:problem(cur.pos - 4, 4, "CorrelationData are null")
+            end
+            put(ctx, item, "action.correlation_data", data)
+        end
+        if bit(flags, 3) then
+            words = words .. " of " .. read_requestor_id(ctx, cur, item)
+        end
+        if bit(flags, 4) then
+            put(ctx, item, "action.timeout_hint", cur:take(8, "TimeoutHint"))
+        end
+        return words
+    end)
+end
+
+local function dissect_action(ctx, cur, tree, head)
+    if head.chunk then
         local at, left = cur.pos, cur:left()
-        note(ctx, tree, E.undecoded, cur, at, left, "Actions are not dissected")
-        put(ctx, tree, "undissected", cur:rest("Action"))
-        ctx.info[#ctx.info + 1] = "Action"
-    elseif head.encrypted then
+        note(ctx, tree, E.undecoded, cur, at, left, "chunks with an ActionHeader are not dissected")
+        put(ctx, tree, "undissected", cur:rest("Chunk"))
+        ctx.info[#ctx.info + 1] = "chunk of an Action"
+        return
+    end
+    read_action_header(ctx, cur, tree)
+    if not bit(head.flags, 4) or not bit(head.flags, 6) then
+        cur:problem(0, 1, "an Action without PublisherId or payload header, which it is addressed by")
+    end
+    dissect_dataset_messages(ctx, cur, tree, head.writer_ids)
+end
+
+local function dissect_body(ctx, cur, tree, head)
+    if head.encrypted then
         dissect_encrypted(ctx, cur, tree, head)
+    elseif bit(head.extended2, 5) then
+        dissect_action(ctx, cur, tree, head)
     elseif head.chunk then
         dissect_chunk(ctx, cur, tree, head)
     else

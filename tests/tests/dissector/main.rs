@@ -1,5 +1,6 @@
 //! The Wireshark dissector in `docs/wireshark`: tshark has to show what was sent, and to point at what is wrong.
 
+mod actions;
 mod messages;
 mod sealed;
 mod time;

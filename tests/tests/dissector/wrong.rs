@@ -37,7 +37,9 @@ const WRONG: &[(&str, usize, &str)] = &[
         "Signature of 32 bytes does not fit in the 1 left",
     ),
     ("+07", 10, "field encoding 3 is reserved"),
-    ("+8106", 11, "DataSetMessage type 6 is reserved"),
+    ("+8104", 11, "DataSetMessage type 4 is reserved"),
+    ("+8107", 11, "DataSetMessage type 7 is reserved"),
+    ("+8106", 10, "action response without ActionHeader"),
     ("+8140", 11, "DataSetFlags2 0x40 has reserved bits"),
     (
         "+010300",
@@ -287,6 +289,10 @@ fn judged(datagram: &[u8]) -> Option<Result<(), DecodeError>> {
         if let Err(error) = field {
             return Some(Err(error));
         }
+    }
+    if message.is_action() {
+        // Judged where Actions are.
+        return None;
     }
     for data_set_message in message.messages() {
         let read = data_set_message.and_then(|found| {
