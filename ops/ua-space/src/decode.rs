@@ -15,7 +15,7 @@ use crate::keys::{self, KeyFile};
 use crate::metadata::{MetaDataFile, Writer};
 use crate::raw_data::Layout;
 use crate::values::show_variant;
-use crate::{discovery, hex, iso_time, messages, shape};
+use crate::{actions, discovery, hex, iso_time, messages, shape};
 
 /// What a reader knows besides the datagrams.
 #[derive(Debug)]
@@ -134,12 +134,18 @@ impl Context {
             reading.shape.sealed = Some(shape::Sealed {
                 hex: hex::text(message.payload()),
                 chunk: message.is_chunk(),
+                action: message.is_action(),
             });
         } else if message.is_chunk() {
             reading.chunk(message);
             if let Some(chunks) = chunks.filter(|_| reading.faults.is_empty()) {
                 self.put_together(message, reading, chunks);
             }
+        } else if message.is_action() {
+            let shown = actions::read(message);
+            reading.shape.action_header = shown.header;
+            reading.shape.data_set_messages = Some(shown.messages);
+            reading.faults.extend(shown.fault);
         } else {
             match message.message_type() {
                 NetworkMessageType::DataSet => self.messages(message, reading),

@@ -17,7 +17,7 @@ use crate::arguments::RawReading;
 use crate::decode::Context;
 use crate::raw_data::Layout;
 use crate::values::{WrongValue, data_value_bytes, variant_bytes};
-use crate::{discovery, hex, iso_time, node_ids, shape};
+use crate::{actions, discovery, hex, iso_time, node_ids, shape};
 
 type Written = Result<(), WrongValue>;
 
@@ -105,6 +105,9 @@ impl Writing<'_> {
         } else if let Some(announcement) = &self.json.announcement {
             let body = discovery::announcement_body(announcement);
             self.announcement(&body.map_err(|wrong| wrong.at("announcement"))?, &mut out)?;
+        } else if let Some(action) = &self.json.action_header {
+            let headers = (&self.header, &self.extras());
+            actions::write(self.json, action, headers, &mut out)?;
         } else {
             self.messages(&mut out)?;
         }
@@ -231,7 +234,13 @@ impl Writing<'_> {
 
     /// The headers, and behind them what was not opened.
     fn sealed(&self, sealed: &shape::Sealed, out: &mut Vec<u8>) -> Result<(), WrongValue> {
-        let payload_at = if sealed.chunk || self.json.network_message_type.is_some() {
+        let payload_at = if sealed.action {
+            if sealed.chunk {
+                let what = "a chunk with an ActionHeader is not written";
+                return Err(WrongValue::new(what).at("sealed"));
+            }
+            actions::headers(self.json, (&self.header, &self.extras()), out)?
+        } else if sealed.chunk || self.json.network_message_type.is_some() {
             self.other_headers(sealed.chunk, out)?
         } else {
             let ids = self.json.data_set_writer_ids.as_deref();
@@ -490,7 +499,7 @@ fn index(field: &shape::Field) -> Result<u16, WrongValue> {
     field.index.ok_or_else(missing)
 }
 
-fn data_set_header(json: &shape::DataSetMessage) -> Result<DataSetHeader, WrongValue> {
+pub(crate) fn data_set_header(json: &shape::DataSetMessage) -> Result<DataSetHeader, WrongValue> {
     Ok(DataSetHeader {
         valid: json.valid,
         sequence_number: json.sequence_number,
@@ -502,7 +511,7 @@ fn data_set_header(json: &shape::DataSetMessage) -> Result<DataSetHeader, WrongV
     })
 }
 
-fn publisher_id(json: &shape::PublisherId) -> Result<PublisherId<'_>, WrongValue> {
+pub(crate) fn publisher_id(json: &shape::PublisherId) -> Result<PublisherId<'_>, WrongValue> {
     use shape::PublisherIdType;
 
     fn number<T: FromStr>(json: &shape::PublisherId) -> Result<T, WrongValue> {

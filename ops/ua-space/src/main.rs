@@ -1,5 +1,6 @@
 //! `ua-space`: looks into the space.
 
+mod actions;
 mod arguments;
 mod capture;
 mod check;

@@ -44,6 +44,8 @@ pub(crate) struct Datagram {
     pub(crate) promoted_fields: Option<Vec<FieldValue>>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) security_header: Option<SecurityHeader>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) action_header: Option<ActionHeader>,
     /// What stands behind the headers, while it is encrypted or its signature was not verified.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) sealed: Option<Sealed>,
@@ -155,6 +157,75 @@ pub(crate) struct Sealed {
     /// The payload is a chunk.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub(crate) chunk: bool,
+    /// The payload starts with an ActionHeader.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub(crate) action: bool,
+}
+
+/// What belongs to all requests or responses of a NetworkMessage (OPC 10000-14, 7.2.4.4.2).
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub(crate) struct ActionHeader {
+    #[serde(rename = "type")]
+    pub(crate) kind: ActionKind,
+    /// How the requests or responses are laid out.
+    #[serde(default, skip_serializing_if = "ActionDialect::is_standard")]
+    pub(crate) dialect: ActionDialect,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) response_address: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) correlation_data_hex: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) requestor_id: Option<PublisherId>,
+    /// In milliseconds.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) timeout_hint: Option<f64>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(crate) enum ActionKind {
+    Request,
+    Response,
+}
+
+/// By the text of the standard, or without DataSetMessage headers as UA-.NETStandard has it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(crate) enum ActionDialect {
+    #[default]
+    Standard,
+    UaNetStandard,
+}
+
+impl ActionDialect {
+    #[expect(
+        clippy::trivially_copy_pass_by_ref,
+        reason = "what serde calls is given a reference"
+    )]
+    const fn is_standard(&self) -> bool {
+        matches!(self, Self::Standard)
+    }
+}
+
+/// What a request or response says of itself (OPC 10000-14, 7.2.4.5.9 and 7.2.4.5.10).
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+pub(crate) struct Action {
+    pub(crate) target_id: u16,
+    pub(crate) request_id: u16,
+    pub(crate) state: ActionState,
+    /// Of RawData.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) field_count: Option<u16>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "camelCase")]
+pub(crate) enum ActionState {
+    Idle,
+    Executing,
+    Done,
 }
 
 /// A piece of a message (OPC 10000-14, 7.2.4.4.4).
@@ -244,6 +315,9 @@ pub(crate) struct DataSetMessage {
     pub(crate) major_version: Option<u32>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) minor_version: Option<u32>,
+    /// Of a request or response.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) action: Option<Action>,
     /// Bytes it is padded to with zeros.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) configured_size: Option<u16>,
@@ -271,6 +345,7 @@ impl Default for DataSetMessage {
             status16: None,
             major_version: None,
             minor_version: None,
+            action: None,
             configured_size: None,
             message_hex: None,
             raw_data_hex: None,
@@ -287,6 +362,8 @@ pub(crate) enum MessageKind {
     DeltaFrame,
     Event,
     KeepAlive,
+    ActionRequest,
+    ActionResponse,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
