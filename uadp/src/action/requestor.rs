@@ -80,7 +80,8 @@ pub struct Requestor {
 pub struct RequestorSettings {
     /// PublishingInterval of the Responder's WriterGroup, at which requests are repeated. Default 100 ms.
     pub publishing_interval: Duration,
-    /// When nothing was heard of the Responder for so long it is taken for lost. Default 2 s.
+    /// When nothing was heard of the Responder for so long it is taken for lost. [`Duration::MAX`] leaves that to the
+    /// deadline, for Responders that do not repeat Executing by themselves. Default 2 s.
     pub receive_timeout: Duration,
     /// How often an acknowledgement is sent at most. Default 5.
     pub idle_repeats: u8,
