@@ -116,7 +116,7 @@ pub struct Delivery {
     pub kept: Kept,
 }
 
-/// A drop worth a line in the log. A repeated one is told at its 1st, 10th, 100th ... occurrence.
+/// A drop worth a line in the log. One that is repeated for the same cause is told at its 1st, 10th, 100th ... occurrence.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Notice {
     /// The topic, if it is about one.
@@ -125,7 +125,7 @@ pub struct Notice {
     pub from: Option<SocketAddr>,
     /// Why.
     pub reason: Reason,
-    /// How often it happened by now.
+    /// How often it happened for that cause by now.
     pub total: u64,
     /// What exactly, in words.
     pub detail: String,

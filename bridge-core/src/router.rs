@@ -69,7 +69,7 @@ pub struct Router {
     base_bytes: usize,
     /// Buffers given back by [`recycle`](Self::recycle).
     spare: Vec<Vec<u8>>,
-    /// Datagrams and messages that belong to no topic.
+    /// Datagrams and messages that belong to no topic, and topics that are no longer followed.
     others: Counters,
     hops: Hops,
 }
@@ -441,7 +441,7 @@ impl Router {
             .map(|(topic, entry)| (*topic, &entry.counters))
     }
 
-    /// The counters of datagrams and messages that belong to no topic.
+    /// The counters of datagrams and messages that belong to no topic, and of topics that are no longer followed.
     #[must_use]
     pub const fn others(&self) -> &Counters {
         &self.others
