@@ -211,7 +211,7 @@ impl SpaceNodes {
     /// What the topic shows.
     pub(crate) fn shown(&self, topic: TopicId) -> Shown {
         let shown = self.values.read().get(topic).cloned();
-        shown.unwrap_or_else(|| Shown::nothing(StatusCode::BadWaitingForInitialData))
+        shown.unwrap_or_else(Shown::waiting)
     }
 
     /// Shows something else for a topic, and tells who watches its nodes.
@@ -230,38 +230,36 @@ impl SpaceNodes {
         let Some(shown) = values.get(topic.topic) else {
             return kept;
         };
-        for (node, field) in topic.places() {
-            let view = shown.view(topic, field);
-            let before = before.as_ref().map(|before| before.view(topic, field));
-            self.notify(subscriptions, node, &view, before.as_ref());
+        let before = before.unwrap_or_else(Shown::waiting);
+        let views = before.views(topic).zip(shown.views(topic));
+        for (node, (before, view)) in topic.nodes().zip(views) {
+            self.notify(subscriptions, node, &view, &before);
         }
         kept
     }
 
     /// The server compares values alone for an item without filter, though a status that changed is to be reported
-    /// too (OPC 10000-4, 7.22.2: the default trigger is StatusValue). A null value in between makes it report both;
+    /// too (OPC 10000-4, 7.22.2: the default trigger is StatusValue). No value in between makes it report both;
     /// clients with a queue of one see only the second.
     fn notify(
         &self,
         subscriptions: &SubscriptionCache,
         node: &NodeId,
         view: &View<'_>,
-        before: Option<&View<'_>>,
+        before: &View<'_>,
     ) {
         let mut notifier = subscriptions.data_notifier();
         let Some(mut items) = notifier.notify_for(node, AttributeId::Value) else {
             return;
         };
-        let flipped = before.is_some_and(|before| {
-            before.stamp().status != view.stamp().status && before.has_value_of(view)
-        });
+        let flipped = before.stamp().status != view.stamp().status && before.has_value_of(view);
         let weight = view.weight();
         if weight <= SMALL {
             if flipped {
                 let watched = self.watched.lock();
                 for (handle, _) in items.entries() {
                     if watched.is_unfiltered(*handle) {
-                        items.data_value_to_item(view.refused(view.stamp().status), handle);
+                        items.data_value_to_item(view.between(), handle);
                     }
                 }
             }
@@ -272,7 +270,7 @@ impl SpaceNodes {
         for (handle, _) in items.entries() {
             let (value, unfiltered) = self.for_item(*handle, view, &mut decoded);
             if flipped && unfiltered {
-                items.data_value_to_item(view.refused(view.stamp().status), handle);
+                items.data_value_to_item(view.between(), handle);
             }
             items.data_value_to_item(value, handle);
         }
@@ -371,10 +369,8 @@ impl SpaceNodes {
         subscriptions: &SubscriptionCache,
         write: &ParsedWriteValue,
     ) -> Result<(), StatusCode> {
-        let place = match write.attribute_id {
-            AttributeId::Value => self.place(&write.node_id),
-            _ => None,
-        };
+        let is_value = write.attribute_id == AttributeId::Value;
+        let place = self.place(&write.node_id).filter(|_| is_value);
         let Some((topic, field)) = place else {
             let exists = address_space.node_exists(&write.node_id);
             return Err(if exists {

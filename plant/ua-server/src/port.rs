@@ -88,9 +88,10 @@ impl ServerPort {
 
         let (writes_in, writes) = mpsc::channel(MOST_WRITES);
         let (created, created_items) = mpsc::channel(MOST_CREATED);
+        let room = Arc::new(Semaphore::new(ROOM_FOR_WRITES));
         let exits = Exits {
             writes: writes_in,
-            room: Arc::new(Semaphore::new(ROOM_FOR_WRITES)),
+            room,
             created,
         };
         if setup.trust_any_client {
@@ -108,14 +109,7 @@ impl ServerPort {
             .with_node_manager(Ordered::around(nodes))
             .build()
             .map_err(configuration)?;
-        let manager = handle
-            .node_managers()
-            .get_of_type::<Ordered>()
-            .and_then(|ordered| ordered.space())
-            .ok_or_else(|| {
-                configuration("the server has no node manager for the space".to_owned())
-            })?;
-        check_namespaces(&layout, &manager).map_err(configuration)?;
+        let manager = manager(&handle, &layout).map_err(configuration)?;
         manager.inner().limit_writes(largest_write(mapping));
 
         let (runtime, listener) = threads(listener).map_err(|error| io(error.to_string()))?;
@@ -309,8 +303,13 @@ impl InMemoryNodeManagerImplBuilder for NodesBuilder {
     }
 }
 
-/// Holds the server to the indexes of the mapping: it hands them out itself.
-fn check_namespaces(layout: &Layout, manager: &SpaceManager) -> Result<(), String> {
+/// The node manager of the space, held to the indexes of the mapping: the server hands them out itself.
+fn manager(handle: &ServerHandle, layout: &Layout) -> Result<Arc<SpaceManager>, String> {
+    let manager = handle
+        .node_managers()
+        .get_of_type::<Ordered>()
+        .and_then(|ordered| ordered.space())
+        .ok_or_else(|| "the server has no node manager for the space".to_owned())?;
     let wanted = layout.namespaces.iter().skip(1);
     for ((index, uri), (expected, wanted)) in manager
         .inner()
@@ -323,7 +322,7 @@ fn check_namespaces(layout: &Layout, manager: &SpaceManager) -> Result<(), Strin
             ));
         }
     }
-    Ok(())
+    Ok(manager)
 }
 
 const SERVER_THREADS: usize = 2;

@@ -95,6 +95,11 @@ impl Shown {
         }
     }
 
+    /// No value came yet.
+    pub(crate) fn waiting() -> Self {
+        Self::nothing(StatusCode::BadWaitingForInitialData)
+    }
+
     fn size(&self) -> usize {
         self.block.as_ref().map_or(0, Bytes::len)
     }
@@ -110,7 +115,23 @@ impl Shown {
             Some(place) => place,
         };
         let value = fields.clone().nth(place).and_then(Result::ok);
-        let value = value.unwrap_or(uadp::Variant::Null);
+        self.one(topic, place, value.unwrap_or(uadp::Variant::Null))
+    }
+
+    /// What each of the topic's nodes has, in the order of [`TopicNode::places`].
+    pub(crate) fn views<'a>(&'a self, topic: &'a TopicNode) -> impl Iterator<Item = View<'a>> {
+        let mut fields = self.fields();
+        let components = topic.places().filter_map(|(_, field)| field);
+        let components = components.map(move |place| {
+            let value = fields.as_mut().and_then(Iterator::next);
+            let value = value.and_then(Result::ok);
+            self.one(topic, place, value.unwrap_or(uadp::Variant::Null))
+        });
+        std::iter::once(self.view(topic, None)).chain(components)
+    }
+
+    /// The value of the field at a place.
+    fn one<'a>(&'a self, topic: &TopicNode, place: usize, value: uadp::Variant<'a>) -> View<'a> {
         // In place of a value of another type it says why there is none (OPC 10000-14, 7.2.4.5.5).
         if let uadp::Variant::Scalar(Scalar::StatusCode(status)) = value
             && let Some(field) = topic.fields.get(place)
@@ -207,6 +228,11 @@ impl<'a> View<'a> {
         }
     }
 
+    /// No value at all: it is another one than any before it or behind it, a null value included.
+    pub(crate) fn between(&self) -> DataValue {
+        data_value(None, self.stamp())
+    }
+
     /// In place of the value, why it is not given.
     pub(crate) fn refused(&self, status: StatusCode) -> DataValue {
         let stamp = self.stamp();
@@ -258,12 +284,15 @@ fn part(array: uadp::Array<'_>, first: usize, last: usize) -> Option<uadp::Array
 }
 
 fn weight(value: &uadp::Variant<'_>) -> usize {
-    let elements = |array: &uadp::Array<'_>| match array.element() {
-        BuiltinType::Variant | BuiltinType::DataValue => {
+    let elements = |array: &uadp::Array<'_>| {
+        let element = array.element();
+        if matches!(element, BuiltinType::Variant | BuiltinType::DataValue) {
             array.iter().map(|element| scalar_weight(&element)).sum()
+        } else if is_boxed(element) {
+            array.len() * (VARIANT + BOXED) + array.bytes().len()
+        } else {
+            array.len() * VARIANT
         }
-        element if element.fixed_size().is_some() && !is_boxed(element) => array.len() * VARIANT,
-        _ => array.len() * (VARIANT + BOXED) + array.bytes().len(),
     };
     match value {
         uadp::Variant::Null => VARIANT,
@@ -274,6 +303,9 @@ fn weight(value: &uadp::Variant<'_>) -> usize {
 }
 
 fn scalar_weight(value: &Scalar<'_>) -> usize {
+    if !is_boxed(value.builtin_type()) {
+        return VARIANT;
+    }
     let inner = match value {
         Scalar::Variant(inner) => inner.get().as_ref().map_or(0, weight),
         Scalar::DataValue(inner) => {
@@ -281,20 +313,32 @@ fn scalar_weight(value: &Scalar<'_>) -> usize {
             inner.value.as_ref().map_or(0, weight)
         }
         Scalar::String(text) | Scalar::XmlElement(text) => text.map_or(0, str::len),
+        Scalar::LocalizedText(text) => text.text.map_or(0, str::len),
         Scalar::ByteString(bytes) => bytes.map_or(0, <[u8]>::len),
         Scalar::ExtensionObject(object) => match object.body {
             uadp::ExtensionBody::None => 0,
             uadp::ExtensionBody::Binary(bytes) => bytes.len(),
             uadp::ExtensionBody::Xml(text) => text.len(),
         },
-        _ => {
-            return VARIANT
-                + if is_boxed(value.builtin_type()) {
-                    BOXED
-                } else {
-                    0
-                };
-        }
+        // Of the size of their types, or a few bytes more.
+        Scalar::DateTime(_)
+        | Scalar::Guid(_)
+        | Scalar::NodeId(_)
+        | Scalar::ExpandedNodeId(_)
+        | Scalar::QualifiedName(_)
+        | Scalar::DiagnosticInfo(_)
+        | Scalar::Boolean(_)
+        | Scalar::SByte(_)
+        | Scalar::Byte(_)
+        | Scalar::Int16(_)
+        | Scalar::UInt16(_)
+        | Scalar::Int32(_)
+        | Scalar::UInt32(_)
+        | Scalar::Int64(_)
+        | Scalar::UInt64(_)
+        | Scalar::Float(_)
+        | Scalar::Double(_)
+        | Scalar::StatusCode(_) => 0,
     };
     VARIANT + BOXED + inner
 }
