@@ -264,46 +264,6 @@ async fn who_comes_when_nobody_listened_gets_the_newest_value_and_not_what_the_l
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]
-async fn a_reader_that_is_killed_keeps_no_value_from_the_others() {
-    // Twice what a reader may leave unacknowledged.
-    const VALUES: u32 = 512;
-    let Some(cell) = Cell::with(&[Peer::Python]) else {
-        return;
-    };
-    if !PATCHED {
-        Cell::skip("RustDDS as published waits for every reader");
-        return;
-    }
-    let domain = join();
-    let mut out = outlet(&domain, Offered::KeepLatest);
-    let mut killed = reads(&cell, OURS.0, TEXT, &LATCHED);
-    let mut other = reads(&cell, OURS.0, TEXT, &[]);
-    eventually("both readers are discovered", SOON, || {
-        let graph = Graph::snapshot(domain.participant());
-        out.set_readers(graph.readers(OURS.1), now()).unwrap();
-        (graph.readers(OURS.1).len() == 2).then_some(())
-    });
-    offer(&mut out, "both");
-    sent(&mut out).await;
-    for reader in [&mut killed, &mut other] {
-        reader.wait_for_line("\"both\"", SOON);
-    }
-    killed.signal(Signal::SIGKILL);
-    killed.wait_for_end(SOON);
-    let begin = Instant::now();
-    for number in 0..VALUES {
-        let due = begin + Duration::from_millis(3) * number;
-        tokio::time::sleep_until(due.into()).await;
-        offer(&mut out, &number.to_string());
-        assert_eq!(out.waiting(), 0, "at {number}");
-    }
-    other.wait_for_line(&format!("\"{}\"", VALUES - 1), SOON);
-    let numbers = (0..VALUES).map(|number| number.to_string());
-    let expected: Vec<String> = std::iter::once("both".to_owned()).chain(numbers).collect();
-    assert_eq!(heard(&other), expected);
-}
-
-#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
 async fn a_writer_that_is_replaced_repairs_what_its_reader_lacks() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;
