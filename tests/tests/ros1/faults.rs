@@ -586,7 +586,9 @@ fn many_topics(count: usize) -> String {
             format!("  - {{node: ns=2;i={n}, name: T{n}, {bindings}}}\n")
         })
         .collect();
-    format!("spaces: [{{id: 1}}, {{id: 2}}]\nnamespaces: {{2: urn:test:many}}\nvariables:\n{variables}")
+    format!(
+        "spaces: [{{id: 1}}, {{id: 2}}]\nnamespaces: {{2: urn:test:many}}\nvariables:\n{variables}"
+    )
 }
 
 /// Requirement: of two programs of one name that start in the same instant one stays with all it has, and the other ends
