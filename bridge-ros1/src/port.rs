@@ -2,8 +2,8 @@
 //!
 //! One task owns everything; [`Ros1Port::recv`](Port::recv) is its only wait.
 
-mod reload;
 mod found;
+mod reload;
 mod strays;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};

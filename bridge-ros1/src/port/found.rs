@@ -117,7 +117,6 @@ mod tests {
     use bridge_node::Port as _;
     use mappings::{Mapping, SpaceId};
     use tcpros::{Graph, NodeOptions};
-    use uadp::BuiltinType;
 
     use super::*;
     use crate::port::PortOptions;
@@ -153,7 +152,6 @@ mod tests {
     }
 
     /// One value, which has a standard type to be written in.
-    const BOOLEAN: &[(BuiltinType, bool)] = &[(BuiltinType::Boolean, false)];
     const HONEST: &str = "/ua_1_9_9";
 
     #[tokio::test]
