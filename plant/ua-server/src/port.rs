@@ -177,11 +177,9 @@ impl Port for ServerPort {
         if sample.kept == Kept::Beside && sample.source < self.space.shown(sample.topic) {
             return Ok(());
         }
-        let gave_way = self.space.update(
-            sample.topic,
-            sample.payload,
-            (sample.source, sample.status),
-        )?;
+        let gave_way =
+            self.space
+                .update(sample.topic, sample.payload, (sample.source, sample.status))?;
         self.unbound.extend(gave_way);
         Ok(())
     }

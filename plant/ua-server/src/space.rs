@@ -199,7 +199,8 @@ impl Space {
             if self
                 .topics
                 .get(&topic)
-                .is_some_and(|known| known.silent.is_none()) {
+                .is_some_and(|known| known.silent.is_none())
+            {
                 self.set_status(topic, None);
             }
         }
