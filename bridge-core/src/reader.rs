@@ -202,7 +202,8 @@ impl Reader {
 
     /// Whether what comes from there may be of the writer: of one that was not heard for `timeout` nobody knows.
     pub(crate) fn may_be(&self, from: SocketAddr, now: Instant, timeout: Duration) -> bool {
-        self.from.is_none_or(|known| known == from) || now.saturating_duration_since(self.heard) >= timeout
+        self.from.is_none_or(|known| known == from)
+            || now.saturating_duration_since(self.heard) >= timeout
     }
 
     /// Takes note of the version of a message, and says whether what was known of the content is no longer true.

@@ -258,7 +258,15 @@ mod tests {
             let from = SocketAddr::from(([127, 0, 0, 1], port));
             router.handle_datagram(&datagram, from, crate::clock::now());
         }
-        let status = Status::of(("bridge", SpaceId::ROS1), &router, (&About::default(), &[]));
+        let ready = Readiness {
+            not_ready: Vec::new(),
+            interfaces: Interfaces {
+                pubsub: 1,
+                local: None,
+            },
+        };
+        let about = About::default();
+        let status = Status::of(("bridge", SpaceId::ROS1), &router, (&about, &[]), ready);
         let line =
             "ua_sender_changed_total{program=\"bridge\",space=\"1\",topic=\"ua_2_5_10\"} 1\n";
         assert!(
