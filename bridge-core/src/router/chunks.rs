@@ -86,7 +86,9 @@ impl Router {
             .take()
             .unwrap_or_else(|| Box::new(Chunks::new(self.mapping.pubsub(), now.monotonic)));
         let since = chunks.since_start(now);
-        match chunks.reassembler.receive_from(from, message, since) {
+        let received = chunks.reassembler.receive_from(from, message, since);
+        let large = matches!(&received, Ok(Some(whole)) if whole.bytes.len() > MAX_SPARE);
+        match received {
             Ok(None) => {}
             Ok(Some(whole)) if whole.message_type == NetworkMessageType::Announcement => {
                 match Announcement::decode_body(whole.bytes) {
@@ -119,6 +121,10 @@ impl Router {
                 let cause = (reason_of(refusal), case_of(refusal));
                 self.count(about, cause, 1, || told(refusal, most));
             }
+        }
+        if large {
+            // The next one of this size may never come, and its buffer would be kept for it.
+            drop(chunks.reassembler.take_whole());
         }
         self.count_given_up(&mut chunks.reassembler);
         self.chunks = Some(chunks);
@@ -226,6 +232,8 @@ fn told(refusal: ChunkRefusal, most: u32) -> String {
     }
 }
 
+/// The buffer of a whole message is used again up to this size, which is more than that of images.
+const MAX_SPARE: usize = 16 << 20;
 const CHUNK_IN_CHUNKS: DecodeError = DecodeError::Misread("a chunk in chunks");
 /// Messages of one sender unfinished at a time: datagrams of so many large topics may come in turn.
 const MAX_OPEN: usize = 512;
