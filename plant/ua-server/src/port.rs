@@ -177,11 +177,11 @@ impl Port for ServerPort {
         if sample.kept == Kept::Beside && sample.source < self.space.shown(sample.topic) {
             return Ok(());
         }
-        let gave_way =
-            self.space
-                .update(sample.topic, sample.payload, (sample.source, sample.status))?;
-        self.unbound.extend(gave_way);
-        Ok(())
+        let shown = self
+            .space
+            .update(sample.topic, sample.payload, (sample.source, sample.status));
+        self.unbound.extend(self.space.take_gave_way());
+        shown
     }
 
     fn wanted(

@@ -27,6 +27,8 @@ pub(crate) struct Space {
     room: Room,
     /// Topics whose writer speaks again, without a sample so far.
     returned: Vec<TopicId>,
+    /// Topics whose nodes had to go for others.
+    gave_way: Vec<TopicId>,
 }
 
 /// A topic of another space, and what was last heard of it.
@@ -57,6 +59,7 @@ impl Space {
             structures: layout.structures.clone(),
             room: Room::new(MOST_UNMAPPED),
             returned: Vec::new(),
+            gave_way: Vec::new(),
         }
     }
 
@@ -116,8 +119,8 @@ impl Space {
     }
 
     /// Takes in a sample: the fields of its DataSet as a key frame carries them. One that cannot be shown leaves a status
-    /// that says why in the place of the value before it, which is no longer true either. Returns the topics whose nodes had
-    /// to go for its own.
+    /// that says why in the place of the value before it, which is no longer true either. Whose nodes had to go
+    /// for its own says [`take_gave_way`](Self::take_gave_way).
     ///
     /// # Errors
     /// Why it is not shown: fields that are malformed or not those of the mapping, no memory, or too many unmapped
@@ -127,12 +130,11 @@ impl Space {
         topic: TopicId,
         payload: Bytes,
         (source, status): (Option<Timestamp>, u16),
-    ) -> Result<Vec<TopicId>, &'static str> {
+    ) -> Result<(), &'static str> {
         let block = values::compact(payload);
-        let gave_way = match self.topics.contains_key(&topic) {
-            true => Vec::new(),
-            false => self.add_unmapped(topic, &block)?,
-        };
+        if !self.topics.contains_key(&topic) {
+            self.add_unmapped(topic, &block)?;
+        }
         let Some(known) = self.topics.get_mut(&topic) else {
             return Err("unknown topic");
         };
@@ -164,10 +166,13 @@ impl Space {
             .show(&self.subscriptions, &known.node, shown);
         match why {
             Some((_, why)) => Err(why),
-            None => kept
-                .map(|()| gave_way)
-                .map_err(|_| "the values take up all the memory there is for them"),
+            None => kept.map_err(|_| "the values take up all the memory there is for them"),
         }
+    }
+
+    /// The topics whose nodes had to go for others, since this was asked.
+    pub(crate) fn take_gave_way(&mut self) -> Vec<TopicId> {
+        std::mem::take(&mut self.gave_way)
     }
 
     /// When the value shown of a topic was taken.
@@ -223,11 +228,11 @@ impl Space {
     }
 
     /// Takes out the nodes of topics that nobody mapped and whose writers fell silent, of those first that are silent
-    /// longest, when it is time to look for room. Returns their topics.
-    fn let_unmapped_go(&mut self) -> Vec<TopicId> {
+    /// longest, when it is time to look for room.
+    fn let_unmapped_go(&mut self) {
         let now = now().monotonic;
         if !self.room.wants_look(now) {
-            return Vec::new();
+            return;
         }
         let unmapped = self.topics.iter().filter(|(_, known)| !known.mapped);
         let there = unmapped.clone().count();
@@ -247,12 +252,12 @@ impl Space {
             );
         }
         self.room.looked(there - topics.len(), now);
-        topics
+        self.gave_way.extend(topics);
     }
 
-    /// A topic nobody mapped gets a node of its own when its first value comes. Returns the topics that gave way to it.
-    fn add_unmapped(&mut self, topic: TopicId, block: &[u8]) -> Result<Vec<TopicId>, &'static str> {
-        let gave_way = self.let_unmapped_go();
+    /// A topic nobody mapped gets a node of its own when its first value comes.
+    fn add_unmapped(&mut self, topic: TopicId, block: &[u8]) -> Result<(), &'static str> {
+        self.let_unmapped_go();
         if !self.room.take() {
             return Err("too many unmapped topics");
         }
@@ -270,7 +275,7 @@ impl Space {
         );
         self.manager.inner().know(&node);
         self.topics.insert(topic, Known::new(node, false));
-        Ok(gave_way)
+        Ok(())
     }
 }
 
