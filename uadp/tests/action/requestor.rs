@@ -146,6 +146,31 @@ fn a_silent_responder_is_told_within_the_receive_timeout() {
 }
 
 #[test]
+fn silence_can_be_left_to_the_deadline() {
+    let settings = RequestorSettings {
+        receive_timeout: std::time::Duration::MAX,
+        ..RequestorSettings::default()
+    };
+    let mut requestor = Requestor::new(OwnedPublisherId::UInt16(1), [7; 16], settings);
+    let mut responder = responder();
+    let call = requestor
+        .call(request(&block(1), at(60_000)), at(0))
+        .unwrap();
+    let asked = requests(&mut requestor, at(0));
+    ask(&mut responder, &asked[0], at(0)).unwrap();
+    let executing = responses(&mut responder, at(0));
+    answer(&mut requestor, &executing[0], at(0)).unwrap();
+    requestor.handle_timeout(at(59_999));
+    assert_eq!(
+        requestor.poll_given_up(),
+        None,
+        "said once that it executes"
+    );
+    requestor.handle_timeout(at(60_000));
+    assert_eq!(requestor.poll_given_up(), Some((call, Unknown::Deadline)));
+}
+
+#[test]
 fn what_is_answered_after_it_was_given_up_is_not_told() {
     let (mut requestor, mut responder) = (requestor(), responder());
     requestor.call(request(&block(1), at(100)), at(0)).unwrap();
