@@ -3,6 +3,13 @@
 use std::path::PathBuf;
 
 use serde_json::{Value, json};
+use uadp::action::{
+    ActionCall, ActionDialect, ActionEncoder, ActionFields, ActionHeader, ActionKind, ActionStart,
+    ActionState,
+};
+use uadp::{
+    DataSetHeader, Extras, Keys, NetworkHeader, PublisherId, Sealer, SecurityMode, SecurityPolicy,
+};
 
 use crate::program::run_on;
 
@@ -103,4 +110,43 @@ fn what_is_wrong_with_an_action_is_told_with_its_place() {
     let place =
         "offset 30, in DataSetMessage of DataSetWriterId 61, ActionState: the reserved value 0x7";
     assert!(ended.stderr.contains(place), "{}", ended.stderr);
+}
+
+#[test]
+fn an_action_that_is_not_opened_is_written_again_as_it_was() {
+    let keys = Keys::from_bytes(SecurityPolicy::PubSubAes128Ctr, &[7; 52]).unwrap();
+    let mut sealer = Sealer::new(SecurityMode::SignAndEncrypt);
+    sealer.update_keys(3, [keys]).unwrap();
+    let seal = sealer.seal([1, 2, 3, 4]).unwrap();
+    let start = ActionStart {
+        network: NetworkHeader {
+            publisher_id: Some(PublisherId::UInt16(2)),
+            ..NetworkHeader::default()
+        },
+        action: ActionHeader::new(ActionKind::Request),
+        dialect: ActionDialect::Standard,
+        extras: Extras {
+            security: Some(seal.header()),
+            ..Extras::default()
+        },
+    };
+    let call = ActionCall {
+        target_id: 7,
+        request_id: 1,
+        state: ActionState::Executing,
+    };
+    let mut datagram = Vec::new();
+    let mut encoder = ActionEncoder::new(&mut datagram, &start, &[61]).unwrap();
+    encoder
+        .fields(&DataSetHeader::default(), call, ActionFields::NONE)
+        .unwrap();
+    encoder.finish_sealed(seal).unwrap();
+    let digits: String = datagram.iter().map(|byte| format!("{byte:02x}")).collect();
+
+    // That it is not opened is told beside it.
+    let shown = run_on(&["decode", "-"], digits.as_bytes()).stdout;
+    let shown: Value = serde_json::from_str(&shown).unwrap();
+    assert_eq!(shown["sealed"]["action"], true);
+    let again = run_on(&["encode", "-"], shown.to_string().as_bytes()).quiet();
+    assert_eq!(again.trim().replace(' ', ""), digits);
 }
