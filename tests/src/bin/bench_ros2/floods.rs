@@ -1,4 +1,4 @@
-//! More than both bridges can carry, from ROS 1 to ROS 2.
+//! More than both bridges can carry.
 
 use std::time::Duration;
 
@@ -9,15 +9,17 @@ use crate::through::{NAMES, Ways};
 
 pub(crate) fn measure(cell: &Cell, floods: u64) {
     let mut ways = Ways::stand(cell, WAITING);
-    let way = 1;
+    println!("\nMessages of 1 KiB, `drop_oldest: {WAITING}`, each rate {floods} times:\n");
     println!(
-        "\n{} of messages of 1 KiB, `drop_oldest: {WAITING}`, each rate {floods} times:\n",
-        NAMES[way]
+        "| way | offered | sent | lost | of these dropped by the bridges | taken/s | p50, ms | longest, ms |"
     );
-    println!(
-        "| offered | sent | lost | of these dropped by the bridges | taken/s | p50, ms | longest, ms |"
-    );
-    println!("|---|---|---|---|---|---|---|");
+    println!("|---|---|---|---|---|---|---|---|");
+    for way in [1, 2] {
+        flood(&mut ways, way, floods);
+    }
+}
+
+fn flood(ways: &mut Ways, way: usize, floods: u64) {
     for (shown, ticks, rate) in RATES {
         for _ in 0..floods {
             let pace = Pace {
@@ -38,7 +40,8 @@ pub(crate) fn measure(cell: &Cell, floods: u64) {
             #[expect(clippy::cast_precision_loss, reason = "a rate for people")]
             let taken = report.distinct as f64 / took.as_secs_f64();
             println!(
-                "| {shown} | {ticks} | {} | {} | {taken:.0} | {:.1} | {:.1} |",
+                "| {} | {shown} | {ticks} | {} | {} | {taken:.0} | {:.1} | {:.1} |",
+                NAMES[way],
                 ticks - report.distinct,
                 bridges_dropped() - before,
                 report.times.at(0.5) / 1000.0,
