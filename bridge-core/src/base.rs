@@ -8,7 +8,7 @@ use uadp::{
 };
 
 use crate::counters::Reason;
-use crate::reader::Place;
+use crate::place::Place;
 
 /// The last key frame of a writer with what its delta frames have changed since.
 ///

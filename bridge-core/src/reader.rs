@@ -9,6 +9,7 @@ use uadp::{BuiltinType, Timestamp};
 use crate::base::Base;
 use crate::counters::Reason;
 use crate::output::Kept;
+use crate::place::Place;
 use crate::writer::MAX_KEPT;
 
 /// The state of a topic we receive.
@@ -96,33 +97,6 @@ pub(crate) struct Held {
     pub(crate) instance: Option<Timestamp>,
     pub(crate) status: u16,
     pub(crate) arrived: Timestamp,
-}
-
-/// What the header of a DataSetMessage says of its place among the others.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Place {
-    pub(crate) sequence: Option<u16>,
-    pub(crate) stamp: Option<Timestamp>,
-    /// Whether the stamp has PicoSeconds, as all bridges send: two samples of one writer then never share it.
-    pub(crate) fine: bool,
-    /// When its NetworkMessage was sent.
-    pub(crate) sent: Option<Timestamp>,
-    pub(crate) from: SocketAddr,
-}
-
-impl Place {
-    /// The stamp, where it tells one sample of the writer from all others.
-    pub(crate) fn instance(&self) -> Option<Timestamp> {
-        self.stamp.filter(|_| self.fine)
-    }
-
-    /// Whether the sample was taken just before it was sent, as no repetition is.
-    fn is_fresh(&self) -> bool {
-        let (Some(stamp), Some(sent)) = (self.stamp, self.sent) else {
-            return false;
-        };
-        (0..FRESH).contains(&(sent.unix_nanos() - stamp.unix_nanos()))
-    }
 }
 
 impl Reader {
@@ -439,9 +413,6 @@ const MAX_KNOWN: usize = MAX_KEPT;
 /// How long the second other word on what a topic is has to wait for, and how often that is doubled.
 const RENAME_AFTER: Duration = Duration::from_secs(10);
 const MOST_DOUBLINGS: u32 = 8;
-/// How many nanoseconds after it was taken a sample is sent at most that is no repetition; those that a rate held back or
-/// that are long in their chunks are not among them.
-const FRESH: i128 = 100_000_000;
 /// A quarter of the sequence numbers' range.
 const QUARTER: u16 = 0x4000;
 /// From here on a number counts as behind the last one.

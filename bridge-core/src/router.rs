@@ -35,7 +35,6 @@ use crate::topic::{Item, Role, Topic};
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Idle, MAX_KEPT, Message};
 use chunks::Chunks;
-pub(crate) use content::Takes;
 use discovery::Discovery;
 use receive::Sample;
 use told::About;

@@ -12,7 +12,7 @@ use crate::gate::Gate;
 use crate::output::Delivery;
 use crate::queue::Queue;
 use crate::reader::Reader;
-use crate::router::Takes;
+use crate::takes::Takes;
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Message, Writer};
 

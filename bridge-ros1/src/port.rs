@@ -8,7 +8,6 @@ mod strays;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
 use std::net::IpAddr;
-use std::ops::Bound;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -25,7 +24,7 @@ use tcpros::{
 use tracing::{info, warn};
 use uadp::{BuiltinType, Timestamp};
 
-use self::found::{MAX_NAME, Refused};
+use self::found::Refused;
 use crate::definitions::Definitions;
 use crate::services::Ros1Graph;
 use crate::sink::{Open, Sink};
@@ -394,98 +393,6 @@ impl Ros1Port {
         let topics: Vec<TopicId> = self.sinks.keys().copied().collect();
         for topic in topics {
             self.reconcile_sink(topic);
-        }
-    }
-
-    /// Subscribes the topics that somebody publishes under a name of our space or of a pattern, and lets go of those
-    /// nobody does.
-    fn find_sources(&mut self) {
-        let mut found = Vec::new();
-        self.refused.topics = 0;
-        // Each topic has its turn, also where there are more than there is room for.
-        let after = (Bound::Excluded(self.taken_last.clone()), Bound::Unbounded);
-        let before = ..=self.taken_last.clone();
-        let publishers = &self.graph.publishers;
-        let topics = publishers.range(after).chain(publishers.range(before));
-        for (ros_topic, publishers) in topics {
-            if self.source_of.contains_key(ros_topic)
-                || publishers.iter().all(|name| name == self.node.name())
-            {
-                continue;
-            }
-            if ros_topic.len() > MAX_NAME {
-                self.refused.topics += 1;
-                continue;
-            }
-            let named = ros_topic
-                .strip_prefix('/')
-                .and_then(|name| name.parse::<TopicId>().ok());
-            let typed = self.graph.types.get(ros_topic).and_then(|t| t.parse().ok());
-            let made = self.mapping.matching(self.own, ros_topic, typed.as_ref());
-            match (named, made) {
-                (Some(topic), _) => {
-                    let variable = self.mapping.variable(topic);
-                    let bound = variable
-                        .is_some_and(|v| v.binding(self.own).is_some() || v.service.is_some());
-                    if topic.space == self.own && !bound {
-                        found.push((ros_topic.clone(), Ok((topic, None, Selection::Whole))));
-                    }
-                }
-                (None, Some(made)) if !self.is_written(ros_topic) => {
-                    let made = made.map(|made| (made.topic, made.message_type, made.selection));
-                    found.push((ros_topic.clone(), made.map_err(|fault| fault.to_string())));
-                }
-                (None, _) => {}
-            }
-        }
-        let mut places = self.places();
-        for (ros_topic, made) in found {
-            match made {
-                Ok(value) => self.add_found(ros_topic, value, &mut places),
-                Err(fault) => self.tell_once(&ros_topic, "pattern", || fault),
-            }
-        }
-        // Those that are known already may have lost their subscription.
-        for index in 0..self.sources.len() {
-            self.resubscribe(index);
-        }
-        for source in &mut self.sources {
-            let published = self.graph.publishers.contains_key(&source.ros_topic);
-            let connected = source
-                .subscription
-                .as_ref()
-                .is_some_and(|s| s.publishers() > 0);
-            // A master that has just restarted does not name all who publish.
-            if source.found && !published && !connected && !source.is_live() {
-                source.subscription = None;
-            }
-        }
-    }
-
-    /// Whether values of other spaces are written there: others who publish it too are not a value of ours.
-    fn is_written(&self, ros_topic: &str) -> bool {
-        let mut sinks = self.sinks.values();
-        sinks.any(|sink| {
-            self.node
-                .resolve(&sink.ros_topic)
-                .is_ok_and(|name| name == ros_topic)
-        })
-    }
-
-    /// Subscribes a topic that was found in the graph, if somebody publishes it and it is not subscribed.
-    fn resubscribe(&mut self, index: usize) {
-        let lost = |s: &&Source| s.subscription.is_none() && !s.values.is_empty();
-        let Some(source) = self.sources.get(index).filter(lost) else {
-            return;
-        };
-        let publishers = self.graph.publishers.get(&source.ros_topic);
-        let others = |names: &Vec<String>| names.iter().any(|name| name != self.node.name());
-        if !publishers.is_some_and(others) {
-            return;
-        }
-        let ros_topic = source.ros_topic.clone();
-        if let Err(error) = self.subscribe(index) {
-            self.tell_once(&ros_topic, "not subscribed", || error.to_string());
         }
     }
 

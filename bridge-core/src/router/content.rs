@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use mappings::{TopicId, UaField, Variable};
+use mappings::{TopicId, UaField};
 use uadp::{
     Array, DataSetHeader, DataSetMessage, DataValue, EncodeError, FieldEncoder, FieldEncoding,
     Fields, MessageKind, NetworkHeader, NetworkMessageEncoder, RawDialect, RawLayout, RawValue,
@@ -14,31 +14,10 @@ use super::{About, Router};
 use crate::base::Base;
 use crate::counters::Reason;
 use crate::layout::Layout;
-use crate::reader::Place;
+use crate::place::Place;
 use crate::settings::Now;
+use crate::takes::Takes;
 use crate::topic::{Role, Topic};
-
-/// What of the fields of foreign messages a topic takes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) enum Takes {
-    /// All of them.
-    #[default]
-    All,
-    /// One, and the mapping does not say which.
-    One,
-    /// The one the mapping names.
-    Named,
-}
-
-impl Takes {
-    pub(crate) fn of(variable: Option<&Variable>) -> Self {
-        match variable {
-            Some(variable) if variable.ua_field.is_some() => Self::Named,
-            Some(variable) if variable.value_type.is_some() => Self::One,
-            Some(_) | None => Self::All,
-        }
-    }
-}
 
 /// What of the fields of a message is taken.
 enum Choice {

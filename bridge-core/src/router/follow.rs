@@ -6,12 +6,12 @@ use std::time::Instant;
 
 use mappings::{Overflow, TopicId};
 
-use super::content::Takes;
 use super::{About, Router};
 use crate::counters::Reason;
 use crate::gate::Gate;
 use crate::reader::Reader;
 use crate::settings::Now;
+use crate::takes::Takes;
 use crate::topic::{Role, Topic};
 use crate::writer::Writer;
 

@@ -16,7 +16,8 @@ use crate::fields;
 use crate::hops::Hop;
 use crate::loop_rule::{Side, may_cross};
 use crate::output::{Delivery, Kept, Output};
-use crate::reader::{Held, Place};
+use crate::place::Place;
+use crate::reader::Held;
 use crate::settings::{Local, Now};
 use crate::topic::{Item, Role, Topic};
 

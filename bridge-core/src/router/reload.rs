@@ -4,11 +4,12 @@ use std::sync::Arc;
 
 use mappings::{Mapping, Overflow, PubSub, TopicId};
 
-use super::{About, Router, Takes};
+use super::{About, Router};
 use crate::counters::Reason;
 use crate::gate::Gate;
 use crate::queue::Queue;
 use crate::settings::{Local, Now};
+use crate::takes::Takes;
 use crate::topic::{Item, Role, Topic};
 
 impl Router {

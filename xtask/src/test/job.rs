@@ -152,6 +152,10 @@ impl Done {
     fn print(&self) {
         let took = self.took.as_secs_f64();
         if self.passed {
+            if self.counts == Counts::default() {
+                // A program without tests, or without one that was asked for.
+                return;
+            }
             let count = match self.counts.passed {
                 1 => String::new(),
                 passed => format!(" ({passed} tests)"),
