@@ -130,7 +130,17 @@ fn sum(name: &str, checked: &Checked, spaces: &[SpaceId]) -> String {
         several(mapping.patterns().len(), "pattern"),
         several(mapping.spaces().len(), "ROS space"),
     ];
-    format!("{name} can run{part}: {}", parts.join(", "))
+    // Most likely a slip of the pen; a bridge would run there without a line of configuration.
+    let unknown: Vec<String> = spaces
+        .iter()
+        .filter(|space| **space != SpaceId::UA && mapping.space(**space).is_none())
+        .map(ToString::to_string)
+        .collect();
+    let unknown = match unknown.is_empty() {
+        true => String::new(),
+        false => format!(" (it has no space {})", unknown.join(", ")),
+    };
+    format!("{name} can run{part}{unknown}: {}", parts.join(", "))
 }
 
 #[derive(Serialize)]

@@ -85,6 +85,12 @@ fn each_host_has_its_part_checked() {
     for (spaces, code, severity, sum) in [
         ("1", 0, "warning[M063]", "can run for space 1: 1 variable"),
         ("0", 0, "warning[M063]", "can run for space 0: 1 variable"),
+        (
+            "7",
+            0,
+            "warning[M063]",
+            "can run for space 7 (it has no space 7): 1 variable",
+        ),
         ("2", 78, "error[M063]", "cannot run for space 2"),
         ("1,2", 78, "error[M063]", "cannot run for the spaces 1, 2"),
     ] {
