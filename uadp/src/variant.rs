@@ -69,19 +69,13 @@ impl<'a> Variant<'a> {
     #[inline]
     pub(crate) fn read_at(reader: &mut Reader<'a>, depth: Depth) -> Result<Self, DecodeError> {
         let encoding = reader.u8("Variant")?;
-        match BuiltinType::from_id(encoding & TYPE_ID) {
-            Some(builtin) => Self::read_as(builtin, encoding, reader, depth),
-            None => Self::read_untyped(encoding, reader, depth),
-        }
-    }
-
-    #[inline]
-    fn read_as(
-        builtin: BuiltinType,
-        encoding: u8,
-        reader: &mut Reader<'a>,
-        depth: Depth,
-    ) -> Result<Self, DecodeError> {
+        let builtin = match BuiltinType::from_id(encoding & TYPE_ID) {
+            Some(builtin) => builtin,
+            None => match Self::without_type(encoding)? {
+                Some(builtin) => builtin,
+                None => return Ok(Self::Null),
+            },
+        };
         match encoding & !TYPE_ID {
             0 if builtin == BuiltinType::Variant => Err(VARIANT_IN_VARIANT),
             0 => Scalar::read_at(builtin, reader, depth).map(Self::Scalar),
@@ -109,18 +103,13 @@ impl<'a> Variant<'a> {
         }
     }
 
+    /// What a Variant holds whose type is none that is assigned; `None` for nothing.
     #[cold]
-    fn read_untyped(
-        encoding: u8,
-        reader: &mut Reader<'a>,
-        depth: Depth,
-    ) -> Result<Self, DecodeError> {
+    fn without_type(encoding: u8) -> Result<Option<BuiltinType>, DecodeError> {
         match encoding {
-            0 => Ok(Self::Null),
+            0 => Ok(None),
             // Types yet to come: decoders take what they hold for ByteStrings (OPC 10000-6, 5.2.2.16).
-            _ if matches!(encoding & TYPE_ID, 26..=31) => {
-                Self::read_as(BuiltinType::ByteString, encoding, reader, depth)
-            }
+            _ if matches!(encoding & TYPE_ID, 26..=31) => Ok(Some(BuiltinType::ByteString)),
             _ => Err(DecodeError::Reserved {
                 field: "Variant encoding",
                 value: encoding.into(),
