@@ -33,7 +33,7 @@ const TARGETS: &[&str] = &["--workspace", "--locked"];
 const SYSTEM_TESTS: &str = "system-tests";
 /// Test programs that measure what the machine can carry, so that what runs beside them would be measured, too.
 const ALONE: &[&str] = &["large", "rate", "ros2_fuzz", "ros2_large", "sharing"];
-/// System tests at a time. With more of them than this the waits for peers of a small machine run out.
+/// System tests at a time, on two cores. Most of what they do is wait; more at a time were not tried.
 const BESIDE: usize = 3;
 /// Peers of other makers fail now and then where nothing of ours takes part. More of it than this is no accident.
 const MOST_FLAKY: usize = 2;

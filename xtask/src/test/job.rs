@@ -10,7 +10,8 @@ use std::{
 
 use anyhow::Context as _;
 
-/// A test that takes longer than this hangs: the longest one takes some two minutes.
+/// A test that takes longer than this hangs: the longest one takes a minute. Peers that it has started then are not
+/// ended with it.
 const LONGEST: Duration = Duration::from_secs(600);
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
