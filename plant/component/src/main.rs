@@ -1,0 +1,3 @@
+//! A component of the cell.
+
+fn main() {}

@@ -1,0 +1,3 @@
+//! The local discovery server.
+
+fn main() {}

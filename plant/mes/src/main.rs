@@ -1,0 +1,3 @@
+//! The semantic MES.
+
+fn main() {}
