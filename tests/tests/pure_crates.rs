@@ -152,6 +152,76 @@ fn what_the_plant_thinks_with_reaches_no_io_and_knows_no_space() {
 }
 
 #[test]
+fn the_opc_ua_library_knows_neither_skills_nor_who_is_there_nor_the_space() {
+    does_not_reach(
+        "plant-opcua",
+        &[
+            "skills",
+            "discovery",
+            "registry",
+            "knowledge",
+            "uadp",
+            "messages",
+            "mappings",
+            "bridge-*",
+            "tcpros",
+            "transport",
+            "oxigraph",
+        ],
+    );
+}
+
+#[test]
+fn skills_know_neither_discovery_nor_rdf_nor_the_space_nor_ros() {
+    does_not_reach(
+        "skills",
+        &[
+            "discovery",
+            "registry",
+            "mdns-sd",
+            "knowledge",
+            "oxigraph",
+            "uadp",
+            "messages",
+            "bridge-*",
+            "tcpros",
+            "transport",
+        ],
+    );
+}
+
+#[test]
+fn discovery_knows_neither_skills_nor_rdf() {
+    does_not_reach(
+        "discovery",
+        &["skills", "plant-opcua", "knowledge", "oxigraph", "tcpros"],
+    );
+}
+
+#[test]
+fn knowledge_has_no_sessions_of_opc_ua() {
+    does_not_reach(
+        "knowledge",
+        &[
+            "async-opcua",
+            "plant-opcua",
+            "skills",
+            "discovery",
+            "uadp",
+            "bridge-*",
+            "tcpros",
+        ],
+    );
+}
+
+#[test]
+fn no_program_of_the_plant_knows_a_ros_library() {
+    for program in ["ua-component", "ua-mes"] {
+        does_not_reach(program, &["tcpros", "rosrust*", "ros2-client", "rustdds"]);
+    }
+}
+
+#[test]
 fn the_check_sees_what_a_shell_reaches() {
     assert!(forbidden(&tree("bridge-node"), IMPURE).contains(&"tokio".to_owned()));
 }
