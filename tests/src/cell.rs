@@ -29,6 +29,8 @@ pub enum Peer {
     CycloneC,
     /// rclpy over Fast DDS, of each [`Distribution`], in the Python environments that `cargo xtask test` makes.
     Ros2,
+    /// node-opcua, which `cargo xtask test` installs from npm.
+    NodeOpcua,
     /// Wireshark's tshark, from Debian or Ubuntu.
     Tshark,
 }
@@ -80,6 +82,7 @@ static ONLY: Mutex<()> = Mutex::new(());
 pub(crate) const TSHARK: &str = "/usr/bin/tshark";
 pub(crate) const FASTDDS: &str = "fastdds-peer";
 pub(crate) const CYCLONE: &str = "cyclone-peer";
+pub(crate) const NODE_OPCUA: &str = "node-opcua";
 
 impl Cell {
     /// Puts this thread into a new network, or says why the test is skipped and gives `None`.
@@ -219,6 +222,7 @@ pub(crate) fn compiled(name: &str) -> PathBuf {
 fn find(peer: Peer, python: &Path) -> Result<(), String> {
     let (fastdds, cyclone) = (compiled(FASTDDS), compiled(CYCLONE));
     let [jazzy, kilted] = Distribution::ALL.map(Distribution::python);
+    let node_opcua = compiled(NODE_OPCUA).join("node_modules/node-opcua-client");
     let needed: &[&Path] = match peer {
         Peer::Ros1 => &[
             Path::new("/usr/bin/rosmaster"),
@@ -234,6 +238,7 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
         Peer::FastDds => &[&fastdds],
         Peer::CycloneC => &[&cyclone],
         Peer::Ros2 => &[&jazzy, &kilted],
+        Peer::NodeOpcua => &[&node_opcua],
         Peer::Tshark => &[Path::new(TSHARK)],
     };
     match needed.iter().find(|path| !path.exists()) {

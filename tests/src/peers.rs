@@ -1,4 +1,5 @@
-//! The peers: ROS 1, Fast DDS and Cyclone DDS from Debian, Cyclone DDS and asyncua from PyPI, rosrust.
+//! The peers: ROS 1, Fast DDS and Cyclone DDS from Debian, Cyclone DDS and asyncua from PyPI, node-opcua from npm,
+//! rosrust.
 
 use std::{
     path::{Path, PathBuf},
@@ -9,7 +10,7 @@ use nix::sys::signal::Signal;
 
 use crate::{
     Cell, Child, GROUP, Started,
-    cell::{CYCLONE, Distribution, FASTDDS, compiled},
+    cell::{CYCLONE, Distribution, FASTDDS, NODE_OPCUA, compiled},
     eventually, program, xml_rpc,
 };
 
@@ -206,6 +207,36 @@ impl Cell {
         let mut child = self.python(script, args).start();
         let status = child.wait_for_end(START);
         status.success().then(|| child.json_lines())
+    }
+
+    /// A node-opcua script of `peers/node-opcua` that stays and has said it is ready.
+    #[must_use]
+    pub fn node_opcua(&self, script: &str, args: &[&str]) -> Child {
+        self.node_opcua_started(script, args).start().ready(START)
+    }
+
+    /// A node-opcua script of `peers/node-opcua` that ends by itself; the JSON lines it printed.
+    ///
+    /// # Panics
+    /// When it fails.
+    #[must_use]
+    pub fn node_opcua_once(&self, script: &str, args: &[&str]) -> Vec<serde_json::Value> {
+        let mut child = self.node_opcua_started(script, args).start();
+        let status = child.wait_for_end(START);
+        assert!(status.success(), "{script} ended with {status}: {child}");
+        child.json_lines()
+    }
+
+    /// A node-opcua script of `peers/node-opcua`, not started yet.
+    #[must_use]
+    pub fn node_opcua_started(&self, script: &str, args: &[&str]) -> Started {
+        let modules = compiled(NODE_OPCUA).join("node_modules");
+        Started::new(script, Path::new("node"))
+            .env("NODE_PATH", modules)
+            // node-opcua warns of what it has seen in its own surroundings, and keeps its certificates below HOME.
+            .env("HOME", self.folder())
+            .args([peer_script("node-opcua").join(script)])
+            .args(args)
     }
 
     /// asyncua's PubSub listening on the UADP group.

@@ -1,5 +1,5 @@
-//! The software of other makers that the system tests talk to: ROS 1 and the DDS libraries from Debian or Ubuntu, the
-//! rest, ROS 2 among it, from PyPI.
+//! The software of other makers that the system tests talk to: ROS 1 and the DDS libraries from Debian or Ubuntu,
+//! node-opcua from npm, the rest, ROS 2 among it, from PyPI.
 
 mod native;
 
@@ -62,6 +62,10 @@ const VENVS: [(&str, &str); 3] = [
 ];
 
 const PYTHON: &str = "venv";
+const NODE_OPCUA: &str = "node-opcua";
+const LOCK: &str = "package-lock.json";
+/// Where there is no npm already.
+const APT_NODE: &[&str] = &["nodejs", "npm"];
 
 /// Installs what is missing. What cannot be installed is told; its tests then skip themselves, or fail with `CI=true`.
 pub(crate) fn install(workspace: &Workspace) -> Ended {
@@ -76,6 +80,7 @@ pub(crate) fn install(workspace: &Workspace) -> Ended {
     for (folder, requirements) in VENVS {
         told("from PyPI", venv(workspace, folder, requirements));
     }
+    told("from npm", node_opcua(workspace));
     told("of DDS", native::build(workspace));
     ended
 }
@@ -95,6 +100,41 @@ pub(crate) fn run(workspace: &Workspace) -> Ended {
 /// When it cannot be installed.
 pub(crate) fn for_building() -> anyhow::Result<Ended> {
     apt_install(APT_BUILD).map(|()| Ended::WELL)
+}
+
+/// node-opcua in the versions of `tests/peers/node-opcua`, with none of the scripts that packages bring along.
+fn node_opcua(workspace: &Workspace) -> anyhow::Result<()> {
+    let wanted = workspace.root.join("tests/peers").join(NODE_OPCUA);
+    let folder = workspace.peers().join(NODE_OPCUA);
+    let lock = fs::read_to_string(wanted.join(LOCK))
+        .with_context(|| format!("{} cannot be read", wanted.join(LOCK).display()))?;
+    let installed = folder.join("installed");
+    if fs::read_to_string(&installed).is_ok_and(|there| there == lock) {
+        return Ok(());
+    }
+    if !succeeds("npm", &["--version"]) {
+        apt_install(APT_NODE)?;
+    }
+    step(&format!(
+        "installing from npm into {}: node-opcua",
+        folder.display()
+    ));
+    fs::create_dir_all(&folder).with_context(|| format!("{}", folder.display()))?;
+    for file in ["package.json", LOCK] {
+        fs::copy(wanted.join(file), folder.join(file))
+            .with_context(|| format!("{file} cannot be copied to {}", folder.display()))?;
+    }
+    let mut npm = Command::new("npm");
+    npm.current_dir(&folder).args([
+        "ci",
+        "--ignore-scripts",
+        "--omit=dev",
+        "--no-audit",
+        "--no-fund",
+        "--loglevel=error",
+    ]);
+    must(&mut npm)?;
+    fs::write(&installed, lock).with_context(|| format!("{}", installed.display()))
 }
 
 /// The Python that has the peers of PyPI but ROS 2.

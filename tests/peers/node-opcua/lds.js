@@ -1,0 +1,37 @@
+"use strict";
+// lds.js PORT: node-opcua's discovery server. Says `ready`, and then a JSON line whenever what it sees on the network
+// is another.
+const { OPCUADiscoveryServer } = require("node-opcua-server-discovery");
+const { findServersOnNetwork } = require("node-opcua-client");
+const path = require("path");
+const { OPCUACertificateManager } = require("node-opcua-certificate-manager");
+
+async function main([port]) {
+  const serverCertificateManager = new OPCUACertificateManager({
+    rootFolder: path.join(process.env.HOME, "pki"),
+    automaticallyAcceptUnknownCertificate: true,
+  });
+  await serverCertificateManager.initialize();
+  const server = new OPCUADiscoveryServer({ port: Number(port), serverCertificateManager });
+  await server.start();
+  console.log("ready");
+  let last = "";
+  for (;;) {
+    const found = await findServersOnNetwork(`opc.tcp://127.0.0.1:${port}`);
+    const seen = JSON.stringify(found.map((server) => ({
+      name: server.serverName,
+      url: server.discoveryUrl,
+      capabilities: server.serverCapabilities,
+    })));
+    if (seen !== last) {
+      last = seen;
+      console.log(`{"network":${seen}}`);
+    }
+    await new Promise((resolve) => setTimeout(resolve, 100));
+  }
+}
+
+main(process.argv.slice(2)).catch((error) => {
+  console.error(error);
+  process.exit(1);
+});
