@@ -5,7 +5,7 @@
 
 use crate::{Dialect, TypeName};
 
-const PACKAGES: [(&str, &str); 19] = [
+const PACKAGES: [(&str, &str); 20] = [
     ("action_msgs", include_str!("../bundle/action_msgs.txt")),
     (
         "actionlib_msgs",
@@ -41,6 +41,7 @@ const PACKAGES: [(&str, &str); 19] = [
         "trajectory_msgs",
         include_str!("../bundle/trajectory_msgs.txt"),
     ),
+    ("ua_msgs", include_str!("../bundle/ua_msgs.txt")),
     (
         "unique_identifier_msgs",
         include_str!("../bundle/unique_identifier_msgs.txt"),

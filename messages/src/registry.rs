@@ -34,9 +34,10 @@ impl Registry {
     }
 
     /// With the common interfaces built in: std_msgs, geometry_msgs, sensor_msgs, nav_msgs, trajectory_msgs,
-    /// diagnostic_msgs, actionlib_msgs, tf2_msgs, rosgraph_msgs, shape_msgs, visualization_msgs, stereo_msgs and the
-    /// services of std_srvs, for ROS 1 also roscpp and their services, and for ROS 2 builtin_interfaces, action_msgs,
-    /// unique_identifier_msgs, lifecycle_msgs and rcl_interfaces with the services of action_msgs and rcl_interfaces.
+    /// diagnostic_msgs, actionlib_msgs, tf2_msgs, rosgraph_msgs, shape_msgs, visualization_msgs, stereo_msgs, the
+    /// services of std_srvs and ua_msgs (the skills of OPC UA, `ros/ua_msgs`), for ROS 1 also roscpp and their services,
+    /// and for ROS 2 builtin_interfaces, action_msgs, unique_identifier_msgs, lifecycle_msgs and rcl_interfaces with the
+    /// services of action_msgs and rcl_interfaces.
     pub fn bundle(dialect: Dialect) -> Self {
         let mut registry = Self::empty(dialect);
         for (kind, name, text) in bundle::texts(dialect) {

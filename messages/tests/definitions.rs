@@ -500,3 +500,34 @@ fn an_action_of_ros_2_has_its_status_before_its_result() {
         "{error}"
     );
 }
+
+/// `ros/ua_msgs` is what people build who want these types in their own nodes.
+#[test]
+fn the_package_people_build_has_the_skill_messages_that_are_built_in() {
+    let folder = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../ros/ua_msgs");
+    let cmake = std::fs::read_to_string(folder.join("CMakeLists.txt")).unwrap();
+    for dialect in [Dialect::Ros1, Dialect::Ros2] {
+        let built_in = Registry::bundle(dialect);
+        let mut files = Registry::empty(dialect);
+        for entry in std::fs::read_dir(folder.join("msg")).unwrap() {
+            let path = entry.unwrap().path();
+            let stem = path.file_stem().unwrap().to_str().unwrap().to_owned();
+            let text = std::fs::read_to_string(&path).unwrap();
+            files.add(&name(&format!("ua_msgs/{stem}")), &text).unwrap();
+            assert!(cmake.contains(&format!(" {stem}.msg")), "{stem}");
+        }
+        let of_ours: Vec<&TypeName> = built_in
+            .names()
+            .filter(|known| known.package() == "ua_msgs")
+            .collect();
+        assert_eq!(files.names().collect::<Vec<_>>(), of_ours);
+        for each in of_ours {
+            let (ours, file) = (built_in.get(each).unwrap(), files.get(each).unwrap());
+            assert_eq!(ours.leaves(), file.leaves(), "{each}");
+            assert_eq!(ours.constants(), file.constants(), "{each}");
+            if dialect == Dialect::Ros1 {
+                assert_eq!(ours.md5(), file.md5(), "{each}");
+            }
+        }
+    }
+}

@@ -9,6 +9,8 @@
     python3 make.py hashes    needs rosbags -> ros2_type_hashes.txt
     python3 make.py idl       needs rosbags -> rosbags_idl.json
 
+ua_msgs of this project (../../../ros/ua_msgs) is read from its files into each of the stores of rosbags.
+
 ros1_md5.txt    name and md5 of each ROS 1 type: rosbags' store ROS1_NOETIC
 ros1_services.txt name and md5 of each service of those packages, of roscpp/Logger, and of the messages genaction made
                 of two actions: the classes genpy made
@@ -20,6 +22,7 @@ rosbags_idl.json messages of ROS2_JAZZY in IDL, as rosbags reads them again, and
                 is to make of them, one line each, by the rules of the crate's documentation (written here a second time)
 """
 import json
+import pathlib
 import random
 import sys
 
@@ -27,9 +30,14 @@ from fields import events, make
 from serializers import CLOCKS, HIDDEN, Cyclone, Genpy, Rosbags, full, short
 
 PACKAGES_1 = """std_msgs geometry_msgs sensor_msgs nav_msgs trajectory_msgs diagnostic_msgs actionlib_msgs
-    rosgraph_msgs shape_msgs visualization_msgs stereo_msgs""".split()
+    rosgraph_msgs shape_msgs visualization_msgs stereo_msgs ua_msgs""".split()
 PACKAGES_2 = PACKAGES_1 + """builtin_interfaces action_msgs unique_identifier_msgs tf2_msgs lifecycle_msgs
     rcl_interfaces""".split()
+
+
+def ours():
+    files = pathlib.Path(__file__).resolve().parents[3].glob("ros/ua_msgs/msg/*.msg")
+    return [(f"ua_msgs/{path.stem}", path.read_text()) for path in sorted(files)]
 
 
 def write(path, samples):
@@ -42,7 +50,7 @@ def rosbags():
 
     samples = []
     for dialect, packages in ((1, PACKAGES_1), (2, PACKAGES_2)):
-        lib = Rosbags(dialect)
+        lib = Rosbags(dialect, ours())
         store = lib.store
 
         def written(desc):
@@ -123,7 +131,7 @@ def services():
 
 def hashes():
     from rosbags.interfaces import Nodetype
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     def written(desc):
         node, what = desc
@@ -138,14 +146,16 @@ def hashes():
     with open("ros2_type_hashes.txt", "w") as out:
         for which in "HUMBLE IRON JAZZY KILTED LYRICAL".split():
             store = get_typestore(getattr(Stores, "ROS2_" + which))
+            for name, text in ours():
+                store.register(get_types_from_msg(text, full(name)))
             out.write(f"# {which.title()}\n")
-            for full in sorted(store.fielddefs):
-                fields = [f"{f}:{written(d)}" for f, d in store.fielddefs[full][1]
+            for name in sorted(store.fielddefs):
+                fields = [f"{f}:{written(d)}" for f, d in store.fielddefs[name][1]
                           if f != "structure_needs_at_least_one_member"]
-                line = " ".join([store.hash_rihs01(full), short(full), *fields])
-                if before.get(full) != line:
+                line = " ".join([store.hash_rihs01(name), short(name), *fields])
+                if before.get(name) != line:
                     out.write(line + "\n")
-                    before[full] = line
+                    before[name] = line
 
 
 IDL_WORDS = {"bool": "boolean", "byte": "octet", "char": "uint8", "float32": "float", "float64": "double"}
