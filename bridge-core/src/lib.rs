@@ -10,6 +10,7 @@
 //! and no allocation.
 
 mod base;
+mod call;
 mod counters;
 mod description;
 mod fields;
@@ -33,12 +34,17 @@ mod topic;
 mod transcoder;
 mod writer;
 
+pub use call::{
+    Answered, AskError, AskErrorKind, AskId, CallCounters, CallDescription, CallField, Executed,
+    Execution, Offered, ValueDescription, split_name,
+};
 pub use counters::{Counters, Reason, Verdict};
 pub use description::Described;
 pub use fields::{decode_fields, encode_fields};
 pub use hops::{Delays, Hop, Hops};
-pub use loop_rule::{Side, may_cross};
+pub use loop_rule::{Owned, Side, What, may_cross};
 pub use output::{Delivery, Heard, Kept, Notice, Output, PublisherKey};
 pub use room::Room;
 pub use router::Router;
 pub use settings::{Local, Now, Settings};
+pub use uadp::action::{ExecutionId, Refusal};

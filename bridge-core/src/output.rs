@@ -4,8 +4,10 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use mappings::TopicId;
+use uadp::action::ExecutionId;
 use uadp::{BuiltinType, Timestamp};
 
+use crate::call::{Answered, AskId, CallDescription, Execution};
 use crate::counters::Reason;
 use crate::description::Described;
 
@@ -60,6 +62,50 @@ pub enum Output {
         topic: TopicId,
         /// [`Delivery::instance`] of the value.
         instance: Timestamp,
+    },
+    /// A request or response to send, as a [`Datagram`](Self::Datagram) is.
+    Action {
+        /// The call.
+        topic: TopicId,
+        /// The whole UDP payload.
+        bytes: Vec<u8>,
+    },
+    /// What became of a request of the local side. Each has one, unless it was given up.
+    Answer {
+        /// Which request.
+        ask: AskId,
+        /// Of which call.
+        topic: TopicId,
+        /// The response, or why there is none.
+        answer: Answered,
+    },
+    /// A call of another program can be asked for, or is another than before.
+    CallKnown {
+        /// Which call.
+        topic: TopicId,
+        /// What it takes and gives.
+        description: Arc<CallDescription>,
+    },
+    /// Nobody executes that call any longer.
+    CallGone {
+        /// Which call.
+        topic: TopicId,
+    },
+    /// A request for the local side to execute. Each is to be ended with [`Router::executed`](crate::Router::executed).
+    Execute(Execution),
+    /// Who asked does not want it any longer: it is to be cancelled where that can be done, and ended all the same.
+    Abandoned {
+        /// Which execution.
+        execution: ExecutionId,
+        /// Of which call.
+        topic: TopicId,
+    },
+    /// Somebody else writes a namespace of ours: nothing of ours is sent in it as long as that is so.
+    Taken {
+        /// Which namespace.
+        namespace: u16,
+        /// Who; nobody any more without one.
+        by: Option<SocketAddr>,
     },
     /// Something to log.
     Notice(Notice),

@@ -1,6 +1,7 @@
 //! The Router: verdicts on samples, queues per topic, repetitions and silences.
 
 mod batch;
+mod calls;
 mod chunks;
 mod content;
 mod discovery;
@@ -23,7 +24,7 @@ use crate::counters::{Cause, Counters, Reason, Verdict};
 use crate::fields;
 use crate::gate::{Passage, Waiting};
 use crate::hops::{Hop, Hops};
-use crate::loop_rule::{Side, may_cross};
+use crate::loop_rule::{Owned, Side, What, may_cross};
 use crate::network::{check_size, data_set_header, encode, keep_alive};
 use crate::output::{Delivery, Heard, Kept, Output, PublisherKey};
 use crate::pace::Pace;
@@ -43,6 +44,7 @@ use told::About;
 #[derive(Debug)]
 pub struct Router {
     settings: Settings,
+    owned: Owned,
     mapping: Arc<Mapping>,
     topics: HashMap<TopicId, Topic>,
     /// For topics that nobody here knows.
@@ -79,6 +81,7 @@ impl Router {
     pub fn new(settings: Settings, mapping: Arc<Mapping>) -> Self {
         Self {
             settings,
+            owned: Owned::All,
             mapping,
             topics: HashMap::new(),
             room: Room::new(follow::MAX_STRAYS),
@@ -97,6 +100,15 @@ impl Router {
             others: Counters::default(),
             hops: Hops::new(),
         }
+    }
+
+    /// Whether that topic is of what this program alone writes.
+    pub(crate) fn is_home(&self, topic: TopicId) -> bool {
+        self.owned.is_home(self.settings.own, topic)
+    }
+
+    fn may_cross(&self, heard_on: Side, what: What, topic: TopicId) -> bool {
+        may_cross(self.is_home(topic), heard_on, what)
     }
 
     /// Ties a topic to its local message type, compiled once. A topic bound anew starts afresh with the new type; a
@@ -179,7 +191,7 @@ impl Router {
             received,
             latched_by,
         } = heard;
-        if !may_cross(self.settings.own, Side::Local, topic.space) {
+        if !self.may_cross(Side::Local, What::Value, topic) {
             return self.refuse(topic, Reason::Looped, String::new());
         }
         let mut encoded = Encoded {

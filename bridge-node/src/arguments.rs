@@ -3,6 +3,8 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
+use clap::FromArgMatches;
+
 use crate::logging::LogFormat;
 
 /// Flags win over `UA_*` environment variables, which win over the mapping.
@@ -14,6 +16,14 @@ pub struct Arguments {
     /// Check the mapping, print every finding, and exit
     #[arg(long)]
     pub check: bool,
+    /// All but the mapping.
+    #[command(flatten)]
+    pub flags: Flags,
+}
+
+/// What programs take whether they have a mapping or not.
+#[derive(Debug, Clone, clap::Args)]
+pub struct Flags {
     /// Hear and decode, but publish nothing on either side
     #[arg(long)]
     pub dry_run: bool,
@@ -46,4 +56,32 @@ pub struct Arguments {
         value_parser = clap::value_parser!(u32).range(..=10_000)
     )]
     pub busy_poll: u32,
+}
+
+/// The arguments of a program that has no mapping file but a configuration of its own.
+#[derive(Debug, Clone)]
+pub struct WithoutMapping(pub Arguments);
+
+impl clap::Args for WithoutMapping {
+    fn augment_args(command: clap::Command) -> clap::Command {
+        Flags::augment_args(command)
+    }
+
+    fn augment_args_for_update(command: clap::Command) -> clap::Command {
+        Flags::augment_args_for_update(command)
+    }
+}
+
+impl FromArgMatches for WithoutMapping {
+    fn from_arg_matches(matches: &clap::ArgMatches) -> Result<Self, clap::Error> {
+        Ok(Self(Arguments {
+            mapping: None,
+            check: false,
+            flags: Flags::from_arg_matches(matches)?,
+        }))
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &clap::ArgMatches) -> Result<(), clap::Error> {
+        self.0.flags.update_from_arg_matches(matches)
+    }
 }

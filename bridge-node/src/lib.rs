@@ -19,15 +19,18 @@ mod services;
 mod stamp;
 mod status;
 
-pub use arguments::Arguments;
-pub use bridge_core::{Described, Kept, PublisherKey, Reason, Room};
+pub use arguments::{Arguments, Flags, WithoutMapping};
+pub use bridge_core::{
+    Answered, AskError, AskErrorKind, AskId, CallDescription, CallField, Described, Executed,
+    ExecutionId, Kept, Offered, Owned, PublisherKey, Reason, Refusal, Room, ValueDescription,
+};
 pub use busy_poll::BusyPoll;
 pub use clock::{now, timestamp};
 pub use definitions::Definitions;
 pub use exit::{Failure, FailureKind};
 pub use logging::{LogFormat, LogRecord, LogSink, hear_log};
-pub use port::{Delivery, Port, PortEvent};
-pub use program::{Context, Program, run};
+pub use port::{Delivery, Execution, Port, PortEvent};
+pub use program::{Context, Made, Program, run};
 pub use services::{CallFault, Outcome, ServiceCall, ServiceGraph, Services};
 pub use stamp::wants_stamp;
 pub use type_files::{Environment, TypePaths};

@@ -224,6 +224,26 @@ pub(crate) struct MappingFile {
 }
 
 impl MappingFile {
+    /// A mapping without a file, which never changes.
+    pub(crate) fn none(mapping: Mapping) -> Self {
+        let running = Running {
+            mapping: Arc::new(mapping),
+            types: Arc::default(),
+            about: Arc::default(),
+        };
+        Self {
+            file: None,
+            files: Arc::default(),
+            hash: String::new(),
+            fingerprint: 0,
+            known: Arc::default(),
+            told: BTreeSet::new(),
+            gone: false,
+            spaces: Vec::new(),
+            running,
+        }
+    }
+
     /// Reads the mapping for the first time and prints its findings, as they are for a program of the `spaces` it says of a
     /// mapping. Without a file: zero configuration. `None`: with `only_check`, it was checked and can run; where it does not
     /// say which spaces the program serves, for everybody.
@@ -236,23 +256,7 @@ impl MappingFile {
         spaces: impl FnOnce(&Mapping) -> Result<Vec<SpaceId>, Failure>,
     ) -> Result<Option<Self>, Failure> {
         let Some(file) = file else {
-            let running = Running {
-                mapping: Arc::default(),
-                types: Arc::default(),
-                about: Arc::default(),
-            };
-            let without = Self {
-                file: None,
-                files: Arc::default(),
-                hash: String::new(),
-                fingerprint: 0,
-                known: Arc::default(),
-                told: BTreeSet::new(),
-                gone: false,
-                spaces: Vec::new(),
-                running,
-            };
-            return Ok((!only_check).then_some(without));
+            return Ok((!only_check).then(|| Self::none(Mapping::default())));
         };
         let mut reading = read(file, &TypePaths::default(), &Known::new())
             .map_err(|error| Failure::new(FailureKind::Io, error))?;

@@ -1,12 +1,16 @@
 //! What a bridge program brings to the shell: its own side of the bridge.
 
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
+use std::time::Duration;
 
-use bridge_core::{Described, Kept, PublisherKey, Reason};
+use bridge_core::{
+    Answered, AskId, CallDescription, Described, Executed, ExecutionId, Kept, Offered,
+    PublisherKey, Reason, ValueDescription,
+};
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
-use messages::{MessageType, Selection};
+use messages::{MessageType, Selection, ServiceType};
 use type_files::TypePaths;
 use uadp::{BuiltinType, Timestamp};
 
@@ -48,6 +52,39 @@ pub trait Port: Send + 'static {
         let _one_value = (topic, instance);
     }
 
+    /// A call of another program can be asked for from now on, or is another than before.
+    fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
+        let _not_served = (topic, description);
+    }
+
+    /// Nobody executes a call any longer. What was asked is still answered.
+    fn call_gone(&mut self, topic: TopicId) {
+        let _not_served = topic;
+    }
+
+    /// What became of a request that was reported as [`PortEvent::Ask`].
+    fn answered(&mut self, ask: AskId, topic: TopicId, answer: Answered<Bytes>) {
+        let _never_asked = (ask, topic, answer);
+    }
+
+    /// Executes a request for a call that was reported as [`PortEvent::Offer`]: what it came to is reported as
+    /// [`PortEvent::Executed`]. Never waits. False where it is not executed, for which nothing is to be reported.
+    fn execute(&mut self, execution: Execution) -> bool {
+        let _never_offered = execution;
+        false
+    }
+
+    /// Who asked for an execution does not want it any longer. It is to be reported as executed all the same.
+    fn abandoned(&mut self, execution: ExecutionId, topic: TopicId) {
+        let _goes_on = (execution, topic);
+    }
+
+    /// Somebody else writes a namespace of ours, and nothing of ours is sent in it; or, without anybody, no longer. The
+    /// program is not ready meanwhile, and that is told.
+    fn taken(&mut self, namespace: u16, by: Option<SocketAddr>) {
+        let _told_by_the_shell = (namespace, by);
+    }
+
     /// Another mapping takes the place of the one there is. What both say alike goes on undisturbed; what only the old one
     /// says is given up ([`PortEvent::Unbound`]), and what only the new one says taken up. Returns what is not changed
     /// while the program runs, by its keys in the mapping and with the reason, for people. `types` are the definitions of
@@ -68,6 +105,9 @@ pub trait Port: Send + 'static {
     /// Withdraws every registration and ends. Bounded by 2 s.
     fn shutdown(self) -> impl Future<Output = ()> + Send;
 }
+
+/// A request for the local side to execute.
+pub type Execution = bridge_core::Execution<Bytes>;
 
 /// One value of another space on its way to the local side.
 #[derive(Debug, Clone)]
@@ -160,6 +200,65 @@ pub enum PortEvent {
         topic: TopicId,
         /// What went wrong, for the log.
         detail: String,
+    },
+    /// What a value of our own space is, where the port speaks in fields and no mapping says it.
+    Described {
+        /// Which value.
+        topic: TopicId,
+        /// What it is.
+        description: ValueDescription,
+    },
+    /// The local side asks for a call under that type from now on.
+    CallBound {
+        /// Which call.
+        topic: TopicId,
+        /// Its type in the port's dialect.
+        service_type: Arc<ServiceType>,
+    },
+    /// The local side no longer asks for a call, or will under another type.
+    CallUnbound {
+        /// Which call.
+        topic: TopicId,
+    },
+    /// The local side has somebody who would ask for a call: what it is is asked of who executes it.
+    CallWanted {
+        /// Which call.
+        topic: TopicId,
+    },
+    /// A request of the local side.
+    Ask {
+        /// Tells it from all others.
+        ask: AskId,
+        /// For which call.
+        topic: TopicId,
+        /// It, in the port's encoding.
+        request: Bytes,
+        /// How long the answer is waited for.
+        timeout: Duration,
+    },
+    /// Who asked is gone: the request is not answered any more, and whoever executes it is told so.
+    AskGivenUp {
+        /// Which request.
+        ask: AskId,
+    },
+    /// The local side executes a call of its own from now on, or it is another than before.
+    Offer {
+        /// Which call: of a namespace that the program owns.
+        topic: TopicId,
+        /// What it is.
+        offered: Offered,
+    },
+    /// The local side no longer executes a call, or no longer has a value, of its own.
+    Withdrawn {
+        /// Which.
+        topic: TopicId,
+    },
+    /// What an execution came to.
+    Executed {
+        /// Which.
+        execution: ExecutionId,
+        /// Its outcome.
+        outcome: Executed,
     },
     /// The port cannot go on, such as a ROS 1 node that was told to shut down because another took its name. The
     /// program ends with this message.

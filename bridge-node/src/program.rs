@@ -1,11 +1,14 @@
 //! From the command line to the run loop and back: what every program's `main` does.
 
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Read;
 use std::net::SocketAddr;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_core::{Local, Router, Settings};
+use bridge_core::{Local, Owned, Router, Settings};
 use clap::Parser;
 use clap::error::ErrorKind;
 use mappings::{Mapping, PubSub, SpaceId};
@@ -18,6 +21,7 @@ use type_files::TypePaths;
 
 use crate::arguments::Arguments;
 use crate::busy_poll::BusyPoll;
+use crate::clock::now;
 use crate::descriptors;
 use crate::exit::{Failure, FailureKind};
 use crate::logging;
@@ -41,6 +45,24 @@ pub trait Program: Parser {
     /// The arguments all programs have.
     fn arguments(&self) -> &Arguments;
 
+    /// Whether it listens for a moment for somebody else in its namespaces before it sends anything in them.
+    const CLAIMS: bool = false;
+
+    /// A mapping made in code, in place of a file: for programs with a configuration of their own.
+    ///
+    /// # Errors
+    /// When that configuration cannot run; what is wrong with it in detail is printed by then.
+    fn made(&self) -> Result<Option<Made>, Failure> {
+        Ok(None)
+    }
+
+    /// The namespaces of its space that it alone writes. Asked again when the mapping changes.
+    #[must_use]
+    fn owned(mapping: &Mapping) -> Owned {
+        let _whole_space = mapping;
+        Owned::All
+    }
+
     /// The spaces it serves, none of them twice: each with a local side, a Router and a place in the group of its own.
     ///
     /// # Errors
@@ -52,6 +74,15 @@ pub trait Program: Parser {
     /// # Errors
     /// What keeps it from running at all. A peer that is not there yet is waited for instead.
     fn start(&self, context: Context) -> impl Future<Output = Result<Self::Port, Failure>>;
+}
+
+/// What a program with a configuration of its own comes to.
+#[derive(Debug)]
+pub enum Made {
+    /// This is to run.
+    Run(Mapping),
+    /// The configuration was only to be checked, and can run.
+    Checked,
 }
 
 /// What a port is started with.
@@ -81,12 +112,18 @@ pub fn run<P: Program>() -> ExitCode {
             };
         }
     };
-    logging::start(program.arguments().log, P::QUIET);
+    logging::start(program.arguments().flags.log, P::QUIET);
     descriptors::raise();
     let arguments = program.arguments();
     let mapping = arguments.mapping.as_deref();
     let spaces = |mapping: &Mapping| program.spaces(mapping);
-    let ended = match MappingFile::open(mapping, arguments.check, spaces) {
+    let mapping = match program.made() {
+        Ok(Some(Made::Run(made))) => Ok(Some(MappingFile::none(made))),
+        Ok(Some(Made::Checked)) => Ok(None),
+        Ok(None) => MappingFile::open(mapping, arguments.check, spaces),
+        Err(failure) => Err(failure),
+    };
+    let ended = match mapping {
         Ok(Some(mapping)) => serve(program, mapping),
         Ok(None) => Ok(()),
         Err(failure) => Err(failure),
@@ -113,7 +150,7 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
         let signal = stopped()?;
         let hangup = listen(SignalKind::hangup())?;
         let (changed, changes) = watch::channel(running);
-        let mut requests = metrics::serve(arguments.metrics, spaces.len()).await?;
+        let mut requests = metrics::serve(arguments.flags.metrics, spaces.len()).await?;
         let several = spaces.len() > 1;
         let (stopping, stop) = watch::channel(false);
         let mut shells = JoinSet::new();
@@ -175,7 +212,12 @@ async fn prepare<P: Program>(
         local: P::LOCAL,
         source: Some(udp.source()),
     };
-    let router = Router::new(settings, Arc::clone(&mapping));
+    let mut router = Router::new(settings, Arc::clone(&mapping));
+    router.set_owned(P::owned(&mapping), now());
+    router.set_instance(instance()?);
+    if P::CLAIMS {
+        router.claim(now());
+    }
     let context = Context {
         mapping: Arc::clone(&mapping),
         types,
@@ -189,16 +231,18 @@ async fn prepare<P: Program>(
         held: port.addresses().and_then(Held::start),
         port,
         udp,
+        owned: P::owned,
         requests,
         changes: changes.clone(),
         fixed: Fixed {
             started: mapping,
-            address: arguments.address.is_none(),
-            interface: arguments.interface.is_none(),
+            address: arguments.flags.address.is_none(),
+            interface: arguments.flags.interface.is_none(),
         },
         restart: Vec::new(),
-        busy: BusyPoll::new(Duration::from_micros(arguments.busy_poll.into())),
-        dry_run: arguments.dry_run,
+        taken: BTreeMap::new(),
+        busy: BusyPoll::new(Duration::from_micros(arguments.flags.busy_poll.into())),
+        dry_run: arguments.flags.dry_run,
     })
 }
 
@@ -206,6 +250,17 @@ async fn prepare<P: Program>(
 async fn told(mut stop: watch::Receiver<bool>) {
     let _told_or_alone = stop.wait_for(|stop| *stop).await;
 }
+
+/// Random bytes, which tell the requests of this run from those of others.
+fn instance() -> Result<[u8; 16], Failure> {
+    let mut bytes = [0; 16];
+    File::open(RANDOM)
+        .and_then(|mut random| random.read_exact(&mut bytes))
+        .map_err(|error| Failure::new(FailureKind::Io, format!("cannot read {RANDOM}: {error}")))?;
+    Ok(bytes)
+}
+
+const RANDOM: &str = "/dev/urandom";
 
 /// How a space's run loop ended.
 fn how(ended: Option<Result<Result<(), Failure>, JoinError>>) -> Result<(), Failure> {
@@ -219,7 +274,7 @@ fn how(ended: Option<Result<Result<(), Failure>, JoinError>>) -> Result<(), Fail
 
 fn open(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Udp, Failure> {
     let pubsub = mapping.pubsub();
-    let address: SocketAddr = match &arguments.address {
+    let address: SocketAddr = match &arguments.flags.address {
         Some(url) => PubSub::parse_address(url).ok_or_else(|| {
             let message = format!("--address {url}: for example opc.udp://{}", PubSub::ADDRESS);
             Failure::new(FailureKind::Usage, message)
@@ -228,6 +283,7 @@ fn open(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Udp, 
     };
     let options = Options {
         interface: arguments
+            .flags
             .interface
             .clone()
             .or_else(|| pubsub.interface.clone()),

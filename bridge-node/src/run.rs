@@ -1,5 +1,6 @@
 //! The run loop: the only place where a bridge waits.
 
+use std::collections::BTreeMap;
 use std::future::poll_fn;
 use std::io;
 use std::pin::pin;
@@ -7,7 +8,7 @@ use std::sync::Arc;
 use std::task::Poll;
 use std::time::Duration;
 
-use bridge_core::{Heard, Notice, Output, Reason, Router};
+use bridge_core::{Executed, Heard, Notice, Output, Owned, Reason, Refusal, Router};
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
 use tokio::sync::watch;
@@ -20,7 +21,7 @@ use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
 use crate::mapping_file::Running;
 use crate::metrics::Requests;
-use crate::port::{Delivery, Port, PortEvent};
+use crate::port::{Delivery, Execution, Port, PortEvent};
 use crate::status::{Interfaces, Readiness, Status};
 
 /// A bridge in the middle: router, port and socket, and who asks for the status.
@@ -32,11 +33,15 @@ pub(crate) struct Shell<P> {
     pub(crate) udp: Udp,
     /// The interfaces the port has taken for good.
     pub(crate) held: Option<Held>,
+    /// The namespaces it alone writes, by the mapping.
+    pub(crate) owned: fn(&Mapping) -> Owned,
     pub(crate) requests: Requests,
     pub(crate) changes: watch::Receiver<Running>,
     pub(crate) fixed: Fixed,
     /// What of the mapping waits for the next start.
     pub(crate) restart: Vec<String>,
+    /// The namespaces that somebody else writes, with what is told of each.
+    pub(crate) taken: BTreeMap<u16, String>,
     pub(crate) busy: BusyPoll,
     pub(crate) dry_run: bool,
 }
@@ -192,6 +197,7 @@ impl<P: Port> Shell<P> {
                 not_ready: [lost, side_lost, self.port.hindrance()]
                     .into_iter()
                     .flatten()
+                    .chain(self.taken.values().cloned())
                     .collect(),
                 interfaces,
             },
@@ -246,6 +252,7 @@ impl<P: Port> Shell<P> {
             return;
         }
         self.router.replace_mapping(Arc::clone(&mapping), now());
+        self.router.set_owned((self.owned)(&mapping), now());
         self.restart = self.fixed.differing(&mapping);
         self.restart.extend(self.port.reload(&mapping, &types));
         if !self.restart.is_empty() {
@@ -319,6 +326,32 @@ impl<P: Port> Shell<P> {
             PortEvent::Dropped { reason, why, count } => self.router.dropped(reason, count, why),
             PortEvent::Unmatched { topic } => self.router.unmatched(topic),
             PortEvent::CallFailed { topic, detail } => self.router.call_failed(topic, &detail),
+            PortEvent::Described { topic, description } => {
+                self.router.describe_value(topic, description, now());
+            }
+            PortEvent::CallBound {
+                topic,
+                service_type,
+            } => match self.router.bind_call(topic, &service_type, now()) {
+                Ok(()) => info!(%topic, service_type = %service_type.name(), "call bound"),
+                Err(why) => {
+                    warn!(%topic, service_type = %service_type.name(), "cannot be asked for: {why}")
+                }
+            },
+            PortEvent::CallUnbound { topic } => self.router.unbind_call(topic),
+            PortEvent::CallWanted { topic } => self.router.want_call(topic, now()),
+            PortEvent::Ask {
+                ask,
+                topic,
+                request,
+                timeout,
+            } => self.router.ask(ask, topic, &request, timeout, now()),
+            PortEvent::AskGivenUp { ask } => self.router.give_up(ask, now()),
+            PortEvent::Offer { topic, offered } => self.router.offer(topic, offered, now()),
+            PortEvent::Withdrawn { topic } => self.router.withdraw(topic, now()),
+            PortEvent::Executed { execution, outcome } => {
+                self.router.executed(execution, outcome, now());
+            }
             PortEvent::Ended(why) => return Err(Failure::new(FailureKind::Unavailable, why)),
         }
         Ok(())
@@ -364,11 +397,72 @@ impl<P: Port> Shell<P> {
                     dropped,
                 } => self.silent(topic, silent, dropped),
                 Output::Retired { topic, instance } => self.port.retired(topic, instance),
+                Output::Action { topic, bytes } => {
+                    if let Err(error) = self.send(&bytes) {
+                        self.router
+                            .not_called(topic, not_sent(error), &error.to_string());
+                    }
+                    self.router.recycle(bytes);
+                }
+                Output::Answer { ask, topic, answer } => {
+                    self.port.answered(ask, topic, answer.map(Bytes::from));
+                }
+                Output::CallKnown { topic, description } => {
+                    info!(%topic, name = description.name, "a call can be asked for");
+                    self.port.call_known(topic, &description);
+                }
+                Output::CallGone { topic } => {
+                    info!(%topic, "a call is gone");
+                    self.port.call_gone(topic);
+                }
+                Output::Execute(execution) => self.execute(execution),
+                Output::Abandoned { execution, topic } => self.port.abandoned(execution, topic),
+                Output::Taken { namespace, by } => self.taken(namespace, by),
                 Output::Notice(notice) => tell(&notice),
                 other => debug!(?other, "an output this program does not know"),
             }
         }
         true
+    }
+
+    fn execute(&mut self, execution: bridge_core::Execution) {
+        let bridge_core::Execution {
+            id,
+            topic,
+            request,
+            requestor,
+            deadline,
+        } = execution;
+        let execution = Execution {
+            id,
+            topic,
+            request: Bytes::from(request),
+            requestor,
+            deadline,
+        };
+        if self.dry_run || !self.port.execute(execution) {
+            let refused = Executed::Refused(Refusal::NotExecutable);
+            self.router.executed(id, refused, now());
+        }
+    }
+
+    fn taken(&mut self, namespace: u16, by: Option<std::net::SocketAddr>) {
+        match by {
+            Some(by) => {
+                let why = format!(
+                    "namespace {namespace} of space {} is in use from {by}: nothing is published in it; give this \
+                     program another number, or end the other one",
+                    self.own
+                );
+                warn!("{why}");
+                self.taken.insert(namespace, why);
+            }
+            None => {
+                info!(namespace, "the namespace is free again: publishing in it");
+                self.taken.remove(&namespace);
+            }
+        }
+        self.port.taken(namespace, by);
     }
 
     fn silent(&mut self, topic: TopicId, silent: bool, dropped: Option<Reason>) {

@@ -55,6 +55,16 @@ impl Mapping {
         }
     }
 
+    /// A mapping without variables, for a program that has no document: what it writes it describes itself.
+    #[must_use]
+    pub fn made(pubsub: PubSub, namespaces: BTreeMap<u16, String>) -> Self {
+        Self {
+            pubsub,
+            namespaces,
+            ..Self::default()
+        }
+    }
+
     pub(crate) fn with_type_paths(mut self, paths: Vec<PathBuf>) -> Self {
         self.type_paths = paths;
         self

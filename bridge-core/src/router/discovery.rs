@@ -19,7 +19,7 @@ use crate::counters::Reason;
 use crate::description::{Described, Description, Source, mapped_leaves};
 use crate::layout::Layout;
 use crate::learned::{Learned, News, Rank};
-use crate::loop_rule::{Side, may_cross};
+use crate::loop_rule::Owned;
 use crate::network::announcement_chunks;
 use crate::output::Output;
 use crate::reader::Ask;
@@ -323,7 +323,7 @@ impl Router {
     }
 
     /// Plans to ask what a topic of another space consists of.
-    pub(super) fn ask(&mut self, topic: TopicId, now: Now) {
+    pub(super) fn ask_what(&mut self, topic: TopicId, now: Now) {
         if self.is_learned(topic) {
             self.plan_probe(topic, now);
         }
@@ -387,8 +387,8 @@ impl Router {
                 Ok(_) => self.drop_undecoded(None, from, &DISCOVERY),
                 Err(error) => self.drop_undecoded(None, from, &error),
             }
-        } else if !may_cross(self.settings.own, Side::Ua, space) {
-            self.drop_own(from);
+        } else if space == self.settings.own && (self.owned == Owned::All || self.is_source(from)) {
+            self.drop_own(None, from, now);
         } else if message.is_chunk() && !message.is_sealed() {
             self.handle_chunk(message, (space, 0), from, now);
         } else {
@@ -623,7 +623,7 @@ impl Router {
             return None;
         }
         if described.is_none() {
-            self.ask(topic, now);
+            self.ask_what(topic, now);
         }
         if !fits {
             self.count(About::topic(topic), (Reason::MetaData, "values"), 1, || {

@@ -23,7 +23,7 @@ impl Router {
         from: SocketAddr,
         now: Now,
     ) -> Option<&mut Topic> {
-        let is_stray = topic.space != self.settings.own && self.mapping.variable(topic).is_none();
+        let is_stray = !self.is_home(topic) && self.mapping.variable(topic).is_none();
         if is_stray && !self.topics.contains_key(&topic) && !self.take_place(now) {
             self.count(About::sender(from), Reason::TooManyTopics, 1, || {
                 format!(
@@ -46,7 +46,7 @@ impl Router {
         if !self.topics.contains_key(&topic) {
             let variable = self.mapping.variable(topic);
             let overflow = variable.map_or(Overflow::KeepLatest, |found| found.overflow);
-            let role = if topic.space == self.settings.own {
+            let role = if self.is_home(topic) {
                 Role::Ours(Box::new(Writer::new(now.monotonic)))
             } else {
                 Role::Theirs(Box::new(Reader::new(from, now.monotonic)))
@@ -54,7 +54,7 @@ impl Router {
             let mut entry = Topic::new(role, overflow);
             entry.takes = Takes::of(variable);
             entry.gate = match variable {
-                Some(variable) if topic.space == self.settings.own => Gate::new(variable.publish),
+                Some(variable) if self.is_home(topic) => Gate::new(variable.publish),
                 Some(_) | None => None,
             };
             self.topics.insert(topic, entry);

@@ -14,7 +14,7 @@ use super::{About, Router};
 use crate::counters::Reason;
 use crate::fields;
 use crate::hops::Hop;
-use crate::loop_rule::{Side, may_cross};
+use crate::loop_rule::{Owned, Side, What, may_cross};
 use crate::output::{Delivery, Kept, Output};
 use crate::place::Place;
 use crate::reader::Held;
@@ -44,11 +44,12 @@ impl Router {
             self.handle_discovery(message, (space, from), now);
             return;
         }
-        if !may_cross(self.settings.own, Side::Ua, space) {
-            self.drop_own(from);
+        let namespace = header.group.and_then(|group| group.writer_group_id);
+        if self.is_ours(space, namespace) {
+            self.drop_own(namespace, from, now);
             return;
         }
-        let Some(namespace) = header.group.and_then(|group| group.writer_group_id) else {
+        let Some(namespace) = namespace else {
             self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return;
         };
@@ -96,23 +97,43 @@ impl Router {
         self.settings.source = Some(source);
     }
 
-    /// Counts a datagram with our own PublisherId: our own, or that of a rival.
-    pub(super) fn drop_own(&mut self, from: SocketAddr) {
+    /// Whether messages of that group are of what this program alone writes. One without a group is of our space only where
+    /// all of it is ours.
+    fn is_ours(&self, space: SpaceId, namespace: Option<u16>) -> bool {
+        let home = namespace.map_or(self.owned == Owned::All, |namespace| {
+            self.owned.has(namespace)
+        });
+        !may_cross(space == self.settings.own && home, Side::Ua, What::Value)
+    }
+
+    /// Counts what is said in our own name: by ourselves, or by a rival.
+    pub(super) fn drop_own(&mut self, namespace: Option<u16>, from: SocketAddr, now: Now) {
         let own = self.settings.own;
-        let ours = self.settings.source.is_none_or(|source| {
+        if self.is_source(from) {
+            self.count(About::sender(from), Reason::Looped, 1, String::new);
+            return;
+        }
+        let shared = namespace.filter(|_| self.owned != Owned::All);
+        if let Some(namespace) = shared {
+            self.contend(namespace, from, now);
+        }
+        self.count(About::sender(from), Reason::SpaceTaken, 1, || match shared {
+            Some(namespace) => format!(
+                "another program writes namespace {namespace} of space {own}: every sample is doubled; give one of \
+                 them another number"
+            ),
+            None => format!(
+                "another program sends as space {own}: every sample is doubled; end one of them"
+            ),
+        });
+    }
+
+    /// Whether our own datagrams come from there, as far as that is known.
+    pub(super) fn is_source(&self, from: SocketAddr) -> bool {
+        self.settings.source.is_none_or(|source| {
             source.port() == from.port()
                 && (source.ip().is_unspecified() || source.ip() == from.ip())
-        });
-        let reason = if ours {
-            Reason::Looped
-        } else {
-            Reason::SpaceTaken
-        };
-        self.count(About::sender(from), reason, 1, || {
-            format!(
-                "another program sends as space {own}: every sample is doubled; end one of them"
-            )
-        });
+        })
     }
 
     /// One DataSetMessage of another space: into the sequence, and on if it brings something new.
@@ -170,7 +191,7 @@ impl Router {
             self.tell_returned(topic);
         }
         if changed {
-            self.ask(topic, now);
+            self.ask_what(topic, now);
         }
         self.retire(topic, now);
         match admitted {

@@ -113,7 +113,7 @@ impl Router {
             .and_then(|entry| entry.bound.clone());
         if let Some((message_type, selection)) = bound {
             self.describe(topic, Some((&message_type, &selection)), now);
-        } else if self.settings.local == Local::Fields && topic.space == self.settings.own {
+        } else if self.settings.local == Local::Fields && self.is_home(topic) {
             self.describe(topic, None, now);
         }
     }

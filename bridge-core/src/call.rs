@@ -1,0 +1,296 @@
+//! Calls as the local side has them: what one takes and gives, who asks, and what became of it.
+
+use std::fmt;
+use std::time::Instant;
+
+use mappings::{Overflow, SpaceId, TopicId};
+use messages::{Leaf, MessageType, Rank, ServiceType, TypeName};
+use uadp::action::{ExecutionId, Refusal};
+use uadp::{BuiltinType, StatusCode};
+
+use crate::counters::Counters;
+
+/// What a call takes and gives, as its ActionMetaData say it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CallDescription {
+    /// Its name for people, as `parallel-gripper.Grasp.Start`; may be empty.
+    pub name: String,
+    /// What it is, for people; may be empty.
+    pub about: String,
+    /// What a request has in it, in this order.
+    pub request: Vec<CallField>,
+    /// What an answer has in it, in this order.
+    pub response: Vec<CallField>,
+}
+
+/// One field of a request or response.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CallField {
+    /// Unique in the request or response.
+    pub name: String,
+    /// The builtin type of it, or of its elements.
+    pub builtin: BuiltinType,
+    /// Whether it is an array.
+    pub rank: Rank,
+    /// Of a request: it has a value of its own where the request has no fields at all.
+    pub optional: bool,
+}
+
+/// One request of the local side, by a number that the port chooses and uses once.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct AskId(pub u64);
+
+/// What became of a request: the response in the local encoding, or why there is none.
+pub type Answered<R = Vec<u8>> = Result<R, AskError>;
+
+/// Why a request has no response.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{text}")]
+pub struct AskError {
+    /// Whether it was executed, as far as that is known.
+    pub kind: AskErrorKind,
+    /// The same for machines.
+    pub status: StatusCode,
+    /// The same for people.
+    pub text: String,
+}
+
+/// Whether a request without response was executed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum AskErrorKind {
+    /// It was not.
+    Refused,
+    /// It was, and went wrong, or its response cannot be read here.
+    Failed,
+    /// It may have been, or may be still.
+    Unknown,
+}
+
+/// A request of another program that the local side is to execute.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Execution<R = Vec<u8>> {
+    /// Tells it from all others.
+    pub id: ExecutionId,
+    /// Which call.
+    pub topic: TopicId,
+    /// The request, in the local encoding. A block of fields is well-formed, and whether they are those of the call is for
+    /// who executes it to say.
+    pub request: R,
+    /// The space that asks, if it says so.
+    pub requestor: Option<SpaceId>,
+    /// Who asks does not wait any longer.
+    pub deadline: Instant,
+}
+
+/// What an execution came to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Executed {
+    /// It was executed, with this response in the local encoding.
+    Answered(Vec<u8>),
+    /// It was executed and went wrong.
+    Failed(StatusCode),
+    /// It was not executed.
+    Refused(Refusal),
+    /// Nobody knows: what executed it is gone.
+    Lost,
+}
+
+/// A call that the local side executes.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Offered {
+    /// What it takes and gives.
+    pub description: CallDescription,
+    /// Whether requests from other hosts are executed too; else only those from a loopback address.
+    pub open: bool,
+}
+
+/// What a value of our own space is, where no mapping says it and the local side speaks in fields.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ValueDescription {
+    /// Its name for people, as `parallel-gripper.Grasp.State`; may be empty.
+    pub name: String,
+    /// The ROS type that the fields make, if they make one.
+    pub message_type: Option<TypeName>,
+    /// What it is, for people and programs; may be empty.
+    pub about: String,
+    /// The fields, in the order of the values.
+    pub fields: Vec<Leaf>,
+    /// What its queue does when full: a state has one place and is repeated, events have several and are not.
+    pub overflow: Overflow,
+}
+
+/// What became of the requests of one call.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct CallCounters {
+    /// Requests of the local side.
+    pub asked: u64,
+    /// Those that were executed, whatever came out.
+    pub answered: u64,
+    /// Those that were not executed.
+    pub refused: u64,
+    /// Those of which nobody knows.
+    pub unknown: u64,
+    /// Requests of others that were handed to the local side.
+    pub executed: u64,
+    /// Requests and responses that were dropped, or refused here, by reason.
+    pub drops: Counters,
+}
+
+impl CallField {
+    /// A single value.
+    #[must_use]
+    pub fn scalar(name: &str, builtin: BuiltinType) -> Self {
+        Self {
+            name: name.to_owned(),
+            builtin,
+            rank: Rank::Scalar,
+            optional: false,
+        }
+    }
+
+    /// An array.
+    #[must_use]
+    pub fn array(name: &str, builtin: BuiltinType) -> Self {
+        Self {
+            rank: Rank::Array { fixed: None },
+            ..Self::scalar(name, builtin)
+        }
+    }
+
+    /// The same, which has a value of its own in a request without fields.
+    #[must_use]
+    pub fn optional(self) -> Self {
+        Self {
+            optional: true,
+            ..self
+        }
+    }
+}
+
+impl CallDescription {
+    /// Whether it can be asked for without any field.
+    #[must_use]
+    pub fn may_be_empty(&self) -> bool {
+        self.request.iter().all(|field| field.optional)
+    }
+
+    /// Whether it can be asked for as that ROS type: each field of the type's response is in the response of the call, and
+    /// the fields of the requests are the same, in whatever order; or the type's request has none, and the call can be
+    /// asked for so. Further fields of the response are left out.
+    ///
+    /// # Errors
+    /// Why not, for people.
+    pub fn fits(&self, service: &ServiceType) -> Result<(), String> {
+        self.request_order(service.request())?;
+        self.response_order(service.response())?;
+        Ok(())
+    }
+
+    /// For each field of the request its place in the ROS message; `None` where the request goes without fields.
+    pub(crate) fn request_order(
+        &self,
+        message: &MessageType,
+    ) -> Result<Option<Vec<usize>>, String> {
+        let leaves = message.leaves();
+        if leaves.is_empty() && self.may_be_empty() {
+            return Ok(None);
+        }
+        let place = |field: &CallField| {
+            let find = |leaf: &Leaf| {
+                is_same(field, leaf)
+                    && takes(field.rank, leaf.rank)
+                    && field.builtin == leaf.builtin
+            };
+            let found = leaves.iter().position(find);
+            found.ok_or_else(|| format!("its request has {field}, and {} has not", message.name()))
+        };
+        let order: Vec<usize> = self.request.iter().map(place).collect::<Result<_, _>>()?;
+        let missing = leaves
+            .iter()
+            .enumerate()
+            .find(|(at, _)| !order.contains(at));
+        match missing {
+            None => Ok(Some(order)),
+            Some((_, leaf)) => Err(format!(
+                "{} has `{}`, and its request has not",
+                message.name(),
+                leaf.path
+            )),
+        }
+    }
+
+    /// For each field of the ROS message its place in the response.
+    pub(crate) fn response_order(&self, message: &MessageType) -> Result<Vec<usize>, String> {
+        let place = |leaf: &Leaf| {
+            let find = |field: &CallField| {
+                is_same(field, leaf)
+                    && takes(leaf.rank, field.rank)
+                    && field.builtin == leaf.builtin
+            };
+            let found = self.response.iter().position(find);
+            found.ok_or_else(|| {
+                format!(
+                    "{} has `{}` ({}), and its response has not",
+                    message.name(),
+                    leaf.path,
+                    kind(leaf.builtin, leaf.rank)
+                )
+            })
+        };
+        message.leaves().iter().map(place).collect()
+    }
+}
+
+impl fmt::Display for CallField {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "`{}` ({})", self.name, kind(self.builtin, self.rank))
+    }
+}
+
+impl AskError {
+    pub(crate) fn refused(refusal: Refusal, text: impl Into<String>) -> Self {
+        Self {
+            kind: AskErrorKind::Refused,
+            status: refusal.status_code(),
+            text: text.into(),
+        }
+    }
+}
+
+/// The topic and the name for people that the name of a DataSet or Action says; an announcement has no WriterGroupId, so the
+/// topic stands in front.
+#[must_use]
+pub fn split_name(name: &str) -> Option<(TopicId, &str)> {
+    let (topic, name) = name.split_once(' ').unwrap_or((name, ""));
+    Some((topic.parse().ok()?, name))
+}
+
+/// The name of the DataSet or Action of a topic.
+pub(crate) fn join_name(topic: TopicId, name: &str) -> String {
+    match name {
+        "" => topic.to_string(),
+        name => format!("{topic} {name}"),
+    }
+}
+
+/// ROS 1 and ROS 2 write some names in other cases.
+fn is_same(field: &CallField, leaf: &Leaf) -> bool {
+    field.name.eq_ignore_ascii_case(&leaf.path)
+}
+
+/// Whether values of `given` have a place in what is of `wanted`.
+fn takes(wanted: Rank, given: Rank) -> bool {
+    match (wanted, given) {
+        (Rank::Scalar, Rank::Scalar) => true,
+        (Rank::Array { fixed: None }, Rank::Array { .. }) => true,
+        (Rank::Array { fixed }, Rank::Array { fixed: given }) => fixed == given,
+        (Rank::Scalar, Rank::Array { .. }) | (Rank::Array { .. }, Rank::Scalar) => false,
+    }
+}
+
+fn kind(builtin: BuiltinType, rank: Rank) -> String {
+    match rank {
+        Rank::Scalar => format!("{builtin}"),
+        Rank::Array { .. } => format!("{builtin}[]"),
+    }
+}
