@@ -12,6 +12,7 @@ mod exit;
 mod logging;
 mod mapping_file;
 mod metrics;
+pub mod policy;
 mod port;
 mod program;
 mod run;

@@ -6,22 +6,21 @@ mod found;
 mod reload;
 mod strays;
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use bridge_node::{
-    Delivery, Described, Kept, Port, PortEvent, Room, Services, TypePaths, timestamp,
-};
+use bridge_node::policy::{Policy, Step, TYPE_CHANGES, Word, is_bad, type_changes};
+use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, TypePaths, timestamp};
 use mappings::{Mapping, SpaceId, TopicId, Variable};
 use messages::{DefinitionError, MessageType, Selection, TextKind, TypeName};
 use tcpros::{
     Graph, Inbox, InboxEvent, Latched, Message, Node, NodeError, NodeOptions, Peer,
     SubscriberOptions, TopicType, Wanted,
 };
-use tracing::{info, warn};
+use tracing::info;
 use uadp::{BuiltinType, Timestamp};
 
 use self::found::Refused;
@@ -50,8 +49,7 @@ pub struct PortOptions {
 #[derive(Debug)]
 pub struct Ros1Port {
     node: Node,
-    own: SpaceId,
-    mapping: Arc<Mapping>,
+    policy: Policy,
     definitions: Definitions,
     watcher: Watcher,
     graph: Graph,
@@ -63,16 +61,12 @@ pub struct Ros1Port {
     inbox: Inbox<usize>,
     /// Topics we write.
     sinks: HashMap<TopicId, Sink>,
-    /// For those nobody here knows.
-    room: Room,
     /// Services that are called for values.
     services: Services,
     /// What `recv` hands out next; filled by one message or by one pass over the topics.
     events: VecDeque<PortEvent>,
     /// The topic of the graph that was taken in last: the next look goes on behind it, so that each has its turn.
     taken_last: String,
-    /// What was already told, so that it is told once.
-    told: BTreeSet<(String, &'static str)>,
     /// The address that other nodes are told, where it is one and no name.
     address: Option<IpAddr>,
     master: String,
@@ -109,8 +103,7 @@ impl Ros1Port {
         let mut port = Self {
             watcher: Watcher::of(&node),
             node,
-            own,
-            mapping: Arc::clone(&mapping),
+            policy: Policy::new(own, mapping),
             definitions,
             services,
             graph: Graph::default(),
@@ -119,41 +112,40 @@ impl Ros1Port {
             source_of: BTreeMap::new(),
             inbox: Inbox::new(),
             sinks: HashMap::new(),
-            room: Room::new(MAX_TOPICS),
             events: bound.into(),
             taken_last: String::new(),
-            told: BTreeSet::new(),
             address,
             master,
             has_master: false,
             refused: Refused::default(),
         };
-        port.take_bindings(&mapping)?;
+        port.take_bindings()?;
         Ok(port)
     }
 
-    fn take_bindings(&mut self, mapping: &Mapping) -> Result<(), NodeError> {
-        for (variable, binding) in mapping.bindings(self.own) {
+    fn take_bindings(&mut self) -> Result<(), NodeError> {
+        let mapping = Arc::clone(self.policy.mapping());
+        for (variable, binding) in mapping.bindings(self.policy.own()) {
             let topic = variable.topic;
-            let name = binding.message_type.clone();
-            let selection = binding.selection.clone();
-            if topic.space == self.own {
+            if topic.space == self.policy.own() {
                 let ros_topic = self.node.resolve(&binding.ros_topic)?;
-                let index = self.source(ros_topic, Some(name));
+                let index = self.source(ros_topic, Some(binding.message_type.clone()));
                 if let Some(source) = self.sources.get_mut(index) {
-                    source.values.push((topic, selection));
+                    source.values.push((topic, binding.selection.clone()));
                 }
                 self.subscribe(index)?;
             } else {
-                let ros_topic = binding.ros_topic.clone();
-                self.sinks.insert(
-                    topic,
-                    Sink::mapped(ros_topic, name, selection, variable.overflow),
-                );
-                self.open_sink(topic);
+                self.take_up_sink(topic);
             }
         }
         Ok(())
+    }
+
+    /// Writes the values of another space where the mapping says.
+    fn take_up_sink(&mut self, topic: TopicId) {
+        let sink = Sink::new(self.policy.destination(topic));
+        self.sinks.insert(topic, sink);
+        self.open_sink(topic);
     }
 
     /// The index of the source of that topic, made when there is none.
@@ -256,7 +248,7 @@ impl Ros1Port {
             });
         }
         if let Some(ros_topic) = ros_topic {
-            self.tell_once(&ros_topic, "too many latched", || {
+            self.policy.told.once(&ros_topic, "too many latched", || {
                 format!(
                     "more than {MAX_LATCHED} latched publishers are connected: the last message of {} does not reach late joiners",
                     peer.caller_id
@@ -277,7 +269,7 @@ impl Ros1Port {
         let (ros_topic, mapped) = (source.ros_topic.clone(), !source.found);
         let found = self.definitions.of_publisher(&peer.header, mapped);
         if let Err(error) = &found {
-            self.tell_once(&ros_topic, "unreadable type", || {
+            self.policy.told.once(&ros_topic, "unreadable type", || {
                 format!("messages of {} are dropped: {error}", peer.caller_id)
             });
         }
@@ -324,14 +316,16 @@ impl Ros1Port {
             .expected
             .clone()
             .or_else(|| source.bound.as_ref().map(|b| b.name().clone()));
-        self.tell_once(&ros_topic, "publisher of another type", || {
-            format!(
-                "messages of {} are dropped: it publishes {} and the topic crosses as {}",
-                peer.caller_id,
-                peer.header.type_name().unwrap_or("?"),
-                ours.map_or_else(|| "another type".to_owned(), |name| name.to_string()),
-            )
-        });
+        self.policy
+            .told
+            .once(&ros_topic, "publisher of another type", || {
+                format!(
+                    "messages of {} are dropped: it publishes {} and the topic crosses as {}",
+                    peer.caller_id,
+                    peer.header.type_name().unwrap_or("?"),
+                    ours.map_or_else(|| "another type".to_owned(), |name| name.to_string()),
+                )
+            });
     }
 
     /// Changes a source and reports when that makes it live or ends it.
@@ -467,10 +461,10 @@ impl Ros1Port {
                     message_type: Arc::clone(&message_type),
                     publisher,
                     reported: 0,
-                    stamps: sink.stamps(&message_type),
+                    stamps: sink.choice.stamps(&message_type),
                 };
                 sink.open = Some(open);
-                let selection = sink.selection(message_type.name());
+                let selection = sink.choice.selection(message_type.name());
                 self.events.push_back(PortEvent::Bound {
                     topic,
                     message_type,
@@ -478,24 +472,17 @@ impl Ros1Port {
                 });
             }
             Err(error) => {
-                self.tell_once(&ros_topic, "not published", || error.to_string());
+                self.policy
+                    .told
+                    .once(&ros_topic, "not published", || error.to_string());
             }
         }
     }
 
     /// The local type a writer says its value is of, if it is known and has the fields that are said.
     fn learned(&mut self, topic: TopicId, described: &Described) -> Option<(TypeName, Selection)> {
-        let name = &described.message_type;
-        match self.definitions.get(name) {
-            Ok(message_type) => {
-                let selection = described.selection(&message_type);
-                if selection.is_none() {
-                    self.tell_once(&topic.to_string(), "other fields", || {
-                        format!("its writer says it is {name}, which has other fields here")
-                    });
-                }
-                Some((name.clone(), selection?))
-            }
+        match self.definitions.get(&described.message_type) {
+            Ok(message_type) => self.policy.learned(topic, described, &message_type),
             Err(error) => {
                 let said = "its writer says what it is, and that is of no use";
                 self.tell_unknown(&topic.to_string(), said, &error);
@@ -504,35 +491,12 @@ impl Ros1Port {
         }
     }
 
-    /// Whether the type of a topic is another than the Router knows by now: what it wrote is still in the old one.
-    fn type_changes(&self, topic: TopicId) -> bool {
-        self.events.iter().any(|event| {
-            matches!(
-                event,
-                PortEvent::Bound { topic: other, .. } | PortEvent::Unbound { topic: other }
-                    if *other == topic
-            )
-        })
-    }
-
     /// Logs of a topic, once, that a type is not known.
     fn tell_unknown(&mut self, topic: &str, what: &str, error: &DefinitionError) {
-        if self.told.len() < MAX_TOLD && self.told.insert((topic.to_owned(), "unknown type")) {
-            let why = self.definitions.explain(TextKind::Message, error);
-            warn!(topic, "{what}: {why}");
-        }
-    }
-
-    /// Logs something about a topic the first time it happens.
-    fn tell_once(&mut self, topic: &str, what: &'static str, message: impl FnOnce() -> String) {
-        if self.told.len() < MAX_TOLD && self.told.insert((topic.to_owned(), what)) {
-            warn!(topic, "{}", message());
-            if self.told.len() == MAX_TOLD {
-                warn!(
-                    "so many peculiarities were told that no further ones are, until the mapping is read again"
-                );
-            }
-        }
+        let definitions = &mut self.definitions;
+        self.policy.told.once(topic, "unknown type", || {
+            format!("{what}: {}", definitions.explain(TextKind::Message, error))
+        });
     }
 }
 
@@ -562,10 +526,10 @@ impl Port for Ros1Port {
     }
 
     fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
-        if self.type_changes(sample.topic) {
+        if type_changes(&self.events, sample.topic) {
             return Err(TYPE_CHANGES);
         }
-        if sample.status & STATUS_BAD != 0 {
+        if is_bad(sample.status) {
             return Err("bad status");
         }
         // What was handed out before is for late joiners, and a service is none.
@@ -611,7 +575,13 @@ impl Port for Ros1Port {
         described: Option<&Described>,
     ) {
         let for_service = |variable: &Variable| variable.service.is_some();
-        if topic.space == self.own || self.mapping.variable(topic).is_some_and(for_service) {
+        if topic.space == self.policy.own()
+            || self
+                .policy
+                .mapping()
+                .variable(topic)
+                .is_some_and(for_service)
+        {
             return;
         }
         if !self.take_in(topic) {
@@ -621,39 +591,28 @@ impl Port for Ros1Port {
             [(builtin, array)] => self.definitions.standard_type(*builtin, *array),
             _ => None,
         };
-        let learned = described.and_then(|described| self.learned(topic, described));
+        let word = Word {
+            described: described.cloned(),
+            learned: described.and_then(|described| self.learned(topic, described)),
+            standard,
+        };
         let Some(sink) = self.sinks.get_mut(&topic) else {
             return;
         };
-        let Some(open) = &sink.open else {
-            sink.standard = standard;
-            sink.learned = learned;
-            self.open_sink(topic);
-            return;
-        };
-        let message_type = Arc::clone(&open.message_type);
-        let subscribed = open.publisher.subscribers() > 0;
-        let same = |name: &TypeName| name == message_type.name();
-        let other_type = learned.as_ref().is_some_and(|(name, _)| !same(name));
-        // The type that somebody subscribed to stays, whatever of it the value is; without a word nothing changes.
-        if sink.mapped.is_some() || (subscribed && other_type) || learned.is_none() {
-            return;
-        }
-        let before = sink.selection(message_type.name());
-        sink.learned = learned;
-        let selection = sink.selection(message_type.name());
-        if other_type {
-            self.open_sink(topic);
-        } else if selection != before {
-            let stamps = sink.stamps(&message_type);
-            if let Some(open) = &mut sink.open {
-                open.stamps = stamps;
+        let open = sink.open.as_ref();
+        let written = open.map(|open| (open.message_type.name(), open.publisher.subscribers() > 0));
+        match sink.choice.hear(word, written) {
+            Step::Stay => {}
+            Step::Open => self.open_sink(topic),
+            Step::Select(selection) => {
+                let Some(open) = &mut sink.open else { return };
+                open.stamps = sink.choice.stamps(&open.message_type);
+                self.events.push_back(PortEvent::Bound {
+                    topic,
+                    message_type: Arc::clone(&open.message_type),
+                    selection,
+                });
             }
-            self.events.push_back(PortEvent::Bound {
-                topic,
-                message_type,
-                selection,
-            });
         }
     }
 
@@ -716,13 +675,3 @@ fn utc() -> SystemTime {
 fn latch_key(instance: Timestamp) -> u64 {
     u64::try_from(instance.unix_nanos()).unwrap_or_default()
 }
-
-/// Why a value is not written while its topic goes over to another type.
-const TYPE_CHANGES: &str = "type changes";
-/// The severity bit of a Bad StatusCode (OPC 10000-4, 7.39.1) in its upper 16 bits.
-const STATUS_BAD: u16 = 0x8000;
-/// Topics of the space that the mapping does not name and that are read: anybody in the graph can invent names. Likewise those
-/// that are written, of values nobody here knows.
-const MAX_TOPICS: usize = 4096;
-/// Peculiarities told; a graph with more of them is told about no further ones.
-const MAX_TOLD: usize = 4096;

@@ -3,21 +3,18 @@
 use std::sync::Arc;
 use std::time::Instant;
 
+use bridge_node::policy::{Choice, Destination};
 use bytes::{Bytes, BytesMut};
-use mappings::{Overflow, TopicId, Variable};
-use messages::{MessageType, Selection, TypeName};
+use mappings::Overflow;
+use messages::{MessageType, TypeName};
 use tcpros::{Publisher, PublisherOptions, RosTime};
 
 /// Where the values of one topic of another space go.
 #[derive(Debug)]
 pub(crate) struct Sink {
     pub(crate) ros_topic: String,
-    /// What the mapping ties it to; it decides alone.
-    pub(crate) mapped: Option<(TypeName, Selection)>,
-    /// What the writer of the value says it is, and what of the message it makes.
-    pub(crate) learned: Option<(TypeName, Selection)>,
-    /// The std_msgs type of the value the Router holds, if it is one value and there is such a type.
-    pub(crate) standard: Option<TypeName>,
+    /// In which type.
+    pub(crate) choice: Choice,
     /// The topic as it is written.
     pub(crate) open: Option<Open>,
     /// Since when its writer in the space is silent.
@@ -56,67 +53,38 @@ impl Open {
 }
 
 impl Sink {
-    /// For a value with or without a variable in the mapping, but without a ROS topic there.
-    pub(crate) fn by_name(topic: TopicId, variable: Option<&Variable>) -> Self {
-        let overflow = variable
-            .map(|variable| variable.overflow)
-            .unwrap_or_default();
-        Self::new(format!("/{topic}"), None, overflow)
-    }
-
-    /// For a value the mapping ties to a ROS topic.
-    pub(crate) fn mapped(
-        ros_topic: String,
-        message_type: TypeName,
-        selection: Selection,
-        overflow: Overflow,
-    ) -> Self {
-        Self::new(ros_topic, Some((message_type, selection)), overflow)
-    }
-
-    fn new(ros_topic: String, mapped: Option<(TypeName, Selection)>, overflow: Overflow) -> Self {
-        // The value of a state is of use to who comes late, an event is not.
-        let latch = overflow == Overflow::KeepLatest;
-        Self {
+    pub(crate) fn new(destination: Destination) -> Self {
+        let Destination {
             ros_topic,
             mapped,
-            learned: None,
-            standard: None,
+            overflow,
+        } = destination;
+        Self {
+            ros_topic,
+            choice: Choice::new(mapped),
             open: None,
             silent: None,
-            latch,
+            // The value of a state is of use to who comes late, an event is not.
+            latch: overflow == Overflow::KeepLatest,
         }
     }
 
     /// Whether the mapping says the same of both.
     pub(crate) fn is_like(&self, other: &Self) -> bool {
         self.ros_topic == other.ros_topic
-            && self.mapped == other.mapped
+            && self.choice.mapped() == other.choice.mapped()
             && self.latch == other.latch
     }
 
-    /// The types it could have, best first: the mapping's; what subscribers ask for; what its writer
-    /// says; the standard type of the value.
+    /// The types it could have, best first. `asked_for` is the one the master names.
     pub(crate) fn candidates(&self, asked_for: Option<&str>) -> Vec<TypeName> {
-        if let Some((message_type, _)) = &self.mapped {
-            return vec![message_type.clone()];
-        }
         let refused = self
             .open
             .as_ref()
             .and_then(|open| open.publisher.refused_type());
         let asked_for = asked_for.map(str::to_owned).into_iter().chain(refused);
-        let mut candidates: Vec<TypeName> = Vec::new();
-        for name in asked_for
-            .filter_map(|name| name.parse().ok())
-            .chain(self.learned.as_ref().map(|(name, _)| name.clone()))
-            .chain(self.standard.clone())
-        {
-            if !candidates.contains(&name) {
-                candidates.push(name);
-            }
-        }
-        candidates
+        let asked_for = asked_for.filter_map(|name| name.parse().ok());
+        self.choice.candidates(asked_for)
     }
 
     /// Whether what is open serves somebody, or nobody asked for anything else: it is then not to be given up.
@@ -124,20 +92,6 @@ impl Sink {
         self.open.as_ref().is_some_and(|open| {
             open.publisher.subscribers() > 0 || open.publisher.refused_type().is_none()
         })
-    }
-
-    /// What of a message of that type the value is.
-    pub(crate) fn selection(&self, name: &TypeName) -> Selection {
-        let learned = self.learned.as_ref().filter(|(learned, _)| learned == name);
-        self.mapped
-            .as_ref()
-            .or(learned)
-            .map_or(Selection::Whole, |(_, selection)| selection.clone())
-    }
-
-    /// Whether the stamp at the beginning of such messages is no part of the value.
-    pub(crate) fn stamps(&self, message_type: &MessageType) -> bool {
-        bridge_node::wants_stamp(message_type, Some(&self.selection(message_type.name())))
     }
 
     /// The Router's queue says what waits; behind it, as much is held for a slow subscriber as for any.
@@ -151,33 +105,23 @@ impl Sink {
 
 #[cfg(test)]
 mod tests {
+    use bridge_node::policy::{Step, Word};
+    use messages::Selection;
+
     use super::*;
 
     #[test]
-    fn a_message_of_one_field_gets_a_stamp_and_a_whole_one_keeps_its_own() {
-        let imu: TypeName = "sensor_msgs/Imu".parse().unwrap();
-        let registry = messages::Registry::bundle(messages::Dialect::Ros1);
-        let message_type = registry.get(&imu).unwrap();
-        let stamps = |selection: Selection| {
-            Sink::mapped(
-                "/imu".to_owned(),
-                imu.clone(),
-                selection,
-                Overflow::KeepLatest,
-            )
-            .stamps(&message_type)
-        };
-        assert!(stamps(Selection::Field("angular_velocity.z".to_owned())));
-        assert!(!stamps(Selection::Field("header.stamp".to_owned())));
-        assert!(!stamps(Selection::Whole));
-        assert!(!stamps(Selection::Bytes));
-    }
-
-    #[test]
     fn a_subscriber_decides_before_the_standard_type() {
-        let mut sink = Sink::by_name("ua_2_2_3".parse().unwrap(), None);
-        sink.standard = Some("std_msgs/Float64".parse().unwrap());
-        assert_eq!(sink.ros_topic, "/ua_2_2_3");
+        let mut sink = Sink::new(Destination {
+            ros_topic: "/ua_2_2_3".to_owned(),
+            mapped: None,
+            overflow: Overflow::KeepLatest,
+        });
+        let word = Word {
+            standard: Some("std_msgs/Float64".parse().unwrap()),
+            ..Word::default()
+        };
+        assert_eq!(sink.choice.hear(word, None), Step::Open);
         assert_eq!(sink.candidates(None), ["std_msgs/Float64".parse().unwrap()]);
         let asked: [TypeName; 2] = [
             "std_msgs/Float32".parse().unwrap(),
@@ -185,18 +129,16 @@ mod tests {
         ];
         assert_eq!(sink.candidates(Some("std_msgs/Float32")), asked);
         assert_eq!(sink.candidates(Some("*")).len(), 1);
+        assert!(sink.options().latch);
     }
 
     #[test]
-    fn the_mapping_decides_before_any_subscriber() {
-        let bool: TypeName = "std_msgs/Bool".parse().unwrap();
-        let sink = Sink::mapped(
-            "/button".to_owned(),
-            bool.clone(),
-            Selection::Whole,
-            Overflow::DropOldest(8.try_into().unwrap()),
-        );
-        assert_eq!(sink.candidates(Some("std_msgs/String")), [bool]);
+    fn an_event_is_not_latched() {
+        let sink = Sink::new(Destination {
+            ros_topic: "/button".to_owned(),
+            mapped: Some(("std_msgs/Bool".parse().unwrap(), Selection::Whole)),
+            overflow: Overflow::DropOldest(8.try_into().unwrap()),
+        });
         assert!(!sink.options().latch);
     }
 }

@@ -17,13 +17,15 @@ mod strays;
 mod writing;
 
 use std::collections::{BTreeMap, BTreeSet, HashMap, VecDeque};
+use std::convert::Infallible;
 use std::future::poll_fn;
 use std::net::IpAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
-use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Room, Services, TypePaths, now};
+use bridge_node::policy::{Policy, Read, Step, TYPE_CHANGES, Word, is_bad, type_changes};
+use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, TypePaths, now};
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{DefinitionError, Selection, TextKind, TypeName};
@@ -75,11 +77,10 @@ pub struct Ros2Port {
     presence: RawWriter,
     discovery: DomainParticipantStatusListener,
     strangers: Strangers,
-    own: SpaceId,
+    policy: Policy,
     domain_id: u16,
     /// The addresses RustDDS has its sockets on; all when empty.
     networks: Vec<IpAddr>,
-    mapping: Arc<Mapping>,
     definitions: Definitions,
     descriptions: Descriptions,
     /// Tells what the types are that are read and written here.
@@ -101,8 +102,6 @@ pub struct Ros2Port {
     /// Topics we write.
     /// In Boxes, because the table has room for up to twice as many as there are.
     sinks: HashMap<TopicId, Box<Sink>>,
-    /// For those nobody here knows.
-    room: Room,
     /// Readers that were replaced; they hear on until their successor is matched.
     retired: VecDeque<(Instant, Reader)>,
     /// Writers that were given up, while their readers may lack something.
@@ -116,8 +115,6 @@ pub struct Ros2Port {
     incompatible: BTreeSet<GUID>,
     /// Readers of others that were told and counted as having another definition of a type than we write.
     misreading: BTreeSet<GUID>,
-    /// What was already told, so that it is told once.
-    told: BTreeSet<(String, &'static str)>,
     drops: Drops,
     schedule: Schedule,
 }
@@ -164,10 +161,9 @@ impl Ros2Port {
             strangers: Strangers::default(),
             domain,
             presence,
-            own,
+            policy: Policy::new(own, mapping),
             domain_id: domain_options.domain,
             networks: domain_options.networks,
-            mapping: Arc::clone(&mapping),
             definitions,
             descriptions: Descriptions::new(peers.clone()),
             told_types,
@@ -179,7 +175,6 @@ impl Ros2Port {
             source_of: BTreeMap::new(),
             inbox: Inbox::new(),
             sinks: HashMap::new(),
-            room: Room::new(MAX_TOPICS),
             retired: VecDeque::new(),
             former: VecDeque::new(),
             events: bound.into(),
@@ -187,43 +182,52 @@ impl Ros2Port {
             clock,
             incompatible: BTreeSet::new(),
             misreading: BTreeSet::new(),
-            told: BTreeSet::new(),
             drops: Drops::default(),
             schedule: Schedule::new(),
         };
-        port.take_bindings(&mapping);
+        port.take_bindings();
         Ok(port)
     }
 
-    fn take_bindings(&mut self, mapping: &Mapping) {
-        for (variable, binding) in mapping.bindings(self.own) {
-            let selection = binding.selection.clone();
-            if variable.topic.space == self.own {
-                let name = binding.message_type.clone();
-                let index = self.source(dds_topic(&binding.ros_topic), name);
-                if let Some(source) = self.sources.get_mut(index) {
-                    // Most topics have one.
-                    if source.values.is_empty() {
-                        source.values.reserve_exact(1);
-                    }
-                    source.values.push((variable.topic, selection));
-                }
-            } else {
-                let name = binding.message_type.clone();
-                let sink = Sink::mapped(&binding.ros_topic, name, selection, variable.overflow);
-                self.sinks.insert(variable.topic, Box::new(sink));
+    fn take_bindings(&mut self) {
+        for (dds_topic, (message_type, values)) in self.read() {
+            let index = self.source(dds_topic, message_type);
+            if let Some(source) = self.sources.get_mut(index) {
+                // Most topics have one.
+                source.values.reserve_exact(values.len());
+                source.values.extend(values);
+            }
+        }
+        self.take_up_sinks();
+    }
+
+    /// What the mapping reads.
+    fn read(&self) -> Read {
+        let name = |ros_topic: &str| Ok::<_, Infallible>(dds_topic(ros_topic));
+        self.policy.read(name)
+    }
+
+    /// Takes up the values of other spaces that the mapping ties to topics here.
+    fn take_up_sinks(&mut self) {
+        for topic in self.policy.written() {
+            if !self.sinks.contains_key(&topic) {
+                let sink = Sink::new(self.policy.destination(topic));
+                self.sinks.insert(topic, Box::new(sink));
             }
         }
     }
 
     /// What a mapping says otherwise that only a start can change.
     fn fixed(&self, mapping: &Mapping) -> Vec<String> {
-        let declared = mapping.space(self.own).and_then(|space| space.domain);
+        let declared = mapping
+            .space(self.policy.own())
+            .and_then(|space| space.domain);
         let other = declared.filter(|domain| *domain != self.domain_id);
         let fixed = other.map(|domain| {
             format!(
                 "spaces (space {} in domain {domain}, not {})",
-                self.own, self.domain_id
+                self.policy.own(),
+                self.domain_id
             )
         });
         fixed.into_iter().collect()
@@ -383,15 +387,7 @@ impl Ros2Port {
     fn learned(&mut self, topic: TopicId, described: &Described) -> Option<(TypeName, Selection)> {
         let name = &described.message_type;
         match self.definitions.get(name) {
-            Ok(found) => {
-                let selection = described.selection(&found.message_type);
-                if selection.is_none() {
-                    self.tell_once(&topic.to_string(), "other fields", || {
-                        format!("its writer says it is {name}, which has other fields here")
-                    });
-                }
-                Some((name.clone(), selection?))
-            }
+            Ok(found) => self.policy.learned(topic, described, &found.message_type),
             Err(error) => {
                 let dds_topic = self.sinks.get(&topic).map(|sink| sink.dds_topic.as_str());
                 let readers = self.graph.readers(dds_topic.unwrap_or_default());
@@ -409,39 +405,12 @@ impl Ros2Port {
         }
     }
 
-    /// Whether the type of a topic is another than the Router knows by now: what it wrote is still in the old one.
-    fn type_changes(&self, topic: TopicId) -> bool {
-        self.events.iter().any(|event| {
-            matches!(
-                event,
-                PortEvent::Bound { topic: other, .. } | PortEvent::Unbound { topic: other }
-                    if *other == topic
-            )
-        })
-    }
-
     /// Logs of a topic, once, that a type is not known; says whether it was.
     fn tell_unknown_type(&mut self, topic: &str, what: &str, error: &DefinitionError) -> bool {
-        if self.told.len() >= MAX_TOLD || !self.told.insert((topic.to_owned(), "unknown type")) {
-            return false;
-        }
-        let why = self.definitions.explain(TextKind::Message, error);
-        warn!(topic, "{what}: {why}");
-        true
-    }
-
-    /// Logs something about a topic the first time it happens; says whether it was.
-    fn tell_once(
-        &mut self,
-        topic: &str,
-        what: &'static str,
-        message: impl FnOnce() -> String,
-    ) -> bool {
-        if self.told.len() >= MAX_TOLD || !self.told.insert((topic.to_owned(), what)) {
-            return false;
-        }
-        warn!(topic, "{}", message());
-        true
+        let definitions = &mut self.definitions;
+        self.policy.told.once(topic, "unknown type", || {
+            format!("{what}: {}", definitions.explain(TextKind::Message, error))
+        })
     }
 }
 
@@ -459,14 +428,14 @@ impl Port for Ros2Port {
             kept,
             ..
         } = sample;
-        if self.type_changes(topic) {
+        if type_changes(&self.events, topic) {
             return Err(TYPE_CHANGES);
         }
         if kept == Kept::Again {
             // A writer of depth 1 has no place for more than the last value.
             return Ok(());
         }
-        if status & STATUS_BAD != 0 {
+        if is_bad(status) {
             return Err("bad status");
         }
         if let Some(replaced) = self.services.hand_over(topic, &payload) {
@@ -497,7 +466,7 @@ impl Port for Ros2Port {
         self.schedule.waiting |= open.outlet.is_waiting();
         if let Err(Refusal::TooLarge(limit)) = offered {
             let dds_topic = dds_topic.clone();
-            self.tell_once(&dds_topic, "too large", || {
+            self.policy.told.once(&dds_topic, "too large", || {
                 format!(
                     "a message of {size} bytes is not sent: above {limit} bytes it might never be complete at a \
                      subscriber of this topic ({})",
@@ -514,7 +483,7 @@ impl Port for Ros2Port {
         shape: &[(BuiltinType, bool)],
         described: Option<&Described>,
     ) {
-        let at_home = topic.space == self.own || self.is_at_home(topic.space);
+        let at_home = topic.space == self.policy.own() || self.is_at_home(topic.space);
         if at_home || self.services.takes(topic) {
             return;
         }
@@ -526,40 +495,31 @@ impl Port for Ros2Port {
             [(builtin, array)] => self.definitions.standard_type(*builtin, *array),
             _ => None,
         };
-        let learned = described.and_then(|described| self.learned(topic, described));
+        let word = Word {
+            described: described.cloned(),
+            learned: described.and_then(|described| self.learned(topic, described)),
+            standard,
+        };
         let Some(sink) = self.sinks.get_mut(&topic) else {
             return;
         };
-        sink.described = described.cloned();
-        let Some(open) = &sink.open else {
-            sink.standard = standard;
-            sink.learned = learned;
-            self.open_sink(topic, Instant::now());
-            return;
-        };
-        let message_type = Arc::clone(&open.definition.message_type);
-        let subscribed = !self.graph.readers(&sink.dds_topic).is_empty();
-        let same = |name: &TypeName| name == message_type.name();
-        let other_type = learned.as_ref().is_some_and(|(name, _)| !same(name));
-        // The type that somebody subscribed to stays, whatever of it the value is; without a word nothing changes.
-        if sink.mapped.is_some() || (subscribed && other_type) || learned.is_none() {
-            return;
-        }
-        let before = sink.selection(message_type.name());
-        sink.learned = learned;
-        let selection = sink.selection(message_type.name());
-        if other_type {
-            self.open_sink(topic, Instant::now());
-        } else if selection != before {
-            let stamps = sink.stamps(&message_type);
-            if let Some(open) = &mut sink.open {
-                open.stamps = stamps;
+        let open = sink.open.as_ref().map(|open| {
+            let subscribed = !self.graph.readers(&sink.dds_topic).is_empty();
+            (open.definition.name(), subscribed)
+        });
+        match sink.choice.hear(word, open) {
+            Step::Stay => {}
+            Step::Open => self.open_sink(topic, Instant::now()),
+            Step::Select(selection) => {
+                let Some(open) = &mut sink.open else { return };
+                let message_type = Arc::clone(&open.definition.message_type);
+                open.stamps = sink.choice.stamps(&message_type);
+                self.events.push_back(PortEvent::Bound {
+                    topic,
+                    message_type,
+                    selection,
+                });
             }
-            self.events.push_back(PortEvent::Bound {
-                topic,
-                message_type,
-                selection,
-            });
         }
     }
 
@@ -656,15 +616,6 @@ fn dds_time(time: uadp::Timestamp) -> rustdds::Timestamp {
 }
 
 const NANOS: u64 = 1_000_000_000;
-/// Why a value is not written while its topic goes over to another type.
-const TYPE_CHANGES: &str = "type changes";
-/// The severity bit of a Bad StatusCode (OPC 10000-4, 7.39.1) in its upper 16 bits.
-const STATUS_BAD: u16 = 0x8000;
-/// Topics of the space that are read: anybody in the domain can invent names. Likewise those that are written, of values
-/// nobody here knows.
-const MAX_TOPICS: usize = 4096;
-/// Peculiarities told; a domain with more of them is told about no further ones.
-const MAX_TOLD: usize = 4096;
 
 #[cfg(test)]
 mod tests {

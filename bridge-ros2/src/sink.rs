@@ -2,10 +2,10 @@
 
 use std::time::Instant;
 
-use bridge_node::Described;
+use bridge_node::policy::{Choice, Destination};
 use bytes::{Bytes, BytesMut};
-use mappings::{Overflow, TopicId, Variable};
-use messages::{MessageType, Selection, TypeName};
+use mappings::Overflow;
+use messages::TypeName;
 use rustdds::Duration;
 
 use crate::clock::RosTime;
@@ -20,14 +20,8 @@ use crate::qos::Offered;
 pub(crate) struct Sink {
     pub(crate) dds_topic: String,
     pub(crate) offered: Offered,
-    /// What the mapping ties it to; it decides alone.
-    pub(crate) mapped: Option<(TypeName, Selection)>,
-    /// What the writer of the value says of it.
-    pub(crate) described: Option<Described>,
-    /// The type it says, where it is known here and has those fields, and what of the message they are.
-    pub(crate) learned: Option<(TypeName, Selection)>,
-    /// The std_msgs type of the value the Router holds, if it is one value and there is such a type.
-    pub(crate) standard: Option<TypeName>,
+    /// In which type.
+    pub(crate) choice: Choice,
     /// The topic as it is written.
     pub(crate) open: Option<Open>,
     /// Since when its writer in the space is silent.
@@ -81,38 +75,16 @@ pub(crate) fn shortest_deadline(readers: &[Endpoint]) -> Option<Duration> {
 }
 
 impl Sink {
-    /// For a value with or without a variable in the mapping, but without a ROS topic there.
-    pub(crate) fn by_name(topic: TopicId, variable: Option<&Variable>) -> Self {
+    pub(crate) fn new(destination: Destination) -> Self {
+        let Destination {
+            ros_topic,
+            mapped,
+            overflow,
+        } = destination;
         Self {
-            dds_topic: dds_topic(&topic.to_string()),
-            offered: offered(
-                variable
-                    .map(|variable| variable.overflow)
-                    .unwrap_or_default(),
-            ),
-            mapped: None,
-            described: None,
-            learned: None,
-            standard: None,
-            open: None,
-            silent: None,
-        }
-    }
-
-    /// For a value the mapping ties to a ROS topic.
-    pub(crate) fn mapped(
-        ros_topic: &str,
-        message_type: TypeName,
-        selection: Selection,
-        overflow: Overflow,
-    ) -> Self {
-        Self {
-            dds_topic: dds_topic(ros_topic),
+            dds_topic: dds_topic(&ros_topic),
             offered: offered(overflow),
-            mapped: Some((message_type, selection)),
-            described: None,
-            learned: None,
-            standard: None,
+            choice: Choice::new(mapped),
             open: None,
             silent: None,
         }
@@ -121,33 +93,22 @@ impl Sink {
     /// Whether the mapping says the same of both.
     pub(crate) fn is_like(&self, other: &Self) -> bool {
         self.dds_topic == other.dds_topic
-            && self.mapped == other.mapped
+            && self.choice.mapped() == other.choice.mapped()
             && self.offered == other.offered
     }
 
-    /// The types it could have, best first: the mapping's; what a subscriber asks for, that in which it is written first;
-    /// what its writer says; the standard type of the value.
+    /// The types it could have, best first; of those that subscribers ask for, that in which it is written.
     pub(crate) fn candidates(&self, readers: &[Endpoint]) -> Vec<TypeName> {
-        if let Some((message_type, _)) = &self.mapped {
-            return vec![message_type.clone()];
-        }
-        let mut candidates: Vec<TypeName> = Vec::new();
         let asked_for = readers
             .iter()
             .filter_map(|reader| TypeName::from_dds(&reader.type_name).ok());
-        let learned = self.learned.as_ref().map(|(name, _)| name.clone());
         let written = self.open.as_ref().map(|open| open.definition.name());
         let is_asked_for = |name: &&TypeName| {
             let dds_type = name.dds();
             readers.iter().any(|reader| reader.type_name == dds_type)
         };
-        candidates.extend(written.filter(is_asked_for).cloned());
-        for name in asked_for.chain(learned).chain(self.standard.clone()) {
-            if !candidates.contains(&name) {
-                candidates.push(name);
-            }
-        }
-        candidates
+        let written = written.filter(is_asked_for).cloned();
+        self.choice.candidates(written.into_iter().chain(asked_for))
     }
 
     /// Whether what is open serves somebody, so that it is not to be given up for another type. A subscriber whose definition
@@ -158,30 +119,6 @@ impl Sink {
             let served = |reader: &Endpoint| reader.is_of(&dds_type, open.definition.hash);
             readers.is_empty() || readers.iter().any(served)
         })
-    }
-
-    /// Looks at what the writer of the value says again, with the definition that is written.
-    pub(crate) fn learn_from(&mut self, message_type: &MessageType) {
-        let name = message_type.name();
-        let described = self.described.as_ref();
-        if let Some(described) = described.filter(|described| described.message_type == *name) {
-            let selection = described.selection(message_type);
-            self.learned = selection.map(|selection| (name.clone(), selection));
-        }
-    }
-
-    /// Whether the stamp at the beginning of such messages is no part of the value.
-    pub(crate) fn stamps(&self, message_type: &MessageType) -> bool {
-        bridge_node::wants_stamp(message_type, Some(&self.selection(message_type.name())))
-    }
-
-    /// What of a message of that type the value is.
-    pub(crate) fn selection(&self, name: &TypeName) -> Selection {
-        let learned = self.learned.as_ref().filter(|(learned, _)| learned == name);
-        self.mapped
-            .as_ref()
-            .or(learned)
-            .map_or(Selection::Whole, |(_, selection)| selection.clone())
     }
 }
 
@@ -197,8 +134,11 @@ fn offered(overflow: Overflow) -> Offered {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use bridge_node::policy::{Step, Word};
+    use messages::Selection;
     use rustdds::GUID;
+
+    use super::*;
 
     fn reader(name: &str) -> Endpoint {
         Endpoint {
@@ -215,10 +155,22 @@ mod tests {
         candidates.iter().map(ToString::to_string).collect()
     }
 
+    fn sink(ros_topic: &str, mapped: Option<&str>) -> Sink {
+        Sink::new(Destination {
+            ros_topic: ros_topic.to_owned(),
+            mapped: mapped.map(|name| (name.parse().unwrap(), Selection::Whole)),
+            overflow: Overflow::KeepLatest,
+        })
+    }
+
     #[test]
     fn a_subscriber_decides_before_the_standard_type() {
-        let mut sink = Sink::by_name("ua_1_2_3".parse().unwrap(), None);
-        sink.standard = Some("std_msgs/Float64".parse().unwrap());
+        let mut sink = sink("/ua_1_2_3", None);
+        let word = Word {
+            standard: Some("std_msgs/Float64".parse().unwrap()),
+            ..Word::default()
+        };
+        assert_eq!(sink.choice.hear(word, None), Step::Open);
         assert_eq!(names(&sink.candidates(&[])), ["std_msgs/Float64"]);
         assert_eq!(
             names(&sink.candidates(&[reader("std_msgs/Float32")])),
@@ -227,37 +179,9 @@ mod tests {
     }
 
     #[test]
-    fn a_message_of_one_field_gets_a_stamp_and_a_whole_one_keeps_its_own() {
-        let imu: TypeName = "sensor_msgs/Imu".parse().unwrap();
-        let registry = messages::Registry::bundle(messages::Dialect::Ros2);
-        let message_type = registry.get(&imu).unwrap();
-        let stamps = |selection| {
-            Sink::mapped("/imu", imu.clone(), selection, Overflow::KeepLatest).stamps(&message_type)
-        };
-        assert!(stamps(Selection::Field("angular_velocity.z".to_owned())));
-        assert!(!stamps(Selection::Field("header.stamp".to_owned())));
-        assert!(!stamps(Selection::Whole));
-        assert!(!stamps(Selection::Bytes));
-    }
-
-    #[test]
-    fn the_mapping_decides_before_any_subscriber() {
-        let sink = Sink::mapped(
-            "/button",
-            "std_msgs/Bool".parse().unwrap(),
-            Selection::Whole,
-            Overflow::KeepLatest,
-        );
-        assert_eq!(
-            names(&sink.candidates(&[reader("std_msgs/String")])),
-            ["std_msgs/Bool"]
-        );
-        assert_eq!(sink.dds_topic, "rt/button");
-    }
-
-    #[test]
-    fn a_topic_of_the_space_has_its_own_name() {
-        let sink = Sink::by_name("ua_1_2_3".parse().unwrap(), None);
-        assert_eq!(sink.dds_topic, "rt/ua_1_2_3");
+    fn a_topic_has_the_name_of_ros_in_the_domain() {
+        let mapped = sink("/button", Some("std_msgs/Bool"));
+        assert_eq!(mapped.dds_topic, "rt/button");
+        assert_eq!(sink("/ua_1_2_3", None).dds_topic, "rt/ua_1_2_3");
     }
 }

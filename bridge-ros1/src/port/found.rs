@@ -7,11 +7,12 @@ use std::ops::Bound;
 use std::time::{Duration, Instant};
 
 use bridge_node::PortEvent;
+use bridge_node::policy::{Found, MAX_TOPICS};
 use mappings::TopicId;
 use messages::{Selection, TypeName};
 use tracing::warn;
 
-use super::{MAX_TOPICS, Ros1Port};
+use super::Ros1Port;
 use crate::source::Source;
 
 impl Ros1Port {
@@ -35,32 +36,24 @@ impl Ros1Port {
                 self.refused.topics += 1;
                 continue;
             }
-            let named = ros_topic
-                .strip_prefix('/')
-                .and_then(|name| name.parse::<TopicId>().ok());
             let typed = self.graph.types.get(ros_topic).and_then(|t| t.parse().ok());
-            let made = self.mapping.matching(self.own, ros_topic, typed.as_ref());
-            match (named, made) {
-                (Some(topic), _) => {
-                    let variable = self.mapping.variable(topic);
-                    let bound = variable
-                        .is_some_and(|v| v.binding(self.own).is_some() || v.service.is_some());
-                    if topic.space == self.own && !bound {
-                        found.push((ros_topic.clone(), Ok((topic, None, Selection::Whole))));
-                    }
-                }
-                (None, Some(made)) if !self.is_written(ros_topic) => {
-                    let made = made.map(|made| (made.topic, made.message_type, made.selection));
-                    found.push((ros_topic.clone(), made.map_err(|fault| fault.to_string())));
-                }
-                (None, _) => {}
-            }
+            let made = match self.policy.found(ros_topic, typed.as_ref()) {
+                Found::Named(topic) => Ok((topic, None, Selection::Whole)),
+                // Others who publish where values of other spaces go are not a value of ours.
+                Found::Made(_) | Found::Fault(_) if self.is_written(ros_topic) => continue,
+                Found::Made(made) => Ok((made.topic, made.message_type, made.selection)),
+                Found::Fault(fault) => Err(fault.to_string()),
+                Found::Tied(_) | Found::Nothing => continue,
+            };
+            found.push((ros_topic.clone(), made));
         }
         let mut places = self.places();
         for (ros_topic, made) in found {
             match made {
                 Ok(value) => self.add_found(ros_topic, value, &mut places),
-                Err(fault) => self.tell_once(&ros_topic, "pattern", || fault),
+                Err(fault) => {
+                    self.policy.told.once(&ros_topic, "pattern", || fault);
+                }
             }
         }
         // Those that are known already may have lost their subscription.
@@ -80,7 +73,7 @@ impl Ros1Port {
         }
     }
 
-    /// Whether values of other spaces are written there: others who publish it too are not a value of ours.
+    /// Whether values of other spaces are written there.
     fn is_written(&self, ros_topic: &str) -> bool {
         let mut sinks = self.sinks.values();
         sinks.any(|sink| {
@@ -103,7 +96,9 @@ impl Ros1Port {
         }
         let ros_topic = source.ros_topic.clone();
         if let Err(error) = self.subscribe(index) {
-            self.tell_once(&ros_topic, "not subscribed", || error.to_string());
+            self.policy
+                .told
+                .once(&ros_topic, "not subscribed", || error.to_string());
         }
     }
 
@@ -151,9 +146,7 @@ impl Ros1Port {
         let same = |source: &&Source| source.values.iter().any(|(other, _)| *other == topic);
         if let Some(other) = self.sources.iter().find(same) {
             let other = other.ros_topic.clone();
-            self.tell_once(&ros_topic, "pattern", || {
-                format!("it would be {topic}, which {other} is already: it does not cross")
-            });
+            self.policy.tell_same(&ros_topic, topic, &other);
             return;
         }
         self.taken_last.clone_from(&ros_topic);

@@ -1,12 +1,13 @@
 //! Values of other spaces that neither the mapping names nor a subscriber wants: they are written while there is room.
 
 use std::collections::BTreeSet;
-use std::time::Instant;
 
-use bridge_node::{PortEvent, Reason};
+use bridge_node::policy::{Admission, Policy};
+use bridge_node::{PortEvent, Reason, now};
 use mappings::TopicId;
+use tcpros::Graph;
 
-use super::{MAX_TOPICS, Ros1Port};
+use super::Ros1Port;
 use crate::sink::Sink;
 
 impl Ros1Port {
@@ -15,8 +16,12 @@ impl Ros1Port {
         if self.sinks.contains_key(&topic) {
             return true;
         }
-        let sink = Sink::by_name(topic, self.mapping.variable(topic));
-        if self.is_stray(topic, &sink) && !self.take_place() {
+        let sink = Sink::new(self.policy.destination(topic));
+        if self
+            .policy
+            .is_stray(topic, is_subscribed(&sink, &self.graph))
+            && !self.take_place()
+        {
             self.events.push_back(PortEvent::Dropped {
                 reason: Reason::TooManyTopics,
                 why: "values that the mapping does not name and nobody subscribes to",
@@ -28,49 +33,32 @@ impl Ros1Port {
         true
     }
 
-    fn is_stray(&self, topic: TopicId, sink: &Sink) -> bool {
-        let open = sink.open.as_ref();
-        let subscribed = open.is_some_and(|open| open.publisher.subscribers() > 0)
-            || self.graph.subscribers.contains_key(&sink.ros_topic);
-        self.mapping.variable(topic).is_none() && !subscribed
-    }
-
     fn take_place(&mut self) -> bool {
-        let now = bridge_node::now().monotonic;
-        if self.room.wants_look(now) {
-            let there = self.let_strays_go();
-            self.room.looked(there, now);
-        }
-        self.room.take()
-    }
-
-    /// Gives up topics of writers that fell silent, those first that are silent longest; says how many strays there are then.
-    fn let_strays_go(&mut self) -> usize {
-        let strays = self
-            .sinks
-            .iter()
-            .filter(|(topic, sink)| self.is_stray(**topic, sink));
-        let strays: Vec<(Option<Instant>, TopicId)> =
-            strays.map(|(topic, sink)| (sink.silent, *topic)).collect();
-        let silent = strays.iter();
-        let mut silent: Vec<(Instant, TopicId)> = silent
-            .filter_map(|(since, topic)| since.map(|since| (since, *topic)))
-            .collect();
-        silent.sort_unstable();
-        silent.truncate(MOST_LET_GO);
+        let (sinks, graph) = (&self.sinks, &self.graph);
+        let strays = |policy: &Policy| {
+            let strays = sinks
+                .iter()
+                .filter(|(topic, sink)| policy.is_stray(**topic, is_subscribed(sink, graph)));
+            let strays = strays.map(|(topic, sink)| (sink.silent, *topic));
+            strays.collect::<Vec<_>>()
+        };
+        let now = now().monotonic;
+        let Admission { admitted, gone } = self.policy.admit_stray(now, strays);
         let mut names = BTreeSet::new();
-        for (_, topic) in &silent {
-            if let Some(sink) = self.sinks.remove(topic) {
-                names.insert(topic.to_string());
-                names.insert(sink.ros_topic);
+        for topic in gone {
+            if let Some(sink) = self.sinks.remove(&topic) {
+                names.extend([topic.to_string(), sink.ros_topic]);
             }
-            self.events.push_back(PortEvent::Unbound { topic: *topic });
+            self.events.push_back(PortEvent::Unbound { topic });
         }
         // Should they return, what is peculiar is told anew.
-        self.told.retain(|(topic, _)| !names.contains(topic));
-        strays.len() - silent.len()
+        self.policy.told.forget(&names);
+        admitted
     }
 }
 
-/// How many are given up at a time: the master is told of each.
-const MOST_LET_GO: usize = MAX_TOPICS / 32;
+fn is_subscribed(sink: &Sink, graph: &Graph) -> bool {
+    let open = sink.open.as_ref();
+    open.is_some_and(|open| open.publisher.subscribers() > 0)
+        || graph.subscribers.contains_key(&sink.ros_topic)
+}

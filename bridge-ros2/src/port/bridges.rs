@@ -13,12 +13,13 @@ impl Ros2Port {
     /// Whether another bridge serves that space in this domain. Anybody may say so; where the mapping has the space in
     /// another domain it is not believed.
     pub(super) fn is_at_home(&self, space: SpaceId) -> bool {
-        self.graph.is_at_home(space.into()) && is_possible(&self.mapping, space, self.domain_id)
+        self.graph.is_at_home(space.into())
+            && is_possible(self.policy.mapping(), space, self.domain_id)
     }
 
     /// Tells of bridges of other spaces in the domain, whose word keeps values out.
     pub(super) fn tell_of_bridges(&mut self) {
-        let own = u16::from(self.own);
+        let own = u16::from(self.policy.own());
         let others = self.graph.bridges().filter(|(_, space)| *space != own);
         // By the space: a stranger may come under any number of names.
         let others: BTreeMap<_, _> = others.map(|(bridge, space)| (space, bridge)).collect();
@@ -31,14 +32,14 @@ impl Ros2Port {
                 nodes => format!("participant {} ({})", hex(&bridge), nodes.join(", ")),
             };
             let domain = self.domain_id;
-            if is_possible(&self.mapping, space, domain) {
-                self.tell_once(&bridge_topic(number), "bridge", || {
+            if is_possible(self.policy.mapping(), space, domain) {
+                self.policy.told.once(&bridge_topic(number), "bridge", || {
                     format!(
                         "{who} says it is the bridge of space {space} in domain {domain}: its values are left to it"
                     )
                 });
             } else {
-                self.tell_once(&bridge_topic(number), "no bridge", || {
+                self.policy.told.once(&bridge_topic(number), "no bridge", || {
                     format!(
                         "{who} says it is the bridge of space {space}, which the mapping has in another domain than \
                          {domain}: it is not believed"

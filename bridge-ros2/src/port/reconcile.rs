@@ -4,13 +4,14 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::PortEvent;
-use mappings::{PatternFault, PatternVariable, TopicId};
+use bridge_node::policy::{Found, MAX_TOPICS};
+use mappings::TopicId;
 use messages::{Selection, TypeName};
 use rustdds::GUID;
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 
-use super::{MAX_TOPICS, Ros2Port, lost};
+use super::{Ros2Port, lost};
 use crate::compatibility::Incompatibility;
 use crate::definitions::Definition;
 use crate::domain::{Domain, DomainError};
@@ -88,7 +89,7 @@ impl Ros2Port {
         // What is left are endpoints of services and of the node itself, and readers that were replaced and hear on.
         if made == 0 {
             let count = lost.len();
-            self.tell_once("", "unannounced", || {
+            self.policy.told.once("", "unannounced", || {
                 format!("{count} endpoints of services or of the node were not announced by the DDS stack; start again")
             });
         } else {
@@ -116,7 +117,7 @@ impl Ros2Port {
             // Those that were given up leave their place behind.
             let read = self.sources.iter().filter(|s| !s.values.is_empty());
             if read.count() >= MAX_TOPICS {
-                self.tell_once("", "too many topics", || {
+                self.policy.told.once("", "too many topics", || {
                     format!("more than {MAX_TOPICS} topics of the space: the rest is left alone")
                 });
                 return;
@@ -126,9 +127,7 @@ impl Ros2Port {
                 sources.find(|source| source.values.iter().any(|(other, _)| *other == topic));
             if let Some(other) = same {
                 let other = other.dds_topic.clone();
-                self.tell_once(&dds_topic, "pattern", || {
-                    format!("it would be {topic}, which {other} is already: it does not cross")
-                });
+                self.policy.tell_same(&dds_topic, topic, &other);
                 continue;
             }
             if let Some(name) = self.found_type(topic, &dds_topic, now) {
@@ -145,7 +144,8 @@ impl Ros2Port {
         let writers = self.graph.writers(dds_topic).to_vec();
         let mut known = None;
         for writer in &writers {
-            if known.is_some() || !self.may_be(dds_topic, &writer.type_name) {
+            // A pattern may be about one type.
+            if known.is_some() || self.found(dds_topic, &writer.type_name) == Found::Nothing {
                 continue;
             }
             let found = match TypeName::from_dds(&writer.type_name) {
@@ -168,65 +168,53 @@ impl Ros2Port {
 
     /// The value a topic is that the mapping does not name: by its own name, or by a pattern.
     fn value_of(&mut self, dds_topic: String) -> Option<(String, TopicId, Selection)> {
-        let name = ros_topic(&dds_topic)?;
-        if let Ok(topic) = name.parse::<TopicId>() {
-            if topic.space != self.own {
-                return None;
-            }
-            if self.is_tied(topic) {
-                self.tell_once(&dds_topic, "tied elsewhere", || {
-                    format!("{topic} comes from another ROS topic, as the mapping says; this one is left alone")
+        let writers = self.graph.writers(&dds_topic).iter();
+        let mut found = writers.map(|writer| self.found(&dds_topic, &writer.type_name));
+        match found.find(|found| *found != Found::Nothing)? {
+            Found::Named(topic) => Some((dds_topic, topic, Selection::Whole)),
+            Found::Tied(topic) => {
+                self.policy.told.once(&dds_topic, "tied elsewhere", || {
+                    format!("{topic} comes from another ROS topic or a service, as the mapping says; this one is left alone")
                 });
-                return None;
-            }
-            return Some((dds_topic, topic, Selection::Whole));
-        }
-        // Others who write where values of other spaces go are not a value of ours.
-        if self.sinks.values().any(|sink| sink.dds_topic == dds_topic) {
-            return None;
-        }
-        let made = self
-            .graph
-            .writers(&dds_topic)
-            .iter()
-            .find_map(|writer| self.made_of(name, &writer.type_name))?;
-        match made {
-            Ok(made) => Some((dds_topic, made.topic, made.selection)),
-            Err(fault) => {
-                self.tell_once(&dds_topic, "pattern", || fault.to_string());
                 None
             }
+            // Others who write where values of other spaces go are not a value of ours.
+            Found::Made(_) | Found::Fault(_) if self.is_written(&dds_topic) => None,
+            Found::Made(made) => Some((dds_topic, made.topic, made.selection)),
+            Found::Fault(fault) => {
+                self.policy
+                    .told
+                    .once(&dds_topic, "pattern", || fault.to_string());
+                None
+            }
+            Found::Nothing => None,
         }
     }
 
-    /// What a pattern makes of a topic that is written in that type.
-    pub(super) fn made_of(
-        &self,
-        name: &str,
-        dds_type: &str,
-    ) -> Option<Result<PatternVariable, PatternFault>> {
-        let message_type = TypeName::from_dds(dds_type).ok()?;
-        let name = format!("/{name}");
-        self.mapping.matching(self.own, &name, Some(&message_type))
+    /// What a topic that the mapping does not name is in the space, written in that type. A type that is none of ROS is
+    /// one that no pattern is about.
+    pub(super) fn found(&self, dds_topic: &str, dds_type: &str) -> Found {
+        let Some(name) = ros_topic(dds_topic) else {
+            return Found::Nothing;
+        };
+        let message_type = TypeName::from_dds(dds_type).ok();
+        let found = self
+            .policy
+            .found(&format!("/{name}"), message_type.as_ref());
+        match found {
+            Found::Made(_) | Found::Fault(_) if message_type.is_none() => Found::Nothing,
+            found => found,
+        }
     }
 
-    /// Whether a topic that the mapping does not name is a value in that type: a pattern may be about one type.
-    fn may_be(&self, dds_topic: &str, dds_type: &str) -> bool {
-        ros_topic(dds_topic).is_some_and(|name| {
-            name.parse::<TopicId>().is_ok() || self.made_of(name, dds_type).is_some()
-        })
-    }
-
-    /// Whether the mapping gives this value to another ROS topic of our domain.
-    pub(super) fn is_tied(&self, topic: TopicId) -> bool {
-        self.mapping
-            .variable(topic)
-            .is_some_and(|variable| variable.binding(self.own).is_some())
+    /// Whether values of other spaces are written there.
+    pub(super) fn is_written(&self, dds_topic: &str) -> bool {
+        self.sinks.values().any(|sink| sink.dds_topic == dds_topic)
     }
 
     /// Says once why a topic cannot be used.
     fn tell_unknown(&mut self, topic: TopicId, dds_topic: &str, error: &str) {
-        let first = self.tell_once(dds_topic, "unknown type", || {
+        let first = self.policy.told.once(dds_topic, "unknown type", || {
             format!(
                 "the topic cannot cross: {error}. Start the bridge where the ROS workspace that defines it is sourced \
                  (AMENT_PREFIX_PATH), or map the topic to a known type"
@@ -451,7 +439,7 @@ impl Ros2Port {
             && stranger.type_name == name.dds()
         {
             let owner = self.domain.owner(stranger.guid);
-            self.tell_once(&topic, OTHER_DEFINITION, || {
+            self.policy.told.once(&topic, OTHER_DEFINITION, || {
                 format!(
                     "a publisher of {} has another definition of {name}, with the hash {theirs}; the topic crosses with \
                      {ours}: its messages are dropped",
@@ -460,7 +448,7 @@ impl Ros2Port {
             });
             return;
         }
-        self.tell_once(&topic, OTHER_TYPE, || {
+        self.policy.told.once(&topic, OTHER_TYPE, || {
             format!(
                 "a publisher has type {}, but the topic crosses as {name}: its messages are dropped",
                 stranger.type_name
@@ -500,7 +488,7 @@ impl Ros2Port {
             let unmatched = |topic: TopicId| PortEvent::Unmatched { topic };
             self.events.extend(topics.into_iter().map(unmatched));
             let owner = self.domain.owner(guid);
-            self.tell_once(&dds_topic, found.policy, || {
+            self.policy.told.once(&dds_topic, found.policy, || {
                 format!(
                     "a {peer} of {} is not matched: in {} {} is offered and {} requested",
                     owner.as_deref().unwrap_or("an unnamed node"),
@@ -539,7 +527,7 @@ impl Ros2Port {
             Ok(endpoint) => Some(endpoint),
             Err(error) => {
                 let text = error.to_string();
-                self.tell_once(&text, "endpoint", || text.clone());
+                self.policy.told.once(&text, "endpoint", || text.clone());
                 None
             }
         }

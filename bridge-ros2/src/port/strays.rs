@@ -1,13 +1,14 @@
 //! Values of other spaces that neither the mapping names nor a subscriber wants: they are written while there is room.
 
 use std::collections::BTreeSet;
-use std::time::Instant;
 
+use bridge_node::policy::{Admission, Policy};
 use bridge_node::{PortEvent, Reason, now};
 use mappings::TopicId;
 
+use super::Ros2Port;
 use super::writing::unwritten;
-use super::{MAX_TOPICS, Ros2Port};
+use crate::graph::Graph;
 use crate::sink::Sink;
 
 impl Ros2Port {
@@ -16,8 +17,9 @@ impl Ros2Port {
         if self.sinks.contains_key(&topic) {
             return true;
         }
-        let sink = Sink::by_name(topic, self.mapping.variable(topic));
-        if self.is_stray(topic, &sink) && !self.take_place() {
+        let sink = Sink::new(self.policy.destination(topic));
+        let subscribed = is_subscribed(&sink, &self.graph);
+        if self.policy.is_stray(topic, subscribed) && !self.take_place() {
             self.events.push_back(PortEvent::Dropped {
                 reason: Reason::TooManyTopics,
                 why: "values that the mapping does not name and nobody subscribes to",
@@ -29,49 +31,33 @@ impl Ros2Port {
         true
     }
 
-    fn is_stray(&self, topic: TopicId, sink: &Sink) -> bool {
-        self.mapping.variable(topic).is_none() && self.graph.readers(&sink.dds_topic).is_empty()
-    }
-
     fn take_place(&mut self) -> bool {
+        let (sinks, graph) = (&self.sinks, &self.graph);
+        let strays = |policy: &Policy| {
+            let strays = sinks
+                .iter()
+                .filter(|(topic, sink)| policy.is_stray(**topic, is_subscribed(sink, graph)));
+            let strays = strays.map(|(topic, sink)| (sink.silent, *topic));
+            strays.collect::<Vec<_>>()
+        };
         let now = now().monotonic;
-        if self.room.wants_look(now) {
-            let there = self.let_strays_go();
-            self.room.looked(there, now);
-        }
-        self.room.take()
-    }
-
-    /// Gives up topics of writers that fell silent, those first that are silent longest; says how many strays there are then.
-    fn let_strays_go(&mut self) -> usize {
-        let strays = self
-            .sinks
-            .iter()
-            .filter(|(topic, sink)| self.is_stray(**topic, sink));
-        let strays: Vec<(Option<Instant>, TopicId)> =
-            strays.map(|(topic, sink)| (sink.silent, *topic)).collect();
-        let silent = strays.iter();
-        let mut silent: Vec<(Instant, TopicId)> = silent
-            .filter_map(|(since, topic)| since.map(|since| (since, *topic)))
-            .collect();
-        silent.sort_unstable();
-        silent.truncate(MOST_LET_GO);
+        let Admission { admitted, gone } = self.policy.admit_stray(now, strays);
         let mut names = BTreeSet::new();
-        for (_, topic) in &silent {
-            if let Some(sink) = self.sinks.remove(topic) {
+        for topic in gone {
+            if let Some(sink) = self.sinks.remove(&topic) {
                 // Nobody reads what it wrote.
-                let unwritten = sink.open.as_ref().and_then(|open| unwritten(*topic, open));
+                let unwritten = sink.open.as_ref().and_then(|open| unwritten(topic, open));
                 self.events.extend(unwritten);
-                names.insert(topic.to_string());
-                names.insert(sink.dds_topic);
+                names.extend([topic.to_string(), sink.dds_topic]);
             }
-            self.events.push_back(PortEvent::Unbound { topic: *topic });
+            self.events.push_back(PortEvent::Unbound { topic });
         }
         // Should they return, what is peculiar is told anew.
-        self.told.retain(|(topic, _)| !names.contains(topic));
-        strays.len() - silent.len()
+        self.policy.told.forget(&names);
+        admitted
     }
 }
 
-/// How many are given up at a time: RustDDS takes commands from a bounded queue, and drops what does not fit.
-const MOST_LET_GO: usize = MAX_TOPICS / 32;
+fn is_subscribed(sink: &Sink, graph: &Graph) -> bool {
+    !graph.readers(&sink.dds_topic).is_empty()
+}

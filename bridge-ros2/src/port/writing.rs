@@ -27,7 +27,7 @@ impl Ros2Port {
             let dds_topic = sink.dds_topic.clone();
             if let Some(open) = given_up {
                 self.events.extend(unwritten(topic, &open));
-                self.tell_once(&dds_topic, "at home", || {
+                self.policy.told.once(&dds_topic, "at home", || {
                     format!(
                         "another bridge of this domain serves space {}: its values are left to it",
                         topic.space
@@ -93,7 +93,7 @@ impl Ros2Port {
         let others: Vec<Endpoint> = readers.iter().filter(other).cloned().collect();
         let dds_topic = sink.dds_topic.clone();
         if let Some(other) = of_another_type {
-            self.tell_once(&dds_topic, "subscriber of another type", || {
+            self.policy.told.once(&dds_topic, "subscriber of another type", || {
                 format!(
                     "a subscriber asks for the type {other}, the topic is written in {dds_type}: it gets no values"
                 )
@@ -108,7 +108,7 @@ impl Ros2Port {
             }
             self.events.push_back(lost(topic, OTHER_DEFINITION_READ, 1));
             let owner = self.domain.owner(reader.guid);
-            self.tell_once(&dds_topic, OTHER_DEFINITION_READ, || {
+            self.policy.told.once(&dds_topic, OTHER_DEFINITION_READ, || {
                 format!(
                     "a subscriber of {} has another definition of {name}, with the hash {theirs}; the topic is written with \
                      {ours}: it may misread the values",
@@ -231,14 +231,14 @@ impl Ros2Port {
             let before = sink.open.as_ref();
             self.events
                 .extend(before.and_then(|open| unwritten(topic, open)));
-            sink.learn_from(&message_type);
-            selection = sink.selection(message_type.name());
+            sink.choice.learn_from(&message_type);
+            selection = sink.choice.selection(message_type.name());
             sink.open = Some(Open {
                 definition,
                 outlet,
                 deadline,
                 tightened: 0,
-                stamps: sink.stamps(&message_type),
+                stamps: sink.choice.stamps(&message_type),
             });
         }
         self.events.push_back(PortEvent::Bound {

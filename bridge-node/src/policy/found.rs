@@ -1,0 +1,98 @@
+//! What a topic of a graph is in the space that the mapping does not name.
+
+use mappings::{PatternFault, PatternVariable, TopicId};
+use messages::TypeName;
+
+use super::Policy;
+
+/// What a topic that the mapping does not name is in the space.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Found {
+    /// By its own name a value of ours, whole, in whatever type it has.
+    Named(TopicId),
+    /// It has the name of a value of ours that the mapping ties to something else.
+    Tied(TopicId),
+    /// A pattern makes a value of it.
+    Made(PatternVariable),
+    /// A pattern is about it and makes nothing of it.
+    Fault(PatternFault),
+    /// Nothing.
+    Nothing,
+}
+
+impl Policy {
+    /// What a topic is, by its full name (`/ua_1_5_3`, `/turtle1/pose`) and its type, where that is known.
+    #[must_use]
+    pub fn found(&self, ros_topic: &str, typed: Option<&TypeName>) -> Found {
+        let name = ros_topic.strip_prefix('/').unwrap_or_default();
+        match name.parse::<TopicId>() {
+            Ok(topic) if topic.space != self.own => Found::Nothing,
+            Ok(topic) if self.is_tied(topic) => Found::Tied(topic),
+            Ok(topic) => Found::Named(topic),
+            Err(_) => match self.mapping.matching(self.own, ros_topic, typed) {
+                Some(Ok(made)) => Found::Made(made),
+                Some(Err(fault)) => Found::Fault(fault),
+                None => Found::Nothing,
+            },
+        }
+    }
+
+    /// Whether the mapping makes this value of another topic of our graph, or of a service.
+    fn is_tied(&self, topic: TopicId) -> bool {
+        let variable = self.mapping.variable(topic);
+        variable.is_some_and(|v| v.binding(self.own).is_some() || v.service.is_some())
+    }
+
+    /// Tells once of a topic that it would be a value which another topic is already.
+    pub fn tell_same(&mut self, ros_topic: &str, topic: TopicId, other: &str) {
+        self.told.once(ros_topic, "pattern", || {
+            format!("it would be {topic}, which {other} is already: it does not cross")
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use mappings::{Mapping, SpaceId};
+
+    use super::*;
+
+    const CELL: &str = r#"
+spaces: [{id: 1}, {id: 2}]
+namespaces: {5: urn:a:b}
+variables:
+  - {node: ns=5;i=11, name: Turn, origin: 1, ros: {space: 1, topic: /turn, type: geometry_msgs/Twist}}
+  - {node: ns=5;i=12, name: Named, origin: 1}
+patterns:
+  - {topics: "/robot/*", origin: 1, node: "ns=5;i=10{1}", name: "Robot{1}", type: std_msgs/Float64}
+"#;
+
+    fn found(ros_topic: &str, typed: Option<&str>) -> Found {
+        let mapping = Mapping::from_yaml(CELL, "cell.yaml");
+        let policy = Policy::new(SpaceId::ROS1, Arc::new(mapping.mapping.unwrap()));
+        policy.found(ros_topic, typed.map(|name| name.parse().unwrap()).as_ref())
+    }
+
+    #[test]
+    fn a_topic_with_the_name_of_a_value_of_ours_is_that_value() {
+        let topic = |text: &str| text.parse::<TopicId>().unwrap();
+        assert_eq!(found("/ua_1_9_9", None), Found::Named(topic("ua_1_9_9")));
+        // The mapping says what it is, and not where it comes from.
+        assert_eq!(found("/ua_1_5_12", None), Found::Named(topic("ua_1_5_12")));
+        assert_eq!(found("/ua_1_5_11", None), Found::Tied(topic("ua_1_5_11")));
+        assert_eq!(found("/ua_2_9_9", None), Found::Nothing);
+        assert_eq!(found("/other", None), Found::Nothing);
+    }
+
+    #[test]
+    fn a_pattern_makes_values_of_topics_of_its_type() {
+        let Found::Made(made) = found("/robot/7", Some("std_msgs/Float64")) else {
+            panic!("the pattern is about it");
+        };
+        assert_eq!(made.node.to_string(), "ns=5;i=107");
+        assert_eq!(found("/robot/7", Some("std_msgs/String")), Found::Nothing);
+        assert_eq!(found("/turn", None), Found::Nothing, "it has a variable");
+    }
+}

@@ -1,0 +1,229 @@
+//! What the ports of both ROS decide alike: which topics of a graph are values of the space, in which type values of
+//! other spaces are written, what gives way, what another mapping changes, and what is told once.
+//!
+//! No IO and no clock: a port says what there is in its graph, and carries out what comes of it with its library.
+
+mod choice;
+mod found;
+mod reload;
+mod told;
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::Instant;
+
+use bridge_core::{Described, Room};
+use mappings::{Mapping, SpaceId, TopicId};
+use messages::{MessageType, Selection, TypeName};
+
+pub use self::choice::{Choice, Step, Word};
+pub use self::found::Found;
+pub use self::reload::{Destination, Read, still_made, taken_up};
+pub use self::told::Told;
+use crate::PortEvent;
+
+/// What a port knows of its own space, apart from what its graph has.
+#[derive(Debug)]
+pub struct Policy {
+    own: SpaceId,
+    mapping: Arc<Mapping>,
+    /// What is peculiar is told once.
+    pub told: Told,
+    /// For values nobody here knows.
+    room: Room,
+}
+
+/// What is done about a value that neither the mapping names nor anybody here wants.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Admission {
+    /// Whether it has a place.
+    pub admitted: bool,
+    /// Those that are to go for it and others to come.
+    pub gone: Vec<TopicId>,
+}
+
+impl Policy {
+    /// Of a port whose graph is that space.
+    #[must_use]
+    pub fn new(own: SpaceId, mapping: Arc<Mapping>) -> Self {
+        Self {
+            own,
+            mapping,
+            told: Told::default(),
+            room: Room::new(MAX_TOPICS),
+        }
+    }
+
+    /// The space whose values are produced in the graph.
+    #[must_use]
+    pub const fn own(&self) -> SpaceId {
+        self.own
+    }
+
+    /// The cell.
+    #[must_use]
+    pub const fn mapping(&self) -> &Arc<Mapping> {
+        &self.mapping
+    }
+
+    /// Goes over to another mapping and returns the one before. What is peculiar is told anew.
+    pub fn replace(&mut self, mapping: &Arc<Mapping>) -> Arc<Mapping> {
+        self.told.clear();
+        std::mem::replace(&mut self.mapping, Arc::clone(mapping))
+    }
+
+    /// Whether a value is one that can be made up by anybody on the network: the mapping does not name it, and nobody
+    /// here subscribes to it.
+    #[must_use]
+    pub fn is_stray(&self, topic: TopicId, subscribed: bool) -> bool {
+        !subscribed && self.mapping.variable(topic).is_none()
+    }
+
+    /// Room for one more stray. `strays` are those there are, each with since when its writer is silent; they are only
+    /// looked at when no place is left, and then those give way first that are silent longest, at most
+    /// [`MOST_LET_GO`] of them. One whose writer is heard never does.
+    pub fn admit_stray<I>(&mut self, now: Instant, strays: impl FnOnce(&Self) -> I) -> Admission
+    where
+        I: IntoIterator<Item = (Option<Instant>, TopicId)>,
+    {
+        let mut gone = Vec::new();
+        if self.room.wants_look(now) {
+            let mut there = 0_usize;
+            let mut silent: Vec<(Instant, TopicId)> = strays(self)
+                .into_iter()
+                .inspect(|_| there += 1)
+                .filter_map(|(since, topic)| since.map(|since| (since, topic)))
+                .collect();
+            silent.sort_unstable();
+            silent.truncate(MOST_LET_GO);
+            self.room.looked(there - silent.len(), now);
+            gone = silent.into_iter().map(|(_, topic)| topic).collect();
+        }
+        Admission {
+            admitted: self.room.take(),
+            gone,
+        }
+    }
+
+    /// What of a message of the type that the writer of a value says it is the value is. `None`, and told once, where the
+    /// type has other fields here.
+    pub fn learned(
+        &mut self,
+        topic: TopicId,
+        described: &Described,
+        message_type: &MessageType,
+    ) -> Option<(TypeName, Selection)> {
+        let name = &described.message_type;
+        let selection = described.selection(message_type);
+        if selection.is_none() {
+            self.told.once(&topic.to_string(), "other fields", || {
+                format!("its writer says it is {name}, which has other fields here")
+            });
+        }
+        Some((name.clone(), selection?))
+    }
+}
+
+/// Whether the type of a topic is another than the Router knows by now: what it wrote is still in the old one.
+#[must_use]
+pub fn type_changes(waiting: &VecDeque<PortEvent>, topic: TopicId) -> bool {
+    waiting.iter().any(|event| {
+        matches!(
+            event,
+            PortEvent::Bound { topic: other, .. } | PortEvent::Unbound { topic: other }
+                if *other == topic
+        )
+    })
+}
+
+/// Whether a status, the upper 16 bits of a StatusCode (OPC 10000-4, 7.39.1), is Bad.
+#[must_use]
+pub const fn is_bad(status: u16) -> bool {
+    status & 0x8000 != 0
+}
+
+/// Why a value is not written while its topic goes over to another type.
+pub const TYPE_CHANGES: &str = "type changes";
+/// Topics of the space that the mapping does not name and that are read: anybody in a graph can invent names. Likewise
+/// those that are written, of values nobody here knows.
+pub const MAX_TOPICS: usize = 4096;
+/// How many strays are given up at a time: a master is told of each, and RustDDS takes commands from a bounded queue.
+pub const MOST_LET_GO: usize = MAX_TOPICS / 32;
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    fn policy(mapping: &str) -> Policy {
+        let mapping = Mapping::from_yaml(mapping, "cell.yaml").mapping.unwrap();
+        Policy::new(SpaceId::ROS1, Arc::new(mapping))
+    }
+
+    fn topic(id: u16) -> TopicId {
+        format!("ua_2_9_{id}").parse().unwrap()
+    }
+
+    #[test]
+    fn what_the_mapping_names_or_somebody_wants_is_no_stray() {
+        let policy = policy(
+            "
+spaces: [{id: 1}, {id: 2}]
+namespaces: {9: urn:a:b}
+variables:
+  - {node: ns=9;i=1, name: Turn, origin: 2, ros: {space: 2, topic: /turn, type: geometry_msgs/Twist}}
+",
+        );
+        assert!(!policy.is_stray(topic(1), false));
+        assert!(!policy.is_stray(topic(2), true));
+        assert!(policy.is_stray(topic(2), false));
+    }
+
+    #[test]
+    fn those_silent_longest_give_way_and_those_heard_do_not() {
+        let mut policy = Policy::new(SpaceId::ROS1, Arc::default());
+        let start = Instant::now();
+        for _ in 0..MAX_TOPICS {
+            let admission = policy.admit_stray(start, |_| -> [_; 0] { panic!("there is room") });
+            assert!(admission.admitted && admission.gone.is_empty());
+        }
+        let heard = (1..=10).map(|id| (None, topic(id)));
+        let silent = (11..=65_000).map(|id| {
+            let since = start + Duration::from_millis(u64::from(id).abs_diff(200));
+            (Some(since), topic(id))
+        });
+        let now = start + Duration::from_secs(60);
+        // All there are, were they so many: none of them is free for a while.
+        let admission = policy.admit_stray(now, |_| heard.chain(silent));
+        assert_eq!(
+            (admission.admitted, admission.gone.len()),
+            (false, MOST_LET_GO)
+        );
+        assert_eq!(admission.gone.first(), Some(&topic(200)));
+        assert!(
+            admission
+                .gone
+                .iter()
+                .all(|gone| gone.identifier.get().abs_diff(200) <= 64)
+        );
+        // Not at every stranger that comes.
+        let again = policy.admit_stray(now, |_| -> [_; 0] { panic!("it was looked a moment ago") });
+        assert!(!again.admitted);
+        let later = now + Duration::from_secs(2);
+        let left = policy.admit_stray(later, |_| [(None, topic(1))]);
+        assert!(left.admitted && left.gone.is_empty());
+    }
+
+    #[test]
+    fn a_type_that_the_router_does_not_know_yet_is_a_change() {
+        let mut waiting = VecDeque::from([PortEvent::Live {
+            topic: topic(1),
+            live: true,
+        }]);
+        assert!(!type_changes(&waiting, topic(1)));
+        waiting.push_back(PortEvent::Unbound { topic: topic(1) });
+        assert!(type_changes(&waiting, topic(1)) && !type_changes(&waiting, topic(2)));
+        assert!(is_bad(0x8034) && !is_bad(0x4000) && !is_bad(0));
+    }
+}

@@ -1,0 +1,69 @@
+//! What is peculiar about a topic, told once.
+
+use std::collections::BTreeSet;
+
+use tracing::warn;
+
+/// What was told already. Bounded: anybody in a graph can make up what is peculiar.
+#[derive(Debug, Default)]
+pub struct Told(BTreeSet<(String, &'static str)>);
+
+impl Told {
+    /// Logs something about a topic the first time it happens; says whether it was. `what` names the kind of it.
+    pub fn once(
+        &mut self,
+        topic: &str,
+        what: &'static str,
+        message: impl FnOnce() -> String,
+    ) -> bool {
+        if self.0.len() >= MAX_TOLD || !self.0.insert((topic.to_owned(), what)) {
+            return false;
+        }
+        warn!(topic, "{}", message());
+        if self.0.len() == MAX_TOLD {
+            warn!(
+                "so many peculiarities were told that no further ones are, until the mapping is read again"
+            );
+        }
+        true
+    }
+
+    /// Has everything told anew.
+    pub fn clear(&mut self) {
+        self.0.clear();
+    }
+
+    /// Has what is peculiar about these topics told anew.
+    pub fn forget(&mut self, topics: &BTreeSet<String>) {
+        self.0.retain(|(topic, _)| !topics.contains(topic));
+    }
+}
+
+/// Peculiarities told; a graph with more of them is told about no further ones.
+const MAX_TOLD: usize = 4096;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_kind_is_told_once_of_a_topic_until_it_is_forgotten() {
+        let mut told = Told::default();
+        let text = String::new;
+        assert!(told.once("/a", "type", text));
+        assert!(!told.once("/a", "type", || panic!("it is not made in vain")));
+        assert!(told.once("/a", "fields", text) && told.once("/b", "type", text));
+        told.forget(&BTreeSet::from(["/a".to_owned()]));
+        assert!(told.once("/a", "type", text) && !told.once("/b", "type", text));
+        told.clear();
+        assert!(told.once("/b", "type", text));
+    }
+
+    #[test]
+    fn what_a_stranger_makes_up_ends() {
+        let mut told = Told::default();
+        let topics = (0..2 * MAX_TOLD).map(|n| format!("/made_up{n}"));
+        let lines = topics.filter(|topic| told.once(topic, "type", String::new));
+        assert_eq!(lines.count(), MAX_TOLD);
+    }
+}
