@@ -1,1 +1,18 @@
-//! Servers and clients of OPC UA.
+//! OPC UA for the programs of the plant: servers whose address space is made of NodeSets and of instances of their
+//! types, and clients that come back by themselves. It knows no skills, no discovery, no space and no ROS.
+//!
+//! Reading order: `limits` (the bounds of both sides), `endpoint` and `pki` (how clients get in), `nodeset` (types from
+//! files), `server` and `client`.
+
+pub mod client;
+pub mod endpoint;
+pub mod limits;
+pub mod nodeset;
+pub mod pki;
+pub mod server;
+
+pub use opcua::types;
+
+/// What programs hide of the logs of the OPC UA libraries, in the syntax of `tracing` filters: they say at level info
+/// what they do for each peer, and at level error what a bad peer did.
+pub const QUIET: &str = "opcua_server=warn,opcua_client=error,opcua_crypto=warn,opcua_core=warn,opcua_nodes=warn,opcua_types=off";

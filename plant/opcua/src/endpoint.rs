@@ -1,0 +1,221 @@
+//! Endpoint URLs: where a server listens, and what it tells clients.
+
+use std::fmt;
+use std::io;
+use std::net::{IpAddr, SocketAddr, TcpListener, ToSocketAddrs as _};
+use std::str::FromStr;
+
+
+/// The endpoint URL of the server: `opc.tcp://host:port/path` (OPC 10000-6, 7.1.2.2).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EndpointUrl {
+    host: String,
+    port: u16,
+    path: String,
+}
+
+impl EndpointUrl {
+    /// The host clients are told: that of the URL, or this computer's name where the URL has the wildcard address,
+    /// which no client can connect to.
+    #[must_use]
+    pub fn advertised_host(&self) -> String {
+        let bare = self.host.trim_matches(['[', ']']);
+        match bare.parse::<IpAddr>() {
+            Ok(address) if address.is_unspecified() => {
+                opcua::crypto::hostname().unwrap_or_else(|_| "localhost".to_owned())
+            }
+            Ok(_) | Err(_) => self.host.clone(),
+        }
+    }
+
+    /// The path of the URL, `/` at least.
+    #[must_use]
+    pub fn path(&self) -> &str {
+        &self.path
+    }
+
+    /// The URL clients are told, with the port that is listened on.
+    #[must_use]
+    pub fn advertised(&self, port: u16) -> String {
+        format!("opc.tcp://{}:{port}{}", self.advertised_host(), self.path)
+    }
+
+    /// Opens the listening socket, with no delay for small packets on the connections it accepts.
+    ///
+    /// # Errors
+    /// The host has no address, or none of its addresses can be listened on.
+    pub fn bind(&self) -> Result<TcpListener, BindError> {
+        let failed = |address: String| {
+            move |source: io::Error| {
+                let kind = source.kind();
+                if kind == io::ErrorKind::AddrInUse {
+                    BindError::Taken {
+                        address,
+                        port: self.port,
+                    }
+                } else if kind == io::ErrorKind::AddrNotAvailable {
+                    BindError::NotOurs(address)
+                } else {
+                    BindError::Other { address, source }
+                }
+            }
+        };
+        let name = format!("{}:{}", self.host, self.port);
+        let addresses: Vec<SocketAddr> = name
+            .to_socket_addrs()
+            .map_err(|source| BindError::Unresolved {
+                host: self.host.clone(),
+                source,
+            })?
+            .collect();
+        let shown = addresses.first().map_or_else(|| name, ToString::to_string);
+        let listener = TcpListener::bind(addresses.as_slice()).map_err(failed(shown.clone()))?;
+        listener
+            .set_nonblocking(true)
+            .map_err(failed(shown.clone()))?;
+        // Connections take it over. Without it a notification waits for the client's delayed acknowledgement, 40 ms.
+        socket2::SockRef::from(&listener)
+            .set_tcp_nodelay(true)
+            .map_err(failed(shown))?;
+        Ok(listener)
+    }
+}
+
+impl FromStr for EndpointUrl {
+    type Err = UrlError;
+
+    fn from_str(text: &str) -> Result<Self, UrlError> {
+        let rest = text.strip_prefix("opc.tcp://").ok_or(UrlError::Scheme)?;
+        let (authority, path) = match rest.split_once('/') {
+            Some((authority, path)) => (authority, format!("/{path}")),
+            None => (rest, "/".to_owned()),
+        };
+        let (host, port) = match authority.rsplit_once(':') {
+            Some((host, port)) if !port.contains(']') => {
+                (host, port.parse().map_err(|_| UrlError::Port)?)
+            }
+            _ => (authority, DEFAULT_PORT),
+        };
+        let bracketed = host.starts_with('[') && host.ends_with(']');
+        if host.is_empty()
+            || (host.contains(':') && !bracketed)
+            || host.contains(char::is_whitespace)
+        {
+            return Err(UrlError::Host);
+        }
+        Ok(Self {
+            host: host.to_owned(),
+            port,
+            path,
+        })
+    }
+}
+
+impl fmt::Display for EndpointUrl {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "opc.tcp://{}:{}{}", self.host, self.port, self.path)
+    }
+}
+
+/// Why a text is not an endpoint URL.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum UrlError {
+    /// Not `opc.tcp`.
+    #[error("an endpoint URL begins with `opc.tcp://`, such as opc.tcp://127.0.0.1:4840")]
+    Scheme,
+    /// No host, or one that cannot be.
+    #[error("the host of the endpoint URL is a name or an address (an IPv6 address in brackets)")]
+    Host,
+    /// Not a number, or too large.
+    #[error("the port of the endpoint URL is a number up to 65535")]
+    Port,
+}
+
+/// Why nothing listens.
+#[derive(Debug, thiserror::Error)]
+pub enum BindError {
+    /// Another program has the port.
+    #[error(
+        "another program listens on {address} already (see `ss -ltnp 'sport = :{port}'`); \
+         stop it, or choose another endpoint"
+    )]
+    Taken {
+        /// Address and port.
+        address: String,
+        /// The port.
+        port: u16,
+    },
+    /// The host is another computer.
+    #[error("{0} is no address of this computer; choose one of its own as endpoint")]
+    NotOurs(String),
+    /// The host has no address.
+    #[error("the host {host} of the endpoint has no address: {source}")]
+    Unresolved {
+        /// The host.
+        host: String,
+        /// What the system says.
+        #[source]
+        source: io::Error,
+    },
+    /// Anything else.
+    #[error("cannot listen on {address}: {source}")]
+    Other {
+        /// Address and port.
+        address: String,
+        /// What the system says.
+        #[source]
+        source: io::Error,
+    },
+}
+
+/// The port of OPC UA Connection Protocol registered with IANA.
+const DEFAULT_PORT: u16 = 4840;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_endpoint_url_has_a_host_a_port_and_a_path() {
+        let url: EndpointUrl = "opc.tcp://cell-1.local:4841/ua/server".parse().unwrap();
+        assert_eq!(url.to_string(), "opc.tcp://cell-1.local:4841/ua/server");
+        let url: EndpointUrl = "opc.tcp://[::1]".parse().unwrap();
+        assert_eq!(url.to_string(), "opc.tcp://[::1]:4840/");
+    }
+
+    #[test]
+    fn what_is_no_endpoint_url_is_refused_with_the_part_that_is_wrong() {
+        for (text, error) in [
+            ("127.0.0.1:4840", UrlError::Scheme),
+            ("http://127.0.0.1:4840", UrlError::Scheme),
+            ("opc.tcp://", UrlError::Host),
+            ("opc.tcp://::1:4840", UrlError::Host),
+            ("opc.tcp://127.0.0.1:99999", UrlError::Port),
+            ("opc.tcp://127.0.0.1:", UrlError::Port),
+        ] {
+            assert_eq!(text.parse::<EndpointUrl>(), Err(error), "{text}");
+        }
+    }
+
+    #[test]
+    fn clients_are_never_told_the_wildcard_address() {
+        for text in ["opc.tcp://0.0.0.0:4840", "opc.tcp://[::]:4840"] {
+            let host = text.parse::<EndpointUrl>().unwrap().advertised_host();
+            assert!(
+                !host.is_empty() && !host.contains("0.0.0.0") && !host.contains("::"),
+                "{host}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_taken_port_is_named_with_what_to_do() {
+        let url: EndpointUrl = "opc.tcp://127.0.0.1:0".parse().unwrap();
+        let first = url.bind().unwrap();
+        let port = first.local_addr().unwrap().port();
+        let url: EndpointUrl = format!("opc.tcp://127.0.0.1:{port}").parse().unwrap();
+        let message = url.bind().unwrap_err().to_string();
+        assert!(message.contains(&format!("127.0.0.1:{port}")), "{message}");
+        assert!(message.contains("endpoint"), "{message}");
+    }
+}

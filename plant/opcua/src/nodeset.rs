@@ -1,0 +1,371 @@
+//! NodeSet2 files (OPC 10000-6, Annex F): read, checked and put into an order in which each has what it needs.
+
+use std::collections::{BTreeSet, HashMap, HashSet};
+use std::fs::File;
+use std::io::{self, Read as _};
+use std::path::PathBuf;
+use std::str::FromStr as _;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use opcua::nodes::{ImportedItem, NodeSet2Import, NodeSetImport};
+use opcua::server::address_space::AddressSpace;
+use opcua::types::{NamespaceMap, NodeId, NodeSetNamespaceMapper};
+use opcua::xml::load_nodeset2_file;
+use opcua::xml::schema::ua_node_set::{UANode, UANodeSet};
+
+use crate::limits::LARGEST_NODESET;
+
+/// The namespace of the OPC Foundation, index 0 of every server.
+pub const CORE: &str = "http://opcfoundation.org/UA/";
+
+/// Why NodeSets cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum NodeSetError {
+    /// The file cannot be read.
+    #[error("the NodeSet {file} cannot be read: {source}")]
+    Read {
+        /// The file.
+        file: String,
+        /// What the system says.
+        #[source]
+        source: io::Error,
+    },
+    /// The text is no NodeSet2 document.
+    #[error("{file} is not a NodeSet2 document: {reason}")]
+    Xml {
+        /// The file.
+        file: String,
+        /// What is wrong and where.
+        reason: String,
+    },
+    /// A node of the document is wrong.
+    #[error("{file}: node {node}: {reason}")]
+    Node {
+        /// The file.
+        file: String,
+        /// The NodeId as the file has it.
+        node: String,
+        /// What is wrong.
+        reason: String,
+    },
+    /// Values of nodes cannot be read, such as structures of types that are not known.
+    #[error("{file}: {missing} of its {all} nodes cannot be used, for a value that cannot be read")]
+    Values {
+        /// The file.
+        file: String,
+        /// How many nodes are left out.
+        missing: usize,
+        /// How many nodes the file has.
+        all: usize,
+    },
+    /// No file has the nodes of a namespace that is needed.
+    #[error("{file} needs the namespace {uri}, and no NodeSet given has it")]
+    Missing {
+        /// The file.
+        file: String,
+        /// The namespace.
+        uri: String,
+    },
+    /// Each of some files needs another of them.
+    #[error("these NodeSets need each other: {0}")]
+    Circle(String),
+    /// Two files have the same namespace.
+    #[error("{first} and {second} both have nodes of the namespace {uri}")]
+    Twice {
+        /// One file.
+        first: String,
+        /// The other file.
+        second: String,
+        /// The namespace.
+        uri: String,
+    },
+}
+
+/// Where a NodeSet comes from.
+#[derive(Debug)]
+pub(crate) enum Source {
+    Text { name: String, xml: String },
+    File(PathBuf),
+}
+
+/// A NodeSet that can be imported.
+pub(crate) struct NodeSet {
+    file: String,
+    /// The namespaces of its table, by their index less `offset`.
+    uris: Vec<String>,
+    offset: usize,
+    /// The namespaces it has nodes of.
+    provides: BTreeSet<String>,
+    /// The namespaces it refers to beside those and [`CORE`].
+    needs: BTreeSet<String>,
+    nodes: usize,
+    import: NodeSet2Import,
+}
+
+/// Reads the sources and orders them.
+///
+/// # Errors
+/// The first thing that is wrong with any of them.
+pub(crate) fn load(sources: Vec<Source>) -> Result<Vec<NodeSet>, NodeSetError> {
+    let read = sources.into_iter().map(NodeSet::read);
+    ordered(read.collect::<Result<_, _>>()?)
+}
+
+impl NodeSet {
+    fn read(source: Source) -> Result<Self, NodeSetError> {
+        let (file, xml) = match source {
+            Source::Text { name, xml } => (name, xml),
+            Source::File(path) => {
+                let file = path.display().to_string();
+                let mut xml = String::new();
+                let read = File::open(&path).and_then(|opened| {
+                    opened.take(LARGEST_NODESET + 1).read_to_string(&mut xml)
+                });
+                match read {
+                    Ok(bytes) if bytes as u64 > LARGEST_NODESET => {
+                        let reason = format!("it has more than {} MiB", LARGEST_NODESET >> 20);
+                        return Err(NodeSetError::Xml { file, reason });
+                    }
+                    Ok(_) => (file, xml),
+                    Err(source) => return Err(NodeSetError::Read { file, source }),
+                }
+            }
+        };
+        let wrong = |reason: String| NodeSetError::Xml {
+            file: file.clone(),
+            reason,
+        };
+        // A byte order mark is no part of the document.
+        let document = load_nodeset2_file(xml.trim_start_matches('\u{feff}'))
+            .map_err(|error| wrong(error.to_string()))?;
+        let set = document
+            .node_set
+            .ok_or_else(|| wrong("it has no UANodeSet element".to_owned()))?;
+        Self::checked(file, set)
+    }
+
+    fn checked(file: String, set: UANodeSet) -> Result<Self, NodeSetError> {
+        let table = set.namespace_uris.as_ref();
+        let uris = table.map_or_else(Vec::new, |table| table.uris.clone());
+        // Some tools list the core namespace too, as index 0.
+        let offset = usize::from(uris.first().is_none_or(|first| first != CORE));
+        let aliases = set.aliases.iter().flat_map(|table| &table.aliases);
+        let check = Check {
+            file: &file,
+            uris: &uris,
+            offset,
+            aliases: aliases
+                .map(|alias| (alias.alias.as_str(), alias.id.0.as_str()))
+                .collect(),
+        };
+        let mut seen = HashSet::new();
+        let mut provides = BTreeSet::new();
+        let mut needs = BTreeSet::new();
+        for node in &set.nodes {
+            let (id, used) = check.node(node)?;
+            let uri = check.uri(id.namespace).unwrap_or(CORE);
+            if uri == CORE {
+                return Err(check.wrong(node, "a NodeSet has no nodes of the core namespace"));
+            }
+            provides.insert(uri.to_owned());
+            needs.extend(used);
+            if !seen.insert(id) {
+                return Err(check.wrong(node, "there are two nodes with this NodeId"));
+            }
+        }
+        for model in set.models.iter().flat_map(|table| &table.models) {
+            provides.insert(model.model_uri.clone());
+            let required = model.required_model.iter();
+            needs.extend(required.map(|model| model.model_uri.clone()));
+        }
+        needs.remove(CORE);
+        needs.retain(|uri| !provides.contains(uri));
+        Ok(Self {
+            file,
+            uris,
+            offset,
+            provides,
+            needs,
+            nodes: set.nodes.len(),
+            import: NodeSet2Import::new_nodeset("en", set, Vec::new()),
+        })
+    }
+
+    /// The namespaces it has nodes of.
+    pub(crate) fn provides(&self) -> impl Iterator<Item = &str> {
+        self.provides.iter().map(String::as_str)
+    }
+
+    /// Puts the nodes into an address space, which owns the namespaces from now on.
+    ///
+    /// # Errors
+    /// Nodes that are left out.
+    pub(crate) fn import(
+        &self,
+        address_space: &mut AddressSpace,
+        namespaces: &mut NamespaceMap,
+    ) -> Result<(), NodeSetError> {
+        let counted = Counted {
+            set: self,
+            loaded: AtomicUsize::new(0),
+        };
+        address_space.import_node_set(&counted, namespaces);
+        let loaded = counted.loaded.into_inner();
+        if loaded < self.nodes {
+            return Err(NodeSetError::Values {
+                file: self.file.clone(),
+                missing: self.nodes - loaded,
+                all: self.nodes,
+            });
+        }
+        Ok(())
+    }
+}
+
+/// The import of the library, without what it prints to the standard output for each namespace.
+struct Counted<'a> {
+    set: &'a NodeSet,
+    loaded: AtomicUsize,
+}
+
+impl NodeSetImport for Counted<'_> {
+    fn register_namespaces(&self, namespaces: &mut NodeSetNamespaceMapper<'_>) {
+        for (index, uri) in (0_u16..).skip(self.set.offset).zip(&self.set.uris) {
+            if uri != CORE {
+                namespaces.add_namespace(uri, index);
+            }
+        }
+    }
+
+    fn get_own_namespaces(&self) -> Vec<String> {
+        let uris = self.set.uris.iter().filter(|uri| *uri != CORE);
+        uris.cloned().collect()
+    }
+
+    fn load<'a>(
+        &'a self,
+        namespaces: &'a NodeSetNamespaceMapper<'_>,
+    ) -> Box<dyn Iterator<Item = ImportedItem> + 'a> {
+        let items = self.set.import.load(namespaces);
+        Box::new(items.inspect(|_| {
+            self.loaded.fetch_add(1, Ordering::Relaxed);
+        }))
+    }
+}
+
+/// What the library would panic at, or leave out without saying so.
+struct Check<'a> {
+    file: &'a str,
+    uris: &'a [String],
+    offset: usize,
+    aliases: HashMap<&'a str, &'a str>,
+}
+
+impl Check<'_> {
+    fn wrong(&self, node: &UANode, reason: impl Into<String>) -> NodeSetError {
+        NodeSetError::Node {
+            file: self.file.to_owned(),
+            node: node.base().node_id.0.clone(),
+            reason: reason.into(),
+        }
+    }
+
+    fn uri(&self, index: u16) -> Option<&str> {
+        if index == 0 {
+            return Some(CORE);
+        }
+        let at = usize::from(index).checked_sub(self.offset)?;
+        self.uris.get(at).map(String::as_str)
+    }
+
+    fn id(&self, text: &str) -> Result<NodeId, String> {
+        let resolved = self.aliases.get(text).copied().unwrap_or(text);
+        let id = NodeId::from_str(resolved)
+            .map_err(|_| format!("`{text}` is neither a NodeId nor an alias"))?;
+        match self.uri(id.namespace) {
+            Some(_) => Ok(id),
+            None => Err(format!(
+                "`{text}` has namespace {}, and the table of the file has {}",
+                id.namespace,
+                self.uris.len()
+            )),
+        }
+    }
+
+    /// The NodeId of a node, and the namespaces it refers to.
+    fn node(&self, node: &UANode) -> Result<(NodeId, BTreeSet<String>), NodeSetError> {
+        let base = node.base();
+        let mut used = BTreeSet::new();
+        let mut id_of = |text: &str| {
+            let id = self.id(text).map_err(|reason| self.wrong(node, reason))?;
+            used.extend(self.uri(id.namespace).map(str::to_owned));
+            Ok(id)
+        };
+        let id = id_of(&base.node_id.0)?;
+        for reference in base.references.iter().flat_map(|list| &list.references) {
+            id_of(&reference.reference_type.0)?;
+            if id_of(&reference.node_id.0)? == id {
+                return Err(self.wrong(node, "it refers to itself"));
+            }
+        }
+        match node {
+            UANode::Variable(variable) => drop(id_of(&variable.data_type.0)?),
+            UANode::VariableType(variable) => drop(id_of(&variable.data_type.0)?),
+            UANode::Object(_)
+            | UANode::Method(_)
+            | UANode::View(_)
+            | UANode::ObjectType(_)
+            | UANode::DataType(_)
+            | UANode::ReferenceType(_) => {}
+        }
+        let name = base.browse_name.0.as_str();
+        let index = match name.split_once(':') {
+            Some((index, _)) if index.chars().all(|c| c.is_ascii_digit()) => index.parse().ok(),
+            Some(_) | None => Some(0),
+        };
+        if index.and_then(|index| self.uri(index)).is_none() {
+            let reason = format!("the namespace of its BrowseName `{name}` is not in the table");
+            return Err(self.wrong(node, reason));
+        }
+        Ok((id, used))
+    }
+}
+
+/// The NodeSets with each after those it needs.
+fn ordered(sets: Vec<NodeSet>) -> Result<Vec<NodeSet>, NodeSetError> {
+    let mut owners: HashMap<&str, &NodeSet> = HashMap::new();
+    for set in &sets {
+        for uri in &set.provides {
+            if let Some(first) = owners.insert(uri, set) {
+                return Err(NodeSetError::Twice {
+                    first: first.file.clone(),
+                    second: set.file.clone(),
+                    uri: uri.clone(),
+                });
+            }
+        }
+    }
+    for set in &sets {
+        if let Some(uri) = set.needs.iter().find(|uri| !owners.contains_key(uri.as_str())) {
+            return Err(NodeSetError::Missing {
+                file: set.file.clone(),
+                uri: uri.clone(),
+            });
+        }
+    }
+    let mut waiting = sets;
+    let mut there: BTreeSet<String> = BTreeSet::new();
+    let mut ordered = Vec::new();
+    while !waiting.is_empty() {
+        let ready = |set: &NodeSet| set.needs.is_subset(&there);
+        let (next, rest): (Vec<_>, Vec<_>) = waiting.into_iter().partition(ready);
+        if next.is_empty() {
+            let files: Vec<&str> = rest.iter().map(|set| set.file.as_str()).collect();
+            return Err(NodeSetError::Circle(files.join(", ")));
+        }
+        there.extend(next.iter().flat_map(|set| set.provides.iter().cloned()));
+        ordered.extend(next);
+        waiting = rest;
+    }
+    Ok(ordered)
+}

@@ -1,0 +1,364 @@
+//! The application's own certificate, and the certificates of clients that were refused.
+
+use std::collections::BTreeSet;
+use std::fs::{self, File};
+use std::io;
+use std::path::{Path, PathBuf};
+
+use opcua::crypto::{CertificateStore, X509Data};
+use tracing::{info, warn};
+
+/// The directories of an OPC UA certificate store: `own`, `private`, `trusted` and `rejected` under one root.
+#[derive(Debug)]
+pub struct Pki {
+    root: PathBuf,
+    reported: BTreeSet<PathBuf>,
+}
+
+/// Why the certificate store cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum PkiError {
+    /// A directory cannot be made or read.
+    #[error(
+        "the certificate store {path} cannot be used: {source}; choose another directory for it"
+    )]
+    Directory {
+        /// The directory.
+        path: PathBuf,
+        /// What the system says.
+        #[source]
+        source: io::Error,
+    },
+    /// Half of the pair is there: a new one would silently replace what clients trust.
+    #[error("{present} is there but {missing} is not: put it back, or remove both for a new pair")]
+    Half {
+        /// What is there.
+        present: PathBuf,
+        /// What is not.
+        missing: PathBuf,
+    },
+    /// The files are there and cannot be read as a certificate and its key.
+    #[error("{0}; put back the certificate and its key, or remove both for a new pair")]
+    Unreadable(String),
+    /// A new pair cannot be made or written.
+    #[error("no certificate could be made: {0}")]
+    Make(String),
+}
+
+impl Pki {
+    /// Uses the store under `root`, making what is missing of its directories.
+    ///
+    /// # Errors
+    /// A directory cannot be made or read.
+    pub fn open(root: PathBuf) -> Result<Self, PkiError> {
+        for name in ["own", "private", "trusted", "rejected"] {
+            let path = root.join(name);
+            let made = fs::create_dir_all(&path).and_then(|()| match name {
+                "private" => owner_only(&path),
+                _ => Ok(()),
+            });
+            made.map_err(|source| PkiError::Directory { path, source })?;
+        }
+        let mut pki = Self {
+            root,
+            reported: BTreeSet::new(),
+        };
+        pki.reported = pki
+            .rejected()
+            .map_err(|source| PkiError::Directory {
+                path: pki.root.join("rejected"),
+                source,
+            })?
+            .into_iter()
+            .collect();
+        Ok(pki)
+    }
+
+    /// The directory.
+    #[must_use]
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// Makes the application instance certificate and its key when neither is there, naming the application and
+    /// the hosts it is reached under (OPC 10000-6, 6.2.2), and warns when those there do not fit any more. Of several
+    /// servers that start at once in one store the first makes the pair, and the others take it.
+    ///
+    /// # Errors
+    /// Files that cannot be read or written, or half a pair.
+    pub fn ensure_own(&self, application_uri: &str, host: &str) -> Result<(), PkiError> {
+        let _alone = self.lock()?;
+        let certificate = self.root.join(OWN_CERTIFICATE);
+        let key = self.root.join(OWN_KEY);
+        match (certificate.exists(), key.exists()) {
+            (true, true) => check_own(&certificate, &key, application_uri),
+            (true, false) => Err(PkiError::Half {
+                present: certificate,
+                missing: key,
+            }),
+            (false, true) => Err(PkiError::Half {
+                present: key,
+                missing: certificate,
+            }),
+            (false, false) => {
+                let data = certificate_data(application_uri, host);
+                CertificateStore::create_certificate_and_key(&data, false, &certificate, &key)
+                    .map_err(PkiError::Make)?;
+                info!(certificate = %certificate.display(), application_uri, "made the application's own certificate");
+                Ok(())
+            }
+        }
+    }
+
+    /// Waits until no other server is making its certificate here, and keeps others from it until the file is dropped.
+    fn lock(&self) -> Result<File, PkiError> {
+        let path = self.root.join(LOCK);
+        let locked = File::create(&path).and_then(|file| match file.lock() {
+            // Some network file systems have no locks; two servers that start at once there are left to chance.
+            Err(error) if error.kind() != io::ErrorKind::Unsupported => Err(error),
+            Ok(()) | Err(_) => Ok(file),
+        });
+        locked.map_err(|source| PkiError::Directory { path, source })
+    }
+
+    /// Says how to trust each client certificate refused since the last call, and keeps the newest
+    /// [`REJECTED_KEPT`] of them: anyone who reaches the port can have one stored.
+    pub fn report_rejected(&mut self) {
+        // Clients' certificates are refused all the same when the directory is gone: the server says so itself.
+        let rejected = self.rejected().unwrap_or_default();
+        let oldest = rejected.len().saturating_sub(REJECTED_KEPT);
+        for (at, path) in rejected.iter().enumerate() {
+            if at < oldest {
+                remove(path);
+            } else if !self.reported.contains(path) {
+                // No shell command to copy: the file name begins with a name the client chose.
+                warn!(
+                    "a client was refused because its certificate is not trusted; to trust it, move {:?} into {:?}",
+                    path,
+                    self.root.join("trusted"),
+                );
+            }
+        }
+        self.reported = rejected.into_iter().collect();
+    }
+
+    /// The refused certificates, oldest first.
+    fn rejected(&self) -> io::Result<Vec<PathBuf>> {
+        let mut found = Vec::new();
+        for entry in fs::read_dir(self.root.join("rejected"))? {
+            let entry = entry?;
+            found.push((entry.metadata()?.modified()?, entry.path()));
+        }
+        found.sort();
+        Ok(found.into_iter().map(|(_, path)| path).collect())
+    }
+}
+
+/// Where the store is when nobody says so: systemd's state directory, the user's, or the system's.
+#[must_use]
+pub fn default_root(variable: impl Fn(&str) -> Option<String>) -> PathBuf {
+    let given = |name| {
+        variable(name)
+            .filter(|value| !value.is_empty())
+            .map(PathBuf::from)
+    };
+    if let Some(state) = given("STATE_DIRECTORY") {
+        return state.join("pki");
+    }
+    let state = given("XDG_STATE_HOME")
+        .or_else(|| given("HOME").map(|home| home.join(".local/state")))
+        .unwrap_or_else(|| PathBuf::from("/var/lib"));
+    state.join("ua-bridge/pki")
+}
+
+fn remove(refused: &Path) {
+    if let Err(error) = fs::remove_file(refused) {
+        warn!(path = %refused.display(), %error, "an old refused certificate cannot be removed");
+    }
+}
+
+fn certificate_data(application_uri: &str, host: &str) -> X509Data {
+    let mut addresses = vec![host.to_owned(), "127.0.0.1".to_owned(), "::1".to_owned()];
+    addresses.dedup();
+    X509Data {
+        key_size: 2048,
+        common_name: "UA bridge".to_owned(),
+        organization: "UA bridge".to_owned(),
+        organizational_unit: "UA bridge".to_owned(),
+        country: "XX".to_owned(),
+        state: "-".to_owned(),
+        // Without the addresses of the computer's name: they are asked of a name service, which may not answer.
+        alt_host_names: X509Data::alt_host_names(
+            application_uri,
+            Some(addresses),
+            true,
+            true,
+            false,
+        ),
+        certificate_duration_days: CERTIFICATE_DAYS,
+    }
+}
+
+fn check_own(certificate: &Path, key: &Path, application_uri: &str) -> Result<(), PkiError> {
+    let own = CertificateStore::read_cert(certificate).map_err(PkiError::Unreadable)?;
+    CertificateStore::read_pkey(key).map_err(PkiError::Unreadable)?;
+    if own.is_application_uri_valid(application_uri).is_err() {
+        warn!(
+            certificate = %certificate.display(),
+            application_uri,
+            "the certificate names another application: clients will refuse it; remove it and its key for a new pair",
+        );
+    }
+    let now = opcua::types::DateTime::now().as_chrono();
+    if own.is_time_valid(&now).is_err() {
+        warn!(
+            certificate = %certificate.display(),
+            "the certificate is not valid now (see `openssl x509 -noout -dates`): clients will refuse it",
+        );
+    }
+    Ok(())
+}
+
+#[cfg(unix)]
+fn owner_only(path: &Path) -> io::Result<()> {
+    use std::os::unix::fs::PermissionsExt as _;
+    fs::set_permissions(path, fs::Permissions::from_mode(0o700))
+}
+
+#[cfg(not(unix))]
+fn owner_only(_path: &Path) -> io::Result<()> {
+    Ok(())
+}
+
+pub(crate) const OWN_CERTIFICATE: &str = "own/cert.der";
+pub(crate) const OWN_KEY: &str = "private/private.pem";
+/// Held while the pair is looked for and made.
+const LOCK: &str = "private/lock";
+/// Five years, as other stacks make them: clients trust this very file, so a new one is work for people.
+const CERTIFICATE_DAYS: u32 = 1826;
+/// How many refused client certificates are kept.
+const REJECTED_KEPT: usize = 100;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn scratch(name: &str) -> PathBuf {
+        let path =
+            std::env::temp_dir().join(format!("plant-opcua-pki-{}-{name}", std::process::id()));
+        drop(fs::remove_dir_all(&path));
+        path
+    }
+
+    #[test]
+    fn a_missing_certificate_is_made_for_the_application_and_the_host() {
+        let root = scratch("made");
+        let pki = Pki::open(root.clone()).unwrap();
+        pki.ensure_own("urn:cell:server", "192.0.2.7").unwrap();
+        let own = CertificateStore::read_cert(&root.join(OWN_CERTIFICATE)).unwrap();
+        assert!(own.is_application_uri_valid("urn:cell:server").is_ok());
+        assert!(own.is_hostname_valid("192.0.2.7").is_ok());
+        assert!(own.is_hostname_valid("localhost").is_ok());
+        assert!(own.is_hostname_valid("192.0.2.8").is_err());
+        let before = fs::read(root.join(OWN_CERTIFICATE)).unwrap();
+        pki.ensure_own("urn:cell:server", "192.0.2.7").unwrap();
+        assert_eq!(
+            before,
+            fs::read(root.join(OWN_CERTIFICATE)).unwrap(),
+            "a certificate that is there is kept"
+        );
+        fs::remove_dir_all(root).unwrap();
+    }
+
+    #[test]
+    fn servers_that_start_at_once_in_one_store_have_one_certificate() {
+        let root = scratch("at-once");
+        let start = std::sync::Barrier::new(3);
+        let begin = || {
+            let pki = Pki::open(root.clone()).unwrap();
+            start.wait();
+            pki.ensure_own("urn:cell:server", "localhost")
+                .map(|()| fs::read(root.join(OWN_CERTIFICATE)).unwrap())
+        };
+        let made: Vec<Vec<u8>> = std::thread::scope(|scope| {
+            let servers: Vec<_> = (0..3).map(|_| scope.spawn(begin)).collect();
+            let ended = servers.into_iter().map(|server| server.join().unwrap());
+            ended.collect::<Result<_, _>>().unwrap()
+        });
+        assert!(
+            made.iter().all(|one| *one == made[0]),
+            "each has the same certificate"
+        );
+        fs::remove_dir_all(root).unwrap();
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn only_the_owner_reads_the_private_key() {
+        use std::os::unix::fs::PermissionsExt as _;
+        let root = scratch("mode");
+        Pki::open(root.clone()).unwrap();
+        let mode = fs::metadata(root.join("private"))
+            .unwrap()
+            .permissions()
+            .mode();
+        assert_eq!(mode & 0o077, 0);
+        fs::remove_dir_all(root).unwrap();
+    }
+
+    #[test]
+    fn half_a_pair_is_refused_and_both_files_are_named() {
+        let root = scratch("half");
+        let pki = Pki::open(root.clone()).unwrap();
+        fs::write(root.join(OWN_KEY), "key").unwrap();
+        let error = pki
+            .ensure_own("urn:a", "localhost")
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains("private.pem") && error.contains("cert.der"),
+            "{error}"
+        );
+        fs::remove_dir_all(root).unwrap();
+    }
+
+    #[test]
+    fn refused_certificates_do_not_fill_the_disk() {
+        let root = scratch("rejected");
+        let mut pki = Pki::open(root.clone()).unwrap();
+        for n in 0..REJECTED_KEPT + 5 {
+            fs::write(root.join("rejected").join(format!("{n}.der")), "x").unwrap();
+        }
+        pki.report_rejected();
+        assert_eq!(
+            fs::read_dir(root.join("rejected")).unwrap().count(),
+            REJECTED_KEPT
+        );
+        fs::remove_dir_all(root).unwrap();
+    }
+
+    #[test]
+    fn the_store_is_in_the_state_directory_of_the_user_or_the_system() {
+        let with = |pairs: &'static [(&str, &str)]| {
+            default_root(move |name| {
+                pairs
+                    .iter()
+                    .find(|(key, _)| *key == name)
+                    .map(|(_, value)| (*value).to_owned())
+            })
+        };
+        assert_eq!(
+            with(&[("XDG_STATE_HOME", "/s"), ("HOME", "/h")]),
+            Path::new("/s/ua-bridge/pki")
+        );
+        assert_eq!(
+            with(&[("HOME", "/h")]),
+            Path::new("/h/.local/state/ua-bridge/pki")
+        );
+        assert_eq!(with(&[]), Path::new("/var/lib/ua-bridge/pki"));
+        assert_eq!(
+            with(&[("STATE_DIRECTORY", "/var/lib/x"), ("HOME", "/h")]),
+            Path::new("/var/lib/x/pki")
+        );
+    }
+}

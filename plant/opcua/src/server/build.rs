@@ -1,0 +1,350 @@
+//! From a configuration to a server that listens.
+
+use std::io;
+use std::path::PathBuf;
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+use opcua::crypto::SecurityPolicy;
+use opcua::server::address_space::AddressSpace;
+use opcua::server::diagnostics::NamespaceMetadata;
+use opcua::server::node_manager::memory::{
+    CoreNodeManager, CoreNodeManagerBuilder, InMemoryNodeManager, InMemoryNodeManagerBuilder,
+};
+use opcua::server::node_manager::{
+    DynNodeManager, NodeManagerBuilder, ServerContext,
+};
+use opcua::server::{ANONYMOUS_USER_TOKEN_ID, ServerEndpoint};
+use opcua::sync::Mutex;
+use opcua::types::{BuildInfo, DateTime, MessageSecurityMode, UAString};
+
+use super::calls::Calls;
+use super::nodes::{Nodes, Spaces};
+use super::routed::Routed;
+use super::{Inner, Server};
+use crate::endpoint::{BindError, EndpointUrl};
+use crate::limits;
+use crate::nodeset::{self, NodeSet, NodeSetError, Source};
+use crate::pki::{OWN_CERTIFICATE, OWN_KEY, Pki, PkiError};
+
+/// A security policy that clients may choose.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Security {
+    /// Neither signed nor encrypted.
+    None,
+    /// Signed, or signed and encrypted.
+    Basic256Sha256,
+}
+
+/// What a server is, and how clients get in. All users are anonymous.
+#[derive(Debug, Clone)]
+pub struct ServerConfig {
+    /// The ApplicationUri.
+    pub application_uri: String,
+    /// The name for people.
+    pub application_name: String,
+    /// The ProductUri.
+    pub product_uri: String,
+    /// The version of the program.
+    pub software_version: String,
+    /// Where clients connect; port 0 is any free one.
+    pub endpoint: EndpointUrl,
+    /// What clients may choose from.
+    pub security: Vec<Security>,
+    /// The directory of certificates, which [`Security::Basic256Sha256`] needs.
+    pub pki: Option<PathBuf>,
+    /// Trusts every client's certificate, and keeps it as trusted. For tests and demonstrations only.
+    pub trust_unknown_clients: bool,
+    /// How long a session may be silent at most.
+    pub session_timeout: Duration,
+}
+
+impl ServerConfig {
+    /// A server without security.
+    #[must_use]
+    pub fn new(application_uri: &str, application_name: &str, endpoint: EndpointUrl) -> Self {
+        Self {
+            application_uri: application_uri.to_owned(),
+            application_name: application_name.to_owned(),
+            product_uri: "urn:ua-bridge:plant".to_owned(),
+            software_version: env!("CARGO_PKG_VERSION").to_owned(),
+            endpoint,
+            security: vec![Security::None],
+            pki: None,
+            trust_unknown_clients: false,
+            session_timeout: Duration::from_secs(60),
+        }
+    }
+}
+
+/// Why there is no server.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// Nothing listens.
+    #[error(transparent)]
+    Bind(#[from] BindError),
+    /// The certificates cannot be used.
+    #[error(transparent)]
+    Pki(#[from] PkiError),
+    /// A NodeSet cannot be used.
+    #[error(transparent)]
+    NodeSet(#[from] NodeSetError),
+    /// The security asked for needs certificates, and there is no directory for them.
+    #[error("Basic256Sha256 needs a directory for certificates, and none is given")]
+    NoPki,
+    /// Clients could choose nothing.
+    #[error("the endpoint has no security policy, not even None")]
+    NoSecurity,
+    /// The system.
+    #[error("the listening socket cannot be used: {0}")]
+    Io(#[from] io::Error),
+    /// The library refuses the configuration.
+    #[error("the OPC UA server cannot be configured: {0}")]
+    Configuration(String),
+}
+
+/// Collects what a server is made of.
+#[derive(Debug)]
+pub struct ServerBuilder {
+    config: ServerConfig,
+    sources: Vec<Source>,
+    namespaces: Vec<String>,
+}
+
+impl ServerBuilder {
+    /// A server with the core namespace, and an own one with the ApplicationUri.
+    #[must_use]
+    pub fn new(config: ServerConfig) -> Self {
+        Self {
+            namespaces: vec![config.application_uri.clone()],
+            config,
+            sources: Vec::new(),
+        }
+    }
+
+    /// Loads a NodeSet2 document, which errors call `name`. The order of NodeSets does not matter.
+    #[must_use]
+    pub fn nodeset_str(mut self, name: &str, xml: &str) -> Self {
+        self.sources.push(Source::Text {
+            name: name.to_owned(),
+            xml: xml.to_owned(),
+        });
+        self
+    }
+
+    /// Loads a NodeSet2 file. The order of NodeSets does not matter.
+    #[must_use]
+    pub fn nodeset_file(mut self, path: impl Into<PathBuf>) -> Self {
+        self.sources.push(Source::File(path.into()));
+        self
+    }
+
+    /// Has one more namespace for instances.
+    #[must_use]
+    pub fn namespace(mut self, uri: &str) -> Self {
+        self.namespaces.push(uri.to_owned());
+        self
+    }
+
+    /// Loads the NodeSets and opens the listening socket. Nobody is served until [`Server::start`].
+    ///
+    /// # Errors
+    /// A NodeSet that cannot be used, a port that cannot be listened on, or certificates that cannot be made.
+    pub fn build(self) -> Result<Server, ServerError> {
+        let sets = nodeset::load(self.sources)?;
+        let config = self.config;
+        if config.security.is_empty() {
+            return Err(ServerError::NoSecurity);
+        }
+        let secured = config.security.contains(&Security::Basic256Sha256);
+        let host = config.endpoint.advertised_host();
+        let pki = match &config.pki {
+            Some(root) => {
+                let pki = Pki::open(root.clone())?;
+                pki.ensure_own(&config.application_uri, host.trim_matches(['[', ']']))?;
+                root.clone()
+            }
+            None if secured => return Err(ServerError::NoPki),
+            None => PathBuf::from(NO_PKI),
+        };
+        let listener = config.endpoint.bind()?;
+        let port = listener.local_addr()?.port();
+        let listener = tokio::net::TcpListener::from_std(listener)?;
+
+        let made = Arc::new(Made::default());
+        let calls = Arc::new(Calls::default());
+        let builder = described(&config, port)
+            .pki_dir(pki)
+            .with_node_manager(Core {
+                made: Arc::clone(&made),
+                calls: Arc::clone(&calls),
+            })
+            .with_node_manager(Own {
+                made: Arc::clone(&made),
+                calls: Arc::clone(&calls),
+                sets,
+                namespaces: self.namespaces,
+            });
+        // Without certificates the library complains of them though nobody can ask for any.
+        let (server, handle) = if secured {
+            builder.build()
+        } else {
+            tracing::subscriber::with_default(tracing::subscriber::NoSubscriber::new(), || {
+                builder.build()
+            })
+        }
+        .map_err(ServerError::Configuration)?;
+        if let Some(error) = made.error.lock().take() {
+            return Err(error.into());
+        }
+        let (Some(manager), Some(spaces)) = (made.own.get(), calls.spaces.get()) else {
+            let reason = "it has no address space".to_owned();
+            return Err(ServerError::Configuration(reason));
+        };
+        Ok(Server {
+            inner: Arc::new(Inner {
+                handle,
+                manager: Arc::clone(manager),
+                spaces: Arc::clone(spaces),
+                calls: Arc::clone(&calls),
+                application_uri: config.application_uri,
+                url: config.endpoint.advertised(port),
+                port,
+                making: Mutex::new(()),
+                waiting: Mutex::new(Some((server, listener))),
+                running: Mutex::default(),
+            }),
+        })
+    }
+}
+
+fn described(config: &ServerConfig, port: u16) -> opcua::server::ServerBuilder {
+    let anonymous = [ANONYMOUS_USER_TOKEN_ID.to_owned()];
+    let timeout = u64::try_from(config.session_timeout.as_millis()).unwrap_or(u64::MAX);
+    let poll = u64::try_from(limits::POLL.as_millis()).unwrap_or(u64::MAX);
+    let mut builder = opcua::server::ServerBuilder::new()
+        .without_node_managers()
+        .application_name(&config.application_name)
+        .application_uri(&config.application_uri)
+        .product_uri(&config.product_uri)
+        .build_info(BuildInfo {
+            product_uri: UAString::from(&config.product_uri),
+            manufacturer_name: UAString::null(),
+            product_name: UAString::from(&config.application_name),
+            software_version: UAString::from(&config.software_version),
+            build_number: UAString::null(),
+            build_date: DateTime::null(),
+        })
+        .discovery_urls(vec![config.endpoint.advertised(port)])
+        .host(config.endpoint.advertised_host())
+        .port(port)
+        .certificate_path(OWN_CERTIFICATE)
+        .private_key_path(OWN_KEY)
+        .trust_client_certs(config.trust_unknown_clients)
+        .subscription_poll_interval_ms(poll)
+        .max_session_timeout_ms(timeout)
+        .limits(limits::server());
+    for security in &config.security {
+        let (policy, modes) = match security {
+            Security::None => (SecurityPolicy::None, [MessageSecurityMode::None].as_slice()),
+            Security::Basic256Sha256 => (
+                SecurityPolicy::Basic256Sha256,
+                [
+                    MessageSecurityMode::Sign,
+                    MessageSecurityMode::SignAndEncrypt,
+                ]
+                .as_slice(),
+            ),
+        };
+        for mode in modes {
+            let endpoint = ServerEndpoint::new(config.endpoint.path(), policy, *mode, &anonymous);
+            builder = builder.add_endpoint(format!("{policy} {mode}"), endpoint);
+        }
+    }
+    builder
+}
+
+/// The node managers, for those who need more of them than the library hands out.
+#[derive(Default)]
+struct Made {
+    core: OnceLock<Arc<CoreNodeManager>>,
+    own: OnceLock<Arc<InMemoryNodeManager<Nodes>>>,
+    error: Mutex<Option<NodeSetError>>,
+}
+
+/// Builds the node manager of the core namespace.
+struct Core {
+    made: Arc<Made>,
+    calls: Arc<Calls>,
+}
+
+impl NodeManagerBuilder for Core {
+    fn build(self: Box<Self>, context: ServerContext) -> Arc<DynNodeManager> {
+        let builder = Box::new(InMemoryNodeManagerBuilder::new(CoreNodeManagerBuilder));
+        let inner = builder.build(context);
+        if let Ok(core) = Arc::clone(&inner).into_any_arc().downcast() {
+            self.made.core.get_or_init(|| core);
+        }
+        Arc::new(Routed {
+            inner,
+            calls: self.calls,
+            last: None,
+        })
+    }
+}
+
+/// Builds the node manager of all other namespaces.
+struct Own {
+    made: Arc<Made>,
+    calls: Arc<Calls>,
+    sets: Vec<NodeSet>,
+    namespaces: Vec<String>,
+}
+
+impl NodeManagerBuilder for Own {
+    fn build(self: Box<Self>, context: ServerContext) -> Arc<DynNodeManager> {
+        let Self {
+            made,
+            calls,
+            sets,
+            namespaces,
+        } = *self;
+        let sessions = Arc::clone(&calls.sessions);
+        let fill = |context: ServerContext, address_space: &mut AddressSpace| {
+            let mut types = context.type_tree.write();
+            let map = types.namespaces_mut();
+            for uri in namespaces
+                .iter()
+                .map(String::as_str)
+                .chain(sets.iter().flat_map(NodeSet::provides))
+            {
+                address_space.add_namespace(uri, map.add_namespace(uri));
+            }
+            let imported = sets.iter().try_for_each(|set| set.import(address_space, map));
+            if let Err(error) = imported {
+                *made.error.lock() = Some(error);
+            }
+            let known = address_space.namespaces().iter();
+            let metadata = known.map(|(index, uri)| NamespaceMetadata {
+                namespace_uri: uri.clone(),
+                namespace_index: *index,
+                ..NamespaceMetadata::default()
+            });
+            Nodes::new(metadata.collect(), sessions)
+        };
+        let inner = Box::new(InMemoryNodeManagerBuilder::new(fill)).build(context);
+        let own: Option<Arc<InMemoryNodeManager<Nodes>>> =
+            Arc::clone(&inner).into_any_arc().downcast().ok();
+        if let (Some(core), Some(own)) = (made.core.get(), own) {
+            let address_space = Arc::clone(own.address_space());
+            made.own.get_or_init(|| own);
+            let spaces = Spaces::new(Arc::clone(core), address_space);
+            calls.spaces.get_or_init(|| Arc::new(spaces));
+        }
+        let last = calls.spaces.get().cloned();
+        Arc::new(Routed { inner, calls, last })
+    }
+}
+
+/// No directory can be made there.
+pub(crate) const NO_PKI: &str = "/dev/null/pki";

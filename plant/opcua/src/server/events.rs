@@ -1,0 +1,162 @@
+//! The events of state machines: TransitionEventType, ProgramTransitionEventType and what is declared below it.
+//!
+//! The structs the library generates for them cannot carry the NodeId of a state. This one answers select clauses of
+//! each of the three types of the core namespace and of the declared type.
+
+use opcua::nodes::{BaseEventType, Event, EventField};
+use opcua::types::{
+    AttributeId, ByteString, DateTime, LocalizedText, NodeId, NumericRange, ObjectTypeId,
+    QualifiedName, Variant,
+};
+
+/// A state or a transition of a state machine.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct StateRef {
+    /// The name, as `ReadyToRunning`.
+    pub name: String,
+    /// The node of the state or transition, in the type of the state machine.
+    pub id: NodeId,
+    /// Its number there.
+    pub number: u32,
+}
+
+/// A transition of a program (OPC 10000-10, 5.2.5).
+#[derive(Debug, Clone)]
+pub struct TransitionEvent {
+    /// The state machine.
+    pub source: NodeId,
+    /// Its name.
+    pub source_name: String,
+    /// ProgramTransitionEventType or a subtype of it.
+    pub event_type: NodeId,
+    /// What has happened, in words.
+    pub message: String,
+    /// 1 to 1000.
+    pub severity: u16,
+    /// Where it was.
+    pub from_state: StateRef,
+    /// Where it is.
+    pub to_state: StateRef,
+    /// How it got there.
+    pub transition: StateRef,
+    /// The result so far.
+    pub intermediate_result: Variant,
+    /// What the declared type has beside.
+    pub fields: Vec<(QualifiedName, Variant)>,
+    /// When it happened.
+    pub time: DateTime,
+}
+
+/// An event on its way to clients.
+pub(crate) struct Raised {
+    base: BaseEventType,
+    event: TransitionEvent,
+    /// The event type and its supertypes.
+    types: Vec<NodeId>,
+}
+
+impl Raised {
+    pub(crate) fn new(event: &TransitionEvent, types: Vec<NodeId>, id: ByteString) -> Self {
+        let base = BaseEventType {
+            event_id: id,
+            event_type: event.event_type.clone(),
+            source_node: event.source.clone(),
+            source_name: event.source_name.as_str().into(),
+            time: event.time,
+            receive_time: event.time,
+            message: LocalizedText::new("", &event.message),
+            severity: event.severity,
+            ..BaseEventType::default()
+        };
+        Self {
+            base,
+            event: event.clone(),
+            types,
+        }
+    }
+
+    fn state(&self, state: &StateRef, is_transition: bool, below: Option<&str>) -> Variant {
+        let text = || LocalizedText::new("", &state.name);
+        match below {
+            None | Some("EffectiveDisplayName") => text().into(),
+            Some("Id") => state.id.clone().into(),
+            Some("Name") => QualifiedName::from(state.name.as_str()).into(),
+            Some("Number") => state.number.into(),
+            Some("TransitionTime" | "EffectiveTransitionTime") if is_transition => {
+                self.event.time.into()
+            }
+            Some(_) => Variant::Empty,
+        }
+    }
+
+    fn field(&self, path: &[QualifiedName]) -> Option<Variant> {
+        let names: Vec<&str> = path.iter().map(|name| name.name.as_ref()).collect();
+        let core = path.iter().all(|name| name.namespace_index == 0);
+        let own = self.event.fields.iter().find(|(name, _)| path == [name.clone()]);
+        if let Some((_, value)) = own {
+            return Some(value.clone());
+        }
+        if !core {
+            return None;
+        }
+        let (first, below) = match names.as_slice() {
+            [first] => (*first, None),
+            [first, below] => (*first, Some(*below)),
+            _ => return None,
+        };
+        match first {
+            "FromState" => Some(self.state(&self.event.from_state, false, below)),
+            "ToState" => Some(self.state(&self.event.to_state, false, below)),
+            "Transition" => Some(self.state(&self.event.transition, true, below)),
+            "IntermediateResult" if below.is_none() => Some(self.event.intermediate_result.clone()),
+            _ => None,
+        }
+    }
+}
+
+impl Event for Raised {
+    fn get_field(
+        &self,
+        type_definition_id: &NodeId,
+        attribute_id: AttributeId,
+        index_range: &NumericRange,
+        browse_path: &[QualifiedName],
+    ) -> Variant {
+        if !self.types.contains(type_definition_id) {
+            return Variant::Empty;
+        }
+        self.get_value(attribute_id, index_range, browse_path)
+    }
+
+    fn time(&self) -> &DateTime {
+        &self.base.time
+    }
+
+    fn event_type_id(&self) -> &NodeId {
+        &self.base.event_type
+    }
+}
+
+impl EventField for Raised {
+    fn get_value(
+        &self,
+        attribute_id: AttributeId,
+        index_range: &NumericRange,
+        remaining_path: &[QualifiedName],
+    ) -> Variant {
+        if attribute_id == AttributeId::Value
+            && let Some(value) = self.field(remaining_path)
+        {
+            return value.range_of_owned(index_range).unwrap_or(Variant::Empty);
+        }
+        self.base.get_value(attribute_id, index_range, remaining_path)
+    }
+}
+
+/// The types whose select clauses an event of this type answers.
+pub(crate) fn answered(event_type: &NodeId, supertypes: Vec<&NodeId>) -> Vec<NodeId> {
+    let above = supertypes.into_iter().cloned();
+    let mut types: Vec<NodeId> = std::iter::once(event_type.clone()).chain(above).collect();
+    types.retain(|id| *id != ObjectTypeId::BaseObjectType);
+    types
+}

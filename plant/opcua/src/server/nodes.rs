@@ -1,0 +1,319 @@
+//! Our nodes: what they show, and what clients write to them.
+
+use std::collections::{BTreeSet, HashMap};
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use opcua::nodes::{DefaultTypeTree, NodeType};
+use opcua::server::SubscriptionCache;
+use opcua::server::address_space::{AccessLevel, AddressSpace, user_access_level};
+use opcua::server::diagnostics::NamespaceMetadata;
+use opcua::server::node_manager::memory::{CoreNodeManager, InMemoryNodeManagerImpl};
+use opcua::server::node_manager::{ParsedWriteValue, RequestContext, ServerContext, WriteNode};
+use opcua::sync::RwLock;
+use opcua::types::{
+    Argument, AttributeId, DataValue, DateTime, NodeId, ObjectTypeId, ReferenceTypeId, StatusCode,
+};
+use tokio::time::{Instant, timeout_at};
+
+use super::calls::{self, fits};
+use super::sessions::{Caller, Sessions};
+use super::view::View;
+use crate::limits::LONGEST_REQUEST;
+
+/// A write that has passed the checks of access, DataType and ValueRank.
+#[derive(Debug, Clone)]
+pub struct WriteRequest {
+    /// Who writes.
+    pub caller: Caller,
+    /// The variable.
+    pub node: NodeId,
+    /// The whole value the variable would have.
+    pub value: DataValue,
+}
+
+/// What decides on the values clients write to a variable. It is given up after [`LONGEST_REQUEST`].
+#[async_trait]
+pub trait WriteHandler: Send + Sync + 'static {
+    /// Lets the server show the value.
+    ///
+    /// # Errors
+    /// Why it is refused.
+    async fn write(&self, request: WriteRequest) -> Result<(), StatusCode>;
+}
+
+struct Function<F>(F);
+
+#[async_trait]
+impl<F> WriteHandler for Function<F>
+where
+    F: Fn(WriteRequest) -> Result<(), StatusCode> + Send + Sync + 'static,
+{
+    async fn write(&self, request: WriteRequest) -> Result<(), StatusCode> {
+        (self.0)(request)
+    }
+}
+
+/// A handler that decides at once.
+pub fn write<F>(function: F) -> Arc<dyn WriteHandler>
+where
+    F: Fn(WriteRequest) -> Result<(), StatusCode> + Send + Sync + 'static,
+{
+    Arc::new(Function(function))
+}
+
+/// The address spaces of both node managers.
+pub(crate) struct Spaces {
+    core: Arc<CoreNodeManager>,
+    own: Arc<RwLock<AddressSpace>>,
+    indexes: BTreeSet<u16>,
+    no_types: DefaultTypeTree,
+}
+
+impl Spaces {
+    pub(crate) fn new(core: Arc<CoreNodeManager>, own: Arc<RwLock<AddressSpace>>) -> Self {
+        let indexes = own.read().namespaces().keys().copied().collect();
+        Self {
+            core,
+            own,
+            indexes,
+            no_types: DefaultTypeTree::new(),
+        }
+    }
+
+    pub(crate) fn own(&self) -> &RwLock<AddressSpace> {
+        &self.own
+    }
+
+    /// Whether a node is of one of our namespaces.
+    pub(crate) fn owns(&self, id: &NodeId) -> bool {
+        self.indexes.contains(&id.namespace)
+    }
+
+    /// Looks at the nodes of both.
+    pub(crate) fn with<T>(&self, look: impl FnOnce(View<'_>) -> T) -> T {
+        let core = self.core.address_space().read();
+        let own = self.own.read();
+        look(View {
+            core: &core,
+            own: &own,
+            no_types: &self.no_types,
+        })
+    }
+
+    /// The input arguments of a method of ours; none without the property.
+    ///
+    /// # Errors
+    /// The value of the property is something else.
+    pub(crate) fn input_arguments(&self, method: &NodeId) -> Result<Vec<Argument>, StatusCode> {
+        self.with(|view| {
+            let properties = view.targets(method, ReferenceTypeId::HasProperty, true);
+            let mut nodes = properties.into_iter().filter_map(|id| view.node(id));
+            let property = nodes.find(|node| {
+                let name = node.as_node().browse_name();
+                name.namespace_index == 0 && name.name.as_ref() == "InputArguments"
+            });
+            property.map_or(Ok(Vec::new()), |node| {
+                calls::arguments(node).ok_or(StatusCode::BadInternalError)
+            })
+        })
+    }
+
+    pub(crate) fn executable(&self, method: &NodeId) -> bool {
+        match self.own.read().find(method) {
+            Some(NodeType::Method(method)) => method.executable(),
+            Some(_) | None => false,
+        }
+    }
+
+    /// Lets clients select the fields of the supertypes of an event type by the type itself, and optional fields: the
+    /// library knows those alone that the type declares.
+    pub(crate) fn inherit_event_fields(&self, types: &mut DefaultTypeTree) {
+        self.with(|view| {
+            let base: NodeId = ObjectTypeId::BaseEventType.into();
+            let event_types: Vec<NodeId> = view.subtypes(&base).into_iter().cloned().collect();
+            for event_type in &event_types {
+                for (path, node) in view.event_fields(event_type) {
+                    if let Some(class) = view.class(&node) {
+                        let path: Vec<_> = path.iter().collect();
+                        types.add_type_property(&node, event_type, &path, class);
+                    }
+                }
+            }
+        });
+    }
+}
+
+/// The implementation of our node manager.
+pub(crate) struct Nodes {
+    namespaces: Vec<NamespaceMetadata>,
+    writers: RwLock<HashMap<NodeId, Arc<dyn WriteHandler>>>,
+    sessions: Arc<Sessions>,
+}
+
+impl Nodes {
+    pub(crate) fn new(namespaces: Vec<NamespaceMetadata>, sessions: Arc<Sessions>) -> Self {
+        Self {
+            namespaces,
+            writers: RwLock::default(),
+            sessions,
+        }
+    }
+
+    pub(crate) fn on_write(&self, node: &NodeId, handler: Arc<dyn WriteHandler>) {
+        self.writers.write().insert(node.clone(), handler);
+    }
+
+    pub(crate) fn remove(&self, node: &NodeId) {
+        self.writers.write().remove(node);
+    }
+
+    /// The value a variable would have, if it may be written.
+    fn checked(
+        context: &RequestContext,
+        address_space: &AddressSpace,
+        write: &ParsedWriteValue,
+    ) -> Result<DataValue, StatusCode> {
+        let node = address_space
+            .find(&write.node_id)
+            .ok_or(StatusCode::BadNodeIdUnknown)?;
+        let NodeType::Variable(variable) = node else {
+            return Err(StatusCode::BadNotWritable);
+        };
+        if write.attribute_id != AttributeId::Value || !variable.is_writable() {
+            return Err(StatusCode::BadNotWritable);
+        }
+        if !user_access_level(context, node).contains(AccessLevel::CURRENT_WRITE) {
+            return Err(StatusCode::BadUserAccessDenied);
+        }
+        let given = &write.value;
+        if given.status.is_some_and(|status| status != StatusCode::Good) {
+            return Err(StatusCode::BadWriteNotSupported);
+        }
+        let value = given.value.clone().ok_or(StatusCode::BadTypeMismatch)?;
+        let whole = if write.index_range.has_range() {
+            let shown = super::value_of(variable);
+            let mut whole = shown.value.ok_or(StatusCode::BadIndexRangeNoData)?;
+            whole.set_range_of(&write.index_range, &value)?;
+            whole
+        } else {
+            value
+        };
+        let types = context.type_tree.read();
+        if !fits(&whole, &variable.data_type(), variable.value_rank(), &*types) {
+            return Err(StatusCode::BadTypeMismatch);
+        }
+        Ok(DataValue {
+            value: Some(whole),
+            status: Some(StatusCode::Good),
+            source_timestamp: given.source_timestamp,
+            ..DataValue::default()
+        })
+    }
+}
+
+/// Shows values, all or none, and tells who watches their nodes.
+///
+/// # Errors
+/// A node that is no variable of ours.
+pub(crate) fn show(
+    address_space: &RwLock<AddressSpace>,
+    subscriptions: &SubscriptionCache,
+    values: Vec<(NodeId, DataValue)>,
+) -> Result<(), StatusCode> {
+    let mut address_space = address_space.write();
+    for (node, _) in &values {
+        match address_space.find(node) {
+            Some(NodeType::Variable(_)) => {}
+            Some(_) => return Err(StatusCode::BadAttributeIdInvalid),
+            None => return Err(StatusCode::BadNodeIdUnknown),
+        }
+    }
+    let now = DateTime::now();
+    let mut shown = Vec::with_capacity(values.len());
+    for (node, mut value) in values {
+        value.status.get_or_insert(StatusCode::Good);
+        value.source_timestamp.get_or_insert(now);
+        value.server_timestamp.get_or_insert(now);
+        if let Some(NodeType::Variable(variable)) = address_space.find_mut(&node) {
+            variable.set_data_value(value);
+            shown.push(node);
+        }
+    }
+    // Until all are told, so that nobody is told in another order.
+    subscriptions.maybe_notify(
+        shown.iter().map(|node| (node, AttributeId::Value)),
+        |node, attribute, range, encoding| {
+            let node = address_space.find(node)?.as_node();
+            node.get_attribute(
+                opcua::types::TimestampsToReturn::Both,
+                attribute,
+                range,
+                encoding,
+            )
+        },
+    );
+    Ok(())
+}
+
+#[async_trait]
+impl InMemoryNodeManagerImpl for Nodes {
+    async fn init(&self, _address_space: &mut AddressSpace, _context: ServerContext) {}
+
+    fn name(&self) -> &'static str {
+        "plant"
+    }
+
+    fn namespaces(&self) -> Vec<NamespaceMetadata> {
+        self.namespaces.clone()
+    }
+
+    async fn write(
+        &self,
+        context: &RequestContext,
+        address_space: &RwLock<AddressSpace>,
+        nodes: &mut [&mut WriteNode],
+    ) -> Result<(), StatusCode> {
+        let end = Instant::now() + LONGEST_REQUEST;
+        for write in nodes {
+            let checked = Self::checked(context, &address_space.read(), write.value());
+            let value = match checked {
+                Ok(value) => value,
+                Err(status) => {
+                    write.set_status(status);
+                    continue;
+                }
+            };
+            let node = write.value().node_id.clone();
+            let handler = self.writers.read().get(&node).cloned();
+            if let Some(handler) = handler {
+                let request = WriteRequest {
+                    caller: self.sessions.caller(context),
+                    node: node.clone(),
+                    value: value.clone(),
+                };
+                let decided = timeout_at(end, handler.write(request)).await;
+                if let Err(status) = decided.unwrap_or(Err(StatusCode::BadTimeout)) {
+                    write.set_status(status);
+                    continue;
+                }
+            }
+            let shown = show(address_space, &context.subscriptions, vec![(node, value)]);
+            write.set_status(shown.err().unwrap_or(StatusCode::Good));
+        }
+        Ok(())
+    }
+
+    async fn call(
+        &self,
+        _context: &RequestContext,
+        _address_space: &RwLock<AddressSpace>,
+        methods: &mut [&mut &mut opcua::server::node_manager::MethodCall],
+    ) -> Result<(), StatusCode> {
+        // Methods that have no handler, of objects a NodeSet brought.
+        for call in methods {
+            call.set_status(StatusCode::BadNotImplemented);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,82 @@
+//! Sessions that have called or written something: who they are, and when they are gone.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Weak};
+use std::time::Duration;
+
+use opcua::server::node_manager::RequestContext;
+use opcua::sync::{Mutex, RwLock};
+
+/// The session of the library, whose type has no public name.
+type Watched = Box<dyn Fn() -> bool + Send + Sync>;
+type Told = Arc<dyn Fn(u32) + Send + Sync>;
+
+/// Who calls or writes.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Caller {
+    /// The session, unique while the server runs.
+    pub session: u32,
+    /// The user, `anonymous` for anonymous ones.
+    pub user: String,
+    /// The ApplicationUri the client gave, which nobody has checked without security.
+    pub application_uri: String,
+}
+
+/// The sessions that are looked after.
+#[derive(Default)]
+pub(crate) struct Sessions {
+    watched: Mutex<HashMap<u32, Watched>>,
+    told: RwLock<Vec<Told>>,
+}
+
+impl Sessions {
+    /// Who is behind a request, and looks after that session from now on.
+    pub(crate) fn caller(&self, context: &RequestContext) -> Caller {
+        let mut watched = self.watched.lock();
+        watched.entry(context.session_id).or_insert_with(|| {
+            let session = Arc::downgrade(&context.session);
+            Box::new(move || Weak::upgrade(&session).is_some_and(|one| one.read().is_activated()))
+        });
+        drop(watched);
+        let user = match context.token.0.as_str() {
+            opcua::server::ANONYMOUS_USER_TOKEN_ID => "anonymous".to_owned(),
+            user => user.to_owned(),
+        };
+        let session = context.session.read();
+        let described = session.application_description();
+        Caller {
+            session: context.session_id,
+            user,
+            application_uri: described.application_uri.as_ref().to_owned(),
+        }
+    }
+
+    pub(crate) fn tell(&self, told: Told) {
+        self.told.write().push(told);
+    }
+
+    /// Tells of the sessions that are gone since the last look.
+    pub(crate) fn look(&self) {
+        let mut gone: Vec<u32> = Vec::new();
+        self.watched.lock().retain(|session, lives| {
+            let stays = lives();
+            if !stays {
+                gone.push(*session);
+            }
+            stays
+        });
+        if gone.is_empty() {
+            return;
+        }
+        let told: Vec<Told> = self.told.read().clone();
+        gone.sort_unstable();
+        for session in gone {
+            for one in &told {
+                one(session);
+            }
+        }
+    }
+}
+
+/// How often it is looked.
+pub(crate) const LOOK: Duration = Duration::from_millis(50);
