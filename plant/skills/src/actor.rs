@@ -1,0 +1,576 @@
+//! The task that owns a skill: what is called and how its work ends goes through here, one thing after the other.
+
+use std::any::Any;
+use std::collections::VecDeque;
+use std::future::pending;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, SystemTime};
+
+use program::{Ending, Method, Nature, Program, Refused, Rest, RunId, State, Transition};
+use tokio::sync::{mpsc, oneshot, watch};
+use tokio::task::{JoinError, JoinHandle};
+use tokio::time::{Instant, sleep_until, timeout};
+use tracing::{debug, info, warn};
+
+use crate::authority::{Authority, Owner};
+use crate::driver::{Driver, Reins, Results, Signal, Work};
+use crate::parameters::Parameters;
+use crate::refusal::{Code, Refusal};
+use crate::shown::{Diagnostic, LastCall, Observer, Outcome, Shown, Told, Transitioned};
+use crate::skill::{Facts, Pending, lock};
+use crate::value::Value;
+
+/// What waits for the task.
+#[derive(Debug)]
+pub(crate) enum Order {
+    Call(Call),
+    /// The component ends: what runs is halted, whoever has the lease.
+    Close(oneshot::Sender<()>),
+}
+
+/// A call on its way to the task.
+#[derive(Debug)]
+pub(crate) struct Call {
+    pub(crate) by: Owner,
+    pub(crate) method: Method,
+    pub(crate) parameters: Option<Vec<(String, Value)>>,
+    pub(crate) reply: oneshot::Sender<Result<u32, Refusal>>,
+}
+
+pub(crate) struct Actor {
+    facts: Arc<Facts>,
+    driver: Arc<dyn Driver>,
+    authority: Authority,
+    pending: Arc<Mutex<Pending>>,
+    outcomes: Arc<Mutex<VecDeque<Arc<Outcome>>>>,
+    observers: Vec<Box<dyn Observer>>,
+    program: Program,
+    shown: watch::Sender<Arc<Shown>>,
+    now: Shown,
+    work: Option<Running>,
+}
+
+/// The work of a run, until it has really ended.
+struct Running {
+    run: RunId,
+    task: JoinHandle<Result<Results, String>>,
+    reins: Reins,
+    /// When it has to be done, while it may go on.
+    deadline: Option<Instant>,
+    /// How long it may take from then on, while it is suspended.
+    left: Option<Duration>,
+    /// How it ended, while that cannot be told: what is suspended ends only when it is resumed.
+    ended: Option<Result<Results, String>>,
+}
+
+type Store = (Arc<Mutex<Pending>>, Arc<Mutex<VecDeque<Arc<Outcome>>>>);
+
+impl Actor {
+    pub(crate) fn new(
+        (facts, driver): (Arc<Facts>, Arc<dyn Driver>),
+        authority: Authority,
+        (pending, outcomes): Store,
+        observers: Vec<Box<dyn Observer>>,
+    ) -> (Self, watch::Receiver<Arc<Shown>>) {
+        let program = Program::new(Nature {
+            can_suspend: driver.can_suspend(),
+            rests_in: Rest::Ready,
+        });
+        let created = SystemTime::now();
+        let now = Shown {
+            state: program.state(),
+            last: None,
+            since: created,
+            run: 0,
+            progress: 0.0,
+            step: String::new(),
+            parameters: Arc::default(),
+            outcome: None,
+            diagnostic: Diagnostic {
+                created,
+                last_call: None,
+            },
+            executable: Method::ALL.map(|method| program.is_executable(method)),
+        };
+        let (shown, watched) = watch::channel(Arc::new(now.clone()));
+        let actor = Self {
+            facts,
+            driver,
+            authority,
+            pending,
+            outcomes,
+            observers,
+            program,
+            shown,
+            now,
+            work: None,
+        };
+        (actor, watched)
+    }
+
+    pub(crate) async fn run(mut self, mut orders: mpsc::Receiver<Order>) {
+        loop {
+            let happened = tokio::select! {
+                order = orders.recv() => match order {
+                    Some(Order::Call(call)) => Happened::Call(call),
+                    Some(Order::Close(closed)) => {
+                        self.close().await;
+                        // Whoever had it closed may not wait for it.
+                        let _told = closed.send(());
+                        return;
+                    }
+                    None => break,
+                },
+                happened = happens(&mut self.work) => happened,
+            };
+            match happened {
+                Happened::Call(call) => self.obey(call).await,
+                Happened::Step(step) => self.step(step),
+                Happened::Progress(done) => self.progress(done),
+                Happened::Ended(result) => self.settle(result),
+                Happened::Late => self.late().await,
+            }
+        }
+        // Nobody is left who could ask: what moves comes to a stand.
+        self.close().await;
+    }
+
+    async fn close(&mut self) {
+        if self.program.is_executable(Method::Halt)
+            && let Err(refusal) = self.halt("the end of the component").await
+        {
+            warn!(skill = self.facts.name, "{refusal}");
+        }
+    }
+
+    async fn obey(&mut self, call: Call) {
+        let Call {
+            by,
+            method,
+            parameters,
+            reply,
+        } = call;
+        let answer = self.call(&by, method, parameters).await;
+        self.authority.settle();
+        self.now.diagnostic.last_call = Some(LastCall {
+            method,
+            by: by.clone(),
+            at: SystemTime::now(),
+            refused: answer.as_ref().err().cloned(),
+        });
+        self.tell(Told::Called);
+        if let Err(refusal) = &answer {
+            info!(
+                skill = self.facts.name,
+                "{method} by {by} is refused: {refusal}"
+            );
+        }
+        // Whoever called may be gone; what was done is done.
+        let _told = reply.send(answer);
+    }
+
+    async fn call(
+        &mut self,
+        by: &Owner,
+        method: Method,
+        given: Option<Vec<(String, Value)>>,
+    ) -> Result<u32, Refusal> {
+        self.authority.claim(by)?;
+        // Mode before capability: what cannot be suspended is refused as such only where it runs.
+        let is_running = self.program.state() == State::Running;
+        if !self.program.is_executable(method) && !(method == Method::Suspend && is_running) {
+            return Err(not_now(method, self.program.state()));
+        }
+        match method {
+            Method::Start => self.start(by, given)?,
+            Method::Halt => self.halt(&by.to_string()).await?,
+            Method::Reset => self.reset(by).await?,
+            Method::Suspend => {
+                self.take(Method::Suspend, &format!("suspended by {by}"))?;
+                self.signal(Signal::StandStill);
+                if let Some(work) = &mut self.work {
+                    let deadline = work.deadline.take();
+                    work.left =
+                        deadline.map(|deadline| deadline.saturating_duration_since(Instant::now()));
+                }
+            }
+            Method::Resume => {
+                self.take(Method::Resume, &format!("resumed by {by}"))?;
+                self.signal(Signal::Go);
+                if let Some(work) = &mut self.work {
+                    work.deadline = work.left.take().map(|left| Instant::now() + left);
+                }
+                let ended = self.work.as_mut().and_then(|work| work.ended.take());
+                if let Some(result) = ended {
+                    self.settle(result);
+                }
+            }
+        }
+        Ok(self.now.run)
+    }
+
+    fn start(&mut self, by: &Owner, given: Option<Vec<(String, Value)>>) -> Result<(), Refusal> {
+        if let Some(work) = &self.work {
+            return Err(still_at_work(work.run));
+        }
+        let given = given.unwrap_or_else(|| lock(&self.pending).given(by));
+        let parameters = Parameters::complete(&self.facts.parameters, given)?;
+        self.driver
+            .check(&parameters)
+            .map_err(|why| Refusal::new(Code::InvalidArgument, why))?;
+        self.authority.begin(&self.facts.name)?;
+        let transition = match self.program.call(Method::Start) {
+            Ok(transition) => transition,
+            Err(refused) => {
+                self.authority.end(&self.facts.name);
+                return Err(refusal(refused));
+            }
+        };
+        let Some(run) = self.program.run() else {
+            self.authority.end(&self.facts.name);
+            return Err(not_now(Method::Start, self.program.state()));
+        };
+        lock(&self.pending).kept(by, parameters.all());
+        self.now.parameters = Arc::new(parameters.clone());
+        self.now.run = run.number();
+        self.now.progress = 0.0;
+        self.now.step.clear();
+        self.tell(Told::Parameters(&parameters));
+        self.transition(
+            transition,
+            format!("run {} is started by {by}", run.number()),
+        );
+        // Only now: a driver that is done at once ends a run that everybody has seen begin.
+        let (work, reins) = Work::new(run.number(), parameters);
+        let driver = Arc::clone(&self.driver);
+        self.work = Some(Running {
+            run,
+            task: tokio::spawn(async move { driver.run(work).await }),
+            reins,
+            deadline: self.facts.timeout.map(|timeout| Instant::now() + timeout),
+            left: None,
+            ended: None,
+        });
+        Ok(())
+    }
+
+    async fn halt(&mut self, by: &str) -> Result<(), Refusal> {
+        let goes_on = matches!(self.program.state(), State::Running | State::Suspended);
+        let mut message = format!("halted by {by}");
+        if goes_on {
+            match self.stop_work().await {
+                // It was done before it could be stopped.
+                Stop::Done(result) if self.program.state() == State::Running => {
+                    self.settle(Ok(result))
+                }
+                Stop::Done(_) | Stop::Stopped => {}
+                Stop::BrokenOff(how) => message = format!("{message}; {how}"),
+            }
+            if self.program.state() != State::Ready {
+                self.end_without_work(message.clone());
+            }
+        }
+        self.take(Method::Halt, &message)
+    }
+
+    async fn reset(&mut self, by: &Owner) -> Result<(), Refusal> {
+        if self.program.state() == State::Suspended {
+            // Drops what stands still.
+            let _stopped = self.stop_work().await;
+            if self.work.is_none() {
+                self.end_without_work(format!("reset by {by} while it was suspended"));
+            }
+        }
+        if let Some(work) = &mut self.work {
+            if !work.task.is_finished() {
+                return Err(still_at_work(work.run));
+            }
+            self.work = None;
+        }
+        self.take(Method::Reset, &format!("reset by {by}"))
+    }
+
+    /// The run has taken longer than it may.
+    async fn late(&mut self) {
+        let within = self.facts.timeout.unwrap_or_default();
+        match self.stop_work().await {
+            Stop::Done(result) => self.settle(Ok(result)),
+            Stop::Stopped | Stop::BrokenOff(_) => {
+                let run = self.program.run();
+                let message = format!("the work was not done within {within:?}");
+                self.end_without_work(message.clone());
+                let ended = run.and_then(|run| self.program.ended(run, Ending::Failure).ok());
+                if let Some(transition) = ended {
+                    self.transition(transition, message);
+                }
+            }
+        }
+    }
+
+    /// Stops the work and waits until it has ended, a bounded while; after that it is broken off.
+    async fn stop_work(&mut self) -> Stop {
+        self.signal(Signal::Stop);
+        let Some(work) = &mut self.work else {
+            return Stop::Stopped;
+        };
+        if let Some(ended) = work.ended.take() {
+            self.work = None;
+            return ended.map_or(Stop::Stopped, Stop::Done);
+        }
+        if let Ok(ended) = timeout(TIME_TO_STOP, &mut work.task).await {
+            let ended = outcome_of(ended);
+            self.take_steps();
+            self.work = None;
+            return ended.map_or(Stop::Stopped, Stop::Done);
+        }
+        work.task.abort();
+        let ended = timeout(TIME_TO_BREAK_OFF, &mut work.task).await;
+        let how =
+            format!("its work had not come to a stand after {TIME_TO_STOP:?} and was broken off");
+        warn!(skill = self.facts.name, "run {}: {how}", work.run.number());
+        if ended.is_ok() {
+            self.work = None;
+        }
+        Stop::BrokenOff(how)
+    }
+
+    /// The work has ended by itself.
+    fn settle(&mut self, result: Result<Results, String>) {
+        self.take_steps();
+        match (self.program.state(), &result) {
+            (State::Running, _) | (State::Suspended, Err(_)) => self.finish(result),
+            (State::Suspended, Ok(_)) => {
+                if let Some(work) = &mut self.work {
+                    work.ended = Some(result);
+                }
+            }
+            // It was halted, and could not be broken off then.
+            (State::Halted | State::Ready, _) => self.work = None,
+        }
+    }
+
+    fn finish(&mut self, result: Result<Results, String>) {
+        self.work = None;
+        let Some(run) = self.program.run() else {
+            return;
+        };
+        let ending = if result.is_ok() {
+            Ending::Success
+        } else {
+            Ending::Failure
+        };
+        let message = match &result {
+            Ok(_) => format!("run {} is done", run.number()),
+            Err(why) => why.clone(),
+        };
+        if result.is_ok() {
+            self.now.progress = 1.0;
+        }
+        let outcome = Outcome {
+            run: run.number(),
+            succeeded: result.is_ok(),
+            message: if result.is_ok() {
+                String::new()
+            } else {
+                message.clone()
+            },
+            results: self.in_order(result.unwrap_or_default()),
+        };
+        self.keep(outcome);
+        match self.program.ended(run, ending) {
+            Ok(transition) => self.transition(transition, message),
+            Err(fault) => warn!(skill = self.facts.name, "{fault}"),
+        }
+    }
+
+    /// The outcome of a run whose work was stopped; its transition is the caller's.
+    fn end_without_work(&mut self, message: String) {
+        let Some(run) = self.program.run() else {
+            return;
+        };
+        self.keep(Outcome {
+            run: run.number(),
+            succeeded: false,
+            message,
+            results: Vec::new(),
+        });
+    }
+
+    fn keep(&mut self, outcome: Outcome) {
+        let outcome = Arc::new(outcome);
+        let mut outcomes = lock(&self.outcomes);
+        if outcomes.len() >= MOST_OUTCOMES {
+            outcomes.pop_front();
+        }
+        outcomes.push_back(Arc::clone(&outcome));
+        drop(outcomes);
+        self.now.outcome = Some(Arc::clone(&outcome));
+        self.tell(Told::Outcome(&outcome));
+    }
+
+    /// The results that the type has, in its order.
+    fn in_order(&self, results: Results) -> Results {
+        let mut ordered = Vec::new();
+        for declared in &self.facts.results {
+            let found = results.iter().find(|(name, _)| *name == declared.name);
+            let fits = found.and_then(|(_, value)| declared.shape.take(value.clone()));
+            match fits {
+                Some(value) => ordered.push((declared.name.clone(), value)),
+                None => debug!(
+                    skill = self.facts.name,
+                    "the driver gave no {}", declared.name
+                ),
+            }
+        }
+        ordered
+    }
+
+    fn take(&mut self, method: Method, message: &str) -> Result<(), Refusal> {
+        let transition = self.program.call(method).map_err(refusal)?;
+        self.transition(transition, message.to_owned());
+        Ok(())
+    }
+
+    fn transition(&mut self, transition: &'static Transition, message: String) {
+        let at = SystemTime::now();
+        self.now.state = transition.to;
+        self.now.last = Some(transition);
+        self.now.since = at;
+        self.now.executable = Method::ALL.map(|method| self.program.is_executable(method));
+        if matches!(transition.to, State::Halted | State::Ready) {
+            self.now.step.clear();
+            self.authority.end(&self.facts.name);
+        }
+        debug!(skill = self.facts.name, "{}: {message}", transition.name);
+        self.tell(Told::Transition(&Transitioned {
+            transition,
+            run: self.now.run,
+            message,
+            at,
+        }));
+    }
+
+    fn step(&mut self, step: String) {
+        self.now.step = step;
+        self.tell(Told::Progress);
+    }
+
+    fn progress(&mut self, done: f32) {
+        self.now.progress = done;
+        self.tell(Told::Progress);
+    }
+
+    /// Steps that were said before the work ended.
+    fn take_steps(&mut self) {
+        let mut steps = Vec::new();
+        if let Some(work) = &mut self.work {
+            while let Ok(step) = work.reins.steps.try_recv() {
+                steps.push(step);
+            }
+        }
+        for step in steps {
+            self.step(step);
+        }
+    }
+
+    fn signal(&self, signal: Signal) {
+        if let Some(work) = &self.work {
+            work.reins.signal.send_replace(signal);
+        }
+    }
+
+    fn tell(&self, what: Told<'_>) {
+        for observer in &self.observers {
+            observer.told(what, &self.now);
+        }
+        self.shown.send_replace(Arc::new(self.now.clone()));
+    }
+}
+
+enum Happened {
+    Call(Call),
+    Step(String),
+    Progress(f32),
+    Ended(Result<Results, String>),
+    Late,
+}
+
+/// How work that was told to stop ended.
+enum Stop {
+    /// It was done.
+    Done(Results),
+    /// It stopped.
+    Stopped,
+    /// It did not.
+    BrokenOff(String),
+}
+
+/// The next thing that the work does. Pends where there is none.
+async fn happens(work: &mut Option<Running>) -> Happened {
+    let Some(Running {
+        task,
+        reins,
+        deadline,
+        ended,
+        ..
+    }) = work
+    else {
+        return pending().await;
+    };
+    if ended.is_some() {
+        return pending().await;
+    }
+    let late = async {
+        match deadline {
+            Some(deadline) => sleep_until(*deadline).await,
+            None => pending().await,
+        }
+    };
+    tokio::select! {
+        biased;
+        Some(step) = reins.steps.recv() => Happened::Step(step),
+        ended = task => Happened::Ended(outcome_of(ended)),
+        Ok(()) = reins.progress.changed() => Happened::Progress(*reins.progress.borrow_and_update()),
+        () = late => Happened::Late,
+    }
+}
+
+fn outcome_of(ended: Result<Result<Results, String>, JoinError>) -> Result<Results, String> {
+    match ended {
+        Ok(result) => result,
+        Err(error) => match error.try_into_panic() {
+            Ok(panic) => Err(format!("the driver broke down: {}", text_of(&*panic))),
+            Err(_) => Err("the work was broken off".to_owned()),
+        },
+    }
+}
+
+fn text_of(panic: &(dyn Any + Send)) -> &str {
+    let text = panic.downcast_ref::<String>().map(String::as_str);
+    text.or_else(|| panic.downcast_ref::<&str>().copied())
+        .unwrap_or("no reason given")
+}
+
+fn not_now(method: Method, state: State) -> Refusal {
+    refusal(Refused::State { method, state })
+}
+
+fn refusal(refused: Refused) -> Refusal {
+    let code = match refused {
+        Refused::CannotSuspend => Code::NotSupported,
+        _ => Code::InvalidState,
+    };
+    Refusal::new(code, refused.to_string())
+}
+
+fn still_at_work(run: RunId) -> Refusal {
+    let text = format!("the work of run {} has not come to an end", run.number());
+    Refusal::new(Code::InvalidState, text)
+}
+
+/// So long the work may take to end after it was stopped.
+const TIME_TO_STOP: Duration = Duration::from_secs(1);
+/// And so long its future to be dropped after that; what blocks its thread takes longer.
+const TIME_TO_BREAK_OFF: Duration = Duration::from_millis(100);
+/// The outcomes of so many runs can be asked for.
+const MOST_OUTCOMES: usize = 64;

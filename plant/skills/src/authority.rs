@@ -1,0 +1,150 @@
+//! Who may have a component do something, and that it does one thing at a time.
+
+use std::fmt;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use program::Lease;
+use tokio::sync::watch;
+
+use crate::refusal::{Code, Refusal};
+
+/// Who writes parameters and calls methods.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub enum Owner {
+    /// A session of the OPC UA server, by the server's number for it. Holds the lease until it closes.
+    Session(u32),
+    /// A space that asked for a call. Holds the lease while a run that it began goes on.
+    Space(u16),
+    /// Something in this program, likewise.
+    Local(&'static str),
+}
+
+impl fmt::Display for Owner {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Session(number) => write!(f, "session {number}"),
+            Self::Space(space) => write!(f, "space {space}"),
+            Self::Local(name) => f.write_str(name),
+        }
+    }
+}
+
+/// Shared by the skills of one component.
+#[derive(Debug, Clone)]
+pub struct Authority {
+    inner: Arc<Mutex<Inner>>,
+    holder: watch::Sender<Option<Owner>>,
+}
+
+#[derive(Debug)]
+struct Inner {
+    lease: Lease<Owner>,
+    /// The skill whose run goes on.
+    running: Option<String>,
+}
+
+impl Authority {
+    /// Of a component that nobody has used.
+    #[must_use]
+    pub fn new() -> Self {
+        let inner = Inner {
+            lease: Lease::free(),
+            running: None,
+        };
+        let (holder, _) = watch::channel(None);
+        Self {
+            inner: Arc::new(Mutex::new(inner)),
+            holder,
+        }
+    }
+
+    /// Takes the lease, or keeps it.
+    ///
+    /// # Errors
+    /// BadLocked when it is somebody else's.
+    pub fn claim(&self, by: &Owner) -> Result<(), Refusal> {
+        let mut inner = self.lock();
+        inner.lease.claim(by.clone()).map_err(|held| {
+            let text = format!("{} has the lease of this component", held.by);
+            Refusal::new(Code::Locked, text)
+        })?;
+        self.show(&inner);
+        Ok(())
+    }
+
+    /// Gives the lease back, as when a session closes. A run that goes on does so.
+    pub fn release(&self, by: &Owner) {
+        let mut inner = self.lock();
+        inner.lease.release(by);
+        self.show(&inner);
+    }
+
+    /// Gives back the lease of who holds it for a run only, where none goes on.
+    pub fn settle(&self) {
+        let mut inner = self.lock();
+        if inner.running.is_some() {
+            return;
+        }
+        let passing = inner
+            .lease
+            .holder()
+            .filter(|holder| !matches!(holder, Owner::Session(_)))
+            .cloned();
+        if let Some(holder) = passing {
+            inner.lease.release(&holder);
+        }
+        self.show(&inner);
+    }
+
+    /// Who holds the lease, and each change of it.
+    #[must_use]
+    pub fn holder(&self) -> watch::Receiver<Option<Owner>> {
+        self.holder.subscribe()
+    }
+
+    /// A run of the skill begins.
+    ///
+    /// # Errors
+    /// BadInvalidState while one of another skill goes on: a component does one thing at a time.
+    pub(crate) fn begin(&self, skill: &str) -> Result<(), Refusal> {
+        let mut inner = self.lock();
+        if let Some(running) = &inner.running {
+            let text = format!("{running} of this component runs, and it does one thing at a time");
+            return Err(Refusal::new(Code::InvalidState, text));
+        }
+        inner.running = Some(skill.to_owned());
+        Ok(())
+    }
+
+    /// The run of the skill has ended.
+    pub(crate) fn end(&self, skill: &str) {
+        let mut inner = self.lock();
+        if inner.running.as_deref() == Some(skill) {
+            inner.running = None;
+        }
+        drop(inner);
+        self.settle();
+    }
+
+    fn show(&self, inner: &Inner) {
+        self.holder.send_if_modified(|shown| {
+            let holder = inner.lease.holder();
+            let differs = shown.as_ref() != holder;
+            if differs {
+                *shown = holder.cloned();
+            }
+            differs
+        });
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        // Each change is whole before the lock is given back.
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Default for Authority {
+    fn default() -> Self {
+        Self::new()
+    }
+}

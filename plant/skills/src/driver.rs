@@ -1,0 +1,177 @@
+//! Who does the work of a skill.
+
+use std::time::Duration;
+
+use async_trait::async_trait;
+use tokio::sync::{mpsc, watch};
+
+use crate::parameters::Parameters;
+use crate::value::Value;
+
+/// What a run says at its end: the results of the skill's type by their names.
+pub type Results = Vec<(String, Value)>;
+
+/// Does the work of one skill: a device, a simulation, or a composite of other skills.
+///
+/// What keeps to this is checked by [`conformance`](crate::conformance).
+#[async_trait]
+pub trait Driver: Send + Sync + 'static {
+    /// Whether the work can stand still and go on. Without it Suspend is refused.
+    fn can_suspend(&self) -> bool {
+        false
+    }
+
+    /// Looks at parameters that fit the type, before anything moves.
+    ///
+    /// # Errors
+    /// What is wrong with them, beginning with the name of one: the client is refused with BadInvalidArgument.
+    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+        let _any = parameters;
+        Ok(())
+    }
+
+    /// Does the work of one run. It is told of Halt by [`Work::stopped`], and has a second to bring the machine to a stand;
+    /// then the future is dropped.
+    ///
+    /// # Errors
+    /// Why the work is not done, for people.
+    async fn run(&self, work: Work) -> Result<Results, String>;
+}
+
+/// One run, as its driver sees it.
+#[derive(Debug, Clone)]
+pub struct Work {
+    run: u32,
+    parameters: Parameters,
+    signal: watch::Receiver<Signal>,
+    steps: mpsc::Sender<String>,
+    progress: watch::Sender<f32>,
+}
+
+/// The work was stopped by Halt, Reset, or the end of the program.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("stopped")]
+pub struct Stopped;
+
+impl From<Stopped> for String {
+    fn from(stopped: Stopped) -> Self {
+        stopped.to_string()
+    }
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Signal {
+    Go,
+    StandStill,
+    Stop,
+}
+
+/// The other end of a [`Work`].
+#[derive(Debug)]
+pub(crate) struct Reins {
+    pub(crate) signal: watch::Sender<Signal>,
+    pub(crate) steps: mpsc::Receiver<String>,
+    pub(crate) progress: watch::Receiver<f32>,
+}
+
+impl Work {
+    pub(crate) fn new(run: u32, parameters: Parameters) -> (Self, Reins) {
+        let (signal, signals) = watch::channel(Signal::Go);
+        let (steps, steps_told) = mpsc::channel(MOST_STEPS);
+        let (progress, progressed) = watch::channel(0.0);
+        let work = Self {
+            run,
+            parameters,
+            signal: signals,
+            steps,
+            progress,
+        };
+        let reins = Reins {
+            signal,
+            steps: steps_told,
+            progress: progressed,
+        };
+        (work, reins)
+    }
+
+    /// The number of the run.
+    #[must_use]
+    pub fn run(&self) -> u32 {
+        self.run
+    }
+
+    /// What it was started with, complete and checked.
+    #[must_use]
+    pub fn parameters(&self) -> &Parameters {
+        &self.parameters
+    }
+
+    /// Says what the run is about now. Waits while too much of that is not told yet; no step is left out.
+    pub async fn step(&self, step: impl Into<String>) {
+        tokio::select! {
+            // Nobody is left to be told where the skill is gone, and `stopped` says so.
+            _told = self.steps.send(step.into()) => {}
+            () = self.stopped() => {}
+        }
+    }
+
+    /// Says how much is done, from 0 to 1. Of several the newest counts.
+    pub fn progress(&self, done: f32) {
+        let done = if done.is_finite() {
+            done.clamp(0.0, 1.0)
+        } else {
+            0.0
+        };
+        self.progress.send_replace(done);
+    }
+
+    /// Ready when the run is to end without its work being done.
+    pub async fn stopped(&self) {
+        // Without the skill there is nobody who could want it to go on.
+        let mut signal = self.signal.clone();
+        let _stopped_or_alone = signal.wait_for(|signal| *signal == Signal::Stop).await;
+    }
+
+    /// Ready while the work may go on: at once, or when a suspended run is resumed.
+    ///
+    /// # Errors
+    /// [`Stopped`].
+    pub async fn going(&self) -> Result<(), Stopped> {
+        let mut signal = self.signal.clone();
+        let signal = signal
+            .wait_for(|signal| *signal != Signal::StandStill)
+            .await;
+        match signal.map(|signal| *signal) {
+            Ok(Signal::Go) => Ok(()),
+            Ok(Signal::Stop | Signal::StandStill) | Err(_) => Err(Stopped),
+        }
+    }
+
+    /// Waits while work goes on: time in which the run is suspended does not count.
+    ///
+    /// # Errors
+    /// [`Stopped`].
+    pub async fn spend(&self, time: Duration) -> Result<(), Stopped> {
+        let mut left = time;
+        loop {
+            self.going().await?;
+            if left.is_zero() {
+                return Ok(());
+            }
+            let began = tokio::time::Instant::now();
+            tokio::select! {
+                () = tokio::time::sleep(left) => return self.going().await,
+                () = self.held() => left = left.saturating_sub(began.elapsed()),
+            }
+        }
+    }
+
+    /// Ready when the run is suspended or stopped.
+    async fn held(&self) {
+        let mut signal = self.signal.clone();
+        let _held_or_alone = signal.wait_for(|signal| *signal != Signal::Go).await;
+    }
+}
+
+/// So many steps may wait to be told.
+const MOST_STEPS: usize = 64;

@@ -1,0 +1,95 @@
+//! The skill types of namespace [`NAMESPACE`], out of one table.
+
+mod nodeset;
+mod table;
+
+pub use nodeset::nodeset;
+pub use table::{Preset, SkillType, TYPES, Unit, Variable};
+
+use crate::parameters::Parameter;
+use crate::value::{Builtin, Shape, Value};
+
+/// The URI of the types' namespace.
+pub const NAMESPACE: &str = "urn:ua-bridge:skills";
+/// The type all skills are of.
+pub const SKILL_TYPE: &str = "SkillType";
+/// The event of each transition.
+pub const EVENT_TYPE: &str = "SkillTransitionEventType";
+/// The interface of a component, which has the folder `Skills`.
+pub const CONTROLLER_TYPE: &str = "ISkillControllerType";
+
+/// A type of the table by its BrowseName.
+#[must_use]
+pub fn find(name: &str) -> Option<&'static SkillType> {
+    TYPES.iter().find(|known| known.name == name)
+}
+
+impl SkillType {
+    /// The type it is a subtype of; `None` for SkillType, whose supertype is ProgramStateMachineType of namespace 0.
+    #[must_use]
+    pub fn supertype(&self) -> Option<&'static Self> {
+        find(self.base?)
+    }
+
+    /// Itself and all its supertypes of the table, nearest first.
+    pub fn chain(&'static self) -> impl Iterator<Item = &'static Self> {
+        std::iter::successors(Some(self), |of| of.supertype())
+    }
+
+    /// Its parameters, those of its supertypes first.
+    #[must_use]
+    pub fn parameters(&'static self) -> Vec<Parameter> {
+        self.inherited(|of| of.parameters)
+    }
+
+    /// Its results, those of its supertypes first.
+    #[must_use]
+    pub fn results(&'static self) -> Vec<Parameter> {
+        self.inherited(|of| of.results)
+    }
+
+    fn inherited(
+        &'static self,
+        of: impl Fn(&'static Self) -> &'static [Variable],
+    ) -> Vec<Parameter> {
+        let mut chain: Vec<&Self> = self.chain().collect();
+        chain.reverse();
+        chain
+            .into_iter()
+            .flat_map(of)
+            .map(Variable::parameter)
+            .collect()
+    }
+}
+
+impl Variable {
+    fn parameter(&self) -> Parameter {
+        Parameter {
+            name: self.name.to_owned(),
+            shape: self.shape,
+            length: self.length,
+            default: self.default_value(),
+            unit: self.unit.map(|unit| unit.symbol.to_owned()),
+            range: self.range,
+            about: self.about.to_owned(),
+        }
+    }
+
+    /// What counts where nothing is given.
+    #[must_use]
+    pub fn default_value(&self) -> Option<Value> {
+        match self.preset {
+            Preset::None => None,
+            Preset::Number(number) => {
+                Shape::scalar(Builtin::Double)
+                    .take(number.into())
+                    .and_then(|value| {
+                        // All numbers of the table are of the type they stand for.
+                        self.shape.read_json(&value.to_json()).ok()
+                    })
+            }
+            Preset::Text(text) => Some(text.into()),
+            Preset::Flag(flag) => Some(flag.into()),
+        }
+    }
+}

@@ -1,0 +1,516 @@
+//! The table as a NodeSet2 document (OPC 10000-6, annex F).
+
+use std::fmt::Write as _;
+
+use program::Method;
+
+use super::table::{SkillType, TYPES, Unit, Variable};
+use super::{CONTROLLER_TYPE, EVENT_TYPE, NAMESPACE, SKILL_TYPE};
+use crate::value::{Builtin, Value};
+
+/// The NodeSet of [`NAMESPACE`]: the same text each time. It needs namespace 0 only.
+#[must_use]
+pub fn nodeset() -> String {
+    let mut nodes = Nodes(HEAD.replace("{NAMESPACE}", NAMESPACE));
+    for skill_type in &TYPES {
+        nodes.skill_type(skill_type);
+    }
+    nodes.event_type();
+    nodes.controller_type();
+    let mut text = nodes.0;
+    text.push_str("</UANodeSet>\n");
+    text
+}
+
+/// A node of the document.
+struct Node<'a> {
+    class: &'a str,
+    id: u32,
+    /// With the index of its namespace, as `1:Name`.
+    browse_name: &'a str,
+    /// More attributes, each with a space before it.
+    attributes: String,
+    about: &'a str,
+    /// Type of the reference, whether it is one back, and its target.
+    references: Vec<(&'a str, bool, String)>,
+    value: Option<String>,
+}
+
+impl<'a> Node<'a> {
+    fn new(class: &'a str, id: u32, browse_name: &'a str) -> Self {
+        Self {
+            class,
+            id,
+            browse_name,
+            attributes: String::new(),
+            about: "",
+            references: Vec::new(),
+            value: None,
+        }
+    }
+
+    fn about(mut self, about: &'a str) -> Self {
+        self.about = about;
+        self
+    }
+
+    fn attribute(mut self, name: &str, value: &str) -> Self {
+        self.attributes.push_str(&format!(" {name}=\"{value}\""));
+        self
+    }
+
+    fn forward(mut self, reference: &'a str, target: impl Into<String>) -> Self {
+        self.references.push((reference, false, target.into()));
+        self
+    }
+
+    fn back(mut self, reference: &'a str, target: impl Into<String>) -> Self {
+        self.references.push((reference, true, target.into()));
+        self
+    }
+
+    /// A child of a type, with the modelling rule.
+    fn child_of(self, parent: u32, reference: &'a str, rule: Rule) -> Self {
+        self.attribute("ParentNodeId", &own(parent))
+            .forward("HasModellingRule", rule.node())
+            .back(reference, own(parent))
+    }
+}
+
+#[derive(Clone, Copy)]
+enum Rule {
+    Mandatory,
+    Optional,
+}
+
+impl Rule {
+    fn node(self) -> &'static str {
+        match self {
+            Self::Mandatory => "i=78",
+            Self::Optional => "i=80",
+        }
+    }
+}
+
+fn own(id: u32) -> String {
+    format!("ns=1;i={id}")
+}
+
+struct Nodes(String);
+
+impl Nodes {
+    fn add(&mut self, node: Node<'_>) {
+        let Node {
+            class,
+            id,
+            browse_name,
+            attributes,
+            about,
+            references,
+            value,
+        } = node;
+        let display = browse_name.trim_start_matches("1:");
+        let out = &mut self.0;
+        // A write to a String cannot fail.
+        _ = writeln!(
+            out,
+            "  <{class} NodeId=\"{}\" BrowseName=\"{browse_name}\"{attributes}>",
+            own(id)
+        );
+        _ = writeln!(out, "    <DisplayName>{display}</DisplayName>");
+        if !about.is_empty() {
+            _ = writeln!(out, "    <Description>{}</Description>", escaped(about));
+        }
+        out.push_str("    <References>\n");
+        for (reference, is_back, target) in references {
+            let direction = if is_back { " IsForward=\"false\"" } else { "" };
+            _ = writeln!(
+                out,
+                "      <Reference ReferenceType=\"{reference}\"{direction}>{target}</Reference>"
+            );
+        }
+        out.push_str("    </References>\n");
+        if let Some(value) = value {
+            _ = writeln!(out, "    <Value>{value}</Value>");
+        }
+        _ = writeln!(out, "  </{class}>");
+    }
+
+    fn skill_type(&mut self, of: &SkillType) {
+        let supertype = match of.base.and_then(super::find) {
+            Some(base) => own(base.id),
+            None => PROGRAM_STATE_MACHINE_TYPE.to_owned(),
+        };
+        let browse_name = format!("1:{}", of.name);
+        let mut node = Node::new("UAObjectType", of.id, &browse_name).about(of.about);
+        if of.is_abstract {
+            node = node.attribute("IsAbstract", "true");
+        }
+        node = node.back("HasSubtype", supertype);
+        let is_root = of.name == SKILL_TYPE;
+        if is_root {
+            node = node.forward("GeneratesEvent", own(EVENT_TYPE_ID));
+        }
+        self.add(node);
+        if is_root {
+            self.root_members(of.id);
+        }
+        if is_root || !of.parameters.is_empty() {
+            let rule = if is_root {
+                Rule::Optional
+            } else {
+                Rule::Mandatory
+            };
+            let about = "What the next run is told. Written before Start; kept by it.";
+            self.group(of.id, PARAMETER_SET, ("1:ParameterSet", about), rule);
+        }
+        if is_root || !of.results.is_empty() {
+            let about = "What the newest run that ended has said, whoever asks and whenever.";
+            self.group(
+                of.id,
+                FINAL_RESULT_DATA,
+                ("FinalResultData", about),
+                Rule::Mandatory,
+            );
+        }
+        for (place, parameter) in (0..).zip(of.parameters) {
+            let ids = Ids {
+                node: of.id + PARAMETERS + place,
+                properties: of.id + PARAMETER_PROPERTIES + 2 * place,
+            };
+            self.variable(parameter, of.id + PARAMETER_SET, ids, "3");
+        }
+        for (place, result) in (0..).zip(of.results) {
+            let ids = Ids {
+                node: of.id + RESULTS + place,
+                properties: of.id + RESULT_PROPERTIES + 2 * place,
+            };
+            self.variable(result, of.id + FINAL_RESULT_DATA, ids, "1");
+        }
+    }
+
+    fn group(&mut self, parent: u32, offset: u32, (browse_name, about): (&str, &str), rule: Rule) {
+        let node = Node::new("UAObject", parent + offset, browse_name).about(about);
+        self.add(
+            node.forward("HasTypeDefinition", "i=58")
+                .child_of(parent, "HasComponent", rule),
+        );
+    }
+
+    /// What every skill has beside the members of a Program.
+    fn root_members(&mut self, parent: u32) {
+        for (place, method) in (0..).zip(METHODS) {
+            let node = Node::new("UAMethod", parent + FIRST_METHOD + place, method.name());
+            self.add(node.child_of(parent, "HasComponent", Rule::Mandatory));
+        }
+        let members: [(u32, &str, Builtin, bool, bool, &str); 5] = [
+            (
+                20,
+                "1:Name",
+                Builtin::String,
+                false,
+                true,
+                "What its component calls it.",
+            ),
+            (
+                21,
+                "1:Capabilities",
+                Builtin::String,
+                true,
+                true,
+                "The IRIs of the capabilities that it provides.",
+            ),
+            (
+                22,
+                "1:RunId",
+                Builtin::UInt32,
+                false,
+                false,
+                "The number of the newest run; 0 before the first one.",
+            ),
+            (
+                23,
+                "1:Progress",
+                Builtin::Float,
+                false,
+                false,
+                "How much of the run is done, from 0 to 1.",
+            ),
+            (
+                24,
+                "1:SkillStep",
+                Builtin::String,
+                false,
+                false,
+                "What the run is about now.",
+            ),
+        ];
+        for (offset, browse_name, builtin, array, is_property, about) in members {
+            let reference = if is_property {
+                "HasProperty"
+            } else {
+                "HasComponent"
+            };
+            let definition = if is_property {
+                PROPERTY_TYPE
+            } else {
+                BASE_DATA_VARIABLE_TYPE
+            };
+            let mut node = Node::new("UAVariable", parent + offset, browse_name)
+                .about(about)
+                .attribute("DataType", builtin.name());
+            if array {
+                node = node.attribute("ValueRank", "1");
+            }
+            self.add(node.forward("HasTypeDefinition", definition).child_of(
+                parent,
+                reference,
+                Rule::Mandatory,
+            ));
+        }
+        let outcome = [
+            (
+                30,
+                "1:Run",
+                Builtin::UInt32,
+                "Which run has ended so; 0 before the first one.",
+            ),
+            (
+                31,
+                "1:Succeeded",
+                Builtin::Boolean,
+                "Whether the run did its work.",
+            ),
+            (32, "1:Message", Builtin::String, "Why it did not."),
+        ];
+        for (offset, browse_name, builtin, about) in outcome {
+            let node = Node::new("UAVariable", parent + offset, browse_name)
+                .about(about)
+                .attribute("DataType", builtin.name());
+            let node = node.forward("HasTypeDefinition", BASE_DATA_VARIABLE_TYPE);
+            self.add(node.child_of(parent + FINAL_RESULT_DATA, "HasComponent", Rule::Mandatory));
+        }
+    }
+
+    fn variable(&mut self, variable: &Variable, parent: u32, ids: Ids, access: &str) {
+        let browse_name = format!("1:{}", variable.name);
+        let mut node = Node::new("UAVariable", ids.node, &browse_name)
+            .about(variable.about)
+            .attribute("DataType", variable.shape.builtin.name());
+        if variable.shape.array {
+            node = node.attribute("ValueRank", "1");
+        }
+        if let Some(length) = variable.length {
+            node = node.attribute("ArrayDimensions", &length.to_string());
+        }
+        node = node
+            .attribute("AccessLevel", access)
+            .attribute("UserAccessLevel", access);
+        let definition = match (variable.unit, variable.range) {
+            (None, None) => BASE_DATA_VARIABLE_TYPE,
+            (Some(_), None) => ANALOG_UNIT_TYPE,
+            (None, Some(_)) => ANALOG_ITEM_TYPE,
+            (Some(_), Some(_)) => ANALOG_UNIT_RANGE_TYPE,
+        };
+        node = node.forward("HasTypeDefinition", definition).child_of(
+            parent,
+            "HasComponent",
+            Rule::Mandatory,
+        );
+        node.value = variable.default_value().map(|value| xml_value(&value));
+        self.add(node);
+        if let Some(unit) = variable.unit {
+            let mut property = Node::new("UAVariable", ids.properties, "EngineeringUnits")
+                .attribute("DataType", "i=887");
+            property = property
+                .forward("HasTypeDefinition", PROPERTY_TYPE)
+                .child_of(ids.node, "HasProperty", Rule::Mandatory);
+            property.value = Some(engineering_unit(unit));
+            self.add(property);
+        }
+        if let Some((low, high)) = variable.range {
+            let mut property = Node::new("UAVariable", ids.properties + 1, "EURange")
+                .attribute("DataType", "i=884");
+            property = property
+                .forward("HasTypeDefinition", PROPERTY_TYPE)
+                .child_of(ids.node, "HasProperty", Rule::Mandatory);
+            let body = format!("<Range><Low>{low}</Low><High>{high}</High></Range>");
+            property.value = Some(structure("i=885", &body));
+            self.add(property);
+        }
+    }
+
+    fn event_type(&mut self) {
+        let browse_name = format!("1:{EVENT_TYPE}");
+        let node = Node::new("UAObjectType", EVENT_TYPE_ID, &browse_name)
+            .about("A transition of a skill. IntermediateResult is the text of its step.")
+            .back("HasSubtype", PROGRAM_TRANSITION_EVENT_TYPE);
+        self.add(node);
+        let run = Node::new("UAVariable", EVENT_TYPE_ID + 1, "1:RunId")
+            .about("The number of the run that it begins, goes on with or ends; 0 for none.")
+            .attribute("DataType", "UInt32");
+        self.add(run.forward("HasTypeDefinition", PROPERTY_TYPE).child_of(
+            EVENT_TYPE_ID,
+            "HasProperty",
+            Rule::Mandatory,
+        ));
+    }
+
+    fn controller_type(&mut self) {
+        let browse_name = format!("1:{CONTROLLER_TYPE}");
+        let node = Node::new("UAObjectType", CONTROLLER_TYPE_ID, &browse_name)
+            .about("What a component has that has skills.")
+            .attribute("IsAbstract", "true")
+            .back("HasSubtype", BASE_INTERFACE_TYPE);
+        self.add(node);
+        let skills = Node::new("UAObject", CONTROLLER_TYPE_ID + 1, "1:Skills")
+            .about("Its skills, as components.")
+            .forward("HasTypeDefinition", FOLDER_TYPE);
+        self.add(skills.child_of(CONTROLLER_TYPE_ID, "HasComponent", Rule::Mandatory));
+        let number = Node::new("UAVariable", CONTROLLER_TYPE_ID + 2, "1:NamespaceNumber")
+            .about("Its number in the space of the cell, which is the WriterGroupId of its values.")
+            .attribute("DataType", "UInt16");
+        let number = number.forward("HasTypeDefinition", PROPERTY_TYPE);
+        self.add(number.child_of(CONTROLLER_TYPE_ID, "HasProperty", Rule::Mandatory));
+        let holder = Node::new("UAVariable", CONTROLLER_TYPE_ID + 3, "1:LeaseHolder")
+            .about("Who alone may start its skills now; nothing where anybody may.")
+            .attribute("DataType", "String");
+        let holder = holder.forward("HasTypeDefinition", BASE_DATA_VARIABLE_TYPE);
+        self.add(holder.child_of(CONTROLLER_TYPE_ID, "HasComponent", Rule::Mandatory));
+    }
+}
+
+/// The identifiers of a variable and of the first of its properties.
+struct Ids {
+    node: u32,
+    properties: u32,
+}
+
+fn xml_value(value: &Value) -> String {
+    let one = |value: &Value, attributes: &str| {
+        let name = value.shape().builtin.name();
+        let text = match value {
+            Value::String(text) => escaped(text),
+            other => other.to_string(),
+        };
+        format!("<{name}{attributes}>{text}</{name}>")
+    };
+    match value {
+        Value::Array(builtin, elements) => {
+            let name = builtin.name();
+            let elements: String = elements.iter().map(|element| one(element, "")).collect();
+            format!("<ListOf{name}{TYPES_NAMESPACE}>{elements}</ListOf{name}>")
+        }
+        single => one(single, TYPES_NAMESPACE),
+    }
+}
+
+fn engineering_unit(unit: &Unit) -> String {
+    let Unit { symbol, name, id } = unit;
+    let body = format!(
+        "<EUInformation><NamespaceUri>http://www.opcfoundation.org/UA/units/un/cefact</NamespaceUri><UnitId>{id}</UnitId>\
+         <DisplayName><Text>{symbol}</Text></DisplayName><Description><Text>{name}</Text></Description></EUInformation>"
+    );
+    structure("i=888", &body)
+}
+
+fn structure(encoding: &str, body: &str) -> String {
+    format!(
+        "<ExtensionObject{TYPES_NAMESPACE}><TypeId><Identifier>{encoding}</Identifier></TypeId><Body>{body}</Body></ExtensionObject>"
+    )
+}
+
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;")
+        .replace('<', "&lt;")
+        .replace('>', "&gt;")
+}
+
+const METHODS: [Method; 5] = [
+    Method::Start,
+    Method::Halt,
+    Method::Suspend,
+    Method::Resume,
+    Method::Reset,
+];
+
+const PARAMETER_SET: u32 = 1;
+const FINAL_RESULT_DATA: u32 = 2;
+const FIRST_METHOD: u32 = 5;
+const PARAMETERS: u32 = 10;
+const RESULTS: u32 = 40;
+const PARAMETER_PROPERTIES: u32 = 50;
+const RESULT_PROPERTIES: u32 = 80;
+const EVENT_TYPE_ID: u32 = 2000;
+const CONTROLLER_TYPE_ID: u32 = 2100;
+
+const PROGRAM_STATE_MACHINE_TYPE: &str = "i=2391";
+const PROGRAM_TRANSITION_EVENT_TYPE: &str = "i=2378";
+const BASE_INTERFACE_TYPE: &str = "i=17602";
+const FOLDER_TYPE: &str = "i=61";
+const PROPERTY_TYPE: &str = "i=68";
+const BASE_DATA_VARIABLE_TYPE: &str = "i=63";
+const ANALOG_ITEM_TYPE: &str = "i=2368";
+const ANALOG_UNIT_TYPE: &str = "i=17497";
+const ANALOG_UNIT_RANGE_TYPE: &str = "i=17570";
+const TYPES_NAMESPACE: &str = " xmlns=\"http://opcfoundation.org/UA/2008/02/Types.xsd\"";
+
+const HEAD: &str = r#"<?xml version="1.0" encoding="utf-8"?>
+<UANodeSet xmlns="http://opcfoundation.org/UA/2011/03/UANodeSet.xsd" LastModified="2026-11-25T00:00:00Z">
+  <NamespaceUris>
+    <Uri>{NAMESPACE}</Uri>
+  </NamespaceUris>
+  <Models>
+    <Model ModelUri="{NAMESPACE}" Version="0.1.0" PublicationDate="2026-11-25T00:00:00Z">
+      <RequiredModel ModelUri="http://opcfoundation.org/UA/" />
+    </Model>
+  </Models>
+  <Aliases>
+    <Alias Alias="Boolean">i=1</Alias>
+    <Alias Alias="UInt16">i=5</Alias>
+    <Alias Alias="UInt32">i=7</Alias>
+    <Alias Alias="Float">i=10</Alias>
+    <Alias Alias="Double">i=11</Alias>
+    <Alias Alias="String">i=12</Alias>
+    <Alias Alias="HasModellingRule">i=37</Alias>
+    <Alias Alias="HasTypeDefinition">i=40</Alias>
+    <Alias Alias="GeneratesEvent">i=41</Alias>
+    <Alias Alias="HasSubtype">i=45</Alias>
+    <Alias Alias="HasProperty">i=46</Alias>
+    <Alias Alias="HasComponent">i=47</Alias>
+  </Aliases>
+"#;
+
+#[cfg(test)]
+mod tests {
+    use std::collections::HashSet;
+
+    use super::*;
+
+    #[test]
+    fn no_node_is_there_twice_and_no_reference_of_ours_leads_nowhere() {
+        let text = nodeset();
+        let ids: Vec<&str> = text
+            .split("NodeId=\"ns=1;")
+            .skip(1)
+            .filter_map(|rest| rest.split('"').next())
+            .collect();
+        // Each ParentNodeId is found by the split too, and it must be there likewise.
+        let defined: Vec<&str> = text
+            .split(" NodeId=\"ns=1;")
+            .skip(1)
+            .filter_map(|rest| rest.split('"').next())
+            .collect();
+        let distinct: HashSet<&str> = defined.iter().copied().collect();
+        assert_eq!(distinct.len(), defined.len());
+        assert!(defined.len() > 50, "{}", defined.len());
+        let targets = text
+            .split(">ns=1;")
+            .skip(1)
+            .filter_map(|rest| rest.split('<').next());
+        for id in ids.into_iter().chain(targets) {
+            assert!(distinct.contains(id), "{id}");
+        }
+        assert_eq!(text, nodeset());
+    }
+}

@@ -1,0 +1,308 @@
+//! What a skill is told before it starts, and what it says at its end.
+
+use std::fmt;
+use std::str::FromStr;
+
+use crate::model;
+use crate::refusal::{Code, Refusal};
+use crate::value::{Shape, Value};
+
+/// A type by the URI of its namespace and its BrowseName.
+///
+/// As text `nsu=<uri>;<BrowseName>`; a name without a URI is one of the types of [`NAMESPACE`](crate::NAMESPACE).
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct TypeName {
+    /// The URI.
+    pub namespace: String,
+    /// The BrowseName.
+    pub name: String,
+}
+
+impl TypeName {
+    /// A type of ours.
+    #[must_use]
+    pub fn own(name: &str) -> Self {
+        Self {
+            namespace: model::NAMESPACE.to_owned(),
+            name: name.to_owned(),
+        }
+    }
+}
+
+impl fmt::Display for TypeName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "nsu={};{}", self.namespace, self.name)
+    }
+}
+
+/// No name of a type.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("expected a type as GraspSkillType or nsu=<namespace uri>;<BrowseName>, found `{0}`")]
+pub struct NoTypeName(pub String);
+
+impl FromStr for TypeName {
+    type Err = NoTypeName;
+
+    fn from_str(text: &str) -> Result<Self, NoTypeName> {
+        let (namespace, name) = match text.strip_prefix("nsu=") {
+            Some(rest) => rest
+                .rsplit_once(';')
+                .ok_or_else(|| NoTypeName(text.to_owned()))?,
+            None => (model::NAMESPACE, text),
+        };
+        let fits = |part: &str| {
+            !part.is_empty() && part.len() <= LONGEST_NAME && !part.chars().any(char::is_control)
+        };
+        if !fits(namespace) || !fits(name) || (namespace == model::NAMESPACE && name.contains(';'))
+        {
+            return Err(NoTypeName(text.chars().take(LONGEST_NAME).collect()));
+        }
+        Ok(Self {
+            namespace: namespace.to_owned(),
+            name: name.to_owned(),
+        })
+    }
+}
+
+const LONGEST_NAME: usize = 512;
+
+/// One parameter or result of a skill type.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Parameter {
+    /// Its BrowseName.
+    pub name: String,
+    /// Type and rank.
+    pub shape: Shape,
+    /// How many elements an array has, where the type says so.
+    pub length: Option<u32>,
+    /// What counts where nothing is given. A parameter without it must be given.
+    pub default: Option<Value>,
+    /// The unit by its symbol, as `m/s`.
+    pub unit: Option<String>,
+    /// The lowest and the highest of a number.
+    pub range: Option<(f64, f64)>,
+    /// What it means, for people.
+    pub about: String,
+}
+
+impl Parameter {
+    /// Takes a value for it.
+    ///
+    /// # Errors
+    /// BadTypeMismatch for one of another type, BadInvalidArgument for a number out of range or none at all, or an array of
+    /// another length.
+    pub fn take(&self, value: Value) -> Result<Value, Refusal> {
+        let Self { name, shape, .. } = self;
+        let given = value.shape();
+        let Some(value) = shape.take(value) else {
+            return Err(Refusal::new(
+                Code::TypeMismatch,
+                format!("{name} is {shape}, and {given} was given"),
+            ));
+        };
+        let wrong = |why: String| Err(Refusal::new(Code::InvalidArgument, format!("{name} {why}")));
+        if value.is_unreal() {
+            return wrong(format!("has a value that is no number: {value}"));
+        }
+        if let Value::Array(_, elements) = &value
+            && let Some(length) = self.length
+            && u32::try_from(elements.len()) != Ok(length)
+        {
+            return wrong(format!(
+                "has {length} values, and {} were given",
+                elements.len()
+            ));
+        }
+        if let (Some((low, high)), Some(number)) = (self.range, value.as_f64())
+            && !(low..=high).contains(&number)
+        {
+            return wrong(format!("is from {low} to {high}, and {number} was given"));
+        }
+        Ok(value)
+    }
+}
+
+/// The parameters of one run, complete and checked, in the order of the type.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Parameters(Vec<(String, Value)>);
+
+impl Parameters {
+    /// Completes what was given with the defaults of the type.
+    ///
+    /// # Errors
+    /// BadArgumentsMissing with the names of those that must be given and are not, BadInvalidArgument for a name that the
+    /// type does not have or that is given twice, and as [`Parameter::take`].
+    pub fn complete(declared: &[Parameter], given: Vec<(String, Value)>) -> Result<Self, Refusal> {
+        let mut values: Vec<Option<Value>> = vec![None; declared.len()];
+        for (name, value) in given {
+            let found = declared
+                .iter()
+                .zip(&mut values)
+                .find(|(parameter, _)| parameter.name == name);
+            let Some((parameter, place)) = found else {
+                let text = format!("there is no parameter {}", shortened(&name));
+                return Err(Refusal::new(Code::InvalidArgument, text));
+            };
+            let value = parameter.take(value)?;
+            if place.replace(value).is_some() {
+                return Err(Refusal::new(
+                    Code::InvalidArgument,
+                    format!("{name} is given twice"),
+                ));
+            }
+        }
+        let complete: Vec<(&Parameter, Option<Value>)> = declared
+            .iter()
+            .zip(values)
+            .map(|(parameter, value)| (parameter, value.or_else(|| parameter.default.clone())))
+            .collect();
+        let missing: Vec<&str> = complete
+            .iter()
+            .filter(|(_, value)| value.is_none())
+            .map(|(parameter, _)| parameter.name.as_str())
+            .collect();
+        if !missing.is_empty() {
+            let text = format!("{} must be given", missing.join(", "));
+            return Err(Refusal::new(Code::ArgumentsMissing, text));
+        }
+        let named = |(parameter, value): (&Parameter, Option<Value>)| {
+            Some((parameter.name.clone(), value?))
+        };
+        Ok(Self(complete.into_iter().filter_map(named).collect()))
+    }
+
+    /// A value by the name of its parameter.
+    #[must_use]
+    pub fn get(&self, name: &str) -> Option<&Value> {
+        self.0
+            .iter()
+            .find(|(known, _)| known == name)
+            .map(|(_, value)| value)
+    }
+
+    /// A number.
+    #[must_use]
+    pub fn number(&self, name: &str) -> Option<f64> {
+        self.get(name)?.as_f64()
+    }
+
+    /// Numbers of an array.
+    #[must_use]
+    pub fn numbers(&self, name: &str) -> Option<Vec<f64>> {
+        self.get(name)?.as_f64s()
+    }
+
+    /// Six numbers of an array, as of a position with its orientation.
+    #[must_use]
+    pub fn six(&self, name: &str) -> Option<[f64; 6]> {
+        self.numbers(name)?.try_into().ok()
+    }
+
+    /// A text.
+    #[must_use]
+    pub fn text(&self, name: &str) -> Option<&str> {
+        self.get(name)?.as_str()
+    }
+
+    /// Names and values, in the order of the type.
+    #[must_use]
+    pub fn all(&self) -> &[(String, Value)] {
+        &self.0
+    }
+}
+
+/// At most 64 characters of a name from outside.
+pub(crate) fn shortened(name: &str) -> String {
+    name.chars()
+        .take(64)
+        .map(|c| if c.is_control() { '\u{fffd}' } else { c })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn move_parameters() -> Vec<Parameter> {
+        model::find("PtpMoveSkillType").unwrap().parameters()
+    }
+
+    fn refusal(given: Vec<(&str, Value)>) -> (Code, String) {
+        let given = given
+            .into_iter()
+            .map(|(name, value)| (name.to_owned(), value));
+        let refusal = Parameters::complete(&move_parameters(), given.collect()).unwrap_err();
+        (refusal.code, refusal.text)
+    }
+
+    #[test]
+    fn what_is_not_given_has_its_default_or_is_missing_by_name() {
+        let target = ("TargetPosition".to_owned(), Value::from([0.1; 6]));
+        let parameters = Parameters::complete(&move_parameters(), vec![target]).unwrap();
+        assert_eq!(parameters.number("MaxVelocity"), Some(0.2));
+        assert_eq!(parameters.six("TargetPosition"), Some([0.1; 6]));
+        assert_eq!(parameters.text("ToolFrame"), Some("flange"));
+        assert_eq!(
+            refusal(vec![]),
+            (
+                Code::ArgumentsMissing,
+                "TargetPosition must be given".to_owned()
+            )
+        );
+    }
+
+    #[test]
+    fn a_wrong_parameter_is_refused_by_name_and_with_what_is_right() {
+        let target = || ("TargetPosition", Value::from([0.1; 6]));
+        let cases = [
+            (
+                vec![("TargetPosition", Value::from(vec![0.1; 5]))],
+                Code::InvalidArgument,
+                "TargetPosition has 6 values, and 5 were given",
+            ),
+            (
+                vec![("TargetPosition", Value::from(0.1))],
+                Code::TypeMismatch,
+                "TargetPosition is Double[], and Double was given",
+            ),
+            (
+                vec![("TargetPosition", Value::from([f64::NAN; 6]))],
+                Code::InvalidArgument,
+                "TargetPosition has a value that is no number: [\"NaN\",\"NaN\",\"NaN\",\"NaN\",\"NaN\",\"NaN\"]",
+            ),
+            (
+                vec![target(), ("MaxVelocity", Value::from(-1.0))],
+                Code::InvalidArgument,
+                "MaxVelocity is from 0.001 to 10, and -1 was given",
+            ),
+            (
+                vec![target(), ("Speed", Value::from(1.0))],
+                Code::InvalidArgument,
+                "there is no parameter Speed",
+            ),
+            (
+                vec![target(), target()],
+                Code::InvalidArgument,
+                "TargetPosition is given twice",
+            ),
+        ];
+        for (given, code, text) in cases {
+            assert_eq!(refusal(given), (code, text.to_owned()));
+        }
+    }
+
+    #[test]
+    fn a_type_is_named_with_or_without_its_namespace() {
+        let own: TypeName = "GraspSkillType".parse().unwrap();
+        assert_eq!(own.to_string(), "nsu=urn:ua-bridge:skills;GraspSkillType");
+        let vendor: TypeName = "nsu=urn:vendor;v2;VacuumGraspSkillType".parse().unwrap();
+        assert_eq!(
+            (vendor.namespace.as_str(), vendor.name.as_str()),
+            ("urn:vendor;v2", "VacuumGraspSkillType")
+        );
+        assert_eq!(vendor.to_string().parse(), Ok(vendor));
+        for wrong in ["", "nsu=urn:vendor", "nsu=;x", "nsu=urn:vendor;", "a;b"] {
+            assert!(wrong.parse::<TypeName>().is_err(), "{wrong}");
+        }
+    }
+}

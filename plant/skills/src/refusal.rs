@@ -1,0 +1,80 @@
+//! Why something is not done; nothing has changed then.
+
+use std::fmt;
+
+/// What kind of refusal: a StatusCode of OPC 10000-4.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Code {
+    /// Somebody else has the lease of the component.
+    Locked,
+    /// The state machine has no such transition now.
+    InvalidState,
+    /// The skill cannot do that at all.
+    NotSupported,
+    /// A parameter that must be given is not.
+    ArgumentsMissing,
+    /// A parameter has another type.
+    TypeMismatch,
+    /// A parameter has a value that is not taken.
+    InvalidArgument,
+    /// The component ends.
+    Shutdown,
+    /// Too much waits already.
+    TooManyOperations,
+}
+
+impl Code {
+    /// Its name in OPC 10000-4.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Locked => "BadLocked",
+            Self::InvalidState => "BadInvalidState",
+            Self::NotSupported => "BadNotSupported",
+            Self::ArgumentsMissing => "BadArgumentsMissing",
+            Self::TypeMismatch => "BadTypeMismatch",
+            Self::InvalidArgument => "BadInvalidArgument",
+            Self::Shutdown => "BadShutdown",
+            Self::TooManyOperations => "BadTooManyOperations",
+        }
+    }
+
+    /// Its number (OPC 10000-6, A.2).
+    #[must_use]
+    pub const fn number(self) -> u32 {
+        match self {
+            Self::Locked => 0x80E9_0000,
+            Self::InvalidState => 0x80AF_0000,
+            Self::NotSupported => 0x803D_0000,
+            Self::ArgumentsMissing => 0x8076_0000,
+            Self::TypeMismatch => 0x8074_0000,
+            Self::InvalidArgument => 0x80AB_0000,
+            Self::Shutdown => 0x800C_0000,
+            Self::TooManyOperations => 0x8010_0000,
+        }
+    }
+}
+
+/// A refusal with its reason for people. As text `BadInvalidState: <reason>`.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub struct Refusal {
+    /// What kind.
+    pub code: Code,
+    /// Why, in a sentence.
+    pub text: String,
+}
+
+impl Refusal {
+    pub(crate) fn new(code: Code, text: impl Into<String>) -> Self {
+        Self {
+            code,
+            text: text.into(),
+        }
+    }
+}
+
+impl fmt::Display for Refusal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}: {}", self.code.name(), self.text)
+    }
+}

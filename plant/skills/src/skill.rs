@@ -1,0 +1,231 @@
+//! A skill that is executed here: the handle, and what it is made of.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use program::{Method, State};
+use tokio::sync::{mpsc, oneshot, watch};
+
+use crate::actor::{Actor, Call, Order};
+use crate::authority::{Authority, Owner};
+use crate::driver::Driver;
+use crate::parameters::{Parameter, TypeName, shortened};
+use crate::refusal::{Code, Refusal};
+use crate::shown::{Observer, Outcome, Shown};
+use crate::value::Value;
+
+/// What a skill is, for as long as it is there.
+#[derive(Debug, Clone)]
+pub struct Facts {
+    /// What its component calls it.
+    pub name: String,
+    /// Its type and all supertypes, nearest first.
+    pub types: Vec<TypeName>,
+    /// What a run is told.
+    pub parameters: Vec<Parameter>,
+    /// What a run says at its end.
+    pub results: Vec<Parameter>,
+    /// The IRIs of the capabilities it provides.
+    pub capabilities: Vec<String>,
+    /// How long a run may take; `None` for as long as it likes.
+    pub timeout: Option<Duration>,
+}
+
+/// A skill that is executed here. Clones are of the same one; it ends with the last of them, its run being stopped.
+#[derive(Debug, Clone)]
+pub struct Skill {
+    facts: Arc<Facts>,
+    authority: Authority,
+    pending: Arc<Mutex<Pending>>,
+    orders: mpsc::Sender<Order>,
+    shown: watch::Receiver<Arc<Shown>>,
+    outcomes: Arc<Mutex<VecDeque<Arc<Outcome>>>>,
+}
+
+/// Parameters written for the next run, and by whom: those of one client are nothing to the next.
+#[derive(Debug, Default)]
+pub(crate) struct Pending {
+    by: Option<Owner>,
+    values: BTreeMap<String, Value>,
+}
+
+impl Pending {
+    /// Those of this owner.
+    fn of(&mut self, by: &Owner) -> &mut BTreeMap<String, Value> {
+        if self.by.as_ref() != Some(by) {
+            self.by = Some(by.clone());
+            self.values.clear();
+        }
+        &mut self.values
+    }
+
+    pub(crate) fn given(&mut self, by: &Owner) -> Vec<(String, Value)> {
+        self.of(by).clone().into_iter().collect()
+    }
+
+    pub(crate) fn kept(&mut self, by: &Owner, values: &[(String, Value)]) {
+        *self.of(by) = values.iter().cloned().collect();
+    }
+}
+
+impl Skill {
+    /// Starts a skill, in Halted. Needs a tokio runtime.
+    #[must_use]
+    pub fn spawn(
+        facts: Facts,
+        driver: Arc<dyn Driver>,
+        authority: Authority,
+        observers: Vec<Box<dyn Observer>>,
+    ) -> Self {
+        let facts = Arc::new(facts);
+        let pending = Arc::new(Mutex::new(Pending::default()));
+        let outcomes = Arc::default();
+        let (orders, waiting) = mpsc::channel(MOST_ORDERS);
+        let (actor, shown) = Actor::new(
+            (Arc::clone(&facts), driver),
+            authority.clone(),
+            (Arc::clone(&pending), Arc::clone(&outcomes)),
+            observers,
+        );
+        drop(tokio::spawn(actor.run(waiting)));
+        Self {
+            facts,
+            authority,
+            pending,
+            orders,
+            shown,
+            outcomes,
+        }
+    }
+
+    /// What it is.
+    #[must_use]
+    pub fn facts(&self) -> &Arc<Facts> {
+        &self.facts
+    }
+
+    /// How it is now.
+    #[must_use]
+    pub fn shown(&self) -> Arc<Shown> {
+        self.shown.borrow().clone()
+    }
+
+    /// How it is, and each change; of changes that follow each other closely the newest. An [`Observer`] hears of all.
+    #[must_use]
+    pub fn watch(&self) -> watch::Receiver<Arc<Shown>> {
+        self.shown.clone()
+    }
+
+    /// How a run ended, of the newest ones.
+    #[must_use]
+    pub fn outcome(&self, run: u32) -> Option<Arc<Outcome>> {
+        lock(&self.outcomes)
+            .iter()
+            .find(|outcome| outcome.run == run)
+            .cloned()
+    }
+
+    /// Writes a parameter for the next run.
+    ///
+    /// # Errors
+    /// BadLocked, BadInvalidState while a run goes on, BadInvalidArgument for a name that is none of the type, and as
+    /// [`Parameter::take`]. Nothing has changed then.
+    pub fn write(&self, by: &Owner, name: &str, value: Value) -> Result<(), Refusal> {
+        self.authority.claim(by)?;
+        let written = self.written(by, name, value);
+        self.authority.settle();
+        written
+    }
+
+    fn written(&self, by: &Owner, name: &str, value: Value) -> Result<(), Refusal> {
+        let state = self.shown.borrow().state;
+        if matches!(state, State::Running | State::Suspended) {
+            let text = format!("parameters are kept while the skill is {state}");
+            return Err(Refusal::new(Code::InvalidState, text));
+        }
+        let parameter = self
+            .facts
+            .parameters
+            .iter()
+            .find(|parameter| parameter.name == name);
+        let Some(parameter) = parameter else {
+            let text = format!("there is no parameter {}", shortened(name));
+            return Err(Refusal::new(Code::InvalidArgument, text));
+        };
+        let value = parameter.take(value)?;
+        lock(&self.pending).of(by).insert(name.to_owned(), value);
+        Ok(())
+    }
+
+    /// Calls a method; Start begins a run with the parameters that the same owner has written. Gives the number of the
+    /// newest run.
+    ///
+    /// # Errors
+    /// In this order: BadLocked (authority), BadInvalidState (mode), BadNotSupported (capability), BadArgumentsMissing,
+    /// BadTypeMismatch or BadInvalidArgument (parameters). Nothing has changed then.
+    pub async fn call(&self, by: Owner, method: Method) -> Result<u32, Refusal> {
+        self.order(by, method, None).await
+    }
+
+    /// Begins a run with these parameters, whatever was written before.
+    ///
+    /// # Errors
+    /// As [`call`](Self::call).
+    pub async fn start_with(
+        &self,
+        by: Owner,
+        parameters: Vec<(String, Value)>,
+    ) -> Result<u32, Refusal> {
+        self.order(by, Method::Start, Some(parameters)).await
+    }
+
+    /// Ends the skill: what runs is halted, whoever has the lease. Every later call is refused.
+    pub async fn close(&self) {
+        let (closed, ended) = oneshot::channel();
+        if self.orders.send(Order::Close(closed)).await.is_ok() {
+            // Without an answer it has ended already.
+            let _ended = ended.await;
+        }
+    }
+
+    async fn order(
+        &self,
+        by: Owner,
+        method: Method,
+        parameters: Option<Vec<(String, Value)>>,
+    ) -> Result<u32, Refusal> {
+        let (reply, answer) = oneshot::channel();
+        let call = Call {
+            by,
+            method,
+            parameters,
+            reply,
+        };
+        self.orders
+            .try_send(Order::Call(call))
+            .map_err(|error| match error {
+                mpsc::error::TrySendError::Full(_) => Refusal::new(
+                    Code::TooManyOperations,
+                    "too many calls of this skill wait already",
+                ),
+                mpsc::error::TrySendError::Closed(_) => ends(),
+            })?;
+        answer.await.unwrap_or_else(|_| Err(ends()))
+    }
+}
+
+fn ends() -> Refusal {
+    Refusal::new(Code::Shutdown, "the component ends")
+}
+
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // Each change is whole before the lock is given back.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// So many calls of one skill may wait.
+const MOST_ORDERS: usize = 16;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,536 @@
+//! One skill and a driver, without a server.
+
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::time::Instant;
+
+use async_trait::async_trait;
+use program::TRANSITIONS;
+use tokio::sync::Semaphore;
+
+use super::*;
+use crate::driver::{Results, Work};
+use crate::model;
+use crate::shown::{Told, Transitioned};
+
+const ME: Owner = Owner::Session(1);
+const OTHER: Owner = Owner::Session(2);
+
+/// Does what its `how` says, as often as it is let.
+struct Scripted {
+    how: How,
+    gate: Arc<Semaphore>,
+    began: AtomicU32,
+}
+
+enum How {
+    AtOnce,
+    WhenLet,
+    Panics,
+    Fails,
+    /// Neither ends nor hears.
+    Deaf,
+    /// Does not even give its thread back.
+    Blocks(Duration),
+}
+
+#[async_trait]
+impl Driver for Scripted {
+    fn can_suspend(&self) -> bool {
+        matches!(self.how, How::WhenLet)
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        self.began.fetch_add(1, Ordering::SeqCst);
+        match self.how {
+            How::AtOnce => {}
+            How::WhenLet => {
+                tokio::select! {
+                    permit = self.gate.acquire() => permit.unwrap().forget(),
+                    () = work.stopped() => return Err("stopped".to_owned()),
+                }
+            }
+            How::Panics => panic!("a wire is loose"),
+            How::Fails => return Err("nothing is there".to_owned()),
+            How::Deaf => std::future::pending().await,
+            How::Blocks(time) => std::thread::sleep(time),
+        }
+        Ok(vec![("Gripped".to_owned(), true.into())])
+    }
+}
+
+#[derive(Default)]
+struct Seen {
+    transitions: Vec<(u32, u32)>,
+    story: Vec<String>,
+}
+
+struct Log(Arc<Mutex<Seen>>);
+
+impl Observer for Log {
+    fn told(&self, what: Told<'_>, shown: &Shown) {
+        let mut seen = lock(&self.0);
+        match what {
+            Told::Parameters(_) => seen.story.push("parameters".to_owned()),
+            Told::Transition(Transitioned {
+                transition, run, ..
+            }) => {
+                assert_eq!(shown.state, transition.to);
+                seen.transitions.push((transition.number, *run));
+                seen.story.push(transition.name.to_owned());
+            }
+            Told::Progress => seen.story.push(format!("step {}", shown.step)),
+            Told::Outcome(outcome) => seen.story.push(format!("outcome {}", outcome.succeeded)),
+            Told::Called => {}
+        }
+    }
+}
+
+struct Bench {
+    skill: Skill,
+    driver: Arc<Scripted>,
+    gate: Arc<Semaphore>,
+    seen: Arc<Mutex<Seen>>,
+}
+
+fn facts(type_name: &str, timeout: Option<Duration>) -> Facts {
+    let skill_type = model::find(type_name).unwrap();
+    Facts {
+        name: "Grasp".to_owned(),
+        types: skill_type
+            .chain()
+            .map(|of| TypeName::own(of.name))
+            .collect(),
+        parameters: skill_type.parameters(),
+        results: skill_type.results(),
+        capabilities: Vec::new(),
+        timeout,
+    }
+}
+
+fn bench_of(how: How, type_name: &str, timeout: Option<Duration>) -> Bench {
+    let gate = Arc::new(Semaphore::new(0));
+    let driver = Arc::new(Scripted {
+        how,
+        gate: Arc::clone(&gate),
+        began: AtomicU32::new(0),
+    });
+    let seen = Arc::default();
+    let log = Box::new(Log(Arc::clone(&seen)));
+    let skill = Skill::spawn(
+        facts(type_name, timeout),
+        driver.clone(),
+        Authority::new(),
+        vec![log],
+    );
+    Bench {
+        skill,
+        driver,
+        gate,
+        seen,
+    }
+}
+
+fn bench(how: How) -> Bench {
+    bench_of(how, "GraspSkillType", None)
+}
+
+impl Bench {
+    async fn call(&self, method: Method) -> Result<u32, Refusal> {
+        self.skill.call(ME, method).await
+    }
+
+    async fn until(&self, state: State) -> Arc<Shown> {
+        let mut watch = self.skill.watch();
+        let found = tokio::time::timeout(
+            Duration::from_secs(5),
+            watch.wait_for(|shown| shown.state == state),
+        )
+        .await;
+        found.expect("the state comes in time").unwrap().clone()
+    }
+
+    async fn run_to(&self, state: State) -> Arc<Shown> {
+        self.call(Method::Reset).await.unwrap();
+        self.call(Method::Start).await.unwrap();
+        self.until(state).await
+    }
+
+    fn numbers(&self) -> Vec<u32> {
+        lock(&self.seen)
+            .transitions
+            .iter()
+            .map(|(number, _)| *number)
+            .collect()
+    }
+}
+
+#[tokio::test]
+async fn of_twenty_calls_eight_are_taken_and_the_others_change_nothing() {
+    let mut taken = 0;
+    for state in State::ALL {
+        for method in Method::ALL {
+            let bench = bench(How::WhenLet);
+            let way: &[Method] = match state {
+                State::Halted => &[],
+                State::Ready => &[Method::Reset],
+                State::Running => &[Method::Reset, Method::Start],
+                State::Suspended => &[Method::Reset, Method::Start, Method::Suspend],
+            };
+            for step in way {
+                bench.call(*step).await.unwrap();
+            }
+            let before = (bench.skill.shown(), bench.numbers());
+            assert_eq!(before.0.state, state);
+            let executable = Method::ALL
+                .iter()
+                .zip(before.0.executable)
+                .any(|(of, can)| *of == method && can);
+            match bench.call(method).await {
+                Ok(_) => {
+                    assert!(executable);
+                    taken += 1;
+                }
+                Err(refusal) => {
+                    assert!(!executable, "{method} in {state}: {refusal}");
+                    assert_eq!(refusal.code, Code::InvalidState);
+                    let after = bench.skill.shown();
+                    assert_eq!(
+                        (after.state, after.run, &after.parameters),
+                        (state, before.0.run, &before.0.parameters)
+                    );
+                    assert_eq!(bench.numbers(), before.1);
+                }
+            }
+        }
+    }
+    assert_eq!(taken, 8);
+}
+
+#[tokio::test]
+async fn each_of_the_nine_transitions_is_told_once_and_in_order() {
+    let bench = bench(How::WhenLet);
+    let calls = [
+        Method::Reset,   // 1
+        Method::Halt,    // 9
+        Method::Reset,   // 1
+        Method::Start,   // 2
+        Method::Suspend, // 5
+        Method::Resume,  // 6
+        Method::Suspend, // 5
+        Method::Reset,   // 8
+        Method::Start,   // 2
+        Method::Suspend, // 5
+        Method::Halt,    // 7
+        Method::Reset,   // 1
+        Method::Start,   // 2
+        Method::Halt,    // 3
+    ];
+    for method in calls {
+        bench.call(method).await.unwrap();
+    }
+    bench.gate.add_permits(1);
+    bench.run_to(State::Ready).await; // 1 2 4
+    assert_eq!(
+        bench.numbers(),
+        [1, 9, 1, 2, 5, 6, 5, 8, 2, 5, 7, 1, 2, 3, 1, 2, 4]
+    );
+    let mut kinds = bench.numbers();
+    kinds.sort_unstable();
+    kinds.dedup();
+    assert_eq!(kinds.len(), TRANSITIONS.len());
+    assert_eq!(bench.skill.shown().run, 4);
+}
+
+#[tokio::test]
+async fn the_transition_is_told_before_the_work_begins_and_the_outcome_before_its_end() {
+    let bench = bench(How::AtOnce);
+    let shown = bench.run_to(State::Ready).await;
+    let story = lock(&bench.seen).story.clone();
+    let expected = [
+        "HaltedToReady",
+        "parameters",
+        "ReadyToRunning",
+        "outcome true",
+        "RunningToReady",
+    ];
+    assert_eq!(story, expected);
+    let outcome = shown.outcome.clone().unwrap();
+    assert_eq!(
+        outcome.results,
+        [("Gripped".to_owned(), Value::Boolean(true))]
+    );
+    assert_eq!((shown.run, shown.progress), (1, 1.0));
+    assert_eq!(bench.skill.outcome(1), Some(outcome));
+    assert_eq!(bench.skill.outcome(2), None);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn ten_thousand_runs_that_end_at_once_never_stick() {
+    let bench = bench(How::AtOnce);
+    bench.call(Method::Reset).await.unwrap();
+    let mut watch = bench.skill.watch();
+    for run in 1..=10_000 {
+        assert_eq!(bench.call(Method::Start).await, Ok(run));
+        let ended = watch.wait_for(|shown| shown.state == State::Ready && shown.run == run);
+        let ended = tokio::time::timeout(Duration::from_secs(5), ended).await;
+        assert!(ended.is_ok(), "run {run} does not end");
+    }
+    assert_eq!(bench.driver.began.load(Ordering::SeqCst), 10_000);
+}
+
+#[tokio::test]
+async fn of_two_clients_that_race_one_begins_one_run_with_its_own_parameters() {
+    let bench = bench(How::WhenLet);
+    bench.call(Method::Reset).await.unwrap();
+    bench.skill.write(&ME, "Force", 7.0.into()).unwrap();
+    let refusal = bench
+        .skill
+        .write(&OTHER, "Force", 900.0.into())
+        .unwrap_err();
+    assert_eq!(
+        refusal.to_string(),
+        "BadLocked: session 1 has the lease of this component"
+    );
+    let (first, second) = tokio::join!(
+        bench.call(Method::Start),
+        bench.skill.call(OTHER, Method::Start)
+    );
+    assert_eq!(first, Ok(1));
+    assert_eq!(second.unwrap_err().code, Code::Locked);
+    assert_eq!(bench.skill.shown().parameters.number("Force"), Some(7.0));
+    // Authority comes before everything else.
+    let refusal = bench.skill.call(OTHER, Method::Reset).await.unwrap_err();
+    assert_eq!(refusal.code, Code::Locked);
+    // The run outlives the session; the lease does not.
+    bench.skill.authority.release(&ME);
+    assert_eq!(bench.skill.shown().state, State::Running);
+    bench.gate.add_permits(1);
+    bench.until(State::Ready).await;
+    assert!(bench.skill.outcome(1).unwrap().succeeded);
+    // What the first client wrote is nothing to the second.
+    bench.skill.call(OTHER, Method::Start).await.unwrap();
+    assert_eq!(bench.skill.shown().parameters.number("Force"), Some(20.0));
+}
+
+#[tokio::test]
+async fn a_space_has_the_lease_while_its_run_goes_on_and_no_longer() {
+    let bench = bench(How::WhenLet);
+    let space = Owner::Space(2);
+    bench
+        .skill
+        .call(space.clone(), Method::Reset)
+        .await
+        .unwrap();
+    assert_eq!(*bench.skill.authority.holder().borrow(), None);
+    bench.skill.start_with(space.clone(), vec![]).await.unwrap();
+    assert_eq!(*bench.skill.authority.holder().borrow(), Some(space));
+    assert_eq!(
+        bench.call(Method::Halt).await.unwrap_err().code,
+        Code::Locked
+    );
+    bench.gate.add_permits(1);
+    bench.until(State::Ready).await;
+    assert_eq!(*bench.skill.authority.holder().borrow(), None);
+    assert!(bench.call(Method::Halt).await.is_ok());
+}
+
+#[tokio::test]
+async fn a_wrong_or_missing_parameter_moves_nothing() {
+    let bench = bench_of(How::AtOnce, "PtpMoveSkillType", None);
+    bench.call(Method::Reset).await.unwrap();
+    let refusal = bench.call(Method::Start).await.unwrap_err();
+    assert_eq!(
+        refusal.to_string(),
+        "BadArgumentsMissing: TargetPosition must be given"
+    );
+    let refusal = bench
+        .skill
+        .write(&ME, "TargetPosition", vec![1.0].into())
+        .unwrap_err();
+    assert_eq!(
+        refusal.to_string(),
+        "BadInvalidArgument: TargetPosition has 6 values, and 1 were given"
+    );
+    let fast = vec![
+        ("TargetPosition".to_owned(), [0.1; 6].into()),
+        ("MaxVelocity".to_owned(), 99.0.into()),
+    ];
+    let refusal = bench.skill.start_with(ME, fast).await.unwrap_err();
+    assert_eq!(refusal.code, Code::InvalidArgument);
+    assert_eq!(
+        (bench.skill.shown().state, bench.skill.shown().run),
+        (State::Ready, 0)
+    );
+    assert_eq!(bench.driver.began.load(Ordering::SeqCst), 0);
+    bench
+        .skill
+        .write(&ME, "TargetPosition", [0.1; 6].into())
+        .unwrap();
+    assert_eq!(bench.call(Method::Start).await, Ok(1));
+}
+
+#[tokio::test]
+async fn parameters_of_a_run_are_kept_while_it_goes_on() {
+    let bench = bench(How::WhenLet);
+    bench.run_to(State::Running).await;
+    let refusal = bench.skill.write(&ME, "Force", 1.0.into()).unwrap_err();
+    assert_eq!(refusal.code, Code::InvalidState);
+    assert_eq!(bench.skill.shown().parameters.number("Force"), Some(20.0));
+}
+
+#[tokio::test]
+async fn a_driver_that_breaks_down_or_fails_leaves_a_halted_skill_that_says_why() {
+    for (how, why) in [
+        (How::Panics, "the driver broke down: a wire is loose"),
+        (How::Fails, "nothing is there"),
+    ] {
+        let bench = bench(how);
+        let shown = bench.run_to(State::Halted).await;
+        let outcome = shown.outcome.clone().unwrap();
+        assert_eq!(
+            (outcome.run, outcome.succeeded, outcome.message.as_str()),
+            (1, false, why)
+        );
+        assert_eq!(bench.numbers(), [1, 2, 3]);
+        assert!(
+            bench.call(Method::Reset).await.is_ok(),
+            "it can be used again"
+        );
+    }
+}
+
+#[tokio::test]
+async fn a_driver_that_does_not_hear_is_broken_off() {
+    let bench = bench(How::Deaf);
+    bench.run_to(State::Running).await;
+    let asked = Instant::now();
+    bench.call(Method::Halt).await.unwrap();
+    assert!(asked.elapsed() < Duration::from_secs(2));
+    let shown = bench.until(State::Halted).await;
+    let message = &shown.outcome.as_ref().unwrap().message;
+    assert!(message.ends_with("was broken off"), "{message}");
+    bench.call(Method::Reset).await.unwrap();
+    assert_eq!(bench.call(Method::Start).await, Ok(2));
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn what_still_blocks_is_not_started_anew() {
+    let bench = bench(How::Blocks(Duration::from_secs(2)));
+    bench.run_to(State::Running).await;
+    bench.call(Method::Halt).await.unwrap();
+    let refusal = bench.call(Method::Reset).await.unwrap_err();
+    assert_eq!(
+        refusal.to_string(),
+        "BadInvalidState: the work of run 1 has not come to an end"
+    );
+    assert_eq!(bench.skill.shown().state, State::Halted);
+    let free = async {
+        while bench.call(Method::Reset).await.is_err() {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    tokio::time::timeout(Duration::from_secs(5), free)
+        .await
+        .unwrap();
+    assert_eq!(bench.skill.shown().state, State::Ready);
+}
+
+#[tokio::test]
+async fn a_run_that_takes_too_long_fails() {
+    let bench = bench_of(
+        How::WhenLet,
+        "GraspSkillType",
+        Some(Duration::from_millis(20)),
+    );
+    let shown = bench.run_to(State::Halted).await;
+    assert_eq!(
+        shown.outcome.as_ref().unwrap().message,
+        "the work was not done within 20ms"
+    );
+    // Time in which it stands still does not count.
+    bench.call(Method::Reset).await.unwrap();
+    bench.call(Method::Start).await.unwrap();
+    bench.call(Method::Suspend).await.unwrap();
+    tokio::time::sleep(Duration::from_millis(40)).await;
+    assert_eq!(bench.skill.shown().state, State::Suspended);
+    bench.gate.add_permits(1);
+    bench.call(Method::Resume).await.unwrap();
+    bench.until(State::Ready).await;
+}
+
+#[tokio::test]
+async fn work_that_is_done_while_it_is_suspended_ends_when_it_is_resumed() {
+    let bench = bench(How::WhenLet);
+    bench.run_to(State::Running).await;
+    bench.call(Method::Suspend).await.unwrap();
+    bench.gate.add_permits(1);
+    while bench.gate.available_permits() > 0 {
+        tokio::task::yield_now().await;
+    }
+    tokio::task::yield_now().await;
+    assert_eq!(bench.skill.shown().state, State::Suspended);
+    bench.call(Method::Resume).await.unwrap();
+    bench.until(State::Ready).await;
+    assert_eq!(bench.numbers(), [1, 2, 5, 6, 4]);
+}
+
+#[tokio::test]
+async fn suspending_is_refused_where_the_driver_cannot() {
+    let bench = bench(How::Deaf);
+    let refusal = bench.call(Method::Suspend).await.unwrap_err();
+    assert_eq!(
+        refusal.code,
+        Code::InvalidState,
+        "mode comes before capability"
+    );
+    bench.run_to(State::Running).await;
+    assert_eq!(
+        bench.call(Method::Suspend).await.unwrap_err().code,
+        Code::NotSupported
+    );
+}
+
+#[tokio::test]
+async fn a_component_does_one_thing_at_a_time() {
+    let gate = Arc::new(Semaphore::new(0));
+    let driver = Arc::new(Scripted {
+        how: How::WhenLet,
+        gate: Arc::clone(&gate),
+        began: AtomicU32::new(0),
+    });
+    let authority = Authority::new();
+    let skill = |name: &str| {
+        let facts = Facts {
+            name: name.to_owned(),
+            ..facts("GraspSkillType", None)
+        };
+        Skill::spawn(facts, driver.clone(), authority.clone(), Vec::new())
+    };
+    let (one, two) = (skill("One"), skill("Two"));
+    for skill in [&one, &two] {
+        skill.call(ME, Method::Reset).await.unwrap();
+    }
+    one.call(ME, Method::Start).await.unwrap();
+    let refusal = two.call(ME, Method::Start).await.unwrap_err();
+    assert_eq!(
+        refusal.to_string(),
+        "BadInvalidState: One of this component runs, and it does one thing at a time"
+    );
+    assert_eq!(two.shown().state, State::Ready);
+    one.call(ME, Method::Halt).await.unwrap();
+    assert!(two.call(ME, Method::Start).await.is_ok());
+}
+
+#[tokio::test]
+async fn at_the_end_of_the_component_what_runs_is_halted() {
+    let bench = bench(How::WhenLet);
+    bench.run_to(State::Running).await;
+    bench.skill.close().await;
+    let outcome = bench.skill.outcome(1).unwrap();
+    assert_eq!(outcome.message, "halted by the end of the component");
+    assert_eq!(bench.skill.shown().state, State::Halted);
+    assert_eq!(
+        bench.call(Method::Reset).await.unwrap_err().code,
+        Code::Shutdown
+    );
+}

@@ -1,0 +1,410 @@
+//! Values of parameters and results: the builtin types of OPC UA that a skill is told in.
+
+use std::fmt;
+
+use serde_json::Value as Json;
+
+macro_rules! builtins {
+    ($($(#[$doc:meta])* $name:ident = $id:literal,)*) => {
+        /// A builtin type (OPC 10000-6, 5.1.2); the numbers are its identifiers in namespace 0.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+        pub enum Builtin { $($(#[$doc])* $name = $id,)* }
+
+        impl Builtin {
+            /// All of them, by their numbers.
+            pub const ALL: &'static [Self] = &[$(Self::$name),*];
+
+            /// As `Double`.
+            #[must_use]
+            pub const fn name(self) -> &'static str {
+                match self { $(Self::$name => stringify!($name)),* }
+            }
+
+            /// The numeric identifier of the data type in namespace 0.
+            #[must_use]
+            pub const fn id(self) -> u8 {
+                match self { $(Self::$name => $id),* }
+            }
+        }
+    };
+}
+
+builtins! {
+    /// true or false
+    Boolean = 1,
+    /// 8 bits with a sign
+    SByte = 2,
+    /// 8 bits
+    Byte = 3,
+    /// 16 bits with a sign
+    Int16 = 4,
+    /// 16 bits
+    UInt16 = 5,
+    /// 32 bits with a sign
+    Int32 = 6,
+    /// 32 bits
+    UInt32 = 7,
+    /// 64 bits with a sign
+    Int64 = 8,
+    /// 64 bits
+    UInt64 = 9,
+    /// IEEE 754, 32 bits
+    Float = 10,
+    /// IEEE 754, 64 bits
+    Double = 11,
+    /// UTF-8
+    String = 12,
+}
+
+impl Builtin {
+    /// The type of that number in namespace 0, where it is one of those.
+    #[must_use]
+    pub fn of_id(id: u32) -> Option<Self> {
+        Self::ALL
+            .iter()
+            .copied()
+            .find(|builtin| u32::from(builtin.id()) == id)
+    }
+}
+
+/// A builtin type and its rank: one value, or an array of one dimension.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Shape {
+    /// Of the value, or of each element.
+    pub builtin: Builtin,
+    /// Whether there are several.
+    pub array: bool,
+}
+
+impl Shape {
+    /// One value.
+    #[must_use]
+    pub const fn scalar(builtin: Builtin) -> Self {
+        Self {
+            builtin,
+            array: false,
+        }
+    }
+
+    /// An array of one dimension.
+    #[must_use]
+    pub const fn array(builtin: Builtin) -> Self {
+        Self {
+            builtin,
+            array: true,
+        }
+    }
+
+    /// The value that a JSON text has in this shape.
+    ///
+    /// # Errors
+    /// What is expected instead, for people. Numbers are never rounded or cut.
+    pub fn read_json(self, json: &Json) -> Result<Value, String> {
+        if !self.array {
+            return scalar_of_json(self.builtin, json);
+        }
+        let Json::Array(elements) = json else {
+            return Err(format!("expected an array of {}", self.builtin.name()));
+        };
+        let elements = elements
+            .iter()
+            .map(|element| scalar_of_json(self.builtin, element));
+        Ok(Value::Array(
+            self.builtin,
+            elements.collect::<Result<_, _>>()?,
+        ))
+    }
+
+    /// The value in this shape where it can be without loss: itself, or a number in a wider type.
+    #[must_use]
+    pub fn take(self, value: Value) -> Option<Value> {
+        if value.shape() == self {
+            return Some(value);
+        }
+        match value {
+            Value::Array(_, elements) if self.array => {
+                let one = Self::scalar(self.builtin);
+                let elements = elements.into_iter().map(|element| one.take(element));
+                Some(Value::Array(self.builtin, elements.collect::<Option<_>>()?))
+            }
+            Value::String(_) | Value::Boolean(_) | Value::Array(..) => None,
+            number if !self.array => scalar_of_json(self.builtin, &number.to_json()).ok(),
+            _ => None,
+        }
+    }
+}
+
+impl fmt::Display for Shape {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.builtin.name())?;
+        f.write_str(if self.array { "[]" } else { "" })
+    }
+}
+
+/// A value of one of the builtin types, or an array of them.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Value {
+    /// true or false
+    Boolean(bool),
+    /// 8 bits with a sign
+    SByte(i8),
+    /// 8 bits
+    Byte(u8),
+    /// 16 bits with a sign
+    Int16(i16),
+    /// 16 bits
+    UInt16(u16),
+    /// 32 bits with a sign
+    Int32(i32),
+    /// 32 bits
+    UInt32(u32),
+    /// 64 bits with a sign
+    Int64(i64),
+    /// 64 bits
+    UInt64(u64),
+    /// IEEE 754, 32 bits
+    Float(f32),
+    /// IEEE 754, 64 bits
+    Double(f64),
+    /// UTF-8
+    String(String),
+    /// Values that all are of the type said first.
+    Array(Builtin, Vec<Self>),
+}
+
+impl Value {
+    /// What type it is of.
+    #[must_use]
+    pub fn shape(&self) -> Shape {
+        let builtin = match self {
+            Self::Boolean(_) => Builtin::Boolean,
+            Self::SByte(_) => Builtin::SByte,
+            Self::Byte(_) => Builtin::Byte,
+            Self::Int16(_) => Builtin::Int16,
+            Self::UInt16(_) => Builtin::UInt16,
+            Self::Int32(_) => Builtin::Int32,
+            Self::UInt32(_) => Builtin::UInt32,
+            Self::Int64(_) => Builtin::Int64,
+            Self::UInt64(_) => Builtin::UInt64,
+            Self::Float(_) => Builtin::Float,
+            Self::Double(_) => Builtin::Double,
+            Self::String(_) => Builtin::String,
+            Self::Array(builtin, _) => return Shape::array(*builtin),
+        };
+        Shape::scalar(builtin)
+    }
+
+    /// As JSON. Numbers that JSON has none for are the texts `NaN`, `Infinity`, `-Infinity`, as OPC 10000-6 has it (5.4.2.4).
+    #[must_use]
+    pub fn to_json(&self) -> Json {
+        match self {
+            Self::Boolean(value) => (*value).into(),
+            Self::SByte(value) => (*value).into(),
+            Self::Byte(value) => (*value).into(),
+            Self::Int16(value) => (*value).into(),
+            Self::UInt16(value) => (*value).into(),
+            Self::Int32(value) => (*value).into(),
+            Self::UInt32(value) => (*value).into(),
+            Self::Int64(value) => (*value).into(),
+            Self::UInt64(value) => (*value).into(),
+            Self::Float(value) => real(f64::from(*value)),
+            Self::Double(value) => real(*value),
+            Self::String(value) => value.clone().into(),
+            Self::Array(_, elements) => elements.iter().map(Self::to_json).collect(),
+        }
+    }
+
+    /// A single number, of whatever type, as Double.
+    #[must_use]
+    pub fn as_f64(&self) -> Option<f64> {
+        match self {
+            Self::Boolean(_) | Self::String(_) | Self::Array(..) => None,
+            Self::Float(value) => Some(f64::from(*value)),
+            Self::Double(value) => Some(*value),
+            whole => whole.to_json().as_f64(),
+        }
+    }
+
+    /// An array of numbers as Double.
+    #[must_use]
+    pub fn as_f64s(&self) -> Option<Vec<f64>> {
+        match self {
+            Self::Array(_, elements) => elements.iter().map(Self::as_f64).collect(),
+            _ => None,
+        }
+    }
+
+    /// A text.
+    #[must_use]
+    pub fn as_str(&self) -> Option<&str> {
+        match self {
+            Self::String(text) => Some(text),
+            _ => None,
+        }
+    }
+
+    /// A Boolean.
+    #[must_use]
+    pub fn as_bool(&self) -> Option<bool> {
+        match self {
+            Self::Boolean(value) => Some(*value),
+            _ => None,
+        }
+    }
+
+    /// Whether a number in it is none, or has no end: nothing that a machine should be told.
+    #[must_use]
+    pub fn is_unreal(&self) -> bool {
+        match self {
+            Self::Float(value) => !value.is_finite(),
+            Self::Double(value) => !value.is_finite(),
+            Self::Array(_, elements) => elements.iter().any(Self::is_unreal),
+            _ => false,
+        }
+    }
+}
+
+/// As JSON.
+impl fmt::Display for Value {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}", self.to_json())
+    }
+}
+
+macro_rules! from {
+    ($($type:ty => $variant:ident),* $(,)?) => {$(
+        impl From<$type> for Value {
+            fn from(value: $type) -> Self {
+                Self::$variant(value.into())
+            }
+        }
+    )*};
+}
+
+from! { bool => Boolean, i32 => Int32, u32 => UInt32, f32 => Float, f64 => Double, String => String, &str => String }
+
+impl From<Vec<f64>> for Value {
+    fn from(values: Vec<f64>) -> Self {
+        Self::Array(
+            Builtin::Double,
+            values.into_iter().map(Self::Double).collect(),
+        )
+    }
+}
+
+impl From<[f64; 6]> for Value {
+    fn from(values: [f64; 6]) -> Self {
+        values.to_vec().into()
+    }
+}
+
+fn real(value: f64) -> Json {
+    match serde_json::Number::from_f64(value) {
+        Some(number) => Json::Number(number),
+        None if value.is_nan() => "NaN".into(),
+        None if value > 0.0 => "Infinity".into(),
+        None => "-Infinity".into(),
+    }
+}
+
+fn scalar_of_json(builtin: Builtin, json: &Json) -> Result<Value, String> {
+    let whole = json.as_i64();
+    let natural = json.as_u64();
+    let value = match builtin {
+        Builtin::Boolean => json.as_bool().map(Value::Boolean),
+        Builtin::SByte => whole.and_then(|n| n.try_into().ok()).map(Value::SByte),
+        Builtin::Byte => natural.and_then(|n| n.try_into().ok()).map(Value::Byte),
+        Builtin::Int16 => whole.and_then(|n| n.try_into().ok()).map(Value::Int16),
+        Builtin::UInt16 => natural.and_then(|n| n.try_into().ok()).map(Value::UInt16),
+        Builtin::Int32 => whole.and_then(|n| n.try_into().ok()).map(Value::Int32),
+        Builtin::UInt32 => natural.and_then(|n| n.try_into().ok()).map(Value::UInt32),
+        Builtin::Int64 => whole.map(Value::Int64),
+        Builtin::UInt64 => natural.map(Value::UInt64),
+        Builtin::Float => real_of_json(json).and_then(narrow).map(Value::Float),
+        Builtin::Double => real_of_json(json).map(Value::Double),
+        Builtin::String => json.as_str().map(|text| Value::String(text.to_owned())),
+    };
+    value.ok_or_else(|| format!("expected {}, found {}", builtin.name(), shown(json)))
+}
+
+/// At most 40 characters of a JSON text.
+fn shown(json: &Json) -> String {
+    let text = json.to_string();
+    let mut short: String = text.chars().take(40).collect();
+    if short.len() < text.len() {
+        short.push_str("...");
+    }
+    short
+}
+
+fn real_of_json(json: &Json) -> Option<f64> {
+    match json.as_str() {
+        Some("NaN") => Some(f64::NAN),
+        Some("Infinity") => Some(f64::INFINITY),
+        Some("-Infinity") => Some(f64::NEG_INFINITY),
+        Some(_) => None,
+        None => json.as_f64(),
+    }
+}
+
+/// The nearest Float; none where that would be infinite.
+fn narrow(value: f64) -> Option<f32> {
+    #[expect(
+        clippy::cast_possible_truncation,
+        reason = "rounding to the nearest is what a Float is given for"
+    )]
+    let narrow = value as f32;
+    (narrow.is_finite() || !value.is_finite()).then_some(narrow)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_value_is_the_same_after_its_way_through_json() {
+        let values = [
+            Value::from(true),
+            Value::SByte(-7),
+            Value::UInt64(u64::MAX),
+            Value::Int64(i64::MIN),
+            Value::Float(0.1),
+            Value::from(1.5),
+            Value::from("ja \"so\""),
+            Value::from([0.1, 0.2, 0.3, 0.0, -1.5, 1e300]),
+            Value::Array(Builtin::String, Vec::new()),
+            Value::from(f64::INFINITY),
+        ];
+        for value in values {
+            assert_eq!(value.shape().read_json(&value.to_json()), Ok(value));
+        }
+    }
+
+    #[test]
+    fn numbers_that_do_not_fit_are_refused_and_never_cut() {
+        let read = |builtin, text: &str| {
+            Shape::scalar(builtin).read_json(&serde_json::from_str(text).unwrap())
+        };
+        assert!(read(Builtin::Byte, "256").is_err());
+        assert!(read(Builtin::UInt16, "-1").is_err());
+        assert!(read(Builtin::Int32, "1.5").is_err());
+        assert!(read(Builtin::Float, "1e300").is_err());
+        assert_eq!(read(Builtin::Double, "3"), Ok(Value::Double(3.0)));
+        assert_eq!(
+            read(Builtin::Boolean, "1"),
+            Err("expected Boolean, found 1".to_owned())
+        );
+    }
+
+    #[test]
+    fn a_narrower_number_is_taken_where_a_wider_one_is_wanted() {
+        let double = Shape::scalar(Builtin::Double);
+        assert_eq!(double.take(Value::Float(0.5)), Some(Value::Double(0.5)));
+        assert_eq!(double.take(Value::from("0.5")), None);
+        assert_eq!(double.take(Value::from(vec![0.5])), None);
+        let doubles = Shape::array(Builtin::Double);
+        let floats = Value::Array(Builtin::Float, vec![Value::Float(0.5)]);
+        assert_eq!(doubles.take(floats), Some(Value::from(vec![0.5])));
+        assert_eq!(Shape::scalar(Builtin::Byte).take(Value::Int32(300)), None);
+    }
+}
