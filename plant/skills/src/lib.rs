@@ -5,19 +5,25 @@
 
 mod actor;
 mod authority;
+mod composite;
+pub mod conformance;
 mod driver;
 pub mod model;
 mod parameters;
 mod refusal;
+mod runs;
 mod shown;
+pub mod simulated;
 mod skill;
 mod value;
 
 pub use authority::{Authority, Owner};
+pub use composite::{Broken, Job, PickAndPlace, Teller};
 pub use driver::{Driver, Results, Stopped, Work};
 pub use model::NAMESPACE;
 pub use parameters::{NoTypeName, Parameter, Parameters, TypeName};
 pub use refusal::{Code, Refusal};
+pub use runs::{LocalRun, Runs, SkillFault};
 pub use shown::{Diagnostic, LastCall, Observer, Outcome, Shown, Told, Transitioned};
 pub use skill::{Facts, Skill};
 pub use value::{Builtin, Shape, Value};

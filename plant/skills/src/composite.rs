@@ -1,0 +1,474 @@
+//! Pick and place: one skill made of those of a robot and a gripper.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use tracing::warn;
+
+use crate::driver::{Driver, Results, Work};
+use crate::parameters::Parameters;
+use crate::runs::{Runs, SkillFault};
+use crate::value::Value;
+
+/// Skills of other components that together bring a thing from one place to another.
+#[derive(Clone)]
+pub struct PickAndPlace {
+    /// PtpMoveSkillType of the robot.
+    pub ptp: Arc<dyn Runs>,
+    /// LinearMoveSkillType of the same robot.
+    pub linear: Arc<dyn Runs>,
+    /// GraspSkillType of the gripper.
+    pub grasp: Arc<dyn Runs>,
+    /// ReleaseSkillType of the same gripper.
+    pub release: Arc<dyn Runs>,
+    /// How long each of their runs may take.
+    pub within: Duration,
+}
+
+/// What to bring where.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Job {
+    /// Where the thing is: m, m, m, rad, rad, rad.
+    pub pick: [f64; 6],
+    /// Where it is to be.
+    pub place: [f64; 6],
+    /// How far above both the straight moves begin and end, m.
+    pub approach: f64,
+}
+
+/// Why the thing is not where it should be.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{step}: {why}; {}", match retreated {
+    Ok(()) => "the robot has retreated".to_owned(),
+    Err(why) => format!("the robot has not retreated: {why}"),
+})]
+pub struct Broken {
+    /// In which step.
+    pub step: &'static str,
+    /// What happened there.
+    pub why: String,
+    /// Whether the robot is away from the place, or why not.
+    pub retreated: Result<(), String>,
+}
+
+/// Who is told of the steps, and may want them to stop.
+#[async_trait]
+pub trait Teller: Send + Sync {
+    /// A step begins.
+    async fn step(&self, step: &'static str);
+
+    /// Ready when nothing more is to be done.
+    async fn stopped(&self) {
+        std::future::pending().await
+    }
+}
+
+#[async_trait]
+impl Teller for Work {
+    async fn step(&self, step: &'static str) {
+        Self::step(self, step).await;
+    }
+
+    async fn stopped(&self) {
+        Self::stopped(self).await;
+    }
+}
+
+#[async_trait]
+impl<F: Fn(&'static str) + Send + Sync> Teller for F {
+    async fn step(&self, step: &'static str) {
+        self(step);
+    }
+}
+
+/// How a step went wrong.
+enum Fault {
+    /// Halt: everything stands still where it is.
+    Stopped,
+    /// There is no robot any more that could retreat.
+    RobotLost(String),
+    Other(String),
+}
+
+impl PickAndPlace {
+    /// Does the job. When a step fails, or a component is lost, what moves is halted and the robot retreats from the place
+    /// where it is.
+    ///
+    /// # Errors
+    /// [`Broken`].
+    pub async fn run(&self, job: &Job, teller: &dyn Teller) -> Result<(), Broken> {
+        let above = |at: [f64; 6]| {
+            let [x, y, z, a, b, c] = at;
+            [x, y, z + job.approach, a, b, c]
+        };
+        let (over_pick, over_place) = (above(job.pick), above(job.place));
+        // The step, who does it, where to, and where the robot retreats to from there.
+        let at_pick = ("MovePickApproachError", &self.linear, over_pick);
+        let between = ("MovePlaceApproachError", &self.ptp, over_place);
+        let at_place = ("MovePlaceApproachError", &self.linear, over_place);
+        let steps: [(&'static str, &Arc<dyn Runs>, Option<[f64; 6]>, _); 8] = [
+            (
+                "MovePickApproachBefore",
+                &self.ptp,
+                Some(over_pick),
+                at_pick,
+            ),
+            ("MovePick", &self.linear, Some(job.pick), at_pick),
+            ("Grasp", &self.grasp, None, at_pick),
+            (
+                "MovePickApproachAfter",
+                &self.linear,
+                Some(over_pick),
+                at_pick,
+            ),
+            (
+                "MovePlaceApproachBefore",
+                &self.ptp,
+                Some(over_place),
+                between,
+            ),
+            ("MovePlace", &self.linear, Some(job.place), at_place),
+            ("Release", &self.release, None, at_place),
+            (
+                "MovePlaceApproachAfter",
+                &self.linear,
+                Some(over_place),
+                at_place,
+            ),
+        ];
+        teller.step("Init").await;
+        for (step, skill, target, retreat) in steps {
+            teller.step(step).await;
+            let fault = match self.part(skill, target, teller).await {
+                Ok(()) => continue,
+                Err(fault) => fault,
+            };
+            let (why, retreated) = match fault {
+                Fault::Stopped => (
+                    "stopped".to_owned(),
+                    Err("it was halted, and stands still".to_owned()),
+                ),
+                Fault::RobotLost(why) => (why.clone(), Err(why)),
+                Fault::Other(why) => (why, self.retreat(retreat, teller).await),
+            };
+            warn!("pick and place: {step}: {why}");
+            return Err(Broken {
+                step,
+                why,
+                retreated,
+            });
+        }
+        teller.step("Idle").await;
+        Ok(())
+    }
+
+    async fn part(
+        &self,
+        skill: &Arc<dyn Runs>,
+        target: Option<[f64; 6]>,
+        teller: &dyn Teller,
+    ) -> Result<(), Fault> {
+        let fault = tokio::select! {
+            fault = run(&**skill, target, self.within) => match fault {
+                Ok(()) => return Ok(()),
+                Err(Ran::Lost(why)) if target.is_some() => return Err(Fault::RobotLost(why)),
+                Err(Ran::Lost(why) | Ran::Failed(why)) => return Err(Fault::Other(why)),
+            },
+            why = self.ptp.lost() => return Err(Fault::RobotLost(lost(&*self.ptp, &why))),
+            why = self.linear.lost() => return Err(Fault::RobotLost(lost(&*self.linear, &why))),
+            why = self.grasp.lost() => Fault::Other(lost(&*self.grasp, &why)),
+            why = self.release.lost() => Fault::Other(lost(&*self.release, &why)),
+            () = teller.stopped() => Fault::Stopped,
+        };
+        if target.is_some()
+            && let Err(fault) = skill.halt().await
+        {
+            return Err(Fault::RobotLost(format!(
+                "{} cannot be halted: {fault}",
+                skill.name()
+            )));
+        }
+        Err(fault)
+    }
+
+    async fn retreat(
+        &self,
+        (step, skill, to): (&'static str, &Arc<dyn Runs>, [f64; 6]),
+        teller: &dyn Teller,
+    ) -> Result<(), String> {
+        teller.step(step).await;
+        tokio::select! {
+            retreated = run(&**skill, Some(to), self.within) => retreated.map_err(|fault| match fault {
+                Ran::Lost(why) | Ran::Failed(why) => why,
+            }),
+            () = teller.stopped() => {
+                // It is to stand still, and there is nothing left that could be done if it does not.
+                let halted = skill.halt().await;
+                Err(halted.err().map_or_else(|| "halted".to_owned(), |fault| fault.to_string()))
+            }
+        }
+    }
+}
+
+/// How the run of one skill did not end well.
+enum Ran {
+    Lost(String),
+    Failed(String),
+}
+
+async fn run(skill: &dyn Runs, target: Option<[f64; 6]>, within: Duration) -> Result<(), Ran> {
+    let parameters = target.map(|target| ("TargetPosition".to_owned(), Value::from(target)));
+    let name = skill.name();
+    match skill.run(parameters.into_iter().collect(), within).await {
+        Ok(outcome) if outcome.succeeded => Ok(()),
+        Ok(outcome) => Err(Ran::Failed(format!("{name} failed: {}", outcome.message))),
+        Err(SkillFault::Lost(why)) => Err(Ran::Lost(lost(skill, &why))),
+        Err(fault) => Err(Ran::Failed(format!("{name}: {fault}"))),
+    }
+}
+
+fn lost(skill: &dyn Runs, why: &str) -> String {
+    format!("{} is lost: {why}", skill.name())
+}
+
+#[async_trait]
+impl Driver for PickAndPlace {
+    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+        job(parameters).map(drop)
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let job = job(work.parameters())?;
+        Self::run(self, &job, &work)
+            .await
+            .map_err(|broken| broken.to_string())?;
+        Ok(Vec::new())
+    }
+}
+
+fn job(parameters: &Parameters) -> Result<Job, String> {
+    let six = |name: &str| {
+        parameters
+            .six(name)
+            .ok_or_else(|| format!("{name} has no six numbers"))
+    };
+    Ok(Job {
+        pick: six("PickPosition")?,
+        place: six("PlacePosition")?,
+        approach: parameters
+            .number("ApproachOffset")
+            .ok_or("ApproachOffset is no number")?,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Mutex;
+
+    use tokio::sync::watch;
+
+    use super::*;
+    use crate::authority::{Authority, Owner};
+    use crate::conformance;
+    use crate::model;
+    use crate::parameters::TypeName;
+    use crate::runs::LocalRun;
+    use crate::shown::Outcome;
+    use crate::simulated::{Arm, ArmSettings, Gripper, GripperSettings, Path};
+    use crate::skill::{Facts, Skill, lock};
+
+    const PICK: [f64; 6] = [0.4, 0.2, 0.1, 0.0, 0.0, 0.0];
+    const PLACE: [f64; 6] = [0.4, -0.2, 0.1, 0.0, 0.0, 0.0];
+    const JOB: Job = Job {
+        pick: PICK,
+        place: PLACE,
+        approach: 0.05,
+    };
+
+    /// A skill whose component can be lost.
+    struct Losable {
+        inner: LocalRun,
+        gone: watch::Receiver<bool>,
+    }
+
+    #[async_trait]
+    impl Runs for Losable {
+        fn name(&self) -> String {
+            self.inner.name()
+        }
+
+        async fn run(
+            &self,
+            parameters: Vec<(String, Value)>,
+            within: Duration,
+        ) -> Result<Outcome, SkillFault> {
+            if *self.gone.borrow() {
+                return Err(SkillFault::Lost("no answer".to_owned()));
+            }
+            self.inner.run(parameters, within).await
+        }
+
+        async fn halt(&self) -> Result<(), SkillFault> {
+            self.inner.halt().await
+        }
+
+        async fn lost(&self) -> String {
+            let mut gone = self.gone.clone();
+            let _gone = gone.wait_for(|gone| *gone).await;
+            "no answer".to_owned()
+        }
+    }
+
+    struct Cell {
+        arm: Arm,
+        gripper: Gripper,
+        composite: PickAndPlace,
+        gone: watch::Sender<bool>,
+        steps: Mutex<Vec<&'static str>>,
+    }
+
+    fn skill(name: &str, driver: Arc<dyn Driver>, authority: &Authority) -> LocalRun {
+        let of = model::find(name).unwrap();
+        let facts = Facts {
+            name: name.trim_end_matches("SkillType").to_owned(),
+            types: vec![TypeName::own(name)],
+            parameters: of.parameters(),
+            results: of.results(),
+            capabilities: Vec::new(),
+            timeout: None,
+        };
+        let skill = Skill::spawn(facts, driver, authority.clone(), Vec::new());
+        LocalRun {
+            skill,
+            by: Owner::Local("composite"),
+        }
+    }
+
+    fn cell(object: bool) -> Cell {
+        let arm = Arm::new(ArmSettings {
+            time_scale: 50.0,
+            ..ArmSettings::default()
+        });
+        let gripper = Gripper::new(GripperSettings {
+            duration: Duration::from_millis(20),
+            object,
+            time_scale: 1.0,
+        });
+        let (robot, hand) = (Authority::new(), Authority::new());
+        let (gone, watched) = watch::channel(false);
+        let losable = |name: &str, driver| {
+            Arc::new(Losable {
+                inner: skill(name, driver, &hand),
+                gone: watched.clone(),
+            })
+        };
+        let composite = PickAndPlace {
+            ptp: Arc::new(skill(
+                "PtpMoveSkillType",
+                arm.moves(Path::PointToPoint),
+                &robot,
+            )),
+            linear: Arc::new(skill(
+                "LinearMoveSkillType",
+                arm.moves(Path::Linear),
+                &robot,
+            )),
+            grasp: losable("GraspSkillType", gripper.grasp(None)),
+            release: losable("ReleaseSkillType", gripper.release(None)),
+            within: Duration::from_secs(5),
+        };
+        Cell {
+            arm,
+            gripper,
+            composite,
+            gone,
+            steps: Mutex::default(),
+        }
+    }
+
+    impl Cell {
+        async fn run(&self, lose_at: Option<&'static str>) -> Result<(), Broken> {
+            let teller = |step| {
+                lock(&self.steps).push(step);
+                if lose_at == Some(step) {
+                    self.gone.send_replace(true);
+                }
+            };
+            self.composite.run(&JOB, &teller).await
+        }
+
+        fn steps(&self) -> Vec<&'static str> {
+            lock(&self.steps).clone()
+        }
+    }
+
+    #[tokio::test]
+    async fn the_steps_come_in_order_and_the_tool_ends_above_the_place() {
+        let cell = cell(true);
+        assert_eq!(cell.run(None).await, Ok(()));
+        let expected = [
+            "Init",
+            "MovePickApproachBefore",
+            "MovePick",
+            "Grasp",
+            "MovePickApproachAfter",
+            "MovePlaceApproachBefore",
+            "MovePlace",
+            "Release",
+            "MovePlaceApproachAfter",
+            "Idle",
+        ];
+        assert_eq!(cell.steps(), expected);
+        assert!((cell.arm.position()[2] - 0.15).abs() < 1e-9);
+        assert!(!cell.gripper.holds());
+    }
+
+    #[tokio::test]
+    async fn without_a_thing_to_grasp_the_robot_retreats_from_the_pick() {
+        let cell = cell(false);
+        let broken = cell.run(None).await.unwrap_err();
+        assert_eq!(
+            broken.to_string(),
+            "Grasp: Grasp failed: nothing is between the fingers; the robot has retreated"
+        );
+        assert_eq!(cell.steps().last(), Some(&"MovePickApproachError"));
+        assert!((cell.arm.position()[2] - 0.15).abs() < 1e-9);
+    }
+
+    #[tokio::test]
+    async fn when_the_gripper_is_lost_on_the_way_the_move_is_halted_and_the_robot_retreats() {
+        for (step, retreat) in [
+            ("MovePick", "MovePickApproachError"),
+            ("MovePlaceApproachBefore", "MovePlaceApproachError"),
+            ("MovePlace", "MovePlaceApproachError"),
+        ] {
+            let cell = cell(true);
+            let broken = cell.run(Some(step)).await.unwrap_err();
+            assert_eq!(broken.step, step);
+            assert!(broken.why.ends_with("is lost: no answer"), "{}", broken.why);
+            assert_eq!(broken.retreated, Ok(()));
+            assert_eq!(cell.steps().last(), Some(&retreat));
+            let y = if step == "MovePick" { 0.2 } else { -0.2 };
+            let [_, at_y, at_z, ..] = cell.arm.position();
+            assert!((at_y - y).abs() < 1e-9 && (at_z - 0.15).abs() < 1e-9);
+        }
+    }
+
+    #[tokio::test]
+    async fn as_a_driver_it_hears_halt_and_the_robot_stands_still() {
+        let cell = cell(true);
+        let parameters: Vec<(String, Value)> = vec![
+            ("PickPosition".to_owned(), PICK.into()),
+            ("PlacePosition".to_owned(), PLACE.into()),
+        ];
+        conformance::check(
+            "PickAndPlaceSkillType",
+            Arc::new(cell.composite.clone()),
+            || parameters.clone(),
+        )
+        .await
+        .unwrap();
+        assert!(!cell.gripper.holds());
+    }
+}

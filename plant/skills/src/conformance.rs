@@ -1,0 +1,172 @@
+//! What every driver has to keep to, as a check that takes any: simulated, of a device, of ROS, of an MTP.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use program::{Method, State};
+
+use crate::authority::{Authority, Owner};
+use crate::driver::Driver;
+use crate::model;
+use crate::parameters::TypeName;
+use crate::shown::{Outcome, Shown};
+use crate::skill::{Facts, Skill};
+use crate::value::Value;
+
+const BY: Owner = Owner::Local("the conformance check");
+const WAIT: Duration = Duration::from_secs(10);
+
+/// Runs a driver of a type of the table through what a skill asks of it. With the `parameters`, which are asked for before each
+/// run, its work has to succeed each time and to take some 20 ms at least, so that it can be stopped and suspended on the way.
+///
+/// # Errors
+/// The first thing in which the driver differs, for people.
+pub async fn check(
+    skill_type: &str,
+    driver: Arc<dyn Driver>,
+    mut parameters: impl FnMut() -> Vec<(String, Value)>,
+) -> Result<(), String> {
+    let can_suspend = driver.can_suspend();
+    let skill = skill(skill_type, driver)?;
+    let outcome = run(&skill, &parameters()).await?;
+    if !outcome.succeeded {
+        return Err(format!("the run failed: {}", outcome.message));
+    }
+    let declared: Vec<&str> = skill
+        .facts()
+        .results
+        .iter()
+        .map(|result| result.name.as_str())
+        .collect();
+    let given: Vec<&str> = outcome
+        .results
+        .iter()
+        .map(|(name, _)| name.as_str())
+        .collect();
+    if declared != given {
+        return Err(format!(
+            "the type has the results {declared:?}, the driver gave {given:?}"
+        ));
+    }
+
+    start(&skill, &parameters()).await?;
+    let asked = tokio::time::Instant::now();
+    call(&skill, Method::Halt).await?;
+    let outcome = skill
+        .shown()
+        .outcome
+        .clone()
+        .ok_or("a halted run has no outcome")?;
+    if outcome.message.contains("broken off") {
+        return Err(format!(
+            "the driver did not hear Halt within {:?}",
+            asked.elapsed()
+        ));
+    }
+    if skill.shown().state != State::Halted {
+        return Err(format!("after Halt the skill is {}", skill.shown().state));
+    }
+
+    if can_suspend {
+        start(&skill, &parameters()).await?;
+        call(&skill, Method::Suspend).await?;
+        // Twice as long as what is not suspended takes to say something.
+        tokio::time::sleep(Duration::from_millis(60)).await;
+        let before = skill.shown().progress;
+        tokio::time::sleep(Duration::from_millis(60)).await;
+        let shown = skill.shown();
+        if shown.state != State::Suspended || (shown.progress - before).abs() > f32::EPSILON {
+            return Err(format!(
+                "the work went on while it was suspended: {before} to {}",
+                shown.progress
+            ));
+        }
+        call(&skill, Method::Resume).await?;
+        let shown = until(&skill, |shown| shown.state != State::Running).await?;
+        let succeeded = shown
+            .outcome
+            .as_ref()
+            .is_some_and(|outcome| outcome.run == shown.run && outcome.succeeded);
+        if !succeeded {
+            return Err("the run did not succeed after it was resumed".to_owned());
+        }
+        start(&skill, &parameters()).await?;
+        call(&skill, Method::Suspend).await?;
+        call(&skill, Method::Reset).await?;
+    }
+    let outcome = run(&skill, &parameters()).await?;
+    if !outcome.succeeded {
+        return Err(format!(
+            "it does not work again after it was stopped: {}",
+            outcome.message
+        ));
+    }
+    Ok(())
+}
+
+/// Runs a driver of a type of the table once.
+///
+/// # Errors
+/// Why there is no outcome, for people; a refusal with its code.
+pub async fn run_once(
+    skill_type: &str,
+    driver: Arc<dyn Driver>,
+    parameters: Vec<(String, Value)>,
+) -> Result<Outcome, String> {
+    run(&skill(skill_type, driver)?, &parameters).await
+}
+
+fn skill(skill_type: &str, driver: Arc<dyn Driver>) -> Result<Skill, String> {
+    let of = model::find(skill_type).ok_or_else(|| format!("there is no type {skill_type}"))?;
+    let facts = Facts {
+        name: of.name.to_owned(),
+        types: of.chain().map(|of| TypeName::own(of.name)).collect(),
+        parameters: of.parameters(),
+        results: of.results(),
+        capabilities: Vec::new(),
+        timeout: None,
+    };
+    Ok(Skill::spawn(facts, driver, Authority::new(), Vec::new()))
+}
+
+async fn run(skill: &Skill, parameters: &[(String, Value)]) -> Result<Outcome, String> {
+    start(skill, parameters).await?;
+    let shown = until(skill, |shown| {
+        matches!(shown.state, State::Ready | State::Halted)
+    })
+    .await?;
+    let outcome = shown
+        .outcome
+        .as_ref()
+        .filter(|outcome| outcome.run == shown.run);
+    outcome
+        .map(|outcome| Outcome::clone(outcome))
+        .ok_or_else(|| "the run left no outcome".to_owned())
+}
+
+async fn start(skill: &Skill, parameters: &[(String, Value)]) -> Result<(), String> {
+    if skill.shown().state == State::Halted {
+        call(skill, Method::Reset).await?;
+    }
+    skill
+        .start_with(BY, parameters.to_vec())
+        .await
+        .map_err(|refusal| refusal.to_string())?;
+    Ok(())
+}
+
+async fn call(skill: &Skill, method: Method) -> Result<(), String> {
+    let taken = skill.call(BY, method).await;
+    taken
+        .map(drop)
+        .map_err(|refusal| format!("{method} is refused: {refusal}"))
+}
+
+async fn until(skill: &Skill, is: impl FnMut(&Arc<Shown>) -> bool) -> Result<Arc<Shown>, String> {
+    let mut watch = skill.watch();
+    match tokio::time::timeout(WAIT, watch.wait_for(is)).await {
+        Ok(Ok(shown)) => Ok(Arc::clone(&shown)),
+        Ok(Err(_)) => Err("the skill has ended".to_owned()),
+        Err(_) => Err(format!("the run does not end within {WAIT:?}")),
+    }
+}

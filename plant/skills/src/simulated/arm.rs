@@ -1,0 +1,278 @@
+//! A robot of six axes that moves nothing real.
+
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use async_trait::async_trait;
+use tokio::time::Instant;
+
+use super::Profile;
+use crate::driver::{Driver, Results, Work};
+use crate::parameters::Parameters;
+use crate::skill::lock;
+
+/// How a simulated robot is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ArmSettings {
+    /// How far from its base the tool comes, m.
+    pub reach: f64,
+    /// How many times faster than time it works.
+    pub time_scale: f64,
+    /// Where its tool is at the beginning: m, m, m, rad, rad, rad.
+    pub home: [f64; 6],
+    /// How fast it turns its tool at most, rad/s.
+    pub turning: f64,
+}
+
+impl Default for ArmSettings {
+    fn default() -> Self {
+        Self {
+            reach: 1.3,
+            time_scale: 1.0,
+            home: [0.4, 0.0, 0.5, 0.0, 0.0, 0.0],
+            turning: 3.0,
+        }
+    }
+}
+
+/// How the tool gets from where it is to the target.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Path {
+    /// All six coordinates by themselves, each as fast as it may, beginning and ending together.
+    PointToPoint,
+    /// Along a straight line.
+    Linear,
+}
+
+/// One robot; its drivers share where its tool is.
+#[derive(Debug, Clone)]
+pub struct Arm {
+    settings: ArmSettings,
+    position: Arc<Mutex<[f64; 6]>>,
+}
+
+impl Arm {
+    /// One whose tool is at home.
+    #[must_use]
+    pub fn new(settings: ArmSettings) -> Self {
+        let position = Arc::new(Mutex::new(settings.home));
+        Self { settings, position }
+    }
+
+    /// The driver of the moves of one kind.
+    #[must_use]
+    pub fn moves(&self, path: Path) -> Arc<dyn Driver> {
+        Arc::new(Motion {
+            arm: self.clone(),
+            path,
+        })
+    }
+
+    /// Where its tool is.
+    #[must_use]
+    pub fn position(&self) -> [f64; 6] {
+        *lock(&self.position)
+    }
+}
+
+struct Motion {
+    arm: Arm,
+    path: Path,
+}
+
+#[async_trait]
+impl Driver for Motion {
+    fn can_suspend(&self) -> bool {
+        true
+    }
+
+    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+        let [x, y, z, ..] = parameters
+            .six("TargetPosition")
+            .ok_or("TargetPosition has no six numbers")?;
+        let (far, reach) = (length(&[x, y, z]), self.arm.settings.reach);
+        if far > reach {
+            return Err(format!(
+                "TargetPosition is {far:.3} m from the base, and the tool comes {reach} m far"
+            ));
+        }
+        Ok(())
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let parameters = work.parameters();
+        let missing = |name: &str| format!("{name} is not there");
+        let target = parameters
+            .six("TargetPosition")
+            .ok_or_else(|| missing("TargetPosition"))?;
+        let speed = parameters
+            .number("MaxVelocity")
+            .ok_or_else(|| missing("MaxVelocity"))?;
+        let acceleration = parameters
+            .number("MaxAcceleration")
+            .ok_or_else(|| missing("MaxAcceleration"))?;
+        let from = self.arm.position();
+        let profile = self.profile(from, target, (speed, acceleration));
+        work.step("Move").await;
+        let mut moved = Duration::ZERO;
+        loop {
+            let seconds = moved.as_secs_f64() * self.arm.settings.time_scale;
+            let share = profile.share(seconds);
+            *lock(&self.arm.position) = between(from, target, share);
+            #[expect(clippy::cast_possible_truncation, reason = "a share for people to see")]
+            work.progress(share as f32);
+            if seconds >= profile.seconds() {
+                break;
+            }
+            // What stands still has not moved meanwhile.
+            work.going().await.map_err(|_| self.stopped())?;
+            let began = Instant::now();
+            work.spend(TICK).await.map_err(|_| self.stopped())?;
+            moved += began.elapsed().min(2 * TICK);
+        }
+        Ok(vec![("Position".to_owned(), self.arm.position().into())])
+    }
+}
+
+impl Motion {
+    /// The motion of the slowest coordinate: the others keep pace with it.
+    fn profile(
+        &self,
+        from: [f64; 6],
+        target: [f64; 6],
+        (speed, acceleration): (f64, f64),
+    ) -> Profile {
+        let way: Vec<f64> = target
+            .iter()
+            .zip(from)
+            .map(|(to, from)| to - from)
+            .collect();
+        let (places, turns) = way.split_at(3);
+        let turning = self.arm.settings.turning;
+        let along = match self.path {
+            Path::Linear => vec![length(places)],
+            Path::PointToPoint => places.to_vec(),
+        };
+        let moves = along
+            .into_iter()
+            .map(|way| Profile::new(way, speed, acceleration));
+        // It gains its speed of turning within the same time as that of moving.
+        let turns = turns
+            .iter()
+            .map(|way| Profile::new(*way, turning, turning * acceleration / speed));
+        moves
+            .chain(turns)
+            .max_by(|a, b| a.seconds().total_cmp(&b.seconds()))
+            .unwrap_or_else(|| Profile::new(0.0, speed, acceleration))
+    }
+
+    fn stopped(&self) -> String {
+        let [x, y, z, ..] = self.arm.position();
+        format!("stopped at {x:.3}, {y:.3}, {z:.3} m")
+    }
+}
+
+fn between(from: [f64; 6], target: [f64; 6], share: f64) -> [f64; 6] {
+    let mut at = target;
+    if share < 1.0 {
+        for (at, from) in at.iter_mut().zip(from) {
+            *at = from + (*at - from) * share;
+        }
+    }
+    at
+}
+
+fn length(of: &[f64]) -> f64 {
+    of.iter().map(|part| part * part).sum::<f64>().sqrt()
+}
+
+/// How often it says where it is.
+const TICK: Duration = Duration::from_millis(10);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::conformance;
+    use crate::value::Value;
+
+    fn to(target: [f64; 6], more: &[(&str, f64)]) -> Vec<(String, Value)> {
+        let more = more
+            .iter()
+            .map(|(name, value)| ((*name).to_owned(), Value::from(*value)));
+        std::iter::once(("TargetPosition".to_owned(), target.into()))
+            .chain(more)
+            .collect()
+    }
+
+    fn quick() -> Arm {
+        Arm::new(ArmSettings {
+            time_scale: 20.0,
+            ..ArmSettings::default()
+        })
+    }
+
+    #[tokio::test]
+    async fn its_drivers_are_as_drivers_should_be() {
+        let mut corners = [[-0.5, 0.3, 0.2], [0.5, 0.3, -0.2], [0.1, -0.6, 0.4]];
+        let mut around = || {
+            corners.rotate_left(1);
+            let [x, y, z] = corners[0];
+            to([x, y, z, 0.0, x, 0.0], &[])
+        };
+        for (skill_type, path) in [
+            ("PtpMoveSkillType", Path::PointToPoint),
+            ("LinearMoveSkillType", Path::Linear),
+        ] {
+            conformance::check(skill_type, quick().moves(path), &mut around)
+                .await
+                .unwrap();
+        }
+    }
+
+    #[tokio::test]
+    async fn its_tool_arrives_and_the_next_move_begins_there() {
+        let arm = quick();
+        let target = [0.2, 0.3, 0.1, 0.0, 0.5, 0.0];
+        let moved = conformance::run_once(
+            "PtpMoveSkillType",
+            arm.moves(Path::PointToPoint),
+            to(target, &[]),
+        )
+        .await
+        .unwrap();
+        assert!(moved.succeeded, "{}", moved.message);
+        assert_eq!(moved.results, [("Position".to_owned(), target.into())]);
+        assert_eq!(arm.position(), target);
+        let up = [0.2, 0.3, 0.4, 0.0, 0.5, 0.0];
+        conformance::run_once("LinearMoveSkillType", arm.moves(Path::Linear), to(up, &[]))
+            .await
+            .unwrap();
+        assert_eq!(arm.position(), up);
+    }
+
+    #[test]
+    fn a_straight_line_takes_the_time_of_its_length_and_a_free_way_that_of_its_slowest_part() {
+        let motion = |path| Motion { arm: quick(), path };
+        let (from, target) = ([0.0; 6], [0.3, 0.4, 0.0, 0.0, 0.0, 0.0]);
+        let seconds = |path| motion(path).profile(from, target, (0.2, 1.0)).seconds();
+        assert!((seconds(Path::Linear) - Profile::new(0.5, 0.2, 1.0).seconds()).abs() < 1e-9);
+        assert!((seconds(Path::PointToPoint) - Profile::new(0.4, 0.2, 1.0).seconds()).abs() < 1e-9);
+    }
+
+    #[tokio::test]
+    async fn what_it_cannot_reach_is_refused_before_it_moves() {
+        let arm = quick();
+        let run = conformance::run_once(
+            "PtpMoveSkillType",
+            arm.moves(Path::PointToPoint),
+            to([2.0; 6], &[]),
+        )
+        .await;
+        let refusal = run.unwrap_err();
+        assert!(
+            refusal.starts_with("BadInvalidArgument: TargetPosition is 3.464 m"),
+            "{refusal}"
+        );
+        assert_eq!(arm.position(), ArmSettings::default().home);
+    }
+}

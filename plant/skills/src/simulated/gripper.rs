@@ -1,0 +1,167 @@
+//! A gripper that holds nothing real.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use async_trait::async_trait;
+
+use crate::driver::{Driver, Results, Work};
+
+/// How a simulated gripper is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GripperSettings {
+    /// How long closing and opening take, before the time scale.
+    pub duration: Duration,
+    /// Whether there is a thing where it closes.
+    pub object: bool,
+    /// How many times faster than time it works.
+    pub time_scale: f64,
+}
+
+impl Default for GripperSettings {
+    fn default() -> Self {
+        Self {
+            duration: Duration::from_millis(400),
+            object: true,
+            time_scale: 1.0,
+        }
+    }
+}
+
+/// One gripper; its drivers share what it holds.
+#[derive(Debug, Clone, Default)]
+pub struct Gripper {
+    settings: GripperSettings,
+    holds: Arc<AtomicBool>,
+}
+
+impl Gripper {
+    /// One that holds nothing.
+    #[must_use]
+    pub fn new(settings: GripperSettings) -> Self {
+        Self {
+            settings,
+            holds: Arc::default(),
+        }
+    }
+
+    /// The driver of GraspSkillType and what is below it; with other settings than the gripper's if need be.
+    #[must_use]
+    pub fn grasp(&self, settings: Option<GripperSettings>) -> Arc<dyn Driver> {
+        self.motion(true, settings)
+    }
+
+    /// The driver of ReleaseSkillType and what is below it.
+    #[must_use]
+    pub fn release(&self, settings: Option<GripperSettings>) -> Arc<dyn Driver> {
+        self.motion(false, settings)
+    }
+
+    /// Whether it holds a thing.
+    #[must_use]
+    pub fn holds(&self) -> bool {
+        self.holds.load(Ordering::SeqCst)
+    }
+
+    fn motion(&self, closes: bool, settings: Option<GripperSettings>) -> Arc<dyn Driver> {
+        let settings = settings.unwrap_or_else(|| self.settings.clone());
+        Arc::new(Motion {
+            closes,
+            settings,
+            holds: Arc::clone(&self.holds),
+        })
+    }
+}
+
+/// Opening or closing it.
+#[derive(Debug)]
+struct Motion {
+    closes: bool,
+    settings: GripperSettings,
+    holds: Arc<AtomicBool>,
+}
+
+#[async_trait]
+impl Driver for Motion {
+    fn can_suspend(&self) -> bool {
+        true
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let (step, holds) = if self.closes {
+            ("Close", self.settings.object)
+        } else {
+            ("Open", false)
+        };
+        work.step(step).await;
+        let piece = self
+            .settings
+            .duration
+            .div_f64(self.settings.time_scale * f64::from(PIECES));
+        for done in 1..=PIECES {
+            work.spend(piece)
+                .await
+                .map_err(|_| format!("stopped while the fingers {}", step.to_lowercase()))?;
+            work.progress(f32::from(done) / f32::from(PIECES));
+        }
+        self.holds.store(holds, Ordering::SeqCst);
+        if !self.closes {
+            return Ok(Vec::new());
+        }
+        if !holds {
+            return Err("nothing is between the fingers".to_owned());
+        }
+        Ok(vec![("Gripped".to_owned(), true.into())])
+    }
+}
+
+const PIECES: u8 = 10;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::conformance;
+
+    fn quick(object: bool) -> Gripper {
+        let duration = Duration::from_millis(40);
+        Gripper::new(GripperSettings {
+            duration,
+            object,
+            time_scale: 1.0,
+        })
+    }
+
+    #[tokio::test]
+    async fn its_drivers_are_as_drivers_should_be() {
+        for (skill_type, driver) in [
+            ("GraspSkillType", quick(true).grasp(None)),
+            ("ReleaseSkillType", quick(true).release(None)),
+        ] {
+            conformance::check(skill_type, driver, Vec::new)
+                .await
+                .unwrap();
+        }
+    }
+
+    #[tokio::test]
+    async fn it_holds_a_thing_from_grasp_to_release_and_says_if_there_is_none() {
+        let gripper = quick(true);
+        let grasped = conformance::run_once("GraspSkillType", gripper.grasp(None), Vec::new())
+            .await
+            .unwrap();
+        assert_eq!(grasped.results, [("Gripped".to_owned(), true.into())]);
+        assert!(gripper.holds());
+        conformance::run_once("ReleaseSkillType", gripper.release(None), Vec::new())
+            .await
+            .unwrap();
+        assert!(!gripper.holds());
+        let empty = conformance::run_once("GraspSkillType", quick(false).grasp(None), Vec::new())
+            .await
+            .unwrap();
+        assert_eq!(
+            (empty.succeeded, empty.message.as_str()),
+            (false, "nothing is between the fingers")
+        );
+    }
+}
