@@ -15,7 +15,7 @@ mod registry;
 mod watch;
 
 pub use asked::{ApplicationType, Asked, Channel, MdnsConfiguration, RegisterFault};
-pub use name::{instance_name, renamed};
+pub use name::{instance_name, label, renamed};
 pub use network::{Announcement, NetworkRecord};
 pub use registry::{Event, Loss, Registered, Registry, Settings};
 pub use watch::{Outcome, Probe};

@@ -20,6 +20,12 @@ pub fn renamed(name: &str) -> String {
     format!("{}{tail}", cut(base, MAX_LABEL - tail.len()))
 }
 
+/// A text as one label of DNS: without control characters, and of at most 63 bytes.
+#[must_use]
+pub fn label(text: &str) -> String {
+    cut(&clean(text), MAX_LABEL).to_owned()
+}
+
 /// Without control characters, which no page and no log shall show.
 fn clean(text: &str) -> String {
     text.chars().filter(|letter| !letter.is_control()).collect()

@@ -22,7 +22,7 @@ pub struct NetworkRecord {
     pub announcement: Announcement,
 }
 
-/// Records by instance name.
+/// Records by instance name in small letters: names of DNS differ by more than their case.
 #[derive(Debug, Default)]
 pub(crate) struct Network {
     records: BTreeMap<String, NetworkRecord>,
@@ -33,7 +33,8 @@ impl Network {
     /// Takes a record in. One that changed gets a new id. Gives the record it takes the place of, or itself where nothing
     /// is new.
     pub(crate) fn put(&mut self, announcement: Announcement) -> Option<NetworkRecord> {
-        let known = self.records.get(&announcement.instance);
+        let key = announcement.instance.to_ascii_lowercase();
+        let known = self.records.get(&key);
         if let Some(known) = known.filter(|known| known.announcement == announcement) {
             return Some(known.clone());
         }
@@ -42,16 +43,15 @@ impl Network {
             record_id: self.last_id,
             announcement,
         };
-        self.records
-            .insert(record.announcement.instance.clone(), record)
+        self.records.insert(key, record)
     }
 
     pub(crate) fn remove(&mut self, instance: &str) -> Option<NetworkRecord> {
-        self.records.remove(instance)
+        self.records.remove(&instance.to_ascii_lowercase())
     }
 
     pub(crate) fn get(&self, instance: &str) -> Option<&NetworkRecord> {
-        self.records.get(instance)
+        self.records.get(&instance.to_ascii_lowercase())
     }
 
     pub(crate) fn len(&self) -> usize {

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use crate::asked::{Asked, Channel, RegisterFault};
+use crate::name::{label, renamed};
 use crate::network::{Announcement, Network, NetworkRecord};
 use crate::watch::{Outcome, Probe, Sign, Watch};
 
@@ -62,6 +63,20 @@ pub enum Loss {
     Unreachable,
 }
 
+impl Loss {
+    /// For logs and counters.
+    #[must_use]
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::Unregistered => "unregistered",
+            Self::Goodbye => "goodbye",
+            Self::Expired => "expired",
+            Self::SemaphoreGone => "semaphore_gone",
+            Self::Unreachable => "unreachable",
+        }
+    }
+}
+
 /// What has happened.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
@@ -117,6 +132,8 @@ pub struct Registry {
 #[derive(Debug)]
 struct Server {
     asked: Asked,
+    /// What we announce for it: what it asked for, under another name where that one was taken.
+    announced: Option<Announcement>,
     since: Instant,
     forget_at: Instant,
 }
@@ -171,8 +188,10 @@ impl Registry {
             Some(server) => (Registered::Changed, server.since),
             None => (Registered::New, now),
         };
+        let announced = self.free(&asked);
         let server = Server {
             asked,
+            announced,
             since,
             forget_at,
         };
@@ -184,18 +203,18 @@ impl Registry {
     fn take(&mut self, server: Server, now: Instant) {
         let server_uri = server.asked.server_uri.clone();
         let discovery_urls = server.asked.discovery_urls.clone();
-        let wished = server.asked.announcement();
+        let wished = server.announced.clone();
         let before = self.servers.insert(server_uri.clone(), server);
-        let before = before.map(|server| server.asked);
-        let announced = before.as_ref().and_then(Asked::announcement);
+        let announced = before.as_ref().and_then(|before| before.announced.as_ref());
         if let Some(old) =
             announced.filter(|old| wished.as_ref().map(|new| &new.instance) != Some(&old.instance))
         {
             self.network.remove(&old.instance);
             self.events.push_back(Event::Withdraw {
-                instance: old.instance,
+                instance: old.instance.clone(),
             });
         }
+        let before = before.map(|server| server.asked);
         for url in before.iter().flat_map(|asked| &asked.discovery_urls) {
             self.unwatch(url);
         }
@@ -207,7 +226,6 @@ impl Registry {
             discovery_urls,
         });
         if let Some(wished) = wished {
-            // A record of that name is ours by now, wherever it came from.
             self.network.put(wished.clone());
             self.events.push_back(Event::Announce(wished));
         }
@@ -257,8 +275,8 @@ impl Registry {
 
     /// What came of a try.
     pub fn probed(&mut self, url: &str, outcome: Outcome, now: Instant) {
-        let lost_after = self.settings.lost_after;
-        match self.watch.probed(url, outcome, lost_after, now) {
+        let patience = (self.settings.probe_every, self.settings.lost_after);
+        match self.watch.probed(url, outcome, patience, now) {
             Sign::Nothing => {}
             Sign::Restarted => self.events.push_back(Event::Restarted {
                 url: url.to_owned(),
@@ -335,13 +353,19 @@ impl Registry {
             .map(|record| record.announcement.instance.clone())
             .collect();
         for uri in servers {
-            // One that has another endpoint is looked after there.
-            let other = self.servers.get_mut(&uri).map(|server| {
-                server.asked.discovery_urls.retain(|known| known != url);
-                !server.asked.discovery_urls.is_empty()
-            });
-            if other == Some(false) {
+            // One that has another endpoint is looked after there, and announced with it.
+            let Some(server) = self.servers.get_mut(&uri) else {
+                continue;
+            };
+            server.asked.discovery_urls.retain(|known| known != url);
+            let Some(other) = server.asked.discovery_urls.first() else {
                 self.end(&uri, Loss::Unreachable);
+                continue;
+            };
+            if let Some(announced) = server.announced.as_mut().filter(|old| old.url == url) {
+                announced.url.clone_from(other);
+                self.network.put(announced.clone());
+                self.events.push_back(Event::Announce(announced.clone()));
             }
         }
         for instance in records {
@@ -355,7 +379,7 @@ impl Registry {
         let Some(server) = self.servers.remove(server_uri) else {
             return;
         };
-        if let Some(announcement) = server.asked.announcement() {
+        if let Some(announcement) = server.announced {
             self.network.remove(&announcement.instance);
             self.events.push_back(Event::Withdraw {
                 instance: announcement.instance,
@@ -363,6 +387,8 @@ impl Registry {
         }
         for url in &server.asked.discovery_urls {
             self.unwatch(url);
+            // Where it is announced on the network as well, that is held against it at once.
+            self.watch.hasten(url);
         }
         self.events.push_back(Event::Gone {
             server_uri: server_uri.to_owned(),
@@ -388,13 +414,39 @@ impl Registry {
         }
     }
 
-    /// Whether a registered server asked us to announce that name.
+    /// Whether we announce that name for a registered server.
     fn is_ours(&self, instance: &str) -> bool {
-        let mut wishes = self
+        let mut announced = self
             .servers
             .values()
-            .filter_map(|server| server.asked.mdns.as_ref());
-        wishes.any(|mdns| mdns.name == instance)
+            .filter_map(|server| server.announced.as_ref());
+        announced.any(|ours| ours.instance.eq_ignore_ascii_case(instance))
+    }
+
+    /// What to announce for a server: its wish, counted on where another server has that name (RFC 6762, 9). Nothing
+    /// where the wish is heard on the network already with the same URL: then the server does it itself.
+    fn free(&self, asked: &Asked) -> Option<Announcement> {
+        let mut wish = asked.announcement()?;
+        let others = |name: &str| {
+            self.servers
+                .values()
+                .filter(|server| server.asked.server_uri != asked.server_uri)
+                .filter_map(|server| server.announced.as_ref())
+                .any(|announced| announced.instance.eq_ignore_ascii_case(name))
+        };
+        // Each turn passes by one of the names there are.
+        for _ in 0..=self.servers.len() + self.network.len() {
+            let heard = self
+                .network
+                .get(&wish.instance)
+                .filter(|_| !self.is_ours(&wish.instance));
+            match heard {
+                Some(heard) if heard.announcement.url == wish.url => return None,
+                None if !others(&wish.instance) => return Some(wish),
+                Some(_) | None => wish.instance = renamed(&wish.instance),
+            }
+        }
+        None
     }
 }
 
@@ -408,9 +460,13 @@ impl Server {
 impl Asked {
     /// How it is to be announced, if it is.
     fn announcement(&self) -> Option<Announcement> {
-        let mdns = self.mdns.as_ref().filter(|mdns| !mdns.name.is_empty())?;
+        let mdns = self.mdns.as_ref()?;
+        let instance = label(&mdns.name);
+        if instance.is_empty() {
+            return None;
+        }
         Some(Announcement {
-            instance: mdns.name.clone(),
+            instance,
             url: self.discovery_urls.first()?.clone(),
             capabilities: mdns.capabilities.clone(),
         })

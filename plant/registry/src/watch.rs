@@ -22,6 +22,8 @@ pub enum Outcome {
     Refused,
     /// Nothing came back.
     Silent,
+    /// It could not be tried, as when the name of the host is not known here: that says nothing of the server.
+    Untried,
 }
 
 /// What a try says of a server.
@@ -75,6 +77,13 @@ impl Watch {
         Some(Probe { url: url.clone() })
     }
 
+    /// Has a URL tried at the next opportunity.
+    pub(crate) fn hasten(&mut self, url: &str) {
+        if let Some(watched) = self.0.get_mut(url) {
+            watched.try_at = watched.answered;
+        }
+    }
+
     pub(crate) fn due(&self) -> Option<Instant> {
         self.0.values().map(|watched| watched.try_at).min()
     }
@@ -84,7 +93,7 @@ impl Watch {
         &mut self,
         url: &str,
         outcome: Outcome,
-        lost_after: Duration,
+        (every, lost_after): (Duration, Duration),
         now: Instant,
     ) -> Sign {
         let Some(watched) = self.0.get_mut(url) else {
@@ -104,7 +113,12 @@ impl Watch {
             Outcome::Silent if now.saturating_duration_since(watched.answered) >= lost_after => {
                 Sign::Lost
             }
-            Outcome::Silent => Sign::Nothing,
+            Outcome::Silent => {
+                // Tried again soon, so that two tries that wait fit into the time.
+                watched.try_at = now + every / 10;
+                Sign::Nothing
+            }
+            Outcome::Untried => Sign::Nothing,
         }
     }
 }

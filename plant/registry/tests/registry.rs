@@ -367,6 +367,77 @@ fn nobody_takes_back_on_the_network_what_a_registered_server_has_us_announce() {
 }
 
 #[test]
+fn nobody_takes_the_record_of_another_by_registering_under_its_name() {
+    let (mut registry, now) = start();
+    registry.announced(robot(), now);
+    register(&mut registry, &gripper(), now).unwrap();
+    events(&mut registry);
+    let named = |uri: &str, name: &str, url: &str| {
+        let mut asked = gripper();
+        asked.server_uri = uri.to_owned();
+        asked.discovery_urls = vec![url.to_owned()];
+        asked.mdns.as_mut().unwrap().name = name.to_owned();
+        asked
+    };
+    let urls = |registry: &Registry| -> Vec<(String, String)> {
+        let found = registry.find_servers_on_network(0, 0, &[]).into_iter();
+        found
+            .map(|record| {
+                let Announcement { instance, url, .. } = record.announcement.clone();
+                (instance, url)
+            })
+            .collect()
+    };
+    let before = urls(&registry);
+    // Of one that is heard on the network, and of one that is registered; the case of names says nothing.
+    for (uri, name, counted) in [
+        ("urn:a", "ROBOT-pc-4842", "ROBOT-pc-4842 (2)"),
+        ("urn:b", "gripper-PC-4841", "gripper-PC-4841 (2)"),
+        ("urn:c", "gripper-pc-4841", "gripper-pc-4841 (3)"),
+    ] {
+        let asked = named(uri, name, "opc.tcp://10.9.9.9:1");
+        registry.register(asked, &secured(uri), None, now).unwrap();
+        let happened = events(&mut registry);
+        assert!(
+            matches!(&*happened, [Event::Registered { .. }, Event::Announce(wish)] if wish.instance == counted),
+            "{happened:?}"
+        );
+        let offline = Asked {
+            is_online: false,
+            ..named(uri, name, "opc.tcp://10.9.9.9:1")
+        };
+        if uri != "urn:b" {
+            registry
+                .register(offline, &secured(uri), None, now)
+                .unwrap();
+            assert!(events(&mut registry).contains(&Event::Withdraw {
+                instance: counted.to_owned()
+            }));
+        }
+    }
+    let after = urls(&registry);
+    assert!(before.iter().all(|record| after.contains(record)), "{after:?}");
+    // Whoever announces itself is not announced a second time, and leaves by its own goodbye.
+    let itself = named("urn:robot", &robot().instance, &robot().url);
+    registry
+        .register(itself, &secured("urn:robot"), None, now)
+        .unwrap();
+    assert!(matches!(&*events(&mut registry), [Event::Registered { .. }]));
+    registry.withdrawn(&robot().instance);
+    assert!(matches!(&*events(&mut registry), [Event::Vanished { .. }]));
+}
+
+#[test]
+fn what_cannot_be_tried_is_not_lost_for_it() {
+    let (mut registry, now) = start();
+    registry.announced(robot(), now);
+    for second in 1..10_u32 {
+        registry.probed(&robot().url, Outcome::Untried, now + SECOND * second);
+    }
+    assert!(matches!(&*events(&mut registry), [Event::Seen(_)]));
+}
+
+#[test]
 fn made_up_servers_take_no_more_room_than_there_is() {
     let settings = Settings {
         most: 3,
