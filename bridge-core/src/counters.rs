@@ -60,11 +60,18 @@ pub enum Reason {
     Unchanged,
     /// A newer value took its place before its topic's rate let it go.
     Outpaced,
+    /// A request that is not executed, for what it is, where it comes from, or because there are too many; or a response that
+    /// is not told.
+    CallRefused,
+    /// A request that somebody else is to execute, or a response that nobody here waits for: both go to the whole group.
+    NotAsked,
+    /// A response of somebody who does not execute the call.
+    Forged,
 }
 
 impl Reason {
     /// All of them, in the order of their counters.
-    pub const ALL: [Self; 27] = [
+    pub const ALL: [Self; 30] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -92,6 +99,9 @@ impl Reason {
         Self::IncompatibleQos,
         Self::Unchanged,
         Self::Outpaced,
+        Self::CallRefused,
+        Self::NotAsked,
+        Self::Forged,
     ];
 
     /// The label of its counter.
@@ -125,6 +135,9 @@ impl Reason {
             Self::IncompatibleQos => "incompatible_qos",
             Self::Unchanged => "unchanged",
             Self::Outpaced => "outpaced",
+            Self::CallRefused => "call_refused",
+            Self::NotAsked => "not_asked",
+            Self::Forged => "forged",
         }
     }
 
@@ -158,6 +171,7 @@ impl Reason {
                 | Self::IncompatibleQos
                 | Self::Unchanged
                 | Self::Outpaced
+                | Self::NotAsked
         )
     }
 }

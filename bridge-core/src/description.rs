@@ -3,7 +3,8 @@
 //! The name of the DataSet is that of the topic (`ua_1_2_10`), since an announcement has no WriterGroupId: with the
 //! PublisherId and DataSetWriterId it has, the name tells which topic it is about. The description is the name of the ROS
 //! type that the fields make, with ` as bytes` behind it where they are one ByteString with the whole message. It is
-//! missing where they make none: one value out of a message, or values that were converted on the way.
+//! missing where they make none: one value out of a message, or values that were converted on the way. A local side that
+//! speaks in fields may say more: a name for people behind that of the topic, and what the value is behind `; `.
 
 use std::collections::BTreeMap;
 use std::collections::hash_map::DefaultHasher;
@@ -21,6 +22,7 @@ use uadp::{
     SecurityHeader, StatusCode, Timestamp, Variant,
 };
 
+use crate::call::{ValueDescription, join_name, split_name};
 use crate::learned::Weight;
 
 /// What the DataSetMetaData of a writer of another space says of its topic.
@@ -30,6 +32,10 @@ pub struct Described {
     pub message_type: TypeName,
     /// The message stands in one ByteString as it is.
     pub bytes: bool,
+    /// Its name for people; may be empty.
+    pub name: String,
+    /// What it is, for people and programs; may be empty.
+    pub about: String,
     /// The fields, in the order of the values.
     pub fields: Vec<Leaf>,
 }
@@ -79,12 +85,18 @@ impl Described {
         let Some(description) = meta_data.description.text else {
             return Ok(None);
         };
-        let (name, bytes) = match description.strip_suffix(AS_BYTES) {
+        let (made, about) = description.split_once(ABOUT).unwrap_or((description, ""));
+        let (name, bytes) = match made.strip_suffix(AS_BYTES) {
             Some(name) => (name, true),
-            None => (description, false),
+            None => (made, false),
         };
         if name.len() > MAX_NAME {
             return Err("the name of the type is too long".to_owned());
+        }
+        let (_, called) = meta_data.name.and_then(split_name).unzip();
+        let called = called.unwrap_or_default();
+        if called.len() > MAX_NAME || about.len() > MAX_ABOUT {
+            return Err("its name or description is too long".to_owned());
         }
         let Ok(message_type) = name.parse() else {
             return Ok(None);
@@ -96,6 +108,8 @@ impl Described {
         Ok(Some(Self {
             message_type,
             bytes,
+            name: called.to_owned(),
+            about: about.to_owned(),
             fields: fields.collect::<Result<_, _>>()?,
         }))
     }
@@ -104,7 +118,8 @@ impl Described {
 impl Weight for Described {
     fn weight(&self) -> usize {
         let names: usize = self.fields.iter().map(|field| field.path.len()).sum();
-        names + self.fields.len() * size_of::<Leaf>() + MAX_NAME
+        let texts = self.name.len() + self.about.len();
+        names + texts + self.fields.len() * size_of::<Leaf>() + MAX_NAME
     }
 }
 
@@ -116,18 +131,25 @@ fn read_field(field: &FieldMetaData<'_>) -> Result<Leaf, String> {
     let Some(builtin) = field.builtin_type() else {
         return Err(format!("{} is no builtin type", field.built_in_type));
     };
-    let rank = match field.value_rank {
-        -1 => Rank::Scalar,
-        1 => Rank::Array {
-            fixed: field.array_dimensions.get(0).filter(|length| *length > 0),
-        },
-        other => return Err(format!("a field of ValueRank {other}, which ROS has not")),
-    };
     Ok(Leaf {
         path: path.to_owned(),
         builtin,
-        rank,
+        rank: read_rank(field)?,
     })
+}
+
+/// Whether a field is an array.
+///
+/// # Errors
+/// It has more dimensions, or may have.
+pub(crate) fn read_rank(field: &FieldMetaData<'_>) -> Result<Rank, String> {
+    match field.value_rank {
+        -1 => Ok(Rank::Scalar),
+        1 => Ok(Rank::Array {
+            fixed: field.array_dimensions.get(0).filter(|length| *length > 0),
+        }),
+        other => Err(format!("a field of ValueRank {other}, which ROS has not")),
+    }
 }
 
 /// ROS 1 and ROS 2 write some names in other cases.
@@ -158,6 +180,8 @@ pub(crate) struct Source<'s> {
     pub(crate) leaves: &'s [Leaf],
     /// What the mapping says of the value.
     pub(crate) variable: Option<&'s Variable>,
+    /// What the local side says of it, where it speaks in fields.
+    pub(crate) said: Option<&'s ValueDescription>,
     /// Namespace index -> URI, as far as known.
     pub(crate) namespaces: &'s BTreeMap<u16, String>,
 }
@@ -223,6 +247,7 @@ impl Source<'_> {
     fn encode(&self, version: ConfigurationVersion) -> Result<(Vec<u8>, usize), EncodeError> {
         let (_, namespace, _) = self.topic.triple();
         let description = self.description();
+        let called = self.said.map_or("", |said| &said.name);
         let named: Vec<FieldText> = self.leaves.iter().map(|leaf| self.names(leaf)).collect();
         let mut buffers = <[Vec<u8>; 3]>::default();
         let properties = match (self.leaves, self.variable) {
@@ -259,8 +284,8 @@ impl Source<'_> {
                 structure_data_types: list(&described),
                 ..DataTypeSchemaHeader::default()
             },
-            name: Some(&self.topic.to_string()),
-            description: text(description.as_deref().unwrap_or_default()),
+            name: Some(&join_name(self.topic, called)),
+            description: text(&description),
             fields: List::new(&fields),
             configuration_version: version,
             ..DataSetMetaDataType::default()
@@ -311,6 +336,9 @@ impl Source<'_> {
 
     /// The message that the values make, if they make one.
     fn made(&self) -> Option<&TypeName> {
+        if let Some(said) = self.said {
+            return said.message_type.as_ref();
+        }
         let Some((message_type, selection)) = self.message else {
             return self.variable.and_then(whole_message);
         };
@@ -326,8 +354,15 @@ impl Source<'_> {
         }
     }
 
-    fn description(&self) -> Option<String> {
-        let name = self.made()?;
+    fn description(&self) -> String {
+        let about = self.said.map_or("", |said| &said.about);
+        let (before, about) = match about {
+            "" => ("", ""),
+            about => (ABOUT, about),
+        };
+        let Some(name) = self.made() else {
+            return format!("{before}{about}");
+        };
         let behind = match self.message {
             Some((_, Selection::Bytes)) => AS_BYTES,
             Some((
@@ -341,7 +376,7 @@ impl Source<'_> {
             ))
             | None => "",
         };
-        Some(format!("{name}{behind}"))
+        format!("{name}{behind}{before}{about}")
     }
 
     fn field<'f>(
@@ -558,7 +593,7 @@ fn data_type(builtin: BuiltinType, of: Option<&TypeName>, namespace: u16) -> Nod
     }
 }
 
-const fn value_rank(rank: Rank) -> i32 {
+pub(crate) const fn value_rank(rank: Rank) -> i32 {
     match rank {
         Rank::Scalar => -1,
         Rank::Array { .. } => 1,
@@ -566,7 +601,7 @@ const fn value_rank(rank: Rank) -> i32 {
 }
 
 /// Elements in each dimension, 0 where that is open.
-fn sizes(rank: Rank) -> Vec<u32> {
+pub(crate) fn sizes(rank: Rank) -> Vec<u32> {
     match rank {
         Rank::Scalar => Vec::new(),
         Rank::Array { fixed } => vec![fixed.unwrap_or(0)],
@@ -574,14 +609,14 @@ fn sizes(rank: Rank) -> Vec<u32> {
 }
 
 /// The null array without elements.
-const fn list<T>(elements: &[T]) -> List<'_, T> {
+pub(crate) const fn list<T>(elements: &[T]) -> List<'_, T> {
     match elements {
         [] => List::null(),
         elements => List::new(elements),
     }
 }
 
-const fn text(text: &str) -> LocalizedText<'_> {
+pub(crate) const fn text(text: &str) -> LocalizedText<'_> {
     LocalizedText {
         locale: None,
         text: if text.is_empty() { None } else { Some(text) },
@@ -589,7 +624,7 @@ const fn text(text: &str) -> LocalizedText<'_> {
 }
 
 /// The same whenever the field is announced.
-fn field_id(topic: TopicId, index: usize, name: &str) -> Guid {
+pub(crate) fn field_id(topic: TopicId, index: usize, name: &str) -> Guid {
     let mut hasher = DefaultHasher::new();
     (topic.triple(), index).hash(&mut hasher);
     let first = hasher.finish().to_le_bytes();
@@ -603,7 +638,7 @@ fn field_id(topic: TopicId, index: usize, name: &str) -> Guid {
 }
 
 /// Seconds since 2000-01-01 UTC (VersionTime: OPC 10000-4, 7.44).
-fn version_time(utc: Timestamp) -> u32 {
+pub(crate) fn version_time(utc: Timestamp) -> u32 {
     let seconds = utc.unix_nanos() / 1_000_000_000 - UNIX_2000;
     u32::try_from(seconds.max(0)).unwrap_or(u32::MAX)
 }
@@ -612,6 +647,10 @@ fn version_time(utc: Timestamp) -> u32 {
 const STRUCTURE: NodeId<'static> = NodeId::numeric(0, 22);
 /// Seconds from 1970 to 2000.
 const UNIX_2000: i128 = 946_684_800;
+/// What stands between the type and what else is said.
+const ABOUT: &str = "; ";
+/// Bytes of that that are believed.
+const MAX_ABOUT: usize = 1_024;
 /// What stands behind the type of a message that crosses as it is.
 const AS_BYTES: &str = " as bytes";
 /// The one field of such a message.
@@ -623,4 +662,4 @@ pub(crate) const MAX_FIELDS: usize = 4096;
 /// Of a higher index the list of namespaces would be long.
 const MAX_NAMESPACES: u16 = 64;
 /// Bytes of the largest announcement that is sent.
-const MAX_ANNOUNCEMENT: usize = 64 << 10;
+pub(crate) const MAX_ANNOUNCEMENT: usize = 64 << 10;

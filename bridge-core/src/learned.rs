@@ -155,6 +155,8 @@ mod tests {
         Described {
             message_type: name.parse().unwrap(),
             bytes: true,
+            name: String::new(),
+            about: String::new(),
             fields: Vec::new(),
         }
     }

@@ -11,6 +11,8 @@
 
 mod base;
 mod call;
+mod call_announcement;
+mod call_plan;
 mod counters;
 mod description;
 mod fields;

@@ -227,6 +227,12 @@ impl Reader {
         fell
     }
 
+    /// Takes note that the writer says it has ended, and says whether the topic was not silent before.
+    pub(crate) fn leave(&mut self) -> bool {
+        self.shape = None;
+        !std::mem::replace(&mut self.silent, true)
+    }
+
     /// Why the newest message since the last good value was dropped, if one was.
     pub(crate) const fn loss(&self) -> Option<Reason> {
         self.dropped

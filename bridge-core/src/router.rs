@@ -6,8 +6,10 @@ mod chunks;
 mod content;
 mod discovery;
 mod follow;
+mod own;
 mod receive;
 mod reload;
+mod roll;
 mod send;
 mod told;
 
@@ -24,7 +26,7 @@ use crate::counters::{Cause, Counters, Reason, Verdict};
 use crate::fields;
 use crate::gate::{Passage, Waiting};
 use crate::hops::{Hop, Hops};
-use crate::loop_rule::{Owned, Side, What, may_cross};
+use crate::loop_rule::{Owned, Side, What};
 use crate::network::{check_size, data_set_header, encode, keep_alive};
 use crate::output::{Delivery, Heard, Kept, Output, PublisherKey};
 use crate::pace::Pace;
@@ -35,8 +37,10 @@ use crate::settings::{Local, Now, Settings};
 use crate::topic::{Item, Role, Topic};
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Idle, MAX_KEPT, Message};
+use calls::Calls;
 use chunks::Chunks;
 use discovery::Discovery;
+use own::Claims;
 use receive::Sample;
 use told::About;
 
@@ -59,6 +63,12 @@ pub struct Router {
     chunks: Option<Box<Chunks>>,
     /// What topics consist of, announced and learned; `None` before there is any.
     discovery: Option<Box<Discovery>>,
+    /// Calls asked for and executed; `None` before there is any.
+    calls: Option<Box<Calls>>,
+    /// Random bytes that tell our requests from those of others.
+    instance: [u8; 16],
+    /// The namespaces of ours in which nothing is sent; `None` where there is none.
+    claims: Option<Box<Claims>>,
     /// What is told besides samples.
     told: VecDeque<Output>,
     /// Topics of other spaces of which the port is to be told something, each once.
@@ -91,6 +101,9 @@ impl Router {
             pace: Pace::default(),
             chunks: None,
             discovery: None,
+            calls: None,
+            instance: [0; 16],
+            claims: None,
             told: VecDeque::new(),
             news: VecDeque::new(),
             news_first: false,
@@ -100,15 +113,6 @@ impl Router {
             others: Counters::default(),
             hops: Hops::new(),
         }
-    }
-
-    /// Whether that topic is of what this program alone writes.
-    pub(crate) fn is_home(&self, topic: TopicId) -> bool {
-        self.owned.is_home(self.settings.own, topic)
-    }
-
-    fn may_cross(&self, heard_on: Side, what: What, topic: TopicId) -> bool {
-        may_cross(self.is_home(topic), heard_on, what)
     }
 
     /// Ties a topic to its local message type, compiled once. A topic bound anew starts afresh with the new type; a
@@ -374,6 +378,8 @@ impl Router {
             self.handle_due(topic, now);
             self.schedule(topic);
         }
+        self.look_at_claims(now);
+        self.look_at_calls(now);
         self.discover(now);
         self.expire_chunks(now);
     }
@@ -388,7 +394,13 @@ impl Router {
         };
         let chunks = self.chunks.as_ref().and_then(|chunks| chunks.due());
         let discovery = self.discovery_due();
-        [timer, pace, chunks, discovery].into_iter().flatten().min()
+        let calls = self.calls.as_ref().and_then(|calls| calls.due());
+        let claims = self.claims.as_ref();
+        let claims = claims.and_then(|claims| claims.due(self.mapping.pubsub().receive_timeout));
+        [timer, pace, chunks, discovery, calls, claims]
+            .into_iter()
+            .flatten()
+            .min()
     }
 
     /// The local side took a delivery of the topic: its time in this program ends at `now`, and the value is good.

@@ -6,6 +6,7 @@ use std::time::Instant;
 use mappings::Overflow;
 use messages::{MessageType, Plan, Selection};
 
+use crate::call::ValueDescription;
 use crate::counters::Counters;
 use crate::description::Description;
 use crate::gate::Gate;
@@ -37,6 +38,8 @@ pub(crate) struct Topic {
     pub(crate) gate: Option<Box<Gate>>,
     /// What is announced of it, if it is of our own space and its type is known.
     pub(crate) description: Option<Box<Description>>,
+    /// What the local side says it is, where it speaks in fields.
+    pub(crate) said: Option<Box<ValueDescription>>,
     /// When it is to be announced again.
     pub(crate) announce_at: Option<Instant>,
     pub(crate) counters: Counters,
@@ -94,6 +97,7 @@ impl Topic {
             takes: Takes::default(),
             gate: None,
             description: None,
+            said: None,
             announce_at: None,
             counters: Counters::default(),
             ready: false,

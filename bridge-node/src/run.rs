@@ -80,6 +80,9 @@ impl<P: Port> Shell<P> {
         stop: impl Future<Output = ()> + Send,
     ) -> Result<(), Failure> {
         let ended = self.carry(stop).await;
+        // Nobody is to wait for what is executed no longer.
+        self.router.withdraw_all(now());
+        while self.drain() {}
         let status = self.status();
         let [topics, sent, delivered, dropped] = status.summary();
         info!(topics, sent, delivered, dropped, "ending");

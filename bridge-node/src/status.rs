@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use bridge_core::{Counters, Delays, Hop, Router};
+use bridge_core::{CallCounters, Counters, Delays, Hop, Router};
 use mappings::SpaceId;
 use serde::Serialize;
 
@@ -18,6 +18,8 @@ pub(crate) struct Status {
     readiness: Readiness,
     mapping: MappingStatus,
     topics: BTreeMap<String, TopicStatus>,
+    /// Calls that are known, asked for or executed here.
+    calls: BTreeMap<String, CallStatus>,
     /// Datagrams and messages that belong to no topic.
     others: TopicStatus,
     hops: BTreeMap<&'static str, HopStatus>,
@@ -62,6 +64,21 @@ struct TopicStatus {
 }
 
 #[derive(Debug, Clone, Serialize)]
+struct CallStatus {
+    /// Its name for people, of one that somebody else executes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    name: Option<String>,
+    /// Whether somebody else executes it now.
+    known: bool,
+    asked: u64,
+    answered: u64,
+    refused: u64,
+    unknown: u64,
+    executed: u64,
+    dropped: BTreeMap<&'static str, u64>,
+}
+
+#[derive(Debug, Clone, Serialize)]
 struct HopStatus {
     count: u64,
     negative: u64,
@@ -81,6 +98,14 @@ impl Status {
             .topics()
             .map(|(topic, counters)| (topic.to_string(), counters.into()))
             .collect();
+        let calls = router
+            .calls()
+            .map(|(topic, counters)| {
+                let known = router.described_call(topic);
+                let name = known.map(|known| known.name.clone());
+                (topic.to_string(), CallStatus::of(counters, name))
+            })
+            .collect();
         let hops = HOPS
             .into_iter()
             .map(|(hop, label)| (label, router.hops().of(hop).into()))
@@ -94,6 +119,7 @@ impl Status {
                 restart_needed: restart.to_vec(),
             },
             topics,
+            calls,
             others: router.others().into(),
             hops,
         }
@@ -171,6 +197,22 @@ impl Status {
                 );
             }
         }
+        for (topic, call) in &self.calls {
+            let labels = format!("{own},call=\"{topic}\"");
+            line("call_known", &labels, &u8::from(call.known));
+            line("calls_asked_total", &labels, &call.asked);
+            line("calls_answered_total", &labels, &call.answered);
+            line("calls_refused_total", &labels, &call.refused);
+            line("calls_unknown_total", &labels, &call.unknown);
+            line("calls_executed_total", &labels, &call.executed);
+            for (reason, count) in &call.dropped {
+                line(
+                    "calls_dropped_total",
+                    &format!("{labels},reason=\"{reason}\""),
+                    count,
+                );
+            }
+        }
         for (hop, delays) in &self.hops {
             let labels = format!("{own},hop=\"{hop}\"");
             line("hop_count", &labels, &delays.count);
@@ -180,6 +222,32 @@ impl Status {
             line("hop_max_microseconds", &labels, &delays.max_us);
         }
         text
+    }
+}
+
+impl CallStatus {
+    fn of(counters: &CallCounters, name: Option<String>) -> Self {
+        let CallCounters {
+            asked,
+            answered,
+            refused,
+            unknown,
+            executed,
+            drops,
+        } = counters;
+        Self {
+            known: name.is_some(),
+            name: name.filter(|name| !name.is_empty()),
+            asked: *asked,
+            answered: *answered,
+            refused: *refused,
+            unknown: *unknown,
+            executed: *executed,
+            dropped: drops
+                .drops()
+                .map(|(reason, count)| (reason.label(), count))
+                .collect(),
+        }
     }
 }
 
@@ -225,7 +293,7 @@ const HOPS: [(Hop, &str); 4] = [
 mod tests {
     use std::net::SocketAddr;
 
-    use bridge_core::{Local, Settings};
+    use bridge_core::{AskId, Local, Settings};
     use uadp::{
         DataSetHeader, GroupHeader, NetworkHeader, NetworkMessageEncoder, PublisherId, Scalar,
     };
@@ -276,5 +344,39 @@ mod tests {
         );
         let json: serde_json::Value = serde_json::from_str(&status.json()).unwrap();
         assert_eq!(json["topics"]["ua_2_5_10"]["sender_changed"], 1);
+    }
+
+    #[test]
+    fn what_became_of_calls_stands_in_both_pages() {
+        let settings = Settings {
+            own: SpaceId::ROS1,
+            local: Local::Fields,
+            source: None,
+        };
+        let mut router = Router::new(settings, std::sync::Arc::default());
+        let call = "ua_0_7_105".parse().unwrap();
+        let timeout = std::time::Duration::from_secs(1);
+        router.ask(AskId(1), call, &[0, 0], timeout, crate::clock::now());
+        let ready = Readiness {
+            not_ready: Vec::new(),
+            interfaces: Interfaces {
+                pubsub: 1,
+                local: None,
+            },
+        };
+        let about = About::default();
+        let status = Status::of(("bridge", SpaceId::ROS1), &router, (&about, &[]), ready);
+        let own = "program=\"bridge\",space=\"1\",call=\"ua_0_7_105\"";
+        let text = status.prometheus();
+        for line in [
+            format!("ua_calls_asked_total{{{own}}} 1\n"),
+            format!("ua_calls_refused_total{{{own}}} 1\n"),
+            format!("ua_calls_dropped_total{{{own},reason=\"call_refused\"}} 1\n"),
+        ] {
+            assert!(text.contains(&line), "{text}");
+        }
+        let json: serde_json::Value = serde_json::from_str(&status.json()).unwrap();
+        assert_eq!(json["calls"]["ua_0_7_105"]["refused"], 1);
+        assert_eq!(json["calls"]["ua_0_7_105"]["known"], false);
     }
 }

@@ -1,105 +1,665 @@
-//! Calls: asking for those of other programs, and executing our own.
+//! Calls: asking for those of other programs.
+//!
+//! A request is repeated until it is answered, and executed once: [`uadp::action`] sees to both. Here is what that needs of
+//! the space: who executes a call and from where (`learn`), what our own are (`execute`), and the bytes of both sides.
 
+mod execute;
+mod learn;
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use mappings::TopicId;
-use messages::ServiceType;
-use uadp::action::{ExecutionId, Refusal};
+use mappings::{SpaceId, TopicId};
+use messages::{ServiceType, Wire};
+use uadp::action::{
+    ActionAddress, ActionDialect, ActionFields, ActionKind, ActionMessage, ActionRequest,
+    ActionToSend, CallId, CallRefusal, ExecutionId, Outcome, Refusal, Requestor, RequestorSettings,
+    Responder, ResponderSettings, ResponseDrop, Unknown,
+};
+use uadp::{
+    EncodeError, Extras, NetworkHeader, NetworkMessage, OwnedPublisherId, PublisherId, StatusCode,
+};
 
-use super::Router;
-use crate::call::{AskError, AskId, CallDescription, Executed, Offered, ValueDescription};
-use crate::counters::Reason;
-use crate::loop_rule::Owned;
+use self::execute::{Own, Running};
+use self::learn::{Group, Known};
+use super::{About, Router};
+use crate::call::{AskError, AskErrorKind, AskId, CallCounters, CallDescription};
+use crate::call_announcement::TARGET;
+use crate::call_plan::CallPlan;
+use crate::counters::{Cause, Reason};
+use crate::fields;
+use crate::loop_rule::{Side, What};
 use crate::output::Output;
-use crate::settings::Now;
+use crate::settings::{Local, Now};
+
+/// The calls of a Router.
+#[derive(Debug)]
+pub(super) struct Calls {
+    /// What its times count from.
+    start: Instant,
+    requestor: Requestor,
+    /// It answers to the group, whoever asks.
+    responder: Responder<()>,
+    table: HashMap<TopicId, Call>,
+    /// Who executes the calls of a namespace.
+    groups: HashMap<(SpaceId, u16), Group>,
+    /// Bytes of what is known of calls.
+    weight: usize,
+    asked: BTreeMap<CallId, Asked>,
+    asks: HashMap<AskId, CallId>,
+    executions: BTreeMap<ExecutionId, Running>,
+    /// What the port is to be told, in this order: never more than calls and requests there are.
+    news: VecDeque<Output>,
+    /// When our own are announced again.
+    announce_at: Option<Instant>,
+    /// When it is looked who fell silent.
+    look_at: Option<Instant>,
+    /// When there is something to do.
+    due: Option<Instant>,
+}
+
+/// One call.
+#[derive(Debug, Default)]
+struct Call {
+    /// What is known of one of another program.
+    known: Option<Known>,
+    /// What the local side asks for it as.
+    bound: Option<Bound>,
+    /// One of our own.
+    own: Option<Own>,
+    /// Requests of ours that are not answered.
+    open: usize,
+    counters: CallCounters,
+}
+
+/// A call's ROS type here.
+#[derive(Debug)]
+struct Bound {
+    service: Arc<ServiceType>,
+    /// `None` while the call is not known.
+    plan: Option<Result<Arc<CallPlan>, String>>,
+}
+
+/// A request of ours.
+#[derive(Debug)]
+struct Asked {
+    ask: AskId,
+    topic: TopicId,
+    /// What its response is read with, where the local side speaks ROS.
+    plan: Option<Arc<CallPlan>>,
+}
+
+impl Calls {
+    fn new(own: SpaceId, instance: [u8; 16], receive_timeout: Duration, start: Instant) -> Self {
+        let settings = RequestorSettings {
+            receive_timeout,
+            ..RequestorSettings::default()
+        };
+        Self {
+            start,
+            requestor: Requestor::new(OwnedPublisherId::UInt16(own.into()), instance, settings),
+            responder: Responder::new(ResponderSettings::default()),
+            table: HashMap::new(),
+            groups: HashMap::new(),
+            weight: 0,
+            asked: BTreeMap::new(),
+            asks: HashMap::new(),
+            executions: BTreeMap::new(),
+            news: VecDeque::new(),
+            announce_at: None,
+            look_at: None,
+            due: None,
+        }
+    }
+
+    fn since_start(&self, now: Now) -> Duration {
+        now.monotonic.saturating_duration_since(self.start)
+    }
+
+    fn reckon(&mut self) {
+        let requests = self.requestor.poll_timeout();
+        let next = requests.into_iter().chain(self.responder.poll_timeout());
+        let next = next.map(|due| self.start + due);
+        self.due = next.chain(self.announce_at).chain(self.look_at).min();
+    }
+
+    pub(super) const fn due(&self) -> Option<Instant> {
+        self.due
+    }
+
+    /// The request is over: it counts no longer as open.
+    fn close(&mut self, id: CallId) -> Option<Asked> {
+        let asked = self.asked.remove(&id)?;
+        self.asks.remove(&asked.ask);
+        if let Some(call) = self.table.get_mut(&asked.topic) {
+            call.open = call.open.saturating_sub(1);
+        }
+        Some(asked)
+    }
+}
 
 impl Router {
-    /// Says which namespaces of the space this program alone writes.
-    pub fn set_owned(&mut self, owned: Owned, now: Now) {
-        let _ = now;
-        self.owned = owned;
+    /// Gives it random bytes, which tell its requests from those of other programs of the space and of its own earlier runs.
+    /// To be given before the first call is known.
+    pub const fn set_instance(&mut self, instance: [u8; 16]) {
+        self.instance = instance;
     }
 
-    /// Gives it random bytes.
-    pub fn set_instance(&mut self, instance: [u8; 16]) {
-        let _ = (instance, self);
+    fn calls_mut(&mut self, now: Now) -> &mut Calls {
+        let (own, instance) = (self.settings.own, self.instance);
+        let timeout = self.mapping.pubsub().receive_timeout;
+        self.calls
+            .get_or_insert_with(|| Box::new(Calls::new(own, instance, timeout, now.monotonic)))
     }
 
-    /// Claims.
-    pub fn claim(&mut self, now: Now) {
-        let _ = (now, self);
+    /// What is counted of each call that is known, asked for or executed here, in no order.
+    pub fn calls(&self) -> impl Iterator<Item = (TopicId, &CallCounters)> {
+        let all = self.calls.iter().flat_map(|calls| &calls.table);
+        all.map(|(topic, call)| (*topic, &call.counters))
     }
 
-    pub(super) fn contend(&mut self, namespace: u16, from: std::net::SocketAddr, now: Now) {
-        let _ = (namespace, from, now, self);
+    /// What a call of another program is, if somebody executes it.
+    #[must_use]
+    pub fn described_call(&self, topic: TopicId) -> Option<&Arc<CallDescription>> {
+        let known = self.calls.as_ref()?.table.get(&topic)?.known.as_ref()?;
+        (!known.gone).then_some(&known.description)
     }
 
-    /// Describes.
-    pub fn describe_value(&mut self, topic: TopicId, description: ValueDescription, now: Now) {
-        let _ = (topic, description, now, self);
-    }
-
-    /// Binds.
+    /// The local side asks for a call under that type. It may not be known yet: then its executing side is asked what it is,
+    /// and whether it fits turns out later.
     ///
     /// # Errors
-    /// It does not fit.
+    /// Why the call as it is known cannot be asked for under that type, for people. It stays bound all the same: it may
+    /// become another.
     pub fn bind_call(
         &mut self,
         topic: TopicId,
         service: &Arc<ServiceType>,
         now: Now,
     ) -> Result<(), String> {
-        let _ = (topic, service, now, self);
-        Ok(())
+        if self.wire().is_none() || self.is_home(topic) {
+            return Ok(());
+        }
+        self.calls_mut(now).table.entry(topic).or_default().bound = Some(Bound {
+            service: Arc::clone(service),
+            plan: None,
+        });
+        let bound = self.compile(topic);
+        self.want_call(topic, now);
+        bound
     }
 
-    /// Unbinds.
+    fn wire(&self) -> Option<Wire> {
+        match self.settings.local {
+            Local::Ros1 => Some(Wire::Ros1),
+            Local::Cdr => Some(Wire::Cdr),
+            Local::Fields => None,
+        }
+    }
+
+    /// Makes the plan of a call that is known and bound.
+    fn compile(&mut self, topic: TopicId) -> Result<(), String> {
+        let wire = self.wire();
+        let call = self.calls.as_mut();
+        let call = call.and_then(|calls| calls.table.get_mut(&topic));
+        let Some(Call {
+            known: Some(known),
+            bound: Some(bound),
+            ..
+        }) = call
+        else {
+            return Ok(());
+        };
+        let Some(wire) = wire else { return Ok(()) };
+        let plan = CallPlan::compile(&known.description, &bound.service, (wire, &mut self.plans));
+        let outcome = plan.as_ref().map(|_| ()).map_err(Clone::clone);
+        bound.plan = Some(plan.map(Arc::new));
+        outcome
+    }
+
+    /// The local side no longer asks for a call. What was asked is answered.
     pub fn unbind_call(&mut self, topic: TopicId) {
-        let _ = (topic, self);
+        let calls = self.calls.as_mut();
+        if let Some(call) = calls.and_then(|calls| calls.table.get_mut(&topic)) {
+            call.bound = None;
+        }
     }
 
-    /// Wants.
+    /// The local side has somebody who would ask for a call: where it is not known, its executing side is asked what it is.
     pub fn want_call(&mut self, topic: TopicId, now: Now) {
-        let _ = (topic, now, self);
+        if self.described_call(topic).is_none() && !self.is_home(topic) {
+            self.plan_probe(topic, now);
+        }
     }
 
-    /// Asks.
+    /// Asks for a call. What becomes of it comes as an [`Output::Answer`], within `timeout` or soon after, unless it is
+    /// [given up](Self::give_up). `ask` is used once.
     pub fn ask(&mut self, ask: AskId, topic: TopicId, request: &[u8], timeout: Duration, now: Now) {
-        let _ = (request, timeout, now);
-        let answer = Err(AskError::refused(Refusal::NoSuchAction, "not built yet"));
-        self.tell(Output::Answer { ask, topic, answer });
+        let begun = self.begin(topic, request, timeout, now);
+        let calls = self.calls_mut(now);
+        let call = calls.table.entry(topic).or_default();
+        call.counters.asked += 1;
+        match begun {
+            Ok((id, plan)) => {
+                call.open += 1;
+                calls.asked.insert(id, Asked { ask, topic, plan });
+                calls.asks.insert(ask, id);
+                calls.reckon();
+            }
+            Err((cause, error)) => {
+                call.counters.refused += 1;
+                let detail = error.text.clone();
+                calls.news.push_back(Output::Answer {
+                    ask,
+                    topic,
+                    answer: Err(error),
+                });
+                self.count_call(topic, None, cause, || detail);
+            }
+        }
     }
 
-    /// Gives up.
+    fn begin(
+        &mut self,
+        topic: TopicId,
+        request: &[u8],
+        timeout: Duration,
+        now: Now,
+    ) -> Result<(CallId, Option<Arc<CallPlan>>), (Cause, AskError)> {
+        let refuse = |refusal: Refusal, case: &'static str, text: String| {
+            (
+                (Reason::CallRefused, case).into(),
+                AskError::refused(refusal, text),
+            )
+        };
+        if !self.may_cross(Side::Local, What::Request, topic) {
+            let text = format!("{topic} is executed here: nobody else can be asked");
+            return Err((
+                Reason::Looped.into(),
+                AskError::refused(Refusal::NoSuchAction, text),
+            ));
+        }
+        if self.described_call(topic).is_none() {
+            self.want_call(topic, now);
+            let text = format!("nobody executes {topic} now, as far as is known here");
+            return Err(refuse(Refusal::NoSuchAction, "unknown", text));
+        }
+        let wire = self.wire();
+        let (space, namespace, writer_id) = topic.triple();
+        let calls = self.calls_mut(now);
+        let since = calls.since_start(now);
+        let call = calls.table.entry(topic).or_default();
+        if call.open >= MAX_OPEN {
+            let text = format!("{MAX_OPEN} requests for {topic} at a time are all there may be");
+            return Err(refuse(Refusal::Busy, "open", text));
+        }
+        let plan = match (wire, &call.bound) {
+            (None, _) => None,
+            (
+                Some(_),
+                Some(Bound {
+                    plan: Some(plan), ..
+                }),
+            ) => Some(
+                plan.clone()
+                    .map_err(|why| refuse(Refusal::InvalidArgument, "type", why))?,
+            ),
+            (Some(_), _) => {
+                let text = format!("{topic} is bound to no type here");
+                return Err(refuse(Refusal::NotExecutable, "unbound", text));
+            }
+        };
+        let block = plan.as_ref().map(|plan| plan.request(request, namespace));
+        let block = block
+            .transpose()
+            .map_err(|(cause, text)| (cause, AskError::refused(Refusal::InvalidArgument, text)))?;
+        let fields = block.as_deref().unwrap_or(request);
+        if fields.len() > MAX_REQUEST {
+            let text = format!(
+                "{} bytes, and {MAX_REQUEST} are all there may be",
+                fields.len()
+            );
+            return Err((
+                Reason::TooBig.into(),
+                AskError::refused(Refusal::TooBig, text),
+            ));
+        }
+        let request = ActionRequest {
+            address: ActionAddress {
+                publisher_id: OwnedPublisherId::UInt16(space),
+                writer_group_id: Some(namespace),
+                writer_id,
+                target_id: TARGET,
+            },
+            dialect: ActionDialect::Standard,
+            fields: ActionFields::Variants(fields),
+            timeout,
+        };
+        match calls.requestor.call(request, since) {
+            Ok(id) => Ok((id, plan)),
+            Err(why @ (CallRefusal::TooManyCalls(_) | CallRefusal::TooManyBytes { .. })) => {
+                Err(refuse(Refusal::Busy, "in flight", why.to_string()))
+            }
+            Err(why) => Err(refuse(Refusal::InvalidArgument, "request", why.to_string())),
+        }
+    }
+
+    /// Nobody waits for that answer any longer: it does not come, and whoever executes the request is told so.
     pub fn give_up(&mut self, ask: AskId, now: Now) {
-        let _ = (ask, now, self);
+        let Some(calls) = &mut self.calls else {
+            return;
+        };
+        let since = calls.since_start(now);
+        if let Some(id) = calls.asks.get(&ask).copied() {
+            calls.requestor.abandon(id, since);
+            calls.close(id);
+            calls.reckon();
+        }
     }
 
-    /// What it is.
-    #[must_use]
-    pub fn described_call(&self, topic: TopicId) -> Option<&Arc<CallDescription>> {
-        let _ = (topic, self);
-        None
-    }
-
-    /// Offers.
-    pub fn offer(&mut self, topic: TopicId, offered: Offered, now: Now) {
-        let _ = (topic, offered, now, self);
-    }
-
-    /// Withdraws.
-    pub fn withdraw(&mut self, topic: TopicId, now: Now) {
-        let _ = (topic, now, self);
-    }
-
-    /// Executed.
-    pub fn executed(&mut self, execution: ExecutionId, outcome: Executed, now: Now) {
-        let _ = (execution, outcome, now, self);
-    }
-
-    /// Not called.
+    /// A request or response could not be sent: it is sent again.
     pub fn not_called(&mut self, topic: TopicId, reason: Reason, detail: &str) {
-        let _ = (topic, reason, detail, self);
+        self.count_call(topic, None, (reason, "socket"), || detail.to_owned());
+    }
+
+    /// Requests and responses of that Publisher, or for it.
+    pub(super) fn handle_actions(
+        &mut self,
+        message: &NetworkMessage<'_>,
+        (space, from): (SpaceId, SocketAddr),
+        now: Now,
+    ) {
+        let actions = match message.actions(ActionDialect::Standard) {
+            Ok(actions) => actions,
+            Err(error) => return self.drop_undecoded(None, from, &error),
+        };
+        for action in actions {
+            let action = match action {
+                Ok(action) => action,
+                Err(error) => {
+                    self.drop_undecoded(None, from, &error);
+                    continue;
+                }
+            };
+            let namespace = action.writer_group_id.unwrap_or_default();
+            let topic = TopicId::new(u16::from(space.get()), namespace, action.writer_id);
+            match (topic, action.action.kind) {
+                (None, _) => self.count(About::sender(from), Reason::NotInSpace, 1, String::new),
+                (Some(topic), ActionKind::Request) => {
+                    self.handle_request(topic, &action, from, now);
+                }
+                (Some(topic), ActionKind::Response) => {
+                    self.handle_response(topic, &action, from, now);
+                }
+            }
+        }
+        self.settle();
+    }
+
+    fn handle_response(
+        &mut self,
+        topic: TopicId,
+        response: &ActionMessage<'_>,
+        from: SocketAddr,
+        now: Now,
+    ) {
+        if !self.may_cross(Side::Ua, What::Response, topic) {
+            let (_, namespace, _) = topic.triple();
+            return self.drop_own(Some(namespace), from, now);
+        }
+        let Some(calls) = &mut self.calls else {
+            return self.count(About::sender(from), Reason::NotAsked, 1, String::new);
+        };
+        let since = calls.since_start(now);
+        let known = calls.table.get(&topic).and_then(|call| call.known.as_ref());
+        let impostor = known.is_some_and(|known| known.from != from);
+        let heard = match impostor {
+            true => Err(ResponseDrop::Elsewhere),
+            false => calls.requestor.handle_response(response, since),
+        };
+        match heard {
+            Ok(uadp::action::Heard::Done(id, outcome)) => self.conclude(id, outcome),
+            Ok(uadp::action::Heard::Executing(_) | uadp::action::Heard::Closed(_)) => {}
+            Err(ResponseDrop::Elsewhere) => {
+                self.count_call(topic, Some(from), Reason::Forged, || {
+                    format!("{from} answers for {topic}, which it does not execute")
+                });
+            }
+            // Answers go to the group, those to others and those that are repeated too.
+            Err(_) => self.count_call(topic, Some(from), Reason::NotAsked, String::new),
+        }
+    }
+
+    /// Tells what became of a request.
+    fn conclude(&mut self, id: CallId, outcome: Outcome<'_>) {
+        let Some(asked) = self.calls.as_mut().and_then(|calls| calls.close(id)) else {
+            return;
+        };
+        let Asked { ask, topic, plan } = asked;
+        let mut response = self.buffer();
+        let (answer, cause) = match outcome {
+            Outcome::Answered { status, fields } if status.0 & BAD == 0 => {
+                match read(fields, plan.as_deref(), &mut response) {
+                    Ok(()) => (Ok(response), None),
+                    Err((cause, detail)) => {
+                        let text =
+                            format!("it was executed, but its response cannot be read: {detail}");
+                        (failed(BAD_DECODING_ERROR, text), Some((cause, detail)))
+                    }
+                }
+            }
+            Outcome::Answered { status, .. } => {
+                let text = format!("it was executed and went wrong: status 0x{:08X}", status.0);
+                (failed(status, text), None)
+            }
+            Outcome::Refused(refusal) => {
+                (Err(AskError::refused(refusal, refusal.to_string())), None)
+            }
+            Outcome::Unknown(why) => (Err(unknown(why)), None),
+        };
+        if let Some(calls) = &mut self.calls {
+            if let Some(call) = calls.table.get_mut(&topic) {
+                let counters = &mut call.counters;
+                let counter = match &answer {
+                    Err(error) if error.kind == AskErrorKind::Refused => &mut counters.refused,
+                    Err(error) if error.kind == AskErrorKind::Unknown => &mut counters.unknown,
+                    Ok(_) | Err(_) => &mut counters.answered,
+                };
+                *counter += 1;
+            }
+            calls.news.push_back(Output::Answer { ask, topic, answer });
+        }
+        if let Some((cause, detail)) = cause {
+            self.count_call(topic, None, cause, || detail);
+        }
+    }
+
+    /// What is to be told of requests that nobody answered and executions that nobody waits for.
+    pub(super) fn settle(&mut self) {
+        while let Some((id, why)) = self
+            .calls
+            .as_mut()
+            .and_then(|calls| calls.requestor.poll_given_up())
+        {
+            self.conclude(id, Outcome::Unknown(why));
+        }
+        if let Some(calls) = &mut self.calls {
+            while let Some(execution) = calls.responder.poll_overdue() {
+                if let Some(running) = calls.executions.get(&execution) {
+                    let topic = running.topic;
+                    calls.news.push_back(Output::Abandoned { execution, topic });
+                }
+            }
+            calls.reckon();
+        }
+    }
+
+    /// Announces and gives up what is due.
+    pub(super) fn look_at_calls(&mut self, now: Now) {
+        let Some(calls) = &mut self.calls else {
+            return;
+        };
+        if calls.due.is_none_or(|due| due > now.monotonic) {
+            return;
+        }
+        let since = calls.since_start(now);
+        calls.requestor.handle_timeout(since);
+        calls.responder.handle_timeout(since);
+        if calls.announce_at.is_some_and(|at| at <= now.monotonic) {
+            self.announce_calls(now);
+        }
+        self.look_for_silence(now);
+        self.settle();
+    }
+
+    /// What the port is to be told of calls, or the next request or response that is to be sent.
+    pub(super) fn next_action(&mut self, now: Now) -> Option<Output> {
+        let mut bytes = self.spare.pop().unwrap_or_default();
+        let told = self.write_action(&mut bytes, now);
+        match told {
+            Some(Told::News(output)) => {
+                self.recycle(bytes);
+                Some(output)
+            }
+            Some(Told::Datagram(topic)) => Some(Output::Action { topic, bytes }),
+            None => {
+                self.recycle(bytes);
+                None
+            }
+        }
+    }
+
+    fn write_action(&mut self, bytes: &mut Vec<u8>, now: Now) -> Option<Told> {
+        loop {
+            let calls = self.calls.as_mut()?;
+            if let Some(news) = calls.news.pop_front() {
+                return Some(Told::News(news));
+            }
+            if calls.due.is_none_or(|due| due > now.monotonic) {
+                return None;
+            }
+            let since = calls.since_start(now);
+            let answer = calls.responder.poll_transmit(since);
+            let answer = answer.map(|((), answer)| encode(&answer, bytes));
+            let next = answer.or_else(|| {
+                let request = calls.requestor.poll_transmit(since);
+                request.map(|request| encode(&request, bytes))
+            });
+            match next {
+                // What timed out meanwhile is told.
+                None => {
+                    self.settle();
+                    let calls = self.calls.as_mut()?;
+                    return calls.news.pop_front().map(Told::News);
+                }
+                Some((Some(topic), Ok(()))) if !self.is_withheld(topic) => {
+                    return Some(Told::Datagram(topic));
+                }
+                Some((Some(topic), Ok(()))) => {
+                    self.count_call(topic, None, (Reason::SpaceTaken, "withheld"), String::new);
+                }
+                Some((topic, Err(error))) => {
+                    if let Some(topic) = topic {
+                        self.count_call(topic, None, Reason::TooBig, || error.to_string());
+                    }
+                }
+                Some((None, Ok(()))) => {}
+            }
+            bytes.clear();
+        }
+    }
+
+    /// As [`count`](Self::count), for a call.
+    fn count_call(
+        &mut self,
+        topic: TopicId,
+        from: Option<SocketAddr>,
+        cause: impl Into<Cause>,
+        detail: impl FnOnce() -> String,
+    ) {
+        let cause = cause.into();
+        let call = self.calls.as_mut();
+        let counters = match call.and_then(|calls| calls.table.get_mut(&topic)) {
+            Some(call) => &mut call.counters.drops,
+            None => &mut self.others,
+        };
+        let total = counters.add(cause, 1);
+        let about = About {
+            topic: Some(topic),
+            from,
+        };
+        self.tell_of_drop(about, cause, (total.saturating_sub(1), total), detail);
     }
 }
+
+/// What comes of a look at the calls.
+enum Told {
+    News(Output),
+    Datagram(TopicId),
+}
+
+/// Writes the NetworkMessage, and says of which call it is.
+fn encode(
+    action: &ActionToSend<'_>,
+    bytes: &mut Vec<u8>,
+) -> (Option<TopicId>, Result<(), EncodeError>) {
+    let ActionAddress {
+        publisher_id,
+        writer_group_id,
+        writer_id,
+        ..
+    } = action.address;
+    let topic = match publisher_id.as_id() {
+        PublisherId::UInt16(space) => {
+            TopicId::new(space, writer_group_id.unwrap_or_default(), *writer_id)
+        }
+        PublisherId::Byte(_)
+        | PublisherId::UInt32(_)
+        | PublisherId::UInt64(_)
+        | PublisherId::String(_) => None,
+    };
+    let written = action
+        .encode(bytes, &NetworkHeader::default(), &Extras::default())
+        .and_then(uadp::action::ActionEncoder::finish);
+    (topic, written)
+}
+
+/// Appends a response as the local side has it.
+fn read(
+    fields: ActionFields<'_>,
+    plan: Option<&CallPlan>,
+    out: &mut Vec<u8>,
+) -> Result<(), (Cause, String)> {
+    let variants = fields.variants().map_err(fields::undecodable)?;
+    match plan {
+        Some(plan) => plan.response(variants.bytes(), out),
+        None => fields::copy(&variants, out),
+    }
+}
+
+fn failed(status: StatusCode, text: String) -> Result<Vec<u8>, AskError> {
+    Err(AskError {
+        kind: AskErrorKind::Failed,
+        status,
+        text,
+    })
+}
+
+fn unknown(why: Unknown) -> AskError {
+    AskError {
+        kind: AskErrorKind::Unknown,
+        status: why.status_code(),
+        text: format!("whether it was executed is not known: {why}"),
+    }
+}
+
+/// The severity of a Bad StatusCode (OPC 10000-4, 7.39.1).
+const BAD: u32 = 0x8000_0000;
+/// Bad_DecodingError (OPC 10000-6, A.2).
+const BAD_DECODING_ERROR: StatusCode = StatusCode(0x8007_0000);
+/// Requests for one call that wait for their answer.
+const MAX_OPEN: usize = 256;
+/// Bytes of the fields of a request, which has to fit a datagram.
+const MAX_REQUEST: usize = 60_000;

@@ -1,6 +1,6 @@
 //! What topics consist of: announced for those of our own space, learned and asked for of the others.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -15,6 +15,7 @@ use uadp::{NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader};
 
 use super::receive::DISCOVERY;
 use super::{About, Router};
+use crate::call::split_name;
 use crate::counters::Reason;
 use crate::description::{Described, Description, Source, mapped_leaves};
 use crate::layout::Layout;
@@ -31,9 +32,15 @@ use crate::topic::{Role, Topic};
 pub(super) struct Discovery {
     /// What its times count from.
     start: Instant,
-    announcer: Announcer,
+    pub(super) announcer: Announcer,
     /// Topics of our own space by their DataSetWriterId: all that a probe names.
-    writers: BTreeMap<u16, Vec<TopicId>>,
+    pub(super) writers: BTreeMap<u16, Vec<TopicId>>,
+    /// Calls of ours by their DataSetWriterId.
+    pub(super) actions: BTreeMap<u16, Vec<TopicId>>,
+    /// Spaces that are asked which calls they have.
+    pub(super) rolls: BTreeMap<SpaceId, ProbeTimer>,
+    /// Namespaces whose program was asked that when it was first heard.
+    pub(super) met: HashSet<(SpaceId, u16)>,
     /// Publishers that are asked.
     probing: BTreeMap<SpaceId, Probing>,
     learned: Learned<Described>,
@@ -61,6 +68,9 @@ impl Discovery {
             start,
             announcer: Announcer::new([], limits),
             writers: BTreeMap::new(),
+            actions: BTreeMap::new(),
+            rolls: BTreeMap::new(),
+            met: HashSet::new(),
             probing: BTreeMap::new(),
             learned: Learned::default(),
             layouts: Learned::default(),
@@ -73,14 +83,18 @@ impl Discovery {
         self.layouts.last(topic)
     }
 
-    fn since_start(&self, now: Now) -> Duration {
+    pub(super) fn since_start(&self, now: Now) -> Duration {
         now.monotonic.saturating_duration_since(self.start)
     }
 
-    fn reckon(&mut self) {
+    pub(super) fn reckon(&mut self) {
         let probes = self.probing.values();
         let probes = probes.filter_map(|probing| probing.timer.poll_timeout());
-        let next = probes.chain(self.announcer.poll_timeout()).min();
+        let rolls = self.rolls.values().filter_map(ProbeTimer::poll_timeout);
+        let next = probes
+            .chain(rolls)
+            .chain(self.announcer.poll_timeout())
+            .min();
         self.due = next.map(|due| self.start + due);
     }
 
@@ -97,7 +111,7 @@ impl Discovery {
     }
 
     /// A topic of a Publisher is no longer to be asked for.
-    fn answered(&mut self, space: SpaceId, is_it: impl Fn(TopicId) -> bool) {
+    pub(super) fn answered(&mut self, space: SpaceId, is_it: impl Fn(TopicId) -> bool) {
         if let Some(probing) = self.probing.get_mut(&space) {
             probing.topics.retain(|topic| !is_it(*topic));
             if probing.topics.is_empty() {
@@ -109,7 +123,7 @@ impl Discovery {
 }
 
 impl Router {
-    fn discovery(&mut self, now: Now) -> &mut Discovery {
+    pub(super) fn discovery(&mut self, now: Now) -> &mut Discovery {
         let own = self.settings.own;
         self.discovery
             .get_or_insert_with(|| Box::new(Discovery::new(own, now.monotonic)))
@@ -131,6 +145,7 @@ impl Router {
         let period = self.mapping.pubsub().metadata_period;
         let Some(Topic {
             plan,
+            said,
             description,
             announce_at,
             ..
@@ -138,29 +153,20 @@ impl Router {
         else {
             return;
         };
-        let variable = self.mapping.variable(topic);
+        let said = said.as_deref().filter(|_| message.is_none());
+        let variable = self.mapping.variable(topic).filter(|_| said.is_none());
         let mapped = match (message, variable) {
             (None, Some(variable)) => mapped_leaves(variable),
             (Some(_), _) | (None, None) => Vec::new(),
         };
         let leaves = match (message, plan) {
             (Some(_), Some(plan)) => plan.leaves(),
+            (None, _) if said.is_some() => said.map_or(&[][..], |said| &said.fields),
             (None, _) if !mapped.is_empty() => &mapped,
             (Some(_), None) => return,
             (None, _) => {
                 // The mapping has left it open again.
-                *description = None;
-                *announce_at = None;
-                let (_, _, writer_id) = topic.triple();
-                if let Some(discovery) = &mut self.discovery
-                    && let Some(topics) = discovery.writers.get_mut(&writer_id)
-                {
-                    topics.retain(|of| *of != topic);
-                    if topics.is_empty() {
-                        discovery.writers.remove(&writer_id);
-                    }
-                }
-                return;
+                return self.forget_described(topic);
             }
         };
         let source = Source {
@@ -168,6 +174,7 @@ impl Router {
             message,
             leaves,
             variable,
+            said,
             namespaces: self.mapping.namespaces(),
         };
         match Description::new(source, description.as_deref(), now.utc) {
@@ -225,16 +232,22 @@ impl Router {
         };
         let since = discovery.since_start(now);
         while let Some(due) = discovery.announcer.poll(since) {
-            let Subject::DataSetMetaData(writer_id) = due.subject else {
+            let (Subject::DataSetMetaData(writer_id) | Subject::ActionMetaData(writer_id)) =
+                due.subject
+            else {
                 continue;
             };
-            match discovery.writers.get(&writer_id).map(Vec::as_slice) {
-                Some(topics) => {
-                    for topic in topics {
-                        self.announce(*topic, due.sequence_number, now);
-                    }
-                }
-                None => self.deny(writer_id, due.sequence_number),
+            let values = discovery.writers.get(&writer_id);
+            let calls = discovery.actions.get(&writer_id);
+            for topic in values.into_iter().flatten() {
+                self.announce(*topic, due.sequence_number, now);
+            }
+            for topic in calls.into_iter().flatten() {
+                self.announce_call(*topic, due.sequence_number, now);
+            }
+            // Where others write the same space, it may be theirs.
+            if values.is_none() && calls.is_none() && self.owned == Owned::All {
+                self.deny(writer_id, due.sequence_number);
             }
         }
         // Anything is random enough to ask at another time than others do.
@@ -255,12 +268,15 @@ impl Router {
                 }
             }
         }
+        self.call_rolls(&mut discovery, (since, random));
         discovery.reckon();
         self.discovery = Some(discovery);
     }
 
     fn announce(&mut self, topic: TopicId, sequence_number: u16, now: Now) {
-        let (max_datagram, _) = self.sizes();
+        if self.is_withheld(topic) {
+            return;
+        }
         let mut bytes = self.buffer();
         let Some(Topic {
             description: Some(description),
@@ -272,6 +288,18 @@ impl Router {
         };
         let body_at = description.write(sequence_number, &mut bytes);
         counters.announced += 1;
+        self.send_announcement(topic, sequence_number, (bytes, body_at), now);
+    }
+
+    /// Sends an announcement about a topic, in chunks where it is larger than a datagram.
+    pub(super) fn send_announcement(
+        &mut self,
+        topic: TopicId,
+        sequence_number: u16,
+        (bytes, body_at): (Vec<u8>, usize),
+        now: Now,
+    ) {
+        let (max_datagram, _) = self.sizes();
         if bytes.len() <= usize::from(max_datagram) {
             self.tell(Output::Discovery { bytes });
             return;
@@ -345,7 +373,7 @@ impl Router {
         }
     }
 
-    fn plan_probe(&mut self, topic: TopicId, now: Now) {
+    pub(super) fn plan_probe(&mut self, topic: TopicId, now: Now) {
         let random = u32::try_from(now.utc.unix_nanos() & 0xFFFF_FFFF).unwrap_or_default();
         let discovery = self.discovery(now);
         let since = discovery.since_start(now);
@@ -383,6 +411,11 @@ impl Router {
         if message.message_type() == NetworkMessageType::Probe {
             match Probe::decode(message) {
                 Ok(Probe::DataSetMetaData(ids)) => self.handle_probe(ids, space, now),
+                // Our own question is heard too.
+                Ok(Probe::PubSubConnections { .. }) if !self.is_source(from) => {
+                    self.handle_roll(space, now);
+                }
+                Ok(Probe::PubSubConnections { .. }) => {}
                 // Of endpoints and configurations there is nothing to tell.
                 Ok(_) => self.drop_undecoded(None, from, &DISCOVERY),
                 Err(error) => self.drop_undecoded(None, from, &error),
@@ -406,7 +439,8 @@ impl Router {
         if asked == own {
             let probe = Probe::DataSetMetaData(ids);
             discovery.announcer.handle_probe(&probe, since);
-        } else if let Some(probing) = discovery.probing.get_mut(&asked) {
+        }
+        if let Some(probing) = discovery.probing.get_mut(&asked) {
             // One pass: a datagram has room for 32 000 ids, and each pass decodes all of them.
             let mut missing: BTreeSet<u16> = probing.topics.iter().map(|t| t.triple().2).collect();
             for id in ids {
@@ -427,6 +461,10 @@ impl Router {
         (space, from): (SpaceId, SocketAddr),
         now: Now,
     ) {
+        if let Announced::ActionMetaData(action) = &announcement.announced {
+            self.learn_call(action, (space, from), now);
+            return;
+        }
         let Announced::DataSetMetaData {
             writer_id,
             meta_data,
@@ -436,13 +474,22 @@ impl Router {
             self.drop_undecoded(None, from, &DISCOVERY);
             return;
         };
-        if status.0 & STATUS_BAD != 0 {
-            self.learn_of_none(*writer_id, (space, from), now);
-            return;
-        }
-        let named = meta_data.name.and_then(|name| name.parse().ok());
+        let named = meta_data.name.and_then(split_name);
+        let named = named.map(|(topic, _)| topic);
         let topic =
             named.filter(|topic: &TopicId| topic.space == space && topic.triple().2 == *writer_id);
+        if let Some(topic) = topic.filter(|topic| self.is_home(*topic)) {
+            let (_, namespace, _) = topic.triple();
+            self.drop_own(Some(namespace), from, now);
+            return;
+        }
+        if status.0 & STATUS_BAD != 0 {
+            match topic {
+                Some(topic) => self.unlearn(topic, from, now),
+                None => self.learn_of_none(*writer_id, (space, from), now),
+            }
+            return;
+        }
         let Some(topic) = topic else {
             self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return;

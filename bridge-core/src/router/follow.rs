@@ -60,6 +60,7 @@ impl Router {
             self.topics.insert(topic, entry);
             if from.is_some() {
                 self.schedule(topic);
+                self.meet(topic, now);
             }
         }
         self.topics.get_mut(&topic)

@@ -44,6 +44,10 @@ impl Router {
             self.handle_discovery(message, (space, from), now);
             return;
         }
+        if message.is_action() {
+            self.handle_actions(message, (space, from), now);
+            return;
+        }
         let namespace = header.group.and_then(|group| group.writer_group_id);
         if self.is_ours(space, namespace) {
             self.drop_own(namespace, from, now);
@@ -53,6 +57,9 @@ impl Router {
             self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
             return;
         };
+        if let Some(calls) = &mut self.calls {
+            calls.heard(space, namespace, from, now);
+        }
         if message.is_chunk() && !message.is_sealed() {
             self.handle_chunk(message, (space, namespace), from, now);
             return;

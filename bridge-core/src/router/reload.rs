@@ -119,7 +119,7 @@ impl Router {
     }
 
     /// Lets the samples that wait stand in a queue of another kind.
-    fn requeue(&mut self, topic: TopicId, overflow: Overflow) {
+    pub(super) fn requeue(&mut self, topic: TopicId, overflow: Overflow) {
         let Some(entry) = self.topics.get_mut(&topic) else {
             return;
         };

@@ -16,6 +16,11 @@ impl Router {
         if let Some(told) = self.told.pop_front() {
             return Some(told);
         }
+        if self.calls.is_some()
+            && let Some(action) = self.next_action(now)
+        {
+            return Some(action);
+        }
         // In turn, so that many topics nobody knows do not keep the values of the others waiting.
         self.news_first = !self.news_first;
         let next = if self.news_first {
@@ -53,6 +58,10 @@ impl Router {
 
     /// Takes one thing of a topic, and puts it back in line if it has more.
     fn take_turn(&mut self, topic: TopicId, now: Now) -> Option<Output> {
+        if self.claims.is_some() && self.is_withheld(topic) {
+            self.withhold(topic);
+            return None;
+        }
         let entry = self.topics.get_mut(&topic)?;
         let item = match entry.sending {
             Some(_) => None,

@@ -32,6 +32,17 @@ impl Router {
         };
         let total = counters.add(cause, count);
         let before = total.saturating_sub(count);
+        self.tell_of_drop(About { topic, from }, cause, (before, total), detail);
+    }
+
+    /// Tells of drops for a cause, of which there were so many before and are so many now.
+    pub(super) fn tell_of_drop(
+        &mut self,
+        About { topic, from }: About,
+        cause: Cause,
+        (before, total): (u64, u64),
+        detail: impl FnOnce() -> String,
+    ) {
         let told =
             !cause.reason.is_routine() && (before + 1..=total).take(MAX_TOLD_STEPS).any(is_told);
         if told {

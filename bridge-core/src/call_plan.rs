@@ -1,0 +1,126 @@
+//! Requests and responses between a ROS service type and the fields of a call.
+
+use std::sync::Arc;
+
+use messages::{Plan, PlanError, Selection, ServiceType, Wire};
+use uadp::{
+    DataSetHeader, EncodeError, FieldEncoder, Fields, NetworkHeader, NetworkMessage,
+    NetworkMessageEncoder, Variant,
+};
+
+use crate::call::CallDescription;
+use crate::counters::{Cause, Reason};
+use crate::fields::{self, Payload};
+use crate::plans::Plans;
+
+/// How the bytes of one service type become the fields of one call, and the other way.
+#[derive(Debug)]
+pub(crate) struct CallPlan {
+    request: Arc<Plan>,
+    response: Arc<Plan>,
+    /// For each field of the request its place in the ROS message; `None` where it goes without fields.
+    request_order: Option<Vec<usize>>,
+    /// For each field of the ROS message its place in the response.
+    response_order: Vec<usize>,
+}
+
+impl CallPlan {
+    /// For calls of that kind under that type.
+    ///
+    /// # Errors
+    /// Why they do not fit, for people.
+    pub(crate) fn compile(
+        description: &CallDescription,
+        service: &ServiceType,
+        (wire, plans): (Wire, &mut Plans),
+    ) -> Result<Self, String> {
+        let why = |error: PlanError| error.to_string();
+        let mut plan = |message| plans.plan(message, &Selection::Whole, wire).map_err(why);
+        Ok(Self {
+            request: plan(service.request())?,
+            response: plan(service.response())?,
+            request_order: description.request_order(service.request())?,
+            response_order: description.response_order(service.response())?,
+        })
+    }
+
+    /// The block of fields of a request in ROS bytes.
+    pub(crate) fn request(
+        &self,
+        message: &[u8],
+        namespace: u16,
+    ) -> Result<Vec<u8>, (Cause, String)> {
+        let payload = Payload::Ros(&self.request, message);
+        let read = block(|frame| fields::read(&payload, namespace, frame))?;
+        match &self.request_order {
+            None => Ok(NO_FIELDS.to_vec()),
+            Some(order) if is_identity(order) => Ok(read),
+            Some(order) => arrange(&read, order),
+        }
+    }
+
+    /// Appends the ROS bytes of a response.
+    pub(crate) fn response(&self, fields: &[u8], out: &mut Vec<u8>) -> Result<(), (Cause, String)> {
+        let count = Fields::parse(fields).map_err(fields::undecodable)?.len();
+        let order = &self.response_order;
+        let arranged = match is_identity(order) && count == order.len() {
+            true => None,
+            false => Some(arrange(fields, order)?),
+        };
+        let fields = Fields::parse(arranged.as_deref().unwrap_or(fields));
+        fields::write(&self.response, fields.map_err(fields::undecodable)?, out)
+    }
+}
+
+/// The fields at those places, in that order.
+fn arrange(fields: &[u8], order: &[usize]) -> Result<Vec<u8>, (Cause, String)> {
+    let fields = Fields::parse(fields).map_err(fields::undecodable)?;
+    let all: Vec<Variant<'_>> = fields
+        .collect::<Result<_, _>>()
+        .map_err(fields::undecodable)?;
+    block(|frame| {
+        for place in order {
+            let missing = || {
+                let detail = format!("field {place} is missing, there are {}", all.len());
+                ((Reason::Mismatch, "missing").into(), detail)
+            };
+            let field = all.get(*place).ok_or_else(missing)?;
+            frame.variant(field).map_err(too_big)?;
+        }
+        Ok(())
+    })
+}
+
+/// A block of the fields that are written.
+fn block(
+    write: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), (Cause, String)>,
+) -> Result<Vec<u8>, (Cause, String)> {
+    let mut scratch = Vec::new();
+    let mut message = NetworkMessageEncoder::new(&mut scratch, &NetworkHeader::default(), None)
+        .map_err(too_big)?;
+    let mut frame = message
+        .key_frame(&DataSetHeader::default())
+        .map_err(too_big)?;
+    write(&mut frame)?;
+    frame.finish().map_err(too_big)?;
+    message.finish().map_err(too_big)?;
+    let message = NetworkMessage::decode(&scratch).map_err(fields::undecodable)?;
+    let fields = message
+        .messages()
+        .next()
+        .transpose()
+        .and_then(|message| message.map(|message| message.fields()).transpose())
+        .map_err(fields::undecodable)?;
+    Ok(fields.map_or_else(|| NO_FIELDS.to_vec(), |fields| fields.bytes().to_vec()))
+}
+
+fn is_identity(order: &[usize]) -> bool {
+    order.iter().copied().eq(0..order.len())
+}
+
+fn too_big(error: EncodeError) -> (Cause, String) {
+    (Reason::TooBig.into(), error.to_string())
+}
+
+/// The block without fields.
+pub(crate) const NO_FIELDS: [u8; 2] = [0, 0];

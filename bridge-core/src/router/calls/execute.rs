@@ -1,0 +1,310 @@
+//! Calls of our own: announced, and executed by the local side.
+
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use mappings::{SpaceId, TopicId};
+use uadp::action::{
+    ActionFields, ActionMessage, ExecutionId, FinishRefusal, Outcome, Refusal, Requested,
+};
+use uadp::discovery::{Announced, Announcement, DataSetMetaDataType};
+use uadp::{Fields, PublisherId, SecurityHeader, StatusCode};
+
+use super::super::receive::number_of;
+use super::super::{About, Router};
+use crate::call::{Executed, Execution, Offered, join_name};
+use crate::call_announcement::{CallAnnouncement, TARGET};
+use crate::counters::Reason;
+use crate::loop_rule::{Side, What};
+use crate::output::Output;
+use crate::settings::Now;
+
+/// A call of ours.
+#[derive(Debug)]
+pub(super) struct Own {
+    offered: Offered,
+    announcement: Option<CallAnnouncement>,
+}
+
+/// A request that the local side executes.
+#[derive(Debug)]
+pub(super) struct Running {
+    pub(super) topic: TopicId,
+    deadline: Instant,
+}
+
+impl Router {
+    /// The local side executes a call from now on, or it is another than before: it is announced. One of a namespace that is
+    /// not ours is not taken.
+    pub fn offer(&mut self, topic: TopicId, offered: Offered, now: Now) {
+        if !self.is_home(topic) {
+            return self.count(About::topic(topic), Reason::Looped, 1, String::new);
+        }
+        let period = self.mapping.pubsub().metadata_period;
+        let calls = self.calls_mut(now);
+        let call = calls.table.entry(topic).or_default();
+        let before = call.own.take().and_then(|own| own.announcement);
+        let (_, _, writer_id) = topic.triple();
+        let made = CallAnnouncement::new(topic, &offered.description, before.as_ref(), now.utc);
+        let (announcement, fault) = match made {
+            Ok(announcement) => (Some(announcement), None),
+            Err(error) => (None, Some(error)),
+        };
+        call.own = Some(Own {
+            offered,
+            announcement,
+        });
+        calls.announce_at.get_or_insert(now.monotonic + period);
+        calls.reckon();
+        self.plan_action(topic, now);
+        if let Some(error) = fault {
+            self.count_call(topic, None, Reason::MetaData, || {
+                format!("what call {writer_id} takes and gives cannot be announced: {error}")
+            });
+        }
+    }
+
+    /// The local side no longer executes a call, or no longer has a value, of its own: that is announced. Requests that are
+    /// executed go on.
+    pub fn withdraw(&mut self, topic: TopicId, now: Now) {
+        if !self.is_home(topic) {
+            return;
+        }
+        let calls = self.calls.as_mut();
+        if let Some(call) = calls.and_then(|calls| calls.table.get_mut(&topic)) {
+            call.own = None;
+        }
+        self.unbind(topic, now);
+        self.forget_described(topic);
+        let withheld = self.is_withheld(topic);
+        if !withheld {
+            self.announce_none(topic);
+        }
+    }
+
+    /// As [`withdraw`](Self::withdraw), for all calls of ours and all values that no mapping says: the program ends.
+    pub fn withdraw_all(&mut self, now: Now) {
+        let calls = self.calls.iter().flat_map(|calls| &calls.table);
+        let calls = calls.filter(|(_, call)| call.own.is_some());
+        let said = self.topics.iter().filter(|(_, entry)| entry.said.is_some());
+        let topics = calls
+            .map(|(topic, _)| *topic)
+            .chain(said.map(|(topic, _)| *topic));
+        let topics: Vec<TopicId> = topics.collect();
+        for topic in topics {
+            self.withdraw(topic, now);
+        }
+    }
+
+    /// Says that there is nothing under that name.
+    fn announce_none(&mut self, topic: TopicId) {
+        let (space, _, writer_id) = topic.triple();
+        let announcement = Announcement {
+            sequence_number: 0,
+            announced: Announced::DataSetMetaData {
+                writer_id,
+                meta_data: DataSetMetaDataType {
+                    name: Some(&join_name(topic, "")),
+                    ..DataSetMetaDataType::default()
+                },
+                status: BAD_NOT_FOUND,
+            },
+        };
+        let mut bytes = self.buffer();
+        let publisher = PublisherId::UInt16(space);
+        if announcement
+            .encode(publisher, SecurityHeader::NONE, &mut bytes)
+            .is_ok()
+        {
+            self.tell(Output::Discovery { bytes });
+        }
+    }
+
+    /// Plans to announce all calls of ours.
+    pub(in super::super) fn announce_calls(&mut self, now: Now) {
+        let period = self.mapping.pubsub().metadata_period;
+        let Some(calls) = &mut self.calls else {
+            return;
+        };
+        let own = calls.table.iter().filter(|(_, call)| call.own.is_some());
+        let own: Vec<TopicId> = own.map(|(topic, _)| *topic).collect();
+        calls.announce_at = (!own.is_empty()).then(|| now.monotonic + period);
+        for topic in own {
+            self.plan_action(topic, now);
+        }
+    }
+
+    /// Announces a call of ours.
+    pub(in super::super) fn announce_call(&mut self, topic: TopicId, sequence: u16, now: Now) {
+        if self.is_withheld(topic) {
+            return;
+        }
+        let mut bytes = self.buffer();
+        let call = self.calls.as_mut();
+        let call = call.and_then(|calls| calls.table.get_mut(&topic));
+        let own = call.and_then(|call| call.own.as_ref());
+        let Some(announcement) = own.and_then(|own| own.announcement.as_ref()) else {
+            return;
+        };
+        let body_at = announcement.write(sequence, &mut bytes);
+        self.send_announcement(topic, sequence, (bytes, body_at), now);
+    }
+
+    /// A request: for the local side, if it is one of ours and may be executed.
+    pub(super) fn handle_request(
+        &mut self,
+        topic: TopicId,
+        request: &ActionMessage<'_>,
+        from: SocketAddr,
+        now: Now,
+    ) {
+        if !self.may_cross(Side::Ua, What::Request, topic) || self.is_withheld(topic) {
+            return self.count_call(topic, Some(from), Reason::NotAsked, String::new);
+        }
+        let Some(calls) = &mut self.calls else {
+            return self.count(About::sender(from), Reason::NotAsked, 1, String::new);
+        };
+        let since = calls.since_start(now);
+        match calls.responder.handle_request(request, (), since) {
+            Ok(Requested::Execute(id)) => {
+                let own = calls.table.get(&topic).and_then(|call| call.own.as_ref());
+                match may_be_executed(own, request, from) {
+                    Ok(fields) => self.execute((topic, id), (request, fields), now),
+                    Err((refusal, case, detail)) => {
+                        // Whom it is told is who asks for it again.
+                        let _told = calls.responder.refuse(id, refusal, since).is_ok();
+                        let cause = (Reason::CallRefused, case);
+                        self.count_call(topic, Some(from), cause, || detail);
+                    }
+                }
+            }
+            Ok(Requested::Refused(..)) => {
+                let cause = (Reason::CallRefused, "busy");
+                self.count_call(topic, Some(from), cause, || {
+                    "as many requests as can be are executed already".to_owned()
+                });
+            }
+            Ok(Requested::Abandoned(execution)) => {
+                if calls.executions.contains_key(&execution) {
+                    calls.news.push_back(Output::Abandoned { execution, topic });
+                }
+            }
+            Ok(Requested::Repeated(_) | Requested::Closed(_)) => {}
+            Err(why) => {
+                let cause = (Reason::CallRefused, "request");
+                self.count_call(topic, Some(from), cause, || why.to_string());
+            }
+        }
+    }
+
+    fn execute(
+        &mut self,
+        (topic, id): (TopicId, ExecutionId),
+        (request, fields): (&ActionMessage<'_>, &[u8]),
+        now: Now,
+    ) {
+        let mut block = self.buffer();
+        block.extend_from_slice(fields);
+        let Some(calls) = &mut self.calls else {
+            return;
+        };
+        let hint = request.action.timeout().unwrap_or(TIMEOUT);
+        let deadline = now.monotonic + hint.min(MAX_TIMEOUT);
+        calls.executions.insert(id, Running { topic, deadline });
+        if let Some(call) = calls.table.get_mut(&topic) {
+            call.counters.executed += 1;
+        }
+        let (number, _) = number_of(request.action.requestor_id);
+        calls.news.push_back(Output::Execute(Execution {
+            id,
+            topic,
+            request: block,
+            requestor: u16::try_from(number).ok().and_then(SpaceId::new),
+            deadline,
+        }));
+    }
+
+    /// What an execution came to; who asked is told.
+    pub fn executed(&mut self, execution: ExecutionId, outcome: Executed, now: Now) {
+        let Some(calls) = &mut self.calls else {
+            return;
+        };
+        let Some(Running { topic, .. }) = calls.executions.remove(&execution) else {
+            return;
+        };
+        let since = calls.since_start(now);
+        let told = match &outcome {
+            Executed::Answered(fields) => {
+                match Fields::parse(fields).and_then(|of| of.checked_bytes()) {
+                    Ok(fields) => Outcome::Answered {
+                        status: StatusCode::GOOD,
+                        fields: ActionFields::Variants(fields),
+                    },
+                    Err(_) => Outcome::Answered {
+                        status: BAD_ENCODING_ERROR,
+                        fields: ActionFields::NONE,
+                    },
+                }
+            }
+            Executed::Failed(status) => Outcome::Answered {
+                status: *status,
+                fields: ActionFields::NONE,
+            },
+            Executed::Refused(refusal) => Outcome::Refused(*refusal),
+            Executed::Lost => Outcome::Unknown(uadp::action::Unknown::Lost),
+        };
+        let finished = calls.responder.finish(execution, told, since);
+        calls.reckon();
+        match finished {
+            Ok(()) => {}
+            // It is what was asked for.
+            Err(FinishRefusal::Abandoned) => {
+                self.count_call(topic, None, Reason::NotAsked, String::new);
+            }
+            Err(FinishRefusal::TooBig) => self.count_call(topic, None, Reason::TooBig, || {
+                "a response that does not fit a datagram".to_owned()
+            }),
+            Err(why) => {
+                let cause = (Reason::CallRefused, "response");
+                self.count_call(topic, None, cause, || why.to_string());
+            }
+        }
+    }
+}
+
+impl super::Calls {
+    /// Forgets executions of which nothing was heard long after their deadline.
+    pub(super) fn forget_executions(&mut self, now: Instant) {
+        self.executions
+            .retain(|_, running| running.deadline + FORGOTTEN > now);
+    }
+}
+
+/// The fields of a request that may be executed.
+fn may_be_executed<'a>(
+    own: Option<&Own>,
+    request: &ActionMessage<'a>,
+    from: SocketAddr,
+) -> Result<&'a [u8], (Refusal, &'static str, String)> {
+    let Some(own) = own.filter(|_| request.target_id == TARGET) else {
+        let detail = "it is no call of this program".to_owned();
+        return Err((Refusal::NoSuchAction, "unknown", detail));
+    };
+    if !own.offered.open && !from.ip().is_loopback() {
+        let detail = format!("{from} is another host, and calls are not open to others");
+        return Err((Refusal::NotAllowed, "not allowed", detail));
+    }
+    let fields = request.fields.variants();
+    fields
+        .and_then(|fields| fields.checked_bytes())
+        .map_err(|error| (Refusal::InvalidArgument, "fields", error.to_string()))
+}
+
+/// Bad_NotFound and Bad_EncodingError (OPC 10000-6, A.2).
+const BAD_NOT_FOUND: StatusCode = StatusCode(0x803E_0000);
+const BAD_ENCODING_ERROR: StatusCode = StatusCode(0x8006_0000);
+/// As a Responder has them.
+const TIMEOUT: Duration = Duration::from_secs(60);
+const MAX_TIMEOUT: Duration = Duration::from_secs(3600);
+/// So long after its deadline an execution is not answered any more.
+const FORGOTTEN: Duration = Duration::from_secs(60);

@@ -1,0 +1,319 @@
+//! Calls of other programs: what they are, who executes them, and since when nobody does.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use mappings::{SpaceId, TopicId};
+use uadp::discovery::ActionMetaData;
+
+use super::super::{About, Router};
+use super::Calls;
+use crate::call::{CallDescription, split_name};
+use crate::call_announcement;
+use crate::counters::Reason;
+use crate::learned::Weight;
+use crate::output::Output;
+use crate::settings::Now;
+
+/// What is known of a call.
+#[derive(Debug)]
+pub(super) struct Known {
+    pub(super) description: Arc<CallDescription>,
+    /// Who executes it.
+    pub(super) from: SocketAddr,
+    /// When that was last said.
+    said: Instant,
+    /// The port holds it to be gone.
+    pub(super) gone: bool,
+}
+
+/// Who executes the calls of a namespace: one program, which in most cases sends values there too.
+#[derive(Debug)]
+pub(super) struct Group {
+    from: SocketAddr,
+    /// When it last said something of a call.
+    said: Instant,
+    /// When values of it were last heard, if there were any.
+    heard: Option<Instant>,
+    /// It is silent.
+    gone: bool,
+    /// Somebody else says it has these calls.
+    contended: bool,
+}
+
+impl Group {
+    /// Whether nothing is heard of it any more.
+    fn is_silent(&self, now: Instant, (silence, forgotten): (Duration, Duration)) -> bool {
+        let since = |at: Instant| now.saturating_duration_since(at);
+        match self.heard {
+            Some(heard) => since(heard) >= silence,
+            None => since(self.said) >= forgotten,
+        }
+    }
+}
+
+impl Calls {
+    /// A message of values of that namespace came.
+    #[inline]
+    pub(in super::super) fn heard(
+        &mut self,
+        space: SpaceId,
+        namespace: u16,
+        from: SocketAddr,
+        now: Now,
+    ) {
+        let Some(group) = self.groups.get_mut(&(space, namespace)) else {
+            return;
+        };
+        if group.from != from {
+            return;
+        }
+        group.heard = Some(now.monotonic);
+        if std::mem::take(&mut group.gone) {
+            self.revive((space, namespace), now.monotonic);
+        }
+    }
+
+    /// The program of a namespace is back: its calls are there again.
+    fn revive(&mut self, of: (SpaceId, u16), now: Instant) {
+        for (topic, call) in &mut self.table {
+            let (_, namespace, _) = topic.triple();
+            if (topic.space, namespace) == of
+                && let Some(known) = &mut call.known
+                && known.gone
+            {
+                known.gone = false;
+                self.news.push_back(Output::CallKnown {
+                    topic: *topic,
+                    description: Arc::clone(&known.description),
+                });
+            }
+        }
+        self.look_at.get_or_insert(now + LOOK);
+        self.reckon();
+    }
+
+    /// Whether there is room for one more.
+    fn has_room(&mut self, weight: usize) -> bool {
+        let full = |calls: &Self| {
+            calls.table.len() >= MAX_CALLS || calls.weight.saturating_add(weight) > MAX_WEIGHT
+        };
+        if full(self) {
+            let gone = self.table.extract_if(|_, call| {
+                let gone = call.known.as_ref().is_none_or(|known| known.gone);
+                gone && call.bound.is_none() && call.own.is_none() && call.open == 0
+            });
+            let freed: usize = gone
+                .filter_map(|(_, call)| call.known)
+                .map(|known| known.description.weight())
+                .sum();
+            self.weight -= freed;
+        }
+        !full(self)
+    }
+}
+
+impl Router {
+    /// Takes in what a program says of one of its calls.
+    pub(in super::super) fn learn_call(
+        &mut self,
+        action: &ActionMetaData<'_>,
+        (space, from): (SpaceId, SocketAddr),
+        now: Now,
+    ) {
+        let named = action.name().and_then(split_name);
+        let named =
+            named.filter(|(topic, _)| topic.space == space && topic.triple().2 == action.writer_id);
+        let Some((topic, name)) = named else {
+            return self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
+        };
+        let (_, namespace, _) = topic.triple();
+        if self.is_home(topic) {
+            return self.drop_own(Some(namespace), from, now);
+        }
+        if !self.may_execute((space, namespace), from, now) {
+            let cause = (Reason::MetaData, "sender");
+            return self.count_call(topic, Some(from), cause, || {
+                "another program than the one that executes the calls of its namespace says what it is"
+                    .to_owned()
+            });
+        }
+        match call_announcement::read(action, name) {
+            Ok(description) => self.take_in_call(topic, description, from, now),
+            Err(why) => {
+                let cause = (Reason::MetaData, "useless");
+                self.count_call(topic, Some(from), cause, || why);
+            }
+        }
+    }
+
+    /// Whether what is said from there may be of the program that executes the calls of that namespace.
+    fn may_execute(&mut self, of: (SpaceId, u16), from: SocketAddr, now: Now) -> bool {
+        let silences = self.silences();
+        let Some(group) = self
+            .calls
+            .as_mut()
+            .and_then(|calls| calls.groups.get_mut(&of))
+        else {
+            return true;
+        };
+        let may = group.from == from || group.is_silent(now.monotonic, silences);
+        group.contended |= !may;
+        may
+    }
+
+    fn take_in_call(
+        &mut self,
+        topic: TopicId,
+        description: CallDescription,
+        from: SocketAddr,
+        now: Now,
+    ) {
+        let (_, namespace, _) = topic.triple();
+        let calls = self.calls_mut(now);
+        let weight = description.weight();
+        let before = calls.table.get(&topic).and_then(|call| call.known.as_ref());
+        let same = before.is_some_and(|known| *known.description == description);
+        let back = before.is_none_or(|known| known.gone);
+        if !same && !calls.has_room(weight) {
+            let cause = (Reason::MetaData, "no room");
+            return self.count_call(topic, Some(from), cause, || {
+                "there is no room for what more calls are".to_owned()
+            });
+        }
+        let group = calls.groups.entry((topic.space, namespace));
+        let group = group.or_insert(Group {
+            from,
+            said: now.monotonic,
+            heard: None,
+            gone: false,
+            contended: false,
+        });
+        if group.from != from {
+            // A program that was started anew.
+            (group.from, group.heard, group.contended) = (from, None, false);
+        }
+        (group.said, group.gone) = (now.monotonic, false);
+        calls.look_at.get_or_insert(now.monotonic + LOOK);
+        let call = calls.table.entry(topic).or_default();
+        match &mut call.known {
+            Some(known) if same => {
+                (known.from, known.said, known.gone) = (from, now.monotonic, false);
+            }
+            known => {
+                let before = known.replace(Known {
+                    description: Arc::new(description),
+                    from,
+                    said: now.monotonic,
+                    gone: false,
+                });
+                calls.weight += weight;
+                calls.weight -= before.map_or(0, |known| known.description.weight());
+            }
+        }
+        calls.reckon();
+        self.answered(topic, now);
+        if same && !back {
+            return;
+        }
+        if let Err(why) = self.compile(topic) {
+            self.count_call(topic, None, (Reason::Mismatch, "type"), || why);
+        }
+        if let Some(calls) = &mut self.calls
+            && let Some(known) = calls.table.get(&topic).and_then(|call| call.known.as_ref())
+        {
+            calls.news.push_back(Output::CallKnown {
+                topic,
+                description: Arc::clone(&known.description),
+            });
+        }
+    }
+
+    /// Takes in that a program no longer executes a call.
+    pub(in super::super) fn unlearn_call(&mut self, topic: TopicId, from: SocketAddr) {
+        let calls = self.calls.as_mut();
+        if let Some(calls) = calls
+            && let Some(call) = calls.table.get_mut(&topic)
+            && let Some(known) = &mut call.known
+            && known.from == from
+            && !std::mem::replace(&mut known.gone, true)
+        {
+            calls.news.push_back(Output::CallGone { topic });
+        }
+    }
+
+    /// Who sends values is gone when they are missing; who sends none, when its announcements are.
+    fn silences(&self) -> (Duration, Duration) {
+        let pubsub = self.mapping.pubsub();
+        let forgotten = pubsub.metadata_period.saturating_mul(MISSED);
+        (pubsub.receive_timeout, forgotten)
+    }
+
+    /// Tells of the calls that nobody executes any longer.
+    pub(super) fn look_for_silence(&mut self, now: Now) {
+        let silences @ (_, forgotten) = self.silences();
+        let Some(calls) = &mut self.calls else {
+            return;
+        };
+        if calls.look_at.is_none_or(|at| at > now.monotonic) {
+            return;
+        }
+        calls.forget_executions(now.monotonic);
+        for group in calls.groups.values_mut() {
+            group.gone = group.is_silent(now.monotonic, silences);
+        }
+        let mut asked = Vec::new();
+        for (topic, call) in &mut calls.table {
+            let (_, namespace, _) = topic.triple();
+            let Some(known) = &mut call.known else {
+                continue;
+            };
+            let group = calls.groups.get(&(topic.space, namespace));
+            let old = now.monotonic.saturating_duration_since(known.said) >= forgotten;
+            let silent = group.is_none_or(|group| group.gone);
+            if (old || silent) && !std::mem::replace(&mut known.gone, true) {
+                calls.news.push_back(Output::CallGone { topic: *topic });
+                if group.is_some_and(|group| group.contended) {
+                    asked.push(*topic);
+                }
+            }
+        }
+        calls
+            .groups
+            .retain(|_, group| now.monotonic.saturating_duration_since(group.said) < forgotten);
+        let some = !calls.groups.is_empty() || !calls.executions.is_empty();
+        calls.look_at = some.then(|| now.monotonic + LOOK);
+        // Somebody else said it has them.
+        for topic in asked {
+            self.plan_probe(topic, now);
+        }
+    }
+
+    /// Forgets what is known of calls that are ours now, and what we offer of those that are not.
+    pub(in super::super) fn sort_calls(&mut self, now: Now) {
+        let (owned, own) = (self.owned.clone(), self.settings.own);
+        let Some(calls) = &mut self.calls else {
+            return;
+        };
+        for (topic, call) in &mut calls.table {
+            if !owned.is_home(own, *topic) {
+                call.own = None;
+            } else if let Some(known) = call.known.take() {
+                calls.weight -= known.description.weight();
+                if !known.gone {
+                    calls.news.push_back(Output::CallGone { topic: *topic });
+                }
+            }
+        }
+        self.announce_calls(now);
+    }
+}
+
+/// Announcements that may be lost before a call is held to be gone.
+const MISSED: u32 = 3;
+/// How often it is looked who is silent.
+const LOOK: Duration = Duration::from_millis(500);
+/// Calls there may be, and bytes of what they take and give.
+const MAX_CALLS: usize = 4_096;
+const MAX_WEIGHT: usize = 4 << 20;

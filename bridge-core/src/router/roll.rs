@@ -1,0 +1,178 @@
+//! Which calls other programs have, and what is said of values and calls that come and go.
+
+use std::net::SocketAddr;
+use std::time::Duration;
+
+use mappings::{SpaceId, TopicId};
+use uadp::discovery::{Included, List, Probe, ProbeLimits, ProbeStep, ProbeTimer, Subject};
+use uadp::{PublisherId, SecurityHeader};
+
+use super::Router;
+use super::discovery::Discovery;
+use crate::call::ValueDescription;
+use crate::output::Output;
+use crate::settings::{Local, Now};
+use crate::topic::{Role, Topic};
+
+impl Router {
+    /// The local side says what a value of ours is: it is announced, and again whenever it changes. Only for a local side that
+    /// speaks in fields; what the mapping says of it does not count then.
+    pub fn describe_value(&mut self, topic: TopicId, description: ValueDescription, now: Now) {
+        if self.settings.local != Local::Fields || !self.is_home(topic) {
+            return;
+        }
+        let overflow = description.overflow;
+        let Some(entry) = self.follow(topic, None, now) else {
+            return;
+        };
+        entry.said = Some(Box::new(description));
+        if entry.overflow != overflow {
+            self.requeue(topic, overflow);
+        }
+        self.describe(topic, None, now);
+    }
+
+    /// A topic of ours is no longer announced.
+    pub(super) fn forget_described(&mut self, topic: TopicId) {
+        if let Some(entry) = self.topics.get_mut(&topic) {
+            entry.said = None;
+            entry.description = None;
+            entry.announce_at = None;
+        }
+        let (_, _, writer_id) = topic.triple();
+        let Some(discovery) = &mut self.discovery else {
+            return;
+        };
+        for of in [&mut discovery.writers, &mut discovery.actions] {
+            if let Some(topics) = of.get_mut(&writer_id) {
+                topics.retain(|of| *of != topic);
+                if topics.is_empty() {
+                    of.remove(&writer_id);
+                }
+            }
+        }
+        let actions: Vec<u16> = discovery.actions.keys().copied().collect();
+        discovery.announcer.set_actions(actions);
+    }
+
+    /// Plans to announce a call of ours.
+    pub(super) fn plan_action(&mut self, topic: TopicId, now: Now) {
+        let (_, _, writer_id) = topic.triple();
+        let discovery = self.discovery(now);
+        let since = discovery.since_start(now);
+        let topics = discovery.actions.entry(writer_id).or_default();
+        if !topics.contains(&topic) {
+            topics.push(topic);
+            let actions: Vec<u16> = discovery.actions.keys().copied().collect();
+            discovery.announcer.set_actions(actions);
+        }
+        let subject = Subject::ActionMetaData(writer_id);
+        // One that is planned already says it all.
+        let _planned = discovery
+            .announcer
+            .announce(subject, Included::default(), since)
+            .is_ok();
+        discovery.reckon();
+    }
+
+    /// Somebody asks a space which calls it has: who asks for its connections asks for what can be done over them.
+    pub(super) fn handle_roll(&mut self, asked: SpaceId, now: Now) {
+        if let Some(discovery) = &mut self.discovery {
+            let since = discovery.since_start(now);
+            if let Some(timer) = discovery.rolls.get_mut(&asked) {
+                timer.handle_probe(since);
+                discovery.reckon();
+            }
+        }
+        if asked == self.settings.own {
+            self.announce_calls(now);
+        }
+    }
+
+    /// A program of space 0 is heard for the first time, which may have calls: it is asked for them. In no other space programs
+    /// come and go by themselves, and nothing is executed there.
+    pub(super) fn meet(&mut self, topic: TopicId, now: Now) {
+        if topic.space != SpaceId::UA {
+            return;
+        }
+        let (_, namespace, _) = topic.triple();
+        let random = u32::try_from(now.utc.unix_nanos() & 0xFFFF_FFFF).unwrap_or_default();
+        let discovery = self.discovery(now);
+        if discovery.met.len() >= MAX_MET || !discovery.met.insert((topic.space, namespace)) {
+            return;
+        }
+        let since = discovery.since_start(now);
+        let limits = ProbeLimits {
+            max_period: Duration::from_secs(1),
+            attempts: 2,
+        };
+        discovery
+            .rolls
+            .entry(topic.space)
+            .or_insert_with(|| ProbeTimer::new(since, random, limits));
+        discovery.reckon();
+    }
+
+    /// Asks the spaces that are to be asked which calls they have.
+    pub(super) fn call_rolls(
+        &mut self,
+        discovery: &mut Discovery,
+        (since, random): (Duration, u32),
+    ) {
+        let mut asked = Vec::new();
+        discovery.rolls.retain(|space, timer| {
+            match timer.poll(since, random.rotate_left(space.get().into())) {
+                ProbeStep::Wait => true,
+                ProbeStep::Send => {
+                    asked.push(*space);
+                    true
+                }
+                ProbeStep::Answered | ProbeStep::GivenUp => false,
+            }
+        });
+        for space in asked {
+            let probe = Probe::PubSubConnections {
+                transport_profile_uris: List::null(),
+                include_writer_groups: false,
+                include_data_set_writers: false,
+            };
+            let mut bytes = self.buffer();
+            let publisher = Some(PublisherId::UInt16(space.into()));
+            if probe
+                .encode(publisher, SecurityHeader::NONE, &mut bytes)
+                .is_ok()
+            {
+                self.tell(Output::Discovery { bytes });
+            }
+        }
+    }
+
+    /// A call that was asked for is known.
+    pub(super) fn answered(&mut self, topic: TopicId, now: Now) {
+        let discovery = self.discovery(now);
+        discovery.answered(topic.space, |other| other == topic);
+        if let Some(timer) = discovery.rolls.get_mut(&topic.space) {
+            timer.handle_answer();
+            discovery.reckon();
+        }
+    }
+
+    /// A program says that it has a value or call no longer.
+    pub(super) fn unlearn(&mut self, topic: TopicId, from: SocketAddr, now: Now) {
+        let timeout = self.mapping.pubsub().receive_timeout;
+        if let Some(Topic {
+            role: Role::Theirs(reader),
+            ..
+        }) = self.topics.get_mut(&topic)
+            && reader.may_be(from, now.monotonic, timeout)
+            && reader.leave()
+        {
+            self.tell_silence(topic);
+        }
+        self.unlearn_call(topic, from);
+        self.settle();
+    }
+}
+
+/// Namespaces that are asked for their calls when they are first heard.
+const MAX_MET: usize = 4_096;

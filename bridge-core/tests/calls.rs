@@ -1,0 +1,565 @@
+//! Calls between Routers: asked for in one space, executed in another, answered to who asked.
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
+
+mod cell;
+
+use std::sync::Arc;
+
+use bridge_core::{
+    AskErrorKind, AskId, CallDescription, CallField, Executed, Local, Offered, Output, Owned,
+    Reason, ValueDescription,
+};
+use cell::{Cell, Program, component, ms, topic};
+use mappings::{Overflow, TopicId};
+use messages::{Dialect, Leaf, Rank, Registry, ServiceType};
+use uadp::{BuiltinType, Fields, Scalar, StatusCode, Variant};
+
+const BRIDGE: usize = 0;
+const GRIPPER: usize = 1;
+
+fn start() -> TopicId {
+    topic(0, 7, 105)
+}
+
+fn service(dialect: Dialect, name: &str) -> Arc<ServiceType> {
+    let name = name.parse().unwrap();
+    Registry::bundle(dialect).service(&name).unwrap()
+}
+
+/// Start of a skill whose parameters all have values of their own.
+fn grasp() -> CallDescription {
+    CallDescription {
+        name: "gripper.Grasp.Start".to_owned(),
+        about: String::new(),
+        request: vec![CallField::scalar("Force", BuiltinType::Double).optional()],
+        response: vec![
+            CallField::scalar("success", BuiltinType::Boolean),
+            CallField::scalar("message", BuiltinType::String),
+            CallField::scalar("run", BuiltinType::UInt32),
+        ],
+    }
+}
+
+fn offered(description: CallDescription) -> Offered {
+    Offered {
+        description,
+        open: false,
+    }
+}
+
+/// A bridge of space 1 and a component with the namespace 7, whose call is known in the bridge.
+fn plugged_in(local: Local) -> Cell {
+    let mut cell = Cell::new(vec![Program::new(1, local), component(7)]);
+    cell.offer(GRIPPER, start(), offered(grasp()));
+    cell.run(ms(200));
+    assert_eq!(cell.known(BRIDGE), [start()]);
+    cell
+}
+
+/// The fields of a block.
+fn told(block: &[u8]) -> Vec<String> {
+    let fields = Fields::parse(block).unwrap();
+    fields
+        .map(|field| format!("{:?}", field.unwrap()))
+        .collect()
+}
+
+fn succeeded(run: u32) -> Executed {
+    let fields = [
+        Variant::Scalar(Scalar::Boolean(true)),
+        Variant::Scalar(Scalar::String(Some("grasps"))),
+        Variant::Scalar(Scalar::UInt32(run)),
+    ];
+    Executed::Answered(cell::block(&fields))
+}
+
+#[test]
+fn a_ros_service_call_starts_a_skill_and_is_answered() {
+    // success, and the message behind its length.
+    let ros1 = [&[1][..], &6_u32.to_le_bytes(), b"grasps"].concat();
+    // Padded to four bytes.
+    let cdr = [
+        &[0, 1, 0, 0, 1, 0, 0, 0][..],
+        &7_u32.to_le_bytes(),
+        b"grasps\0\0",
+    ]
+    .concat();
+    let cases = [
+        (Local::Ros1, Dialect::Ros1, &[][..], ros1),
+        (Local::Cdr, Dialect::Ros2, &[0, 1, 0, 0, 0][..], cdr),
+    ];
+    for (local, dialect, request, answer) in cases {
+        let mut cell = plugged_in(local);
+        let trigger = service(dialect, "std_srvs/Trigger");
+        let now = cell.now();
+        let bridge = &mut cell.programs[BRIDGE].router;
+        assert_eq!(bridge.bind_call(start(), &trigger, now), Ok(()));
+        cell.ask(BRIDGE, AskId(1), start(), request, ms(3_000));
+        cell.run(ms(50));
+        let execution = cell.executions(GRIPPER).pop().unwrap();
+        assert_eq!(execution.topic, start());
+        assert_eq!(told(&execution.request), Vec::<String>::new());
+        assert_eq!(execution.requestor.map(|space| space.get()), Some(1));
+        cell.executed(GRIPPER, execution.id, succeeded(4));
+        cell.run(ms(50));
+        let answers = cell.answers(BRIDGE);
+        let (ask, found) = answers.first().unwrap();
+        let found = found.clone().unwrap();
+        assert_eq!((*ask, found), (AskId(1), answer), "{local:?}");
+        assert_eq!(answers.len(), 1);
+        let counters = cell.counters(BRIDGE, start());
+        assert_eq!((counters.asked, counters.answered), (1, 1));
+        assert_eq!(cell.counters(GRIPPER, start()).executed, 1);
+    }
+}
+
+#[test]
+fn a_block_of_fields_is_asked_with_as_it_is() {
+    let mut cell = plugged_in(Local::Fields);
+    let request = cell::block(&[Variant::Scalar(Scalar::Double(2.5))]);
+    cell.ask(BRIDGE, AskId(1), start(), &request, ms(3_000));
+    cell.run(ms(50));
+    let execution = cell.executions(GRIPPER).pop().unwrap();
+    assert_eq!(execution.request, request);
+    cell.executed(GRIPPER, execution.id, succeeded(9));
+    cell.run(ms(50));
+    let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
+    assert!(told(&answer.unwrap())[2].contains('9'));
+}
+
+#[test]
+fn a_type_that_lacks_what_the_call_wants_is_refused_with_the_name_of_the_field() {
+    let mut wants = grasp();
+    wants.request = vec![CallField::scalar("Force", BuiltinType::Double)];
+    let trigger = service(Dialect::Ros1, "std_srvs/Trigger");
+    let why = wants.fits(&trigger).unwrap_err();
+    assert!(why.contains("`Force` (Double)"), "{why}");
+    let set_bool = service(Dialect::Ros1, "std_srvs/SetBool");
+    let why = grasp().fits(&set_bool).unwrap_err();
+    assert!(why.contains("`Force`"), "{why}");
+    let mut silent = grasp();
+    silent.response.remove(1);
+    let why = silent.fits(&trigger).unwrap_err();
+    assert!(why.contains("`message` (String)"), "{why}");
+    // Names in other cases and another order fit.
+    let mut turned = grasp();
+    turned.response.reverse();
+    turned.response[1].name = "Message".to_owned();
+    assert_eq!(turned.fits(&trigger), Ok(()));
+
+    let mut cell = plugged_in(Local::Ros1);
+    cell.offer(GRIPPER, start(), offered(wants));
+    cell.run(ms(700));
+    let now = cell.now();
+    assert!(
+        cell.programs[BRIDGE]
+            .router
+            .bind_call(start(), &trigger, now)
+            .is_err()
+    );
+    cell.ask(BRIDGE, AskId(1), start(), &[], ms(3_000));
+    cell.run(ms(50));
+    let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
+    let error = answer.unwrap_err();
+    assert_eq!(error.kind, AskErrorKind::Refused);
+    assert!(error.text.contains("`Force`"), "{error}");
+    assert_eq!(cell.executions(GRIPPER).len(), 0, "nothing moves");
+}
+
+#[test]
+fn answers_in_another_order_are_sorted_by_name_and_further_fields_left_out() {
+    let mut cell = plugged_in(Local::Ros1);
+    let mut turned = grasp();
+    turned.response.reverse();
+    cell.offer(GRIPPER, start(), offered(turned));
+    cell.run(ms(700));
+    let now = cell.now();
+    let trigger = service(Dialect::Ros1, "std_srvs/Trigger");
+    let bridge = &mut cell.programs[BRIDGE].router;
+    bridge.bind_call(start(), &trigger, now).unwrap();
+    cell.ask(BRIDGE, AskId(1), start(), &[], ms(3_000));
+    cell.run(ms(50));
+    let execution = cell.executions(GRIPPER).pop().unwrap();
+    let fields = [
+        Variant::Scalar(Scalar::UInt32(4)),
+        Variant::Scalar(Scalar::String(Some("no"))),
+        Variant::Scalar(Scalar::Boolean(false)),
+    ];
+    let answer = Executed::Answered(cell::block(&fields));
+    cell.executed(GRIPPER, execution.id, answer);
+    cell.run(ms(50));
+    let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
+    assert_eq!(answer.unwrap(), [0, 2, 0, 0, 0, b'n', b'o']);
+}
+
+#[test]
+fn what_nobody_executes_is_refused_and_what_dies_midway_is_unknown() {
+    let mut cell = plugged_in(Local::Fields);
+    cell.ask(BRIDGE, AskId(1), topic(0, 9, 105), &[0, 0], ms(3_000));
+    let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
+    assert_eq!(answer.unwrap_err().kind, AskErrorKind::Refused);
+
+    cell.ask(BRIDGE, AskId(2), start(), &[0, 0], ms(10_000));
+    cell.run(ms(50));
+    assert_eq!(cell.executions(GRIPPER).len(), 1);
+    cell.kill(GRIPPER);
+    cell.run(ms(4_000));
+    let (ask, answer) = cell.answers(BRIDGE).pop().unwrap();
+    assert_eq!(
+        (ask, answer.unwrap_err().kind),
+        (AskId(2), AskErrorKind::Unknown)
+    );
+    assert_eq!(cell.counters(BRIDGE, start()).unknown, 1);
+}
+
+#[test]
+fn bad_outcomes_are_told_as_what_they_are() {
+    let mut cell = plugged_in(Local::Fields);
+    let outcomes = [
+        (
+            Executed::Failed(StatusCode(0x8001_0000)),
+            AskErrorKind::Failed,
+        ),
+        (
+            Executed::Refused(bridge_core::Refusal::Busy),
+            AskErrorKind::Refused,
+        ),
+        (Executed::Lost, AskErrorKind::Unknown),
+        // No block of fields.
+        (Executed::Answered(vec![1]), AskErrorKind::Failed),
+    ];
+    for (number, (outcome, kind)) in (1..).zip(outcomes) {
+        cell.ask(BRIDGE, AskId(number), start(), &[0, 0], ms(3_000));
+        cell.run(ms(50));
+        let execution = cell.executions(GRIPPER).pop().unwrap();
+        cell.executed(GRIPPER, execution.id, outcome);
+        cell.run(ms(50));
+        let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
+        assert_eq!(answer.unwrap_err().kind, kind);
+    }
+}
+
+#[test]
+fn requests_from_other_hosts_are_executed_only_where_that_is_allowed() {
+    for open in [false, true] {
+        let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+        cell.programs[BRIDGE].address = "192.168.1.9:5000".parse().unwrap();
+        let description = grasp();
+        cell.offer(GRIPPER, start(), Offered { description, open });
+        cell.run(ms(200));
+        cell.ask(BRIDGE, AskId(1), start(), &[0, 0], ms(3_000));
+        cell.run(ms(50));
+        let executions = cell.executions(GRIPPER);
+        assert_eq!(executions.len(), usize::from(open));
+        let refused = cell.counters(GRIPPER, start()).drops;
+        assert_eq!(refused.dropped(Reason::CallRefused), u64::from(!open));
+        if !open {
+            let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
+            assert_eq!(answer.unwrap_err().status, StatusCode(0x801F_0000));
+        }
+    }
+}
+
+#[test]
+fn a_forged_answer_is_not_believed_whether_from_a_third_space_or_a_third_address() {
+    let mut cell = Cell::new(vec![
+        Program::new(1, Local::Fields),
+        component(7),
+        Program::new(3, Local::Fields),
+    ]);
+    cell.offer(GRIPPER, start(), offered(grasp()));
+    cell.run(ms(200));
+    cell.ask(BRIDGE, AskId(1), start(), &[0, 0], ms(3_000));
+    cell.run(ms(50));
+    let execution = cell.executions(GRIPPER).pop().unwrap();
+    cell.executed(GRIPPER, execution.id, succeeded(1));
+    // What it says is caught, and said by somebody else first.
+    let said = cell.datagrams_of(GRIPPER);
+    let answer = said
+        .into_iter()
+        .rfind(|bytes| cell::is_action(bytes))
+        .unwrap();
+    let stranger = "127.0.0.1:999".parse().unwrap();
+    cell.hear(BRIDGE, &answer, stranger);
+    let mut third = answer.clone();
+    // PublisherId of the Responder, a UInt16 behind the flags.
+    let at = third.windows(2).position(|bytes| *bytes == [0, 0]).unwrap();
+    third[at] = 3;
+    let other = cell.programs[2].address;
+    cell.hear(BRIDGE, &third, other);
+    assert_eq!(cell.answers(BRIDGE).len(), 0);
+    assert_eq!(cell.dropped(BRIDGE, Reason::Forged), 2);
+    let gripper = cell.programs[GRIPPER].address;
+    cell.hear(BRIDGE, &answer, gripper);
+    assert_eq!(cell.answers(BRIDGE).len(), 1);
+    cell.hear(BRIDGE, &answer, gripper);
+    assert_eq!(cell.answers(BRIDGE).len(), 0, "once");
+    assert!(cell.dropped(BRIDGE, Reason::NotAsked) > 0);
+}
+
+#[test]
+fn who_gives_up_gets_no_answer_and_who_executes_is_told() {
+    let mut cell = plugged_in(Local::Fields);
+    cell.ask(BRIDGE, AskId(1), start(), &[0, 0], ms(3_000));
+    cell.run(ms(50));
+    let execution = cell.executions(GRIPPER).pop().unwrap();
+    let now = cell.now();
+    cell.programs[BRIDGE].router.give_up(AskId(1), now);
+    cell.run(ms(200));
+    assert_eq!(cell.abandoned(GRIPPER), [execution.id]);
+    cell.executed(GRIPPER, execution.id, succeeded(1));
+    cell.run(ms(500));
+    assert_eq!(cell.answers(BRIDGE).len(), 0);
+}
+
+#[test]
+fn no_more_requests_are_open_than_there_is_room_for() {
+    let mut cell = plugged_in(Local::Fields);
+    for number in 0..300 {
+        cell.ask(BRIDGE, AskId(number), start(), &[0, 0], ms(60_000));
+    }
+    let refused = cell.answers(BRIDGE);
+    assert_eq!(refused.len(), 44);
+    assert!(refused.iter().all(|(_, answer)| {
+        let busy = bridge_core::Refusal::Busy.status_code();
+        answer.as_ref().is_err_and(|error| error.status == busy)
+    }));
+    cell.run(ms(300));
+    assert_eq!(cell.executions(GRIPPER).len(), 256);
+}
+
+#[test]
+fn calls_of_several_components_with_equal_identifiers_are_told_apart() {
+    let mut cell = Cell::new(vec![
+        Program::new(1, Local::Fields),
+        component(7),
+        component(8),
+    ]);
+    let mut other = grasp();
+    other.name = "vacuum.Grasp.Start".to_owned();
+    cell.offer(1, start(), offered(grasp()));
+    cell.offer(2, topic(0, 8, 105), offered(other));
+    cell.run(ms(200));
+    assert_eq!(cell.known(BRIDGE), [start(), topic(0, 8, 105)]);
+    let names = [start(), topic(0, 8, 105)].map(|call| {
+        let known = cell.programs[BRIDGE].router.described_call(call).unwrap();
+        known.name.clone()
+    });
+    assert_eq!(names, ["gripper.Grasp.Start", "vacuum.Grasp.Start"]);
+    cell.ask(BRIDGE, AskId(1), topic(0, 8, 105), &[0, 0], ms(3_000));
+    cell.run(ms(100));
+    assert_eq!(cell.executions(1).len(), 0);
+    assert_eq!(cell.executions(2).len(), 1);
+}
+
+#[test]
+fn a_component_that_dies_is_gone_when_its_values_are_missing_and_back_when_it_is_started_anew() {
+    let mut cell = plugged_in(Local::Fields);
+    cell.describe(GRIPPER, topic(0, 7, 101), state());
+    cell.say(GRIPPER, topic(0, 7, 101), "Ready");
+    cell.run(ms(20_000));
+    assert_eq!(cell.gone(BRIDGE), [], "it lives");
+    cell.kill(GRIPPER);
+    cell.run(ms(1_900));
+    assert_eq!(cell.gone(BRIDGE), [], "a datagram or two may be lost");
+    cell.run(ms(1_800));
+    assert_eq!(cell.gone(BRIDGE), [start()]);
+    cell.ask(BRIDGE, AskId(1), start(), &[0, 0], ms(3_000));
+    let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
+    assert_eq!(answer.unwrap_err().kind, AskErrorKind::Refused);
+
+    // At another port, as it is with a program that was started anew.
+    let again = component(7).at_port(7_777);
+    cell.start(GRIPPER, again);
+    cell.offer(GRIPPER, start(), offered(grasp()));
+    cell.run(ms(500));
+    assert_eq!(cell.known(BRIDGE), [start()]);
+    cell.ask(BRIDGE, AskId(2), start(), &[0, 0], ms(3_000));
+    cell.run(ms(50));
+    assert_eq!(cell.executions(GRIPPER).len(), 1);
+}
+
+#[test]
+fn a_component_that_is_started_anew_at_once_is_asked_as_soon_as_its_past_is_over() {
+    let mut cell = plugged_in(Local::Fields);
+    cell.describe(GRIPPER, topic(0, 7, 101), state());
+    cell.say(GRIPPER, topic(0, 7, 101), "Ready");
+    cell.run(ms(2_000));
+    let again = component(7).at_port(7_777);
+    cell.start(GRIPPER, again);
+    cell.offer(GRIPPER, start(), offered(grasp()));
+    cell.run(ms(5_500));
+    assert_eq!(
+        (cell.gone(BRIDGE), cell.known(BRIDGE)),
+        (vec![start()], vec![start()])
+    );
+    cell.ask(BRIDGE, AskId(2), start(), &[0, 0], ms(3_000));
+    cell.run(ms(50));
+    assert_eq!(cell.executions(GRIPPER).len(), 1);
+}
+
+#[test]
+fn a_call_without_values_is_gone_when_it_is_not_announced_any_more_or_said_to_be() {
+    let mut cell = plugged_in(Local::Fields);
+    cell.run(ms(100_000));
+    assert_eq!(cell.gone(BRIDGE), [], "it is announced every 30 s");
+    let now = cell.now();
+    cell.programs[GRIPPER].router.withdraw_all(now);
+    cell.run(ms(50));
+    assert_eq!(cell.gone(BRIDGE), [start()], "at once");
+
+    let mut cell = plugged_in(Local::Fields);
+    cell.kill(GRIPPER);
+    cell.run(ms(80_000));
+    assert_eq!(cell.gone(BRIDGE), []);
+    cell.run(ms(15_000));
+    assert_eq!(cell.gone(BRIDGE), [start()]);
+}
+
+#[test]
+fn who_comes_late_learns_the_calls_that_are_there_by_asking() {
+    let mut cell = Cell::new(vec![component(7)]);
+    cell.describe(0, topic(0, 7, 101), state());
+    cell.offer(0, start(), offered(grasp()));
+    cell.say(0, topic(0, 7, 101), "Ready");
+    cell.run(ms(5_000));
+    cell.programs.push(Program::new(2, Local::Fields));
+    // The next key frame comes within a second, and what is asked for then within another.
+    cell.run(ms(2_000));
+    assert_eq!(cell.known(1), [start()]);
+
+    // Or because somebody wants that one.
+    let mut cell = Cell::new(vec![component(7)]);
+    cell.offer(0, start(), offered(grasp()));
+    cell.run(ms(5_000));
+    cell.programs.push(Program::new(2, Local::Fields));
+    let now = cell.now();
+    cell.programs[1].router.want_call(start(), now);
+    cell.run(ms(1_000));
+    assert_eq!(cell.known(1), [start()]);
+}
+
+fn state() -> ValueDescription {
+    ValueDescription {
+        name: "gripper.Grasp.State".to_owned(),
+        message_type: Some("std_msgs/String".parse().unwrap()),
+        about: "GripperSkillType nsu=urn:x".to_owned(),
+        fields: vec![Leaf {
+            path: "data".to_owned(),
+            builtin: BuiltinType::String,
+            rank: Rank::Scalar,
+        }],
+        overflow: Overflow::KeepLatest,
+    }
+}
+
+#[test]
+fn a_value_that_the_program_describes_itself_crosses_under_the_ros_type_it_says() {
+    let mut cell = Cell::new(vec![Program::new(1, Local::Ros1), component(7)]);
+    let value = topic(0, 7, 101);
+    cell.describe(GRIPPER, value, state());
+    cell.say(GRIPPER, value, "Ready");
+    cell.run(ms(2_000));
+    let outputs = cell.outputs(BRIDGE);
+    let described = outputs.iter().rev().find_map(|output| match output {
+        Output::Unbound { described, .. } => described.clone(),
+        _ => None,
+    });
+    let described = described.unwrap();
+    assert_eq!(described.message_type.as_str(), "std_msgs/String");
+    assert_eq!(described.name, "gripper.Grasp.State");
+    assert_eq!(described.about, "GripperSkillType nsu=urn:x");
+}
+
+#[test]
+fn a_namespace_that_somebody_else_writes_is_left_alone_until_it_is_free() {
+    let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+    let value = topic(0, 7, 101);
+    cell.describe(GRIPPER, value, state());
+    cell.offer(GRIPPER, start(), offered(grasp()));
+    cell.say(GRIPPER, value, "first");
+    cell.run(ms(5_000));
+
+    cell.programs.push(component(7).at_port(7_777));
+    let now = cell.now();
+    cell.programs[2].router.claim(now);
+    cell.describe(2, value, state());
+    cell.offer(2, start(), offered(grasp()));
+    cell.say(2, value, "second");
+    cell.run(ms(1_000));
+    assert_eq!(cell.taken(2), [(7, true)]);
+    cell.say(2, value, "third");
+    cell.run(ms(5_000));
+    assert_eq!(
+        cell.datagrams_of(2).len(),
+        1,
+        "its question, and nothing else"
+    );
+    assert_eq!(cell.taken(GRIPPER), [], "it was there first");
+    assert_eq!(cell.texts(BRIDGE, value), ["first"]);
+
+    cell.kill(GRIPPER);
+    cell.run(ms(5_000));
+    assert_eq!(cell.taken(2), [(7, false)]);
+    assert_eq!(cell.texts(BRIDGE, value), ["third"]);
+    cell.run(ms(2_000));
+    assert_eq!(cell.known(BRIDGE).last(), Some(&start()));
+}
+
+#[test]
+fn a_free_namespace_is_used_after_a_moment_and_nothing_is_lost_meanwhile() {
+    let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+    let value = topic(0, 7, 102);
+    let now = cell.now();
+    cell.programs[GRIPPER].router.claim(now);
+    let events = ValueDescription {
+        overflow: Overflow::DropOldest(std::num::NonZeroU16::new(10).unwrap()),
+        ..state()
+    };
+    cell.describe(GRIPPER, value, events);
+    for text in ["a", "b", "c"] {
+        cell.say(GRIPPER, value, text);
+    }
+    cell.run(ms(250));
+    assert_eq!(cell.texts(BRIDGE, value), Vec::<String>::new());
+    cell.run(ms(100));
+    assert_eq!(cell.texts(BRIDGE, value), ["a", "b", "c"]);
+}
+
+#[test]
+fn a_server_shows_the_values_of_components_beside_its_own() {
+    let mut cell = Cell::new(vec![
+        Program::new(0, Local::Fields).owning(&[2]),
+        component(7),
+    ]);
+    let (theirs, ours) = (topic(0, 7, 101), topic(0, 2, 10));
+    cell.say(GRIPPER, theirs, "Ready");
+    cell.say(0, ours, "mine");
+    cell.run(ms(100));
+    assert_eq!(cell.texts(0, theirs), ["Ready"]);
+    assert_eq!(cell.texts(GRIPPER, ours), ["mine"]);
+    assert_eq!(cell.dropped(0, Reason::SpaceTaken), 0);
+    // Somebody else in its own namespace is another matter.
+    cell.programs.push(component(2).at_port(7_777));
+    cell.say(2, ours, "rival");
+    cell.run(ms(100));
+    assert_eq!(cell.texts(0, ours), Vec::<String>::new());
+    assert!(cell.dropped(0, Reason::SpaceTaken) > 0);
+
+    // The mapping says it has 7 too: what it heard there is forgotten, and that it is in use told.
+    let now = cell.now();
+    let both = Owned::Only([2, 7].into());
+    cell.programs[0].router.set_owned(both, now);
+    cell.say(GRIPPER, theirs, "again");
+    cell.run(ms(100));
+    assert_eq!(cell.texts(0, theirs), Vec::<String>::new());
+    let only = Owned::Only([2].into());
+    cell.programs[0].router.set_owned(only, now);
+    cell.run(ms(1_000));
+    assert_eq!(cell.texts(0, theirs), ["again"], "by its repetition");
+}

@@ -1,0 +1,367 @@
+//! Programs around one group, with a clock that moves when told.
+#![allow(dead_code, reason = "each test file uses some of it")]
+
+use std::collections::{BTreeMap, VecDeque};
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bridge_core::{
+    Answered, AskId, CallCounters, Executed, Execution, ExecutionId, Heard, Local, Now, Offered,
+    Output, Owned, Reason, Router, Settings, ValueDescription,
+};
+use mappings::{Mapping, SpaceId, TopicId};
+use uadp::{
+    DataSetHeader, Fields, NetworkHeader, NetworkMessage, NetworkMessageEncoder, Scalar, Timestamp,
+    Variant,
+};
+
+/// Who hears the datagrams of whom, in which order and how often; all hear each once by default.
+pub(crate) type Network = Box<dyn FnMut(&[u8]) -> usize>;
+
+pub(crate) struct Cell {
+    pub(crate) programs: Vec<Program>,
+    /// What is under way on the group: from where, and what.
+    under_way: VecDeque<(SocketAddr, Vec<u8>)>,
+    /// How often each datagram comes.
+    pub(crate) copies: Network,
+    /// Whether what is under way is taken from the end, by turns.
+    pub(crate) reorders: bool,
+    turn: usize,
+    started: Instant,
+    passed: Duration,
+}
+
+pub(crate) struct Program {
+    pub(crate) router: Router,
+    pub(crate) address: SocketAddr,
+    outputs: Vec<Output>,
+    sent: Vec<Vec<u8>>,
+    dead: bool,
+}
+
+impl Program {
+    pub(crate) fn new(space: u16, local: Local) -> Self {
+        let address = SocketAddr::from(([127, 0, 0, 1], 10_000 + space));
+        Self::at(space, local, address)
+    }
+
+    fn at(space: u16, local: Local, address: SocketAddr) -> Self {
+        let settings = Settings {
+            own: SpaceId::new(space).unwrap(),
+            local,
+            source: Some(address),
+        };
+        let mut router = Router::new(settings, Arc::new(Mapping::default()));
+        let mut instance = [7; 16];
+        for (place, byte) in instance.iter_mut().zip(address.port().to_le_bytes()) {
+            *place = byte;
+        }
+        router.set_instance(instance);
+        Self {
+            router,
+            address,
+            outputs: Vec::new(),
+            sent: Vec::new(),
+            dead: false,
+        }
+    }
+
+    pub(crate) fn at_port(mut self, port: u16) -> Self {
+        self.address.set_port(port);
+        self.router.set_source(self.address);
+        self
+    }
+
+    pub(crate) fn owning(mut self, namespaces: &[u16]) -> Self {
+        let owned = Owned::Only(namespaces.iter().copied().collect());
+        self.router.set_owned(owned, start());
+        self
+    }
+}
+
+/// A program that writes one namespace of space 0.
+pub(crate) fn component(namespace: u16) -> Program {
+    let address = SocketAddr::from(([127, 0, 0, 1], 20_000 + namespace));
+    Program::at(0, Local::Fields, address).owning(&[namespace])
+}
+
+impl Cell {
+    pub(crate) fn new(programs: Vec<Program>) -> Self {
+        Self {
+            programs,
+            under_way: VecDeque::new(),
+            copies: Box::new(|_| 1),
+            reorders: false,
+            turn: 0,
+            started: start().monotonic,
+            passed: Duration::ZERO,
+        }
+    }
+
+    pub(crate) fn now(&mut self) -> Now {
+        self.passed += Duration::from_micros(1);
+        let nanos = i128::try_from(self.passed.as_nanos()).unwrap();
+        Now {
+            monotonic: self.started + self.passed,
+            utc: Timestamp::from_unix_nanos(START + nanos),
+        }
+    }
+
+    /// Lets everything happen that is due within that time.
+    pub(crate) fn run(&mut self, time: Duration) {
+        let end = self.passed + time;
+        for _ in 0..200_000 {
+            self.carry();
+            let due = self.programs.iter().filter(|program| !program.dead);
+            let due = due
+                .filter_map(|program| program.router.poll_timeout())
+                .min();
+            let next = due.map(|due| due.saturating_duration_since(self.started));
+            match next.filter(|next| *next <= end) {
+                Some(next) => self.passed = self.passed.max(next),
+                None => {
+                    self.passed = self.passed.max(end);
+                    return;
+                }
+            }
+            for at in 0..self.programs.len() {
+                let now = self.now();
+                if !self.programs[at].dead {
+                    self.programs[at].router.handle_timeout(now);
+                    self.drain(at);
+                }
+            }
+        }
+        panic!("no end of it");
+    }
+
+    /// Everybody hears what is under way.
+    fn carry(&mut self) {
+        for at in 0..self.programs.len() {
+            self.drain(at);
+        }
+        for _ in 0..100_000 {
+            self.turn += 1;
+            let next = match self.reorders && self.turn.is_multiple_of(2) {
+                true => self.under_way.pop_back(),
+                false => self.under_way.pop_front(),
+            };
+            let Some((from, bytes)) = next else {
+                return;
+            };
+            for at in 0..self.programs.len() {
+                self.hear(at, &bytes, from);
+            }
+        }
+        panic!("no silence");
+    }
+
+    pub(crate) fn hear(&mut self, at: usize, bytes: &[u8], from: SocketAddr) {
+        let now = self.now();
+        let program = &mut self.programs[at];
+        if !program.dead {
+            program.router.handle_datagram(bytes, from, now);
+            self.drain(at);
+        }
+    }
+
+    pub(crate) fn drain(&mut self, at: usize) {
+        let now = self.now();
+        let program = &mut self.programs[at];
+        if program.dead {
+            return;
+        }
+        while let Some(output) = program.router.poll_output(now) {
+            match output {
+                Output::Datagram { bytes, .. }
+                | Output::Discovery { bytes }
+                | Output::Action { bytes, .. } => {
+                    for _ in 0..(self.copies)(&bytes) {
+                        self.under_way.push_back((program.address, bytes.clone()));
+                    }
+                    program.sent.push(bytes);
+                }
+                other => program.outputs.push(other),
+            }
+        }
+    }
+
+    pub(crate) fn kill(&mut self, at: usize) {
+        self.programs[at].dead = true;
+    }
+
+    pub(crate) fn start(&mut self, at: usize, program: Program) {
+        self.programs[at] = program;
+    }
+
+    pub(crate) fn offer(&mut self, at: usize, topic: TopicId, offered: Offered) {
+        let now = self.now();
+        self.programs[at].router.offer(topic, offered, now);
+    }
+
+    pub(crate) fn describe(&mut self, at: usize, topic: TopicId, what: ValueDescription) {
+        let now = self.now();
+        self.programs[at].router.describe_value(topic, what, now);
+    }
+
+    /// Has a program that speaks in fields say a text.
+    pub(crate) fn say(&mut self, at: usize, topic: TopicId, text: &str) {
+        let now = self.now();
+        let payload = block(&[Variant::Scalar(Scalar::String(Some(text)))]);
+        let heard = Heard {
+            topic,
+            payload: &payload,
+            received: now.utc,
+            latched_by: None,
+        };
+        let _verdict = self.programs[at].router.handle_local(heard, now);
+    }
+
+    pub(crate) fn ask(
+        &mut self,
+        at: usize,
+        ask: AskId,
+        topic: TopicId,
+        request: &[u8],
+        timeout: Duration,
+    ) {
+        let now = self.now();
+        let router = &mut self.programs[at].router;
+        router.ask(ask, topic, request, timeout, now);
+        self.drain(at);
+    }
+
+    pub(crate) fn executed(&mut self, at: usize, execution: ExecutionId, outcome: Executed) {
+        let now = self.now();
+        self.programs[at].router.executed(execution, outcome, now);
+        self.drain(at);
+    }
+
+    /// Takes what a program was told and `pick` picks.
+    fn take<T>(&mut self, at: usize, pick: impl Fn(&Output) -> Option<T>) -> Vec<T> {
+        let outputs = &mut self.programs[at].outputs;
+        let taken = outputs.iter().filter_map(&pick).collect();
+        outputs.retain(|output| pick(output).is_none());
+        taken
+    }
+
+    pub(crate) fn outputs(&mut self, at: usize) -> Vec<Output> {
+        std::mem::take(&mut self.programs[at].outputs)
+    }
+
+    pub(crate) fn answers(&mut self, at: usize) -> Vec<(AskId, Answered)> {
+        self.take(at, |output| match output {
+            Output::Answer { ask, answer, .. } => Some((*ask, answer.clone())),
+            _ => None,
+        })
+    }
+
+    pub(crate) fn executions(&mut self, at: usize) -> Vec<Execution> {
+        self.take(at, |output| match output {
+            Output::Execute(execution) => Some(execution.clone()),
+            _ => None,
+        })
+    }
+
+    pub(crate) fn abandoned(&mut self, at: usize) -> Vec<ExecutionId> {
+        self.take(at, |output| match output {
+            Output::Abandoned { execution, .. } => Some(*execution),
+            _ => None,
+        })
+    }
+
+    pub(crate) fn known(&mut self, at: usize) -> Vec<TopicId> {
+        let mut known = self.take(at, |output| match output {
+            Output::CallKnown { topic, .. } => Some(*topic),
+            _ => None,
+        });
+        known.sort();
+        known
+    }
+
+    pub(crate) fn gone(&mut self, at: usize) -> Vec<TopicId> {
+        self.take(at, |output| match output {
+            Output::CallGone { topic } => Some(*topic),
+            _ => None,
+        })
+    }
+
+    /// Which namespaces are taken, and which are free again.
+    pub(crate) fn taken(&mut self, at: usize) -> Vec<(u16, bool)> {
+        self.take(at, |output| match output {
+            Output::Taken { namespace, by } => Some((*namespace, by.is_some())),
+            _ => None,
+        })
+    }
+
+    /// What a program that speaks in fields was given of a topic.
+    pub(crate) fn texts(&mut self, at: usize, topic: TopicId) -> Vec<String> {
+        self.take(at, |output| match output {
+            Output::Delivery(delivery) if delivery.topic == topic => {
+                match Fields::parse(&delivery.payload).unwrap().next() {
+                    Some(Ok(Variant::Scalar(Scalar::String(Some(text))))) => Some(text.to_owned()),
+                    other => panic!("{other:?}"),
+                }
+            }
+            _ => None,
+        })
+    }
+
+    /// All that a program sent.
+    pub(crate) fn datagrams_of(&mut self, at: usize) -> Vec<Vec<u8>> {
+        self.drain(at);
+        self.programs[at].sent.clone()
+    }
+
+    pub(crate) fn counters(&self, at: usize, topic: TopicId) -> CallCounters {
+        let all: BTreeMap<TopicId, &CallCounters> = self.programs[at].router.calls().collect();
+        all.get(&topic).copied().cloned().unwrap_or_default()
+    }
+
+    /// How often something was dropped for that reason, of whatever.
+    pub(crate) fn dropped(&self, at: usize, reason: Reason) -> u64 {
+        let router = &self.programs[at].router;
+        let calls = router.calls().map(|(_, call)| call.drops.dropped(reason));
+        let topics = router.topics().map(|(_, topic)| topic.dropped(reason));
+        calls.chain(topics).sum::<u64>() + router.others().dropped(reason)
+    }
+}
+
+pub(crate) fn is_action(bytes: &[u8]) -> bool {
+    NetworkMessage::decode(bytes).is_ok_and(|message| message.is_action())
+}
+
+/// A block of fields.
+pub(crate) fn block(fields: &[Variant<'_>]) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let mut message =
+        NetworkMessageEncoder::new(&mut bytes, &NetworkHeader::default(), None).unwrap();
+    let mut frame = message.key_frame(&DataSetHeader::default()).unwrap();
+    for field in fields {
+        frame.variant(field).unwrap();
+    }
+    frame.finish().unwrap();
+    message.finish().unwrap();
+    let message = NetworkMessage::decode(&bytes).unwrap();
+    let message = message.messages().next().unwrap().unwrap();
+    message.fields().unwrap().bytes().to_vec()
+}
+
+pub(crate) fn topic(space: u16, namespace: u16, id: u16) -> TopicId {
+    TopicId::new(space, namespace, id).unwrap()
+}
+
+pub(crate) const fn ms(time: u64) -> Duration {
+    Duration::from_millis(time)
+}
+
+#[expect(clippy::disallowed_methods, reason = "some instant to count from")]
+fn start() -> Now {
+    Now {
+        monotonic: Instant::now(),
+        utc: Timestamp::from_unix_nanos(START),
+    }
+}
+
+const START: i128 = 1_700_000_000_000_000_000;
