@@ -1,0 +1,164 @@
+//! Any set of programs around one group, which loses, doubles and reorders datagrams: a request is executed at most once,
+//! where its name says and never at home, who asked is told what is so, and then there is silence.
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
+
+mod cell;
+
+use std::collections::BTreeMap;
+
+use bridge_core::{
+    AskErrorKind, AskId, CallDescription, CallField, Executed, Local, Offered, Reason,
+};
+use cell::{Cell, Program, block, is_action, ms, topic};
+use proptest::prelude::*;
+use uadp::{BuiltinType, Scalar, Variant};
+
+/// How the group is: per mille of datagrams that are lost and doubled, and whether they come in another order.
+#[derive(Debug, Clone, Copy)]
+struct Weather {
+    lost: u32,
+    doubled: u32,
+    reorders: bool,
+    seed: u32,
+}
+
+fn weather() -> impl Strategy<Value = Weather> {
+    let fair = Just((0, 0));
+    let rough = (0_u32..400, 0_u32..400);
+    (prop_oneof![fair, rough], any::<bool>(), 1_u32..).prop_map(
+        |((lost, doubled), reorders, seed)| Weather {
+            lost,
+            doubled,
+            reorders,
+            seed,
+        },
+    )
+}
+
+impl Weather {
+    fn fill(self, cell: &mut Cell) {
+        let Self {
+            lost,
+            doubled,
+            reorders,
+            mut seed,
+        } = self;
+        cell.reorders = reorders;
+        cell.copies = Box::new(move |_| {
+            // Xorshift: enough to be different each time.
+            seed ^= seed << 13;
+            seed ^= seed >> 17;
+            seed ^= seed << 5;
+            match seed % 1_000 {
+                drawn if drawn < lost => 0,
+                drawn if drawn < lost + doubled => 2,
+                _ => 1,
+            }
+        });
+    }
+}
+
+fn description() -> CallDescription {
+    CallDescription {
+        name: "Echo".to_owned(),
+        about: String::new(),
+        request: vec![CallField::scalar("number", BuiltinType::UInt32)],
+        response: vec![CallField::scalar("number", BuiltinType::UInt32)],
+    }
+}
+
+fn number(number: u32) -> Vec<u8> {
+    block(&[Variant::Scalar(Scalar::UInt32(number))])
+}
+
+fn actions(cell: &mut Cell) -> usize {
+    let all = 0..cell.programs.len();
+    all.map(|at| {
+        let sent = cell.datagrams_of(at);
+        sent.iter().filter(|bytes| is_action(bytes)).count()
+    })
+    .sum()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn a_request_is_executed_at_most_once_and_where_its_name_says(
+        spaces in proptest::collection::btree_set(0_u16..=232, 1..=5),
+        asked in proptest::collection::vec((any::<proptest::sample::Index>(), any::<proptest::sample::Index>()), 1..12),
+        weather in weather(),
+    ) {
+        let spaces: Vec<u16> = spaces.into_iter().collect();
+        let programs = spaces.iter().map(|space| Program::new(*space, Local::Fields));
+        let mut cell = Cell::new(programs.collect());
+        let call = |at: usize| topic(spaces[at], 5, 61);
+        for at in 0..spaces.len() {
+            let description = description();
+            cell.offer(at, call(at), Offered { description, open: false });
+        }
+        cell.run(ms(300));
+        for at in 0..spaces.len() {
+            prop_assert_eq!(cell.known(at).len(), spaces.len() - 1);
+        }
+        weather.fill(&mut cell);
+
+        let mut answers: BTreeMap<u32, Vec<_>> = BTreeMap::new();
+        let mut executed: BTreeMap<u32, Vec<usize>> = BTreeMap::new();
+        let mut wanted = BTreeMap::new();
+        for (id, (asker, executor)) in (0_u32..).zip(&asked) {
+            let (asker, executor) = (asker.index(spaces.len()), executor.index(spaces.len()));
+            cell.ask(asker, AskId(id.into()), call(executor), &number(id), ms(3_000));
+            wanted.insert(id, (asker, executor));
+        }
+        for _ in 0..100 {
+            cell.run(ms(50));
+            for at in 0..spaces.len() {
+                for execution in cell.executions(at) {
+                    prop_assert_eq!(execution.topic, call(at), "never anywhere else");
+                    let id = u32::from_le_bytes(*execution.request.last_chunk().unwrap());
+                    prop_assert_eq!(execution.requestor.map(|space| u16::from(space.get())), Some(spaces[wanted[&id].0]));
+                    executed.entry(id).or_default().push(at);
+                    cell.executed(at, execution.id, Executed::Answered(execution.request));
+                }
+                for (ask, answer) in cell.answers(at) {
+                    let id = u32::try_from(ask.0).unwrap();
+                    prop_assert_eq!(wanted[&id].0, at, "nobody else is told");
+                    answers.entry(id).or_default().push(answer);
+                }
+            }
+        }
+        for (id, (asker, executor)) in wanted {
+            let (told, done) = (&answers[&id], executed.get(&id).cloned().unwrap_or_default());
+            prop_assert_eq!(told.len(), 1);
+            match &told[0] {
+                Ok(response) => {
+                    prop_assert_eq!(response, &number(id));
+                    prop_assert_eq!(done, [executor]);
+                }
+                Err(error) if asker == executor => {
+                    prop_assert_eq!(error.kind, AskErrorKind::Refused);
+                    prop_assert_eq!(done, Vec::<usize>::new(), "never at home");
+                }
+                Err(error) => {
+                    prop_assert_eq!(error.kind, AskErrorKind::Unknown);
+                    prop_assert!(done.len() <= 1 && weather.lost > 0, "{}", error);
+                }
+            }
+        }
+        for at in 0..spaces.len() {
+            prop_assert_eq!(cell.dropped(at, Reason::Forged), 0);
+        }
+        // Answers that nobody acknowledged are said again for a while.
+        cell.run(ms(15_000));
+        let before = actions(&mut cell);
+        cell.run(ms(10_000));
+        prop_assert_eq!(actions(&mut cell), before, "silence");
+    }
+}
