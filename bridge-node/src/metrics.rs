@@ -18,24 +18,44 @@ use tokio::task::AbortHandle;
 use tracing::{debug, info};
 
 use crate::exit::{Failure, FailureKind};
-use crate::status::Status;
+
+/// What a program says of itself at one moment.
+pub trait Told: Send + 'static {
+    /// One JSON object, for /status.
+    fn json(&self) -> String;
+
+    /// The text exposition format of Prometheus, version 0.0.4, for /metrics.
+    fn prometheus(&self) -> String;
+
+    /// What keeps it from its work, a line each; nothing where it can do it. For /readyz.
+    fn not_ready(&self) -> Vec<String>;
+}
 
 /// The run loops that answer, in the order of their spaces.
-type Ask = Arc<[mpsc::Sender<oneshot::Sender<Status>>]>;
+type Ask<T> = Arc<[mpsc::Sender<oneshot::Sender<T>>]>;
 /// A run loop's end: each request brings the place for its answer.
-pub(crate) type Requests = mpsc::Receiver<oneshot::Sender<Status>>;
+pub type Requests<T> = mpsc::Receiver<oneshot::Sender<T>>;
 
 /// The requests of nobody.
-pub(crate) fn never() -> Requests {
+pub(crate) fn never<T>() -> Requests<T> {
     mpsc::channel(1).1
+}
+
+/// Listens at `address` for requests to [`Told`] pages. Without an address there are never any.
+///
+/// # Errors
+/// Nothing can listen there.
+pub async fn serve_pages<T: Told>(address: Option<SocketAddr>) -> Result<Requests<T>, Failure> {
+    let requests = serve(address, 1).await?.pop();
+    Ok(requests.unwrap_or_else(never))
 }
 
 /// Listens at `address` and gives each of so many run loops its requests to answer. Without an address there are
 /// never any.
-pub(crate) async fn serve(
+pub(crate) async fn serve<T: Told>(
     address: Option<SocketAddr>,
     loops: usize,
-) -> Result<Vec<Requests>, Failure> {
+) -> Result<Vec<Requests<T>>, Failure> {
     let (ask, mut requests): (Vec<_>, Vec<_>) = (0..loops).map(|_| mpsc::channel(4)).unzip();
     // The last is taken first; answers are to be in the order of the spaces.
     requests.reverse();
@@ -56,7 +76,7 @@ pub(crate) async fn serve(
     Ok(requests)
 }
 
-async fn accept(listener: TcpListener, ask: Ask) {
+async fn accept<T: Told>(listener: TcpListener, ask: Ask<T>) {
     let mut crowd = Crowd::default();
     loop {
         let (stream, peer) = tokio::select! {
@@ -110,13 +130,13 @@ impl Crowd {
     }
 }
 
-async fn all_closed(ask: &Ask) {
+async fn all_closed<T>(ask: &Ask<T>) {
     for ask in ask.iter() {
         ask.closed().await;
     }
 }
 
-async fn answer(stream: TcpStream, ask: Ask) {
+async fn answer<T: Told>(stream: TcpStream, ask: Ask<T>) {
     let service = service_fn(|request| {
         let ask = Arc::clone(&ask);
         async move { Ok::<_, Infallible>(page(&request, &ask).await) }
@@ -131,7 +151,7 @@ async fn answer(stream: TcpStream, ask: Ask) {
     }
 }
 
-async fn page(request: &Request<Incoming>, ask: &Ask) -> Response<Full<Bytes>> {
+async fn page<T: Told>(request: &Request<Incoming>, ask: &Ask<T>) -> Response<Full<Bytes>> {
     let page = match request.uri().path() {
         "/metrics" => Page::Metrics,
         "/status" => Page::Status,
@@ -159,10 +179,10 @@ async fn page(request: &Request<Incoming>, ask: &Ask) -> Response<Full<Bytes>> {
     match page {
         Page::Metrics => text(
             StatusCode::OK,
-            all.iter().map(Status::prometheus).collect::<String>(),
+            all.iter().map(T::prometheus).collect::<String>(),
         ),
         Page::Ready => {
-            let reasons: String = all.iter().flat_map(Status::not_ready).collect();
+            let reasons: String = all.iter().flat_map(T::not_ready).collect();
             if reasons.is_empty() {
                 text(StatusCode::OK, "ready\n".to_owned())
             } else {
@@ -172,7 +192,7 @@ async fn page(request: &Request<Incoming>, ask: &Ask) -> Response<Full<Bytes>> {
         Page::Status => match all.as_slice() {
             [only] if ask.len() == 1 => text(StatusCode::OK, only.json()),
             all => {
-                let each: Vec<String> = all.iter().map(Status::json).collect();
+                let each: Vec<String> = all.iter().map(T::json).collect();
                 text(StatusCode::OK, format!("[{}]", each.join(",")))
             }
         },
@@ -204,9 +224,10 @@ mod tests {
     use tokio::net::TcpSocket;
 
     use super::*;
+    use crate::status::Status;
 
     /// A page without run loops behind it, and what keeps it open.
-    async fn served() -> (SocketAddr, Requests) {
+    async fn served() -> (SocketAddr, Requests<Status>) {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let address = listener.local_addr().unwrap();
         let (ask, requests) = mpsc::channel(1);

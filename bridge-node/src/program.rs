@@ -10,7 +10,6 @@ use std::time::Duration;
 
 use bridge_core::{Local, Owned, Router, Settings};
 use clap::Parser;
-use clap::error::ErrorKind;
 use mappings::{Mapping, PubSub, SpaceId};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::watch;
@@ -29,6 +28,8 @@ use crate::mapping_file::{MappingFile, Running};
 use crate::metrics::{self, Requests};
 use crate::port::Port;
 use crate::run::{Fixed, Shell};
+use crate::service;
+use crate::status::Status;
 
 /// What one program is, for [`run`].
 pub trait Program: Parser {
@@ -99,18 +100,9 @@ pub struct Context {
 /// Runs a program from its command line to its end.
 #[must_use]
 pub fn run<P: Program>() -> ExitCode {
-    let program = match P::try_parse() {
+    let program: P = match service::parse() {
         Ok(program) => program,
-        Err(usage) => {
-            // Nobody is left to tell when stdout or stderr is closed.
-            let _printed = usage.print();
-            let asked = [ErrorKind::DisplayHelp, ErrorKind::DisplayVersion];
-            return if asked.contains(&usage.kind()) {
-                ExitCode::SUCCESS
-            } else {
-                FailureKind::Usage.into()
-            };
-        }
+        Err(code) => return code,
     };
     logging::start(program.arguments().flags.log, P::QUIET);
     descriptors::raise();
@@ -190,7 +182,7 @@ async fn prepare<P: Program>(
     program: &P,
     changes: &watch::Receiver<Running>,
     (own, several): (SpaceId, bool),
-    requests: Requests,
+    requests: Requests<Status>,
 ) -> Result<Shell<P::Port>, Failure> {
     let arguments = program.arguments();
     let Running {
@@ -301,7 +293,7 @@ fn open(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Udp, 
 }
 
 /// Ready at the first SIGINT or SIGTERM.
-fn stopped() -> Result<impl Future<Output = ()> + Send + 'static, Failure> {
+pub(crate) fn stopped() -> Result<impl Future<Output = ()> + Send + 'static, Failure> {
     let (mut interrupt, mut terminate) = (
         listen(SignalKind::interrupt())?,
         listen(SignalKind::terminate())?,

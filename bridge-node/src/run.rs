@@ -20,7 +20,7 @@ use crate::busy_poll::BusyPoll;
 use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
 use crate::mapping_file::Running;
-use crate::metrics::Requests;
+use crate::metrics::{Requests, Told as _};
 use crate::port::{Delivery, Execution, Port, PortEvent};
 use crate::status::{Interfaces, Readiness, Status};
 
@@ -35,7 +35,7 @@ pub(crate) struct Shell<P> {
     pub(crate) held: Option<Held>,
     /// The namespaces it alone writes, by the mapping.
     pub(crate) owned: fn(&Mapping) -> Owned,
-    pub(crate) requests: Requests,
+    pub(crate) requests: Requests<Status>,
     pub(crate) changes: watch::Receiver<Running>,
     pub(crate) fixed: Fixed,
     /// What of the mapping waits for the next start.

@@ -8,6 +8,7 @@ use mappings::SpaceId;
 use serde::Serialize;
 
 use crate::mapping_file::About;
+use crate::metrics::Told;
 
 /// A program's counters and delays at one moment.
 #[derive(Debug, Clone, Serialize)]
@@ -135,22 +136,23 @@ impl Status {
             all().flat_map(|topic| topic.dropped.values()).sum(),
         ]
     }
+}
 
-    /// What keeps it from its work, a line each.
-    pub(crate) fn not_ready(&self) -> impl Iterator<Item = String> {
+impl Told for Status {
+    fn not_ready(&self) -> Vec<String> {
         let (program, space) = (self.program, self.space);
         let reasons = self.readiness.not_ready.iter();
-        reasons.map(move |why| format!("{program}, space {space}: {why}\n"))
+        reasons
+            .map(|why| format!("{program}, space {space}: {why}\n"))
+            .collect()
     }
 
-    /// One JSON object.
-    pub(crate) fn json(&self) -> String {
+    fn json(&self) -> String {
         // All keys are strings and no number is special, so there is nothing that could fail.
         serde_json::to_string(self).unwrap_or_default()
     }
 
-    /// The text exposition format of Prometheus, version 0.0.4.
-    pub(crate) fn prometheus(&self) -> String {
+    fn prometheus(&self) -> String {
         let mut text = String::new();
         let mut line = |name: &str, labels: &str, value: &dyn std::fmt::Display| {
             // Writing to a string does not fail.
