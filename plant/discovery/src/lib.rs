@@ -1,1 +1,41 @@
-//! Bindings of the registry.
+//! Who is there: the registry of [`registry`] with sockets around it.
+//!
+//! [`announce`] tells of a server: by mDNS to whoever is on the network, and by registration to the Local Discovery
+//! Server. [`watch`] tells who is there. [`lds`] is the Local Discovery Server itself, the program `ua-lds`.
+//!
+//! Reading order: `url` and `interface` (where), `mdns` (announcements and what is heard of others), `probe` (who still
+//! answers), `keeper` (all of that around one registry), `watch` and `announce` (for programs), `wire` (OPC UA over TCP
+//! without sessions), `client` (asking by it), `endpoint`, `connection` and `services` (answering by it), `lds`.
+
+mod announce;
+pub mod client;
+mod clock;
+mod connection;
+mod endpoint;
+mod interface;
+mod keeper;
+pub mod lds;
+mod mdns;
+mod probe;
+mod services;
+mod url;
+mod watch;
+mod wire;
+
+pub use announce::{AnnounceSettings, AnnounceState, Announced, Server, announce};
+pub use interface::Interface;
+pub use mdns::MdnsFault;
+pub use watch::{Found, Known, WatchSettings, Watcher, watch};
+
+/// Where the Local Discovery Server of a host is (OPC 10000-12, 4.2.2).
+pub const DEFAULT_LDS: &str = "opc.tcp://127.0.0.1:4840";
+
+/// Of this host, without a domain.
+fn host_name() -> String {
+    let name = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    let name = name.trim();
+    match name.split('.').next() {
+        Some(first) if !first.is_empty() => first.to_owned(),
+        _ => "localhost".to_owned(),
+    }
+}

@@ -416,13 +416,19 @@ fn nobody_takes_the_record_of_another_by_registering_under_its_name() {
         }
     }
     let after = urls(&registry);
-    assert!(before.iter().all(|record| after.contains(record)), "{after:?}");
+    assert!(
+        before.iter().all(|record| after.contains(record)),
+        "{after:?}"
+    );
     // Whoever announces itself is not announced a second time, and leaves by its own goodbye.
     let itself = named("urn:robot", &robot().instance, &robot().url);
     registry
         .register(itself, &secured("urn:robot"), None, now)
         .unwrap();
-    assert!(matches!(&*events(&mut registry), [Event::Registered { .. }]));
+    assert!(matches!(
+        &*events(&mut registry),
+        [Event::Registered { .. }]
+    ));
     registry.withdrawn(&robot().instance);
     assert!(matches!(&*events(&mut registry), [Event::Vanished { .. }]));
 }

@@ -1,3 +1,64 @@
-//! The local discovery server.
+//! The Local Discovery Server of a host: the program around [`discovery::lds`].
 
-fn main() {}
+use std::net::SocketAddr;
+use std::process::ExitCode;
+
+use bridge_node::{Failure, LogFormat, Service, run_service, serve_pages};
+use discovery::lds::{self, LdsSettings};
+use discovery::{DEFAULT_LDS, Interface};
+
+/// Tells who is there: a Local Discovery Server with multicast extension.
+///
+/// Servers register with it (RegisterServer, RegisterServer2) and are announced on the network by mDNS; clients ask it
+/// (FindServers, FindServersOnNetwork, GetEndpoints). There are no sessions. Who does not answer any more is forgotten
+/// within two seconds.
+#[derive(Debug, clap::Parser)]
+#[command(name = "ua-lds", version)]
+struct UaLds {
+    /// Where servers and clients connect
+    #[arg(long, value_name = "URL", env = "UA_LDS_ENDPOINT", default_value = DEFAULT_LDS)]
+    endpoint: String,
+    /// The network interface of mDNS, by name or address. Without it only this host is told and heard
+    #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
+    interface: Option<String>,
+    /// Let servers of other hosts register. Without it only those of this host may, over a loopback address: channels are
+    /// not secured here
+    #[arg(long)]
+    allow_unsecured: bool,
+    /// Serve what is known at this address: /status as JSON, /metrics for Prometheus, and whether the program can do its
+    /// work: /readyz
+    #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
+    metrics: Option<SocketAddr>,
+    /// How log lines look
+    #[arg(
+        long,
+        value_name = "FORMAT",
+        env = "UA_LOG_FORMAT",
+        default_value = "text"
+    )]
+    log: LogFormat,
+}
+
+fn main() -> ExitCode {
+    run_service::<UaLds>()
+}
+
+impl Service for UaLds {
+    // The libraries log at level error what a bad client did.
+    const QUIET: &'static str = "opcua_core=off,opcua_crypto=off,opcua_types=off,mdns_sd=off";
+
+    fn log(&self) -> LogFormat {
+        self.log
+    }
+
+    async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {
+        let pages = serve_pages(self.metrics).await?;
+        let interface = self.interface.as_deref().map(Interface::parse);
+        let settings = LdsSettings {
+            endpoint: self.endpoint,
+            interface: interface.unwrap_or(Interface::LOOPBACK),
+            allow_unsecured: self.allow_unsecured,
+        };
+        lds::run(settings, pages, stop).await
+    }
+}

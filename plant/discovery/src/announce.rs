@@ -1,0 +1,321 @@
+//! Telling of a server: [`announce`].
+
+use std::pin::Pin;
+use std::time::{Duration, SystemTime};
+
+use registry::{Announcement, instance_name};
+use tokio::sync::{mpsc, watch};
+use tokio::task::JoinHandle;
+use tokio::time::{Instant, sleep_until, timeout};
+use tracing::{debug, info, warn};
+
+use crate::client::{self, AskFault};
+use crate::clock;
+use crate::host_name;
+use crate::interface::Interface;
+use crate::mdns::{Heard, Mdns, MdnsFault, Ours, same_place};
+use crate::url::Url;
+
+/// A server to tell of.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Server {
+    /// Its ApplicationUri.
+    pub application_uri: String,
+    /// Its ProductUri; may be empty.
+    pub product_uri: String,
+    /// Its ApplicationName, from which its name on the network is made with host and port behind it.
+    pub name: String,
+    /// Where it listens, as `opc.tcp://127.0.0.1:43121/`.
+    pub url: String,
+    /// Codes of OPC 10000-12, Annex D.
+    pub capabilities: Vec<String>,
+}
+
+/// To whom a server is told of.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct AnnounceSettings {
+    /// The Local Discovery Server to register with; `None` for none.
+    pub lds: Option<String>,
+    /// Where it is announced by mDNS; `None` for nowhere: then the Local Discovery Server is asked to do it.
+    pub mdns: Option<Interface>,
+    /// How often the registration is repeated.
+    pub register_every: Duration,
+}
+
+impl Default for AnnounceSettings {
+    fn default() -> Self {
+        Self {
+            lds: Some(crate::DEFAULT_LDS.to_owned()),
+            mdns: Some(Interface::LOOPBACK),
+            register_every: Duration::from_secs(60),
+        }
+    }
+}
+
+/// How far the telling has come.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct AnnounceState {
+    /// When it was registered, for the first time since it was not.
+    pub registered: Option<SystemTime>,
+    /// When it was announced first.
+    pub announced: Option<SystemTime>,
+    /// Its name on the network.
+    pub mdns_name: Option<String>,
+    /// Why it is not registered.
+    pub fault: Option<String>,
+}
+
+/// Tells of a server for as long as it is kept.
+#[derive(Debug)]
+pub struct Announced {
+    server: watch::Sender<Server>,
+    state: watch::Receiver<AnnounceState>,
+    /// Closed, it ends the telling.
+    stop: mpsc::Sender<()>,
+    task: JoinHandle<()>,
+}
+
+impl Announced {
+    /// The server is another from now on: what has changed is told.
+    pub fn update(&self, server: Server) {
+        self.server.send_if_modified(|known| {
+            let changed = *known != server;
+            *known = server;
+            changed
+        });
+    }
+
+    /// How far it has come.
+    #[must_use]
+    pub fn state(&self) -> AnnounceState {
+        self.state.borrow().clone()
+    }
+
+    /// Says goodbye and takes the registration back; waits for that for a second at most. To be called before the server
+    /// ends. Whoever drops it instead has the same done without waiting.
+    pub async fn leave(self) {
+        let Self { stop, task, .. } = self;
+        drop(stop);
+        // Late or broken off: others find out by themselves.
+        drop(timeout(LEAVE_LIMIT, task).await);
+    }
+}
+
+/// Starts to tell of a server. Needs a tokio runtime, and waits for nothing: a discovery server may come later.
+///
+/// # Errors
+/// No mDNS daemon can be started.
+pub fn announce(server: Server, settings: AnnounceSettings) -> Result<Announced, MdnsFault> {
+    let mdns = settings.mdns.as_ref().map(Mdns::open).transpose()?;
+    let (sender, changes) = watch::channel(server);
+    let (tell, state) = watch::channel(AnnounceState::default());
+    let (stop, stopped) = mpsc::channel(1);
+    let telling = Telling {
+        settings,
+        mdns,
+        server: changes,
+        state: tell,
+        start_time: clock::ticks(clock::wall()),
+        instance: None,
+        lds_run: None,
+        register_at: Instant::now(),
+        wait: FIRST_WAIT,
+    };
+    let task = tokio::spawn(telling.run(stopped));
+    Ok(Announced {
+        server: sender,
+        state,
+        stop,
+        task,
+    })
+}
+
+struct Telling {
+    settings: AnnounceSettings,
+    mdns: Option<Mdns>,
+    server: watch::Receiver<Server>,
+    state: watch::Sender<AnnounceState>,
+    start_time: i64,
+    /// The name it is announced under.
+    instance: Option<String>,
+    /// Which run of the discovery server was heard.
+    lds_run: Option<Option<i64>>,
+    register_at: Instant,
+    wait: Duration,
+}
+
+type Registering = Pin<Box<dyn Future<Output = Result<(), AskFault>> + Send>>;
+
+impl Telling {
+    async fn run(mut self, mut stopped: mpsc::Receiver<()>) {
+        self.put();
+        let mut registering: Option<Registering> = None;
+        loop {
+            let due = registering.is_none() && self.settings.lds.is_some();
+            let heard = async {
+                match &mut self.mdns {
+                    Some(mdns) => mdns.next().await,
+                    None => std::future::pending().await,
+                }
+            };
+            let registered = async {
+                match &mut registering {
+                    Some(registering) => registering.await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                _ = stopped.recv() => break,
+                heard = heard => self.hear(heard),
+                Ok(()) = self.server.changed() => {
+                    self.put();
+                    self.soon();
+                    registering = None;
+                }
+                result = registered => {
+                    registering = None;
+                    self.registered(result);
+                }
+                () = sleep_until(self.register_at), if due => registering = self.register(true),
+            }
+        }
+        drop(registering);
+        let goodbye = match (&mut self.mdns, &self.instance) {
+            (Some(mdns), Some(instance)) => mdns.take_back(instance),
+            _ => None,
+        };
+        let unregister = self.register(false);
+        let goodbye = async {
+            if let Some(goodbye) = goodbye {
+                goodbye.await;
+            }
+        };
+        let unregister = async {
+            if let Some(unregister) = unregister
+                && let Err(error) = unregister.await
+            {
+                debug!(%error, "the registration was not taken back");
+            }
+        };
+        tokio::join!(goodbye, unregister);
+    }
+
+    /// Announces the server by mDNS, in the place of what it was.
+    fn put(&mut self) {
+        let server = self.server.borrow_and_update().clone();
+        let Some(mdns) = &mut self.mdns else { return };
+        let instance = match &self.instance {
+            // The name stays while it is still true.
+            Some(known) if known.starts_with(&name(&server)) => known.clone(),
+            _ => name(&server),
+        };
+        if let Some(before) = self.instance.take_if(|before| *before != instance) {
+            drop(mdns.take_back(&before));
+        }
+        mdns.put(Ours {
+            announcement: Announcement {
+                instance: instance.clone(),
+                url: server.url,
+                capabilities: server.capabilities,
+            },
+            start_time: Some(self.start_time),
+        });
+        self.state.send_modify(|state| {
+            state.announced.get_or_insert_with(clock::wall);
+            state.mdns_name = Some(instance.clone());
+        });
+        self.instance = Some(instance);
+    }
+
+    fn hear(&mut self, heard: Heard) {
+        match heard {
+            Heard::Renamed { to, .. } => {
+                self.state
+                    .send_modify(|state| state.mdns_name = Some(to.clone()));
+                self.instance = Some(to);
+            }
+            Heard::Announced {
+                announcement,
+                start_time,
+            } => {
+                let lds = self.settings.lds.as_deref();
+                if lds.is_some_and(|lds| same_place(lds, &announcement.url)) {
+                    // One that has just come, or come back, knows nobody yet.
+                    let before = self.lds_run.replace(start_time);
+                    let is_registered = self.state.borrow().registered.is_some();
+                    if !is_registered || before.is_some_and(|before| before != start_time) {
+                        self.soon();
+                    }
+                }
+            }
+            Heard::Withdrawn { .. } => {}
+        }
+    }
+
+    fn soon(&mut self) {
+        self.register_at = Instant::now();
+        self.wait = FIRST_WAIT;
+    }
+
+    fn register(&self, is_online: bool) -> Option<Registering> {
+        let lds = self.settings.lds.clone()?;
+        if !is_online && self.state.borrow().registered.is_none() {
+            return None;
+        }
+        let server = self.server.borrow().clone();
+        // Whoever announces itself is not announced by another.
+        let mdns_name = self.mdns.is_none().then(|| name(&server));
+        Some(Box::pin(async move {
+            client::register(&lds, &server, mdns_name.as_deref(), is_online).await
+        }))
+    }
+
+    fn registered(&mut self, result: Result<(), AskFault>) {
+        let lds = self.settings.lds.as_deref().unwrap_or_default();
+        match result {
+            Ok(()) => {
+                self.register_at = Instant::now() + self.settings.register_every;
+                self.wait = FIRST_WAIT;
+                self.state.send_modify(|state| {
+                    if state.registered.is_none() {
+                        info!(lds, "registered");
+                        state.registered = Some(clock::wall());
+                    }
+                    state.fault = None;
+                });
+            }
+            Err(error) => {
+                self.register_at = Instant::now() + self.wait;
+                self.wait = (self.wait * 2)
+                    .min(MOST_WAIT)
+                    .min(self.settings.register_every);
+                let fault = error.to_string();
+                self.state.send_modify(|state| {
+                    state.registered = None;
+                    // Once for each reason: it is tried again and again.
+                    if state.fault.as_ref() != Some(&fault) {
+                        match error {
+                            AskFault::Refused(_) => warn!(lds, "not registered: {fault}"),
+                            _ => info!(lds, "not registered yet: {fault}"),
+                        }
+                        state.fault = Some(fault);
+                    }
+                });
+            }
+        }
+    }
+}
+
+/// Its name on the network.
+fn name(server: &Server) -> String {
+    let place = Url::parse(&server.url);
+    instance_name(
+        &server.name,
+        &host_name(),
+        place.map_or(0, |place| place.port),
+    )
+}
+
+const FIRST_WAIT: Duration = Duration::from_secs(1);
+const MOST_WAIT: Duration = Duration::from_secs(60);
+const LEAVE_LIMIT: Duration = Duration::from_secs(1);

@@ -1,0 +1,289 @@
+//! One client's connection to the discovery server: HEL, OPN, questions, CLO (OPC 10000-6, 6.7 and 7.1).
+
+use std::net::SocketAddr;
+use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
+use std::time::Duration;
+
+use opcua::core::comms::secure_channel::Role;
+use opcua::core::comms::security_header::AsymmetricSecurityHeader;
+use opcua::core::comms::tcp_types::{AcknowledgeMessage, HelloMessage};
+use opcua::core::{RequestMessage, ResponseMessage};
+use opcua::crypto::SecurityPolicy;
+use opcua::types::{
+    ByteString, ChannelSecurityToken, DateTime, MessageSecurityMode, OpenSecureChannelRequest,
+    OpenSecureChannelResponse, ResponseHeader, SecurityTokenRequestType, ServiceFault, StatusCode,
+};
+use registry::Channel;
+use tokio::io::{AsyncRead, AsyncWrite};
+use tokio::sync::{mpsc, oneshot};
+use tokio::time::timeout;
+use tracing::debug;
+
+use crate::services::{self, Answer, Own, Question};
+use crate::wire::{
+    Conversation, Kind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, Received, WireFault, policy,
+};
+
+/// A question on its way to whoever keeps the registry, with the way back.
+pub(crate) type Asking = (Question, Channel, oneshot::Sender<Answer>);
+
+/// What all connections share.
+#[derive(Debug)]
+pub(crate) struct Shared {
+    pub(crate) own: Own,
+    pub(crate) ask: mpsc::Sender<Asking>,
+    pub(crate) counters: Counters,
+    last_channel: AtomicU32,
+}
+
+/// What was asked, and what was no question.
+#[derive(Debug, Default)]
+pub(crate) struct Counters {
+    pub(crate) connections: AtomicU64,
+    pub(crate) refused_connections: AtomicU64,
+    pub(crate) questions: AtomicU64,
+    pub(crate) unsupported: AtomicU64,
+    pub(crate) malformed: AtomicU64,
+    pub(crate) timed_out: AtomicU64,
+}
+
+pub(crate) fn count(counter: &AtomicU64) {
+    counter.fetch_add(1, Ordering::Relaxed);
+}
+
+impl Shared {
+    pub(crate) fn new(own: Own, ask: mpsc::Sender<Asking>) -> Self {
+        Self {
+            own,
+            ask,
+            counters: Counters::default(),
+            last_channel: AtomicU32::new(0),
+        }
+    }
+
+    /// Never 0, which is no channel.
+    fn next_channel(&self) -> u32 {
+        self.last_channel.fetch_add(1, Ordering::Relaxed) % (u32::MAX - 1) + 1
+    }
+
+    async fn answer(&self, question: Question, channel: Channel) -> Answer {
+        let (reply, answer) = oneshot::channel();
+        let asked = self.ask.send((question, channel, reply)).await;
+        let answer = answer.await;
+        match (asked, answer) {
+            (Ok(()), Ok(answer)) => answer,
+            _ => Answer::Refused(StatusCode::BadShutdown.bits()),
+        }
+    }
+}
+
+/// Answers a client until it goes, says nothing any more, or says what is none of the protocol.
+pub(crate) async fn serve<S>(stream: S, peer: SocketAddr, shared: &Shared)
+where
+    S: AsyncRead + AsyncWrite + Unpin,
+{
+    let mut connection = Connection {
+        conversation: Conversation::new(stream, Role::Server),
+        peer,
+        shared,
+        lifetime: FIRST_IDLE,
+        url: shared.own.url.clone(),
+    };
+    match connection.run().await {
+        Ok(()) | Err(WireFault::Closed) => {}
+        Err(fault) => {
+            if let Some(status) = fault.status() {
+                let late = status == StatusCode::BadTimeout;
+                let counters = &shared.counters;
+                count(if late {
+                    &counters.timed_out
+                } else {
+                    &counters.malformed
+                });
+                let why = fault.to_string();
+                let told = connection.conversation.tell(status, &why);
+                drop(timeout(WRITE_LIMIT, told).await);
+            }
+            debug!(%peer, "a connection ends: {fault}");
+        }
+    }
+}
+
+struct Connection<'a, S> {
+    conversation: Conversation<S>,
+    peer: SocketAddr,
+    shared: &'a Shared,
+    /// How long nothing may come.
+    lifetime: Duration,
+    url: String,
+}
+
+impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
+    async fn run(&mut self) -> Result<(), WireFault> {
+        let hello = self.conversation.greeting::<HelloMessage>(Kind::Hello);
+        let hello = timeout(HELLO_LIMIT, hello).await.map_err(|_| LATE)??;
+        self.acknowledge(&hello).await?;
+        loop {
+            let request = self.conversation.receive::<RequestMessage>(admit);
+            let received = match timeout(self.lifetime, request).await {
+                Ok(received) => received,
+                Err(_) => return Err(LATE),
+            };
+            let (response, request_id) = match received {
+                Ok(Received {
+                    message: RequestMessage::CloseSecureChannel(_),
+                    ..
+                }) => return Ok(()),
+                Ok(Received {
+                    message,
+                    request_id,
+                }) => (self.answer(message).await?, request_id),
+                Err(WireFault::Unreadable {
+                    status,
+                    request_id,
+                    request_handle,
+                }) if self.conversation.channel.secure_channel_id() != 0 => {
+                    count(&self.shared.counters.malformed);
+                    (ServiceFault::new(request_handle, status).into(), request_id)
+                }
+                Err(fault) => return Err(fault),
+            };
+            let sent = timeout(WRITE_LIMIT, self.conversation.send(request_id, &response)).await;
+            match sent.map_err(|_| LATE)? {
+                Err(WireFault::Bad { status, .. }) if status == StatusCode::BadResponseTooLarge => {
+                    let handle = response.response_header().request_handle;
+                    let fault = ResponseMessage::from(ServiceFault::new(handle, status));
+                    self.conversation.send(request_id, &fault).await?;
+                }
+                sent => sent?,
+            }
+        }
+    }
+
+    async fn acknowledge(&mut self, hello: &HelloMessage) -> Result<(), WireFault> {
+        if !hello.is_valid_buffer_sizes() {
+            return Err(WireFault::Bad {
+                status: StatusCode::BadConnectionRejected,
+                what: "a chunk has room for 8192 bytes at least",
+            });
+        }
+        if !hello.is_endpoint_valid_length() {
+            return Err(WireFault::Bad {
+                status: StatusCode::BadTcpEndpointUrlInvalid,
+                what: "the endpoint's URL is too long",
+            });
+        }
+        let number = |size: usize| u32::try_from(size).unwrap_or(u32::MAX);
+        let chunk = number(MOST_CHUNK);
+        let acknowledge = AcknowledgeMessage::new(
+            0,
+            chunk.min(hello.send_buffer_size),
+            chunk.min(hello.receive_buffer_size),
+            number(MOST_HEARD),
+            number(MOST_CHUNKS),
+        );
+        self.conversation
+            .limit(hello.receive_buffer_size, hello.max_message_size);
+        self.conversation.greet(&acknowledge).await
+    }
+
+    async fn answer(&mut self, request: RequestMessage) -> Result<ResponseMessage, WireFault> {
+        match &request {
+            RequestMessage::OpenSecureChannel(open) => return self.open(open),
+            // The channel's own message is opened before anything else is asked on it.
+            _ if self.conversation.channel.secure_channel_id() == 0 => {
+                return Err(WireFault::Bad {
+                    status: StatusCode::BadTcpSecureChannelUnknown,
+                    what: "no channel is open",
+                });
+            }
+            RequestMessage::GetEndpoints(request) => {
+                count(&self.shared.counters.questions);
+                return Ok(self.own().endpoints(request));
+            }
+            _ => {}
+        }
+        let Some(question) = services::question(&request) else {
+            count(&self.shared.counters.unsupported);
+            debug!(peer = %self.peer, service = request.type_name(), "a service that is not one of discovery");
+            return Ok(services::fault(&request, StatusCode::BadServiceUnsupported));
+        };
+        count(&self.shared.counters.questions);
+        let channel = Channel {
+            // Who is on this host may register: what it could forge it could also do.
+            is_secured: self.peer.ip().to_canonical().is_loopback(),
+            certificate_uri: None,
+        };
+        let answer = self.shared.answer(question, channel).await;
+        Ok(services::response(&request, answer, &self.own()))
+    }
+
+    fn own(&self) -> Own {
+        Own {
+            url: self.url.clone(),
+            ..self.shared.own.clone()
+        }
+    }
+
+    /// Issues or renews the token of the channel (OPC 10000-4, 5.5.2).
+    fn open(&mut self, request: &OpenSecureChannelRequest) -> Result<ResponseMessage, WireFault> {
+        let channel = &mut self.conversation.channel;
+        let refused = |status| Ok(ServiceFault::new(&request.request_header, status).into());
+        let id = channel.secure_channel_id();
+        let id = match request.request_type {
+            SecurityTokenRequestType::Issue if id == 0 => self.shared.next_channel(),
+            SecurityTokenRequestType::Renew if id != 0 => id,
+            SecurityTokenRequestType::Issue | SecurityTokenRequestType::Renew => {
+                return Err(WireFault::Bad {
+                    status: StatusCode::BadTcpSecureChannelUnknown,
+                    what: "a channel is issued once, and renewed after that",
+                });
+            }
+        };
+        if request.security_mode != MessageSecurityMode::None {
+            return refused(StatusCode::BadSecurityModeRejected);
+        }
+        let asked = Duration::from_millis(request.requested_lifetime.into());
+        let lifetime = match asked.is_zero() {
+            true => MOST_LIFETIME,
+            false => asked.clamp(LEAST_LIFETIME, MOST_LIFETIME),
+        };
+        let revised_lifetime = u32::try_from(lifetime.as_millis()).unwrap_or(u32::MAX);
+        let token = ChannelSecurityToken {
+            channel_id: id,
+            token_id: channel.token_id().wrapping_add(1),
+            created_at: DateTime::now(),
+            revised_lifetime,
+        };
+        channel.set_security_mode(MessageSecurityMode::None);
+        channel.set_security_token(token.clone());
+        // A quarter more, as the standard has it for what was on its way.
+        self.lifetime = lifetime + lifetime / 4;
+        let response = OpenSecureChannelResponse {
+            response_header: ResponseHeader::new_good(&request.request_header),
+            server_protocol_version: 0,
+            security_token: token,
+            server_nonce: ByteString::null(),
+        };
+        Ok(response.into())
+    }
+}
+
+/// Without a certificate there are no channels but those of policy None.
+fn admit(header: &AsymmetricSecurityHeader) -> Result<(), StatusCode> {
+    match policy(header) {
+        Some(SecurityPolicy::None) => Ok(()),
+        _ => Err(StatusCode::BadSecurityPolicyRejected),
+    }
+}
+
+const LATE: WireFault = WireFault::Bad {
+    status: StatusCode::BadTimeout,
+    what: "nothing came in time",
+};
+const HELLO_LIMIT: Duration = Duration::from_secs(5);
+/// Until a channel is open.
+const FIRST_IDLE: Duration = Duration::from_secs(5);
+const WRITE_LIMIT: Duration = Duration::from_secs(10);
+const LEAST_LIFETIME: Duration = Duration::from_secs(5);
+const MOST_LIFETIME: Duration = Duration::from_secs(300);

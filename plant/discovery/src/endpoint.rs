@@ -1,0 +1,70 @@
+//! The listener of the discovery server: who is let in.
+
+use std::collections::VecDeque;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::net::TcpListener;
+use tokio::task::AbortHandle;
+use tracing::debug;
+
+use crate::connection::{Shared, count, serve};
+
+/// Lets clients in for as long as it runs.
+pub(crate) async fn accept(listener: TcpListener, shared: Arc<Shared>) {
+    let mut crowd = Crowd::default();
+    loop {
+        let (stream, peer) = match listener.accept().await {
+            Ok(accepted) => accepted,
+            // Out of descriptors, most likely: others may be closed by then.
+            Err(error) => {
+                debug!(%error, "a connection was not accepted");
+                tokio::time::sleep(ACCEPT_AGAIN).await;
+                continue;
+            }
+        };
+        count(&shared.counters.connections);
+        if let Err(error) = stream.set_nodelay(true) {
+            debug!(%error, %peer, "a connection that answers late");
+        }
+        let of = Arc::clone(&shared);
+        let task = tokio::spawn(async move { serve(stream, peer, &of).await });
+        if crowd.admit(peer, task.abort_handle()) {
+            count(&shared.counters.refused_connections);
+        }
+    }
+}
+
+/// The open connections in the order in which they came. Who comes is always let in: where there are too many, the oldest
+/// gives way, of the same address if that has its share. A question takes milliseconds, so what is old is idle.
+#[derive(Debug, Default)]
+struct Crowd(VecDeque<(IpAddr, AbortHandle)>);
+
+impl Crowd {
+    /// Takes one in. Whether another gave way.
+    fn admit(&mut self, peer: SocketAddr, task: AbortHandle) -> bool {
+        let address = peer.ip();
+        self.0.retain(|(_, task)| !task.is_finished());
+        let same = |(from, _): &&(IpAddr, AbortHandle)| *from == address;
+        let has_share = self.0.iter().filter(same).count() >= MOST_OF_ONE;
+        let mut gave_way = false;
+        if has_share || self.0.len() >= MOST {
+            let oldest = self
+                .0
+                .iter()
+                .position(|(from, _)| !has_share || *from == address);
+            if let Some((from, task)) = oldest.and_then(|at| self.0.remove(at)) {
+                debug!(%from, "a connection gave way to another");
+                task.abort();
+                gave_way = true;
+            }
+        }
+        self.0.push_back((address, task));
+        gave_way
+    }
+}
+
+const MOST: usize = 128;
+const MOST_OF_ONE: usize = 64;
+const ACCEPT_AGAIN: Duration = Duration::from_millis(100);

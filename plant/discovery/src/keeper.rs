@@ -1,0 +1,208 @@
+//! One registry with everything around it: what mDNS hears goes in, endpoints are tried, what is to be announced goes out.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use registry::{Announcement, Event, Loss, Outcome, Registry, Settings};
+use tokio::task::JoinSet;
+use tokio::time::sleep_until;
+
+use crate::clock::now;
+use crate::mdns::{Heard, Mdns, Ours};
+use crate::probe::probe;
+
+/// See the module's page. Drive it by [`step`](Self::step), then take every [`event`](Self::event).
+pub(crate) struct Keeper {
+    pub(crate) registry: Registry,
+    pub(crate) mdns: Option<Mdns>,
+    probes: JoinSet<(String, Outcome)>,
+    /// Lost without a goodbye: mDNS still has their records, and would not tell of them anew when they come back as they
+    /// were.
+    asleep: BTreeMap<String, Asleep>,
+    /// When an endpoint answered last.
+    answered: BTreeMap<String, Instant>,
+    /// When the program behind an endpoint started, in 100 ns since 1601, where it tells.
+    started: BTreeMap<String, i64>,
+    most: usize,
+}
+
+#[derive(Debug)]
+struct Asleep {
+    announcement: Announcement,
+    try_at: Instant,
+    forget_at: Instant,
+}
+
+impl Keeper {
+    pub(crate) fn new(settings: Settings, mdns: Option<Mdns>) -> Self {
+        Self {
+            registry: Registry::new(settings),
+            mdns,
+            probes: JoinSet::new(),
+            asleep: BTreeMap::new(),
+            answered: BTreeMap::new(),
+            started: BTreeMap::new(),
+            most: settings.most,
+        }
+    }
+
+    /// Waits until something has happened, and takes it in. Whoever drops it before loses nothing.
+    pub(crate) async fn step(&mut self) {
+        self.try_endpoints();
+        let room = self.probes.len() < MOST_PROBES;
+        let due = self.registry.poll_timeout();
+        let due = due
+            .into_iter()
+            .chain(self.asleep.values().map(|asleep| asleep.try_at))
+            .min();
+        let due = due.filter(|_| room).map(tokio::time::Instant::from_std);
+        let timer = async {
+            match due {
+                Some(due) => sleep_until(due).await,
+                None => std::future::pending().await,
+            }
+        };
+        let heard = async {
+            match &mut self.mdns {
+                Some(mdns) => mdns.next().await,
+                None => std::future::pending().await,
+            }
+        };
+        tokio::select! {
+            heard = heard => self.hear(heard),
+            Some(probed) = self.probes.join_next(), if !self.probes.is_empty() => {
+                if let Ok((url, outcome)) = probed {
+                    self.probed(&url, outcome);
+                }
+            }
+            () = timer => self.registry.handle_timeout(now()),
+        }
+    }
+
+    /// What has happened, oldest first; what concerns mDNS has been done.
+    pub(crate) fn event(&mut self) -> Option<Event> {
+        loop {
+            let event = self.registry.poll_event()?;
+            match (&event, &mut self.mdns) {
+                (Event::Announce(announcement), Some(mdns)) => mdns.put(Ours {
+                    announcement: announcement.clone(),
+                    start_time: self.started.get(&announcement.url).copied(),
+                }),
+                (Event::Withdraw { instance }, Some(mdns)) => drop(mdns.take_back(instance)),
+                (Event::Announce(_) | Event::Withdraw { .. }, None) => {}
+                (
+                    Event::Vanished {
+                        record,
+                        loss: Loss::Unreachable,
+                    },
+                    _,
+                ) => {
+                    self.sleeps(record.announcement.clone());
+                    return Some(event);
+                }
+                _ => return Some(event),
+            }
+        }
+    }
+
+    /// How long an endpoint has not answered, of one that did.
+    pub(crate) fn silent_for(&mut self, url: &str) -> Option<Duration> {
+        let answered = self.answered.remove(url)?;
+        Some(now().saturating_duration_since(answered))
+    }
+
+    /// When the program behind an endpoint started, in 100 ns since 1601, where it tells.
+    pub(crate) fn started(&self, url: &str) -> Option<i64> {
+        self.started.get(url).copied()
+    }
+
+    fn hear(&mut self, heard: Heard) {
+        let at = now();
+        match heard {
+            Heard::Announced {
+                announcement,
+                start_time,
+            } => {
+                self.asleep.remove(&announcement.instance);
+                let url = announcement.url.clone();
+                if let Some(start_time) = start_time {
+                    keep(&mut self.started, self.most, &url, start_time);
+                }
+                self.registry.announced(announcement, at);
+                if start_time.is_some() {
+                    self.registry
+                        .probed(&url, Outcome::Alive { start_time }, at);
+                }
+            }
+            Heard::Withdrawn { instance } => {
+                self.asleep.remove(&instance);
+                self.registry.withdrawn(&instance);
+            }
+            // The names of servers that register are chosen by the registry, which hears of the conflict first.
+            Heard::Renamed { .. } => {}
+        }
+    }
+
+    fn sleeps(&mut self, announcement: Announcement) {
+        if self.asleep.len() < self.most {
+            let at = now();
+            let asleep = Asleep {
+                announcement,
+                try_at: at + TRY_ASLEEP,
+                forget_at: at + FORGET_ASLEEP,
+            };
+            self.asleep
+                .insert(asleep.announcement.instance.clone(), asleep);
+        }
+    }
+
+    /// Opens connections to those whose turn it is.
+    fn try_endpoints(&mut self) {
+        let at = now();
+        self.asleep.retain(|_, asleep| at < asleep.forget_at);
+        while self.probes.len() < MOST_PROBES {
+            let next = self.asleep.values_mut().find(|asleep| asleep.try_at <= at);
+            let url = match next {
+                Some(asleep) => {
+                    asleep.try_at = at + TRY_ASLEEP;
+                    asleep.announcement.url.clone()
+                }
+                None => match self.registry.poll_probe(at) {
+                    Some(probe) => probe.url,
+                    None => break,
+                },
+            };
+            self.probes.spawn(probe(url));
+        }
+    }
+
+    fn probed(&mut self, url: &str, outcome: Outcome) {
+        let at = now();
+        if let Outcome::Alive { .. } = outcome {
+            keep(&mut self.answered, self.most, url, at);
+            let back = self
+                .asleep
+                .iter()
+                .find(|(_, asleep)| asleep.announcement.url == url);
+            if let Some(instance) = back.map(|(instance, _)| instance.clone())
+                && let Some(asleep) = self.asleep.remove(&instance)
+            {
+                self.registry.announced(asleep.announcement, at);
+            }
+        }
+        self.registry.probed(url, outcome, at);
+    }
+}
+
+/// Keeps what is known of an endpoint, for no more of them than there may be; others lose it first.
+fn keep<T>(map: &mut BTreeMap<String, T>, most: usize, url: &str, value: T) {
+    if map.len() >= 4 * most && !map.contains_key(url) {
+        map.clear();
+    }
+    map.insert(url.to_owned(), value);
+}
+
+const MOST_PROBES: usize = 64;
+const TRY_ASLEEP: Duration = Duration::from_secs(1);
+/// By then mDNS has forgotten them too, and tells of them when they come back.
+const FORGET_ASLEEP: Duration = Duration::from_secs(150);

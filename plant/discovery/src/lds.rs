@@ -1,0 +1,417 @@
+//! The Local Discovery Server: the registry behind an endpoint of OPC UA, and mDNS on one interface.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, SystemTime};
+
+use bridge_node::{Failure, FailureKind, Requests};
+use registry::{Announcement, Event, Loss, Settings, instance_name};
+use serde::Serialize;
+use tokio::net::TcpListener;
+use tokio::sync::mpsc;
+use tokio::time::{MissedTickBehavior, interval, timeout};
+use tracing::{info, warn};
+
+use crate::clock;
+use crate::connection::{Asking, Counters, Shared};
+use crate::endpoint;
+use crate::host_name;
+use crate::interface::Interface;
+use crate::keeper::Keeper;
+use crate::mdns::{Mdns, Ours};
+use crate::services::{Answer, Own, Question, semaphore};
+use crate::url::Url;
+
+/// How a discovery server runs.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LdsSettings {
+    /// Where it listens, as `opc.tcp://127.0.0.1:4840`.
+    pub endpoint: String,
+    /// Where it announces and hears by mDNS.
+    pub interface: Interface,
+    /// Whether servers of other hosts may register over a channel that is not secured.
+    pub allow_unsecured: bool,
+}
+
+/// What it knows at one moment.
+#[derive(Debug, Clone, Serialize)]
+pub struct LdsStatus {
+    program: &'static str,
+    application_uri: String,
+    endpoint: String,
+    interface: String,
+    since_ms: u64,
+    not_ready: Vec<String>,
+    servers: Vec<ServerStatus>,
+    network: Vec<RecordStatus>,
+    losses: VecDeque<LossStatus>,
+    counters: BTreeMap<&'static str, u64>,
+}
+
+/// A registered server.
+#[derive(Debug, Clone, Serialize)]
+struct ServerStatus {
+    uri: String,
+    name: String,
+    urls: Vec<String>,
+    since_ms: u64,
+}
+
+/// A server that is announced on the network.
+#[derive(Debug, Clone, Serialize)]
+struct RecordStatus {
+    record_id: u32,
+    name: String,
+    url: String,
+    capabilities: Vec<String>,
+    since_ms: u64,
+    /// When its program started, where it tells.
+    started_ms: Option<u64>,
+}
+
+/// A server that is gone.
+#[derive(Debug, Clone, Serialize)]
+struct LossStatus {
+    /// Its ApplicationUri where it was registered, its name where it was announced.
+    name: String,
+    url: String,
+    loss: &'static str,
+    at_ms: u64,
+    /// How long it had not answered, where it had before.
+    silent_ms: Option<u64>,
+}
+
+impl bridge_node::Told for LdsStatus {
+    fn json(&self) -> String {
+        // All keys are strings and no number is special, so there is nothing that could fail.
+        serde_json::to_string(self).unwrap_or_default()
+    }
+
+    fn prometheus(&self) -> String {
+        let lines = self
+            .counters
+            .iter()
+            .map(|(name, count)| format!("ua_lds_{name} {count}\n"));
+        let sizes = [
+            ("registered", self.servers.len()),
+            ("on_network", self.network.len()),
+        ];
+        let sizes = sizes.map(|(name, size)| format!("ua_lds_{name} {size}\n"));
+        lines.chain(sizes).collect()
+    }
+
+    fn not_ready(&self) -> Vec<String> {
+        self.not_ready
+            .iter()
+            .map(|why| format!("{}: {why}\n", self.program))
+            .collect()
+    }
+}
+
+/// Runs a discovery server until it is told to stop.
+///
+/// # Errors
+/// The endpoint or the interface cannot be used.
+pub async fn run(
+    settings: LdsSettings,
+    mut pages: Requests<LdsStatus>,
+    stop: impl Future<Output = ()>,
+) -> Result<(), Failure> {
+    let (mut lds, mut questions) = Lds::start(&settings).await?;
+    let mut semaphores = interval(SEMAPHORES_EVERY);
+    semaphores.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    tokio::pin!(stop);
+    loop {
+        tokio::select! {
+            () = &mut stop => break,
+            () = lds.keeper.step() => {}
+            Some((question, channel, reply)) = questions.recv() => {
+                let answer = lds.answer(question, &channel);
+                // A client that has gone does not wait for it.
+                drop(reply.send(answer));
+            }
+            Some(reply) = pages.recv() => drop(reply.send(lds.status())),
+            _ = semaphores.tick() => lds.look_at_semaphores(),
+        }
+        while let Some(event) = lds.keeper.event() {
+            lds.take(event);
+        }
+    }
+    lds.leave().await;
+    Ok(())
+}
+
+struct Lds {
+    keeper: Keeper,
+    shared: Arc<Shared>,
+    interface: Interface,
+    /// Its own name on the network.
+    instance: String,
+    started: SystemTime,
+    since: BTreeMap<String, SystemTime>,
+    losses: VecDeque<LossStatus>,
+    lost: u64,
+}
+
+impl Lds {
+    async fn start(settings: &LdsSettings) -> Result<(Self, mpsc::Receiver<Asking>), Failure> {
+        let place = Url::parse(&settings.endpoint).ok_or_else(|| {
+            let message = format!(
+                "--endpoint {}: for example opc.tcp://127.0.0.1:4840",
+                settings.endpoint
+            );
+            Failure::new(FailureKind::Usage, message)
+        })?;
+        let listener = TcpListener::bind((place.host.as_str(), place.port)).await.map_err(|error| {
+            let message = format!(
+                "cannot listen at {}: {error}; if another discovery server runs on this host, give another --endpoint",
+                settings.endpoint
+            );
+            Failure::new(FailureKind::Unavailable, message)
+        })?;
+        let at = listener.local_addr().map_err(|error| {
+            Failure::new(
+                FailureKind::Io,
+                format!("cannot listen at {}: {error}", settings.endpoint),
+            )
+        })?;
+        let mdns = Mdns::open(&settings.interface);
+        let mut mdns =
+            mdns.map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))?;
+        let addresses = settings.interface.addresses();
+        if addresses.is_empty() {
+            warn!(
+                "the interface {} has no IPv4 address: nobody is heard there until it has one",
+                settings.interface
+            );
+        }
+        // On all addresses: as those reach it who hear of it.
+        let host = match (at.ip().is_unspecified(), addresses.first()) {
+            (true, Some(address)) => address.to_string(),
+            _ => place.host.clone(),
+        };
+        let url = Url {
+            host,
+            port: at.port(),
+            path: place.path.clone(),
+        }
+        .to_string();
+        let own = Own {
+            application_uri: format!("urn:{}:ua-lds", host_name()),
+            name: "UA bridge discovery server".to_owned(),
+            url: url.clone(),
+        };
+        let started = clock::wall();
+        let instance = instance_name("ua-lds", &host_name(), at.port());
+        mdns.put(Ours {
+            announcement: Announcement {
+                instance: instance.clone(),
+                url: url.clone(),
+                capabilities: vec!["LDS".to_owned()],
+            },
+            start_time: Some(clock::ticks(started)),
+        });
+        let (ask, questions) = mpsc::channel(64);
+        let shared = Arc::new(Shared::new(own, ask));
+        tokio::spawn(endpoint::accept(listener, Arc::clone(&shared)));
+        info!(url, interface = %settings.interface, "ua-lds listens");
+        let registry = Settings {
+            allow_unsecured: settings.allow_unsecured,
+            ..Settings::default()
+        };
+        let lds = Self {
+            keeper: Keeper::new(registry, Some(mdns)),
+            shared,
+            interface: settings.interface.clone(),
+            instance,
+            started,
+            since: BTreeMap::new(),
+            losses: VecDeque::new(),
+            lost: 0,
+        };
+        Ok((lds, questions))
+    }
+
+    fn answer(&mut self, question: Question, channel: &registry::Channel) -> Answer {
+        let registry = &mut self.keeper.registry;
+        match question {
+            Question::FindServers { uris } => {
+                let uris: Vec<&str> = uris.iter().map(String::as_str).collect();
+                let found = registry.find_servers(&uris);
+                Answer::Servers(found.map(|(asked, _)| asked.clone()).collect())
+            }
+            Question::FindOnNetwork {
+                from,
+                most,
+                capabilities,
+            } => {
+                let capabilities: Vec<&str> = capabilities.iter().map(String::as_str).collect();
+                let records = registry.find_servers_on_network(from, most, &capabilities);
+                Answer::OnNetwork {
+                    records: records.into_iter().cloned().collect(),
+                    reset: self.started,
+                }
+            }
+            Question::Register {
+                asked,
+                semaphore_is_there,
+            } => {
+                let uri = asked.server_uri.clone();
+                match registry.register(*asked, channel, semaphore_is_there, clock::now()) {
+                    Ok(_) => Answer::Registered,
+                    Err(fault) => {
+                        warn!(uri = ?cut(&uri), "a registration is refused: {}", cut(&fault.to_string()));
+                        Answer::Refused(fault.status())
+                    }
+                }
+            }
+        }
+    }
+
+    fn take(&mut self, event: Event) {
+        match event {
+            Event::Registered {
+                server_uri,
+                discovery_urls,
+            } => {
+                info!(uri = ?server_uri, urls = ?discovery_urls, "registered");
+                self.since.entry(server_uri).or_insert_with(clock::wall);
+            }
+            Event::Seen(record) => {
+                let Announcement { instance, url, .. } = record.announcement;
+                let now = clock::wall();
+                let started = self.keeper.started(&url).map(clock::of_ticks);
+                let after_ms = started
+                    .and_then(|at| now.duration_since(at).ok())
+                    .map(|after| after.as_millis());
+                info!(name = ?instance, url, after_ms, "seen on the network");
+                self.since.entry(instance).or_insert(now);
+            }
+            Event::Restarted { url } => info!(url, "restarted"),
+            Event::Gone { server_uri, loss } => self.lose(server_uri, String::new(), loss),
+            Event::Vanished { record, loss } => {
+                let Announcement { instance, url, .. } = record.announcement;
+                self.lose(instance, url, loss);
+            }
+            _ => {}
+        }
+    }
+
+    fn lose(&mut self, name: String, url: String, loss: Loss) {
+        let silent = self.keeper.silent_for(&url);
+        let silent_ms = silent.map(|silent| u64::try_from(silent.as_millis()).unwrap_or(u64::MAX));
+        info!(?name, url, loss = loss.label(), silent_ms, "gone");
+        self.since.remove(&name);
+        self.lost += 1;
+        if self.losses.len() >= MOST_LOSSES {
+            self.losses.pop_front();
+        }
+        self.losses.push_back(LossStatus {
+            name,
+            url,
+            loss: loss.label(),
+            at_ms: clock::millis(clock::wall()),
+            silent_ms,
+        });
+    }
+
+    fn look_at_semaphores(&mut self) {
+        let named = self.keeper.registry.find_servers(&[]);
+        let gone = named.filter(|(asked, _)| semaphore(&asked.semaphore_file_path) == Some(false));
+        let gone: Vec<String> = gone.map(|(asked, _)| asked.server_uri.clone()).collect();
+        for uri in gone {
+            self.keeper.registry.semaphore_gone(&uri);
+        }
+    }
+
+    fn status(&self) -> LdsStatus {
+        let since = |name: &str| clock::millis(*self.since.get(name).unwrap_or(&self.started));
+        let registry = &self.keeper.registry;
+        let servers = registry.find_servers(&[]).map(|(asked, _)| ServerStatus {
+            uri: asked.server_uri.clone(),
+            name: asked
+                .names
+                .first()
+                .map(|(_, name)| name.clone())
+                .unwrap_or_default(),
+            urls: asked.discovery_urls.clone(),
+            since_ms: since(&asked.server_uri),
+        });
+        let records = registry.find_servers_on_network(0, 0, &[]).into_iter();
+        let network = records.map(|record| RecordStatus {
+            record_id: record.record_id,
+            name: record.announcement.instance.clone(),
+            url: record.announcement.url.clone(),
+            capabilities: record.announcement.capabilities.clone(),
+            since_ms: since(&record.announcement.instance),
+            started_ms: self
+                .keeper
+                .started(&record.announcement.url)
+                .map(|at| clock::millis(clock::of_ticks(at))),
+        });
+        let no_interface = self.interface.addresses().is_empty();
+        let why = format!("the interface {} has no IPv4 address", self.interface);
+        LdsStatus {
+            program: "ua-lds",
+            application_uri: self.shared.own.application_uri.clone(),
+            endpoint: self.shared.own.url.clone(),
+            interface: self.interface.to_string(),
+            since_ms: clock::millis(self.started),
+            not_ready: no_interface.then_some(why).into_iter().collect(),
+            servers: servers.collect(),
+            network: network.collect(),
+            losses: self.losses.clone(),
+            counters: self.counters(),
+        }
+    }
+
+    fn counters(&self) -> BTreeMap<&'static str, u64> {
+        let get = |counter: &AtomicU64| counter.load(Ordering::Relaxed);
+        let Counters {
+            connections,
+            refused_connections,
+            questions,
+            unsupported,
+            malformed,
+            timed_out,
+        } = &self.shared.counters;
+        BTreeMap::from([
+            ("connections_total", get(connections)),
+            ("connections_gave_way_total", get(refused_connections)),
+            ("questions_total", get(questions)),
+            ("unsupported_total", get(unsupported)),
+            ("malformed_total", get(malformed)),
+            ("timed_out_total", get(timed_out)),
+            ("lost_total", self.lost),
+            ("no_room_total", self.keeper.registry.refused()),
+            (
+                "announcements_ignored_total",
+                self.keeper.mdns.as_ref().map_or(0, Mdns::ignored),
+            ),
+        ])
+    }
+
+    /// Says goodbye.
+    async fn leave(&mut self) {
+        let goodbye = self
+            .keeper
+            .mdns
+            .as_mut()
+            .and_then(|mdns| mdns.take_back(&self.instance));
+        if let Some(goodbye) = goodbye {
+            // Late: others find out by themselves.
+            drop(timeout(LEAVE_LIMIT, goodbye).await);
+        }
+        self.keeper.mdns = None;
+    }
+}
+
+/// As much of a text from outside as a log line is to hold.
+fn cut(text: &str) -> String {
+    text.chars().take(256).collect()
+}
+
+const MOST_LOSSES: usize = 64;
+const SEMAPHORES_EVERY: Duration = Duration::from_secs(5);
+const LEAVE_LIMIT: Duration = Duration::from_secs(1);

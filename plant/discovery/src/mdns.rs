@@ -1,0 +1,447 @@
+//! Announcements by mDNS and DNS-SD (OPC 10000-12, Annex C): `_opcua-tcp._tcp.local.`, on one interface.
+//!
+//! What is heard comes from whoever is on the network, so it is bounded and held against what a URL and a capability may
+//! look like; what does not fit is not heard, and counted.
+
+use std::collections::BTreeMap;
+use std::net::{IpAddr, Ipv4Addr};
+use std::time::Duration;
+
+use mdns_sd::{
+    DaemonEvent, IfKind, Receiver, ResolvedService, ServiceDaemon, ServiceEvent, ServiceInfo,
+};
+use registry::{Announcement, label, renamed};
+use tokio::time::{Instant, sleep_until};
+use tracing::{debug, info, warn};
+
+use crate::interface::Interface;
+use crate::url::Url;
+
+/// No mDNS daemon can be started.
+#[derive(Debug, thiserror::Error)]
+#[error("servers cannot be announced or heard on {interface}: {source}")]
+pub struct MdnsFault {
+    interface: String,
+    #[source]
+    source: mdns_sd::Error,
+}
+
+/// What is heard on the network.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Heard {
+    /// Of a server, for the first time or with something new.
+    Announced {
+        announcement: Announcement,
+        /// When the program started, in 100 ns since 1601, where it tells.
+        start_time: Option<i64>,
+    },
+    /// Of the end of a server: a goodbye, or what was heard has run out.
+    Withdrawn { instance: String },
+    /// That somebody else has the name of what we announce, which is called so from now on.
+    Renamed { from: String, to: String },
+}
+
+/// What is announced.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Ours {
+    pub(crate) announcement: Announcement,
+    /// When the program started, in 100 ns since 1601; ours alone tell it.
+    pub(crate) start_time: Option<i64>,
+}
+
+/// One interface, with a thread of its own that answers and asks.
+pub(crate) struct Mdns {
+    interface: Interface,
+    daemon: ServiceDaemon,
+    events: Receiver<ServiceEvent>,
+    monitor: Option<Receiver<DaemonEvent>>,
+    ours: BTreeMap<String, Announced>,
+    announce_at: Instant,
+    /// Instances that are there: a new one has not heard of ours.
+    there: BTreeMap<String, ()>,
+    ignored: u64,
+}
+
+#[derive(Debug)]
+struct Announced {
+    ours: Ours,
+    fullname: String,
+}
+
+impl Mdns {
+    /// Starts to hear at once.
+    pub(crate) fn open(interface: &Interface) -> Result<Self, MdnsFault> {
+        let fault = |source| MdnsFault {
+            interface: interface.to_string(),
+            source,
+        };
+        let daemon = ServiceDaemon::new().map_err(fault)?;
+        daemon.disable_interface(IfKind::All).map_err(fault)?;
+        daemon.enable_interface(interface.kind()).map_err(fault)?;
+        let events = daemon.browse(SERVICE).map_err(fault)?;
+        let monitor = daemon.monitor().ok();
+        Ok(Self {
+            interface: interface.clone(),
+            daemon,
+            events,
+            monitor,
+            ours: BTreeMap::new(),
+            announce_at: Instant::now() + ANNOUNCE_EVERY,
+            there: BTreeMap::new(),
+            ignored: 0,
+        })
+    }
+
+    /// Announces a server at once, in the place of what was announced under its name.
+    pub(crate) fn put(&mut self, ours: Ours) {
+        let Some(info) = self.info(&ours) else {
+            warn!(
+                name = ours.announcement.instance,
+                url = ours.announcement.url,
+                "a server cannot be announced on {}: no address there",
+                self.interface
+            );
+            return;
+        };
+        let fullname = info.get_fullname().to_owned();
+        self.register(info);
+        let instance = ours.announcement.instance.clone();
+        self.ours.insert(instance, Announced { ours, fullname });
+    }
+
+    /// Takes back what is announced under a name. The goodbye has been sent when the answer comes.
+    pub(crate) fn take_back(
+        &mut self,
+        instance: &str,
+    ) -> Option<impl Future<Output = ()> + Send + use<>> {
+        let announced = self.ours.remove(instance)?;
+        let told = self.daemon.unregister(&announced.fullname).ok()?;
+        Some(async move {
+            // An error is the end of the daemon, which says goodbye for all.
+            let _told = told.recv_async().await;
+        })
+    }
+
+    /// How much was heard that is no announcement of a server.
+    pub(crate) fn ignored(&self) -> u64 {
+        self.ignored
+    }
+
+    /// What is heard next. Whoever drops it before loses nothing.
+    pub(crate) async fn next(&mut self) -> Heard {
+        loop {
+            let event = tokio::select! {
+                event = self.events.recv_async() => event,
+                () = sleep_until(self.announce_at) => {
+                    self.announce_again();
+                    continue;
+                }
+            };
+            match event {
+                Ok(event) => {
+                    if let Some(heard) = self.take(event) {
+                        return heard;
+                    }
+                }
+                Err(_closed) => self.browse_again().await,
+            }
+        }
+    }
+
+    /// The crate closes the channel of whoever was slow, without a word.
+    async fn browse_again(&mut self) {
+        debug!("hearing on {} anew", self.interface);
+        match self.daemon.browse(SERVICE) {
+            Ok(events) => self.events = events,
+            Err(error) => {
+                debug!(%error, "mDNS cannot be heard on {}", self.interface);
+                tokio::time::sleep(ANNOUNCE_EVERY).await;
+            }
+        }
+    }
+
+    /// Late starters that ask from another port than that of mDNS are answered to that port, where some never look: they
+    /// need to be told without having asked.
+    fn announce_again(&mut self) {
+        self.announce_at = Instant::now() + ANNOUNCE_EVERY;
+        self.follow_renames();
+        let infos: Vec<ServiceInfo> = self
+            .ours
+            .values()
+            .filter_map(|ours| self.info(&ours.ours))
+            .collect();
+        for info in infos {
+            self.register(info);
+        }
+    }
+
+    /// A conflict that the daemon itself resolved.
+    fn follow_renames(&mut self) {
+        let changes = self.monitor.iter().flat_map(Receiver::try_iter);
+        for event in changes {
+            if let DaemonEvent::NameChange(change) = event {
+                info!(
+                    from = change.original,
+                    to = change.new_name,
+                    "another host has that mDNS name"
+                );
+            }
+        }
+    }
+
+    fn register(&self, info: ServiceInfo) {
+        // A full queue is emptied in a moment: what is announced comes again.
+        if let Err(error) = self.daemon.register(info) {
+            debug!(%error, "not announced this time");
+        }
+    }
+
+    fn take(&mut self, event: ServiceEvent) -> Option<Heard> {
+        match event {
+            ServiceEvent::ServiceResolved(service) => {
+                let heard = heard(&service, self.interface.is_loopback());
+                let Some((announcement, start_time)) = heard else {
+                    self.ignored += 1;
+                    debug!(name = ?service.fullname, "an announcement that is none of a server");
+                    return None;
+                };
+                if let Some(ours) = self.ours.get(&announcement.instance) {
+                    let theirs = &announcement.url;
+                    return match same_place(&ours.ours.announcement.url, theirs) {
+                        true => Some(Heard::Announced {
+                            announcement,
+                            start_time,
+                        }),
+                        false => self.conflict(&announcement.instance, theirs),
+                    };
+                }
+                if self.there.len() < MOST
+                    && self
+                        .there
+                        .insert(announcement.instance.clone(), ())
+                        .is_none()
+                {
+                    // At once, but not for each of many that appear together: a record is sent once a second at most.
+                    self.announce_at = self.announce_at.min(Instant::now() + SETTLE);
+                }
+                Some(Heard::Announced {
+                    announcement,
+                    start_time,
+                })
+            }
+            ServiceEvent::ServiceRemoved(_, fullname) => {
+                let instance = instance(&fullname)?;
+                self.there.remove(&instance);
+                // Ours is announced still: the goodbye is of another of that name.
+                (!self.ours.contains_key(&instance)).then_some(Heard::Withdrawn { instance })
+            }
+            _ => None,
+        }
+    }
+
+    /// Somebody else has one of our names (RFC 6762, 9). Of two that are ours the one whose URL comes later gives way.
+    fn conflict(&mut self, from: &str, theirs: &str) -> Option<Heard> {
+        let announced = self.ours.get(from)?;
+        if *announced.ours.announcement.url < *theirs {
+            self.announce_at = self.announce_at.min(Instant::now() + SETTLE);
+            return None;
+        }
+        let mut ours = announced.ours.clone();
+        let mut to = renamed(from);
+        while self.there.contains_key(&to) || self.ours.contains_key(&to) {
+            to = renamed(&to);
+        }
+        info!(from, to, theirs, "another server has that mDNS name");
+        ours.announcement.instance.clone_from(&to);
+        drop(self.take_back(from));
+        self.put(ours);
+        Some(Heard::Renamed {
+            from: from.to_owned(),
+            to,
+        })
+    }
+
+    /// For the daemon. `None` where the server listens on no address of the interface.
+    fn info(&self, ours: &Ours) -> Option<ServiceInfo> {
+        let Announcement {
+            instance,
+            url,
+            capabilities,
+        } = &ours.announcement;
+        let url = Url::parse(url)?;
+        let addresses = match url.ip() {
+            Some(IpAddr::V4(ip)) if !ip.is_unspecified() => vec![ip],
+            Some(IpAddr::V6(ip)) if !ip.is_unspecified() => return None,
+            _ => self.interface.addresses(),
+        };
+        let first = addresses.first()?;
+        // Named by the address: two servers of one host share it, and no other program of that host has it.
+        let host = format!("ua-{}.local.", first.to_string().replace('.', "-"));
+        let addresses: Vec<IpAddr> = addresses.iter().copied().map(IpAddr::V4).collect();
+        let path = match url.path.as_str() {
+            "" => "/",
+            path => path,
+        };
+        let mut texts = vec![
+            ("path".to_owned(), path.to_owned()),
+            ("caps".to_owned(), capabilities.join(",")),
+        ];
+        texts.extend(ours.start_time.map(|at| (START.to_owned(), at.to_string())));
+        let info = ServiceInfo::new(SERVICE, instance, &host, &*addresses, url.port, &*texts);
+        let mut info = info.ok()?;
+        info.set_requires_probe(false);
+        Some(info)
+    }
+}
+
+impl Drop for Mdns {
+    fn drop(&mut self) {
+        for announced in self.ours.values() {
+            drop(self.daemon.unregister(&announced.fullname));
+        }
+        // The thread ends in any case: nobody can command it any more.
+        drop(self.daemon.shutdown());
+    }
+}
+
+/// Whether two URLs are of one endpoint.
+pub(crate) fn same_place(one: &str, other: &str) -> bool {
+    one.trim_end_matches('/') == other.trim_end_matches('/')
+}
+
+/// An announcement as the registry takes it.
+fn heard(service: &ResolvedService, loopback: bool) -> Option<(Announcement, Option<i64>)> {
+    let instance = instance(&service.fullname)?;
+    let text = |key| service.get_property_val(key).flatten();
+    let path = match text("path").map(std::str::from_utf8) {
+        None => "",
+        Some(Ok(path)) if path.bytes().all(|byte| byte.is_ascii_graphic()) => path,
+        Some(_) => return None,
+    };
+    let slash = if path.is_empty() || path.starts_with('/') {
+        ""
+    } else {
+        "/"
+    };
+    let ip = address(service.get_addresses_v4(), loopback)?;
+    let port = service.port;
+    if port == 0 {
+        return None;
+    }
+    let url = Url::of(IpAddr::V4(ip), port, &format!("{slash}{path}")).to_string();
+    let texts = |key| text(key).and_then(|value| std::str::from_utf8(value).ok());
+    let capabilities = texts("caps").unwrap_or_default().split(',').map(str::trim);
+    let capabilities = capabilities
+        .filter(|code| is_code(code))
+        .take(MOST_CAPABILITIES);
+    let announcement = Announcement {
+        instance,
+        url,
+        capabilities: capabilities.map(str::to_owned).collect(),
+    };
+    let start_time = texts(START).and_then(|at| at.parse().ok());
+    Some((announcement, start_time))
+}
+
+/// The address to try: on a network never one that means the host itself.
+fn address(all: impl IntoIterator<Item = Ipv4Addr>, loopback: bool) -> Option<Ipv4Addr> {
+    let usable = |ip: &Ipv4Addr| {
+        let one = !(ip.is_unspecified() || ip.is_multicast() || ip.is_broadcast());
+        one && (loopback || !ip.is_loopback())
+    };
+    // The one that says more first: of a host with several, its loopback address means this host only.
+    let all = all.into_iter().filter(usable);
+    all.min_by_key(|ip| (ip.is_loopback() != loopback, ip.is_link_local(), *ip))
+}
+
+/// A code of OPC 10000-12, Annex D, or of a maker.
+fn is_code(text: &str) -> bool {
+    !text.is_empty() && text.len() <= 32 && text.bytes().all(|byte| byte.is_ascii_graphic())
+}
+
+/// The name in front of the service; `None` where it is no name to be shown.
+fn instance(fullname: &str) -> Option<String> {
+    let at = fullname.len().checked_sub(SERVICE.len() + 1)?;
+    let (name, service) = fullname.split_at_checked(at)?;
+    let service = service.strip_prefix('.')?;
+    if !service.eq_ignore_ascii_case(SERVICE) || name.is_empty() {
+        return None;
+    }
+    let name = name.replace("\\.", ".").replace("\\\\", "\\");
+    (label(&name) == name).then_some(name)
+}
+
+const SERVICE: &str = "_opcua-tcp._tcp.local.";
+/// The key of the TXT record that tells one run of a program from the next. Ours alone; others pass over it.
+const START: &str = "start";
+const ANNOUNCE_EVERY: Duration = Duration::from_secs(5);
+const SETTLE: Duration = Duration::from_millis(200);
+/// Instances that are kept in mind.
+const MOST: usize = 4096;
+const MOST_CAPABILITIES: usize = 32;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn resolved(instance: &str, address: &str, texts: &[(&str, &str)]) -> ResolvedService {
+        let info = ServiceInfo::new(SERVICE, instance, "host.local.", address, 4841, texts);
+        info.unwrap().as_resolved_service()
+    }
+
+    #[test]
+    fn an_announcement_is_read_as_a_url_and_capabilities() {
+        let texts = [("path", "/arm"), ("caps", "DA, HD,,AC"), ("start", "17")];
+        let (announcement, start) =
+            heard(&resolved("arm.left", "127.0.0.1", &texts), true).unwrap();
+        assert_eq!(announcement.instance, "arm.left");
+        assert_eq!(announcement.url, "opc.tcp://127.0.0.1:4841/arm");
+        assert_eq!(announcement.capabilities, ["DA", "HD", "AC"]);
+        assert_eq!(start, Some(17));
+    }
+
+    #[test]
+    fn hostile_records_are_not_heard() {
+        let plain = [("path", "/")];
+        for (what, service, loopback) in [
+            (
+                "a line break in the name",
+                resolved("a\nb", "127.0.0.1", &plain),
+                true,
+            ),
+            (
+                "a line break in the path",
+                resolved("a", "127.0.0.1", &[("path", "/\r\nX: y")]),
+                true,
+            ),
+            (
+                "our own host, from the network",
+                resolved("a", "127.0.0.1", &plain),
+                false,
+            ),
+            (
+                "no address of a host",
+                resolved("a", "224.0.0.1", &plain),
+                false,
+            ),
+        ] {
+            assert_eq!(heard(&service, loopback), None, "{what}");
+        }
+        let many = vec!["X"; 200].join(",");
+        let (kept, _) = heard(
+            &resolved("a", "10.0.0.1", &[("caps", many.get(..250).unwrap())]),
+            false,
+        )
+        .unwrap();
+        assert_eq!(kept.capabilities.len(), MOST_CAPABILITIES);
+        assert_eq!(instance("._opcua-tcp._tcp.local."), None);
+        assert_eq!(instance("x._http._tcp.local."), None);
+    }
+
+    #[test]
+    fn of_several_addresses_that_of_the_network_is_taken() {
+        let all = || ["127.0.0.1", "169.254.7.7", "10.0.0.2"].map(|ip| ip.parse().unwrap());
+        assert_eq!(address(all(), false), Some(Ipv4Addr::new(10, 0, 0, 2)));
+        assert_eq!(address(all(), true), Some(Ipv4Addr::LOCALHOST));
+    }
+}

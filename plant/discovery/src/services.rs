@@ -1,0 +1,255 @@
+//! Requests of OPC UA to the registry, and what it says as responses (OPC 10000-4, 5.5).
+
+use std::path::Path;
+use std::time::SystemTime;
+
+use opcua::core::{RequestMessage, ResponseMessage};
+use opcua::types::{
+    ApplicationDescription, ApplicationType, ByteString, DateTime, EndpointDescription,
+    FindServersOnNetworkResponse, FindServersRequest, FindServersResponse, GetEndpointsRequest,
+    GetEndpointsResponse, LocalizedText, MdnsDiscoveryConfiguration, MessageSecurityMode,
+    RegisterServer2Response, RegisterServerResponse, RegisteredServer, ResponseHeader,
+    ServerOnNetwork, ServiceFault, StatusCode, UAString,
+};
+use registry::{Asked, MdnsConfiguration, NetworkRecord};
+
+use crate::clock;
+
+/// A question to whoever keeps the registry.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Question {
+    FindServers {
+        uris: Vec<String>,
+    },
+    FindOnNetwork {
+        from: u32,
+        most: u32,
+        capabilities: Vec<String>,
+    },
+    Register {
+        asked: Box<Asked>,
+        semaphore_is_there: Option<bool>,
+    },
+}
+
+/// What it says.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Answer {
+    Servers(Vec<Asked>),
+    OnNetwork {
+        records: Vec<NetworkRecord>,
+        reset: SystemTime,
+    },
+    Registered,
+    Refused(u32),
+}
+
+/// The discovery server, as it says it itself.
+#[derive(Debug, Clone)]
+pub(crate) struct Own {
+    pub(crate) application_uri: String,
+    pub(crate) name: String,
+    /// As clients reach it.
+    pub(crate) url: String,
+}
+
+impl Own {
+    fn description(&self) -> ApplicationDescription {
+        ApplicationDescription {
+            application_uri: self.application_uri.as_str().into(),
+            application_name: LocalizedText::new("en", &self.name),
+            application_type: ApplicationType::DiscoveryServer,
+            discovery_urls: Some(vec![self.url.as_str().into()]),
+            ..ApplicationDescription::default()
+        }
+    }
+
+    /// GetEndpoints.
+    pub(crate) fn endpoints(&self, request: &GetEndpointsRequest) -> ResponseMessage {
+        let profiles = request.profile_uris.as_deref().unwrap_or_default();
+        let wanted =
+            profiles.is_empty() || profiles.iter().any(|profile| profile.as_ref() == UATCP);
+        let endpoint = || EndpointDescription {
+            endpoint_url: self.url.as_str().into(),
+            server: self.description(),
+            server_certificate: ByteString::null(),
+            security_mode: MessageSecurityMode::None,
+            security_policy_uri: POLICY_NONE.into(),
+            // None at all: there are no sessions.
+            user_identity_tokens: Some(Vec::new()),
+            transport_profile_uri: UATCP.into(),
+            security_level: 0,
+        };
+        let response = GetEndpointsResponse {
+            response_header: ResponseHeader::new_good(&request.request_header),
+            endpoints: Some(wanted.then(endpoint).into_iter().collect()),
+        };
+        response.into()
+    }
+}
+
+/// What a request asks of the registry; `None` for a service that is not one of discovery.
+pub(crate) fn question(request: &RequestMessage) -> Option<Question> {
+    Some(match request {
+        RequestMessage::FindServers(request) => Question::FindServers {
+            uris: texts(request.server_uris.as_deref()),
+        },
+        RequestMessage::FindServersOnNetwork(request) => Question::FindOnNetwork {
+            from: request.starting_record_id,
+            most: request.max_records_to_return,
+            capabilities: texts(request.server_capability_filter.as_deref()),
+        },
+        RequestMessage::RegisterServer(request) => register(&request.server, None),
+        RequestMessage::RegisterServer2(request) => {
+            let all = request.discovery_configuration.iter().flatten();
+            let mut known = all.filter_map(|one| one.inner_as::<MdnsDiscoveryConfiguration>());
+            let mdns = known.next().map(|known| MdnsConfiguration {
+                name: text(&known.mdns_server_name),
+                capabilities: texts(known.server_capabilities.as_deref()),
+            });
+            register(&request.server, mdns)
+        }
+        _ => return None,
+    })
+}
+
+fn register(server: &RegisteredServer, mdns: Option<MdnsConfiguration>) -> Question {
+    let names = server.server_names.iter().flatten();
+    let asked = Asked {
+        server_uri: text(&server.server_uri),
+        product_uri: text(&server.product_uri),
+        names: names
+            .map(|name| (text(&name.locale), text(&name.text)))
+            .collect(),
+        application_type: match server.server_type {
+            ApplicationType::Server => registry::ApplicationType::Server,
+            ApplicationType::Client => registry::ApplicationType::Client,
+            ApplicationType::ClientAndServer => registry::ApplicationType::ClientAndServer,
+            ApplicationType::DiscoveryServer => registry::ApplicationType::DiscoveryServer,
+        },
+        gateway_server_uri: text(&server.gateway_server_uri),
+        discovery_urls: texts(server.discovery_urls.as_deref()),
+        semaphore_file_path: text(&server.semaphore_file_path),
+        is_online: server.is_online,
+        mdns,
+    };
+    Question::Register {
+        semaphore_is_there: semaphore(&asked.semaphore_file_path),
+        asked: Box::new(asked),
+    }
+}
+
+/// Whether a semaphore file is there; `None` where none is named.
+pub(crate) fn semaphore(path: &str) -> Option<bool> {
+    (!path.is_empty()).then(|| Path::new(path).is_file())
+}
+
+/// The response to a request that was a [`question`].
+pub(crate) fn response(request: &RequestMessage, answer: Answer, own: &Own) -> ResponseMessage {
+    let good = || ResponseHeader::new_good(request.request_header());
+    match (request, answer) {
+        (_, Answer::Refused(status)) => fault(request, StatusCode::from(status)),
+        (RequestMessage::FindServers(find), Answer::Servers(servers)) => {
+            let itself = own.description();
+            let uris = find.server_uris.as_deref().unwrap_or_default();
+            let wanted = uris.is_empty() || uris.contains(&itself.application_uri);
+            let others = servers.iter().map(|server| description(server, find));
+            let response = FindServersResponse {
+                response_header: good(),
+                servers: Some(wanted.then_some(itself).into_iter().chain(others).collect()),
+            };
+            response.into()
+        }
+        (RequestMessage::FindServersOnNetwork(_), Answer::OnNetwork { records, reset }) => {
+            let response = FindServersOnNetworkResponse {
+                response_header: good(),
+                last_counter_reset_time: DateTime::from(clock::ticks(reset)),
+                servers: Some(records.iter().map(on_network).collect()),
+            };
+            response.into()
+        }
+        (RequestMessage::RegisterServer(_), Answer::Registered) => RegisterServerResponse {
+            response_header: good(),
+        }
+        .into(),
+        (RequestMessage::RegisterServer2(request), Answer::Registered) => {
+            // The first of the kind that is known counts.
+            let mut taken = false;
+            let all = request.discovery_configuration.iter().flatten();
+            let results = all.map(|one| {
+                let counts = one.inner_is::<MdnsDiscoveryConfiguration>() && !taken;
+                taken |= counts;
+                match counts {
+                    true => StatusCode::Good,
+                    false => StatusCode::BadNotSupported,
+                }
+            });
+            let response = RegisterServer2Response {
+                response_header: good(),
+                configuration_results: Some(results.collect()),
+                diagnostic_infos: None,
+            };
+            response.into()
+        }
+        _ => fault(request, StatusCode::BadInternalError),
+    }
+}
+
+/// A refusal.
+pub(crate) fn fault(request: &RequestMessage, status: StatusCode) -> ResponseMessage {
+    ServiceFault::new(request.request_header(), status).into()
+}
+
+fn description(server: &Asked, request: &FindServersRequest) -> ApplicationDescription {
+    let wanted = request.locale_ids.as_deref().unwrap_or_default();
+    let in_locale = wanted.iter().find_map(|locale| {
+        let mut names = server.names.iter();
+        names.find(|(of, _)| of.eq_ignore_ascii_case(locale.as_ref()))
+    });
+    let (locale, name) = match in_locale.or(server.names.first()) {
+        Some((locale, name)) => (locale.as_str(), name.as_str()),
+        None => ("", ""),
+    };
+    ApplicationDescription {
+        application_uri: server.server_uri.as_str().into(),
+        product_uri: server.product_uri.as_str().into(),
+        application_name: LocalizedText::new(locale, name),
+        application_type: match server.application_type {
+            registry::ApplicationType::Server => ApplicationType::Server,
+            registry::ApplicationType::Client => ApplicationType::Client,
+            registry::ApplicationType::ClientAndServer => ApplicationType::ClientAndServer,
+            registry::ApplicationType::DiscoveryServer => ApplicationType::DiscoveryServer,
+        },
+        gateway_server_uri: server.gateway_server_uri.as_str().into(),
+        discovery_profile_uri: UAString::null(),
+        discovery_urls: Some(
+            server
+                .discovery_urls
+                .iter()
+                .map(|url| url.as_str().into())
+                .collect(),
+        ),
+    }
+}
+
+fn on_network(record: &NetworkRecord) -> ServerOnNetwork {
+    let announcement = &record.announcement;
+    let capabilities = announcement.capabilities.iter();
+    ServerOnNetwork {
+        record_id: record.record_id,
+        server_name: announcement.instance.as_str().into(),
+        discovery_url: announcement.url.as_str().into(),
+        server_capabilities: Some(capabilities.map(|code| code.as_str().into()).collect()),
+    }
+}
+
+fn text(text: &UAString) -> String {
+    text.as_ref().to_owned()
+}
+
+fn texts(all: Option<&[UAString]>) -> Vec<String> {
+    all.unwrap_or_default().iter().map(text).collect()
+}
+
+const UATCP: &str = "http://opcfoundation.org/UA-Profile/Transport/uatcp-uasc-uabinary";
+const POLICY_NONE: &str = "http://opcfoundation.org/UA/SecurityPolicy#None";

@@ -1,0 +1,343 @@
+//! Who is there, for a program: [`watch`].
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::time::{Duration, SystemTime};
+
+use registry::{Announcement, Event, Loss, Settings};
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+
+use crate::client;
+use crate::clock;
+use crate::interface::Interface;
+use crate::keeper::Keeper;
+use crate::mdns::{Mdns, MdnsFault, same_place};
+use crate::url::Url;
+
+/// How servers are watched.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct WatchSettings {
+    /// Where announcements are heard; `None` hears none.
+    pub mdns: Option<Interface>,
+    /// How often each endpoint is tried.
+    pub probe_every: Duration,
+    /// How long one that gives no answer at all still counts as there.
+    pub lost_after: Duration,
+}
+
+impl Default for WatchSettings {
+    fn default() -> Self {
+        let settings = Settings::default();
+        Self {
+            mdns: Some(Interface::LOOPBACK),
+            probe_every: settings.probe_every,
+            lost_after: settings.lost_after,
+        }
+    }
+}
+
+/// A server that is there.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Known {
+    /// By which it is told apart from all others, for as long as it is there: its mDNS instance name.
+    pub name: String,
+    /// Where it is.
+    pub url: String,
+    /// Codes of OPC 10000-12, Annex D.
+    pub capabilities: Vec<String>,
+    /// Its ApplicationUri as it says itself; `None` where it does not.
+    pub application_uri: Option<String>,
+    /// Since when it is there.
+    pub since: SystemTime,
+}
+
+impl Known {
+    /// Whether it is a Local Discovery Server, which has nothing of its own.
+    #[must_use]
+    pub fn is_lds(&self) -> bool {
+        self.capabilities
+            .iter()
+            .any(|code| code.eq_ignore_ascii_case("LDS"))
+    }
+}
+
+/// What has happened to a server.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Found {
+    /// It is there; or it was, and says something else of itself.
+    Seen(Known),
+    /// It is another run of the program: what was known of its inside is void.
+    Restarted(Known),
+    /// It is no longer there.
+    Gone {
+        /// What was known of it.
+        known: Known,
+        /// How that is known.
+        loss: Loss,
+    },
+}
+
+impl Found {
+    /// The server.
+    #[must_use]
+    pub fn known(&self) -> &Known {
+        match self {
+            Self::Seen(known) | Self::Restarted(known) | Self::Gone { known, .. } => known,
+        }
+    }
+}
+
+/// Hears of servers for as long as it is kept.
+#[derive(Debug)]
+pub struct Watcher(mpsc::Receiver<Found>);
+
+impl Watcher {
+    /// What has happened next. `None` only when the runtime ends. Whoever is slow misses no server, but is told only what
+    /// it came to at last.
+    pub async fn next(&mut self) -> Option<Found> {
+        self.0.recv().await
+    }
+}
+
+/// Starts to hear of servers. Needs a tokio runtime, and waits for nothing.
+///
+/// # Errors
+/// No mDNS daemon can be started.
+pub fn watch(settings: WatchSettings) -> Result<Watcher, MdnsFault> {
+    let mdns = settings.mdns.as_ref().map(Mdns::open).transpose()?;
+    let registry = Settings {
+        probe_every: settings.probe_every,
+        lost_after: settings.lost_after,
+        ..Settings::default()
+    };
+    let (tell, found) = mpsc::channel(16);
+    let watching = Watching {
+        keeper: Keeper::new(registry, mdns),
+        servers: Servers::default(),
+        asking: JoinSet::new(),
+        ask: VecDeque::new(),
+    };
+    tokio::spawn(watching.run(tell));
+    Ok(Watcher(found))
+}
+
+struct Watching {
+    keeper: Keeper,
+    servers: Servers,
+    /// Who is asked for its ApplicationUri.
+    asking: JoinSet<(String, Option<String>)>,
+    /// Who is asked next.
+    ask: VecDeque<String>,
+}
+
+impl Watching {
+    async fn run(mut self, tell: mpsc::Sender<Found>) {
+        loop {
+            tokio::select! {
+                permit = tell.reserve(), if !self.servers.outbox.is_empty() => {
+                    let Ok(permit) = permit else { return };
+                    if let Some(found) = self.servers.next() {
+                        permit.send(found);
+                    }
+                    continue;
+                }
+                () = tell.closed() => return,
+                () = self.keeper.step() => {}
+                Some(asked) = self.asking.join_next(), if !self.asking.is_empty() => {
+                    if let Ok((url, uri)) = asked {
+                        self.servers.answered(&url, uri);
+                    }
+                }
+            }
+            while let Some(event) = self.keeper.event() {
+                self.take(event);
+            }
+            while self.asking.len() < MOST_ASKED
+                && let Some(url) = self.ask.pop_front()
+            {
+                self.asking.spawn(application_uri(url));
+            }
+        }
+    }
+
+    fn take(&mut self, event: Event) {
+        match event {
+            Event::Seen(record) => {
+                let ask = self.servers.seen(record.announcement, clock::wall());
+                self.ask.extend(ask);
+            }
+            Event::Vanished { record, loss } => {
+                self.servers.vanished(&record.announcement.instance, loss);
+            }
+            Event::Restarted { url } => self.servers.restarted(&url),
+            // Nobody registers here.
+            _ => {}
+        }
+    }
+}
+
+/// What a server says it is, if it says it in time.
+async fn application_uri(url: String) -> (String, Option<String>) {
+    let found = client::find_servers(&url, ASK_LIMIT)
+        .await
+        .unwrap_or_default();
+    let port = Url::parse(&url).map(|url| url.port);
+    let of_port = |application: &&client::Application| {
+        let ports = application
+            .discovery_urls
+            .iter()
+            .filter_map(|url| Url::parse(url));
+        ports.map(|url| Some(url.port)).any(|its| its == port)
+    };
+    let own = found.iter().find(of_port).or(found.first());
+    let uri = own.map(|application| application.application_uri.clone());
+    (url, uri.filter(|uri| !uri.is_empty()))
+}
+
+const MOST_ASKED: usize = 32;
+const ASK_LIMIT: Duration = Duration::from_millis(500);
+
+/// The servers that are there, and what their reader is still to be told.
+#[derive(Debug, Default)]
+struct Servers {
+    known: BTreeMap<String, Server>,
+    /// Whom the reader believes to be there.
+    told: BTreeSet<String>,
+    outbox: VecDeque<Found>,
+}
+
+#[derive(Debug)]
+struct Server {
+    known: Known,
+    /// The mDNS instances it is announced as: a discovery server may announce it, too.
+    instances: BTreeSet<String>,
+    /// Whether it has been asked who it is.
+    asked: bool,
+}
+
+impl Servers {
+    /// Takes in a new or changed record. Gives the URL to ask who it is.
+    fn seen(&mut self, announcement: Announcement, since: SystemTime) -> Option<String> {
+        let Announcement {
+            instance,
+            url,
+            capabilities,
+        } = announcement;
+        if let Some((name, server)) = self.of_instance(&instance) {
+            if same_place(&server.known.url, &url) {
+                server.known.capabilities = capabilities;
+                let known = server.known.clone();
+                if server.asked {
+                    self.push(Found::Seen(known));
+                }
+                return None;
+            }
+            if server.instances.len() == 1 {
+                server.known.url.clone_from(&url);
+                server.known.capabilities = capabilities;
+                server.asked = false;
+                return Some(url);
+            }
+            server.instances.remove(&instance);
+            debug_assert!(self.known.contains_key(&name), "it has other instances");
+        }
+        if let Some((_, server)) = self.of_url(&url) {
+            server.instances.insert(instance);
+            return None;
+        }
+        let name = match self.known.contains_key(&instance) {
+            true => format!("{instance} at {url}"),
+            false => instance.clone(),
+        };
+        let known = Known {
+            name: name.clone(),
+            url: url.clone(),
+            capabilities,
+            application_uri: None,
+            since,
+        };
+        let server = Server {
+            known,
+            instances: BTreeSet::from([instance]),
+            asked: false,
+        };
+        self.known.insert(name, server);
+        Some(url)
+    }
+
+    /// A server has said who it is, or has not.
+    fn answered(&mut self, url: &str, application_uri: Option<String>) {
+        if let Some((_, server)) = self.of_url(url) {
+            server.known.application_uri = application_uri;
+            server.asked = true;
+            let known = server.known.clone();
+            self.push(Found::Seen(known));
+        }
+    }
+
+    fn vanished(&mut self, instance: &str, loss: Loss) {
+        let Some((name, server)) = self.of_instance(instance) else {
+            return;
+        };
+        server.instances.remove(instance);
+        if server.instances.is_empty()
+            && let Some(server) = self.known.remove(&name)
+        {
+            let known = server.known;
+            self.push(Found::Gone { known, loss });
+        }
+    }
+
+    fn restarted(&mut self, url: &str) {
+        if let Some((_, server)) = self.of_url(url) {
+            let known = server.known.clone();
+            if server.asked {
+                self.push(Found::Restarted(known));
+            }
+        }
+    }
+
+    fn of_instance(&mut self, instance: &str) -> Option<(String, &mut Server)> {
+        let mut all = self.known.iter_mut();
+        let (name, server) = all.find(|(_, server)| server.instances.contains(instance))?;
+        Some((name.clone(), server))
+    }
+
+    fn of_url(&mut self, url: &str) -> Option<(String, &mut Server)> {
+        let mut all = self.known.iter_mut();
+        let (name, server) = all.find(|(_, server)| same_place(&server.known.url, url))?;
+        Some((name.clone(), server))
+    }
+
+    /// Has the reader told, in the place of what it has not been told yet of the same server.
+    fn push(&mut self, found: Found) {
+        let name = found.known().name.clone();
+        let of_it = |waiting: &Found| waiting.known().name == name;
+        let went = self
+            .outbox
+            .iter()
+            .find(|waiting| of_it(waiting) && matches!(waiting, Found::Gone { .. }));
+        let went = went.cloned();
+        self.outbox.retain(|waiting| !of_it(waiting));
+        let told = self.told.contains(&name);
+        match found {
+            Found::Gone { .. } if told => self.outbox.push_back(found),
+            // It came and went while nobody looked.
+            Found::Gone { .. } => {}
+            Found::Seen(known) | Found::Restarted(known) if !told || went.is_some() => {
+                self.outbox.extend(went);
+                self.outbox.push_back(Found::Seen(known));
+            }
+            Found::Seen(_) | Found::Restarted(_) => self.outbox.push_back(found),
+        }
+    }
+
+    fn next(&mut self) -> Option<Found> {
+        let found = self.outbox.pop_front()?;
+        match &found {
+            Found::Gone { known, .. } => self.told.remove(&known.name),
+            Found::Seen(known) | Found::Restarted(known) => self.told.insert(known.name.clone()),
+        };
+        Some(found)
+    }
+}
