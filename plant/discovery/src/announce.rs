@@ -38,7 +38,7 @@ pub struct AnnounceSettings {
     pub lds: Option<String>,
     /// Where it is announced by mDNS; `None` for nowhere: then the Local Discovery Server is asked to do it.
     pub mdns: Option<Interface>,
-    /// How often the registration is repeated.
+    /// How often the registration is repeated; every ten seconds at least where nothing is heard by mDNS.
     pub register_every: Duration,
 }
 
@@ -107,6 +107,15 @@ impl Announced {
 /// No mDNS daemon can be started.
 pub fn announce(server: Server, settings: AnnounceSettings) -> Result<Announced, MdnsFault> {
     let mdns = settings.mdns.as_ref().map(Mdns::open).transpose()?;
+    let register_every = match mdns {
+        Some(_) => settings.register_every,
+        // It does not hear of a discovery server that starts anew.
+        None => settings.register_every.min(MOST_UNHEARD),
+    };
+    let settings = AnnounceSettings {
+        register_every,
+        ..settings
+    };
     let (sender, changes) = watch::channel(server);
     let (tell, state) = watch::channel(AnnounceState::default());
     let (stop, stopped) = mpsc::channel(1);
@@ -317,5 +326,6 @@ fn name(server: &Server) -> String {
 }
 
 const FIRST_WAIT: Duration = Duration::from_secs(1);
+const MOST_UNHEARD: Duration = Duration::from_secs(10);
 const MOST_WAIT: Duration = Duration::from_secs(60);
 const LEAVE_LIMIT: Duration = Duration::from_secs(1);

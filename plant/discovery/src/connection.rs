@@ -287,3 +287,231 @@ const FIRST_IDLE: Duration = Duration::from_secs(5);
 const WRITE_LIMIT: Duration = Duration::from_secs(10);
 const LEAST_LIFETIME: Duration = Duration::from_secs(5);
 const MOST_LIFETIME: Duration = Duration::from_secs(300);
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use opcua::core::comms::tcp_types::ErrorMessage;
+    use opcua::types::{
+        FindServersRequest, NodeId, ReadRequest, RequestHeader, SimpleBinaryEncodable,
+    };
+    use tokio::io::{AsyncReadExt, AsyncWriteExt, DuplexStream, duplex};
+
+    use super::*;
+
+    const PEER: SocketAddr =
+        SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 9);
+
+    /// A discovery server that knows nobody.
+    fn shared() -> Arc<Shared> {
+        let (ask, mut questions) = mpsc::channel::<Asking>(4);
+        tokio::spawn(async move {
+            while let Some((_, _, reply)) = questions.recv().await {
+                drop(reply.send(Answer::Servers(Vec::new())));
+            }
+        });
+        let own = Own {
+            application_uri: "urn:lds".to_owned(),
+            name: "lds".to_owned(),
+            url: "opc.tcp://h:4840".to_owned(),
+        };
+        Arc::new(Shared::new(own, ask))
+    }
+
+    fn connect(shared: &Arc<Shared>) -> DuplexStream {
+        let (here, there) = duplex(1 << 20);
+        let shared = Arc::clone(shared);
+        tokio::spawn(async move { serve(there, PEER, &shared).await });
+        here
+    }
+
+    fn header() -> RequestHeader {
+        RequestHeader::new(&NodeId::null(), &DateTime::now(), 7)
+    }
+
+    /// A client with an open channel.
+    async fn opened(shared: &Arc<Shared>) -> Conversation<DuplexStream> {
+        let mut client = Conversation::new(connect(shared), Role::Client);
+        client
+            .greet(&HelloMessage::new("opc.tcp://h:4840", 65_536, 65_536, 0, 0))
+            .await
+            .unwrap();
+        client
+            .greeting::<AcknowledgeMessage>(Kind::Acknowledge)
+            .await
+            .unwrap();
+        open(&mut client, SecurityTokenRequestType::Issue).await;
+        client
+    }
+
+    async fn open(client: &mut Conversation<DuplexStream>, request_type: SecurityTokenRequestType) {
+        let request = OpenSecureChannelRequest {
+            request_header: header(),
+            client_protocol_version: 0,
+            request_type,
+            security_mode: MessageSecurityMode::None,
+            client_nonce: ByteString::null(),
+            requested_lifetime: 1000,
+        };
+        match ask(client, request).await {
+            ResponseMessage::OpenSecureChannel(opened) => {
+                client.channel.set_security_token(opened.security_token)
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+
+    async fn ask(
+        client: &mut Conversation<DuplexStream>,
+        request: impl Into<RequestMessage>,
+    ) -> ResponseMessage {
+        client.send(5, &request.into()).await.unwrap();
+        let received = client.receive::<ResponseMessage>(|_| Ok(())).await.unwrap();
+        assert_eq!(received.request_id, 5);
+        received.message
+    }
+
+    fn find() -> FindServersRequest {
+        FindServersRequest {
+            request_header: header(),
+            ..FindServersRequest::default()
+        }
+    }
+
+    #[tokio::test]
+    async fn a_channel_is_issued_used_renewed_and_used() {
+        let shared = shared();
+        let mut client = opened(&shared).await;
+        for _ in 0..2 {
+            let before = client.channel.token_id();
+            match ask(&mut client, find()).await {
+                ResponseMessage::FindServers(found) => {
+                    assert_eq!(found.servers.unwrap().len(), 1, "itself")
+                }
+                other => panic!("{other:?}"),
+            }
+            open(&mut client, SecurityTokenRequestType::Renew).await;
+            assert_eq!(client.channel.token_id(), before + 1);
+        }
+    }
+
+    #[tokio::test]
+    async fn what_is_no_service_of_discovery_is_unsupported_and_the_channel_stays() {
+        let shared = shared();
+        let mut client = opened(&shared).await;
+        let read = ReadRequest {
+            request_header: header(),
+            ..ReadRequest::default()
+        };
+        let answer = ask(&mut client, read).await;
+        assert_eq!(
+            answer.response_header().service_result,
+            StatusCode::BadServiceUnsupported
+        );
+        assert_eq!(answer.response_header().request_handle, 7);
+        assert!(matches!(
+            ask(&mut client, find()).await,
+            ResponseMessage::FindServers(_)
+        ));
+    }
+
+    /// What a client that writes these bytes is answered with last.
+    async fn told(shared: &Arc<Shared>, bytes: &[u8]) -> Option<StatusCode> {
+        let mut client = connect(shared);
+        client.write_all(bytes).await.unwrap();
+        client.shutdown().await.unwrap();
+        let mut answer = Vec::new();
+        client.read_to_end(&mut answer).await.unwrap();
+        let at = answer.windows(4).rposition(|four| four == b"ERRF")?;
+        let mut error = answer.get(at..)?;
+        use opcua::types::{DecodingOptions, SimpleBinaryDecodable};
+        Some(
+            ErrorMessage::decode(&mut error, &DecodingOptions::default())
+                .unwrap()
+                .error,
+        )
+    }
+
+    fn hello() -> Vec<u8> {
+        let mut bytes = Vec::new();
+        let hello = HelloMessage::new("opc.tcp://h:4840", 65_536, 65_536, 0, 0);
+        hello.encode(&mut bytes).unwrap();
+        bytes
+    }
+
+    #[tokio::test]
+    async fn what_is_none_of_the_protocol_is_told_what_is_wrong_with_it() {
+        let shared = shared();
+        let after = |bytes: &[u8]| [hello(), bytes.to_vec()].concat();
+        for (what, bytes, status) in [
+            (
+                "HTTP",
+                b"GET / HTTP/1.1\r\n\r\n".to_vec(),
+                StatusCode::BadTcpMessageTypeInvalid,
+            ),
+            (
+                "4 GB",
+                b"HELF\xff\xff\xff\xff".to_vec(),
+                StatusCode::BadTcpMessageTooLarge,
+            ),
+            (
+                "no size",
+                b"HELF\0\0\0\0".to_vec(),
+                StatusCode::BadTcpMessageTooLarge,
+            ),
+            (
+                "a message before a channel",
+                after(b"MSGF\x18\0\0\0\x01\0\0\0\x01\0\0\0\x01\0\0\0\x01\0\0\0"),
+                StatusCode::BadTcpSecureChannelUnknown,
+            ),
+            (
+                "a greeting twice",
+                after(&hello()),
+                StatusCode::BadTcpMessageTypeInvalid,
+            ),
+        ] {
+            assert_eq!(told(&shared, &bytes).await, Some(status), "{what}");
+        }
+    }
+
+    #[tokio::test]
+    async fn no_cut_and_no_flipped_bit_ends_more_than_its_connection() {
+        let shared = shared();
+        // What a client says that opens a channel and asks.
+        let (here, mut there) = duplex(1 << 20);
+        let mut client = Conversation::new(here, Role::Client);
+        let request = OpenSecureChannelRequest {
+            request_header: header(),
+            requested_lifetime: 1000,
+            security_mode: MessageSecurityMode::None,
+            ..OpenSecureChannelRequest::default()
+        };
+        client
+            .send(1, &RequestMessage::from(request))
+            .await
+            .unwrap();
+        client.channel.set_security_token(ChannelSecurityToken {
+            channel_id: 1,
+            token_id: 1,
+            ..ChannelSecurityToken::default()
+        });
+        client.send(2, &RequestMessage::from(find())).await.unwrap();
+        drop(client);
+        let mut said = hello();
+        there.read_to_end(&mut said).await.unwrap();
+        for at in 0..said.len() {
+            let mut flipped = said.clone();
+            for bit in [0x01, 0x80, 0xff] {
+                flipped[at] = said[at] ^ bit;
+                let _status = told(&shared, &flipped).await;
+            }
+            let _status = told(&shared, &said[..at]).await;
+        }
+        let mut reader = opened(&shared).await;
+        assert!(matches!(
+            ask(&mut reader, find()).await,
+            ResponseMessage::FindServers(_)
+        ));
+    }
+}

@@ -275,8 +275,10 @@ impl Mdns {
             _ => self.interface.addresses(),
         };
         let first = addresses.first()?;
-        // Named by the address: two servers of one host share it, and no other program of that host has it.
-        let host = format!("ua-{}.local.", first.to_string().replace('.', "-"));
+        // Of its own: the goodbye of one server takes the host's address away from all that share the name. And no other
+        // program of this host has it.
+        let host = first.to_string().replace('.', "-");
+        let host = format!("ua-{host}-{}.local.", url.port);
         let addresses: Vec<IpAddr> = addresses.iter().copied().map(IpAddr::V4).collect();
         let path = match url.path.as_str() {
             "" => "/",

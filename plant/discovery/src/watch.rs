@@ -341,3 +341,78 @@ impl Servers {
         Some(found)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn robot(instance: &str, port: u16) -> Announcement {
+        Announcement {
+            instance: instance.to_owned(),
+            url: format!("opc.tcp://127.0.0.1:{port}/"),
+            capabilities: Vec::new(),
+        }
+    }
+
+    fn told(servers: &mut Servers) -> Vec<String> {
+        let next = std::iter::from_fn(|| servers.next());
+        next.map(|found| {
+            let what = match &found {
+                Found::Seen(_) => "seen",
+                Found::Restarted(_) => "restarted",
+                Found::Gone { .. } => "gone",
+            };
+            format!("{what} {}", found.known().name)
+        })
+        .collect()
+    }
+
+    /// A server that is there and has said who it is.
+    fn seen(servers: &mut Servers, announcement: Announcement) {
+        let url = announcement.url.clone();
+        if servers.seen(announcement, SystemTime::UNIX_EPOCH).is_some() {
+            servers.answered(&url, Some("urn:robot".to_owned()));
+        }
+    }
+
+    #[test]
+    fn a_server_that_two_announce_is_one_and_there_until_both_take_it_back() {
+        let mut servers = Servers::default();
+        seen(&mut servers, robot("arm", 1));
+        seen(&mut servers, robot("arm of the discovery server", 1));
+        assert_eq!(told(&mut servers), ["seen arm"]);
+        servers.vanished("arm", Loss::Goodbye);
+        assert!(told(&mut servers).is_empty());
+        servers.vanished("arm of the discovery server", Loss::Goodbye);
+        assert_eq!(told(&mut servers), ["gone arm"]);
+    }
+
+    #[test]
+    fn a_slow_reader_is_told_what_it_came_to() {
+        let mut servers = Servers::default();
+        seen(&mut servers, robot("brief", 2));
+        servers.vanished("brief", Loss::Unreachable);
+        assert!(told(&mut servers).is_empty(), "it came and went meanwhile");
+        seen(&mut servers, robot("arm", 1));
+        assert_eq!(told(&mut servers), ["seen arm"]);
+        servers.restarted("opc.tcp://127.0.0.1:1/");
+        servers.vanished("arm", Loss::Unreachable);
+        seen(&mut servers, robot("arm", 1));
+        servers.restarted("opc.tcp://127.0.0.1:1/");
+        assert_eq!(
+            told(&mut servers),
+            ["gone arm", "seen arm"],
+            "the end of the one before is not passed over"
+        );
+    }
+
+    #[test]
+    fn a_server_that_moves_keeps_its_name() {
+        let mut servers = Servers::default();
+        seen(&mut servers, robot("arm", 1));
+        seen(&mut servers, robot("arm", 2));
+        let last = std::iter::from_fn(|| servers.next()).last().unwrap();
+        assert_eq!(last.known().url, "opc.tcp://127.0.0.1:2/");
+        assert_eq!(servers.known.len(), 1);
+    }
+}
