@@ -6,14 +6,19 @@
 //! `ControlEnable`), in the version of CAEX (2.15, 3.0) and in how parts refer to each other (by RefID or by ID); the model has
 //! one name for each thing. What a file says that does not hold together is a [`Finding`], and the rest of it counts.
 //!
+//! [`Module::triples`] tells the same as RDF, in the terms of [`vocabulary`].
+//!
 //! No file is opened here and no server is asked.
 
 mod caex;
 mod model;
+mod rdf;
 mod read;
+pub mod vocabulary;
 
 pub use caex::ManifestError;
 pub use model::{
     Access, Bound, Control, Finding, Identifier, Module, Node, Parameter, Procedure, Role, Service,
     ValueKind,
 };
+pub use rdf::{Object, Triple, escaped};

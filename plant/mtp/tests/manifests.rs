@@ -228,7 +228,7 @@ fn limits_that_the_file_tells_are_numbers() {
     assert!(
         ramp.iter()
             .all(|parameter| parameter.unit == Some(Bound::Constant(1054.0))),
-        "milliseconds"
+        "seconds"
     );
 }
 

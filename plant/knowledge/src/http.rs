@@ -1,0 +1,522 @@
+//! Questions over HTTP on loopback: the SPARQL 1.1 protocol (query only), named questions, the statements themselves.
+
+use std::convert::Infallible;
+use std::io;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::Duration;
+
+use bytes::Bytes;
+use http_body_util::{BodyExt as _, Full, LengthLimitError, Limited};
+use hyper::body::Incoming;
+use hyper::header::{ACCEPT, ALLOW, CONTENT_TYPE, HOST, HeaderValue, RETRY_AFTER};
+use hyper::service::service_fn;
+use hyper::{Method, Request, Response, StatusCode};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use oxigraph::io::RdfFormat;
+use oxigraph::sparql::results::QueryResultsFormat;
+use serde_json::json;
+use tokio::net::{TcpListener, TcpStream};
+use tokio::sync::Semaphore;
+use tokio::task::JoinHandle;
+use tracing::debug;
+
+use crate::query::{Asked, Dataset, Formats, Limits, Queries, QueryFault, Results};
+use crate::question::{QUESTIONS, Question, QuestionFault};
+use crate::store::Knowledge;
+
+/// More pages, by their path: JSON, or nothing where there is no such page.
+pub type Page = Arc<dyn Fn(&str) -> Option<String> + Send + Sync>;
+
+/// A listener that answers until it is dropped.
+#[derive(Debug)]
+pub struct Endpoint {
+    address: SocketAddr,
+    task: JoinHandle<()>,
+}
+
+impl Endpoint {
+    /// Listens at an address of loopback; with port 0 at any free port.
+    ///
+    /// # Errors
+    /// When the address is in use, or not one of loopback.
+    pub async fn bind(
+        address: SocketAddr,
+        knowledge: Arc<Knowledge>,
+        limits: Limits,
+        page: Page,
+    ) -> io::Result<Self> {
+        if !address.ip().is_loopback() {
+            let why = format!(
+                "{} is not on loopback, and questions are answered there only: who may ask is not checked",
+                address.ip()
+            );
+            return Err(io::Error::new(io::ErrorKind::InvalidInput, why));
+        }
+        let listener = TcpListener::bind(address).await?;
+        let address = listener.local_addr()?;
+        let site = Site {
+            queries: Queries::new(knowledge, limits),
+            page,
+        };
+        Ok(Self {
+            address,
+            task: tokio::spawn(accept(listener, site)),
+        })
+    }
+
+    /// Where it listens.
+    #[must_use]
+    pub fn address(&self) -> SocketAddr {
+        self.address
+    }
+}
+
+impl Drop for Endpoint {
+    fn drop(&mut self) {
+        self.task.abort();
+    }
+}
+
+#[derive(Clone)]
+struct Site {
+    queries: Queries,
+    page: Page,
+}
+
+async fn accept(listener: TcpListener, site: Site) {
+    let places = Arc::new(Semaphore::new(MAX_CONNECTIONS));
+    loop {
+        // Who comes to a full house waits in the listener's queue.
+        let Ok(place) = Arc::clone(&places).acquire_owned().await else {
+            return;
+        };
+        let stream = match listener.accept().await {
+            Ok((stream, _)) => stream,
+            Err(error) => {
+                debug!(%error, "a connection for questions was not accepted");
+                tokio::time::sleep(ACCEPT_AGAIN).await;
+                continue;
+            }
+        };
+        let site = site.clone();
+        tokio::spawn(async move {
+            let _place = place;
+            if tokio::time::timeout(CONNECTION_TIME, serve(stream, site))
+                .await
+                .is_err()
+            {
+                debug!("a connection for questions was closed for its age");
+            }
+        });
+    }
+}
+
+async fn serve(stream: TcpStream, site: Site) {
+    let service = service_fn(|request| {
+        let site = site.clone();
+        async move { Ok::<_, Infallible>(site.answer(request).await.unwrap_or_else(Refusal::response)) }
+    });
+    let served = hyper::server::conn::http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(HEADER_TIME)
+        .serve_connection(TokioIo::new(stream), service)
+        .await;
+    if let Err(error) = served {
+        debug!(%error, "a connection for questions broke off");
+    }
+}
+
+impl Site {
+    async fn answer(&self, request: Request<Incoming>) -> Result<Response<Full<Bytes>>, Refusal> {
+        is_local(&request)?;
+        let path = request.uri().path().to_owned();
+        if path == "/sparql" {
+            return self.sparql(request).await;
+        }
+        if request.method() != Method::GET {
+            return Err(Refusal::method("GET"));
+        }
+        let pairs = form(request.uri().query().unwrap_or_default())?;
+        match path.as_str() {
+            "/ask" => Ok(json_page(&catalogue())),
+            "/graphs" => Ok(json_page(
+                &json!({ "graphs": self.queries.knowledge().sources() }),
+            )),
+            "/data" => self.data(&pairs),
+            path => match path.strip_prefix("/ask/") {
+                Some(name) => self.question(name, pairs, accepted(&request)).await,
+                None => match (self.page)(path) {
+                    Some(page) => Ok(content(JSON, page.into_bytes())),
+                    None => Err(Refusal::unknown(
+                        "there are /sparql, /ask, /ask/NAME, /graphs, /data and /status here"
+                            .to_owned(),
+                    )),
+                },
+            },
+        }
+    }
+
+    async fn sparql(&self, request: Request<Incoming>) -> Result<Response<Full<Bytes>>, Refusal> {
+        let formats = Formats::of(&accepted(&request));
+        let mut pairs = form(request.uri().query().unwrap_or_default())?;
+        if request.method() == Method::POST {
+            let media = request
+                .headers()
+                .get(CONTENT_TYPE)
+                .and_then(|media| media.to_str().ok())
+                .unwrap_or_default();
+            let media = media
+                .split(';')
+                .next()
+                .unwrap_or_default()
+                .trim()
+                .to_ascii_lowercase();
+            let most = self.queries.limits().query;
+            match media.as_str() {
+                "application/sparql-query" => {
+                    pairs.push(("query".to_owned(), body(request, most).await?))
+                }
+                // Three bytes for each that is escaped.
+                "application/x-www-form-urlencoded" => {
+                    pairs.extend(form(&body(request, most.saturating_mul(3)).await?)?)
+                }
+                "application/sparql-update" => return Err(QueryFault::NotAQuery.into()),
+                _ => {
+                    let message = "a query is POSTed as application/sparql-query, or as query= in application/x-www-form-urlencoded";
+                    return Err(Refusal::new(
+                        StatusCode::UNSUPPORTED_MEDIA_TYPE,
+                        "media_type",
+                        message,
+                    ));
+                }
+            }
+        } else if request.method() != Method::GET {
+            return Err(Refusal::method("GET, POST"));
+        }
+        let mut query = None;
+        let mut dataset = Dataset::default();
+        for (key, value) in pairs {
+            match key.as_str() {
+                "query" if query.is_some() => {
+                    return Err(Refusal::malformed(
+                        "there are two queries, and one is answered",
+                    ));
+                }
+                "query" => query = Some(value),
+                "default-graph-uri" => dataset.default.push(value),
+                "named-graph-uri" => dataset.named.push(value),
+                "update" => return Err(QueryFault::NotAQuery.into()),
+                _ => {}
+            }
+        }
+        if dataset.default.len() + dataset.named.len() > MAX_GRAPHS {
+            return Err(Refusal::malformed("there are too many graphs"));
+        }
+        let query =
+            query.ok_or_else(|| Refusal::malformed("there is no query: give it as query="))?;
+        self.found(Asked::Sparql(query, dataset, formats)).await
+    }
+
+    async fn question(
+        &self,
+        name: &str,
+        pairs: Vec<(String, String)>,
+        accepted: Vec<String>,
+    ) -> Result<Response<Full<Bytes>>, Refusal> {
+        if let Some(name) = name.strip_suffix(".rq") {
+            return Ok(content(
+                "application/sparql-query",
+                Question::of(name)?.sparql.as_bytes().to_vec(),
+            ));
+        }
+        let question = Question::of(name)?;
+        let sparql = question.with(&pairs)?;
+        let formats = Formats::of(&accepted);
+        let is_standard = accepted
+            .iter()
+            .any(|media| QueryResultsFormat::from_media_type(media).is_some() && media != JSON);
+        let asked = if is_standard {
+            Asked::Sparql(sparql, Dataset::default(), formats)
+        } else {
+            Asked::Question(question, sparql)
+        };
+        self.found(asked).await
+    }
+
+    async fn found(&self, asked: Asked) -> Result<Response<Full<Bytes>>, Refusal> {
+        match self.queries.run(asked).await? {
+            Results::Written(media, bytes) => Ok(content(media, bytes)),
+            Results::Answer(answer) => Ok(json_page(&json!(answer))),
+        }
+    }
+
+    fn data(&self, pairs: &[(String, String)]) -> Result<Response<Full<Bytes>>, Refusal> {
+        let graph = pairs
+            .iter()
+            .find(|(key, _)| key == "graph")
+            .map(|(_, graph)| graph.as_str());
+        let mut quads = Vec::new();
+        match self.queries.knowledge().write_quads(graph, &mut quads) {
+            Ok(Some(())) => Ok(content("application/n-quads", quads)),
+            Ok(None) => Err(Refusal::unknown(
+                "there is no such graph; /graphs has those there are".to_owned(),
+            )),
+            Err(error) => Err(Refusal::new(
+                StatusCode::INTERNAL_SERVER_ERROR,
+                "failed",
+                &error.to_string(),
+            )),
+        }
+    }
+}
+
+impl Formats {
+    /// The first that is accepted of each kind; JSON and N-Triples where all is.
+    fn of(accepted: &[String]) -> Self {
+        let is_any = accepted.is_empty()
+            || accepted
+                .iter()
+                .any(|media| matches!(media.as_str(), "*/*" | "application/*"));
+        let solutions = accepted
+            .iter()
+            .find_map(|media| QueryResultsFormat::from_media_type(media));
+        let triples = accepted
+            .iter()
+            .find_map(|media| RdfFormat::from_media_type(media));
+        Self {
+            solutions: solutions.or_else(|| is_any.then_some(QueryResultsFormat::Json)),
+            triples: triples.or_else(|| is_any.then_some(RdfFormat::NTriples)),
+        }
+    }
+}
+
+/// Why a request is not answered.
+#[derive(Debug)]
+struct Refusal {
+    status: StatusCode,
+    code: &'static str,
+    message: String,
+    allow: Option<&'static str>,
+}
+
+impl Refusal {
+    fn new(status: StatusCode, code: &'static str, message: &str) -> Self {
+        Self {
+            status,
+            code,
+            message: message.to_owned(),
+            allow: None,
+        }
+    }
+
+    fn malformed(message: &str) -> Self {
+        Self::new(StatusCode::BAD_REQUEST, "malformed", message)
+    }
+
+    fn unknown(message: String) -> Self {
+        Self::new(StatusCode::NOT_FOUND, "unknown", &message)
+    }
+
+    fn method(allowed: &'static str) -> Self {
+        let message = format!("this is asked for by {allowed}");
+        Self {
+            allow: Some(allowed),
+            ..Self::new(StatusCode::METHOD_NOT_ALLOWED, "method", &message)
+        }
+    }
+
+    fn response(self) -> Response<Full<Bytes>> {
+        let page = json!({ "error": self.code, "message": self.message });
+        let mut response = json_page(&page);
+        *response.status_mut() = self.status;
+        if let Some(allow) = self.allow {
+            response
+                .headers_mut()
+                .insert(ALLOW, HeaderValue::from_static(allow));
+        }
+        if self.status == StatusCode::SERVICE_UNAVAILABLE {
+            response
+                .headers_mut()
+                .insert(RETRY_AFTER, HeaderValue::from_static("1"));
+        }
+        response
+    }
+}
+
+impl From<QueryFault> for Refusal {
+    fn from(fault: QueryFault) -> Self {
+        let (status, code) = match &fault {
+            QueryFault::Malformed(_) | QueryFault::Graph(_) => {
+                (StatusCode::BAD_REQUEST, "malformed")
+            }
+            QueryFault::NotAQuery => (StatusCode::BAD_REQUEST, "not_a_query"),
+            QueryFault::Service => (StatusCode::BAD_REQUEST, "service"),
+            QueryFault::TooComplex(_) => (StatusCode::BAD_REQUEST, "too_complex"),
+            QueryFault::TooLong { .. } => (StatusCode::PAYLOAD_TOO_LARGE, "too_large"),
+            QueryFault::Time { .. } => (StatusCode::SERVICE_UNAVAILABLE, "time_limit"),
+            QueryFault::Memory { .. } => (StatusCode::INSUFFICIENT_STORAGE, "memory_limit"),
+            QueryFault::Busy(_) => (StatusCode::SERVICE_UNAVAILABLE, "busy"),
+            QueryFault::Result { .. } => (StatusCode::INSUFFICIENT_STORAGE, "result_limit"),
+            QueryFault::NotAcceptable(_) => (StatusCode::NOT_ACCEPTABLE, "not_acceptable"),
+            QueryFault::Failed(_) => (StatusCode::INTERNAL_SERVER_ERROR, "failed"),
+        };
+        Self::new(status, code, &fault.to_string())
+    }
+}
+
+impl From<QuestionFault> for Refusal {
+    fn from(fault: QuestionFault) -> Self {
+        match &fault {
+            QuestionFault::Unknown { .. } => Self::unknown(fault.to_string()),
+            QuestionFault::Parameter { .. } | QuestionFault::Iri { .. } => {
+                Self::malformed(&fault.to_string())
+            }
+            QuestionFault::Sparql { .. } => Self::new(
+                StatusCode::INTERNAL_SERVER_ERROR,
+                "failed",
+                &fault.to_string(),
+            ),
+        }
+    }
+}
+
+/// A page of another site in somebody's browser reaches loopback by a name that leads there; only names of loopback are served.
+fn is_local(request: &Request<Incoming>) -> Result<(), Refusal> {
+    let Some(host) = request.headers().get(HOST) else {
+        return Ok(());
+    };
+    let host = host.to_str().unwrap_or_default();
+    let name = match host.rsplit_once(':') {
+        Some((name, port)) if port.bytes().all(|byte| byte.is_ascii_digit()) => name,
+        _ => host,
+    };
+    let name = name.trim_start_matches('[').trim_end_matches(']');
+    let is_local = name == "localhost"
+        || name
+            .parse::<IpAddr>()
+            .is_ok_and(|address| address.is_loopback());
+    if is_local {
+        Ok(())
+    } else {
+        Err(Refusal::new(
+            StatusCode::MISDIRECTED_REQUEST,
+            "host",
+            "questions are answered on loopback, by 127.0.0.1, [::1] or localhost",
+        ))
+    }
+}
+
+/// The media types that are accepted, in their order, without those that are refused (q=0).
+fn accepted(request: &Request<Incoming>) -> Vec<String> {
+    let all = request
+        .headers()
+        .get_all(ACCEPT)
+        .iter()
+        .filter_map(|accept| accept.to_str().ok());
+    let ranges = all.flat_map(|accept| accept.split(',')).take(MAX_MEDIA);
+    ranges
+        .filter(|range| {
+            !range
+                .split(';')
+                .skip(1)
+                .any(|parameter| matches!(parameter.trim(), "q=0" | "q=0.0"))
+        })
+        .filter_map(|range| range.split(';').next())
+        .map(|media| media.trim().to_ascii_lowercase())
+        .filter(|media| !media.is_empty())
+        .collect()
+}
+
+async fn body(request: Request<Incoming>, most: usize) -> Result<String, Refusal> {
+    let body = tokio::time::timeout(BODY_TIME, Limited::new(request.into_body(), most).collect());
+    let body = body.await.map_err(|_late| {
+        Refusal::new(
+            StatusCode::REQUEST_TIMEOUT,
+            "slow",
+            "the request took too long to come",
+        )
+    })?;
+    let bytes = match body {
+        Ok(body) => body.to_bytes(),
+        Err(error) if error.is::<LengthLimitError>() => {
+            return Err(QueryFault::TooLong { most }.into());
+        }
+        Err(_) => return Err(Refusal::malformed("the request broke off")),
+    };
+    String::from_utf8(bytes.into()).map_err(|_| Refusal::malformed("the request is not in UTF-8"))
+}
+
+/// The pairs of a form or of the query of a URL.
+fn form(text: &str) -> Result<Vec<(String, String)>, Refusal> {
+    let pairs: Vec<&str> = text.split('&').filter(|pair| !pair.is_empty()).collect();
+    if pairs.len() > MAX_PAIRS {
+        return Err(Refusal::malformed("there are too many parameters"));
+    }
+    let pair = |pair: &&str| {
+        let (key, value) = pair.split_once('=').unwrap_or((pair, ""));
+        Some((unescaped(key)?, unescaped(value)?))
+    };
+    let pairs: Option<Vec<_>> = pairs.iter().map(pair).collect();
+    pairs.ok_or_else(|| Refusal::malformed("a parameter is not escaped as %XX of UTF-8"))
+}
+
+fn unescaped(text: &str) -> Option<String> {
+    let mut bytes = Vec::with_capacity(text.len());
+    let mut rest = text.bytes();
+    while let Some(byte) = rest.next() {
+        bytes.push(match byte {
+            b'+' => b' ',
+            b'%' => {
+                let (high, low) = (digit(rest.next()?)?, digit(rest.next()?)?);
+                high << 4 | low
+            }
+            byte => byte,
+        });
+    }
+    String::from_utf8(bytes).ok()
+}
+
+fn digit(byte: u8) -> Option<u8> {
+    char::from(byte)
+        .to_digit(16)
+        .and_then(|digit| u8::try_from(digit).ok())
+}
+
+/// All questions with what they can be narrowed down by.
+fn catalogue() -> serde_json::Value {
+    let questions = QUESTIONS.iter().map(|question| {
+        json!({
+            "name": question.name,
+            "about": question.about(),
+            "parameters": question.parameters().collect::<Vec<_>>(),
+            "lists": question.lists().collect::<Vec<_>>(),
+        })
+    });
+    json!({ "questions": questions.collect::<Vec<_>>() })
+}
+
+fn json_page(page: &serde_json::Value) -> Response<Full<Bytes>> {
+    let mut text = page.to_string();
+    text.push('\n');
+    content(JSON, text.into_bytes())
+}
+
+fn content(media: &'static str, bytes: Vec<u8>) -> Response<Full<Bytes>> {
+    let mut response = Response::new(Full::new(bytes.into()));
+    response
+        .headers_mut()
+        .insert(CONTENT_TYPE, HeaderValue::from_static(media));
+    response
+}
+
+const JSON: &str = "application/json";
+const MAX_CONNECTIONS: usize = 64;
+const MAX_PAIRS: usize = 256;
+const MAX_GRAPHS: usize = 100;
+const MAX_MEDIA: usize = 32;
+const ACCEPT_AGAIN: Duration = Duration::from_millis(100);
+const HEADER_TIME: Duration = Duration::from_secs(5);
+const BODY_TIME: Duration = Duration::from_secs(5);
+/// Above the time of any query.
+const CONNECTION_TIME: Duration = Duration::from_secs(60);

@@ -1,0 +1,388 @@
+//! NodeSets (OPC 10000-6, annex F) as statements: types, what is above them, and the nodes that types declare.
+//!
+//! Of HasSubtype come direct `rdfs:subClassOf` statements; the store's rule makes the rest of them.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use mtp::{Object, Triple, escaped};
+use quick_xml::XmlVersion;
+use quick_xml::escape::resolve_predefined_entity;
+use quick_xml::events::{BytesStart, Event};
+use quick_xml::reader::Reader;
+use thiserror::Error;
+
+use crate::component::{NodeName, OPC_UA};
+use crate::vocabulary as v;
+
+/// A NodeSet that was read.
+#[derive(Debug, Clone, PartialEq)]
+pub struct NodeSet {
+    /// The URI of its model, which is that of its namespace.
+    pub namespace: String,
+    /// The version of its model; empty where none is told.
+    pub version: String,
+    /// What it says.
+    pub triples: Vec<Triple>,
+}
+
+/// Why a file is no NodeSet.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum NodeSetFault {
+    /// More than is read.
+    #[error("the file has {length} bytes, more than the {most} that are read")]
+    TooLarge {
+        /// What it has.
+        length: usize,
+        /// What is read.
+        most: usize,
+    },
+    /// It is not XML, or only half of it.
+    #[error("line {line}: {what}")]
+    Xml {
+        /// Where, counted from 1.
+        line: usize,
+        /// What is wrong.
+        what: String,
+    },
+    /// It is XML of something else.
+    #[error("there is no <UANodeSet> with a <Model ModelUri=..>: this is no NodeSet2")]
+    NoModel,
+}
+
+/// Reads the text of a NodeSet2 file.
+///
+/// # Errors
+/// [`NodeSetFault`].
+pub fn read(xml: &str) -> Result<NodeSet, NodeSetFault> {
+    if xml.len() > MAX_FILE {
+        return Err(NodeSetFault::TooLarge {
+            length: xml.len(),
+            most: MAX_FILE,
+        });
+    }
+    let xml = xml.trim_start_matches('\u{feff}');
+    let mut reader = Reader::from_str(xml);
+    reader.config_mut().expand_empty_elements = true;
+    let mut reading = Reading::default();
+    loop {
+        let event = reader.read_event();
+        let fault = |what: String| NodeSetFault::Xml {
+            line: line(xml, reader.buffer_position()),
+            what,
+        };
+        match event.map_err(|error| fault(error.to_string()))? {
+            Event::Start(start) => reading.open(&start).map_err(fault)?,
+            Event::End(_) => reading.close(),
+            Event::Text(text) => reading.text.push_str(&text.xml10_content()),
+            Event::CData(text) => reading.text.push_str(&text.xml10_content()),
+            Event::GeneralRef(reference) => {
+                let name = reference.xml10_content();
+                match (
+                    reference.resolve_char_ref().ok().flatten(),
+                    resolve_predefined_entity(&name),
+                ) {
+                    (Some(character), _) => reading.text.push(character),
+                    (None, Some(text)) => reading.text.push_str(text),
+                    (None, None) => return Err(fault(format!("XML has no entity &{name};"))),
+                }
+            }
+            Event::DocType(_) => {
+                return Err(fault(
+                    "a NodeSet has no document type; remove the <!DOCTYPE ..>".to_owned(),
+                ));
+            }
+            Event::Eof if reading.open.is_empty() => break,
+            Event::Eof => return Err(fault("the file ends in the middle".to_owned())),
+            Event::Empty(_) | Event::Comment(_) | Event::Decl(_) | Event::PI(_) => {}
+        }
+    }
+    reading.finish().ok_or(NodeSetFault::NoModel)
+}
+
+#[derive(Debug, Default)]
+struct Reading {
+    /// The names of the elements that are open.
+    open: Vec<String>,
+    text: String,
+    namespaces: Vec<String>,
+    aliases: BTreeMap<String, String>,
+    model: Option<(String, String)>,
+    nodes: Vec<UaNode>,
+    alias: String,
+    reference: (String, bool),
+}
+
+#[derive(Debug, Default)]
+struct UaNode {
+    class: String,
+    id: String,
+    browse_name: String,
+    is_abstract: bool,
+    label: String,
+    comment: String,
+    /// Reference type, whether forward, target; as written.
+    references: Vec<(String, bool, String)>,
+}
+
+impl Reading {
+    fn open(&mut self, start: &BytesStart<'_>) -> Result<(), String> {
+        if self.open.len() >= MAX_DEPTH {
+            return Err(format!("elements nest more than {MAX_DEPTH} deep"));
+        }
+        let text = |name: &str| -> Result<String, String> {
+            let attribute = start
+                .try_get_attribute(name)
+                .map_err(|error| error.to_string())?;
+            let Some(attribute) = attribute else {
+                return Ok(String::new());
+            };
+            let value = attribute
+                .normalized_value(XmlVersion::Implicit1_0)
+                .map_err(|error| error.to_string())?;
+            Ok(value.into_owned())
+        };
+        let name = start.local_name().into_inner().to_owned();
+        match (self.open.len(), name.as_str()) {
+            (1, class) if CLASSES.contains(&class) => {
+                if self.nodes.len() >= MAX_NODES {
+                    return Err(format!("there are more than {MAX_NODES} nodes"));
+                }
+                self.nodes.push(UaNode {
+                    class: class.trim_start_matches("UA").to_owned(),
+                    id: text("NodeId")?,
+                    browse_name: text("BrowseName")?,
+                    is_abstract: text("IsAbstract")? == "true",
+                    ..UaNode::default()
+                });
+            }
+            (2, "Model") if self.model.is_none() => {
+                self.model = Some((text("ModelUri")?, text("Version")?))
+            }
+            (2, "Alias") => self.alias = text("Alias")?,
+            (3, "Reference") => {
+                self.reference = (text("ReferenceType")?, text("IsForward")? != "false")
+            }
+            _ => {}
+        }
+        self.text.clear();
+        self.open.push(name);
+        Ok(())
+    }
+
+    fn close(&mut self) {
+        let path: Vec<&str> = self.open.iter().map(String::as_str).collect();
+        let text = self.text.trim();
+        match path.as_slice() {
+            ["UANodeSet", "NamespaceUris", "Uri"] => self.namespaces.push(text.to_owned()),
+            ["UANodeSet", "Aliases", "Alias"] => {
+                drop(self.aliases.insert(self.alias.clone(), text.to_owned()))
+            }
+            ["UANodeSet", _, "References", "Reference"] => {
+                let (reference, is_forward) = self.reference.clone();
+                if let Some(node) = self.nodes.last_mut() {
+                    node.references
+                        .push((reference, is_forward, text.to_owned()));
+                }
+            }
+            ["UANodeSet", class, "DisplayName"] if CLASSES.contains(class) => {
+                if let Some(node) = self.nodes.last_mut().filter(|node| node.label.is_empty()) {
+                    text.clone_into(&mut node.label);
+                }
+            }
+            ["UANodeSet", class, "Description"] if CLASSES.contains(class) => {
+                if let Some(node) = self.nodes.last_mut().filter(|node| node.comment.is_empty()) {
+                    text.clone_into(&mut node.comment);
+                }
+            }
+            _ => {}
+        }
+        self.text.clear();
+        self.open.pop();
+    }
+
+    /// A node as the file writes it, with an alias or an index of its namespace table.
+    fn node(&self, written: &str) -> Option<NodeName> {
+        let written = self.aliases.get(written).map_or(written, String::as_str);
+        let (namespace, identifier) = match written.strip_prefix("ns=") {
+            Some(rest) => {
+                let (index, identifier) = rest.split_once(';')?;
+                (self.namespace(index.parse().ok()?)?, identifier)
+            }
+            None => (OPC_UA, written),
+        };
+        identifier.contains('=').then(|| NodeName {
+            namespace: namespace.to_owned(),
+            identifier: identifier.to_owned(),
+        })
+    }
+
+    fn namespace(&self, index: usize) -> Option<&str> {
+        match index.checked_sub(1) {
+            None => Some(OPC_UA),
+            Some(index) => self.namespaces.get(index).map(String::as_str),
+        }
+    }
+
+    fn finish(self) -> Option<NodeSet> {
+        let (namespace, version) = self.model.clone().filter(|(uri, _)| !uri.is_empty())?;
+        let mut graph = Graph {
+            reading: &self,
+            all: Vec::new(),
+        };
+        let iri = format!("urn:ua-bridge:nodeset:{}", escaped(&namespace));
+        graph.link(&iri, v::RDF_TYPE, v::NODE_SET);
+        graph.text(&iri, v::RDFS_LABEL, &namespace);
+        if !version.is_empty() {
+            graph.text(&iri, v::MODEL_VERSION, &version);
+        }
+        graph.nodes();
+        let triples = graph.all;
+        Some(NodeSet {
+            namespace,
+            version,
+            triples,
+        })
+    }
+}
+
+struct Graph<'a> {
+    reading: &'a Reading,
+    all: Vec<Triple>,
+}
+
+impl Graph<'_> {
+    fn nodes(&mut self) {
+        let reading = self.reading;
+        let mut below: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+        let mut by_iri = BTreeMap::new();
+        for node in &reading.nodes {
+            let Some(name) = reading.node(&node.id) else {
+                continue;
+            };
+            let iri = name.iri();
+            for (reference, is_forward, target) in &node.references {
+                let (Some(reference), Some(target)) =
+                    (reading.node(reference), reading.node(target))
+                else {
+                    continue;
+                };
+                let target = target.iri();
+                let (from, to) = if *is_forward {
+                    (iri.clone(), target)
+                } else {
+                    (target, iri.clone())
+                };
+                match (reference.namespace.as_str(), reference.identifier.as_str()) {
+                    (OPC_UA, HAS_SUBTYPE) => self.link(&to, v::RDFS_SUB_CLASS_OF, &from),
+                    (OPC_UA, HAS_PROPERTY | HAS_COMPONENT | HAS_ORDERED_COMPONENT) => {
+                        below.entry(from).or_default().insert(to);
+                    }
+                    _ => {}
+                }
+            }
+            by_iri.insert(iri, (name, node));
+        }
+        let mut waiting: Vec<&str> = Vec::new();
+        for (iri, (name, node)) in &by_iri {
+            if node.is_type() {
+                self.link(iri, v::RDF_TYPE, v::RDFS_CLASS);
+                self.link(iri, v::RDFS_SUB_CLASS_OF, iri);
+                self.say(iri, v::IS_ABSTRACT, Object::Boolean(node.is_abstract));
+                self.about(iri, name, node);
+                waiting.push(iri);
+            }
+        }
+        // What types declare, and what that holds.
+        let mut told = BTreeSet::new();
+        while let Some(iri) = waiting.pop() {
+            for child in below.get(iri).into_iter().flatten() {
+                let Some((child, (name, node))) = by_iri.get_key_value(child) else {
+                    continue;
+                };
+                if node.is_type() {
+                    continue;
+                }
+                self.link(iri, v::DECLARES, child);
+                if told.insert(child) {
+                    self.link(child, v::RDF_TYPE, v::NODE);
+                    self.about(child, name, node);
+                    waiting.push(child);
+                }
+            }
+        }
+    }
+
+    fn about(&mut self, iri: &str, name: &NodeName, node: &UaNode) {
+        let browse_name = match node.browse_name.split_once(':') {
+            Some((index, rest)) if index.bytes().all(|byte| byte.is_ascii_digit()) => rest,
+            _ => &node.browse_name,
+        };
+        self.text(iri, v::NODE_CLASS, &node.class);
+        self.text(iri, v::BROWSE_NAME, browse_name);
+        self.text(iri, v::NODE_NAMESPACE, &name.namespace);
+        self.text(iri, v::NODE_IDENTIFIER, &name.identifier);
+        self.text(iri, v::NODE_ID, &name.id());
+        self.text(
+            iri,
+            v::RDFS_LABEL,
+            if node.label.is_empty() {
+                browse_name
+            } else {
+                &node.label
+            },
+        );
+        if !node.comment.is_empty() {
+            self.text(iri, v::RDFS_COMMENT, &node.comment);
+        }
+    }
+
+    fn link(&mut self, subject: &str, predicate: &str, object: &str) {
+        self.say(subject, predicate, Object::Iri(object.to_owned()));
+    }
+
+    fn text(&mut self, subject: &str, predicate: &str, text: &str) {
+        self.say(subject, predicate, Object::Text(text.to_owned()));
+    }
+
+    fn say(&mut self, subject: &str, predicate: &str, object: Object) {
+        self.all.push(Triple {
+            subject: subject.to_owned(),
+            predicate: predicate.to_owned(),
+            object,
+        });
+    }
+}
+
+impl UaNode {
+    fn is_type(&self) -> bool {
+        self.class.ends_with("Type")
+    }
+}
+
+fn line(file: &str, position: u64) -> usize {
+    let position = usize::try_from(position)
+        .unwrap_or(usize::MAX)
+        .min(file.len());
+    let before = file.as_bytes().get(..position).unwrap_or_default();
+    before.iter().filter(|byte| **byte == b'\n').count() + 1
+}
+
+const CLASSES: &[&str] = &[
+    "UAObjectType",
+    "UAVariableType",
+    "UADataType",
+    "UAReferenceType",
+    "UAObject",
+    "UAVariable",
+    "UAMethod",
+];
+const HAS_SUBTYPE: &str = "i=45";
+const HAS_PROPERTY: &str = "i=46";
+const HAS_COMPONENT: &str = "i=47";
+const HAS_ORDERED_COMPONENT: &str = "i=49";
+
+/// The largest that is published has 13 MB.
+const MAX_FILE: usize = 64 << 20;
+const MAX_DEPTH: usize = 64;
+const MAX_NODES: usize = 200_000;

@@ -1,0 +1,427 @@
+//! Any query, within limits of time, memory, size and number.
+//!
+//! Each query has a thread of its own: the evaluator does not give way, and a parser that nests needs a stack. A query whose
+//! time is over is cancelled, answered with that, and keeps its place until its thread has ended.
+
+use std::io::{self, Write};
+use std::sync::Arc;
+use std::time::Duration;
+
+use oxigraph::io::{RdfFormat, RdfSerializer};
+use oxigraph::model::{GraphName, NamedNode};
+use oxigraph::sparql::results::{QueryResultsFormat, QueryResultsSerializer};
+use oxigraph::sparql::{
+    CancellationToken, QueryEvaluationError, QueryResults, QuerySolutionIter, QueryTripleIter,
+    SparqlEvaluator,
+};
+use spargebra::SparqlParser;
+use thiserror::Error;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, oneshot};
+
+use crate::bounds;
+use crate::question::{Answer, Question};
+use crate::store::Knowledge;
+
+/// How much one query may take.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Limits {
+    /// Its time.
+    pub time: Duration,
+    /// How many run at a time.
+    pub parallel: usize,
+    /// Rows or statements of a result.
+    pub rows: usize,
+    /// Bytes of a result.
+    pub bytes: usize,
+    /// Bytes of a query.
+    pub query: usize,
+    /// By how many bytes the program may become larger while it runs.
+    pub memory: u64,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            time: Duration::from_secs(10),
+            parallel: 4,
+            rows: 100_000,
+            bytes: 16 << 20,
+            query: 16 << 10,
+            memory: 512 << 20,
+        }
+    }
+}
+
+/// What a query is asked of: `default-graph-uri` and `named-graph-uri` of the SPARQL protocol. Empty: all there is.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub(crate) struct Dataset {
+    /// What the default graph is made of.
+    pub(crate) default: Vec<String>,
+    /// The named graphs.
+    pub(crate) named: Vec<String>,
+}
+
+/// How results are to be written; where there is nothing, that kind of result is not wanted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Formats {
+    /// SELECT and ASK.
+    pub(crate) solutions: Option<QueryResultsFormat>,
+    /// CONSTRUCT and DESCRIBE.
+    pub(crate) triples: Option<RdfFormat>,
+}
+
+/// What a query found.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Results {
+    /// SELECT, ASK, CONSTRUCT and DESCRIBE, with the media type of what is written there.
+    Written(&'static str, Vec<u8>),
+    /// A named question.
+    Answer(Answer),
+}
+
+/// Why a query has no result.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub(crate) enum QueryFault {
+    /// It is no SPARQL.
+    #[error("the query cannot be read: {0}")]
+    Malformed(String),
+    /// It is an update.
+    #[error(
+        "only SELECT, ASK, CONSTRUCT and DESCRIBE are answered; what is known is changed by its sources alone"
+    )]
+    NotAQuery,
+    /// It asks another server.
+    #[error("SERVICE is not answered: no other server is asked from here")]
+    Service,
+    /// A name of a graph is no IRI.
+    #[error("`{0}` is no IRI of a graph")]
+    Graph(String),
+    /// It is too long.
+    #[error("the query has more than {most} bytes")]
+    TooLong {
+        /// What is read.
+        most: usize,
+    },
+    /// It would not end, or not in this memory.
+    #[error("the query is not run: {0}")]
+    TooComplex(String),
+    /// Its time is over.
+    #[error("the query took longer than {} s and was stopped; narrow it down", limit.as_secs_f64())]
+    Time {
+        /// What it had.
+        limit: Duration,
+    },
+    /// It took too much memory.
+    #[error("the query took more than {} MiB of memory and was stopped; narrow it down", limit >> 20)]
+    Memory {
+        /// What it had.
+        limit: u64,
+    },
+    /// Too many run.
+    #[error("{0} queries run at this time, and no more are taken; ask again")]
+    Busy(usize),
+    /// It found too much.
+    #[error("the result is larger than {rows} rows or {bytes} bytes; add a LIMIT")]
+    Result {
+        /// Rows it may have.
+        rows: usize,
+        /// Bytes it may have.
+        bytes: usize,
+    },
+    /// Nobody wants results of this kind.
+    #[error("no format that is accepted can hold the result of {0}")]
+    NotAcceptable(&'static str),
+    /// The evaluator gave up.
+    #[error("the query fails: {0}")]
+    Failed(String),
+}
+
+/// What is asked.
+#[derive(Debug, Clone)]
+pub(crate) enum Asked {
+    /// A query from outside.
+    Sparql(String, Dataset, Formats),
+    /// A question with its parameters in it, to be answered as plain JSON.
+    Question(Question, String),
+}
+
+/// The queries that run.
+#[derive(Debug, Clone)]
+pub(crate) struct Queries {
+    knowledge: Arc<Knowledge>,
+    limits: Limits,
+    places: Arc<Semaphore>,
+}
+
+impl Queries {
+    pub(crate) fn new(knowledge: Arc<Knowledge>, limits: Limits) -> Self {
+        Self {
+            knowledge,
+            limits,
+            places: Arc::new(Semaphore::new(limits.parallel)),
+        }
+    }
+
+    pub(crate) fn limits(&self) -> Limits {
+        self.limits
+    }
+
+    pub(crate) fn knowledge(&self) -> &Arc<Knowledge> {
+        &self.knowledge
+    }
+
+    /// Runs a query. Dropping the future stops it.
+    pub(crate) async fn run(&self, asked: Asked) -> Result<Results, QueryFault> {
+        let limits = self.limits;
+        if let Asked::Sparql(query, ..) = &asked
+            && query.len() > limits.query
+        {
+            return Err(QueryFault::TooLong { most: limits.query });
+        }
+        let busy = QueryFault::Busy(limits.parallel);
+        let place = Arc::clone(&self.places)
+            .try_acquire_owned()
+            .map_err(|_none| busy.clone())?;
+        let running = Stopping(CancellationToken::new());
+        let (tell, mut told) = oneshot::channel();
+        let work = Work {
+            knowledge: Arc::clone(&self.knowledge),
+            asked,
+            limits,
+            token: running.0.clone(),
+        };
+        let thread = std::thread::Builder::new()
+            .name("sparql".to_owned())
+            .stack_size(STACK);
+        let started = thread.spawn(move || {
+            let _place: OwnedSemaphorePermit = place;
+            // Nobody may be left who waits.
+            let _told = tell.send(work.run());
+        });
+        if started.is_err() {
+            return Err(busy);
+        }
+        let before = resident();
+        let mut looks = tokio::time::interval(LOOK);
+        let over = tokio::time::sleep(limits.time);
+        tokio::pin!(over);
+        loop {
+            tokio::select! {
+                result = &mut told => {
+                    return result.unwrap_or_else(|_gone| Err(QueryFault::Failed("its thread ended".to_owned())));
+                }
+                () = &mut over => return Err(QueryFault::Time { limit: limits.time }),
+                _ = looks.tick() => {
+                    if let (Some(before), Some(now)) = (before, resident())
+                        && now.saturating_sub(before) > limits.memory
+                    {
+                        return Err(QueryFault::Memory { limit: limits.memory });
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Stops the query when nobody waits for it any more.
+struct Stopping(CancellationToken);
+
+impl Drop for Stopping {
+    fn drop(&mut self) {
+        self.0.cancel();
+    }
+}
+
+struct Work {
+    knowledge: Arc<Knowledge>,
+    asked: Asked,
+    limits: Limits,
+    token: CancellationToken,
+}
+
+impl Work {
+    fn run(self) -> Result<Results, QueryFault> {
+        let evaluator = SparqlEvaluator::new().with_cancellation_token(self.token.clone());
+        let (text, dataset) = match &self.asked {
+            Asked::Sparql(text, dataset, _) => (text, dataset.clone()),
+            Asked::Question(_, text) => (text, Dataset::default()),
+        };
+        bounds::nests(text)?;
+        let query = match SparqlParser::new().parse_query(text) {
+            Ok(query) => query,
+            Err(_)
+                if SparqlParser::new()
+                    .parse_update(text)
+                    .is_ok_and(|update| !update.operations.is_empty()) =>
+            {
+                return Err(QueryFault::NotAQuery);
+            }
+            Err(error) => return Err(QueryFault::Malformed(error.to_string())),
+        };
+        bounds::check(&query)?;
+        let mut prepared = evaluator.for_query(query);
+        if !dataset.default.is_empty() || !dataset.named.is_empty() {
+            let graphs = |names: &[String]| {
+                names
+                    .iter()
+                    .map(|name| NamedNode::new(name).map_err(|_| QueryFault::Graph(name.clone())))
+                    .collect::<Result<Vec<_>, _>>()
+            };
+            let default = graphs(&dataset.default)?
+                .into_iter()
+                .map(GraphName::from)
+                .collect();
+            let named = graphs(&dataset.named)?
+                .into_iter()
+                .map(Into::into)
+                .collect();
+            // What the protocol says wins over FROM in the query.
+            prepared.dataset_mut().set_default_graph(default);
+            prepared.dataset_mut().set_available_named_graphs(named);
+        }
+        let results = prepared
+            .on_store(self.knowledge.store())
+            .execute()
+            .map_err(|error| self.fault(&error))?;
+        match (results, &self.asked) {
+            (QueryResults::Solutions(solutions), Asked::Question(question, _)) => question
+                .answer(solutions)
+                .map(Results::Answer)
+                .map_err(|error| self.fault(&error)),
+            (QueryResults::Solutions(solutions), Asked::Sparql(.., formats)) => self.solutions(
+                solutions,
+                formats
+                    .solutions
+                    .ok_or(QueryFault::NotAcceptable("SELECT"))?,
+            ),
+            (QueryResults::Boolean(value), Asked::Sparql(.., formats)) => {
+                let format = formats.solutions.ok_or(QueryFault::NotAcceptable("ASK"))?;
+                let written = QueryResultsSerializer::from_format(format)
+                    .serialize_boolean_to_writer(Vec::new(), value);
+                written
+                    .map(|bytes| Results::Written(format.media_type(), bytes))
+                    .map_err(|error| self.broken(&error))
+            }
+            (QueryResults::Graph(triples), Asked::Sparql(.., formats)) => self.triples(
+                triples,
+                formats
+                    .triples
+                    .ok_or(QueryFault::NotAcceptable("CONSTRUCT"))?,
+            ),
+            (QueryResults::Boolean(_) | QueryResults::Graph(_), Asked::Question(question, _)) => {
+                Err(QueryFault::Failed(format!(
+                    "the question `{}` is no SELECT",
+                    question.name
+                )))
+            }
+        }
+    }
+
+    fn solutions(
+        &self,
+        solutions: QuerySolutionIter<'_>,
+        format: QueryResultsFormat,
+    ) -> Result<Results, QueryFault> {
+        let to = Bounded {
+            bytes: Vec::new(),
+            most: self.limits.bytes,
+        };
+        let variables = solutions.variables().to_vec();
+        let mut writer = QueryResultsSerializer::from_format(format)
+            .serialize_solutions_to_writer(to, variables)
+            .map_err(|error| self.broken(&error))?;
+        for (solution, row) in solutions.zip(0..) {
+            let solution = solution.map_err(|error| self.fault(&error))?;
+            if row >= self.limits.rows {
+                return Err(self.too_much());
+            }
+            writer
+                .serialize(&solution)
+                .map_err(|error| self.broken(&error))?;
+        }
+        let to = writer.finish().map_err(|error| self.broken(&error))?;
+        Ok(Results::Written(format.media_type(), to.bytes))
+    }
+
+    fn triples(
+        &self,
+        triples: QueryTripleIter<'_>,
+        format: RdfFormat,
+    ) -> Result<Results, QueryFault> {
+        let mut to = RdfSerializer::from_format(format).for_writer(Bounded {
+            bytes: Vec::new(),
+            most: self.limits.bytes,
+        });
+        for (triple, row) in triples.zip(0..) {
+            let triple = triple.map_err(|error| self.fault(&error))?;
+            if row >= self.limits.rows {
+                return Err(self.too_much());
+            }
+            to.serialize_triple(&triple)
+                .map_err(|error| self.broken(&error))?;
+        }
+        let to = to.finish().map_err(|error| self.broken(&error))?;
+        Ok(Results::Written(format.media_type(), to.bytes))
+    }
+
+    fn fault(&self, error: &QueryEvaluationError) -> QueryFault {
+        if self.token.is_cancelled() {
+            QueryFault::Time {
+                limit: self.limits.time,
+            }
+        } else {
+            QueryFault::Failed(error.to_string())
+        }
+    }
+
+    fn broken(&self, error: &io::Error) -> QueryFault {
+        if error.kind() == io::ErrorKind::FileTooLarge {
+            self.too_much()
+        } else {
+            QueryFault::Failed(error.to_string())
+        }
+    }
+
+    fn too_much(&self) -> QueryFault {
+        QueryFault::Result {
+            rows: self.limits.rows,
+            bytes: self.limits.bytes,
+        }
+    }
+}
+
+/// Takes no more than so many bytes.
+struct Bounded {
+    bytes: Vec<u8>,
+    most: usize,
+}
+
+impl Write for Bounded {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.bytes.len().saturating_add(bytes.len()) > self.most {
+            return Err(io::ErrorKind::FileTooLarge.into());
+        }
+        self.bytes.extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// The bytes of memory that this program has, where the system tells.
+fn resident() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status
+        .lines()
+        .find_map(|line| line.strip_prefix("VmRSS:"))?;
+    let kilobytes: u64 = line.split_whitespace().next()?.parse().ok()?;
+    Some(kilobytes << 10)
+}
+
+/// How often memory is looked at.
+const LOOK: Duration = Duration::from_millis(50);
+/// Only what is used of it is taken.
+const STACK: usize = 256 << 20;

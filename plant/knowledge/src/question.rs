@@ -1,0 +1,374 @@
+//! Named questions: SPARQL in files, and their answers as plain JSON.
+
+use std::collections::BTreeMap;
+
+use oxigraph::model::{Literal, NamedNode, Term};
+use oxigraph::sparql::{QueryEvaluationError, QueryResults, QuerySolutionIter, SparqlEvaluator};
+use serde::Serialize;
+use serde_json::Value;
+use thiserror::Error;
+
+use crate::store::Knowledge;
+
+/// A question with a name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Question {
+    /// Its name.
+    pub name: &'static str,
+    /// Its SPARQL, which can be asked as it stands anywhere. Lines that begin with `#:` say what is special about it.
+    pub sparql: &'static str,
+}
+
+/// The answer: rows in order, each with all columns.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Answer {
+    /// The name of the question.
+    pub question: String,
+    /// The names of the columns, in their order.
+    pub columns: Vec<String>,
+    /// The rows. A value is a text, a number, a truth value, nothing, or a list of texts.
+    pub rows: Vec<BTreeMap<String, Value>>,
+}
+
+/// Why a question has no answer.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum QuestionFault {
+    /// There is no question of this name.
+    #[error("there is no question `{name}`; there are {known}")]
+    Unknown {
+        /// What was asked for.
+        name: String,
+        /// What there is.
+        known: String,
+    },
+    /// The question has no such parameter.
+    #[error("`{question}` has no parameter `{parameter}`; {known}")]
+    Parameter {
+        /// The question.
+        question: &'static str,
+        /// What was given.
+        parameter: String,
+        /// What there is.
+        known: String,
+    },
+    /// A parameter is no IRI.
+    #[error("`{parameter}` is to be an IRI, and `{value}` is none: {why}")]
+    Iri {
+        /// The parameter.
+        parameter: String,
+        /// What was given.
+        value: String,
+        /// What is wrong with it.
+        why: String,
+    },
+    /// The question itself.
+    #[error("the question `{question}` cannot be asked: {why}")]
+    Sparql {
+        /// Which.
+        question: &'static str,
+        /// What is wrong with it.
+        why: String,
+    },
+}
+
+/// All questions, by their names.
+pub const QUESTIONS: &[Question] = &[
+    Question {
+        name: "candidates",
+        sparql: include_str!("../queries/candidates.rq"),
+    },
+    Question {
+        name: "commands",
+        sparql: include_str!("../queries/commands.rq"),
+    },
+    Question {
+        name: "components",
+        sparql: include_str!("../queries/components.rq"),
+    },
+    Question {
+        name: "parameters",
+        sparql: include_str!("../queries/parameters.rq"),
+    },
+    Question {
+        name: "processes",
+        sparql: include_str!("../queries/processes.rq"),
+    },
+    Question {
+        name: "run-steps",
+        sparql: include_str!("../queries/run-steps.rq"),
+    },
+    Question {
+        name: "runs",
+        sparql: include_str!("../queries/runs.rq"),
+    },
+    Question {
+        name: "skills",
+        sparql: include_str!("../queries/skills.rq"),
+    },
+    Question {
+        name: "sources",
+        sparql: include_str!("../queries/sources.rq"),
+    },
+    Question {
+        name: "types",
+        sparql: include_str!("../queries/types.rq"),
+    },
+    Question {
+        name: "what-can-run",
+        sparql: include_str!("../queries/what-can-run.rq"),
+    },
+    Question {
+        name: "where-is",
+        sparql: include_str!("../queries/where-is.rq"),
+    },
+    Question {
+        name: "who-provides",
+        sparql: include_str!("../queries/who-provides.rq"),
+    },
+];
+
+impl Question {
+    /// The question of a name.
+    ///
+    /// # Errors
+    /// [`QuestionFault::Unknown`].
+    pub fn of(name: &str) -> Result<Self, QuestionFault> {
+        let known = || {
+            QUESTIONS
+                .iter()
+                .map(|question| question.name)
+                .collect::<Vec<_>>()
+                .join(", ")
+        };
+        QUESTIONS
+            .iter()
+            .find(|question| question.name == name)
+            .copied()
+            .ok_or_else(|| QuestionFault::Unknown {
+                name: name.chars().take(100).collect(),
+                known: known(),
+            })
+    }
+
+    /// What it asks, in a sentence.
+    #[must_use]
+    pub fn about(self) -> &'static str {
+        self.told("about").next().unwrap_or_default()
+    }
+
+    /// The names of what it can be narrowed down by.
+    pub fn parameters(self) -> impl Iterator<Item = &'static str> {
+        self.told("parameter").chain(self.told("text"))
+    }
+
+    /// The columns that are lists of texts.
+    pub fn lists(self) -> impl Iterator<Item = &'static str> {
+        self.told("list").flat_map(str::split_whitespace)
+    }
+
+    /// Its SPARQL with values for some of its parameters.
+    ///
+    /// # Errors
+    /// [`QuestionFault::Parameter`] and [`QuestionFault::Iri`].
+    pub fn with(self, parameters: &[(String, String)]) -> Result<String, QuestionFault> {
+        let mut sparql = self.sparql.to_owned();
+        for (name, value) in parameters {
+            if !self.parameters().any(|known| known == name) {
+                let all: Vec<_> = self.parameters().collect();
+                return Err(QuestionFault::Parameter {
+                    question: self.name,
+                    parameter: name.chars().take(100).collect(),
+                    known: if all.is_empty() {
+                        "it has none".to_owned()
+                    } else {
+                        format!("it has {}", all.join(", "))
+                    },
+                });
+            }
+            let term: Term = if self.told("text").any(|text| text == name) {
+                Literal::new_simple_literal(value).into()
+            } else {
+                let why = |error: oxigraph::model::IriParseError| QuestionFault::Iri {
+                    parameter: name.clone(),
+                    value: value.chars().take(200).collect(),
+                    why: error.to_string(),
+                };
+                NamedNode::new(value).map_err(why)?.into()
+            };
+            // The printed form of a term has escapes for all that could end it.
+            sparql = sparql.replacen(
+                &format!("VALUES ?for_{name} {{ UNDEF }}"),
+                &format!("VALUES ?for_{name} {{ {term} }}"),
+                1,
+            );
+        }
+        Ok(sparql)
+    }
+
+    fn told(self, key: &'static str) -> impl Iterator<Item = &'static str> {
+        let lines = self
+            .sparql
+            .lines()
+            .filter_map(|line| line.strip_prefix("#: "));
+        lines.filter_map(move |line| line.strip_prefix(key)?.strip_prefix(' '))
+    }
+
+    /// Makes the answer of what was found. Stops with the first error, as of a cancelled question.
+    pub(crate) fn answer(
+        self,
+        solutions: QuerySolutionIter<'_>,
+    ) -> Result<Answer, QueryEvaluationError> {
+        let columns: Vec<String> = solutions
+            .variables()
+            .iter()
+            .map(|variable| variable.as_str().to_owned())
+            .collect();
+        let lists: Vec<&str> = self.lists().collect();
+        let mut rows = Vec::new();
+        for solution in solutions {
+            let solution = solution?;
+            let value = |column: &String| {
+                let term = solution.get(column.as_str());
+                if lists.contains(&column.as_str()) {
+                    list(term)
+                } else {
+                    plain(term)
+                }
+            };
+            rows.push(
+                columns
+                    .iter()
+                    .map(|column| (column.clone(), value(column)))
+                    .collect::<BTreeMap<_, _>>(),
+            );
+        }
+        rows.sort_by_cached_key(|row| {
+            columns
+                .iter()
+                .filter_map(|column| row.get(column))
+                .map(key)
+                .collect::<Vec<_>>()
+        });
+        Ok(Answer {
+            question: self.name.to_owned(),
+            columns,
+            rows,
+        })
+    }
+}
+
+impl Knowledge {
+    /// Asks a question in this thread, without a limit in time: for the questions of this crate, on what this crate let in.
+    ///
+    /// # Errors
+    /// [`QuestionFault`].
+    pub fn ask(
+        &self,
+        name: &str,
+        parameters: &[(String, String)],
+    ) -> Result<Answer, QuestionFault> {
+        let question = Question::of(name)?;
+        let sparql = question.with(parameters)?;
+        let fault = |why: String| QuestionFault::Sparql {
+            question: question.name,
+            why,
+        };
+        let prepared = SparqlEvaluator::new()
+            .parse_query(&sparql)
+            .map_err(|error| fault(error.to_string()))?;
+        match prepared.on_store(self.store()).execute() {
+            Ok(QueryResults::Solutions(solutions)) => question
+                .answer(solutions)
+                .map_err(|error| fault(error.to_string())),
+            Ok(QueryResults::Boolean(_) | QueryResults::Graph(_)) => {
+                Err(fault("it is no SELECT".to_owned()))
+            }
+            Err(error) => Err(fault(error.to_string())),
+        }
+    }
+}
+
+impl Answer {
+    /// The text in a row; empty where there is none.
+    #[must_use]
+    pub fn text<'a>(row: &'a BTreeMap<String, Value>, column: &str) -> &'a str {
+        row.get(column).and_then(Value::as_str).unwrap_or_default()
+    }
+
+    /// The list of texts in a row; empty where there is none.
+    #[must_use]
+    pub fn texts(row: &BTreeMap<String, Value>, column: &str) -> Vec<String> {
+        let all = row
+            .get(column)
+            .and_then(Value::as_array)
+            .into_iter()
+            .flatten();
+        all.filter_map(Value::as_str).map(str::to_owned).collect()
+    }
+}
+
+fn plain(term: Option<&Term>) -> Value {
+    match term {
+        None => Value::Null,
+        Some(Term::NamedNode(node)) => node.as_str().into(),
+        Some(Term::BlankNode(node)) => node.to_string().into(),
+        Some(Term::Literal(literal)) => number(literal).unwrap_or_else(|| literal.value().into()),
+    }
+}
+
+/// A number or a truth value, if the literal is one.
+fn number(literal: &Literal) -> Option<Value> {
+    let of = literal
+        .datatype()
+        .as_str()
+        .strip_prefix("http://www.w3.org/2001/XMLSchema#")?;
+    match of {
+        "integer" | "int" | "long" | "short" | "byte" | "nonNegativeInteger"
+        | "positiveInteger" | "unsignedInt" => literal.value().parse::<i64>().ok().map(Value::from),
+        "double" | "float" | "decimal" => literal
+            .value()
+            .parse::<f64>()
+            .ok()
+            .filter(|number| number.is_finite())
+            .map(Value::from),
+        "boolean" => match literal.value() {
+            "true" | "1" => Some(true.into()),
+            "false" | "0" => Some(false.into()),
+            _ => None,
+        },
+        _ => None,
+    }
+}
+
+fn list(term: Option<&Term>) -> Value {
+    let Some(Term::Literal(all)) = term else {
+        return Value::Array(Vec::new());
+    };
+    let mut all: Vec<&str> = all
+        .value()
+        .split('\n')
+        .filter(|text| !text.is_empty())
+        .collect();
+    all.sort_unstable();
+    all.into()
+}
+
+/// What rows are ordered by: numbers as numbers, then texts.
+fn key(value: &Value) -> (u64, String) {
+    // Of two positive doubles the larger has the larger bits; with the sign turned over, all of them.
+    let order = |number: f64| {
+        let bits = number.to_bits();
+        if number.is_sign_negative() {
+            !bits
+        } else {
+            bits | (1 << 63)
+        }
+    };
+    match value {
+        Value::Number(number) => (number.as_f64().map_or(0, order), String::new()),
+        Value::String(text) => (u64::MAX, text.clone()),
+        Value::Null => (0, String::new()),
+        Value::Bool(_) | Value::Array(_) | Value::Object(_) => (u64::MAX, value.to_string()),
+    }
+}

@@ -1,0 +1,418 @@
+//! The store: a named graph per source, and the merge of them all as the default graph.
+
+use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::sync::{Mutex, PoisonError};
+use std::{fmt, io};
+
+use mtp::{Object, Triple as Statement};
+use oxigraph::io::{RdfFormat, RdfParser, RdfSerializer};
+use oxigraph::model::{
+    GraphName, GraphNameRef, Literal, NamedNode, NamedNodeRef, NamedOrBlankNode, Term, Triple,
+    vocab,
+};
+use oxigraph::store::{StorageError, Store, Transaction};
+use serde::Serialize;
+use thiserror::Error;
+use tokio::sync::watch;
+
+use crate::source::{DERIVED, Source, SourceKind};
+use crate::vocabulary;
+
+/// Why something is not taken into the store.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum KnowledgeFault {
+    /// Something that is to be an IRI is none.
+    #[error("`{text}` is no IRI: {why}")]
+    Iri {
+        /// What was given.
+        text: String,
+        /// What is wrong with it.
+        why: String,
+    },
+    /// More than is taken from one source.
+    #[error("the source says more than the {most} statements that are kept of one")]
+    TooMany {
+        /// What is kept.
+        most: usize,
+    },
+    /// There are too many sources.
+    #[error("there are {most} sources already, and no more are kept")]
+    TooManySources {
+        /// How many are kept.
+        most: usize,
+    },
+    /// It is no Turtle.
+    #[error("{0}")]
+    Turtle(String),
+    /// What rules make is not written by anybody else.
+    #[error("the derived graph is made by rules and cannot be written")]
+    Derived,
+    /// The store itself.
+    #[error("the store fails: {0}")]
+    Store(#[from] StorageError),
+}
+
+/// What is known of the plant. Reading and writing are safe from any thread; who reads sees a source as a whole, before or
+/// after it is replaced.
+///
+/// The default graph holds each statement that some source makes, once: the merge that SPARQL means, as counting needs it.
+pub struct Knowledge {
+    store: Store,
+    /// Writers one after the other.
+    sources: Mutex<BTreeMap<Source, SourceStatus>>,
+    changed: watch::Sender<u64>,
+}
+
+/// What there is of a source.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct SourceStatus {
+    /// The IRI of its graph.
+    pub graph: String,
+    /// What it is.
+    pub kind: SourceKind,
+    /// Which one.
+    pub name: String,
+    /// How many statements it makes.
+    pub statements: usize,
+    /// When it came, in milliseconds since 1970; a source that is replaced keeps it.
+    pub since_ms: u64,
+}
+
+impl Knowledge {
+    /// An empty store in memory.
+    ///
+    /// # Errors
+    /// When there is no memory for it.
+    pub fn new() -> Result<Self, KnowledgeFault> {
+        Ok(Self {
+            store: Store::new()?,
+            sources: Mutex::new(BTreeMap::new()),
+            changed: watch::channel(0).0,
+        })
+    }
+
+    /// Puts what a source says in the place of what it said before, at once for all who read. `at` is in milliseconds since 1970.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault`]; then nothing has changed.
+    pub fn replace(
+        &self,
+        source: &Source,
+        statements: &[Statement],
+        at: u64,
+    ) -> Result<(), KnowledgeFault> {
+        if statements.len() > MAX_STATEMENTS {
+            return Err(KnowledgeFault::TooMany {
+                most: MAX_STATEMENTS,
+            });
+        }
+        let statements = statements
+            .iter()
+            .map(triple)
+            .collect::<Result<HashSet<_>, _>>()?;
+        self.put(source, &statements, at)
+    }
+
+    /// Puts what a Turtle file says in the place of what it said before.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault`]; then nothing has changed.
+    pub fn replace_turtle(
+        &self,
+        source: &Source,
+        turtle: &str,
+        at: u64,
+    ) -> Result<(), KnowledgeFault> {
+        let mut triples = HashSet::new();
+        for quad in RdfParser::from_format(RdfFormat::Turtle)
+            .rename_blank_nodes()
+            .for_slice(turtle)
+        {
+            let quad = quad.map_err(|error| KnowledgeFault::Turtle(error.to_string()))?;
+            triples.insert(Triple::from(quad));
+            if triples.len() > MAX_STATEMENTS {
+                return Err(KnowledgeFault::TooMany {
+                    most: MAX_STATEMENTS,
+                });
+            }
+        }
+        self.put(source, &triples, at)
+    }
+
+    /// Forgets a source, at once for all who read. Tells whether it was there.
+    ///
+    /// # Errors
+    /// [`KnowledgeFault::Store`]; then nothing has changed.
+    pub fn remove(&self, source: &Source) -> Result<bool, KnowledgeFault> {
+        let mut sources = self.sources.lock().unwrap_or_else(PoisonError::into_inner);
+        if !sources.contains_key(source) {
+            return Ok(false);
+        }
+        self.write(&source.graph(), &HashSet::new())?;
+        sources.remove(source);
+        self.tell(&mut sources);
+        Ok(true)
+    }
+
+    /// What there is, and since when.
+    pub fn sources(&self) -> Vec<SourceStatus> {
+        self.sources
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .values()
+            .cloned()
+            .collect()
+    }
+
+    /// A number that rises with each change.
+    pub fn changes(&self) -> watch::Receiver<u64> {
+        self.changed.subscribe()
+    }
+
+    /// All named graphs, or one of them, as N-Quads. `None` where there is no such graph.
+    ///
+    /// # Errors
+    /// When the store or the writer fails.
+    pub fn write_quads(&self, graph: Option<&str>, to: impl io::Write) -> io::Result<Option<()>> {
+        let graph = match graph.map(NamedNodeRef::new) {
+            Some(Ok(graph))
+                if self
+                    .store
+                    .contains_named_graph(graph)
+                    .map_err(io::Error::other)? =>
+            {
+                Some(GraphNameRef::from(graph))
+            }
+            Some(_) => return Ok(None),
+            None => None,
+        };
+        let mut to = RdfSerializer::from_format(RdfFormat::NQuads).for_writer(to);
+        for quad in self.store.quads_for_pattern(None, None, None, graph) {
+            let quad = quad.map_err(io::Error::other)?;
+            if !quad.graph_name.is_default_graph() {
+                to.serialize_quad(&quad)?;
+            }
+        }
+        to.finish()?;
+        Ok(Some(()))
+    }
+
+    pub(crate) fn store(&self) -> &Store {
+        &self.store
+    }
+
+    fn put(
+        &self,
+        source: &Source,
+        triples: &HashSet<Triple>,
+        at: u64,
+    ) -> Result<(), KnowledgeFault> {
+        if source.kind == SourceKind::Derived {
+            return Err(KnowledgeFault::Derived);
+        }
+        let mut sources = self.sources.lock().unwrap_or_else(PoisonError::into_inner);
+        if sources.len() >= MAX_SOURCES && !sources.contains_key(source) {
+            return Err(KnowledgeFault::TooManySources { most: MAX_SOURCES });
+        }
+        let graph = source.graph();
+        self.write(&graph, triples)?;
+        let status = sources
+            .entry(source.clone())
+            .or_insert_with(|| SourceStatus {
+                graph,
+                kind: source.kind,
+                name: source.name.clone(),
+                statements: 0,
+                since_ms: at,
+            });
+        status.statements = triples.len();
+        self.tell(&mut sources);
+        Ok(())
+    }
+
+    /// Counts the derived graph anew, and tells who waits.
+    fn tell(&self, sources: &mut BTreeMap<Source, SourceStatus>) {
+        let derived = NamedNodeRef::new_unchecked(DERIVED);
+        let statements = self
+            .store
+            .quads_for_pattern(None, None, None, Some(derived.into()))
+            .count();
+        let since_ms = sources
+            .values()
+            .map(|source| source.since_ms)
+            .min()
+            .unwrap_or_default();
+        sources.insert(
+            Source::new(SourceKind::Derived, ""),
+            SourceStatus {
+                graph: DERIVED.to_owned(),
+                kind: SourceKind::Derived,
+                name: String::new(),
+                statements,
+                since_ms,
+            },
+        );
+        self.changed.send_modify(|changes| *changes += 1);
+    }
+
+    /// Makes `triples` the whole of a graph, and the default and derived graphs follow, in one transaction.
+    fn write(&self, graph: &str, triples: &HashSet<Triple>) -> Result<(), KnowledgeFault> {
+        let graph = named(graph)?;
+        let sub_class = NamedNodeRef::new_unchecked(vocabulary::RDFS_SUB_CLASS_OF);
+        let mut transaction = self.store.start_transaction()?;
+        let is_about_classes =
+            |changed: &[Triple]| changed.iter().any(|triple| triple.predicate == sub_class);
+        let (added, removed) = difference(&transaction, &graph, triples)?;
+        apply(&mut transaction, &graph, &added, &removed)?;
+        if is_about_classes(&added) || is_about_classes(&removed) {
+            let derived = named(DERIVED)?;
+            let closure = closure(&transaction, sub_class, &derived)?;
+            let (added, removed) = difference(&transaction, &derived, &closure)?;
+            apply(&mut transaction, &derived, &added, &removed)?;
+        }
+        transaction.commit()?;
+        Ok(())
+    }
+}
+
+impl fmt::Debug for Knowledge {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Knowledge")
+            .field("sources", &self.sources)
+            .finish_non_exhaustive()
+    }
+}
+
+/// What is to be added to a graph and removed from it to make it so.
+fn difference(
+    transaction: &Transaction<'_>,
+    graph: &NamedNode,
+    wanted: &HashSet<Triple>,
+) -> Result<(Vec<Triple>, Vec<Triple>), StorageError> {
+    let present = transaction
+        .quads_for_pattern(None, None, None, Some(graph.into()))
+        .map(|quad| quad.map(Triple::from))
+        .collect::<Result<HashSet<_>, _>>()?;
+    let added = wanted.difference(&present).cloned().collect();
+    let removed = present.difference(wanted).cloned().collect();
+    Ok((added, removed))
+}
+
+fn apply(
+    transaction: &mut Transaction<'_>,
+    graph: &NamedNode,
+    added: &[Triple],
+    removed: &[Triple],
+) -> Result<(), StorageError> {
+    for triple in added {
+        transaction.insert(triple.as_ref().in_graph(graph));
+        transaction.insert(triple.as_ref().in_graph(GraphNameRef::DefaultGraph));
+    }
+    for triple in removed {
+        transaction.remove(triple.as_ref().in_graph(graph));
+    }
+    for triple in removed {
+        let (subject, predicate, object) = (
+            triple.subject.as_ref(),
+            triple.predicate.as_ref(),
+            triple.object.as_ref(),
+        );
+        let mut said =
+            transaction.quads_for_pattern(Some(subject), Some(predicate), Some(object), None);
+        let elsewhere = said.find(|quad| {
+            quad.as_ref()
+                .map_or(true, |quad| !quad.graph_name.is_default_graph())
+        });
+        let is_said = elsewhere.transpose()?.is_some();
+        drop(said);
+        if !is_said {
+            transaction.remove(triple.as_ref().in_graph(GraphNameRef::DefaultGraph));
+        }
+    }
+    // A graph without statements is none.
+    let is_empty = transaction
+        .quads_for_pattern(None, None, None, Some(graph.into()))
+        .next()
+        .is_none();
+    if is_empty {
+        transaction.remove_named_graph(graph)?;
+    }
+    Ok(())
+}
+
+/// The rule: who is below whom, through any number of classes between, and each class below itself. Questions never need a
+/// path (`rdfs:subClassOf*`), which the evaluator would follow last and for everything.
+fn closure(
+    transaction: &Transaction<'_>,
+    sub_class: NamedNodeRef<'_>,
+    derived: &NamedNode,
+) -> Result<HashSet<Triple>, StorageError> {
+    let mut above: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
+    for quad in transaction.quads_for_pattern(None, Some(sub_class), None, None) {
+        let quad = quad?;
+        let is_direct = matches!(&quad.graph_name, GraphName::NamedNode(graph) if graph != derived);
+        if let (NamedOrBlankNode::NamedNode(class), Term::NamedNode(supertype), true) =
+            (quad.subject, quad.object, is_direct)
+        {
+            above.entry(supertype.as_str().to_owned()).or_default();
+            above
+                .entry(class.into_string())
+                .or_default()
+                .insert(supertype.into_string());
+        }
+    }
+    let mut all = HashSet::new();
+    for class in above.keys() {
+        let mut seen: BTreeSet<&str> = BTreeSet::from([class.as_str()]);
+        let mut waiting = vec![class.as_str()];
+        while let Some(next) = waiting.pop() {
+            let further = above.get(next).into_iter().flatten();
+            waiting.extend(
+                further
+                    .map(String::as_str)
+                    .filter(|further| seen.insert(further)),
+            );
+        }
+        if all.len() + seen.len() > MAX_DERIVED {
+            tracing::warn!(
+                most = MAX_DERIVED,
+                "the classes have more superclasses than are kept; questions about types miss some"
+            );
+            break;
+        }
+        let class = NamedNode::new_unchecked(class);
+        let above = seen.into_iter().map(NamedNode::new_unchecked);
+        all.extend(above.map(|above| Triple::new(class.clone(), sub_class, above)));
+    }
+    Ok(all)
+}
+
+fn triple(statement: &Statement) -> Result<Triple, KnowledgeFault> {
+    let object: Term = match &statement.object {
+        Object::Iri(iri) => named(iri)?.into(),
+        Object::Text(text) => Literal::new_simple_literal(text).into(),
+        Object::Integer(number) => Literal::from(*number).into(),
+        Object::Number(number) => Literal::from(*number).into(),
+        Object::Boolean(value) => Literal::from(*value).into(),
+        Object::Time(time) => Literal::new_typed_literal(time, vocab::xsd::DATE_TIME).into(),
+    };
+    Ok(Triple::new(
+        named(&statement.subject)?,
+        named(&statement.predicate)?,
+        object,
+    ))
+}
+
+fn named(iri: &str) -> Result<NamedNode, KnowledgeFault> {
+    let text: String = iri.chars().take(200).collect();
+    NamedNode::new(iri).map_err(|error| KnowledgeFault::Iri {
+        text,
+        why: error.to_string(),
+    })
+}
+
+/// The base NodeSet, the largest that is published, makes some 40 000.
+const MAX_STATEMENTS: usize = 200_000;
+const MAX_SOURCES: usize = 2000;
+const MAX_DERIVED: usize = 500_000;

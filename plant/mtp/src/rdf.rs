@@ -1,0 +1,414 @@
+//! From the model to RDF: what a module can do, in the terms of CSS and CaSk.
+//!
+//! A module is a resource, each of its procedures a skill, and each of its services a capability that its procedures realise.
+//! IRIs are made of the base that the importing side gives and of the IDs in the file, never of names alone: two modules of
+//! one name, and two services or procedures of one name in one module, stay apart.
+
+use std::collections::{BTreeMap, HashSet};
+use std::fmt::Write as _;
+
+use crate::model::{
+    Bound, Identifier, Module, Node, Parameter, Procedure, Role, Service, ValueKind,
+};
+use crate::vocabulary as v;
+
+/// A statement.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Triple {
+    /// An IRI.
+    pub subject: String,
+    /// An IRI, of [`vocabulary`](crate::vocabulary) as a rule.
+    pub predicate: String,
+    /// What is said.
+    pub object: Object,
+}
+
+/// What a statement says of its subject.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Object {
+    /// Another thing, by its IRI.
+    Iri(String),
+    /// An xsd:string.
+    Text(String),
+    /// An xsd:integer.
+    Integer(i64),
+    /// An xsd:double.
+    Number(f64),
+    /// An xsd:boolean.
+    Boolean(bool),
+    /// An xsd:dateTime, as it is written there.
+    Time(String),
+}
+
+impl Module {
+    /// What the module is and can do. `base` is an IRI that no other module of the plant has; all others begin with it.
+    ///
+    /// A manifest does not say in which words of the plant its services are capabilities. Each has one of its own,
+    /// `<base>/service/<ID>/capability`, of which an ontology can say what it is a subclass of. `capabilities` says it here: IRIs of classes
+    /// by the name of a service, or by `service/procedure`.
+    #[must_use]
+    pub fn triples(&self, base: &str, capabilities: &BTreeMap<String, Vec<String>>) -> Vec<Triple> {
+        let mut graph = Graph {
+            base,
+            all: Vec::new(),
+            taken: HashSet::new(),
+            capabilities,
+        };
+        graph.module(self);
+        graph.all
+    }
+}
+
+/// Makes any text a part of an IRI: all but letters, digits, `-`, `.`, `_` and `~` of ASCII becomes `%XX`.
+#[must_use]
+pub fn escaped(text: &str) -> String {
+    let mut escaped = String::with_capacity(text.len());
+    for byte in text.bytes() {
+        match byte {
+            b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => {
+                escaped.push(char::from(byte))
+            }
+            // Writing to a String cannot fail.
+            _ => drop(write!(escaped, "%{byte:02X}")),
+        }
+    }
+    escaped
+}
+
+impl Node {
+    /// Its NodeId as OPC 10000-6, 5.1.12 writes it, as `nsu=urn:module;s=Dosing.StateCur`; `ns=` where the file has an index only.
+    #[must_use]
+    pub fn id(&self) -> String {
+        let is_index = self.namespace.bytes().all(|byte| byte.is_ascii_digit());
+        if is_index {
+            format!("ns={};{}", self.namespace, self.identifier)
+        } else {
+            let namespace = self.namespace.replace('%', "%25").replace(';', "%3B");
+            format!("nsu={namespace};{}", self.identifier)
+        }
+    }
+}
+
+impl std::fmt::Display for Identifier {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Numeric(number) => write!(f, "i={number}"),
+            Self::Text(text) => write!(f, "s={text}"),
+        }
+    }
+}
+
+struct Graph<'a> {
+    base: &'a str,
+    all: Vec<Triple>,
+    taken: HashSet<String>,
+    capabilities: &'a BTreeMap<String, Vec<String>>,
+}
+
+impl Graph<'_> {
+    fn module(&mut self, module: &Module) {
+        let iri = self.base.to_owned();
+        self.taken.insert(iri.clone());
+        self.is_a(&iri, &[v::RESOURCE, v::MODULE]);
+        self.text(&iri, v::RDFS_LABEL, &module.name);
+        if !module.version.is_empty() {
+            self.text(&iri, v::VERSION, &module.version);
+        }
+        for endpoint in &module.endpoints {
+            self.text(&iri, v::ENDPOINT, endpoint);
+        }
+        for service in &module.services {
+            self.service(&iri, service);
+        }
+    }
+
+    fn service(&mut self, module: &str, service: &Service) {
+        let iri = self.name(module, "service", &service.id, &service.name);
+        self.link(module, v::OFFERS_SERVICE, &iri);
+        self.is_a(&iri, &[v::SERVICE]);
+        self.text(&iri, v::RDFS_LABEL, &service.name);
+        for (role, node) in &service.control.0 {
+            let node_iri = format!("{iri}/node/{role:?}");
+            self.link(&iri, v::HAS_NODE, &node_iri);
+            self.is_a(&node_iri, &[v::NODE]);
+            self.text(
+                &node_iri,
+                v::RDFS_LABEL,
+                &format!("{}.{role:?}", service.name),
+            );
+            self.text(&node_iri, v::ROLE, &format!("{role:?}"));
+            self.node(&node_iri, node);
+        }
+        let commands = self.commands(&iri, service);
+        let class = format!("{iri}/capability");
+        self.link(&class, v::RDFS_SUB_CLASS_OF, v::CAPABILITY);
+        self.text(&class, v::RDFS_LABEL, &service.name);
+        let shared: Vec<_> = service
+            .parameters
+            .iter()
+            .map(|parameter| self.parameter(&iri, &service.name, parameter))
+            .collect();
+        for procedure in &service.procedures {
+            let skill = self.procedure((module, &iri), service, procedure);
+            self.capability((module, &skill), &class, service, procedure);
+            for parameter in &shared {
+                self.link(&skill, v::HAS_INPUT_PARAMETER, parameter);
+            }
+            for command in &commands {
+                self.link(&skill, v::HAS_SKILL_COMMAND, command);
+            }
+        }
+    }
+
+    /// The commands that a procedure takes: a number each, written to one node.
+    fn commands(&mut self, service_iri: &str, service: &Service) -> Vec<String> {
+        let Some(node) = service.control.node(Role::Command) else {
+            return Vec::new();
+        };
+        let mut commands = Vec::new();
+        for (name, value) in COMMANDS {
+            let iri = format!("{service_iri}/command/{name}");
+            self.is_a(&iri, &[v::SKILL_COMMAND]);
+            self.text(&iri, v::RDFS_LABEL, name);
+            self.say(&iri, v::COMMAND_VALUE, Object::Integer(*value));
+            self.node(&iri, node);
+            commands.push(iri);
+        }
+        commands
+    }
+
+    fn procedure(
+        &mut self,
+        (module, service_iri): (&str, &str),
+        service: &Service,
+        procedure: &Procedure,
+    ) -> String {
+        let iri = self.name(service_iri, "procedure", &procedure.id, &procedure.name);
+        self.link(module, v::PROVIDES_SKILL, &iri);
+        self.link(service_iri, v::HAS_PROCEDURE, &iri);
+        self.is_a(&iri, &[v::SKILL, v::PROCEDURE]);
+        self.text(
+            &iri,
+            v::RDFS_LABEL,
+            &format!("{}/{}", service.name, procedure.name),
+        );
+        self.say(
+            &iri,
+            v::PROCEDURE_NUMBER,
+            Object::Integer(procedure.number.into()),
+        );
+        self.say(&iri, v::IS_DEFAULT, Object::Boolean(procedure.is_default));
+        self.say(
+            &iri,
+            v::IS_SELF_COMPLETING,
+            Object::Boolean(procedure.is_self_completing),
+        );
+        if let Some(command) = service.control.node(Role::Command) {
+            self.node(&iri, command);
+        }
+        let about = format!("{}/{}", service.name, procedure.name);
+        for parameter in &procedure.parameters {
+            let parameter = self.parameter(&iri, &about, parameter);
+            self.link(&iri, v::HAS_INPUT_PARAMETER, &parameter);
+        }
+        iri
+    }
+
+    fn capability(
+        &mut self,
+        (module, skill): (&str, &str),
+        class: &str,
+        service: &Service,
+        procedure: &Procedure,
+    ) {
+        let about = format!("{}/{}", service.name, procedure.name);
+        let told = [&service.name, &about]
+            .into_iter()
+            .filter_map(|name| self.capabilities.get(name))
+            .flatten();
+        let classes: Vec<String> = std::iter::once(class.to_owned())
+            .chain(told.cloned())
+            .collect();
+        let iri = format!("{skill}/capability");
+        self.link(module, v::PROVIDES_CAPABILITY, &iri);
+        self.is_a(&iri, &[v::PROVIDED_CAPABILITY]);
+        self.link(&iri, v::IS_REALIZED_BY_SKILL, skill);
+        for class in classes {
+            self.link(&iri, v::RDF_TYPE, &class);
+            self.link(&class, v::RDFS_SUB_CLASS_OF, v::CAPABILITY);
+        }
+    }
+
+    fn parameter(&mut self, of: &str, about: &str, parameter: &Parameter) -> String {
+        let iri = self.name(of, "parameter", &parameter.id, &parameter.name);
+        self.is_a(&iri, &[v::INPUT_PARAMETER]);
+        self.text(&iri, v::RDFS_LABEL, &format!("{about}.{}", parameter.name));
+        self.text(&iri, v::HAS_VARIABLE_NAME, &parameter.name);
+        self.text(&iri, v::HAS_VARIABLE_TYPE, parameter.kind.data_type());
+        // The module keeps the value it was given last, and starts with one.
+        self.say(&iri, v::IS_REQUIRED, Object::Boolean(false));
+        for (bound, predicate) in [(&parameter.min, v::MIN), (&parameter.max, v::MAX)] {
+            if let Some(Bound::Constant(number)) = bound {
+                self.say(&iri, predicate, Object::Number(*number));
+            }
+        }
+        if let Some(Bound::Constant(code)) = parameter.unit {
+            self.unit(&iri, code);
+        }
+        if let Some(node) = &parameter.write {
+            self.node(&iri, node);
+        }
+        let others = [
+            ("Read", parameter.read.as_ref()),
+            ("Min", bound_node(parameter.min.as_ref())),
+            ("Max", bound_node(parameter.max.as_ref())),
+            ("Unit", bound_node(parameter.unit.as_ref())),
+        ];
+        for (role, node) in others {
+            let Some(node) = node else { continue };
+            let node_iri = format!("{iri}/node/{role}");
+            self.link(&iri, v::HAS_NODE, &node_iri);
+            self.is_a(&node_iri, &[v::NODE]);
+            self.text(
+                &node_iri,
+                v::RDFS_LABEL,
+                &format!("{about}.{}.{role}", parameter.name),
+            );
+            self.text(&node_iri, v::ROLE, role);
+            self.node(&node_iri, node);
+        }
+        iri
+    }
+
+    fn unit(&mut self, parameter: &str, code: f64) {
+        let known = UNITS.iter().find(|(known, _)| f64::from(*known) == code);
+        if let Some((code, symbol)) = known {
+            self.say(parameter, v::UNIT_CODE, Object::Integer((*code).into()));
+            self.text(parameter, v::UNIT, symbol);
+        } else {
+            self.say(parameter, v::UNIT_CODE, Object::Number(code));
+        }
+    }
+
+    fn node(&mut self, of: &str, node: &Node) {
+        self.text(of, v::ENDPOINT, &node.endpoint);
+        self.text(of, v::NODE_NAMESPACE, &node.namespace);
+        self.text(of, v::NODE_IDENTIFIER, &node.identifier.to_string());
+        self.text(of, v::NODE_ID, &node.id());
+    }
+
+    /// An IRI that nothing else has: by its ID, by its name where it has none, and with a number where that is taken.
+    fn name(&mut self, of: &str, kind: &str, id: &str, name: &str) -> String {
+        let part = escaped(if id.is_empty() { name } else { id });
+        let mut iri = format!("{of}/{kind}/{part}");
+        // A part never has a comma of its own.
+        for number in 2.. {
+            if self.taken.insert(iri.clone()) {
+                break;
+            }
+            iri = format!("{of}/{kind}/{part},{number}");
+        }
+        iri
+    }
+
+    fn is_a(&mut self, subject: &str, classes: &[&str]) {
+        for class in classes {
+            self.link(subject, v::RDF_TYPE, class);
+        }
+    }
+
+    fn link(&mut self, subject: &str, predicate: &str, object: &str) {
+        self.say(subject, predicate, Object::Iri(object.to_owned()));
+    }
+
+    fn text(&mut self, subject: &str, predicate: &str, text: &str) {
+        self.say(subject, predicate, Object::Text(text.to_owned()));
+    }
+
+    fn say(&mut self, subject: &str, predicate: &str, object: Object) {
+        self.all.push(Triple {
+            subject: subject.to_owned(),
+            predicate: predicate.to_owned(),
+            object,
+        });
+    }
+}
+
+fn bound_node(bound: Option<&Bound>) -> Option<&Node> {
+    match bound {
+        Some(Bound::Node(node)) => Some(node),
+        Some(Bound::Constant(_)) | None => None,
+    }
+}
+
+impl ValueKind {
+    /// The OPC UA DataType of such values.
+    #[must_use]
+    pub fn data_type(self) -> &'static str {
+        match self {
+            Self::Analog => "Float",
+            Self::Integer => "Int32",
+            Self::Binary => "Boolean",
+            Self::Text => "String",
+        }
+    }
+}
+
+/// The bits of CommandExt (VDI/VDE/NAMUR 2658-4, table 14).
+const COMMANDS: &[(&str, i64)] = &[
+    ("Reset", 2),
+    ("Start", 4),
+    ("Stop", 8),
+    ("Hold", 16),
+    ("Unhold", 32),
+    ("Pause", 64),
+    ("Resume", 128),
+    ("Abort", 256),
+    ("Restart", 512),
+    ("Complete", 1024),
+];
+
+/// The units in use most (VDI/VDE/NAMUR 2658-3, table 10). Of others only the code is told.
+const UNITS: &[(u16, &str)] = &[
+    (1000, "K"),
+    (1001, "°C"),
+    (1002, "°F"),
+    (1005, "°"),
+    (1010, "m"),
+    (1013, "mm"),
+    (1018, "ft"),
+    (1023, "m²"),
+    (1038, "L"),
+    (1041, "hL"),
+    (1054, "s"),
+    (1058, "min"),
+    (1059, "h"),
+    (1060, "d"),
+    (1061, "m/s"),
+    (1077, "Hz"),
+    (1081, "kHz"),
+    (1082, "1/s"),
+    (1083, "1/min"),
+    (1088, "kg"),
+    (1092, "t"),
+    (1100, "g/cm³"),
+    (1105, "g/L"),
+    (1120, "N"),
+    (1123, "mN"),
+    (1130, "Pa"),
+    (1133, "kPa"),
+    (1137, "bar"),
+    (1138, "mbar"),
+    (1175, "Wh"),
+    (1179, "kWh"),
+    (1190, "kW"),
+    (1209, "A"),
+    (1211, "mA"),
+    (1221, "Ah"),
+    (1240, "V"),
+    (1342, "%"),
+    (1349, "m³/h"),
+    (1353, "L/h"),
+    (1384, "mol"),
+    (1422, "pH"),
+];

@@ -1,0 +1,141 @@
+//! The IRIs by which the plant is described: the one table of them.
+//!
+//! CSS (capabilities, skills, services) and CaSk are ontologies of the research groups that made the terms; what they have no
+//! word for (nodes of OPC UA, numbers in the space, limits) is in a namespace of ours.
+
+/// What an IRI of the table is used as.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum TermKind {
+    /// After `rdf:type`.
+    Class,
+    /// From an individual to another.
+    ObjectProperty,
+    /// From an individual to a literal.
+    DataProperty,
+}
+
+/// An IRI of an ontology that others made.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Term {
+    /// The whole of it.
+    pub iri: &'static str,
+    /// What it is used as.
+    pub kind: TermKind,
+}
+
+macro_rules! terms {
+    ($table:ident, $base:literal, $($kind:ident $name:ident = $local:literal),+ $(,)?) => {
+        $(
+            #[doc = concat!("`", $base, $local, "`")]
+            pub const $name: &str = concat!($base, $local);
+        )+
+        const $table: &[Term] = &[$(Term { iri: $name, kind: TermKind::$kind }),+];
+    };
+}
+
+terms!(CSS, "http://www.w3id.org/hsu-aut/css#",
+    Class CAPABILITY = "Capability",
+    Class INPUT_PARAMETER = "InputParameter",
+    Class OUTPUT_PARAMETER = "OutputParameter",
+    Class PROCESS = "Process",
+    Class RESOURCE = "Resource",
+    Class SKILL = "Skill",
+    Class STATE = "State",
+    ObjectProperty HAS_CURRENT_STATE = "hasCurrentState",
+    ObjectProperty IS_REALIZED_BY_SKILL = "isRealizedBySkill",
+    ObjectProperty PROVIDES_CAPABILITY = "providesCapability",
+    ObjectProperty PROVIDES_SKILL = "providesSkill",
+    ObjectProperty REQUIRES_CAPABILITY = "requiresCapability",
+);
+
+terms!(CASK, "http://www.w3id.org/hsu-aut/cask#",
+    Class PROVIDED_CAPABILITY = "ProvidedCapability",
+    Class REQUIRED_CAPABILITY = "RequiredCapability",
+    Class SKILL_COMMAND = "SkillCommand",
+    ObjectProperty HAS_INPUT_PARAMETER = "hasInputParameter",
+    ObjectProperty HAS_OUTPUT_PARAMETER = "hasOutputParameter",
+    ObjectProperty HAS_SKILL_COMMAND = "hasSkillCommand",
+    DataProperty HAS_DEFAULT_VALUE = "hasDefaultValue",
+    DataProperty HAS_VARIABLE_NAME = "hasVariableName",
+    DataProperty HAS_VARIABLE_TYPE = "hasVariableType",
+    DataProperty IS_REQUIRED = "isRequired",
+);
+
+terms!(OURS, "urn:ua-bridge:plant#",
+    Class COMPONENT = "Component",
+    Class MODULE = "Module",
+    Class NODE = "Node",
+    Class NODE_SET = "NodeSet",
+    Class PLAN = "Plan",
+    Class PROCEDURE = "Procedure",
+    Class RUN = "Run",
+    Class SERVICE = "Service",
+    Class STEP = "Step",
+    Class STEP_RUN = "StepRun",
+    ObjectProperty DECLARES = "declares",
+    ObjectProperty HAS_NODE = "hasNode",
+    ObjectProperty HAS_PLAN = "hasPlan",
+    ObjectProperty HAS_PROCEDURE = "hasProcedure",
+    ObjectProperty HAS_STEP = "hasStep",
+    ObjectProperty OF_PROCESS = "ofProcess",
+    ObjectProperty OF_STEP = "ofStep",
+    ObjectProperty OFFERS_SERVICE = "offersService",
+    ObjectProperty REQUIRES_TYPE = "requiresType",
+    ObjectProperty USES_COMPONENT = "usesComponent",
+    ObjectProperty USES_SKILL = "usesSkill",
+    DataProperty APPLICATION_URI = "applicationUri",
+    DataProperty BROWSE_NAME = "browseName",
+    DataProperty COMMAND_VALUE = "commandValue",
+    DataProperty ENDED = "ended",
+    DataProperty ENDPOINT = "endpoint",
+    DataProperty IS_ABSTRACT = "isAbstract",
+    DataProperty IS_DEFAULT = "isDefault",
+    DataProperty IS_SELF_COMPLETING = "isSelfCompleting",
+    DataProperty MAX = "max",
+    DataProperty MIN = "min",
+    DataProperty MODEL_VERSION = "modelVersion",
+    DataProperty NAMESPACE_NUMBER = "namespaceNumber",
+    DataProperty NODE_CLASS = "nodeClass",
+    DataProperty NODE_ID = "nodeId",
+    DataProperty NODE_IDENTIFIER = "nodeIdentifier",
+    DataProperty NODE_NAMESPACE = "nodeNamespace",
+    DataProperty NUMBER = "number",
+    DataProperty OUTCOME = "outcome",
+    DataProperty POSITION = "position",
+    DataProperty PROCEDURE_NUMBER = "procedureNumber",
+    DataProperty REASON = "reason",
+    DataProperty ROLE = "role",
+    DataProperty STARTED = "started",
+    DataProperty UNIT = "unit",
+    DataProperty UNIT_CODE = "unitCode",
+    DataProperty VERSION = "version",
+);
+
+terms!(STANDARD, "",
+    Class RDFS_CLASS = "http://www.w3.org/2000/01/rdf-schema#Class",
+    ObjectProperty RDF_TYPE = "http://www.w3.org/1999/02/22-rdf-syntax-ns#type",
+    ObjectProperty RDFS_SUB_CLASS_OF = "http://www.w3.org/2000/01/rdf-schema#subClassOf",
+    DataProperty RDFS_LABEL = "http://www.w3.org/2000/01/rdf-schema#label",
+    DataProperty RDFS_COMMENT = "http://www.w3.org/2000/01/rdf-schema#comment",
+);
+
+/// All terms of CSS and CaSk that are used, to be compared with the ontologies.
+pub fn foreign() -> impl Iterator<Item = Term> {
+    CSS.iter().chain(CASK).copied()
+}
+
+/// All terms there are.
+pub fn all() -> impl Iterator<Item = Term> {
+    foreign()
+        .chain(OURS.iter().copied())
+        .chain(STANDARD.iter().copied())
+}
+
+/// The prefixes by which questions shorten the IRIs.
+pub const PREFIXES: [(&str, &str); 5] = [
+    ("css", "http://www.w3id.org/hsu-aut/css#"),
+    ("cask", "http://www.w3id.org/hsu-aut/cask#"),
+    ("ua", "urn:ua-bridge:plant#"),
+    ("rdfs", "http://www.w3.org/2000/01/rdf-schema#"),
+    ("xsd", "http://www.w3.org/2001/XMLSchema#"),
+];
