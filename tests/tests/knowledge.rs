@@ -1,0 +1,245 @@
+//! What is known of the plant, judged by rdflib: the same questions on the same statements have the same answers.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use knowledge::{
+    Answer, ComponentFacts, Knowledge, NodeName, ParameterFacts, QUESTIONS, Question, SkillFacts,
+    Source, SourceKind, TypeFacts, nodeset,
+};
+use serde_json::{Value, json};
+use system_tests::{Cell, Peer};
+
+const SHARED: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../shared/data");
+
+fn node(namespace: &str, identifier: &str) -> NodeName {
+    NodeName {
+        namespace: namespace.into(),
+        identifier: identifier.into(),
+    }
+}
+
+fn of_type(namespace: &str, identifier: &str, browse_name: &str) -> TypeFacts {
+    TypeFacts {
+        node: node(namespace, identifier),
+        browse_name: browse_name.into(),
+    }
+}
+
+/// A component with one skill; the names have all that has to be escaped somewhere.
+fn component(uri: &str, own: Option<TypeFacts>, capabilities: &[&str]) -> ComponentFacts {
+    let ours = "urn:ua-bridge:skills";
+    let common = [
+        of_type(ours, "i=1200", "GraspSkillType"),
+        of_type(ours, "i=1000", "SkillType"),
+    ];
+    let force = ParameterFacts {
+        name: "Force \"max\"\n{N}".into(),
+        data_type: "Double".into(),
+        default: Some("20.5".into()),
+        min: Some(-0.25),
+        max: Some(85.0),
+        unit: Some("°N".into()),
+        node: Some(node(uri, "i=10001")),
+        ..ParameterFacts::default()
+    };
+    let gripped = ParameterFacts {
+        name: "Gripped".into(),
+        is_output: true,
+        data_type: "Boolean".into(),
+        ..ParameterFacts::default()
+    };
+    ComponentFacts {
+        application_uri: uri.into(),
+        name: format!("{uri} «ü»"),
+        endpoint: "opc.tcp://127.0.0.1:4855".into(),
+        namespace: own.is_none().then_some(7),
+        skills: vec![SkillFacts {
+            name: "Grasp".into(),
+            number: Some(1),
+            node: node(uri, "i=100"),
+            types: own.into_iter().chain(common).collect(),
+            capabilities: capabilities
+                .iter()
+                .map(|class| (*class).to_owned())
+                .collect(),
+            parameters: vec![force, gripped],
+        }],
+    }
+}
+
+const GRASP: &str = "urn:example:capability:grasp";
+
+/// Components, two modules of one manifest, NodeSets and a file, all in one store.
+fn plant() -> Option<Knowledge> {
+    let read = |file: &str| match std::fs::read_to_string(Path::new(SHARED).join(file)) {
+        Ok(text) => Some(text),
+        Err(error) if std::env::var_os("CI").is_some_and(|ci| ci == "true") => {
+            panic!("{file}: {error}")
+        }
+        Err(error) => {
+            eprintln!("skipped: {file}: {error}");
+            None
+        }
+    };
+    let knowledge = Knowledge::new().unwrap();
+    let vendor = of_type("urn:example:vendor", "s=Vacuum Grasp", "VacuumGraspType");
+    let components = [
+        component("urn:example:gripper", None, &[GRASP]),
+        component(
+            "urn:example:vacuum",
+            Some(vendor),
+            &["urn:example:capability:hold", "urn:example:capability:blow"],
+        ),
+        component("not an iri", None, &[]),
+    ];
+    for facts in components {
+        let (triples, _) = facts.triples();
+        knowledge
+            .replace(
+                &Source::new(SourceKind::Component, &facts.application_uri),
+                &triples,
+                1,
+            )
+            .unwrap();
+    }
+    for (name, file) in [
+        ("one", "pimad-core/PiMAd-core.0-0-1.aml"),
+        ("two", "pimad-core/PiMAd-core.0-0-1.aml"),
+        ("huber", "huber-v14.1/Manifest.aml"),
+    ] {
+        let module = mtp::Module::read(&read(&format!("mtp/{file}"))?).unwrap();
+        let triples = module.triples(&format!("urn:ua-bridge:mtp:{name}"), &BTreeMap::new());
+        knowledge
+            .replace(&Source::new(SourceKind::Mtp, name), &triples, 1)
+            .unwrap();
+    }
+    for file in ["Opc.Ua.Di.NodeSet2.xml", "Opc.Ua.Robotics.NodeSet2.xml"] {
+        let read = nodeset::read(&read(&format!("nodesets/{file}"))?).unwrap();
+        knowledge
+            .replace(
+                &Source::new(SourceKind::NodeSet, &read.namespace),
+                &read.triples,
+                1,
+            )
+            .unwrap();
+    }
+    let classes = format!(
+        "@prefix rdfs: <http://www.w3.org/2000/01/rdf-schema#> . <urn:example:capability:hold> rdfs:subClassOf <{GRASP}> ."
+    );
+    knowledge
+        .replace_turtle(
+            &Source::new(SourceKind::File, "capabilities.ttl"),
+            &classes,
+            1,
+        )
+        .unwrap();
+    Some(knowledge)
+}
+
+/// Rows in one order, numbers as floats, lists in one order.
+fn comparable(question: Question, columns: &[String], rows: Vec<Vec<Value>>) -> Vec<String> {
+    let lists: Vec<&str> = question.lists().collect();
+    let value = |(column, value): (&String, Value)| {
+        let parts = match &value {
+            Value::String(text) if lists.contains(&column.as_str()) => text
+                .split('\n')
+                .filter(|part| !part.is_empty())
+                .map(Value::from)
+                .collect(),
+            Value::Array(parts) => parts.clone(),
+            Value::Null if lists.contains(&column.as_str()) => Vec::new(),
+            Value::Number(number) => return json!(number.as_f64()),
+            _ => return value,
+        };
+        let mut parts: Vec<String> = parts.iter().map(Value::to_string).collect();
+        parts.sort();
+        json!(parts)
+    };
+    let row = |row: Vec<Value>| {
+        columns
+            .iter()
+            .zip(row)
+            .map(value)
+            .collect::<Value>()
+            .to_string()
+    };
+    let mut rows: Vec<String> = rows.into_iter().map(row).collect();
+    rows.sort();
+    rows
+}
+
+fn of_store(question: Question, answer: Answer) -> Vec<String> {
+    let rows = answer.rows.into_iter().map(|mut row| {
+        answer
+            .columns
+            .iter()
+            .map(|column| row.remove(column).unwrap())
+            .collect()
+    });
+    comparable(question, &answer.columns, rows.collect())
+}
+
+#[test]
+fn rdflib_answers_every_question_alike() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let Some(knowledge) = plant() else { return };
+    let asked: Vec<(Question, Vec<(String, String)>)> = QUESTIONS
+        .iter()
+        .map(|question| (*question, Vec::new()))
+        .chain(
+            [
+                ("what-can-run", "capability", GRASP),
+                ("who-provides", "capability", GRASP),
+                ("skills", "type", "urn:ua-bridge:skills#i=1200"),
+                ("types", "type", "http://opcfoundation.org/UA/DI/#i=15063"),
+                ("parameters", "skill", "urn:example:gripper#i=100"),
+                ("where-is", "name", "Grasp"),
+                ("components", "component", "urn:ua-bridge:mtp:two"),
+            ]
+            .map(|(question, parameter, value)| {
+                (
+                    Question::of(question).unwrap(),
+                    vec![(parameter.to_owned(), value.to_owned())],
+                )
+            }),
+        )
+        .collect();
+    let mut quads = Vec::new();
+    knowledge.write_quads(None, &mut quads).unwrap();
+    let quads = cell.file("plant.nq", std::str::from_utf8(&quads).unwrap());
+    let texts = asked
+        .iter()
+        .zip(0..)
+        .map(|((question, parameters), number)| {
+            cell.file(
+                &format!("{number}-{}.rq", question.name),
+                &question.with(parameters).unwrap(),
+            )
+        });
+    let files: Vec<_> = std::iter::once(quads).chain(texts).collect();
+    let args: Vec<&str> = files.iter().map(|file| file.to_str().unwrap()).collect();
+    let told = cell.asyncua_once("knowledge_judge.py", &args);
+    assert_eq!(told.len(), asked.len());
+    let mut empty = Vec::new();
+    for ((question, parameters), told) in asked.iter().zip(told) {
+        let ours = knowledge.ask(question.name, parameters).unwrap();
+        let columns: Vec<String> = serde_json::from_value(told["columns"].clone()).unwrap();
+        assert_eq!(ours.columns, columns, "{}", question.name);
+        if ours.rows.is_empty() {
+            empty.push(question.name);
+        }
+        let rows: Vec<Vec<Value>> = serde_json::from_value(told["rows"].clone()).unwrap();
+        let theirs = comparable(*question, &columns, rows);
+        assert_eq!(
+            of_store(*question, ours),
+            theirs,
+            "{} {parameters:?}",
+            question.name
+        );
+    }
+    // Nothing has run, and no process is known.
+    assert_eq!(empty, ["processes", "run-steps", "runs"]);
+}
