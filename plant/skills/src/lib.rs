@@ -5,6 +5,7 @@
 
 mod actor;
 mod authority;
+mod component;
 mod composite;
 pub mod conformance;
 mod driver;
@@ -12,12 +13,19 @@ pub mod model;
 mod parameters;
 mod refusal;
 mod runs;
+pub mod server;
 mod shown;
 pub mod simulated;
 mod skill;
 mod value;
+mod variant;
+pub mod yaml;
 
 pub use authority::{Authority, Owner};
+pub use component::{
+    Component, DriverFault, DriverSetup, Drivers, Lds, MOST_SKILLS, Partners, Security, Simulation,
+    SkillSetup,
+};
 pub use composite::{Broken, Job, PickAndPlace, Teller};
 pub use driver::{Driver, Results, Stopped, Work};
 pub use model::NAMESPACE;

@@ -158,6 +158,16 @@ impl Skill {
         Ok(())
     }
 
+    /// What an owner that is gone has written counts for nothing any more. Says whether there was anything.
+    pub fn forget(&self, by: &Owner) -> bool {
+        let mut pending = lock(&self.pending);
+        let theirs = pending.by.as_ref() == Some(by);
+        if theirs {
+            *pending = Pending::default();
+        }
+        theirs
+    }
+
     /// Calls a method; Start begins a run with the parameters that the same owner has written. Gives the number of the
     /// newest run.
     ///

@@ -20,7 +20,7 @@ use opcua::server::ServerHandle;
 use opcua::server::node_manager::memory::InMemoryNodeManager;
 use opcua::sync::Mutex;
 use opcua::types::{
-    AttributeId, ByteString, DataEncoding, DataValue, LocalizedText, NodeId, NumericRange,
+    AttributeId, ByteString, DataEncoding, DataValue, LocalizedText, NodeId, NumericRange, QualifiedName,
     StatusCode, TimestampsToReturn, Variant,
 };
 use tokio::net::TcpListener;
@@ -147,6 +147,29 @@ impl Server {
     #[must_use]
     pub fn namespace(&self, uri: &str) -> Option<u16> {
         self.inner.handle.get_namespace_index(uri)
+    }
+
+    /// The URIs of the namespaces, by their indexes.
+    #[must_use]
+    pub fn namespaces(&self) -> Vec<String> {
+        let mut all = Vec::new();
+        for (uri, index) in self.inner.handle.type_tree().read().namespaces().known_namespaces() {
+            let index = usize::from(*index);
+            if all.len() <= index {
+                all.resize(index + 1, String::new());
+            }
+            if let Some(slot) = all.get_mut(index) {
+                slot.clone_from(uri);
+            }
+        }
+        all
+    }
+
+    /// The BrowseName of a node, also of one of the core namespace.
+    #[must_use]
+    pub fn browse_name(&self, node: &NodeId) -> Option<QualifiedName> {
+        let spaces = &self.inner.spaces;
+        spaces.with(|view| Some(view.node(node)?.as_node().browse_name().clone()))
     }
 
     /// A type by its namespace and BrowseName.

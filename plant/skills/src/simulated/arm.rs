@@ -59,6 +59,15 @@ impl Arm {
         Self { settings, position }
     }
 
+    /// The same robot with other settings; where its tool is stays as it is.
+    #[must_use]
+    pub fn with(&self, settings: ArmSettings) -> Self {
+        Self {
+            settings,
+            position: Arc::clone(&self.position),
+        }
+    }
+
     /// The driver of the moves of one kind.
     #[must_use]
     pub fn moves(&self, path: Path) -> Arc<dyn Driver> {

@@ -1,0 +1,123 @@
+//! A component: what it is called, where it is, and which skills it has.
+
+mod document;
+mod drivers;
+
+use std::fmt;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+pub use drivers::{DriverFault, Drivers};
+
+use crate::driver::Driver;
+use crate::parameters::TypeName;
+use crate::yaml::Place;
+
+/// A component as its YAML says it, or as a program makes it.
+#[derive(Debug, Clone)]
+pub struct Component {
+    /// Its name in the space and in the address space.
+    pub name: String,
+    /// The ApplicationUri of its server, and the URI of the namespace of its nodes.
+    pub application_uri: String,
+    /// Its number in the space: the WriterGroupId of its values.
+    pub namespace: u16,
+    /// Where clients connect; port 0 is any that is free.
+    pub endpoint: String,
+    /// The security policies clients may choose from.
+    pub security: Vec<Security>,
+    /// NodeSet files with types beyond ours.
+    pub nodesets: Vec<PathBuf>,
+    /// Where it registers.
+    pub lds: Lds,
+    /// Whether calls are taken from other hosts, though nothing secures them.
+    pub open: bool,
+    /// Its skills, by their numbers from 1.
+    pub skills: Vec<SkillSetup>,
+}
+
+/// A security policy.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Security {
+    /// Nothing is signed or encrypted.
+    None,
+    /// Both are.
+    Basic256Sha256,
+}
+
+/// The local discovery server.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Lds {
+    /// On this host, at the port kept for it.
+    Local,
+    /// None.
+    Nowhere,
+    /// At this URL.
+    At(String),
+}
+
+/// One skill of a component.
+#[derive(Debug, Clone)]
+pub struct SkillSetup {
+    /// What the component calls it.
+    pub name: String,
+    /// Its type.
+    pub skill_type: TypeName,
+    /// Who does the work.
+    pub driver: DriverSetup,
+    /// The IRIs of the capabilities it provides.
+    pub capabilities: Vec<String>,
+    /// How long a run may take; `None` for as long as it likes.
+    pub timeout: Option<Duration>,
+    /// Where the document says its type.
+    pub place: Place,
+}
+
+/// Who does the work of a skill.
+#[derive(Clone)]
+pub enum DriverSetup {
+    /// This one.
+    Given(Arc<dyn Driver>),
+    /// A simulation of what the type is of.
+    Simulated(Simulation),
+    /// The skills of a robot and a gripper.
+    PickAndPlace(Partners),
+}
+
+impl fmt::Debug for DriverSetup {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Given(_) => f.write_str("Given"),
+            Self::Simulated(simulation) => simulation.fmt(f),
+            Self::PickAndPlace(partners) => partners.fmt(f),
+        }
+    }
+}
+
+/// How a simulation is, where it is not as usual.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Simulation {
+    /// How long a gripper takes.
+    pub duration: Option<Duration>,
+    /// Whether there is a thing to grasp.
+    pub object: Option<bool>,
+    /// How far a robot reaches, m.
+    pub reach: Option<f64>,
+    /// How many times faster than time it works.
+    pub time_scale: Option<f64>,
+}
+
+/// The servers whose skills a composite runs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Partners {
+    /// The endpoint of the robot.
+    pub robot: String,
+    /// The endpoint of the gripper.
+    pub gripper: String,
+    /// How long each of their runs may take.
+    pub within: Duration,
+}
+
+/// Most skills of a component: the identifiers of its nodes from 10 000 on are others'.
+pub const MOST_SKILLS: usize = 99;

@@ -1,0 +1,372 @@
+//! The YAML of a component.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use super::{Component, DriverSetup, Lds, MOST_SKILLS, Partners, Security, Simulation, SkillSetup};
+use crate::parameters::{TypeName, shortened};
+use crate::yaml::{Code, Findings, Kind, Node, Place, Reader, parse};
+
+impl Component {
+    /// Reads the text of a component's YAML; paths in it are relative to `folder`. All that is wrong is told at once.
+    ///
+    /// # Errors
+    /// What is wrong. Whether types exist is only known with their NodeSets.
+    pub fn from_yaml(text: &str, folder: &Path) -> Result<Self, Findings> {
+        let mut findings = Findings::default();
+        let read = match parse(text) {
+            Ok(root) => component(&root, folder, &mut Reader::new(&mut findings)),
+            Err(finding) => {
+                findings.push(finding);
+                None
+            }
+        };
+        match read {
+            Some(component) if findings.is_empty() => Ok(component),
+            _ => Err(findings),
+        }
+    }
+}
+
+fn component(root: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Component> {
+    let keys = [
+        "component",
+        "application_uri",
+        "namespace",
+        "endpoint",
+        "security",
+        "nodesets",
+        "lds",
+        "open",
+        "skills",
+    ];
+    let [
+        name,
+        uri,
+        namespace,
+        endpoint,
+        security,
+        nodesets,
+        lds,
+        open,
+        skills,
+    ] = reader.map(root, keys)?;
+    // Each is read, so that all is told, whether or not another is wrong.
+    let name = reader
+        .needed(name, "component", root.place)
+        .and_then(|node| read_name(node, reader));
+    let uri = reader
+        .needed(uri, "application_uri", root.place)
+        .and_then(|node| read_uri(node, Code::Uri, reader));
+    let namespace = reader
+        .needed(namespace, "namespace", root.place)
+        .and_then(|node| read_namespace(node, reader));
+    let endpoint = match endpoint {
+        Some(node) => read_endpoint(node, reader),
+        None => Some(DEFAULT_ENDPOINT.to_owned()),
+    };
+    let security = match security {
+        Some(node) => read_security(node, reader),
+        None => vec![Security::None],
+    };
+    let nodesets: Vec<PathBuf> = nodesets
+        .map(|node| reader.list(node))
+        .unwrap_or_default()
+        .iter()
+        .filter_map(|node| {
+            reader
+                .text(node, "the path of a file")
+                .map(|path| folder.join(path))
+        })
+        .collect();
+    let lds = match lds {
+        None => Some(Lds::Local),
+        Some(node) => match reader.text(node, "an endpoint or `none`") {
+            Some("none") => Some(Lds::Nowhere),
+            Some(_) => read_endpoint(node, reader).map(Lds::At),
+            None => None,
+        },
+    };
+    let open = open.map_or(Some(false), |node| reader.boolean(node));
+    let skills = reader
+        .needed(skills, "skills", root.place)
+        .map(|node| read_skills(node, reader));
+    Some(Component {
+        name: name?,
+        application_uri: uri?,
+        namespace: namespace?,
+        endpoint: endpoint?,
+        security,
+        nodesets,
+        lds: lds?,
+        open: open?,
+        skills: skills?,
+    })
+}
+
+fn read_name(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+    let text = reader.text(node, "a name")?;
+    let fits = !text.is_empty()
+        && text.len() <= LONGEST_NAME
+        && text
+            .bytes()
+            .all(|b| b.is_ascii_alphanumeric() || b == b'-' || b == b'_');
+    if fits {
+        return Some(text.to_owned());
+    }
+    let message = format!("`{}` is no name of a component or skill", shortened(text));
+    let help = "letters, digits, - and _, at most 64 of them";
+    reader
+        .findings()
+        .error_with(Code::Name, node.place, message, help);
+    None
+}
+
+fn read_uri(node: &Node, code: Code, reader: &mut Reader<'_>) -> Option<String> {
+    let text = reader.text(node, "a URI")?;
+    let scheme = text.split_once(':').is_some_and(|(scheme, rest)| {
+        !rest.is_empty()
+            && scheme.starts_with(|c: char| c.is_ascii_alphabetic())
+            && scheme.bytes().all(is_of_scheme)
+    });
+    let clean = !text
+        .chars()
+        .any(|c| c.is_whitespace() || c.is_control() || "<>\"{}|\\^`".contains(c));
+    if scheme && clean && text.len() <= LONGEST_URI {
+        return Some(text.to_owned());
+    }
+    let message = format!("`{}` is no URI", shortened(text));
+    let help = "for example urn:example:gripper";
+    reader
+        .findings()
+        .error_with(code, node.place, message, help);
+    None
+}
+
+fn is_of_scheme(b: u8) -> bool {
+    b.is_ascii_alphanumeric() || matches!(b, b'+' | b'-' | b'.')
+}
+
+fn read_namespace(node: &Node, reader: &mut Reader<'_>) -> Option<u16> {
+    let text = reader.text(node, "a number")?;
+    let number = text.parse().ok().filter(|number| *number > 0);
+    number.or_else(|| {
+        let message = format!(
+            "expected a number from 1 to 65535, found `{}`",
+            shortened(text)
+        );
+        reader.refuse(node, Code::Namespace, message)
+    })
+}
+
+fn read_endpoint(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+    let text = reader.text(node, "an endpoint")?;
+    match text.parse::<plant_opcua::server::EndpointUrl>() {
+        Ok(_) => Some(text.to_owned()),
+        Err(error) => {
+            let message = format!("`{}` is no endpoint: {error}", shortened(text));
+            let help = format!("for example {DEFAULT_ENDPOINT}, where 0 is any free port");
+            reader
+                .findings()
+                .error_with(Code::Endpoint, node.place, message, help);
+            None
+        }
+    }
+}
+
+fn read_security(node: &Node, reader: &mut Reader<'_>) -> Vec<Security> {
+    let nodes = reader.list(node);
+    let policies: Vec<Security> = nodes
+        .iter()
+        .filter_map(|node| match reader.text(node, "None or Basic256Sha256")? {
+            "None" => Some(Security::None),
+            "Basic256Sha256" => Some(Security::Basic256Sha256),
+            other => {
+                let message = format!(
+                    "expected None or Basic256Sha256, found `{}`",
+                    shortened(other)
+                );
+                reader.refuse(node, Code::WrongValue, message)
+            }
+        })
+        .collect();
+    if nodes.is_empty() {
+        let message = "a server without any security policy serves nobody";
+        reader
+            .findings()
+            .error(Code::WrongValue, node.place, message);
+    }
+    policies
+}
+
+fn read_skills(node: &Node, reader: &mut Reader<'_>) -> Vec<SkillSetup> {
+    let nodes = reader.list(node);
+    if nodes.is_empty() || nodes.len() > MOST_SKILLS {
+        let message = format!(
+            "a component has from 1 to {MOST_SKILLS} skills, and this one {}",
+            nodes.len()
+        );
+        reader.findings().error(Code::TooMany, node.place, message);
+    }
+    let mut skills: Vec<SkillSetup> = Vec::new();
+    for node in nodes.iter().take(MOST_SKILLS) {
+        let Some((skill, name_at)) = read_skill(node, reader) else {
+            continue;
+        };
+        // Names are found by people, who do not tell them apart by case.
+        if skills
+            .iter()
+            .any(|known| known.name.eq_ignore_ascii_case(&skill.name))
+        {
+            let message = format!("there is a skill `{}` already", skill.name);
+            reader.findings().error(Code::NameTwice, name_at, message);
+        }
+        skills.push(skill);
+    }
+    skills
+}
+
+fn read_skill(node: &Node, reader: &mut Reader<'_>) -> Option<(SkillSetup, Place)> {
+    let keys = ["name", "type", "driver", "capabilities", "timeout"];
+    let [name, skill_type, driver, capabilities, timeout] = reader.map(node, keys)?;
+    let name_at = name.map_or(node.place, |name| name.place);
+    let place = skill_type.map_or(node.place, |skill_type| skill_type.place);
+    let name = reader
+        .needed(name, "name", node.place)
+        .and_then(|node| read_name(node, reader));
+    let skill_type = reader
+        .needed(skill_type, "type", node.place)
+        .and_then(|node| read_type(node, reader));
+    let driver = reader
+        .needed(driver, "driver", node.place)
+        .and_then(|node| read_driver(node, reader));
+    let capabilities = capabilities
+        .map(|node| reader.list(node))
+        .unwrap_or_default()
+        .iter()
+        .filter_map(|node| read_uri(node, Code::Capability, reader))
+        .collect();
+    let timeout = match timeout {
+        Some(node) => Some(reader.duration(node)?),
+        None => None,
+    };
+    let skill = SkillSetup {
+        name: name?,
+        skill_type: skill_type?,
+        driver: driver?,
+        capabilities,
+        timeout,
+        place,
+    };
+    Some((skill, name_at))
+}
+
+fn read_type(node: &Node, reader: &mut Reader<'_>) -> Option<TypeName> {
+    let text = reader.text(node, "a skill type")?;
+    match text.parse() {
+        Ok(name) => Some(name),
+        Err(error) => reader.refuse(node, Code::SkillType, error.to_string()),
+    }
+}
+
+fn read_driver(node: &Node, reader: &mut Reader<'_>) -> Option<DriverSetup> {
+    if matches!(&node.kind, Kind::Scalar(text) if text == "simulated") {
+        return Some(DriverSetup::Simulated(Simulation::default()));
+    }
+    let [simulated, pick_and_place] = reader.map(node, ["simulated", "pick_and_place"])?;
+    match (simulated, pick_and_place) {
+        (Some(node), None) => read_simulation(node, reader).map(DriverSetup::Simulated),
+        (None, Some(node)) => read_partners(node, reader).map(DriverSetup::PickAndPlace),
+        _ => {
+            let message = "a driver is exactly one of `simulated` and `pick_and_place`";
+            reader.findings().error(Code::Driver, node.place, message);
+            None
+        }
+    }
+}
+
+fn read_simulation(node: &Node, reader: &mut Reader<'_>) -> Option<Simulation> {
+    let [duration, object, reach, time_scale] =
+        reader.map(node, ["duration", "object", "reach", "time_scale"])?;
+    Some(Simulation {
+        duration: duration.and_then(|node| reader.duration(node)),
+        object: object.and_then(|node| reader.boolean(node)),
+        reach: reach.and_then(|node| reader.number(node, (0.01, 100.0))),
+        time_scale: time_scale.and_then(|node| reader.number(node, (0.01, 1000.0))),
+    })
+}
+
+fn read_partners(node: &Node, reader: &mut Reader<'_>) -> Option<Partners> {
+    let [robot, gripper, within] = reader.map(node, ["robot", "gripper", "within"])?;
+    let robot = reader
+        .needed(robot, "robot", node.place)
+        .and_then(|node| read_endpoint(node, reader));
+    let gripper = reader
+        .needed(gripper, "gripper", node.place)
+        .and_then(|node| read_endpoint(node, reader));
+    let within = within.map_or(Some(USUALLY_WITHIN), |node| reader.duration(node));
+    Some(Partners {
+        robot: robot?,
+        gripper: gripper?,
+        within: within?,
+    })
+}
+
+const DEFAULT_ENDPOINT: &str = "opc.tcp://127.0.0.1:0";
+const USUALLY_WITHIN: Duration = Duration::from_secs(60);
+const LONGEST_NAME: usize = 64;
+const LONGEST_URI: usize = 256;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const GRIPPER: &str = include_str!("../../../../examples/plant/parallel-gripper.yaml");
+    const FAULTS: &str = include_str!("../../tests/faults.yaml");
+    const TOLD: &str = include_str!("../../tests/faults.txt");
+
+    #[test]
+    fn the_example_is_read_as_it_stands() {
+        let component = Component::from_yaml(GRIPPER, Path::new("examples/plant")).unwrap();
+        assert_eq!(
+            (component.name.as_str(), component.namespace),
+            ("parallel-gripper", 7)
+        );
+        let names: Vec<&str> = component
+            .skills
+            .iter()
+            .map(|skill| skill.name.as_str())
+            .collect();
+        assert_eq!(names, ["Grasp", "Release"]);
+        assert!(
+            matches!(&component.skills[0].driver, DriverSetup::Simulated(how) if how.duration == Some(Duration::from_millis(400)))
+        );
+    }
+
+    #[test]
+    fn all_faults_are_told_at_once_with_their_places_and_what_to_do() {
+        let told = Component::from_yaml(FAULTS, Path::new(""))
+            .unwrap_err()
+            .render("faults.yaml", FAULTS);
+        assert_eq!(told, TOLD, "\n{told}");
+    }
+
+    #[test]
+    fn what_is_no_yaml_or_no_map_is_told_with_its_place() {
+        for (text, expected) in [
+            ("component: [", "P001"),
+            ("", "P005"),
+            ("- a\n- b\n", "P005"),
+            ("component: *name\n", "P001"),
+            ("a: 1\n---\nb: 2\n", "P001"),
+            ("component: !name x\n", "P001"),
+        ] {
+            let findings = Component::from_yaml(text, Path::new(""))
+                .unwrap_err()
+                .sorted();
+            assert_eq!(findings[0].code.as_str(), expected, "{text}: {findings:?}");
+        }
+        let deep = format!("component: {}", "[".repeat(10_000));
+        assert!(Component::from_yaml(&deep, Path::new("")).is_err());
+    }
+}

@@ -1,0 +1,577 @@
+//! A component as an OPC UA server: its skills as instances of their types, with methods, events and parameters.
+//!
+//! Reading order: this, `types` (what a skill is, from the instance of its type), `show` (what clients see).
+
+mod show;
+mod types;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use async_trait::async_trait;
+use plant_opcua::server::{
+    EndpointUrl, IdRange, Instance, InstanceError, InstanceSpec, MethodHandler, MethodRequest,
+    Refusal as CallRefusal, Security as Policy, Server, ServerBuilder, ServerConfig, ServerError,
+    write,
+};
+use plant_opcua::types::{NodeId, ObjectId, ObjectTypeId, QualifiedName, StatusCode, Variant};
+use program::Method;
+use tokio::sync::{mpsc, watch};
+use tokio::task::JoinSet;
+
+use self::show::{Nodes, Shower};
+use crate::authority::{Authority, Owner};
+use crate::component::{Component, Drivers, Security, SkillSetup};
+use crate::driver::Driver;
+use crate::model::{self, NAMESPACE};
+use crate::parameters::TypeName;
+use crate::refusal::Refusal;
+use crate::shown::Observer;
+use crate::skill::{Facts, Skill};
+use crate::variant::from_variant;
+use crate::yaml::{Code, Finding, Findings};
+
+/// What the server of a component needs beside the component.
+#[derive(Debug, Clone, Default)]
+pub struct ServeSettings {
+    /// The directory of certificates, which Basic256Sha256 needs.
+    pub pki: Option<PathBuf>,
+    /// Trusts every client's certificate. For tests and demonstrations only.
+    pub trust_any_client: bool,
+}
+
+/// Why a component is not served.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeFault {
+    /// What is wrong with what the component says of its skills.
+    #[error("the component's skills cannot be made")]
+    Findings(Findings),
+    /// A NodeSet cannot be used, or the server cannot be built.
+    #[error(transparent)]
+    Server(#[from] ServerError),
+    /// The address space cannot be made.
+    #[error("the address space cannot be made: {0}")]
+    Space(String),
+}
+
+/// A component that is served, until [`stop`](Self::stop).
+pub struct ComponentServer {
+    server: Server,
+    authority: Authority,
+    skills: Vec<Skill>,
+    tasks: JoinSet<()>,
+}
+
+impl ComponentServer {
+    /// Builds the address space and listens; nobody is served until [`start`](Self::start). Each skill is Halted. `observers`
+    /// are asked for by the number of a skill, from 1, and what it is. Needs a tokio runtime.
+    ///
+    /// # Errors
+    /// Types that are not there or drivers that do not fit them, all of them at once; NodeSets, certificates or an address
+    /// that cannot be used.
+    pub fn build(
+        component: &Component,
+        settings: &ServeSettings,
+        mut observers: impl FnMut(u16, &Facts) -> Vec<Box<dyn Observer>>,
+    ) -> Result<Self, ServeFault> {
+        let server = server_of(component, settings)?;
+        let mut ids = IdRange::new(OWN, FIRST_FREE_ID);
+        let root = root(&server, component, &mut ids)?;
+        let folder = root
+            .node("Skills")
+            .cloned()
+            .ok_or_else(|| ServeFault::Space("it has no folder Skills".to_owned()))?;
+        let mut drivers = Drivers::new();
+        let mut findings = Findings::default();
+        let mut made = Vec::new();
+        for (number, setup) in (1..).zip(&component.skills) {
+            match make(&server, (number, setup), &folder, &mut drivers, &mut ids) {
+                Ok(skill) => made.push(skill),
+                Err(finding) => findings.push(finding),
+            }
+        }
+        if !findings.is_empty() {
+            return Err(ServeFault::Findings(findings));
+        }
+        let authority = Authority::new();
+        let mut served = Vec::new();
+        for (
+            number,
+            Made {
+                facts,
+                driver,
+                nodes,
+            },
+        ) in (1..).zip(made)
+        {
+            let mut all: Vec<Box<dyn Observer>> =
+                vec![Box::new(Shower::new(server.clone(), Arc::clone(&nodes)))];
+            all.extend(observers(number, &facts));
+            nodes.show_at_first(&server, &facts);
+            let skill = Skill::spawn(facts, driver, authority.clone(), all);
+            serve(&server, &nodes, &skill);
+            served.push((skill, nodes));
+        }
+        let skills = served.iter().map(|(skill, _)| skill.clone()).collect();
+        let mut tasks = JoinSet::new();
+        tasks.spawn(free_when_closed(server.clone(), served, authority.clone()));
+        if let Some(node) = root.node("LeaseHolder") {
+            tasks.spawn(show_holder(
+                server.clone(),
+                node.clone(),
+                authority.holder(),
+            ));
+        }
+        Ok(Self {
+            server,
+            authority,
+            skills,
+            tasks,
+        })
+    }
+
+    /// Serves clients from now on.
+    pub fn start(&self) {
+        self.server.start();
+    }
+
+    /// Halts what runs, closes all connections and stops listening. Takes 4 s at most.
+    pub async fn stop(mut self) {
+        self.tasks.abort_all();
+        let closing = self.skills.iter().map(Skill::close);
+        futures_util::future::join_all(closing).await;
+        self.server.stop().await;
+    }
+
+    /// Where clients connect, with the port that is listened on.
+    #[must_use]
+    pub fn url(&self) -> &str {
+        self.server.url()
+    }
+
+    /// The skills, by their numbers from 1.
+    #[must_use]
+    pub fn skills(&self) -> &[Skill] {
+        &self.skills
+    }
+
+    /// Who may have it do something.
+    #[must_use]
+    pub fn authority(&self) -> &Authority {
+        &self.authority
+    }
+}
+
+fn server_of(component: &Component, settings: &ServeSettings) -> Result<Server, ServeFault> {
+    let endpoint: EndpointUrl = component
+        .endpoint
+        .parse()
+        .map_err(|error| ServeFault::Space(format!("{}: {error}", component.endpoint)))?;
+    let policies = component.security.iter().map(|security| match security {
+        Security::None => Policy::None,
+        Security::Basic256Sha256 => Policy::Basic256Sha256,
+    });
+    let config = ServerConfig {
+        security: policies.collect(),
+        pki: settings.pki.clone(),
+        trust_unknown_clients: settings.trust_any_client,
+        ..ServerConfig::new(&component.application_uri, &component.name, endpoint)
+    };
+    let mut builder = ServerBuilder::new(config).nodeset_str(NAMESPACE, &model::nodeset());
+    for file in &component.nodesets {
+        builder = builder.nodeset_file(file);
+    }
+    Ok(builder.build()?)
+}
+
+/// The object of the component, below Objects.
+fn root(server: &Server, component: &Component, ids: &mut IdRange) -> Result<Instance, ServeFault> {
+    let space = |why: &dyn std::fmt::Display| ServeFault::Space(why.to_string());
+    let controller = server
+        .find_type(NAMESPACE, model::CONTROLLER_TYPE)
+        .ok_or_else(|| space(&"there is no ISkillControllerType"))?;
+    let spec = InstanceSpec {
+        reference: plant_opcua::types::ReferenceTypeId::Organizes.into(),
+        interfaces: vec![controller],
+        ..InstanceSpec::new(
+            ObjectTypeId::BaseObjectType.into(),
+            NodeId::new(OWN, COMPONENT_ID),
+            QualifiedName::new(OWN, component.name.as_str()),
+            ObjectId::ObjectsFolder.into(),
+        )
+    };
+    let made = server
+        .instantiate(&spec, &mut |_| ids.next())
+        .map_err(|error| space(&error))?;
+    if let Some(node) = made.node("NamespaceNumber") {
+        server
+            .show(node, component.namespace)
+            .map_err(|status| space(&status))?;
+    }
+    Ok(made)
+}
+
+struct Made {
+    facts: Facts,
+    driver: Arc<dyn Driver>,
+    nodes: Arc<Nodes>,
+}
+
+/// The instance of a skill's type, and what it is.
+fn make(
+    server: &Server,
+    (number, setup): (u32, &SkillSetup),
+    folder: &NodeId,
+    drivers: &mut Drivers,
+    free: &mut IdRange,
+) -> Result<Made, Finding> {
+    let SkillSetup {
+        name,
+        skill_type,
+        place,
+        ..
+    } = setup;
+    let wrong = |code, message: String| Finding::error(code, *place, message);
+    let Some(type_id) = server.find_type(&skill_type.namespace, &skill_type.name) else {
+        let own = skill_type.namespace == NAMESPACE;
+        let names: Vec<&str> = model::TYPES.iter().map(|of| of.name).collect();
+        let near = crate::yaml::nearest(&skill_type.name, &names).filter(|_| own);
+        let help = match near {
+            Some(near) => format!("did you mean `{near}`?"),
+            None if own => {
+                "types of others are named as nsu=<namespace uri>;<BrowseName>".to_owned()
+            }
+            None => "the NodeSet with the type stands under `nodesets`".to_owned(),
+        };
+        return Err(
+            wrong(Code::SkillType, format!("there is no type {skill_type}")).with_help(help),
+        );
+    };
+    let types = types::chain(server, &type_id);
+    let root = TypeName::own(model::SKILL_TYPE);
+    let Some(last) = types.iter().position(|of| *of == root) else {
+        return Err(wrong(
+            Code::SkillType,
+            format!("{skill_type} is no subtype of SkillType"),
+        ));
+    };
+    let types: Vec<TypeName> = types.into_iter().take(last + 1).collect();
+    let driver = drivers
+        .make(&setup.driver, &types)
+        .map_err(|fault| wrong(Code::Driver, fault.to_string()))?;
+    let first = number * IDS_PER_SKILL;
+    let spec = InstanceSpec {
+        event_notifier: true,
+        optional: vec!["ProgramDiagnostic".to_owned()],
+        ..InstanceSpec::new(
+            type_id,
+            NodeId::new(OWN, first),
+            QualifiedName::new(OWN, name.as_str()),
+            folder.clone(),
+        )
+    };
+    let made = server.instantiate(&spec, &mut |path| match kept(path) {
+        Some(offset) => NodeId::new(OWN, first + offset),
+        None => free.next(),
+    });
+    let instance = made.map_err(|error| {
+        let code = if matches!(error, InstanceError::Abstract(_)) {
+            Code::AbstractType
+        } else {
+            Code::SkillType
+        };
+        let finding = wrong(code, format!("{skill_type} has no instances: {error}"));
+        finding.with_help("a subtype that is not abstract has skills")
+    })?;
+    let facts = Facts {
+        name: name.clone(),
+        parameters: types::parameters(server, &instance, "ParameterSet", &types, |of| {
+            of.parameters()
+        }),
+        results: types::parameters(server, &instance, "FinalResultData", &types, |of| {
+            of.results()
+        }),
+        types,
+        capabilities: setup.capabilities.clone(),
+        timeout: setup.timeout,
+    };
+    let nodes = Nodes::new(server, instance, &facts);
+    Ok(Made {
+        facts,
+        driver,
+        nodes: Arc::new(nodes),
+    })
+}
+
+/// The identifier of a node that has its own place within the skill's hundred.
+fn kept(path: &str) -> Option<u32> {
+    Some(match path {
+        "CurrentState" => 1,
+        "ParameterSet" => 3,
+        "FinalResultData" => 4,
+        "Start" => 5,
+        "Halt" => 6,
+        "Suspend" => 7,
+        "Resume" => 8,
+        "Reset" => 9,
+        _ => return None,
+    })
+}
+
+/// Has clients write parameters and call methods.
+fn serve(server: &Server, nodes: &Nodes, skill: &Skill) {
+    for (name, node) in nodes.parameters() {
+        let (skill, name) = (skill.clone(), name.to_owned());
+        server.on_write(
+            node,
+            write(move |request| {
+                let value = request.value.value.as_ref().and_then(from_variant);
+                let value = value.ok_or(StatusCode::BadTypeMismatch)?;
+                let by = Owner::Session(request.caller.session);
+                skill
+                    .write(&by, &name, value)
+                    .map_err(|refusal| status(&refusal))
+            }),
+        );
+    }
+    for method in Method::ALL {
+        if let Some(node) = nodes.method(method) {
+            let handler = Call {
+                skill: skill.clone(),
+                method,
+            };
+            server.on_call(nodes.skill(), node, Arc::new(handler));
+        }
+    }
+}
+
+struct Call {
+    skill: Skill,
+    method: Method,
+}
+
+#[async_trait]
+impl MethodHandler for Call {
+    async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, CallRefusal> {
+        let by = Owner::Session(request.caller.session);
+        match self.skill.call(by, self.method).await {
+            Ok(_) => Ok(Vec::new()),
+            Err(refusal) => Err(status(&refusal).into()),
+        }
+    }
+}
+
+fn status(refusal: &Refusal) -> StatusCode {
+    StatusCode::from(refusal.code.number())
+}
+
+/// A session that is gone has no lease any more, and what it wrote counts for nothing.
+async fn free_when_closed(server: Server, served: Vec<(Skill, Arc<Nodes>)>, authority: Authority) {
+    let (closed, mut told) = mpsc::unbounded_channel();
+    server.on_session_closed(move |session| {
+        // Without the task nobody has a lease.
+        let _told = closed.send(session);
+    });
+    while let Some(session) = told.recv().await {
+        let owner = Owner::Session(session);
+        authority.release(&owner);
+        for (skill, nodes) in &served {
+            if skill.forget(&owner) {
+                nodes.show_defaults(&server, skill.facts());
+            }
+        }
+    }
+}
+
+async fn show_holder(server: Server, node: NodeId, mut holder: watch::Receiver<Option<Owner>>) {
+    loop {
+        let text = holder
+            .borrow_and_update()
+            .as_ref()
+            .map(ToString::to_string)
+            .unwrap_or_default();
+        // The node is ours for as long as the server is there.
+        let _shown = server.show(&node, text);
+        if holder.changed().await.is_err() {
+            return;
+        }
+    }
+}
+
+/// The namespace of the instances: that of the ApplicationUri.
+const OWN: u16 = 1;
+const COMPONENT_ID: u32 = 1;
+const IDS_PER_SKILL: u32 = 100;
+const FIRST_FREE_ID: u32 = 10_000;
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+    use std::time::Duration;
+
+    use program::State;
+
+    use super::*;
+    use crate::value::Value;
+
+    const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/plant");
+
+    fn example(name: &str) -> Component {
+        let folder = Path::new(EXAMPLES);
+        let text = std::fs::read_to_string(folder.join(name)).unwrap();
+        Component::from_yaml(&text, folder)
+            .unwrap_or_else(|found| panic!("{}", found.render(name, &text)))
+    }
+
+    fn served(component: &Component) -> Result<ComponentServer, ServeFault> {
+        ComponentServer::build(component, &ServeSettings::default(), |_, _| Vec::new())
+    }
+
+    fn findings(yaml: &str) -> String {
+        let component = Component::from_yaml(yaml, Path::new(EXAMPLES)).unwrap();
+        match served(&component) {
+            Err(ServeFault::Findings(findings)) => findings.render("x.yaml", yaml),
+            Err(fault) => fault.to_string(),
+            Ok(_) => String::new(),
+        }
+    }
+
+    #[tokio::test]
+    async fn skills_stand_at_their_numbers_and_show_what_happens() {
+        let component = served(&example("parallel-gripper.yaml")).unwrap();
+        let server = &component.server;
+        let value = |id: u32| {
+            server
+                .value(&NodeId::new(1, id))
+                .and_then(|value| value.value)
+        };
+        let name = |id: u32| {
+            server
+                .browse_name(&NodeId::new(1, id))
+                .map(|name| name.name.as_ref().to_owned())
+        };
+        assert_eq!(name(1).as_deref(), Some("parallel-gripper"));
+        let ids = [100, 101, 103, 104, 105, 106, 107, 108, 109, 200];
+        let names: Vec<String> = ids.into_iter().filter_map(name).collect();
+        let expected = [
+            "Grasp",
+            "CurrentState",
+            "ParameterSet",
+            "FinalResultData",
+            "Start",
+            "Halt",
+            "Suspend",
+            "Resume",
+            "Reset",
+            "Release",
+        ];
+        assert_eq!(names, expected);
+
+        let skill = &component.skills()[0];
+        let me = Owner::Session(1);
+        skill.call(me.clone(), Method::Reset).await.unwrap();
+        skill.write(&me, "Force", 12.0.into()).unwrap();
+        skill.call(me, Method::Start).await.unwrap();
+        let state = |value: Option<Variant>| value.map(|value| value.to_string());
+        assert!(
+            state(value(101)).is_some_and(|text| text.contains("Running")),
+            "{:?}",
+            value(101)
+        );
+        let mut watch = skill.watch();
+        let ended = watch.wait_for(|shown| shown.state == State::Ready);
+        tokio::time::timeout(Duration::from_secs(5), ended)
+            .await
+            .unwrap()
+            .unwrap();
+        assert!(state(value(101)).is_some_and(|text| text.contains("Ready")));
+        let children = server.children(&NodeId::new(1, 104));
+        let result = |name: &str| {
+            let child = children
+                .iter()
+                .find(|child| child.browse_name.name.as_ref() == name)?;
+            server
+                .value(&child.node_id)?
+                .value
+                .as_ref()
+                .and_then(from_variant)
+        };
+        assert_eq!(result("Succeeded"), Some(Value::Boolean(true)));
+        assert_eq!(result("Gripped"), Some(Value::Boolean(true)));
+        assert_eq!(result("Run"), Some(Value::UInt32(1)));
+        component.stop().await;
+    }
+
+    #[tokio::test]
+    async fn a_type_of_another_maker_has_what_its_supertypes_have_and_more() {
+        let component = served(&example("vacuum-gripper.yaml")).unwrap();
+        let facts = component.skills()[0].facts();
+        let types: Vec<&str> = facts.types.iter().map(|of| of.name.as_str()).collect();
+        assert_eq!(
+            types,
+            [
+                "VacuumGraspSkillType",
+                "GraspSkillType",
+                "GripperSkillType",
+                "SkillType"
+            ]
+        );
+        assert_eq!(facts.types[0].namespace, "urn:example:vacuum");
+        let parameters: Vec<(&str, Option<&Value>)> = facts
+            .parameters
+            .iter()
+            .map(|of| (of.name.as_str(), of.default.as_ref()))
+            .collect();
+        let expected = [
+            ("Force", Some(&Value::Double(20.0))),
+            ("Vacuum", Some(&Value::Double(60.0))),
+        ];
+        assert_eq!(parameters, expected);
+        assert_eq!(facts.parameters[0].unit.as_deref(), Some("N"));
+        component.stop().await;
+        let robot = served(&example("robot.yaml")).unwrap();
+        assert_eq!(robot.skills().len(), 2);
+        robot.stop().await;
+    }
+
+    #[tokio::test]
+    async fn types_that_are_not_there_or_do_not_fit_are_told_at_once_with_their_places() {
+        let head = "component: x\napplication_uri: urn:x\nnamespace: 9\nnodesets: [vacuum-gripper.xml]\nskills:\n";
+        let skill = |name: &str, of: &str| {
+            format!("  - {{name: {name}, type: \"{of}\", driver: simulated}}\n")
+        };
+        let yaml = [
+            head.to_owned(),
+            skill("A", "GraspSkilType"),
+            skill("B", "MoveSkillType"),
+            skill("C", "nsu=urn:example:vacuum;Nothing"),
+            skill("D", "PickAndPlaceSkillType"),
+            skill("E", "ISkillControllerType"),
+        ];
+        let told = findings(&yaml.concat());
+        for expected in [
+            "error[P020]: there is no type nsu=urn:ua-bridge:skills;GraspSkilType\n --> x.yaml:6:",
+            "did you mean `GraspSkillType`?",
+            "error[P022]: `simulated` does the work of",
+            " --> x.yaml:7:",
+            "the NodeSet with the type stands under `nodesets`",
+            " --> x.yaml:9:",
+            "error[P020]: nsu=urn:ua-bridge:skills;ISkillControllerType is no subtype of SkillType",
+        ] {
+            assert!(told.contains(expected), "{expected}\nis not in\n{told}");
+        }
+        let abstract_type = format!("{head}{}", skill("A", "GripperSkillType"));
+        assert!(
+            findings(&abstract_type).contains("`simulated` does the work of"),
+            "{}",
+            findings(&abstract_type)
+        );
+        let missing =
+            head.replace("vacuum-gripper.xml", "nowhere.xml") + &skill("A", "GraspSkillType");
+        assert!(
+            findings(&missing).contains("nowhere.xml"),
+            "{}",
+            findings(&missing)
+        );
+    }
+}

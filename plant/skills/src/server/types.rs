@@ -1,0 +1,105 @@
+//! What a skill is, from its type and the instance of it.
+
+use plant_opcua::server::{Instance, Server};
+use plant_opcua::types::{NodeId, Variant};
+
+use crate::model::{self, NAMESPACE, SkillType};
+use crate::parameters::{Parameter, TypeName};
+use crate::value::Shape;
+use crate::variant::{builtin_of, from_variant};
+
+/// A type and its supertypes, nearest first.
+pub(super) fn chain(server: &Server, type_id: &NodeId) -> Vec<TypeName> {
+    let namespaces = server.namespaces();
+    let named = |id: &NodeId| {
+        let name = server.browse_name(id)?;
+        Some(TypeName {
+            namespace: namespaces.get(usize::from(name.namespace_index))?.clone(),
+            name: name.name.as_ref().to_owned(),
+        })
+    };
+    let supertypes = server.supertypes(type_id);
+    std::iter::once(type_id)
+        .chain(&supertypes)
+        .filter_map(named)
+        .collect()
+}
+
+/// The variables of one of its groups: those of our types as the table has them and in its order, then what other types add.
+pub(super) fn parameters(
+    server: &Server,
+    instance: &Instance,
+    group: &str,
+    types: &[TypeName],
+    of_table: impl Fn(&'static SkillType) -> Vec<Parameter>,
+) -> Vec<Parameter> {
+    let nearest = types
+        .iter()
+        .find(|of| of.namespace == NAMESPACE)
+        .and_then(|of| model::find(&of.name));
+    let mut all = nearest.map(of_table).unwrap_or_default();
+    for (path, node) in instance.nodes() {
+        let Some(name) = path
+            .strip_prefix(group)
+            .and_then(|rest| rest.strip_prefix('/'))
+        else {
+            continue;
+        };
+        if name.contains('/') || OUTCOME.contains(&name) {
+            continue;
+        }
+        let Some(facts) = server.variable_facts(node) else {
+            continue;
+        };
+        let value = facts.value.value.as_ref().and_then(from_variant);
+        if let Some(known) = all.iter_mut().find(|known| known.name == name) {
+            // A subtype may have another default.
+            if let Some(value) = value.filter(|value| value.shape() == known.shape) {
+                known.default = Some(value);
+            }
+            continue;
+        }
+        let Some(builtin) = builtin_of(&facts.data_type) else {
+            tracing::warn!(
+                "{path}: its data type {} is not one that a skill can be told in",
+                facts.data_type
+            );
+            continue;
+        };
+        let property = |which: &str| instance.node(&format!("{path}/{which}"));
+        all.push(Parameter {
+            name: name.to_owned(),
+            shape: Shape {
+                builtin,
+                array: facts.value_rank >= 1,
+            },
+            length: None,
+            default: value,
+            unit: property("EngineeringUnits").and_then(|node| unit(server, node)),
+            range: property("EURange").and_then(|node| range(server, node)),
+            about: facts.description.text.as_ref().to_owned(),
+        });
+    }
+    all
+}
+
+fn unit(server: &Server, node: &NodeId) -> Option<String> {
+    let value = server.value(node)?.value?;
+    let Variant::ExtensionObject(object) = value else {
+        return None;
+    };
+    let unit = object.inner_as::<plant_opcua::types::EUInformation>()?;
+    Some(unit.display_name.text.as_ref().to_owned())
+}
+
+fn range(server: &Server, node: &NodeId) -> Option<(f64, f64)> {
+    let value = server.value(node)?.value?;
+    let Variant::ExtensionObject(object) = value else {
+        return None;
+    };
+    let range = object.inner_as::<plant_opcua::types::Range>()?;
+    Some((range.low, range.high))
+}
+
+/// What SkillType itself has among its results.
+pub(super) const OUTCOME: [&str; 3] = ["Run", "Succeeded", "Message"];

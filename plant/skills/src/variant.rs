@@ -1,0 +1,121 @@
+//! Values of skills and of OPC UA.
+
+use plant_opcua::types::{Array, NodeId, UAString, Variant, VariantScalarTypeId};
+
+use crate::value::{Builtin, Value};
+
+/// As OPC UA has it.
+pub(crate) fn to_variant(value: &Value) -> Variant {
+    match value {
+        Value::Boolean(value) => Variant::Boolean(*value),
+        Value::SByte(value) => Variant::SByte(*value),
+        Value::Byte(value) => Variant::Byte(*value),
+        Value::Int16(value) => Variant::Int16(*value),
+        Value::UInt16(value) => Variant::UInt16(*value),
+        Value::Int32(value) => Variant::Int32(*value),
+        Value::UInt32(value) => Variant::UInt32(*value),
+        Value::Int64(value) => Variant::Int64(*value),
+        Value::UInt64(value) => Variant::UInt64(*value),
+        Value::Float(value) => Variant::Float(*value),
+        Value::Double(value) => Variant::Double(*value),
+        Value::String(value) => Variant::String(UAString::from(value.as_str())),
+        Value::Array(builtin, elements) => {
+            let values = elements.iter().map(to_variant).collect();
+            Variant::Array(Box::new(Array {
+                value_type: scalar_type(*builtin),
+                values,
+                dimensions: None,
+            }))
+        }
+    }
+}
+
+/// From OPC UA; none for what skills have no values of: other types, arrays of several dimensions, nothing.
+pub(crate) fn from_variant(variant: &Variant) -> Option<Value> {
+    Some(match variant {
+        Variant::Boolean(value) => Value::Boolean(*value),
+        Variant::SByte(value) => Value::SByte(*value),
+        Variant::Byte(value) => Value::Byte(*value),
+        Variant::Int16(value) => Value::Int16(*value),
+        Variant::UInt16(value) => Value::UInt16(*value),
+        Variant::Int32(value) => Value::Int32(*value),
+        Variant::UInt32(value) => Value::UInt32(*value),
+        Variant::Int64(value) => Value::Int64(*value),
+        Variant::UInt64(value) => Value::UInt64(*value),
+        Variant::Float(value) => Value::Float(*value),
+        Variant::Double(value) => Value::Double(*value),
+        Variant::String(value) => Value::String(value.as_ref().to_owned()),
+        Variant::Array(array) => {
+            if array
+                .dimensions
+                .as_ref()
+                .is_some_and(|dimensions| dimensions.len() > 1)
+            {
+                return None;
+            }
+            let builtin = Builtin::ALL
+                .iter()
+                .copied()
+                .find(|one| scalar_type(*one) == array.value_type)?;
+            let elements: Option<Vec<Value>> = array.values.iter().map(from_variant).collect();
+            let elements =
+                elements.filter(|all| all.iter().all(|one| one.shape().builtin == builtin))?;
+            Value::Array(builtin, elements)
+        }
+        _ => return None,
+    })
+}
+
+/// The data type's node in namespace 0.
+pub(crate) fn data_type(builtin: Builtin) -> NodeId {
+    NodeId::new(0, u32::from(builtin.id()))
+}
+
+/// The builtin type of a data type that is one.
+pub(crate) fn builtin_of(data_type: &NodeId) -> Option<Builtin> {
+    let id = (data_type.namespace == 0).then(|| data_type.as_u32())??;
+    Builtin::of_id(id)
+}
+
+fn scalar_type(builtin: Builtin) -> VariantScalarTypeId {
+    match builtin {
+        Builtin::Boolean => VariantScalarTypeId::Boolean,
+        Builtin::SByte => VariantScalarTypeId::SByte,
+        Builtin::Byte => VariantScalarTypeId::Byte,
+        Builtin::Int16 => VariantScalarTypeId::Int16,
+        Builtin::UInt16 => VariantScalarTypeId::UInt16,
+        Builtin::Int32 => VariantScalarTypeId::Int32,
+        Builtin::UInt32 => VariantScalarTypeId::UInt32,
+        Builtin::Int64 => VariantScalarTypeId::Int64,
+        Builtin::UInt64 => VariantScalarTypeId::UInt64,
+        Builtin::Float => VariantScalarTypeId::Float,
+        Builtin::Double => VariantScalarTypeId::Double,
+        Builtin::String => VariantScalarTypeId::String,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_value_is_the_same_after_its_way_through_opc_ua() {
+        for value in [
+            Value::from(true),
+            Value::UInt16(65_535),
+            Value::from("x"),
+            Value::from([0.5; 6]),
+            Value::Array(Builtin::String, Vec::new()),
+        ] {
+            assert_eq!(from_variant(&to_variant(&value)), Some(value));
+        }
+        assert_eq!(from_variant(&Variant::Empty), None);
+        let mixed = Array {
+            value_type: VariantScalarTypeId::Double,
+            values: vec![Variant::Double(1.0), Variant::Int32(1)],
+            dimensions: None,
+        };
+        assert_eq!(from_variant(&Variant::Array(Box::new(mixed))), None);
+        assert_eq!(builtin_of(&data_type(Builtin::Float)), Some(Builtin::Float));
+    }
+}

@@ -1,0 +1,195 @@
+//! What is wrong with a document, told as rustc tells it: code, place, the line with a caret, help.
+
+use std::fmt::{self, Write as _};
+
+use super::tree::Place;
+
+macro_rules! codes {
+    ($($name:ident = $text:literal, $explanation:literal;)*) => {
+        /// What kind of finding. A code keeps its meaning from release to release; new ones may come.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+        #[non_exhaustive]
+        pub enum Code { $(#[doc = concat!($text, ": ", $explanation)] $name,)* }
+
+        impl Code {
+            /// Every code, ascending.
+            pub const ALL: &'static [Self] = &[$(Self::$name),*];
+
+            /// As `P001`.
+            #[must_use]
+            pub const fn as_str(self) -> &'static str {
+                match self { $(Self::$name => $text),* }
+            }
+
+            /// What the code means in general and what to do about it.
+            #[must_use]
+            pub const fn explanation(self) -> &'static str {
+                match self { $(Self::$name => $explanation),* }
+            }
+        }
+    };
+}
+
+codes! {
+    Syntax = "P001", "The text is not YAML, or uses what is not read here: several documents, tags, aliases. Nothing after the place has been looked at.";
+    TooLarge = "P002", "The document passes a limit: 1 MiB, 20 000 values, 16 levels of nesting.";
+    UnknownKey = "P003", "No key of that name is read at this place. Keys are spelt in lower case with underscores.";
+    DuplicateKey = "P004", "A key occurs twice in one map.";
+    WrongValue = "P005", "The value is not what its key takes: a list, a map, a number of a range, or one of a few words.";
+    MissingKey = "P006", "A key that has no default is not there.";
+    Name = "P010", "A name has letters, digits, - and _ only, at most 64 of them: it stands in the names of the space.";
+    NameTwice = "P011", "Two skills of a component have one name.";
+    Uri = "P012", "A URI has a scheme, as urn:example:gripper or https://example.com/grasp, and no blanks.";
+    Namespace = "P013", "The namespace is the number of the component in the space of the cell, from 1 to 65535, and of no other program.";
+    Endpoint = "P014", "An endpoint is opc.tcp://<host>:<port>[/path].";
+    Duration = "P015", "A duration is a number with its unit, as 400 ms, 2.5 s or 10 min.";
+    NodeSet = "P016", "A NodeSet is a file in the form of OPC 10000-6, annex F, beside the document or by its path.";
+    SkillType = "P020", "A skill type is one of urn:ua-bridge:skills by its name, or nsu=<namespace uri>;<BrowseName> of one that a NodeSet brings, and a subtype of SkillType.";
+    AbstractType = "P021", "An abstract type has no skills of its own, only its subtypes have.";
+    Driver = "P022", "Who does the work of a skill: `simulated` for grippers and robots, `pick_and_place` for PickAndPlaceSkillType.";
+    TooMany = "P023", "A component has from 1 to 99 skills.";
+    Capability = "P024", "A capability is the IRI of its class in the plant's knowledge.";
+}
+
+impl fmt::Display for Code {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+/// One finding. Each is an error: the document cannot be used with it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Finding {
+    /// What kind.
+    pub code: Code,
+    /// The text it is about.
+    pub place: Place,
+    /// What is wrong, naming the value.
+    pub message: String,
+    /// What to do about it.
+    pub help: Option<String>,
+}
+
+impl Finding {
+    /// An error.
+    pub fn error(code: Code, place: Place, message: impl Into<String>) -> Self {
+        Self {
+            code,
+            place,
+            message: message.into(),
+            help: None,
+        }
+    }
+
+    /// With what to do about it.
+    #[must_use]
+    pub fn with_help(mut self, help: impl Into<String>) -> Self {
+        self.help = Some(help.into());
+        self
+    }
+
+    /// The finding with its source line, several lines of text that end in a newline. Control characters of the source are
+    /// replaced, so that a document cannot steer the terminal.
+    #[must_use]
+    pub fn render(&self, file: &str, source: &str) -> String {
+        let Place { line, column, len } = self.place;
+        let width = line.to_string().len();
+        let mut out = format!("error[{}]: {}\n", self.code, printable(&self.message));
+        // A write to a String cannot fail.
+        _ = writeln!(out, "{:width$}--> {}:{line}:{column}", "", printable(file));
+        if let Some(text) = line.checked_sub(1).and_then(|n| source.lines().nth(n)) {
+            let shown: String = text.trim_end().chars().take(WIDTH).map(visible).collect();
+            let before = column.saturating_sub(1).min(WIDTH);
+            let carets = len.min(WIDTH.saturating_sub(before)).max(1);
+            _ = writeln!(
+                out,
+                "{:width$} |\n{line} | {shown}\n{:width$} | {:before$}{:^<carets$}",
+                "", "", "", ""
+            );
+        }
+        if let Some(help) = &self.help {
+            _ = writeln!(out, "{:width$} = help: {}", "", printable(help));
+        }
+        out
+    }
+}
+
+/// What has been found so far.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Findings {
+    found: Vec<Finding>,
+    left_out: usize,
+}
+
+impl Findings {
+    /// Takes one in. From a few hundred on they are counted only.
+    pub fn push(&mut self, finding: Finding) {
+        if self.found.len() >= MOST {
+            self.left_out += 1;
+        } else if !self.found.contains(&finding) {
+            self.found.push(finding);
+        }
+    }
+
+    /// Notes an error.
+    pub fn error(&mut self, code: Code, place: Place, message: impl Into<String>) {
+        self.push(Finding::error(code, place, message));
+    }
+
+    /// Notes an error with what to do about it.
+    pub fn error_with(
+        &mut self,
+        code: Code,
+        place: Place,
+        message: impl Into<String>,
+        help: impl Into<String>,
+    ) {
+        self.push(Finding::error(code, place, message).with_help(help));
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.found.is_empty()
+    }
+
+    /// In the order of the text.
+    #[must_use]
+    pub fn sorted(mut self) -> Vec<Finding> {
+        self.found
+            .sort_by_key(|finding| (finding.place, finding.code));
+        if self.left_out > 0 {
+            let message = format!("{} more findings are not shown", self.left_out);
+            self.found
+                .push(Finding::error(Code::TooLarge, Place::START, message));
+        }
+        self.found
+    }
+
+    /// All of them as text for people, a blank line after each.
+    #[must_use]
+    pub fn render(self, file: &str, source: &str) -> String {
+        self.sorted()
+            .iter()
+            .map(|finding| finding.render(file, source) + "\n")
+            .collect()
+    }
+}
+
+/// Widest piece of a line that is shown.
+const WIDTH: usize = 160;
+const MOST: usize = 200;
+
+fn printable(text: &str) -> String {
+    text.chars().map(visible).collect()
+}
+
+fn visible(c: char) -> char {
+    match c {
+        '\t' => '\u{2192}',
+        c if c.is_control() => '\u{fffd}',
+        // Marks that turn the direction of the text around them.
+        '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => '\u{fffd}',
+        c => c,
+    }
+}

@@ -1,0 +1,253 @@
+//! Tree -> values. Every fault is noted and reading goes on beside it.
+
+use std::time::Duration;
+
+use super::findings::{Code, Finding, Findings};
+use super::tree::{Kind, Node, Place};
+use crate::parameters::shortened;
+
+/// Takes values from nodes and notes what is wrong with them.
+#[derive(Debug)]
+pub struct Reader<'f> {
+    findings: &'f mut Findings,
+}
+
+impl<'f> Reader<'f> {
+    /// One that notes there.
+    pub fn new(findings: &'f mut Findings) -> Self {
+        Self { findings }
+    }
+
+    /// Where it notes.
+    pub fn findings(&mut self) -> &mut Findings {
+        self.findings
+    }
+
+    /// The values of a map in the order of `keys`; a key without a value counts as left out. Keys that are none of them are
+    /// noted. `None` where it is no map.
+    pub fn map<'n, const N: usize>(
+        &mut self,
+        node: &'n Node,
+        keys: [&str; N],
+    ) -> Option<[Option<&'n Node>; N]> {
+        let Kind::Map(pairs) = &node.kind else {
+            self.wrong(node, &format!("a map with {}", list(&keys)));
+            return None;
+        };
+        let mut values = [None; N];
+        let mut seen: Vec<&str> = Vec::new();
+        for (key, value) in pairs {
+            let Kind::Scalar(text) = &key.kind else {
+                self.wrong(key, "a key");
+                continue;
+            };
+            if seen.contains(&text.as_str()) {
+                let message = format!("the key `{}` is repeated", shortened(text));
+                self.findings.error(Code::DuplicateKey, key.place, message);
+                continue;
+            }
+            seen.push(text);
+            match keys
+                .iter()
+                .zip(&mut values)
+                .find(|(known, _)| **known == text)
+            {
+                Some((_, slot)) => *slot = Some(value).filter(|value| value.kind != Kind::Null),
+                None => {
+                    let message = format!("unknown key `{}`", shortened(text));
+                    let help = match nearest(text, &keys) {
+                        Some(near) => {
+                            format!("did you mean `{near}`? Known here are {}", list(&keys))
+                        }
+                        None => format!("known here are {}", list(&keys)),
+                    };
+                    self.findings
+                        .error_with(Code::UnknownKey, key.place, message, help);
+                }
+            }
+        }
+        Some(values)
+    }
+
+    /// A key that has to be there.
+    pub fn needed<'n>(
+        &mut self,
+        value: Option<&'n Node>,
+        key: &str,
+        of: Place,
+    ) -> Option<&'n Node> {
+        if value.is_none() {
+            self.findings
+                .error(Code::MissingKey, of, format!("`{key}` is missing"));
+        }
+        value
+    }
+
+    /// A single value as written.
+    pub fn text<'n>(&mut self, node: &'n Node, wanted: &str) -> Option<&'n str> {
+        match &node.kind {
+            Kind::Scalar(text) => Some(text),
+            _ => {
+                self.wrong(node, wanted);
+                None
+            }
+        }
+    }
+
+    /// A list; a single value counts as a list of one.
+    pub fn list<'n>(&mut self, node: &'n Node) -> &'n [Node] {
+        match &node.kind {
+            Kind::List(nodes) => nodes,
+            Kind::Scalar(_) => std::slice::from_ref(node),
+            Kind::Null => &[],
+            Kind::Map(_) => {
+                self.wrong(node, "a list (each entry begins with `- `)");
+                &[]
+            }
+        }
+    }
+
+    /// `true` or `false`.
+    pub fn boolean(&mut self, node: &Node) -> Option<bool> {
+        match self.text(node, "true or false")? {
+            "true" => Some(true),
+            "false" => Some(false),
+            other => self.refuse(
+                node,
+                Code::WrongValue,
+                format!("expected true or false, found `{}`", shortened(other)),
+            ),
+        }
+    }
+
+    /// A number of a range.
+    pub fn number(&mut self, node: &Node, (low, high): (f64, f64)) -> Option<f64> {
+        let text = self.text(node, "a number")?;
+        // `inf` and `nan` are numbers to Rust.
+        let number = text
+            .parse()
+            .ok()
+            .filter(|_| text.contains(|c: char| c.is_ascii_digit()));
+        let number = number.filter(|number| (low..=high).contains(number));
+        number.or_else(|| {
+            let message = format!(
+                "expected a number from {low} to {high}, found `{}`",
+                shortened(text)
+            );
+            self.refuse(node, Code::WrongValue, message)
+        })
+    }
+
+    /// A duration with its unit, from 1 ms to 24 h.
+    pub fn duration(&mut self, node: &Node) -> Option<Duration> {
+        let text = self.text(node, "a duration")?;
+        parse_duration(text).or_else(|| {
+            let message = format!(
+                "expected a duration from 1 ms to 24 h, found `{}`",
+                shortened(text)
+            );
+            let finding = Finding::error(Code::Duration, node.place, message);
+            self.findings
+                .push(finding.with_help("a number with its unit: 400 ms, 2.5 s, 10 min"));
+            None
+        })
+    }
+
+    /// Notes an error at a node. Gives `None`.
+    pub fn refuse<T>(&mut self, node: &Node, code: Code, message: String) -> Option<T> {
+        self.findings.error(code, node.place, message);
+        None
+    }
+
+    /// Notes that `wanted` (with its article) should stand there.
+    pub fn wrong(&mut self, node: &Node, wanted: &str) {
+        let message = format!("expected {wanted}, found {}", node.kind.name());
+        self.findings.error(Code::WrongValue, node.place, message);
+    }
+}
+
+fn parse_duration(text: &str) -> Option<Duration> {
+    let at = text.find(|c: char| !(c.is_ascii_digit() || c == '.'))?;
+    let (number, unit) = text.split_at_checked(at)?;
+    let seconds = match unit.trim() {
+        "ms" => 0.001,
+        "s" => 1.0,
+        "min" => 60.0,
+        "h" => 3600.0,
+        _ => return None,
+    };
+    let seconds = number.parse::<f64>().ok()? * seconds;
+    let duration = Duration::try_from_secs_f64(seconds).ok()?;
+    (Duration::from_millis(1)..=Duration::from_secs(24 * 3600))
+        .contains(&duration)
+        .then_some(duration)
+}
+
+/// `a`, `b`, `c`
+fn list(names: &[&str]) -> String {
+    let names: Vec<String> = names.iter().map(|name| format!("`{name}`")).collect();
+    names.join(", ")
+}
+
+/// The name that was meant, if one differs in a few letters only.
+pub(crate) fn nearest<'k>(name: &str, known: &[&'k str]) -> Option<&'k str> {
+    if name.chars().count() > 64 {
+        return None;
+    }
+    let limit = (name.chars().count() / 3).max(1);
+    let distances = known
+        .iter()
+        .map(|candidate| (distance(name, candidate), *candidate));
+    distances
+        .filter(|(distance, _)| *distance <= limit)
+        .min_by_key(|(distance, _)| *distance)
+        .map(|(_, name)| name)
+}
+
+/// Letters to insert, delete or change, case apart.
+fn distance(a: &str, b: &str) -> usize {
+    let (a, b) = (a.to_lowercase(), b.to_lowercase());
+    let mut row: Vec<usize> = (0..=b.chars().count()).collect();
+    for (above, x) in a.chars().enumerate() {
+        let mut left = above + 1;
+        let mut diagonal = above;
+        for (slot, y) in row.iter_mut().skip(1).zip(b.chars()) {
+            let best = (diagonal + usize::from(x != y))
+                .min(left + 1)
+                .min(*slot + 1);
+            diagonal = std::mem::replace(slot, best);
+            left = best;
+        }
+        if let Some(first) = row.first_mut() {
+            *first = above + 1;
+        }
+    }
+    row.last().copied().unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_duration_has_a_unit_and_is_of_a_sensible_length() {
+        assert_eq!(parse_duration("400 ms"), Some(Duration::from_millis(400)));
+        assert_eq!(parse_duration("2.5s"), Some(Duration::from_millis(2500)));
+        assert_eq!(parse_duration("10 min"), Some(Duration::from_secs(600)));
+        for wrong in [
+            "400", "s", "", "1.2.3 s", "0 ms", "25 h", "-1 s", "1 day", "1e9 s",
+        ] {
+            assert_eq!(parse_duration(wrong), None, "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_misspelt_name_is_known_by_its_letters() {
+        assert_eq!(
+            nearest("capabilties", &["name", "capabilities"]),
+            Some("capabilities")
+        );
+        assert_eq!(nearest("Grasp", &["grasp"]), Some("grasp"));
+        assert_eq!(nearest("speed", &["name", "type"]), None);
+    }
+}

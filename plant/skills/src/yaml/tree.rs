@@ -1,0 +1,255 @@
+//! YAML text -> a tree of nodes that know their place.
+
+use granit_parser::{Event, Parser, ScalarStyle, ScanError, Span};
+
+use super::findings::{Code, Finding};
+
+/// Where in the text, counted from 1 in lines and characters, within one line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Place {
+    /// From 1.
+    pub line: usize,
+    /// From 1, in characters.
+    pub column: usize,
+    /// In characters, at least 1.
+    pub len: usize,
+}
+
+impl Place {
+    /// The beginning of the text.
+    pub const START: Self = Self {
+        line: 1,
+        column: 1,
+        len: 1,
+    };
+}
+
+/// A value of the document.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Node {
+    /// Where it stands.
+    pub place: Place,
+    /// What it is.
+    pub kind: Kind,
+}
+
+/// What a value is.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Kind {
+    /// Nothing, `~` or `null`.
+    Null,
+    /// A single value, as written.
+    Scalar(String),
+    /// Values.
+    List(Vec<Node>),
+    /// Keys and values in the order of the text, repeated keys included.
+    Map(Vec<(Node, Node)>),
+}
+
+impl Kind {
+    /// With its article.
+    #[must_use]
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Self::Null => "nothing",
+            Self::Scalar(_) => "a single value",
+            Self::List(_) => "a list",
+            Self::Map(_) => "a map",
+        }
+    }
+}
+
+/// Reads a text as one document.
+///
+/// # Errors
+/// The first place that cannot be read; nothing after it has been looked at.
+pub fn parse(text: &str) -> Result<Node, Finding> {
+    if text.len() > MAX_BYTES {
+        let message = format!(
+            "the document has {} bytes; at most {MAX_BYTES} are read",
+            text.len()
+        );
+        return Err(Finding::error(Code::TooLarge, Place::START, message));
+    }
+    let options = granit_parser::options! {
+        emit_comments: false,
+        emit_unresolved_aliases: true,
+        flow_nesting_limit: MAX_DEPTH,
+        block_nesting_limit: MAX_DEPTH
+    };
+    let mut builder = Builder::default();
+    for event in Parser::new_from_str_with_options(text, options) {
+        let (event, marks) = event.map_err(|error| syntax(text, &error))?;
+        let place = place(text, marks);
+        if event.tag().is_some() {
+            return Err(not_read(
+                place,
+                "a tag",
+                "leave it out; the key says what its value is",
+            ));
+        }
+        builder.event(event, place)?;
+    }
+    Ok(builder.root.unwrap_or(Node {
+        place: Place::START,
+        kind: Kind::Null,
+    }))
+}
+
+#[derive(Default)]
+struct Builder {
+    open: Vec<Open>,
+    root: Option<Node>,
+    documents: usize,
+    nodes: usize,
+}
+
+/// A list or map whose end has not come.
+struct Open {
+    place: Place,
+    map: bool,
+    children: Vec<Node>,
+}
+
+impl Builder {
+    fn event(&mut self, event: Event<'_>, place: Place) -> Result<(), Finding> {
+        match event {
+            Event::DocumentStart(..) => {
+                self.documents += 1;
+                if self.documents > 1 {
+                    return Err(not_read(
+                        place,
+                        "a second document",
+                        "one file is one document: remove the `---`",
+                    ));
+                }
+                Ok(())
+            }
+            Event::Scalar(text, style, ..) => {
+                let null = style == ScalarStyle::Plain
+                    && matches!(&*text, "" | "~" | "null" | "Null" | "NULL");
+                let kind = if null {
+                    Kind::Null
+                } else {
+                    Kind::Scalar(text.into_owned())
+                };
+                self.put(Node { place, kind })
+            }
+            Event::SequenceStart(..) => self.begin(place, false),
+            Event::MappingStart(..) => self.begin(place, true),
+            Event::SequenceEnd | Event::MappingEnd => match self.open.pop() {
+                Some(open) => self.put(open.into_node()),
+                None => Ok(()),
+            },
+            Event::StreamStart | Event::StreamEnd | Event::DocumentEnd => Ok(()),
+            Event::Alias(_) | Event::UnresolvedAlias(_) | Event::Anchor(..) => Err(not_read(
+                place,
+                "an alias",
+                "a text that begins with * or & stands in quotes",
+            )),
+            // The enumeration is open: a node this does not know would be missing from the tree.
+            other => Err(not_read(
+                place,
+                &format!("{other:?}"),
+                "write it as a plain value",
+            )),
+        }
+    }
+
+    fn begin(&mut self, place: Place, map: bool) -> Result<(), Finding> {
+        if self.open.len() >= MAX_DEPTH {
+            let message = format!("values nest deeper than {MAX_DEPTH} levels");
+            return Err(Finding::error(Code::TooLarge, place, message));
+        }
+        self.open.push(Open {
+            place,
+            map,
+            children: Vec::new(),
+        });
+        Ok(())
+    }
+
+    fn put(&mut self, node: Node) -> Result<(), Finding> {
+        self.nodes += 1;
+        if self.nodes > MAX_NODES {
+            let message = format!("more than {MAX_NODES} values");
+            return Err(Finding::error(Code::TooLarge, node.place, message));
+        }
+        match self.open.last_mut() {
+            Some(open) => open.children.push(node),
+            None => self.root = Some(node),
+        }
+        Ok(())
+    }
+}
+
+impl Open {
+    fn into_node(self) -> Node {
+        let Self {
+            place,
+            map,
+            children,
+        } = self;
+        if !map {
+            return Node {
+                place,
+                kind: Kind::List(children),
+            };
+        }
+        let mut pairs = Vec::with_capacity(children.len() / 2);
+        let mut children = children.into_iter();
+        while let (Some(key), Some(value)) = (children.next(), children.next()) {
+            pairs.push((key, value));
+        }
+        Node {
+            place,
+            kind: Kind::Map(pairs),
+        }
+    }
+}
+
+fn not_read(place: Place, what: &str, help: &str) -> Finding {
+    Finding::error(Code::Syntax, place, format!("{what} is not read here")).with_help(help)
+}
+
+fn syntax(text: &str, error: &ScanError) -> Finding {
+    let place = place(text, Span::empty(*error.marker()));
+    let line = text.lines().nth(place.line - 1).unwrap_or_default();
+    let help = if line.trim_start_matches(' ').starts_with('\t') {
+        "YAML is indented with spaces, never with tabs"
+    } else {
+        "nothing after this place has been checked"
+    };
+    Finding::error(Code::Syntax, place, error.info()).with_help(help)
+}
+
+/// The first line of what is marked.
+fn place(text: &str, marks: Span) -> Place {
+    let (start, end) = (marks.start, marks.end);
+    let len = if end.line() == start.line() {
+        end.col().saturating_sub(start.col())
+    } else {
+        let rest = start
+            .byte_offset()
+            .and_then(|at| text.get(at..))
+            .unwrap_or_default();
+        rest.lines()
+            .next()
+            .unwrap_or_default()
+            .trim_end()
+            .chars()
+            .count()
+    };
+    Place {
+        line: start.line().max(1),
+        column: start.col() + 1,
+        len: len.max(1),
+    }
+}
+
+/// Largest text, in bytes.
+const MAX_BYTES: usize = 1 << 20;
+/// Most values of a text.
+const MAX_NODES: usize = 20_000;
+/// Deepest nesting.
+const MAX_DEPTH: usize = 16;
