@@ -5,6 +5,7 @@
 
 mod arguments;
 mod busy_poll;
+mod calls;
 mod clock;
 mod definitions;
 mod descriptors;
@@ -27,6 +28,7 @@ pub use bridge_core::{
     ExecutionId, Kept, Offered, Owned, PublisherKey, Reason, Refusal, Room, ValueDescription,
 };
 pub use busy_poll::BusyPoll;
+pub use calls::{Asker, CallGraph, Calls};
 pub use clock::{now, timestamp};
 pub use definitions::Definitions;
 pub use exit::{Failure, FailureKind};

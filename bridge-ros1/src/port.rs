@@ -13,11 +13,15 @@ use std::sync::Arc;
 use std::time::SystemTime;
 
 use bridge_node::policy::{Policy, Step, TYPE_CHANGES, Word, is_bad, type_changes};
-use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, TypePaths, timestamp};
+use bridge_node::{
+    Answered, AskId, CallDescription, Calls, Delivery, Described, Kept, Port, PortEvent, Services,
+    TypePaths, timestamp,
+};
+use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId, Variable};
 use messages::{DefinitionError, MessageType, Selection, TextKind, TypeName};
 use tcpros::{
-    Graph, Inbox, InboxEvent, Latched, Message, Node, NodeError, NodeOptions, Peer,
+    Graph, Inbox, InboxEvent, Latched, Message, Node, NodeError, NodeOptions, Peer, ServiceServer,
     SubscriberOptions, TopicType, Wanted,
 };
 use tracing::info;
@@ -63,6 +67,8 @@ pub struct Ros1Port {
     sinks: HashMap<TopicId, Sink>,
     /// Services that are called for values.
     services: Services,
+    /// Calls of other spaces, offered as services.
+    calls: Calls<ServiceServer>,
     /// What `recv` hands out next; filled by one message or by one pass over the topics.
     events: VecDeque<PortEvent>,
     /// The topic of the graph that was taken in last: the next look goes on behind it, so that each has its turn.
@@ -106,6 +112,7 @@ impl Ros1Port {
             policy: Policy::new(own, mapping),
             definitions,
             services,
+            calls: Calls::default(),
             graph: Graph::default(),
             sources: Vec::new(),
             vacant: Vec::new(),
@@ -384,6 +391,7 @@ impl Ros1Port {
                 }));
             }
         }
+        self.calls.tidy(bridge_node::now().monotonic);
         let topics: Vec<TopicId> = self.sinks.keys().copied().collect();
         for topic in topics {
             self.reconcile_sink(topic);
@@ -479,6 +487,18 @@ impl Ros1Port {
         }
     }
 
+    /// Offers the calls that are known as services.
+    fn offer_calls(&mut self) {
+        let mut graph = Ros1Graph {
+            node: &self.node,
+            definitions: &mut self.definitions,
+        };
+        let (all, most) = (|_| true, usize::MAX);
+        let calls = &mut self.calls;
+        let events = calls.offer_waiting(&mut graph, &mut self.policy, all, most);
+        self.events.extend(events);
+    }
+
     /// The local type a writer says its value is of, if it is known and has the fields that are said.
     fn learned(&mut self, topic: TopicId, described: &Described) -> Option<(TypeName, Selection)> {
         match self.definitions.get(&described.message_type) {
@@ -520,6 +540,7 @@ impl Port for Ros1Port {
                     let events = self.services.ended(outcome, timestamp(utc()));
                     self.events.extend(events);
                 }
+                event = self.calls.recv::<Ros1Graph<'_>>() => return event,
                 (index, event) = self.inbox.recv() => self.taken(index, event),
             }
         }
@@ -633,6 +654,19 @@ impl Port for Ros1Port {
         }
     }
 
+    fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
+        self.calls.known(topic, Arc::clone(description));
+        self.offer_calls();
+    }
+
+    fn call_gone(&mut self, topic: TopicId) {
+        self.calls.gone(topic, bridge_node::now().monotonic);
+    }
+
+    fn answered(&mut self, ask: AskId, _: TopicId, answer: Answered<Bytes>) {
+        self.calls.answered(ask, answer);
+    }
+
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
         self.go_over_to(mapping, types);
         Vec::new()
@@ -654,9 +688,10 @@ impl Port for Ros1Port {
             sources,
             watcher,
             services,
+            calls,
             ..
         } = self;
-        drop((watcher, services));
+        drop((watcher, services, calls));
         node.shutdown().await;
         drop((sinks, sources));
     }

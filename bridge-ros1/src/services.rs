@@ -1,12 +1,14 @@
-//! Services of the ROS 1 graph, as values of the space call them.
+//! Services of the ROS 1 graph, as values of the space call them, and calls of the space as services.
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{CallFault, ServiceCall, ServiceGraph};
+use bridge_node::{Asker, CallFault, CallGraph, ServiceCall, ServiceGraph};
 use bytes::Bytes;
 use messages::{MessageType, ServiceType, TextKind, TypeName, Wire};
-use tcpros::{Node, ServiceClient, ServiceClientOptions, ServiceError};
+use tcpros::{
+    Node, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions, ServiceServer,
+};
 use uadp::BuiltinType;
 
 use crate::definitions::Definitions;
@@ -60,6 +62,32 @@ impl ServiceGraph for Ros1Graph<'_> {
         };
         let client = self.node.service_client(service, options);
         client.map(Client).map_err(|error| error.to_string())
+    }
+}
+
+impl CallGraph for Ros1Graph<'_> {
+    type Server = ServiceServer;
+
+    const TELLS_FAULTS: bool = true;
+
+    fn offer(
+        &mut self,
+        service: &str,
+        service_type: &Arc<ServiceType>,
+        asker: Asker,
+    ) -> Result<ServiceServer, String> {
+        let service_type = tcpros::ServiceType {
+            name: service_type.name().to_string(),
+            md5sum: service_type.md5().to_owned(),
+            request_type: service_type.request().name().to_string(),
+            response_type: service_type.response().name().to_string(),
+        };
+        let options = ServiceOptions::default();
+        let handler = move |request: tcpros::ServiceRequest| asker.ask(request.bytes);
+        let server = self
+            .node
+            .advertise_service(service, service_type, options, handler);
+        server.map_err(|error| error.to_string())
     }
 }
 

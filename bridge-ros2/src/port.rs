@@ -25,7 +25,11 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 
 use bridge_node::policy::{Policy, Read, Step, TYPE_CHANGES, Word, is_bad, type_changes};
-use bridge_node::{Delivery, Described, Kept, Port, PortEvent, Services, TypePaths, now};
+use bridge_node::{
+    Answered, AskId, CallDescription, Calls, Delivery, Described, Kept, Port, PortEvent, Services,
+    TypePaths, now,
+};
+use bytes::Bytes;
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{DefinitionError, Selection, TextKind, TypeName};
@@ -43,7 +47,7 @@ use crate::limits;
 use crate::outlet::{Former, Refusal};
 use crate::parameters::ParameterServer;
 use crate::raw::{Payload, RawWriter, Reader};
-use crate::service::ServicePeers;
+use crate::service::{ServicePeers, ServiceServer};
 use crate::sink::Sink;
 use crate::source::{Source, same_participant};
 use crate::type_description::TypeServer;
@@ -96,6 +100,8 @@ pub struct Ros2Port {
     inbox: Inbox<usize>,
     /// Services that are called for values.
     services: Services,
+    /// Calls of other spaces, offered as services.
+    calls: Calls<ServiceServer>,
     /// Whose services they are, and who is there.
     peers: ServicePeers,
     parameters: ParameterServer,
@@ -168,6 +174,7 @@ impl Ros2Port {
             descriptions: Descriptions::new(peers.clone()),
             told_types,
             services,
+            calls: Calls::default(),
             peers,
             parameters,
             graph: Graph::default(),
@@ -258,6 +265,9 @@ impl Ros2Port {
                 let events = self.services.ended(outcome, now().utc);
                 self.events.extend(events);
                 continue;
+            }
+            if let Poll::Ready(event) = self.calls.poll_recv::<Ros2Graph<'_>>(cx) {
+                return Poll::Ready(event);
             }
             match self.inbox.poll_recv(cx) {
                 Poll::Ready(taken) => self.taken(taken),
@@ -531,6 +541,19 @@ impl Port for Ros2Port {
         }
     }
 
+    fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
+        self.calls.known(topic, Arc::clone(description));
+        self.schedule.look_next();
+    }
+
+    fn call_gone(&mut self, topic: TopicId) {
+        self.calls.gone(topic, now().monotonic);
+    }
+
+    fn answered(&mut self, ask: AskId, _: TopicId, answer: Answered<Bytes>) {
+        self.calls.answered(ask, answer);
+    }
+
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
         let restart = self.fixed(mapping);
         self.go_over_to(mapping, types);
@@ -552,6 +575,7 @@ impl Port for Ros2Port {
             retired,
             former,
             services,
+            calls,
             peers,
             parameters,
             descriptions,
@@ -562,6 +586,7 @@ impl Port for Ros2Port {
         drop((
             discovery,
             services,
+            calls,
             peers,
             parameters,
             descriptions,

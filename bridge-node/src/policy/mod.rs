@@ -3,6 +3,7 @@
 //!
 //! No IO and no clock: a port says what there is in its graph, and carries out what comes of it with its library.
 
+mod calls;
 mod choice;
 mod found;
 mod reload;
@@ -16,6 +17,7 @@ use bridge_core::{Described, Room};
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{MessageType, Selection, TypeName};
 
+pub use self::calls::call_type;
 pub use self::choice::{Choice, Step, Word};
 pub use self::found::Found;
 pub use self::reload::{Destination, Read, still_made, taken_up};

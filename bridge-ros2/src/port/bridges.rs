@@ -6,15 +6,14 @@ use std::fmt::Write as _;
 use mappings::{Mapping, SpaceId};
 
 use super::Ros2Port;
-use crate::graph::bridge_topic;
+use crate::graph::{Graph, bridge_topic};
 use crate::node::ParticipantPrefix;
 
 impl Ros2Port {
     /// Whether another bridge serves that space in this domain. Anybody may say so; where the mapping has the space in
     /// another domain it is not believed.
     pub(super) fn is_at_home(&self, space: SpaceId) -> bool {
-        self.graph.is_at_home(space.into())
-            && is_possible(self.policy.mapping(), space, self.domain_id)
+        is_at_home(&self.graph, self.policy.mapping(), space, self.domain_id)
     }
 
     /// Tells of bridges of other spaces in the domain, whose word keeps values out.
@@ -48,6 +47,11 @@ impl Ros2Port {
             }
         }
     }
+}
+
+/// Whether another bridge serves that space in the domain of the graph.
+pub(super) fn is_at_home(graph: &Graph, mapping: &Mapping, space: SpaceId, domain: u16) -> bool {
+    graph.is_at_home(space.into()) && is_possible(mapping, space, domain)
 }
 
 /// Whether a bridge may serve that space in that domain, for all the mapping says.

@@ -6,6 +6,7 @@ use bridge_core::Reason;
 use bridge_node::PortEvent;
 
 use super::Ros2Port;
+use crate::service::{ServiceCounters, ServiceServer};
 
 /// The counts that were reported, by the reason and by what it was.
 #[derive(Debug, Default)]
@@ -21,8 +22,9 @@ impl Drops {
         for (reason, why, total) in totals {
             let told = self.0.entry((reason.label(), why)).or_default();
             let count = total.saturating_sub(*told);
+            // It falls when a service goes.
+            *told = total;
             if count > 0 {
-                *told = total;
                 events.push(PortEvent::Dropped { reason, why, count });
             }
         }
@@ -34,7 +36,13 @@ impl Ros2Port {
     /// Reports what was dropped since the last time.
     pub(super) fn report_drops(&mut self) {
         let served = self.parameters.counters().plus(self.told_types.counters());
+        let calls = self.calls.servers().map(ServiceServer::counters);
+        let calls = calls.fold(ServiceCounters::default(), ServiceCounters::plus);
         let totals = [
+            (Reason::Malformed, "request of a call", calls.malformed),
+            (Reason::CallFailed, "call without a reply", calls.failures),
+            (Reason::Overflow, "request of a call", calls.overflowed),
+            (Reason::NotPublished, "reply of a call", calls.undelivered),
             (
                 Reason::Malformed,
                 "list of nodes",

@@ -1,9 +1,9 @@
-//! Services of the domain, as values of the space call them.
+//! Services of the domain, as values of the space call them, and calls of the space as services.
 
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{CallFault, ServiceCall, ServiceGraph};
+use bridge_node::{Asker, CallFault, CallGraph, ServiceCall, ServiceGraph};
 use bytes::Bytes;
 use mappings::SpaceId;
 use messages::{MessageType, ServiceType, TextKind, TypeName, Wire};
@@ -12,7 +12,10 @@ use uadp::BuiltinType;
 use crate::definitions::Definitions;
 use crate::domain::Domain;
 use crate::parameters::{Parameter, ParameterValue};
-use crate::service::{Service, ServiceClient, ServiceClientOptions, ServiceError, ServicePeers};
+use crate::service::{
+    Service, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions, ServicePeers,
+    ServiceRequest, ServiceServer,
+};
 
 /// A domain and what is known of types.
 pub(super) struct Ros2Graph<'p> {
@@ -66,6 +69,29 @@ impl ServiceGraph for Ros2Graph<'_> {
         };
         ServiceClient::open(self.domain, self.peers, &service, options)
             .map(Client)
+            .map_err(|error| error.to_string())
+    }
+}
+
+impl CallGraph for Ros2Graph<'_> {
+    type Server = ServiceServer;
+
+    // A request without a reply is all there is.
+    const TELLS_FAULTS: bool = false;
+
+    fn offer(
+        &mut self,
+        service: &str,
+        service_type: &Arc<ServiceType>,
+        asker: Asker,
+    ) -> Result<ServiceServer, String> {
+        let service = Service::new(service, service_type.name());
+        if let Some(hashes) = self.definitions.service_type_hashes(service_type.name()) {
+            service.announce(self.domain, &hashes);
+        }
+        let options = ServiceOptions::default();
+        let handler = move |request: ServiceRequest| asker.ask(request.bytes);
+        ServiceServer::open(self.domain, self.peers, &service, options, handler)
             .map_err(|error| error.to_string())
     }
 }

@@ -1,0 +1,130 @@
+//! Under which type a call of another space can be asked for as a service.
+
+use std::sync::Arc;
+
+use bridge_core::CallDescription;
+use messages::{ServiceType, TypeName};
+
+/// The type of the service that a call is offered as: what the mapping says; else what the one who executes it says
+/// (at the beginning of what is said about it, as in `my_msgs/Weigh; Weighs the part`); else one of `std_srvs` that has its
+/// fields. `find` finds the type of a name.
+///
+/// # Errors
+/// Why there is none, for people.
+pub fn call_type(
+    call: &CallDescription,
+    mapped: Option<&TypeName>,
+    mut find: impl FnMut(&TypeName) -> Result<Arc<ServiceType>, String>,
+) -> Result<Arc<ServiceType>, String> {
+    if let Some(name) = mapped {
+        let service_type = find(name)?;
+        call.fits(&service_type)?;
+        return Ok(service_type);
+    }
+    if let Some(name) = named(call) {
+        let service_type = find(&name)?;
+        call.fits(&service_type)?;
+        return Ok(service_type);
+    }
+    let standard = match call.response.is_empty() {
+        true => &STANDARD[..],
+        // It would say nothing of what came out.
+        false => STANDARD.get(..2).unwrap_or_default(),
+    };
+    let found = standard.iter().find_map(|name| {
+        let service_type = find(&name.parse().ok()?).ok()?;
+        call.fits(&service_type).is_ok().then_some(service_type)
+    });
+    found.ok_or_else(|| {
+        let of = |fields: &[bridge_core::CallField]| {
+            let names: Vec<&str> = fields.iter().map(|field| field.name.as_str()).collect();
+            names.join(", ")
+        };
+        format!(
+            "its executor names no service type, and no type of std_srvs has its fields: request ({}), response ({})",
+            of(&call.request),
+            of(&call.response)
+        )
+    })
+}
+
+/// The service type that is named in what is said about a call.
+fn named(call: &CallDescription) -> Option<TypeName> {
+    let first = call.about.split(';').next()?.trim();
+    first.parse().ok()
+}
+
+/// Types for calls that are said to be of none, the one first that tells most.
+const STANDARD: [&str; 3] = ["std_srvs/Trigger", "std_srvs/SetBool", "std_srvs/Empty"];
+
+#[cfg(test)]
+mod tests {
+    use bridge_core::CallField;
+    use messages::{Dialect, Registry};
+    use uadp::BuiltinType;
+
+    use super::*;
+
+    fn answers() -> Vec<CallField> {
+        vec![
+            CallField::scalar("success", BuiltinType::Boolean),
+            CallField::scalar("message", BuiltinType::String),
+            CallField::scalar("run", BuiltinType::UInt32),
+        ]
+    }
+
+    fn call(request: Vec<CallField>, response: Vec<CallField>, about: &str) -> CallDescription {
+        CallDescription {
+            name: "gripper.Grasp.Start".to_owned(),
+            about: about.to_owned(),
+            request,
+            response,
+        }
+    }
+
+    fn chosen(call: &CallDescription, mapped: Option<&str>) -> Result<String, String> {
+        let registry = Registry::bundle(Dialect::Ros2);
+        let mapped = mapped.map(|name| name.parse().unwrap());
+        let find = |name: &TypeName| registry.service(name).map_err(|error| error.to_string());
+        call_type(call, mapped.as_ref(), find).map(|found| found.name().to_string())
+    }
+
+    #[test]
+    fn a_call_that_needs_nothing_is_a_trigger() {
+        let trigger = Ok("std_srvs/Trigger".to_owned());
+        assert_eq!(chosen(&call(vec![], answers(), ""), None), trigger);
+        let force = || CallField::scalar("force", BuiltinType::Double);
+        let optional = call(vec![force().optional()], answers(), "Grasps; softly");
+        assert_eq!(chosen(&optional, None), trigger);
+        let needed = call(vec![force()], answers(), "");
+        let why = chosen(&needed, None).unwrap_err();
+        assert!(why.contains("request (force)"), "{why}");
+    }
+
+    #[test]
+    fn a_call_without_a_result_is_a_service_without_one() {
+        let data = CallField::scalar("data", BuiltinType::Boolean);
+        let set = call(vec![data], answers(), "");
+        assert_eq!(chosen(&set, None).unwrap(), "std_srvs/SetBool");
+        assert_eq!(
+            chosen(&call(vec![], vec![], ""), None).unwrap(),
+            "std_srvs/Empty"
+        );
+        let number = vec![CallField::scalar("number", BuiltinType::Double)];
+        chosen(&call(vec![], number, ""), None).unwrap_err();
+    }
+
+    #[test]
+    fn the_mapping_decides_before_the_executor_and_that_before_the_standard_types() {
+        let named = call(vec![], answers(), "std_srvs/Empty; grasps");
+        assert_eq!(chosen(&named, None).unwrap(), "std_srvs/Empty");
+        assert_eq!(
+            chosen(&named, Some("std_srvs/Trigger")).unwrap(),
+            "std_srvs/Trigger"
+        );
+        chosen(&named, Some("std_srvs/SetBool")).unwrap_err();
+        let unknown = call(vec![], answers(), "my_msgs/Weigh; weighs");
+        let why = chosen(&unknown, None).unwrap_err();
+        assert!(why.contains("my_msgs/Weigh"), "{why}");
+    }
+}
