@@ -2,6 +2,7 @@
 
 #![expect(clippy::unwrap_used, clippy::panic, reason = "test code")]
 
+mod calls;
 mod reload;
 mod services;
 mod strays;
@@ -171,6 +172,15 @@ fn line(event: &PortEvent) -> String {
                 topic.map_or_else(String::new, |t| t.to_string())
             )
         }
+        PortEvent::CallBound { topic, .. } => format!("{topic} call bound"),
+        PortEvent::Ask { topic, .. } => format!("{topic} asked"),
+        PortEvent::Described { .. }
+        | PortEvent::CallUnbound { .. }
+        | PortEvent::CallWanted { .. }
+        | PortEvent::AskGivenUp { .. }
+        | PortEvent::Offer { .. }
+        | PortEvent::Withdrawn { .. }
+        | PortEvent::Executed { .. } => format!("{event:?}"),
         PortEvent::Ended(why) => format!("ended: {why}"),
     }
 }
