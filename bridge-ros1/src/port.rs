@@ -2,6 +2,7 @@
 //!
 //! One task owns everything; [`Ros1Port::recv`](Port::recv) is its only wait.
 
+mod calls;
 mod found;
 mod reload;
 mod strays;
@@ -485,18 +486,6 @@ impl Ros1Port {
                     .once(&ros_topic, "not published", || error.to_string());
             }
         }
-    }
-
-    /// Offers the calls that are known as services.
-    fn offer_calls(&mut self) {
-        let mut graph = Ros1Graph {
-            node: &self.node,
-            definitions: &mut self.definitions,
-        };
-        let (all, most) = (|_| true, usize::MAX);
-        let calls = &mut self.calls;
-        let events = calls.offer_waiting(&mut graph, &mut self.policy, all, most);
-        self.events.extend(events);
     }
 
     /// The local type a writer says its value is of, if it is known and has the fields that are said.

@@ -185,6 +185,17 @@ impl Definitions {
         }
     }
 
+    /// The description of a service that was found, and what it needs.
+    ///
+    /// # Errors
+    /// [`DefinitionError`].
+    pub(crate) fn described_service(
+        &self,
+        name: &TypeName,
+    ) -> Result<Vec<DescribedType>, DefinitionError> {
+        self.known.registry().describe_service(name)
+    }
+
     /// What people are to be told of such an error, or of one of [`service`](Self::service).
     pub(crate) fn explain(&mut self, kind: TextKind, error: &DefinitionError) -> String {
         self.known.explain(kind, error)

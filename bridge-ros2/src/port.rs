@@ -5,6 +5,7 @@
 //! after RustDDS reports a change.
 
 mod bridges;
+mod calls;
 mod descriptions;
 mod drops;
 mod inquiry;

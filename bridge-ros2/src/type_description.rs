@@ -13,8 +13,8 @@ use crate::service::{
     ServiceTypes,
 };
 
-/// What is told of types: each with what it needs, itself first.
-type Known = BTreeMap<(TypeName, TypeHash), Vec<DescribedType>>;
+/// What is told of types by their full names, as `std_msgs/msg/Bool`: each with what it needs, itself first.
+type Known = BTreeMap<(String, TypeHash), Vec<DescribedType>>;
 
 /// Tells others what the types are that this node reads and writes. Dropping it withdraws the service.
 #[derive(Debug)]
@@ -47,16 +47,19 @@ impl TypeServer {
         Ok(Self { known, server })
     }
 
-    /// A type that is read or written from now on.
-    pub(crate) fn learn(&self, described: Vec<DescribedType>, name: &TypeName, hash: TypeHash) {
+    /// A type that is read, written or served from now on, with what it needs.
+    pub(crate) fn learn(&self, described: Vec<DescribedType>, hash: TypeHash) {
+        let Some(first) = described.first() else {
+            return;
+        };
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        known.insert((name.clone(), hash), described);
+        known.insert((first.name.clone(), hash), described);
     }
 
     /// Whether that is told already.
-    pub(crate) fn tells(&self, name: &TypeName, hash: TypeHash) -> bool {
+    pub(crate) fn tells(&self, full: &str, hash: TypeHash) -> bool {
         let known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
-        known.contains_key(&(name.clone(), hash))
+        known.contains_key(&(full.to_owned(), hash))
     }
 
     /// What it has counted so far.
@@ -147,8 +150,10 @@ fn answer(known: &Known, name: &str, hash: &str) -> Bytes {
 
 fn describe<'k>(known: &'k Known, name: &str, hash: &str) -> Result<&'k [DescribedType], String> {
     let unknown = || format!("type {name} is none of this node");
-    let parsed: TypeName = name.parse().map_err(|_| unknown())?;
-    let of_name = || known.iter().filter(|((of, _), _)| *of == parsed);
+    // Of messages the short name will do.
+    let full = name.parse::<TypeName>();
+    let full = full.map_or_else(|_| name.to_owned(), |name| name.ros2());
+    let of_name = || known.iter().filter(|((of, _), _)| *of == full);
     // As in rcl, any hash will do where none is named.
     let asked = of_name().find(|((_, ours), _)| hash.is_empty() || hash == ours.to_string());
     if let Some((_, described)) = asked {
@@ -234,7 +239,7 @@ mod tests {
         let registry = Registry::bundle(Dialect::Ros2);
         let hash = registry.type_hash(name).unwrap();
         let described = registry.describe(name).unwrap();
-        (Known::from([((name.clone(), hash), described)]), hash)
+        (Known::from([((name.ros2(), hash), described)]), hash)
     }
 
     #[test]
@@ -248,7 +253,7 @@ mod tests {
             ("sensor_msgs/msg/JointState", hash.to_string())
         );
         let types = read_answer(&answer(&known, &type_name, &hash.to_string())).unwrap();
-        assert_eq!(types, known[&(wanted, hash)]);
+        assert_eq!(types, known[&(wanted.ros2(), hash)]);
         for (type_name, type_hash) in [("x/msg/Y", ""), ("sensor_msgs/msg/JointState", "RIHS01_0")]
         {
             let refused = read_answer(&answer(&known, type_name, type_hash)).unwrap_err();

@@ -117,6 +117,14 @@ impl Registry {
     pub fn describe(&self, name: &TypeName) -> Result<Vec<DescribedType>, DefinitionError> {
         crate::type_hash::describe(self, name)
     }
+
+    /// Likewise of a service, `package/srv/Name`: request, response and event are among what it needs.
+    ///
+    /// # Errors
+    /// As [`Registry::service`].
+    pub fn describe_service(&self, name: &TypeName) -> Result<Vec<DescribedType>, DefinitionError> {
+        crate::type_hash::describe_service(self, name)
+    }
 }
 
 fn definition(of: &TypeName, described: &DescribedType) -> Result<Definition, DefinitionError> {

@@ -62,16 +62,16 @@ pub(crate) fn describe(
     registry.get(name)?;
     let mut types = Described::new(registry);
     types.message(name)?;
-    let full = name.ros2();
-    let mut needed = BTreeMap::new();
-    types.needs(&full, &mut needed);
-    needed.remove(full.as_str());
-    let all = std::iter::once(full.as_str()).chain(needed.into_keys());
-    let described = all.map(|name| DescribedType {
-        name: name.to_owned(),
-        fields: types.fields(name),
-    });
-    Ok(described.collect())
+    Ok(types.with_needed(&name.ros2()))
+}
+
+/// The description of a service and of what it needs.
+pub(crate) fn describe_service(
+    registry: &Registry,
+    name: &TypeName,
+) -> Result<Vec<DescribedType>, DefinitionError> {
+    let (types, full) = Described::of_service(registry, name)?;
+    Ok(types.with_needed(&full))
 }
 
 /// The hashes of a service and its parts, each by its ROS 2 name, such as `std_srvs/srv/SetBool_Request`.
@@ -132,14 +132,7 @@ impl Registry {
         &self,
         name: &TypeName,
     ) -> Result<ServiceTypeHashes, DefinitionError> {
-        self.service(name)?;
-        let mut types = Described::new(self);
-        let full = format!("{}/srv/{}", name.package(), name.name());
-        if let Some([request, response]) = self.service_definitions(name) {
-            types.definition(&format!("{full}_Request"), request)?;
-            types.definition(&format!("{full}_Response"), response)?;
-        }
-        types.service(&full);
+        let (types, full) = Described::of_service(self, name)?;
         Ok(types.service_hashes(&full))
     }
 
@@ -198,6 +191,35 @@ impl<'r> Described<'r> {
             registry,
             types: BTreeMap::new(),
         }
+    }
+
+    /// A service with all it needs, and its ROS 2 name.
+    fn of_service(
+        registry: &'r Registry,
+        name: &TypeName,
+    ) -> Result<(Self, String), DefinitionError> {
+        registry.service(name)?;
+        let mut types = Self::new(registry);
+        let full = format!("{}/srv/{}", name.package(), name.name());
+        if let Some([request, response]) = registry.service_definitions(name) {
+            types.definition(&format!("{full}_Request"), request)?;
+            types.definition(&format!("{full}_Response"), response)?;
+        }
+        types.service(&full);
+        Ok((types, full))
+    }
+
+    /// A type first, then what it needs in the order of the names.
+    fn with_needed(&self, full: &str) -> Vec<DescribedType> {
+        let mut needed = BTreeMap::new();
+        self.needs(full, &mut needed);
+        needed.remove(full);
+        let all = std::iter::once(full).chain(needed.into_keys());
+        let described = all.map(|name| DescribedType {
+            name: name.to_owned(),
+            fields: self.fields(name),
+        });
+        described.collect()
     }
 
     fn message(&mut self, name: &TypeName) -> Result<(), DefinitionError> {

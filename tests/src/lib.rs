@@ -15,6 +15,7 @@ mod capture;
 mod cell;
 mod child;
 mod enclave;
+mod executor;
 mod host;
 mod judge;
 mod net;
@@ -35,6 +36,7 @@ pub use capture::{Capture, Dissected, hex, is_true};
 pub use cell::{Cell, Distribution, Peer, without_data};
 pub use child::{Child, Started};
 pub use enclave::{Governance, Keystore, Wiretap, has_security};
+pub use executor::{Executes, Executor};
 pub use host::{Cable, HERE, Host, THERE, WIRE, Wire};
 pub use judge::Judge;
 pub use net::{

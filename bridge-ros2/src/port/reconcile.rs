@@ -11,8 +11,6 @@ use rustdds::GUID;
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
 
-use super::bridges::is_at_home;
-use super::services::Ros2Graph;
 use super::{Ros2Port, lost};
 use crate::compatibility::Incompatibility;
 use crate::definitions::Definition;
@@ -57,29 +55,6 @@ impl Ros2Port {
         for topic in topics {
             self.reconcile_sink(topic, now);
         }
-    }
-
-    /// Offers the calls that are known as services, as far as there is room for endpoints; those of a space that another
-    /// bridge of the domain serves are left to it.
-    fn offer_calls(&mut self) {
-        let mapping = Arc::clone(self.policy.mapping());
-        let (graph, domain) = (&self.graph, self.domain_id);
-        let at_home = |topic: TopicId| is_at_home(graph, &mapping, topic.space, domain);
-        self.calls.leave(at_home);
-        if !self.calls.is_waiting() {
-            return;
-        }
-        let mut services = Ros2Graph {
-            peers: &self.peers,
-            domain: &self.domain,
-            definitions: &mut self.definitions,
-        };
-        let (calls, policy) = (&mut self.calls, &mut self.policy);
-        let may = |topic| !at_home(topic);
-        // Each has a reader and a writer.
-        let events = calls.offer_waiting(&mut services, policy, may, self.budget / 2);
-        self.budget = self.budget.saturating_sub(2 * events.len());
-        self.events.extend(events);
     }
 
     /// Makes anew what RustDDS left out of its announcements.
@@ -533,10 +508,10 @@ impl Ros2Port {
             return;
         };
         self.domain.learn_type_hash(&name.dds(), hash.to_string());
-        if !self.told_types.tells(name, hash)
+        if !self.told_types.tells(&name.ros2(), hash)
             && let Ok(described) = self.definitions.described(name, hash)
         {
-            self.told_types.learn(described, name, hash);
+            self.told_types.learn(described, hash);
         }
     }
 

@@ -1,0 +1,219 @@
+//! Somebody in the space who executes a call, by the codec alone.
+
+use std::net::Ipv4Addr;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use uadp::action::{
+    ActionDialect, ActionFields, ExecutionId, Outcome, Requested, Responder, ResponderSettings,
+};
+use uadp::discovery::{
+    ActionMetaData, ActionTargetDataType, Announced, Announcement, DataSetMetaDataType,
+    FieldMetaData, List,
+};
+use uadp::{
+    BuiltinType, ConfigurationVersion, Extras, NetworkHeader, NetworkMessage, NodeId, PublisherId,
+    SecurityHeader, StatusCode,
+};
+
+use crate::{Triple, UadpSocket};
+
+/// Announces a call that needs nothing and answers `success`, `message` and `run`, and executes it.
+pub struct Executor {
+    stop: Arc<AtomicBool>,
+    executed: Arc<AtomicU32>,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// What an [`Executor`] makes of requests.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Executes {
+    /// Each is answered at once, its `message` being the name of the call and `run` how many there were.
+    AtOnce,
+    /// None has an end.
+    Forever,
+}
+
+struct Work {
+    triple: Triple,
+    name: String,
+    socket: UadpSocket,
+    responder: Responder<()>,
+    executes: Executes,
+    /// How often each datagram is heard and sent.
+    copies: usize,
+    executed: Arc<AtomicU32>,
+    start: Instant,
+}
+
+impl Executor {
+    /// Announces the call at once and every [`ANNOUNCED_EVERY`], as long as this lives. With `copies` above 1 the network
+    /// doubles every datagram to it and of it.
+    #[must_use]
+    pub fn start(triple: Triple, name: &str, executes: Executes, copies: usize) -> Self {
+        let (stop, executed) = (Arc::<AtomicBool>::default(), Arc::<AtomicU32>::default());
+        let mut work = Work {
+            triple,
+            name: name.to_owned(),
+            socket: UadpSocket::join_on(Ipv4Addr::LOCALHOST),
+            responder: Responder::new(ResponderSettings::default()),
+            executes,
+            copies,
+            executed: Arc::clone(&executed),
+            start: Instant::now(),
+        };
+        let stopped = Arc::clone(&stop);
+        let thread = std::thread::spawn(move || work.run(&stopped));
+        Self {
+            stop,
+            executed,
+            thread: Some(thread),
+        }
+    }
+
+    /// How many requests were executed, or begun.
+    #[must_use]
+    pub fn executed(&self) -> u32 {
+        self.executed.load(Ordering::Relaxed)
+    }
+
+    /// Ends it in the middle of what it does, as a process that is killed: nothing of it is heard any more.
+    pub fn kill(self) {
+        drop(self);
+    }
+}
+
+impl Drop for Executor {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take()
+            && thread.join().is_err()
+            && !std::thread::panicking()
+        {
+            panic!("the executor has failed");
+        }
+    }
+}
+
+impl Work {
+    fn run(&mut self, stop: &AtomicBool) {
+        let announcement = self.announcement();
+        let mut announce_at = self.start;
+        while !stop.load(Ordering::Relaxed) {
+            if Instant::now() >= announce_at {
+                announce_at = Instant::now() + ANNOUNCED_EVERY;
+                self.socket.send(&announcement);
+            }
+            if let Some(datagram) = self.socket.receive(TURN) {
+                for _ in 0..self.copies {
+                    self.hear(&datagram);
+                }
+            }
+            self.answer();
+        }
+    }
+
+    fn hear(&mut self, datagram: &[u8]) {
+        let Ok(message) = NetworkMessage::decode(datagram) else {
+            return;
+        };
+        let Ok(requests) = message.actions(ActionDialect::Standard) else {
+            return;
+        };
+        let (space, namespace, id) = self.triple;
+        for request in requests.flatten() {
+            let ours = request.publisher_id == PublisherId::UInt16(space)
+                && request.writer_group_id == Some(namespace)
+                && request.writer_id == id;
+            let now = self.start.elapsed();
+            if !ours {
+                continue;
+            }
+            // What it does not take, such as a response of its own, is none of its business.
+            if let Ok(Requested::Execute(execution)) =
+                self.responder.handle_request(&request, (), now)
+            {
+                self.execute(execution, now);
+            }
+        }
+    }
+
+    fn execute(&mut self, execution: ExecutionId, now: Duration) {
+        let run = self.executed.fetch_add(1, Ordering::Relaxed) + 1;
+        if self.executes == Executes::Forever {
+            return;
+        }
+        let mut fields = vec![3, 0, 1, 1, 12];
+        fields.extend(u32::try_from(self.name.len()).unwrap().to_le_bytes());
+        fields.extend(self.name.as_bytes());
+        fields.push(7);
+        fields.extend(run.to_le_bytes());
+        let outcome = Outcome::Answered {
+            status: StatusCode::GOOD,
+            fields: ActionFields::Variants(&fields),
+        };
+        self.responder.finish(execution, outcome, now).unwrap();
+    }
+
+    fn answer(&mut self) {
+        while let Some((_, response)) = self.responder.poll_transmit(self.start.elapsed()) {
+            let mut datagram = Vec::new();
+            let (header, extras) = (NetworkHeader::default(), Extras::default());
+            let encoder = response.encode(&mut datagram, &header, &extras);
+            encoder.unwrap().finish().unwrap();
+            for _ in 0..self.copies {
+                self.socket.send(&datagram);
+            }
+        }
+    }
+
+    fn announcement(&self) -> Vec<u8> {
+        let (space, namespace, id) = self.triple;
+        let name = format!("ua_{space}_{namespace}_{id} {}", self.name);
+        let field = |name, builtin: BuiltinType| FieldMetaData {
+            name: Some(name),
+            built_in_type: builtin as u8,
+            data_type: NodeId::numeric(0, u32::from(builtin as u8)),
+            value_rank: -1,
+            ..FieldMetaData::default()
+        };
+        let fields = [
+            field("success", BuiltinType::Boolean),
+            field("message", BuiltinType::String),
+            field("run", BuiltinType::UInt32),
+        ];
+        let of = |fields| DataSetMetaDataType {
+            name: Some(&name),
+            fields: List::new(fields),
+            configuration_version: ConfigurationVersion { major: 1, minor: 1 },
+            ..DataSetMetaDataType::default()
+        };
+        let target = [ActionTargetDataType {
+            action_target_id: 1,
+            ..ActionTargetDataType::default()
+        }];
+        let announcement = Announcement {
+            sequence_number: 0,
+            announced: Announced::ActionMetaData(ActionMetaData {
+                writer_id: id,
+                action_targets: List::new(&target),
+                request: of(&[]),
+                response: of(&fields),
+                action_methods: List::default(),
+            }),
+        };
+        let mut datagram = Vec::new();
+        let publisher = PublisherId::UInt16(space);
+        announcement
+            .encode(publisher, SecurityHeader::NONE, &mut datagram)
+            .unwrap();
+        datagram
+    }
+}
+
+/// Between two announcements.
+const ANNOUNCED_EVERY: Duration = Duration::from_millis(500);
+/// How long it listens before it looks what is due.
+const TURN: Duration = Duration::from_millis(5);

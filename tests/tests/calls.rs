@@ -1,0 +1,119 @@
+//! Calls of the space, asked for by nodes of ROS 1 and ROS 2 themselves.
+
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+use system_tests::{Cell, Distribution, Executes, Executor, Judge, Peer, eventually};
+
+const START: (u16, u16, u16) = (0, 7, 105);
+const SERVICE: &str = "/ua_0_7_105";
+const NAME: &str = "gripper.Grasp.Start";
+/// rospy and rclpy need seconds to start on a busy machine.
+const SOON: Duration = Duration::from_secs(30);
+
+/// What a rospy client that calls `times` times is told: answers, or texts of errors.
+fn rospy_calls(cell: &Cell, times: usize) -> Vec<Value> {
+    let mut args = vec![SERVICE, "std_srvs/Trigger"];
+    for _ in 0..times {
+        args.extend(["--value", "{}"]);
+    }
+    let mut client = cell.rospy("ros1_call.py", &args);
+    let told = |line: &Value| line.get("value").or_else(|| line.get("error")).cloned();
+    (0..times)
+        .map(|_| client.wait_for_json("an answer", SOON, told))
+        .collect()
+}
+
+fn judge_calls(judge: &mut Judge) -> Value {
+    judge.ask(json!({"call": SERVICE, "type": "std_srvs/srv/Trigger", "value": {}}))["reply"]
+        .clone()
+}
+
+#[test]
+fn a_rospy_client_asks_for_a_call_that_is_executed_once_although_datagrams_are_doubled() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let executor = Executor::start(START, NAME, Executes::AtOnce, 2);
+    let _bridge = cell.bridge_ros1(&[]);
+    let answers = rospy_calls(&cell, 3);
+    let answer = json!({"success": true, "message": NAME});
+    assert_eq!(answers, [answer.clone(), answer.clone(), answer]);
+    assert_eq!(executor.executed(), 3);
+}
+
+#[test]
+fn an_executor_that_is_killed_is_a_fault_to_rospy_and_its_service_goes() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let executor = Executor::start(START, NAME, Executes::Forever, 1);
+    let _bridge = cell.bridge_ros1(&[]);
+    let mut client = cell.rospy(
+        "ros1_call.py",
+        &[SERVICE, "std_srvs/Trigger", "--value", "{}"],
+    );
+    eventually("the call is begun", SOON, || {
+        (executor.executed() == 1).then_some(())
+    });
+    executor.kill();
+    let start = Instant::now();
+    let fault = client.wait_for_json("the fault", SOON, |line| line.get("error").cloned());
+    assert!(start.elapsed() < BOUND, "{:?}", start.elapsed());
+    assert!(fault.as_str().unwrap().contains("known"), "{fault}");
+}
+
+#[test]
+fn an_rclpy_client_sees_and_asks_for_a_call_and_is_told_when_its_executor_is_killed() {
+    let Some(cell) = Cell::with(&[Peer::Ros2]) else {
+        return;
+    };
+    let executor = Executor::start(START, NAME, Executes::AtOnce, 2);
+    let _bridge = cell.bridge_ros2(&[]);
+    let mut judge = cell.judge(Distribution::Jazzy, &["judge"]);
+    // `ros2 node info`.
+    let info = judge.until(&json!({"info": "/ua_bridge_ros2"}), |info| {
+        let services = info["services"].as_array()?;
+        services
+            .iter()
+            .find(|service| service[0] == SERVICE)
+            .cloned()
+    });
+    assert_eq!(info, json!([SERVICE, ["std_srvs/srv/Trigger"]]));
+    // What `ros2 service type` stands for is told by the bridge as by the node of the client.
+    let [ours, theirs] = ["/ua_bridge_ros2", "/judge/judge"].map(|node| {
+        let asked = json!({"type_name": "std_srvs/srv/Trigger", "type_hash": ""});
+        let service = format!("{node}/get_type_description");
+        let interface = "type_description_interfaces/srv/GetTypeDescription";
+        judge.ask(json!({"call": SERVICE, "type": "std_srvs/srv/Trigger", "value": {}}));
+        judge.ask(json!({"call": service, "type": interface, "value": asked}))["reply"]["type_description"].clone()
+    });
+    assert_eq!(ours, theirs);
+    for _ in 0..3 {
+        assert_eq!(
+            judge_calls(&mut judge),
+            json!({"success": true, "message": NAME})
+        );
+    }
+    assert_eq!(executor.executed(), 5);
+    executor.kill();
+    let executor = Executor::start(START, NAME, Executes::Forever, 1);
+    let killed = std::thread::spawn(move || {
+        eventually("the call is begun", SOON, || {
+            (executor.executed() == 1).then_some(())
+        });
+        executor.kill();
+        Instant::now()
+    });
+    let told = judge_calls(&mut judge);
+    let took = killed.join().unwrap().elapsed();
+    assert!(took < BOUND, "{took:?}");
+    assert_eq!(told["success"], false);
+    let why = told["message"].as_str().unwrap();
+    assert!(why.contains("known"), "{why}");
+}
+
+/// Within that a caller is told that the one who executes is gone.
+const BOUND: Duration = Duration::from_secs(8);
