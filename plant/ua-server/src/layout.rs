@@ -7,6 +7,7 @@ use messages::{Leaf, Rank};
 use opcua::types::{ByteString, DataTypeId, Identifier, NodeId, Variant, VariantTypeId};
 use uadp::BuiltinType;
 
+use crate::address::unmapped_node;
 use crate::structures::{Structure, Structures, Types};
 
 /// The nodes of the mapped topics and the namespaces they are in.
@@ -296,9 +297,9 @@ impl TopicNode {
         }
     }
 
-    /// Clients may write what the OPC UA side produces.
+    /// Clients may write what this server produces. In space 0 that is what the mapping names: the rest is of components.
     pub(crate) fn writable(&self) -> bool {
-        self.topic.space == SpaceId::UA
+        self.topic.space == SpaceId::UA && self.node != unmapped_node(self.topic)
     }
 
     /// Every node of the topic, its own first.

@@ -1,7 +1,8 @@
 //! The OPC UA server of the cell: the values of the space as nodes.
 //!
-//! It is the citizen of the space with origin 0. Values of the other spaces come by UADP and are read here; what
-//! clients write to the variables of origin 0 goes out by UADP. It knows no ROS.
+//! It is one of the programs of origin 0, beside components: that of the namespaces of its mapping. Values of the other spaces
+//! and of components come by UADP and are read here; what clients write to the variables of origin 0 goes out by UADP. It knows
+//! no ROS.
 //!
 //! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show),
 //! `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in), `port` (the shell's side),
@@ -24,7 +25,7 @@ mod values;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use bridge_node::{Arguments, Context, Failure, FailureKind, Program};
+use bridge_node::{Arguments, Context, Failure, FailureKind, Owned, Program};
 use mappings::{Mapping, SpaceId};
 
 use crate::endpoint::EndpointUrl;
@@ -64,6 +65,11 @@ impl Program for UaServer {
 
     fn arguments(&self) -> &Arguments {
         &self.arguments
+    }
+
+    /// Those of the mapping: in all others of space 0 components publish.
+    fn owned(mapping: &Mapping) -> Owned {
+        Owned::Only(mapping.namespaces().keys().copied().collect())
     }
 
     fn spaces(&self, _mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
