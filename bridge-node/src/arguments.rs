@@ -23,6 +23,8 @@ pub struct Arguments {
 
 /// What programs take whether they have a mapping or not.
 #[derive(Debug, Clone, clap::Args)]
+// A program may have a struct of that name too, and groups have the names of their structs.
+#[group(skip)]
 pub struct Flags {
     /// Hear and decode, but publish nothing on either side
     #[arg(long)]
