@@ -1,5 +1,6 @@
 //! The Router: verdicts on samples, queues per topic, repetitions and silences.
 
+mod announce;
 mod batch;
 mod calls;
 mod chunks;

@@ -154,7 +154,7 @@ fn a_type_that_lacks_what_the_call_wants_is_refused_with_the_name_of_the_field()
 
     let mut cell = plugged_in(Local::Ros1);
     cell.offer(GRIPPER, start(), offered(wants));
-    cell.run(ms(700));
+    cell.run(ms(3_000));
     let now = cell.now();
     assert!(
         cell.programs[BRIDGE]
@@ -177,7 +177,7 @@ fn answers_in_another_order_are_sorted_by_name_and_further_fields_left_out() {
     let mut turned = grasp();
     turned.response.reverse();
     cell.offer(GRIPPER, start(), offered(turned));
-    cell.run(ms(700));
+    cell.run(ms(3_000));
     let now = cell.now();
     let trigger = service(Dialect::Ros1, "std_srvs/Trigger");
     let bridge = &mut cell.programs[BRIDGE].router;
@@ -195,6 +195,22 @@ fn answers_in_another_order_are_sorted_by_name_and_further_fields_left_out() {
     cell.run(ms(50));
     let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
     assert_eq!(answer.unwrap(), [0, 2, 0, 0, 0, b'n', b'o']);
+}
+
+#[test]
+fn a_call_that_changes_all_the_time_is_not_offered_anew_each_time() {
+    let mut cell = plugged_in(Local::Fields);
+    for number in 0..20 {
+        let mut other = grasp();
+        other.about = format!("version {number}");
+        cell.offer(GRIPPER, start(), offered(other));
+        cell.run(ms(500));
+    }
+    let told = cell.known(BRIDGE).len();
+    assert!((4..=10).contains(&told), "{told} times in 10 s");
+    cell.run(ms(3_000));
+    let bridge = &cell.programs[BRIDGE].router;
+    assert_eq!(bridge.described_call(start()).unwrap().about, "version 19");
 }
 
 #[test]

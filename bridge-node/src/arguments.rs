@@ -87,3 +87,36 @@ impl FromArgMatches for WithoutMapping {
         self.0.flags.update_from_arg_matches(matches)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(clap::Parser)]
+    struct Component {
+        file: PathBuf,
+        #[command(flatten)]
+        arguments: WithoutMapping,
+    }
+
+    #[test]
+    fn a_program_with_a_file_of_its_own_takes_the_same_flags_and_no_mapping() {
+        let typed = [
+            "component",
+            "gripper.yaml",
+            "--interface",
+            "lo",
+            "--dry-run",
+        ];
+        let Component { file, arguments } = Component::try_parse_from(typed).unwrap();
+        let WithoutMapping(arguments) = arguments;
+        assert_eq!(file, PathBuf::from("gripper.yaml"));
+        assert_eq!(arguments.mapping, None);
+        assert_eq!(arguments.flags.interface.as_deref(), Some("lo"));
+        assert!(arguments.flags.dry_run && !arguments.check);
+        let two = ["component", "gripper.yaml", "cell.yaml"];
+        assert!(Component::try_parse_from(two).is_err());
+    }
+}

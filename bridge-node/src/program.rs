@@ -207,9 +207,6 @@ async fn prepare<P: Program>(
     let mut router = Router::new(settings, Arc::clone(&mapping));
     router.set_owned(P::owned(&mapping), now());
     router.set_instance(instance()?);
-    if P::CLAIMS {
-        router.claim(now());
-    }
     let context = Context {
         mapping: Arc::clone(&mapping),
         types,
@@ -224,6 +221,7 @@ async fn prepare<P: Program>(
         port,
         udp,
         owned: P::owned,
+        claims: P::CLAIMS,
         requests,
         changes: changes.clone(),
         fixed: Fixed {

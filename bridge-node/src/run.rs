@@ -35,6 +35,8 @@ pub(crate) struct Shell<P> {
     pub(crate) held: Option<Held>,
     /// The namespaces it alone writes, by the mapping.
     pub(crate) owned: fn(&Mapping) -> Owned,
+    /// Whether it listens for somebody else in them first.
+    pub(crate) claims: bool,
     pub(crate) requests: Requests<Status>,
     pub(crate) changes: watch::Receiver<Running>,
     pub(crate) fixed: Fixed,
@@ -79,6 +81,9 @@ impl<P: Port> Shell<P> {
         mut self,
         stop: impl Future<Output = ()> + Send,
     ) -> Result<(), Failure> {
+        if self.claims {
+            self.router.claim(now());
+        }
         let ended = self.carry(stop).await;
         // Nobody is to wait for what is executed no longer.
         self.router.withdraw_all(now());

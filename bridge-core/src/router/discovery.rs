@@ -6,7 +6,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{MessageType, Selection};
 use uadp::discovery::{
     AnnounceLimits, Announced, Announcement, Announcer, DataSetMetaDataType, Included, List, Probe,
     ProbeLimits, ProbeStep, ProbeTimer, Subject,
@@ -17,11 +16,10 @@ use super::receive::DISCOVERY;
 use super::{About, Router};
 use crate::call::split_name;
 use crate::counters::Reason;
-use crate::description::{Described, Description, Source, mapped_leaves};
+use crate::description::Described;
 use crate::layout::Layout;
 use crate::learned::{Learned, News, Rank};
 use crate::loop_rule::Owned;
-use crate::network::announcement_chunks;
 use crate::output::Output;
 use crate::reader::Ask;
 use crate::settings::{Local, Now};
@@ -98,7 +96,7 @@ impl Discovery {
         self.due = next.map(|due| self.start + due);
     }
 
-    fn plan(&mut self, topic: TopicId, now: Now) {
+    pub(super) fn plan(&mut self, topic: TopicId, now: Now) {
         let since = self.since_start(now);
         let (_, _, writer_id) = topic.triple();
         let subject = Subject::DataSetMetaData(writer_id);
@@ -132,94 +130,6 @@ impl Router {
     /// When [`discover`](Self::discover) is wanted.
     pub(super) fn discovery_due(&self) -> Option<Instant> {
         self.discovery.as_ref()?.due
-    }
-
-    /// The type of a topic of our own space is known: it is announced, and again whenever it changes. Without a message it is
-    /// as the mapping says.
-    pub(super) fn describe(
-        &mut self,
-        topic: TopicId,
-        message: Option<(&MessageType, &Selection)>,
-        now: Now,
-    ) {
-        let period = self.mapping.pubsub().metadata_period;
-        let Some(Topic {
-            plan,
-            said,
-            description,
-            announce_at,
-            ..
-        }) = self.topics.get_mut(&topic)
-        else {
-            return;
-        };
-        let said = said.as_deref().filter(|_| message.is_none());
-        let variable = self.mapping.variable(topic).filter(|_| said.is_none());
-        let mapped = match (message, variable) {
-            (None, Some(variable)) => mapped_leaves(variable),
-            (Some(_), _) | (None, None) => Vec::new(),
-        };
-        let leaves = match (message, plan) {
-            (Some(_), Some(plan)) => plan.leaves(),
-            (None, _) if said.is_some() => said.map_or(&[][..], |said| &said.fields),
-            (None, _) if !mapped.is_empty() => &mapped,
-            (Some(_), None) => return,
-            (None, _) => {
-                // The mapping has left it open again.
-                return self.forget_described(topic);
-            }
-        };
-        let source = Source {
-            topic,
-            message,
-            leaves,
-            variable,
-            said,
-            namespaces: self.mapping.namespaces(),
-        };
-        match Description::new(source, description.as_deref(), now.utc) {
-            Ok(new) if new.differs(description.as_deref()) => {
-                *description = Some(Box::new(new));
-                *announce_at = Some(now.monotonic + period);
-            }
-            Ok(_) => return,
-            Err(error) => {
-                *description = None;
-                self.count(About::topic(topic), Reason::MetaData, 1, || {
-                    format!("what it consists of cannot be announced: {error}")
-                });
-                return;
-            }
-        }
-        let (_, namespace, writer_id) = topic.triple();
-        let discovery = self.discovery(now);
-        let topics = discovery.writers.entry(writer_id).or_default();
-        if !topics.contains(&topic) {
-            topics.push(topic);
-        }
-        discovery.announcer.add_writer(namespace, writer_id);
-        discovery.plan(topic, now);
-        self.schedule(topic);
-    }
-
-    /// Plans to announce a topic again, where that is due and it has a producer.
-    pub(super) fn announce_again(&mut self, topic: TopicId, now: Now) {
-        let period = self.mapping.pubsub().metadata_period;
-        let Some(Topic {
-            role: Role::Ours(writer),
-            announce_at: Some(at),
-            ..
-        }) = self.topics.get_mut(&topic)
-        else {
-            return;
-        };
-        if *at > now.monotonic {
-            return;
-        }
-        *at = now.monotonic + period;
-        if writer.is_live() {
-            self.discovery(now).plan(topic, now);
-        }
     }
 
     /// Announces and asks what is due.
@@ -271,69 +181,6 @@ impl Router {
         self.call_rolls(&mut discovery, (since, random));
         discovery.reckon();
         self.discovery = Some(discovery);
-    }
-
-    fn announce(&mut self, topic: TopicId, sequence_number: u16, now: Now) {
-        if self.is_withheld(topic) {
-            return;
-        }
-        let mut bytes = self.buffer();
-        let Some(Topic {
-            description: Some(description),
-            counters,
-            ..
-        }) = self.topics.get_mut(&topic)
-        else {
-            return;
-        };
-        let body_at = description.write(sequence_number, &mut bytes);
-        counters.announced += 1;
-        self.send_announcement(topic, sequence_number, (bytes, body_at), now);
-    }
-
-    /// Sends an announcement about a topic, in chunks where it is larger than a datagram.
-    pub(super) fn send_announcement(
-        &mut self,
-        topic: TopicId,
-        sequence_number: u16,
-        (bytes, body_at): (Vec<u8>, usize),
-        now: Now,
-    ) {
-        let (max_datagram, _) = self.sizes();
-        if bytes.len() <= usize::from(max_datagram) {
-            self.tell(Output::Discovery { bytes });
-            return;
-        }
-        let body = bytes.get(body_at..).unwrap_or_default();
-        match announcement_chunks(topic.space, sequence_number, body, (max_datagram, now.utc)) {
-            Ok(chunks) => {
-                for bytes in chunks {
-                    self.tell(Output::Discovery { bytes });
-                }
-            }
-            Err(error) => self.count(About::topic(topic), Reason::TooBig, 1, || error.to_string()),
-        }
-        self.recycle(bytes);
-    }
-
-    /// Answers for a DataSetWriter that we do not have.
-    fn deny(&mut self, writer_id: u16, sequence_number: u16) {
-        let announcement = Announcement {
-            sequence_number,
-            announced: Announced::DataSetMetaData {
-                writer_id,
-                meta_data: DataSetMetaDataType::default(),
-                status: BAD_NOT_FOUND,
-            },
-        };
-        let mut bytes = self.buffer();
-        let publisher = PublisherId::UInt16(self.settings.own.into());
-        if announcement
-            .encode(publisher, SecurityHeader::NONE, &mut bytes)
-            .is_ok()
-        {
-            self.tell(Output::Discovery { bytes });
-        }
     }
 
     /// Asks a Publisher what some of its topics consist of.
@@ -696,8 +543,6 @@ impl Router {
 
 /// The severity of a Bad StatusCode (OPC 10000-4, 7.39.1).
 const STATUS_BAD: u32 = 0x8000_0000;
-/// Bad_NotFound (OPC 10000-6, A.2).
-const BAD_NOT_FOUND: uadp::StatusCode = uadp::StatusCode(0x803E_0000);
 /// How long a writer that has not said what the fields of its messages are is left alone.
 const ASK_LAYOUT_AGAIN: Duration = Duration::from_secs(10);
 /// Topics of one Publisher that are asked for at a time: those fit any datagram.

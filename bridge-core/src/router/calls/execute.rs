@@ -10,6 +10,7 @@ use uadp::action::{
 use uadp::discovery::{Announced, Announcement, DataSetMetaDataType};
 use uadp::{Fields, PublisherId, SecurityHeader, StatusCode};
 
+use super::super::announce::BAD_NOT_FOUND;
 use super::super::receive::number_of;
 use super::super::{About, Router};
 use crate::call::{Executed, Execution, Offered, join_name};
@@ -300,8 +301,7 @@ fn may_be_executed<'a>(
         .map_err(|error| (Refusal::InvalidArgument, "fields", error.to_string()))
 }
 
-/// Bad_NotFound and Bad_EncodingError (OPC 10000-6, A.2).
-const BAD_NOT_FOUND: StatusCode = StatusCode(0x803E_0000);
+/// Bad_EncodingError (OPC 10000-6, A.2).
 const BAD_ENCODING_ERROR: StatusCode = StatusCode(0x8006_0000);
 /// As a Responder has them.
 const TIMEOUT: Duration = Duration::from_secs(60);

@@ -24,6 +24,8 @@ pub(super) struct Known {
     pub(super) from: SocketAddr,
     /// When that was last said.
     said: Instant,
+    /// When it was last another than before.
+    changed: Instant,
     /// The port holds it to be gone.
     pub(super) gone: bool,
 }
@@ -176,6 +178,15 @@ impl Router {
         let before = calls.table.get(&topic).and_then(|call| call.known.as_ref());
         let same = before.is_some_and(|known| *known.description == description);
         let back = before.is_none_or(|known| known.gone);
+        let changed = before.map(|known| known.changed);
+        if !same && changed.is_some_and(|at| now.monotonic < at + CHANGE_AFTER) {
+            // Once it may be another, it is asked what it is.
+            self.plan_probe(topic, now);
+            let cause = (Reason::MetaData, "too often");
+            return self.count_call(topic, Some(from), cause, || {
+                "its program says too often that it is something else".to_owned()
+            });
+        }
         if !same && !calls.has_room(weight) {
             let cause = (Reason::MetaData, "no room");
             return self.count_call(topic, Some(from), cause, || {
@@ -206,6 +217,7 @@ impl Router {
                     description: Arc::new(description),
                     from,
                     said: now.monotonic,
+                    changed: now.monotonic,
                     gone: false,
                 });
                 calls.weight += weight;
@@ -314,6 +326,8 @@ impl Router {
 const MISSED: u32 = 3;
 /// How often it is looked who is silent.
 const LOOK: Duration = Duration::from_millis(500);
+/// A call is not another more often than that: the port may have to offer it anew each time.
+const CHANGE_AFTER: Duration = Duration::from_secs(1);
 /// Calls there may be, and bytes of what they take and give.
 const MAX_CALLS: usize = 4_096;
 const MAX_WEIGHT: usize = 4 << 20;
