@@ -5,7 +5,6 @@ use std::io;
 use std::net::{IpAddr, SocketAddr, TcpListener, ToSocketAddrs as _};
 use std::str::FromStr;
 
-
 /// The endpoint URL of the server: `opc.tcp://host:port/path` (OPC 10000-6, 7.1.2.2).
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EndpointUrl {
@@ -34,6 +33,12 @@ impl EndpointUrl {
         &self.path
     }
 
+    /// Host and port, as they are connected to.
+    #[must_use]
+    pub fn authority(&self) -> String {
+        format!("{}:{}", self.host, self.port)
+    }
+
     /// The URL clients are told, with the port that is listened on.
     #[must_use]
     pub fn advertised(&self, port: u16) -> String {
@@ -60,7 +65,7 @@ impl EndpointUrl {
                 }
             }
         };
-        let name = format!("{}:{}", self.host, self.port);
+        let name = self.authority();
         let addresses: Vec<SocketAddr> = name
             .to_socket_addrs()
             .map_err(|source| BindError::Unresolved {

@@ -18,6 +18,8 @@ pub const POLL: Duration = Duration::from_millis(5);
 pub const SHORTEST_PUBLISHING: Duration = Duration::from_millis(10);
 /// Notifications in one response. Clients commonly refuse arrays of more than 1000 elements, and then hear nothing more.
 pub const MOST_NOTIFICATIONS: usize = 1_000;
+/// Nodes or items in one request of a client; servers commonly take 1000.
+pub const MOST_PER_REQUEST: usize = 500;
 /// Sessions of a server.
 pub const MOST_SESSIONS: usize = 50;
 /// How long a method or a write may take until its client is told `BadTimeout`.

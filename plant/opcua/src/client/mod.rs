@@ -1,1 +1,188 @@
-//! Sessions that return.
+//! A client that connects, watches over its connection, and comes back with all its subscriptions.
+//!
+//! Reading order: `supervisor` (the life of a connection), `subscription`, `types` (type closures), `connector`.
+
+mod connector;
+mod services;
+mod subscription;
+mod supervisor;
+mod types;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use opcua::types::StatusCode;
+use tokio::sync::watch;
+
+pub use self::services::{Browse, CallError, MOST_REFERENCES};
+pub use self::subscription::{Notice, Select, Subscription, Watch};
+pub use self::types::MOST_TYPES;
+
+use self::supervisor::Shared;
+
+/// Who a client is, and what it bears.
+#[derive(Debug, Clone)]
+pub struct ClientConfig {
+    /// The ApplicationUri.
+    pub application_uri: String,
+    /// The name for people.
+    pub application_name: String,
+    /// The directory of certificates; without one nothing is secured.
+    pub pki: Option<PathBuf>,
+    /// Trusts the certificate of any server, and keeps it as trusted. For tests and demonstrations only.
+    pub accept_untrusted: bool,
+    /// What it wants of what servers offer.
+    pub security: SecurityChoice,
+    /// How long each request may take.
+    pub timeout: Duration,
+    /// How often it asks the server whether it lives.
+    pub keep_alive: Duration,
+    /// How long it waits before it connects again: at first, and at most.
+    pub backoff: (Duration, Duration),
+}
+
+impl ClientConfig {
+    /// A client without certificates, with 2 s for each request.
+    #[must_use]
+    pub fn new(application_uri: &str, application_name: &str) -> Self {
+        Self {
+            application_uri: application_uri.to_owned(),
+            application_name: application_name.to_owned(),
+            pki: None,
+            accept_untrusted: false,
+            security: SecurityChoice::Best,
+            timeout: Duration::from_secs(2),
+            keep_alive: Duration::from_millis(500),
+            backoff: (Duration::from_millis(250), Duration::from_secs(5)),
+        }
+    }
+}
+
+/// What a client wants of what servers offer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SecurityChoice {
+    /// The best that the server offers: signed and encrypted where the client has certificates.
+    Best,
+    /// No security.
+    None,
+    /// Signed and encrypted.
+    Basic256Sha256,
+}
+
+/// Whether there is a connection.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Link {
+    /// For the first time.
+    Connecting,
+    /// There is.
+    Up {
+        /// Whether the server was started again since the last time: what was known of it may be wrong.
+        restarted: bool,
+        /// How often there has been one.
+        connects: u64,
+        /// Where.
+        endpoint: String,
+        /// Whether it is signed and encrypted.
+        secured: bool,
+        /// The ApplicationUri of the server.
+        application_uri: String,
+    },
+    /// There is none, and it is tried again.
+    Down {
+        /// Why.
+        reason: String,
+    },
+    /// The client is closed.
+    Closed,
+}
+
+/// Why there is no answer.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ClientError {
+    /// There is no connection.
+    #[error("there is no connection: {0}")]
+    NotConnected(String),
+    /// The server does not answer in time, or the connection is lost while it is waited for.
+    #[error("the server did not answer: {0}")]
+    Lost(String),
+    /// The server refuses.
+    #[error("the server answers {0}")]
+    Status(StatusCode),
+    /// The answer is not what was asked for.
+    #[error("the server answers with {0}")]
+    Answer(&'static str),
+}
+
+/// A client of one server. Clones are handles to the same one; it is closed when the last is dropped.
+#[derive(Clone)]
+pub struct Client {
+    shared: Arc<Shared>,
+    /// Closes it when the last clone is gone.
+    _open: Arc<Open>,
+}
+
+struct Open(Arc<Shared>);
+
+impl Drop for Open {
+    fn drop(&mut self) {
+        self.0.close();
+    }
+}
+
+impl Client {
+    /// Connects to the server at `url` from now on, in a task of its own.
+    #[must_use]
+    pub fn open(config: ClientConfig, url: &str) -> Self {
+        let shared = Arc::new(Shared::new(config, url));
+        drop(tokio::spawn(supervisor::run(Arc::clone(&shared))));
+        Self {
+            _open: Arc::new(Open(Arc::clone(&shared))),
+            shared,
+        }
+    }
+
+    /// What holds now, and each change. Between two looks there may have been several: `connects` tells.
+    #[must_use]
+    pub fn link(&self) -> watch::Receiver<Link> {
+        self.shared.link.subscribe()
+    }
+
+    /// Waits until there is a connection.
+    ///
+    /// # Errors
+    /// Why there was none in time.
+    pub async fn up(&self, within: Duration) -> Result<(), ClientError> {
+        let mut link = self.link();
+        let up = link.wait_for(|link| matches!(link, Link::Up { .. } | Link::Closed));
+        let waited = tokio::time::timeout(within, up).await;
+        match waited {
+            Ok(Ok(link)) if matches!(*link, Link::Up { .. }) => Ok(()),
+            Ok(_) => Err(ClientError::NotConnected("the client is closed".to_owned())),
+            Err(_) => Err(self.shared.not_connected()),
+        }
+    }
+
+    /// Closes the session and waits until it is, at most as long as a request may take.
+    pub async fn close(&self) {
+        let mut link = self.link();
+        self.shared.close();
+        let closed = link.wait_for(|link| *link == Link::Closed);
+        drop(tokio::time::timeout(self.shared.config.timeout * 2, closed).await);
+    }
+
+    /// The NamespaceArray of the server, as it was when the connection was made; empty before the first.
+    #[must_use]
+    pub fn namespaces(&self) -> Vec<String> {
+        let connected = self.shared.connected();
+        connected.map_or_else(|_| Vec::new(), |one| one.namespaces.clone())
+    }
+
+    /// The index of a namespace at the server.
+    #[must_use]
+    pub fn namespace(&self, uri: &str) -> Option<u16> {
+        let connected = self.shared.connected().ok()?;
+        let at = connected.namespaces.iter().position(|one| one == uri)?;
+        u16::try_from(at).ok()
+    }
+}

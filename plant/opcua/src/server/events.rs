@@ -64,7 +64,7 @@ impl Raised {
             source_name: event.source_name.as_str().into(),
             time: event.time,
             receive_time: event.time,
-            message: LocalizedText::new("", &event.message),
+            message: LocalizedText::from(&event.message),
             severity: event.severity,
             ..BaseEventType::default()
         };
@@ -76,7 +76,7 @@ impl Raised {
     }
 
     fn state(&self, state: &StateRef, is_transition: bool, below: Option<&str>) -> Variant {
-        let text = || LocalizedText::new("", &state.name);
+        let text = || LocalizedText::from(&state.name);
         match below {
             None | Some("EffectiveDisplayName") => text().into(),
             Some("Id") => state.id.clone().into(),

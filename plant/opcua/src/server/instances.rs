@@ -50,7 +50,7 @@ impl InstanceSpec {
         Self {
             type_id,
             node_id,
-            display_name: LocalizedText::new("", browse_name.name.as_ref()),
+            display_name: LocalizedText::from(browse_name.name.as_ref()),
             browse_name,
             parent,
             reference: ReferenceTypeId::HasComponent.into(),
@@ -473,7 +473,8 @@ impl Plan<'_> {
                 type_definition: type_definition.cloned(),
                 node,
             });
-            let below = self.view.declared(&child.nodes, type_definition, &[]);
+            let parental = child.nodes.iter().find_map(|node| self.view.parental_type(node));
+            let below = self.view.declared(&child.nodes, parental, &[]);
             self.add(&below, &id, &path, depth + 1)?;
         }
         Ok(())

@@ -3,9 +3,9 @@
 
 use std::collections::{BTreeMap, HashSet};
 
-use opcua::nodes::{DefaultTypeTree, HasNodeId as _, NodeType, ReferenceDirection};
+use opcua::nodes::{DefaultTypeTree, HasNodeId as _, NodeType};
 use opcua::server::address_space::AddressSpace;
-use opcua::types::{BrowseDirection, Identifier, NodeClass, NodeId, QualifiedName, ReferenceTypeId};
+use opcua::types::{BrowseDirection, Identifier, NodeClass, NodeId, QualifiedName, ReferenceTypeId, VariableTypeId};
 
 /// The core namespace and our own namespaces.
 #[derive(Clone, Copy)]
@@ -46,33 +46,27 @@ impl<'a> View<'a> {
         }
     }
 
-    /// The references of a node, wherever they are kept: type and target.
-    fn references(self, id: &NodeId, forward: bool) -> Vec<(&'a NodeId, &'a NodeId)> {
+    /// The references of a node, wherever they are kept, in an order that stays the same: type and target.
+    fn references(
+        self,
+        id: &NodeId,
+        forward: bool,
+        kinds: &[ReferenceTypeId],
+    ) -> Vec<(&'a NodeId, &'a NodeId)> {
         let direction = if forward {
             BrowseDirection::Forward
         } else {
             BrowseDirection::Inverse
         };
-        let mut found: Vec<_> = [self.core, self.own]
-            .into_iter()
-            .flat_map(|space| {
-                let all = space.find_references(
-                    id,
-                    None::<(NodeId, bool)>,
-                    self.no_types,
-                    direction,
-                );
-                all.map(|reference| {
-                    debug_assert_eq!(
-                        matches!(reference.direction, ReferenceDirection::Forward),
-                        forward
-                    );
-                    (reference.reference_type, reference.target_node)
-                })
-                .collect::<Vec<_>>()
-            })
-            .collect();
-        // The library keeps them in no order.
+        let mut found: Vec<(&NodeId, &NodeId)> = Vec::new();
+        for space in [self.core, self.own] {
+            let all =
+                space.find_references(id, None::<(NodeId, bool)>, self.no_types, direction);
+            // Some nodes of the core namespace have thousands.
+            let wanted =
+                all.filter(|one| kinds.iter().any(|kind| *one.reference_type == *kind));
+            found.extend(wanted.map(|one| (one.reference_type, one.target_node)));
+        }
         found.sort_by_cached_key(|(kind, target)| (order(kind), order(target)));
         found.dedup();
         found
@@ -85,12 +79,8 @@ impl<'a> View<'a> {
         reference: ReferenceTypeId,
         forward: bool,
     ) -> Vec<&'a NodeId> {
-        let references = self.references(id, forward);
-        references
-            .into_iter()
-            .filter(|(kind, _)| **kind == reference)
-            .map(|(_, target)| target)
-            .collect()
+        let references = self.references(id, forward, &[reference]);
+        references.into_iter().map(|(_, target)| target).collect()
     }
 
     /// The supertypes, nearest first.
@@ -130,6 +120,12 @@ impl<'a> View<'a> {
         type_id == base || self.supertypes(type_id).contains(&base)
     }
 
+    /// The type of an object or variable, if its instances can have children: properties have none.
+    pub(crate) fn parental_type(self, id: &NodeId) -> Option<&'a NodeId> {
+        self.type_definition(id)
+            .filter(|found| **found != VariableTypeId::PropertyType)
+    }
+
     pub(crate) fn type_definition(self, id: &NodeId) -> Option<&'a NodeId> {
         self.targets(id, ReferenceTypeId::HasTypeDefinition, true)
             .into_iter()
@@ -151,10 +147,9 @@ impl<'a> View<'a> {
     }
 
     fn below(self, id: &NodeId, kinds: &[ReferenceTypeId]) -> Vec<Child> {
-        let references = self.references(id, true);
+        let references = self.references(id, true, kinds);
         references
             .into_iter()
-            .filter(|(kind, _)| kinds.iter().any(|wanted| **kind == *wanted))
             .filter_map(|(kind, target)| {
                 let node = self.node(target)?;
                 Some(Child {
@@ -240,7 +235,7 @@ impl<'a> View<'a> {
                 continue;
             };
             found.push((vec![field.name.clone()], first.clone()));
-            for below in self.declared(&field.nodes, self.type_definition(first), &[]) {
+            for below in self.declared(&field.nodes, self.parental_type(first), &[]) {
                 if let Some(node) = below.nodes.first() {
                     found.push((vec![field.name.clone(), below.name.clone()], node.clone()));
                 }

@@ -1,0 +1,266 @@
+//! What a client asks of a server.
+
+use opcua::types::{
+    AttributeId, BrowseDescription, BrowseDirection, BrowsePath, BrowseResultMask, ByteString,
+    CallMethodRequest, DataValue, NodeClassMask, NodeId, QualifiedName, ReadValueId,
+    ReferenceDescription, ReferenceTypeId, RelativePath, RelativePathElement, StatusCode,
+    TimestampsToReturn, Variant, WriteValue,
+};
+
+use super::supervisor::failed;
+use super::{Client, ClientError};
+use crate::limits::MOST_PER_REQUEST;
+
+/// Which references are followed.
+#[derive(Debug, Clone)]
+pub struct Browse {
+    /// Their type.
+    pub reference: NodeId,
+    /// Whether those of subtypes are too.
+    pub subtypes: bool,
+    /// Backwards.
+    pub inverse: bool,
+    /// Which nodes are wanted; empty for all.
+    pub classes: NodeClassMask,
+}
+
+impl Browse {
+    /// Down the hierarchy.
+    #[must_use]
+    pub fn hierarchical() -> Self {
+        Self::of(ReferenceTypeId::HierarchicalReferences)
+    }
+
+    /// Forward, by this type of reference and its subtypes.
+    pub fn of(reference: impl Into<NodeId>) -> Self {
+        Self {
+            reference: reference.into(),
+            subtypes: true,
+            inverse: false,
+            classes: NodeClassMask::empty(),
+        }
+    }
+
+    /// Backwards instead.
+    #[must_use]
+    pub fn inverse(mut self) -> Self {
+        self.inverse = true;
+        self
+    }
+}
+
+/// Why a method has no outputs.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum CallError {
+    /// The server says no.
+    #[error("the call is refused with {status}")]
+    Refused {
+        /// Why.
+        status: StatusCode,
+        /// What is wrong with each argument, where the server says so.
+        arguments: Vec<StatusCode>,
+    },
+    /// There is no answer. With [`ClientError::Lost`] nobody knows whether the method was executed.
+    #[error(transparent)]
+    Client(#[from] ClientError),
+}
+
+impl Client {
+    /// Reads values; one for each node, bad ones too.
+    ///
+    /// # Errors
+    /// No answer.
+    pub async fn read(&self, nodes: &[NodeId]) -> Result<Vec<DataValue>, ClientError> {
+        let what: Vec<_> = nodes
+            .iter()
+            .map(|node| (node.clone(), AttributeId::Value))
+            .collect();
+        self.read_attributes(&what).await
+    }
+
+    /// Reads attributes; one value for each, bad ones too.
+    ///
+    /// # Errors
+    /// No answer.
+    pub async fn read_attributes(
+        &self,
+        what: &[(NodeId, AttributeId)],
+    ) -> Result<Vec<DataValue>, ClientError> {
+        let nodes: Vec<_> = what
+            .iter()
+            .map(|(node, attribute)| ReadValueId {
+                node_id: node.clone(),
+                attribute_id: *attribute as u32,
+                ..ReadValueId::default()
+            })
+            .collect();
+        let session = self.shared.connected()?;
+        let mut values = Vec::with_capacity(nodes.len());
+        for nodes in nodes.chunks(MOST_PER_REQUEST) {
+            let read = session
+                .session
+                .read(nodes, TimestampsToReturn::Both, 0.0)
+                .await;
+            values.extend(as_many(read, nodes.len())?);
+        }
+        Ok(values)
+    }
+
+    /// Writes values; one status for each.
+    ///
+    /// # Errors
+    /// No answer; of more than [`MOST_PER_REQUEST`] values the first may have been written then.
+    pub async fn write(
+        &self,
+        values: &[(NodeId, Variant)],
+    ) -> Result<Vec<StatusCode>, ClientError> {
+        let writes: Vec<_> = values
+            .iter()
+            .map(|(node, value)| WriteValue {
+                node_id: node.clone(),
+                attribute_id: AttributeId::Value as u32,
+                value: DataValue {
+                    value: Some(value.clone()),
+                    ..DataValue::default()
+                },
+                ..WriteValue::default()
+            })
+            .collect();
+        let session = self.shared.connected()?;
+        let mut results = Vec::with_capacity(writes.len());
+        for writes in writes.chunks(MOST_PER_REQUEST) {
+            results.extend(as_many(session.session.write(writes).await, writes.len())?);
+        }
+        Ok(results)
+    }
+
+    /// The references of a node, at most [`MOST_REFERENCES`].
+    ///
+    /// # Errors
+    /// No answer, or the node is not there.
+    pub async fn browse(
+        &self,
+        node: &NodeId,
+        what: Browse,
+    ) -> Result<Vec<ReferenceDescription>, ClientError> {
+        let session = &self.shared.connected()?.session;
+        let description = BrowseDescription {
+            node_id: node.clone(),
+            browse_direction: if what.inverse {
+                BrowseDirection::Inverse
+            } else {
+                BrowseDirection::Forward
+            },
+            reference_type_id: what.reference,
+            include_subtypes: what.subtypes,
+            node_class_mask: what.classes.bits(),
+            result_mask: BrowseResultMask::All as u32,
+        };
+        let browsed = session.browse(&[description], 0, None).await;
+        let mut found = Vec::new();
+        let mut page = as_many(browsed, 1)?.pop();
+        while let Some(result) = page.take() {
+            if result.status_code.is_bad() {
+                return Err(ClientError::Status(result.status_code));
+            }
+            found.extend(result.references.into_iter().flatten());
+            let more: ByteString = result.continuation_point;
+            if more.is_null_or_empty() {
+                break;
+            }
+            let enough = found.len() >= MOST_REFERENCES;
+            let next = session.browse_next(enough, &[more]).await;
+            if enough {
+                break;
+            }
+            page = as_many(next, 1)?.pop();
+        }
+        found.truncate(MOST_REFERENCES);
+        Ok(found)
+    }
+
+    /// The node at a path of BrowseNames down the hierarchy.
+    ///
+    /// # Errors
+    /// No answer, or `BadNoMatch`.
+    pub async fn translate(
+        &self,
+        node: &NodeId,
+        path: &[QualifiedName],
+    ) -> Result<NodeId, ClientError> {
+        let elements = path.iter().map(|name| RelativePathElement {
+            reference_type_id: ReferenceTypeId::HierarchicalReferences.into(),
+            is_inverse: false,
+            include_subtypes: true,
+            target_name: name.clone(),
+        });
+        let path = BrowsePath {
+            starting_node: node.clone(),
+            relative_path: RelativePath {
+                elements: Some(elements.collect()),
+            },
+        };
+        let session = self.shared.connected()?;
+        let translated = session
+            .session
+            .translate_browse_paths_to_node_ids(&[path])
+            .await;
+        let result = as_many(translated, 1)?
+            .pop()
+            .ok_or(ClientError::Answer("no path"))?;
+        if result.status_code.is_bad() {
+            return Err(ClientError::Status(result.status_code));
+        }
+        let whole = result.targets.into_iter().flatten();
+        let target = whole
+            .into_iter()
+            .find(|target| target.remaining_path_index == u32::MAX);
+        target
+            .map(|target| target.target_id.node_id)
+            .ok_or(ClientError::Status(StatusCode::BadNoMatch))
+    }
+
+    /// Calls a method of an object.
+    ///
+    /// # Errors
+    /// A refusal, or no answer.
+    pub async fn call(
+        &self,
+        object: &NodeId,
+        method: &NodeId,
+        arguments: Vec<Variant>,
+    ) -> Result<Vec<Variant>, CallError> {
+        let request = CallMethodRequest {
+            object_id: object.clone(),
+            method_id: method.clone(),
+            input_arguments: (!arguments.is_empty()).then_some(arguments),
+        };
+        let session = self.shared.connected()?;
+        let called = session.session.call(vec![request]).await;
+        let result = as_many(called, 1)?
+            .pop()
+            .ok_or(ClientError::Answer("no result"))?;
+        if result.status_code.is_bad() {
+            return Err(CallError::Refused {
+                status: result.status_code,
+                arguments: result.input_argument_results.unwrap_or_default(),
+            });
+        }
+        Ok(result.output_arguments.unwrap_or_default())
+    }
+}
+
+/// The answer, if it has as many results as there were questions.
+fn as_many<T>(
+    answer: Result<Vec<T>, opcua::types::Error>,
+    wanted: usize,
+) -> Result<Vec<T>, ClientError> {
+    let answer = answer.map_err(|error| failed(&error))?;
+    if answer.len() != wanted {
+        return Err(ClientError::Answer("another number of results"));
+    }
+    Ok(answer)
+}
+
+/// How many references of one node are taken.
+pub const MOST_REFERENCES: usize = 10_000;

@@ -1,0 +1,381 @@
+//! Subscriptions that survive their connection.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+use opcua::client::{MonitoredItem, OnSubscriptionNotification};
+use opcua::types::{
+    AttributeId, ContentFilterBuilder, DataValue, EventFilter, ExtensionObject,
+    MonitoredItemCreateRequest, MonitoringMode, MonitoringParameters, NodeId, NumericRange,
+    Operand, QualifiedName, ReadValueId, SimpleAttributeOperand, StatusCode, TimestampsToReturn,
+    Variant,
+};
+use tokio::sync::mpsc;
+use tracing::warn;
+
+use super::supervisor::{Connected, Shared, failed};
+use super::{Client, ClientError};
+use crate::limits::{MOST_NOTIFICATIONS, MOST_PER_REQUEST};
+
+/// What is watched.
+#[derive(Debug, Clone)]
+pub enum Watch {
+    /// The value of a variable.
+    Value(NodeId),
+    /// The events of an object.
+    Events {
+        /// The object, as the Server.
+        node: NodeId,
+        /// Which fields of them.
+        select: Vec<Select>,
+        /// Only events of this type and its subtypes.
+        of_type: Option<NodeId>,
+    },
+}
+
+/// A field of events.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Select {
+    /// The type that has the field. With BaseEventType servers look at the path alone.
+    pub type_id: NodeId,
+    /// The path.
+    pub path: Vec<QualifiedName>,
+}
+
+impl Select {
+    /// A field of the core namespace by names joined by `/`, as `ToState/Id`.
+    pub fn new(type_id: impl Into<NodeId>, path: &str) -> Self {
+        Self {
+            type_id: type_id.into(),
+            path: path
+                .split('/')
+                .map(|name| QualifiedName::new(0, name))
+                .collect(),
+        }
+    }
+}
+
+/// What a subscription tells.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Notice {
+    /// It is made, for the first time or again: what happened in between was missed. Values follow.
+    Subscribed,
+    /// A value.
+    Value {
+        /// Which of the watches.
+        watch: usize,
+        /// The value.
+        value: DataValue,
+    },
+    /// An event.
+    Event {
+        /// Which of the watches.
+        watch: usize,
+        /// The fields in the order they were selected.
+        fields: Vec<Variant>,
+    },
+    /// The server does not watch that.
+    Refused {
+        /// Which of the watches.
+        watch: usize,
+        /// Why.
+        status: StatusCode,
+    },
+}
+
+/// A subscription; the server is told when it is dropped.
+pub struct Subscription {
+    id: u64,
+    notices: mpsc::Receiver<Notice>,
+    dropped: Arc<AtomicU64>,
+    shared: Arc<Shared>,
+}
+
+impl Subscription {
+    /// The next notice; `None` when the client is closed.
+    pub async fn next(&mut self) -> Option<Notice> {
+        self.notices.recv().await
+    }
+
+    /// How many notices were thrown away because the queue was full.
+    #[must_use]
+    pub fn dropped(&self) -> u64 {
+        self.dropped.load(Ordering::Relaxed)
+    }
+}
+
+impl Drop for Subscription {
+    fn drop(&mut self) {
+        if let Some(wanted) = self.shared.wanted.lock().get_mut(&self.id) {
+            wanted.gone = true;
+        }
+        self.shared.changed.notify_one();
+    }
+}
+
+/// What there should be.
+pub(crate) struct Wanted {
+    watches: Arc<[Watch]>,
+    interval: Duration,
+    queue: Queue,
+    state: State,
+    gone: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum State {
+    Waiting,
+    Making,
+    Made(u32),
+    /// The server does not want it.
+    Refused,
+}
+
+impl Wanted {
+    /// The connection is gone, and with it what was made.
+    pub(crate) fn forget(&mut self) {
+        self.state = State::Waiting;
+    }
+
+    pub(crate) fn is_made(&self) -> bool {
+        matches!(self.state, State::Made(_))
+    }
+}
+
+#[derive(Clone)]
+struct Queue {
+    notices: mpsc::Sender<Notice>,
+    dropped: Arc<AtomicU64>,
+}
+
+impl Queue {
+    fn put(&self, notice: Notice) {
+        if let Err(mpsc::error::TrySendError::Full(_)) = self.notices.try_send(notice) {
+            let total = self.dropped.fetch_add(1, Ordering::Relaxed) + 1;
+            if 10_u64.pow(total.ilog10()) == total {
+                warn!(total, "notices of a subscription are thrown away: nobody takes them");
+            }
+        }
+    }
+}
+
+/// What the library calls with notifications.
+struct Sink(Queue);
+
+/// The client handle of a watch; the library takes 0 for none.
+fn handle(watch: usize) -> u32 {
+    u32::try_from(watch).map_or(u32::MAX, |watch| watch.saturating_add(1))
+}
+
+fn watch_of(item: &MonitoredItem) -> usize {
+    usize::try_from(item.client_handle()).map_or(0, |handle| handle.saturating_sub(1))
+}
+
+impl OnSubscriptionNotification for Sink {
+    fn on_data_value(&mut self, value: DataValue, item: &MonitoredItem) {
+        let watch = watch_of(item);
+        self.0.put(Notice::Value { watch, value });
+    }
+
+    fn on_event(&mut self, fields: Option<Vec<Variant>>, item: &MonitoredItem) {
+        let watch = watch_of(item);
+        let fields = fields.unwrap_or_default();
+        self.0.put(Notice::Event { watch, fields });
+    }
+}
+
+impl Client {
+    /// Watches values and events, with `interval` between notifications and room for `queue` notices. It is made when
+    /// there is a connection, and again with each.
+    #[must_use]
+    pub fn subscribe(&self, watches: Vec<Watch>, interval: Duration, queue: usize) -> Subscription {
+        let (tell, notices) = mpsc::channel(queue.max(1));
+        let dropped = Arc::new(AtomicU64::new(0));
+        let shared = Arc::clone(&self.shared);
+        let mut wanted = shared.wanted.lock();
+        let id = wanted.last_key_value().map_or(0, |(id, _)| id + 1);
+        wanted.insert(
+            id,
+            Wanted {
+                watches: watches.into(),
+                interval,
+                queue: Queue {
+                    notices: tell,
+                    dropped: Arc::clone(&dropped),
+                },
+                state: State::Waiting,
+                gone: false,
+            },
+        );
+        drop(wanted);
+        shared.changed.notify_one();
+        Subscription {
+            id,
+            notices,
+            dropped,
+            shared,
+        }
+    }
+}
+
+/// Makes what is wanted and takes away what is not.
+///
+/// # Errors
+/// Why the connection is no good any more.
+pub(crate) async fn renew(shared: &Shared, connected: &Connected) -> Result<(), String> {
+    loop {
+        let mut gone = None;
+        let mut new = None;
+        {
+            let mut wanted = shared.wanted.lock();
+            let id = wanted.iter().find_map(|(id, one)| one.gone.then_some(*id));
+            if let Some(id) = id {
+                gone = wanted.remove(&id).map(|one| one.state);
+            } else if let Some((id, one)) = wanted
+                .iter_mut()
+                .find(|(_, one)| one.state == State::Waiting)
+            {
+                one.state = State::Making;
+                new = Some((*id, Arc::clone(&one.watches), one.interval, one.queue.clone()));
+            }
+        }
+        match (gone, new) {
+            (Some(State::Made(id)), _) => {
+                let deleted = connected.session.delete_subscription(id).await;
+                deleted.map_err(|error| error.to_string())?;
+            }
+            (Some(State::Waiting | State::Making | State::Refused), _) => {}
+            (None, Some((id, watches, interval, queue))) => {
+                let made = make(connected, &watches, interval, queue).await?;
+                if let Some(wanted) = shared.wanted.lock().get_mut(&id) {
+                    wanted.state = made;
+                }
+            }
+            (None, None) => return Ok(()),
+        }
+    }
+}
+
+async fn make(
+    connected: &Connected,
+    watches: &[Watch],
+    interval: Duration,
+    queue: Queue,
+) -> Result<State, String> {
+    let session = &connected.session;
+    let keep_alive = count(KEEP_ALIVE, interval);
+    let created = session
+        .create_subscription(
+            interval,
+            keep_alive.saturating_mul(LIFETIME),
+            keep_alive,
+            u32::try_from(MOST_NOTIFICATIONS).unwrap_or(u32::MAX),
+            0,
+            true,
+            Sink(queue.clone()),
+        )
+        .await;
+    let id = match created {
+        Ok(id) => id,
+        Err(error) if error.status() == StatusCode::BadTooManySubscriptions => {
+            for watch in 0..watches.len() {
+                let status = error.status();
+                queue.put(Notice::Refused { watch, status });
+            }
+            return Ok(State::Refused);
+        }
+        Err(error) => return Err(error.to_string()),
+    };
+    queue.put(Notice::Subscribed);
+    let requests: Vec<_> = watches
+        .iter()
+        .enumerate()
+        .map(|(at, watch)| request(handle(at), watch, interval))
+        .collect();
+    for (page, requests) in requests.chunks(MOST_PER_REQUEST).enumerate() {
+        let made = session
+            .create_monitored_items(id, TimestampsToReturn::Both, requests.to_vec())
+            .await;
+        let each: Vec<StatusCode> = match made {
+            Ok(items) => items.iter().map(|item| item.result.status_code).collect(),
+            Err(error) => match failed(&error) {
+                ClientError::Status(status) => vec![status; requests.len()],
+                lost => return Err(lost.to_string()),
+            },
+        };
+        for (at, status) in each.into_iter().enumerate().filter(|(_, status)| status.is_bad()) {
+            let watch = page * MOST_PER_REQUEST + at;
+            queue.put(Notice::Refused { watch, status });
+        }
+    }
+    Ok(State::Made(id))
+}
+
+/// How many intervals there are in `time`.
+fn count(time: Duration, interval: Duration) -> u32 {
+    let interval = interval.max(Duration::from_millis(1));
+    u32::try_from(time.as_millis() / interval.as_millis().max(1)).map_or(u32::MAX, |n| n.max(1))
+}
+
+fn request(handle: u32, watch: &Watch, interval: Duration) -> MonitoredItemCreateRequest {
+    let (node, attribute, filter, queue_size) = match watch {
+        Watch::Value(node) => (node, AttributeId::Value, ExtensionObject::null(), VALUES),
+        Watch::Events {
+            node,
+            select,
+            of_type,
+        } => {
+            let filter = EventFilter {
+                select_clauses: Some(
+                    select
+                        .iter()
+                        .map(|field| SimpleAttributeOperand {
+                            type_definition_id: field.type_id.clone(),
+                            browse_path: Some(field.path.clone()),
+                            attribute_id: AttributeId::Value as u32,
+                            index_range: NumericRange::None,
+                        })
+                        .collect(),
+                ),
+                where_clause: of_type
+                    .as_ref()
+                    .map(|of_type| {
+                        let filter = ContentFilterBuilder::new();
+                        filter.of_type(Operand::literal(of_type.clone())).build()
+                    })
+                    .unwrap_or_default(),
+            };
+            let filter = ExtensionObject::from_message(filter);
+            (node, AttributeId::EventNotifier, filter, EVENTS)
+        }
+    };
+    MonitoredItemCreateRequest {
+        item_to_monitor: ReadValueId {
+            node_id: node.clone(),
+            attribute_id: attribute as u32,
+            ..ReadValueId::default()
+        },
+        monitoring_mode: MonitoringMode::Reporting,
+        requested_parameters: MonitoringParameters {
+            client_handle: handle,
+            // Events are not sampled.
+            sampling_interval: match watch {
+                Watch::Value(_) => interval.as_secs_f64() * 1e3,
+                Watch::Events { .. } => 0.0,
+            },
+            filter,
+            queue_size,
+            discard_oldest: true,
+        },
+    }
+}
+
+/// How often a subscription says that it lives.
+const KEEP_ALIVE: Duration = Duration::from_secs(1);
+/// How many keep-alives a server keeps a subscription for nobody.
+const LIFETIME: u32 = 10;
+/// Values the server keeps between two notifications.
+const VALUES: u32 = 10;
+/// Events the server keeps between two notifications.
+const EVENTS: u32 = 1_000;

@@ -1,0 +1,445 @@
+//! The life of a connection: find the endpoint, make the session, read what the server is, subscribe, watch, and all
+//! over again. The library can reconnect too, and then hears nothing of its subscriptions with some servers; here each
+//! connection has a new session.
+
+use std::collections::{BTreeMap, HashMap};
+use std::path::{Path, PathBuf};
+use std::pin::pin;
+use std::sync::Arc;
+use std::time::Duration;
+
+use futures_util::TryStreamExt as _;
+use opcua::client::{
+    ClientBuilder, IdentityToken, Session, SessionActivity, SessionPollResult, SubscriptionActivity,
+};
+use opcua::sync::Mutex;
+use opcua::types::{
+    AttributeId, DataValue, DateTime, EndpointDescription, MessageSecurityMode, NodeId,
+    ReadValueId, StatusCode, TimestampsToReturn, VariableId, Variant,
+};
+use tokio::sync::{Notify, mpsc, oneshot, watch};
+use tokio::task::JoinHandle;
+use tokio::time::{Instant, sleep, timeout};
+use tracing::{debug, info, warn};
+
+use super::connector::Direct;
+use super::subscription::Wanted;
+use super::{ClientConfig, ClientError, Link, SecurityChoice};
+use crate::limits;
+use crate::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
+use crate::server::NO_PKI;
+
+/// What the handles and the supervisor have in common.
+pub(crate) struct Shared {
+    pub(crate) config: ClientConfig,
+    url: String,
+    pub(crate) link: watch::Sender<Link>,
+    connected: Mutex<Option<Arc<Connected>>>,
+    pub(crate) wanted: Mutex<BTreeMap<u64, Wanted>>,
+    /// Something else is wanted, or nothing more.
+    pub(crate) changed: Notify,
+    closing: watch::Sender<bool>,
+}
+
+/// A connection.
+pub(crate) struct Connected {
+    pub(crate) session: Arc<Session>,
+    pub(crate) namespaces: Vec<String>,
+    /// The supertypes that are known.
+    pub(crate) supertypes: Mutex<HashMap<NodeId, Option<NodeId>>>,
+    /// The loop of the library, without which nothing is sent and nothing heard.
+    driving: JoinHandle<()>,
+}
+
+impl Drop for Connected {
+    fn drop(&mut self) {
+        self.driving.abort();
+    }
+}
+
+impl Shared {
+    pub(crate) fn new(config: ClientConfig, url: &str) -> Self {
+        Self {
+            config,
+            url: url.to_owned(),
+            link: watch::Sender::new(Link::Connecting),
+            connected: Mutex::default(),
+            wanted: Mutex::default(),
+            changed: Notify::new(),
+            closing: watch::Sender::new(false),
+        }
+    }
+
+    pub(crate) fn close(&self) {
+        self.closing.send_replace(true);
+    }
+
+    pub(crate) fn connected(&self) -> Result<Arc<Connected>, ClientError> {
+        let connected = self.connected.lock().clone();
+        connected.ok_or_else(|| self.not_connected())
+    }
+
+    pub(crate) fn not_connected(&self) -> ClientError {
+        let reason = match &*self.link.borrow() {
+            Link::Down { reason } => reason.clone(),
+            Link::Closed => "the client is closed".to_owned(),
+            Link::Connecting | Link::Up { .. } => format!("{} has not answered yet", self.url),
+        };
+        ClientError::NotConnected(reason)
+    }
+}
+
+/// Connects again and again until the client is closed.
+pub(crate) async fn run(shared: Arc<Shared>) {
+    let mut closing = shared.closing.subscribe();
+    {
+        let living = pin!(live(&shared));
+        let closed = pin!(closing.wait_for(|closing| *closing));
+        tokio::select! {
+            () = living => {}
+            _ = closed => {}
+        }
+    }
+    let last = shared.connected.lock().take();
+    if let Some(last) = last {
+        // The server frees the session at once instead of after its timeout.
+        let ended = timeout(shared.config.timeout, last.session.disconnect()).await;
+        debug!(url = shared.url, ended = ended.is_ok(), "closed a session");
+    }
+    shared.wanted.lock().clear();
+    shared.link.send_replace(Link::Closed);
+}
+
+async fn live(shared: &Shared) {
+    let client = match library_client(&shared.config) {
+        Ok(client) => client,
+        Err(reason) => {
+            warn!(url = shared.url, reason, "no client can be made");
+            shared.link.send_replace(Link::Down { reason });
+            return std::future::pending().await;
+        }
+    };
+    let mut connects = 0;
+    let mut started = None;
+    let (first, longest) = shared.config.backoff;
+    let mut wait = first;
+    loop {
+        let reason = match connect(shared, &client).await {
+            Ok(mut connection) => {
+                connects += 1;
+                wait = first;
+                let restarted = started.is_some_and(|before| before != connection.started);
+                started = Some(connection.started);
+                for wanted in shared.wanted.lock().values_mut() {
+                    wanted.forget();
+                }
+                *shared.connected.lock() = Some(Arc::clone(&connection.connected));
+                let endpoint = &connection.endpoint;
+                info!(url = shared.url, connects, restarted, "connected");
+                shared.link.send_replace(Link::Up {
+                    restarted,
+                    connects,
+                    endpoint: endpoint.endpoint_url.as_ref().to_owned(),
+                    secured: endpoint.security_mode == MessageSecurityMode::SignAndEncrypt,
+                    application_uri: endpoint.server.application_uri.as_ref().to_owned(),
+                });
+                let reason = watch_over(shared, &mut connection).await;
+                *shared.connected.lock() = None;
+                // Who waits for an answer is told at once.
+                connection.connected.driving.abort();
+                reason
+            }
+            Err(reason) => reason,
+        };
+        if *shared.link.borrow() != (Link::Down { reason: reason.clone() }) {
+            info!(url = shared.url, reason, "not connected");
+        }
+        shared.link.send_replace(Link::Down { reason });
+        sleep(wait).await;
+        wait = (wait * 2).min(longest);
+    }
+}
+
+fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, String> {
+    let root = match &config.pki {
+        Some(root) => {
+            let pki = Pki::open(root.clone()).map_err(|error| error.to_string())?;
+            let host = opcua::crypto::hostname().unwrap_or_else(|_| "localhost".to_owned());
+            pki.ensure_own(&config.application_uri, &host)
+                .map_err(|error| error.to_string())?;
+            root.clone()
+        }
+        None => PathBuf::from(NO_PKI),
+    };
+    let make = || {
+        ClientBuilder::new()
+        .application_name(&config.application_name)
+        .application_uri(&config.application_uri)
+        .product_uri("urn:ua-bridge:plant")
+        .session_name(&config.application_name)
+        .certificate_path(Path::new(OWN_CERTIFICATE))
+        .private_key_path(Path::new(OWN_KEY))
+        .trust_server_certs(config.accept_untrusted)
+        .verify_server_certs(true)
+        .pki_dir(&root)
+        .session_retry_limit(0)
+        .session_timeout(30_000)
+        .request_timeout(config.timeout)
+        .keep_alive_interval(config.keep_alive)
+        .max_failed_keep_alive_count(0)
+        .recreate_subscriptions(false)
+        .min_publish_interval(limits::SHORTEST_PUBLISHING)
+        .max_array_length(limits::LARGEST_ARRAY)
+        .max_string_length(limits::LARGEST_VALUE)
+        .max_byte_string_length(limits::LARGEST_VALUE)
+        .max_message_size(limits::LARGEST_MESSAGE)
+        .max_chunk_count(limits::MOST_CHUNKS)
+        .client()
+    };
+    // Without certificates the library complains of them though nobody asks for any.
+    let made = if config.pki.is_some() {
+        make()
+    } else {
+        tracing::subscriber::with_default(tracing::subscriber::NoSubscriber::new(), make)
+    };
+    made.map_err(|errors| errors.join(", "))
+}
+
+/// A connection and what ends with it.
+struct Connection {
+    connected: Arc<Connected>,
+    endpoint: EndpointDescription,
+    started: DateTime,
+    /// What happens in the loop of the library.
+    activity: mpsc::Receiver<Activity>,
+    ended: oneshot::Receiver<String>,
+}
+
+/// What the watchdogs look at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Activity {
+    Connected,
+    KeptAlive,
+    Missed,
+    Published,
+}
+
+async fn connect(shared: &Shared, client: &opcua::client::Client) -> Result<Connection, String> {
+    let within = shared.config.timeout;
+    let endpoint = timeout(within * 2, endpoint(shared, client))
+        .await
+        .map_err(|_| format!("{} does not tell its endpoints", shared.url))??;
+    let source = Direct::new(&shared.url, within);
+    let (session, event_loop) = client
+        .session_builder()
+        .user_identity_token(IdentityToken::Anonymous)
+        .with_connector(source)
+        .connect_to_endpoint_directly(endpoint.clone())
+        .and_then(|builder| builder.build(Arc::clone(client.certificate_store())))
+        .map_err(|error| error.to_string())?;
+    session.disable_reconnects();
+    let (tell, mut activity) = mpsc::channel(64);
+    let (end, mut ended) = oneshot::channel();
+    let driving = tokio::spawn(async move {
+        let mut events = pin!(event_loop.enter());
+        let reason = loop {
+            let happened = match events.try_next().await {
+                Ok(Some(SessionPollResult::Reconnected(_))) => Activity::Connected,
+                Ok(Some(SessionPollResult::SessionActivity(activity))) => match activity {
+                    SessionActivity::KeepAliveSucceeded => Activity::KeptAlive,
+                    SessionActivity::KeepAliveFailed(_) => Activity::Missed,
+                },
+                Ok(Some(SessionPollResult::Subscription(SubscriptionActivity::Publish))) => {
+                    Activity::Published
+                }
+                Ok(Some(SessionPollResult::ReconnectFailed(status))) => break status.to_string(),
+                Ok(Some(_)) => continue,
+                Ok(None) => break "the connection was closed".to_owned(),
+                Err(status) => break status.to_string(),
+            };
+            if tell.try_send(happened).is_err() {
+                debug!(?happened, "nobody looks at the connection; it tells again a moment later");
+            }
+        };
+        drop(end.send(reason));
+    });
+    let opened = timeout(within * 2, async {
+        tokio::select! {
+            reason = &mut ended => Err(reason.unwrap_or_else(|_| "it ended".to_owned())),
+            _ = activity.recv() => Ok(()),
+        }
+    });
+    let opened = opened.await;
+    let driving = AbortOnDrop(Some(driving));
+    opened.map_err(|_| format!("{} makes no session", shared.url))??;
+    let (namespaces, started) = timeout(within, what_it_is(&session))
+        .await
+        .map_err(|_| "the server does not tell its namespaces".to_owned())??;
+    Ok(Connection {
+        connected: Arc::new(Connected {
+            session,
+            namespaces,
+            supertypes: Mutex::default(),
+            driving: driving.keep(),
+        }),
+        endpoint,
+        started,
+        activity,
+        ended,
+    })
+}
+
+/// A task that must not outlive a failure.
+struct AbortOnDrop(Option<JoinHandle<()>>);
+
+impl AbortOnDrop {
+    fn keep(mut self) -> JoinHandle<()> {
+        self.0.take().unwrap_or_else(|| tokio::spawn(async {}))
+    }
+}
+
+impl Drop for AbortOnDrop {
+    fn drop(&mut self) {
+        if let Some(task) = self.0.take() {
+            task.abort();
+        }
+    }
+}
+
+/// The endpoint of the server that has the security that is wanted, reached as we reach the server.
+async fn endpoint(
+    shared: &Shared,
+    client: &opcua::client::Client,
+) -> Result<EndpointDescription, String> {
+    let config = &shared.config;
+    let asked = Direct::new(&shared.url, config.timeout);
+    let offered = client
+        .get_server_endpoints_from_url(asked)
+        .await
+        .map_err(|error| error.to_string())?;
+    let is_plain = |one: &EndpointDescription| one.security_mode == MessageSecurityMode::None;
+    let is_secured = |one: &EndpointDescription| {
+        one.security_mode == MessageSecurityMode::SignAndEncrypt
+            && one.security_policy_uri.as_ref() == BASIC256SHA256
+    };
+    let has = |wanted: &dyn Fn(&EndpointDescription) -> bool| {
+        let tcp = offered.iter().filter(|one| {
+            let url: &str = one.endpoint_url.as_ref();
+            url.starts_with("opc.tcp://")
+        });
+        tcp.into_iter().find(|one| wanted(one)).cloned()
+    };
+    let can_secure = config.pki.is_some();
+    let chosen = match config.security {
+        SecurityChoice::None => has(&is_plain),
+        SecurityChoice::Basic256Sha256 if can_secure => has(&is_secured),
+        SecurityChoice::Best if can_secure => has(&is_secured).or_else(|| has(&is_plain)),
+        SecurityChoice::Best => has(&is_plain),
+        SecurityChoice::Basic256Sha256 => {
+            return Err("Basic256Sha256 needs a directory for certificates".to_owned());
+        }
+    };
+    let mut chosen =
+        chosen.ok_or_else(|| format!("{} offers no security we can have", shared.url))?;
+    // The name a server gives itself may not be known here.
+    chosen.endpoint_url = shared.url.as_str().into();
+    Ok(chosen)
+}
+
+async fn what_it_is(session: &Session) -> Result<(Vec<String>, DateTime), String> {
+    let wanted = [
+        VariableId::Server_NamespaceArray,
+        VariableId::Server_ServerStatus_StartTime,
+    ]
+    .map(|id| ReadValueId {
+        node_id: id.into(),
+        attribute_id: AttributeId::Value as u32,
+        ..ReadValueId::default()
+    });
+    let read = session.read(&wanted, TimestampsToReturn::Neither, 0.0).await;
+    let mut values = read.map_err(|error| error.to_string())?.into_iter();
+    let namespaces = values.next().and_then(strings);
+    let started = values.next().and_then(|value| {
+        let Some(Variant::DateTime(time)) = value.value else {
+            return None;
+        };
+        Some(*time)
+    });
+    let namespaces = namespaces.ok_or_else(|| "the server has no NamespaceArray".to_owned())?;
+    // A server that tells no start is never seen to be started again.
+    Ok((namespaces, started.unwrap_or_else(DateTime::null)))
+}
+
+fn strings(value: DataValue) -> Option<Vec<String>> {
+    let Some(Variant::Array(array)) = value.value else {
+        return None;
+    };
+    let each = array.values.into_iter().map(|value| {
+        let Variant::String(text) = value else {
+            return None;
+        };
+        Some(text.as_ref().to_owned())
+    });
+    each.collect()
+}
+
+/// Makes the subscriptions, and returns with the reason when the connection is no good any more.
+async fn watch_over(shared: &Shared, connection: &mut Connection) -> String {
+    let mut missed = 0;
+    let mut published = Instant::now();
+    let mut look = tokio::time::interval(LOOK);
+    look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        if let Err(reason) = super::subscription::renew(shared, &connection.connected).await {
+            return reason;
+        }
+        tokio::select! {
+            reason = &mut connection.ended => {
+                return reason.unwrap_or_else(|_| "the connection ended".to_owned());
+            }
+            activity = connection.activity.recv() => match activity {
+                Some(Activity::Missed) => {
+                    missed += 1;
+                    if missed >= MOST_MISSED {
+                        return "the server does not answer".to_owned();
+                    }
+                }
+                Some(Activity::KeptAlive | Activity::Connected) => missed = 0,
+                Some(Activity::Published) => published = Instant::now(),
+                None => {}
+            },
+            () = shared.changed.notified() => {}
+            _ = look.tick() => {
+                let subscribed = shared.wanted.lock().values().any(Wanted::is_made);
+                if !subscribed {
+                    published = Instant::now();
+                } else if published.elapsed() > LONGEST_SILENCE {
+                    return "the server is silent about its subscriptions".to_owned();
+                }
+            }
+        }
+    }
+}
+
+/// The error of a request that failed.
+pub(crate) fn failed(error: &opcua::types::Error) -> ClientError {
+    match error.status() {
+        StatusCode::BadTimeout
+        | StatusCode::BadConnectionClosed
+        | StatusCode::BadNotConnected
+        | StatusCode::BadServerNotConnected
+        | StatusCode::BadCommunicationError
+        | StatusCode::BadSecureChannelClosed
+        | StatusCode::BadSessionClosed
+        | StatusCode::BadShutdown => ClientError::Lost(error.to_string()),
+        status => ClientError::Status(status),
+    }
+}
+
+const BASIC256SHA256: &str = "http://opcfoundation.org/UA/SecurityPolicy#Basic256Sha256";
+/// How many keep-alives in a row may be missed.
+const MOST_MISSED: u32 = 2;
+/// How often it is looked whether subscriptions live.
+const LOOK: Duration = Duration::from_millis(500);
+/// How long nothing may come of any subscription; each says every second that it lives.
+const LONGEST_SILENCE: Duration = Duration::from_secs(5);
