@@ -522,7 +522,9 @@ fn copy(node: &NodeType, id: NodeId) -> Option<NodeType> {
         NodeType::Variable(variable) => {
             let mut value = value_of(variable);
             if value.value.as_ref().is_none_or(|value| *value == Variant::Empty) {
+                // The library tells a status only beside a value.
                 value = DataValue {
+                    value: Some(Variant::Empty),
                     status: Some(StatusCode::BadWaitingForInitialData),
                     ..DataValue::default()
                 };
