@@ -1,3 +1,139 @@
-//! A component of the cell.
+//! A component of the cell, by its own YAML.
 
-fn main() {}
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::OnceLock;
+
+use bridge_node::{Arguments, Context, Failure, FailureKind, Made, Owned, Program, WithoutMapping};
+use mappings::{Mapping, SpaceId};
+use skills::{Component, Lds, Security};
+use ua_component::{ComponentPort, Options, made};
+
+/// A component of the cell: an OPC UA server with skills, which are values and calls of the space too.
+#[derive(Debug, clap::Parser)]
+#[command(name = "ua-component", version)]
+struct UaComponent {
+    /// The YAML of the component
+    #[arg(value_name = "COMPONENT", env = "UA_COMPONENT")]
+    component: PathBuf,
+    /// Check the YAML and the types it names, print every finding, and exit
+    #[arg(long)]
+    check: bool,
+    /// Where clients connect, as opc.tcp://127.0.0.1:0, in place of what the YAML says
+    #[arg(long, value_name = "URL", env = "UA_ENDPOINT")]
+    endpoint: Option<String>,
+    /// The local discovery server it registers with, or `none`, in place of what the YAML says
+    #[arg(long, value_name = "URL", env = "UA_LDS")]
+    lds: Option<String>,
+    /// The certificate store: own, private, trusted and rejected under one directory
+    #[arg(long, value_name = "DIR", env = "UA_PKI")]
+    pki: Option<PathBuf>,
+    /// Trust every client certificate, and keep it as trusted. For tests and demonstrations only
+    #[arg(long)]
+    trust_any_client_certificate: bool,
+    #[command(flatten)]
+    arguments: WithoutMapping,
+    #[arg(skip)]
+    read: OnceLock<Read>,
+}
+
+/// The YAML as it was read.
+#[derive(Debug)]
+struct Read {
+    component: Component,
+    text: String,
+}
+
+fn main() -> ExitCode {
+    bridge_node::run::<UaComponent>()
+}
+
+impl UaComponent {
+    fn file(&self) -> String {
+        self.component.display().to_string()
+    }
+
+    fn read(&self) -> Result<&Read, Failure> {
+        if let Some(read) = self.read.get() {
+            return Ok(read);
+        }
+        let file = self.file();
+        let text = std::fs::read_to_string(&self.component).map_err(|error| {
+            Failure::new(FailureKind::Io, format!("cannot read {file}: {error}"))
+        })?;
+        let folder = self.component.parent().unwrap_or_else(|| Path::new(""));
+        let mut component = Component::from_yaml(&text, folder).map_err(|findings| {
+            let count = findings.len();
+            ua_component::print(&findings.render(&file, &text));
+            Failure::new(
+                FailureKind::Configuration,
+                format!("{file}: {count} errors"),
+            )
+        })?;
+        if let Some(endpoint) = &self.endpoint {
+            component.endpoint.clone_from(endpoint);
+        }
+        match self.lds.as_deref() {
+            Some("none") => component.lds = Lds::Nowhere,
+            Some(url) => component.lds = Lds::At(url.to_owned()),
+            None => {}
+        }
+        Ok(self.read.get_or_init(|| Read { component, text }))
+    }
+
+    fn options(&self, read: &Read) -> Options {
+        let secured = read.component.security.contains(&Security::Basic256Sha256);
+        let usual = || {
+            plant_opcua::pki::default_root(|name| std::env::var(name).ok())
+                .join(&read.component.name)
+        };
+        let pki = self.pki.clone().or_else(|| secured.then(usual));
+        let interface = self.arguments.0.flags.interface.as_deref();
+        let mdns = match interface {
+            None => discovery::Interface::LOOPBACK,
+            Some(interface) => discovery::Interface::parse(interface),
+        };
+        Options {
+            pki,
+            trust_any_client: self.trust_any_client_certificate,
+            mdns: Some(mdns),
+            capabilities: vec!["DA".to_owned()],
+            source: Some((read.text.clone(), self.file())),
+        }
+    }
+}
+
+impl Program for UaComponent {
+    type Port = ComponentPort;
+
+    const NAME: &'static str = "ua-component";
+    const LOCAL: bridge_core::Local = bridge_core::Local::Fields;
+    const QUIET: &'static str = plant_opcua::QUIET;
+    const CLAIMS: bool = true;
+
+    fn arguments(&self) -> &Arguments {
+        &self.arguments.0
+    }
+
+    fn made(&self) -> Result<Option<Made>, Failure> {
+        let read = self.read()?;
+        if self.check {
+            ua_component::check(&read.component, &self.options(read))?;
+            return Ok(Some(Made::Checked));
+        }
+        Ok(Some(Made::Run(made(&read.component))))
+    }
+
+    fn owned(mapping: &Mapping) -> Owned {
+        Owned::Only(mapping.namespaces().keys().copied().collect())
+    }
+
+    fn spaces(&self, _mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
+        Ok(vec![SpaceId::UA])
+    }
+
+    async fn start(&self, _context: Context) -> Result<ComponentPort, Failure> {
+        let read = self.read()?;
+        ComponentPort::start(&read.component, &self.options(read))
+    }
+}

@@ -452,7 +452,7 @@ impl Actor {
 
     fn step(&mut self, step: String) {
         self.now.step = step;
-        self.tell(Told::Progress);
+        self.tell(Told::Step);
     }
 
     fn progress(&mut self, done: f32) {

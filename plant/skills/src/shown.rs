@@ -90,7 +90,9 @@ pub enum Told<'a> {
     Parameters(&'a Parameters),
     /// A transition. Before the work of a run begins, and after the outcome of a run that ends.
     Transition(&'a Transitioned),
-    /// Step or progress of the run.
+    /// The run has come to another step.
+    Step,
+    /// More of the run is done.
     Progress,
     /// How a run has ended; its transition follows.
     Outcome(&'a Outcome),

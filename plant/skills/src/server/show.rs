@@ -247,7 +247,7 @@ impl Observer for Shower {
         match what {
             Told::Parameters(parameters) => nodes.show_parameters(server, parameters),
             Told::Transition(happened) => nodes.show_transition(server, happened, shown),
-            Told::Progress => nodes.show_progress(server, shown),
+            Told::Step | Told::Progress => nodes.show_progress(server, shown),
             Told::Outcome(outcome) => nodes.show_outcome(server, outcome),
             Told::Called => nodes.show_called(server, shown),
         }

@@ -78,9 +78,9 @@ impl Observer for Log {
                 seen.transitions.push((transition.number, *run));
                 seen.story.push(transition.name.to_owned());
             }
-            Told::Progress => seen.story.push(format!("step {}", shown.step)),
+            Told::Step => seen.story.push(format!("step {}", shown.step)),
             Told::Outcome(outcome) => seen.story.push(format!("outcome {}", outcome.succeeded)),
-            Told::Called => {}
+            Told::Progress | Told::Called => {}
         }
     }
 }

@@ -153,6 +153,12 @@ impl Findings {
         self.found.is_empty()
     }
 
+    /// How many there are.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.found.len() + self.left_out
+    }
+
     /// In the order of the text.
     #[must_use]
     pub fn sorted(mut self) -> Vec<Finding> {

@@ -1,0 +1,193 @@
+//! Values as the space carries them: a block of fields is their number (UInt16) and a Variant each (OPC 10000-6, 5.2.2.16).
+
+use messages::Rank;
+use skills::{Builtin, Shape, Value};
+use uadp::{BuiltinType, Fields, Scalar, Variant};
+
+/// The block of these values.
+pub(crate) fn block(values: &[Value]) -> Vec<u8> {
+    // A skill has a few hundred values at most.
+    let mut out = Vec::from(
+        u16::try_from(values.len())
+            .unwrap_or(u16::MAX)
+            .to_le_bytes(),
+    );
+    for value in values {
+        variant(value, &mut out);
+    }
+    out
+}
+
+/// The values of a block; `None` for one that is null.
+///
+/// # Errors
+/// What of it a skill has no values of, for people.
+pub(crate) fn values(block: &[u8]) -> Result<Vec<Option<Value>>, String> {
+    let fields = Fields::parse(block).map_err(|error| error.to_string())?;
+    fields
+        .map(|field| value(&field.map_err(|error| error.to_string())?))
+        .collect()
+}
+
+/// The type of a field.
+pub(crate) fn builtin(of: Builtin) -> BuiltinType {
+    match of {
+        Builtin::Boolean => BuiltinType::Boolean,
+        Builtin::SByte => BuiltinType::SByte,
+        Builtin::Byte => BuiltinType::Byte,
+        Builtin::Int16 => BuiltinType::Int16,
+        Builtin::UInt16 => BuiltinType::UInt16,
+        Builtin::Int32 => BuiltinType::Int32,
+        Builtin::UInt32 => BuiltinType::UInt32,
+        Builtin::Int64 => BuiltinType::Int64,
+        Builtin::UInt64 => BuiltinType::UInt64,
+        Builtin::Float => BuiltinType::Float,
+        Builtin::Double => BuiltinType::Double,
+        Builtin::String => BuiltinType::String,
+    }
+}
+
+/// The rank of a field.
+pub(crate) fn rank(of: Shape) -> Rank {
+    if of.array {
+        Rank::Array { fixed: None }
+    } else {
+        Rank::Scalar
+    }
+}
+
+fn variant(value: &Value, out: &mut Vec<u8>) {
+    match value {
+        Value::Array(builtin, elements) => {
+            out.push(builtin.id() | ARRAY);
+            length(elements.len(), out);
+            for element in elements {
+                scalar(element, out);
+            }
+        }
+        single => {
+            out.push(single.shape().builtin.id());
+            scalar(single, out);
+        }
+    }
+}
+
+fn scalar(value: &Value, out: &mut Vec<u8>) {
+    match value {
+        Value::Boolean(value) => out.push(u8::from(*value)),
+        Value::SByte(value) => out.extend(value.to_le_bytes()),
+        Value::Byte(value) => out.push(*value),
+        Value::Int16(value) => out.extend(value.to_le_bytes()),
+        Value::UInt16(value) => out.extend(value.to_le_bytes()),
+        Value::Int32(value) => out.extend(value.to_le_bytes()),
+        Value::UInt32(value) => out.extend(value.to_le_bytes()),
+        Value::Int64(value) => out.extend(value.to_le_bytes()),
+        Value::UInt64(value) => out.extend(value.to_le_bytes()),
+        Value::Float(value) => out.extend(value.to_le_bytes()),
+        Value::Double(value) => out.extend(value.to_le_bytes()),
+        Value::String(text) => {
+            length(text.len(), out);
+            out.extend(text.as_bytes());
+        }
+        // An array has single values in it.
+        Value::Array(..) => {}
+    }
+}
+
+fn length(of: usize, out: &mut Vec<u8>) {
+    out.extend(i32::try_from(of).unwrap_or(i32::MAX).to_le_bytes());
+}
+
+fn value(field: &Variant<'_>) -> Result<Option<Value>, String> {
+    match field {
+        Variant::Null => Ok(None),
+        Variant::Scalar(scalar) => single(scalar).map(Some),
+        Variant::Array(array) => {
+            let of = Builtin::of_id(u32::from(array.element() as u8));
+            let of = of.ok_or_else(|| {
+                format!(
+                    "an array of {:?} is nothing that a skill is told",
+                    array.element()
+                )
+            })?;
+            let elements: Result<Vec<Value>, String> =
+                array.iter().map(|element| single(&element)).collect();
+            Ok(Some(Value::Array(of, elements?)))
+        }
+        Variant::Matrix(_) => {
+            Err("an array of several dimensions is nothing that a skill is told".to_owned())
+        }
+    }
+}
+
+fn single(scalar: &Scalar<'_>) -> Result<Value, String> {
+    Ok(match scalar {
+        Scalar::Boolean(value) => Value::Boolean(*value),
+        Scalar::SByte(value) => Value::SByte(*value),
+        Scalar::Byte(value) => Value::Byte(*value),
+        Scalar::Int16(value) => Value::Int16(*value),
+        Scalar::UInt16(value) => Value::UInt16(*value),
+        Scalar::Int32(value) => Value::Int32(*value),
+        Scalar::UInt32(value) => Value::UInt32(*value),
+        Scalar::Int64(value) => Value::Int64(*value),
+        Scalar::UInt64(value) => Value::UInt64(*value),
+        Scalar::Float(value) => Value::Float(*value),
+        Scalar::Double(value) => Value::Double(*value),
+        Scalar::String(text) => Value::String(text.unwrap_or_default().to_owned()),
+        other => {
+            return Err(format!(
+                "{:?} is nothing that a skill is told",
+                other.builtin_type()
+            ));
+        }
+    })
+}
+
+const ARRAY: u8 = 0x80;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn values_are_the_same_after_their_way_through_the_space() {
+        let all = vec![
+            Value::from(true),
+            Value::SByte(-1),
+            Value::Byte(200),
+            Value::Int16(-300),
+            Value::UInt16(60_000),
+            Value::from(-70_000),
+            Value::from(70_000_u32),
+            Value::Int64(i64::MIN),
+            Value::UInt64(u64::MAX),
+            Value::from(0.5_f32),
+            Value::from(0.1),
+            Value::from("J\u{f8}rg"),
+            Value::from([0.25; 6]),
+            Value::Array(Builtin::String, vec!["a".into(), "".into()]),
+            Value::Array(Builtin::Boolean, Vec::new()),
+        ];
+        let read = values(&block(&all)).unwrap();
+        assert_eq!(read, all.into_iter().map(Some).collect::<Vec<_>>());
+    }
+
+    #[test]
+    fn what_is_null_is_not_given_and_what_is_no_value_of_a_skill_is_told() {
+        assert_eq!(values(&[1, 0, 0]), Ok(vec![None]));
+        // A StatusCode.
+        assert!(
+            values(&[1, 0, 19, 0, 0, 0, 0])
+                .unwrap_err()
+                .contains("StatusCode")
+        );
+        assert!(values(&[1]).is_err());
+    }
+
+    #[test]
+    fn each_type_has_the_number_of_the_field_type() {
+        for of in Builtin::ALL {
+            assert_eq!(builtin(*of) as u8, of.id());
+        }
+    }
+}

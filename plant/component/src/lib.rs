@@ -1,0 +1,11 @@
+//! A component of the cell: skills, served by OPC UA, as values and calls of the space, and announced to who looks for
+//! them.
+//!
+//! The program `ua-component` is [`ComponentPort`] with the YAML of a component; a program with drivers of its own is the
+//! same with a [`skills::Component`] that it makes.
+
+mod fields;
+mod port;
+mod space;
+
+pub use port::{ComponentPort, Options, check, made, print};

@@ -1,0 +1,329 @@
+//! The local side of a component: its OPC UA server and skills, with values and calls of the space.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge_node::{
+    Delivery, Described, Executed, Execution, ExecutionId, Failure, FailureKind, Port, PortEvent,
+    TypePaths,
+};
+use discovery::{AnnounceSettings, Announced, Interface};
+use mappings::{Mapping, PubSub, TopicId};
+use program::Method;
+use skills::server::{ComponentServer, ServeFault, ServeSettings};
+use skills::{Component, Lds, Owner, Refusal, Skill, Value};
+use tokio::sync::mpsc;
+use tracing::{info, warn};
+use uadp::BuiltinType;
+
+use crate::fields;
+use crate::space::{Outbox, Place, Speaker};
+
+/// What a component is started with beside what it is.
+#[derive(Debug, Clone, Default)]
+pub struct Options {
+    /// The directory of certificates, which Basic256Sha256 needs.
+    pub pki: Option<PathBuf>,
+    /// Trusts every client's certificate. For tests and demonstrations only.
+    pub trust_any_client: bool,
+    /// Where it announces itself by mDNS; `None` for nowhere.
+    pub mdns: Option<Interface>,
+    /// Codes of OPC 10000-12, annex D, that it is announced with.
+    pub capabilities: Vec<String>,
+    /// The text of its YAML and the name of that file, for findings.
+    pub source: Option<(String, String)>,
+}
+
+/// The mapping that a component runs with: it has one namespace, and no variables.
+#[must_use]
+pub fn made(component: &Component) -> Mapping {
+    let namespaces = BTreeMap::from([(component.namespace, component.application_uri.clone())]);
+    Mapping::made(PubSub::default(), namespaces)
+}
+
+/// A component that runs.
+pub struct ComponentPort {
+    server: ComponentServer,
+    announced: Option<Announced>,
+    outbox: Outbox,
+    /// What is said before all else.
+    first: VecDeque<PortEvent>,
+    executed: mpsc::Receiver<PortEvent>,
+    executes: mpsc::Sender<PortEvent>,
+}
+
+impl ComponentPort {
+    /// Serves a component, and announces it. Needs a tokio runtime.
+    ///
+    /// # Errors
+    /// What is wrong with it, all printed by then; an address that cannot be listened on; certificates that cannot be used.
+    pub fn start(component: &Component, options: &Options) -> Result<Self, Failure> {
+        let place = Place {
+            component: component.name.clone(),
+            namespace: component.namespace,
+            open: component.open,
+        };
+        let outbox = Outbox::default();
+        let mut first = VecDeque::new();
+        let settings = ServeSettings {
+            pki: options.pki.clone(),
+            trust_any_client: options.trust_any_client,
+        };
+        let server = ComponentServer::build(component, &settings, |number, facts| {
+            first.extend(place.announce(number, facts));
+            let Some(speaker) = Speaker::new(outbox.clone(), &place, number) else {
+                return Vec::new();
+            };
+            speaker.at_first(facts);
+            vec![Box::new(speaker)]
+        });
+        let server = server.map_err(|fault| failure(fault, options))?;
+        server.start();
+        let announced = announce(component, server.url(), options);
+        info!(
+            skills = server.skills().len(),
+            namespace = component.namespace,
+            "{} is served at {}",
+            component.name,
+            server.url()
+        );
+        let (executes, executed) = mpsc::channel(MOST_EXECUTIONS);
+        Ok(Self {
+            server,
+            announced,
+            outbox,
+            first,
+            executed,
+            executes,
+        })
+    }
+
+    /// Where clients connect.
+    #[must_use]
+    pub fn url(&self) -> &str {
+        self.server.url()
+    }
+
+    /// Its skills, by their numbers from 1.
+    #[must_use]
+    pub fn skills(&self) -> &[Skill] {
+        self.server.skills()
+    }
+
+    fn skill(&self, topic: TopicId) -> Option<(Skill, Method)> {
+        let (number, method) = Place::call(topic)?;
+        let skill = self
+            .server
+            .skills()
+            .get(usize::from(number.checked_sub(1)?))?;
+        Some((skill.clone(), method))
+    }
+}
+
+impl Port for ComponentPort {
+    async fn recv(&mut self) -> PortEvent {
+        if let Some(event) = self.first.pop_front() {
+            return event;
+        }
+        tokio::select! {
+            biased;
+            Some(event) = self.executed.recv() => event,
+            event = self.outbox.next() => event,
+        }
+    }
+
+    fn publish(&mut self, _sample: Delivery) -> Result<(), &'static str> {
+        Err("a component takes no values")
+    }
+
+    fn wanted(
+        &mut self,
+        _topic: TopicId,
+        _shape: &[(BuiltinType, bool)],
+        _described: Option<&Described>,
+    ) {
+        // Values of others are none of its business.
+    }
+
+    fn silent(&mut self, _topic: TopicId, _silent: bool) {}
+
+    fn execute(&mut self, execution: Execution) -> bool {
+        let Some((skill, method)) = self.skill(execution.topic) else {
+            return false;
+        };
+        // Room for the answer before anything moves.
+        let Ok(room) = self.executes.clone().try_reserve_owned() else {
+            return false;
+        };
+        let by = execution
+            .requestor
+            .map_or(Owner::Local("a tool in the space"), |space| {
+                Owner::Space(space.get().into())
+            });
+        let Execution { id, request, .. } = execution;
+        drop(tokio::spawn(async move {
+            let answer = call(&skill, by, method, &request).await;
+            let outcome = Executed::Answered(fields::block(&answer));
+            drop(room.send(PortEvent::Executed {
+                execution: id,
+                outcome,
+            }));
+        }));
+        true
+    }
+
+    fn abandoned(&mut self, _execution: ExecutionId, _topic: TopicId) {
+        // A call is over within a second or two, and a run that it began goes on: its outcome can be asked for later.
+    }
+
+    fn reload(&mut self, _mapping: &Arc<Mapping>, _types: &Arc<TypePaths>) -> Vec<String> {
+        Vec::new()
+    }
+
+    async fn shutdown(self) {
+        let leaving = async {
+            if let Some(announced) = self.announced {
+                announced.leave().await;
+            }
+        };
+        // Both within a second or so; whoever is not done then is left.
+        let ended = tokio::time::timeout(SHUTDOWN, async {
+            tokio::join!(leaving, self.server.stop())
+        });
+        if ended.await.is_err() {
+            warn!("not all connections were closed in time");
+        }
+    }
+}
+
+/// Looks whether a component could be served: its types, NodeSets and drivers. Listens nowhere that anybody knows of.
+///
+/// # Errors
+/// As [`ComponentPort::start`].
+pub fn check(component: &Component, options: &Options) -> Result<(), Failure> {
+    let component = Component {
+        endpoint: "opc.tcp://127.0.0.1:0".to_owned(),
+        security: vec![skills::Security::None],
+        ..component.clone()
+    };
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .map_err(|error| Failure::new(FailureKind::Io, format!("cannot start: {error}")))?;
+    runtime.block_on(async {
+        let settings = ServeSettings::default();
+        let built = ComponentServer::build(&component, &settings, |_, _| Vec::new());
+        let server = built.map_err(|fault| failure(fault, options))?;
+        server.stop().await;
+        Ok(())
+    })
+}
+
+/// Success, message and run of a call.
+async fn call(skill: &Skill, by: Owner, method: Method, request: &[u8]) -> [Value; 3] {
+    let answer = match method {
+        Method::Start => match parameters(skill, request) {
+            Ok(parameters) => skill
+                .start_with(by, parameters)
+                .await
+                .map_err(|refusal| refusal.to_string()),
+            Err(why) => Err(format!("BadInvalidArgument: {why}")),
+        },
+        other => skill
+            .call(by, other)
+            .await
+            .map_err(|refusal: Refusal| refusal.to_string()),
+    };
+    match answer {
+        Ok(run) => [true.into(), "".into(), run.into()],
+        Err(message) => [false.into(), message.into(), skill.shown().run.into()],
+    }
+}
+
+/// The parameters of a request: a field for each of the type's, in its order, or none at all. What is null is not given.
+fn parameters(skill: &Skill, request: &[u8]) -> Result<Vec<(String, Value)>, String> {
+    let values = fields::values(request)?;
+    let declared = &skill.facts().parameters;
+    if values.is_empty() {
+        return Ok(Vec::new());
+    }
+    if values.len() != declared.len() {
+        return Err(format!(
+            "the request has {} fields, and the skill {} parameters",
+            values.len(),
+            declared.len()
+        ));
+    }
+    let given = declared.iter().zip(values);
+    Ok(given
+        .filter_map(|(parameter, value)| Some((parameter.name.clone(), value?)))
+        .collect())
+}
+
+fn failure(fault: ServeFault, options: &Options) -> Failure {
+    match fault {
+        ServeFault::Findings(findings) => {
+            let (text, file) = options.source.clone().unwrap_or_default();
+            let count = findings.len();
+            print(&findings.render(&file, &text));
+            Failure::new(
+                FailureKind::Configuration,
+                format!("{file}: {count} errors"),
+            )
+        }
+        ServeFault::Server(error) => {
+            let kind = match error {
+                plant_opcua::server::ServerError::Bind(_) => FailureKind::Unavailable,
+                plant_opcua::server::ServerError::Pki(_)
+                | plant_opcua::server::ServerError::Io(_) => FailureKind::Io,
+                _ => FailureKind::Configuration,
+            };
+            Failure::new(kind, error.to_string())
+        }
+        ServeFault::Space(_) => Failure::new(FailureKind::Configuration, fault.to_string()),
+    }
+}
+
+/// Prints findings, where those of mappings go.
+pub fn print(text: &str) {
+    use std::io::Write as _;
+    // Nobody is left to tell when it is closed.
+    let _printed = std::io::stderr().lock().write_all(text.as_bytes());
+}
+
+fn announce(component: &Component, url: &str, options: &Options) -> Option<Announced> {
+    let server = discovery::Server {
+        application_uri: component.application_uri.clone(),
+        product_uri: "urn:ua-bridge:plant".to_owned(),
+        name: component.name.clone(),
+        url: url.to_owned(),
+        capabilities: options.capabilities.clone(),
+    };
+    let lds = match &component.lds {
+        Lds::Local => Some(discovery::DEFAULT_LDS.to_owned()),
+        Lds::Nowhere => None,
+        Lds::At(url) => Some(url.clone()),
+    };
+    if lds.is_none() && options.mdns.is_none() {
+        return None;
+    }
+    let settings = AnnounceSettings {
+        lds,
+        mdns: options.mdns.clone(),
+        ..AnnounceSettings::default()
+    };
+    match discovery::announce(server, settings) {
+        Ok(announced) => Some(announced),
+        Err(fault) => {
+            warn!("nobody is told of the component by mDNS: {fault}");
+            None
+        }
+    }
+}
+
+/// Within the 2 s a port has to end.
+const SHUTDOWN: Duration = Duration::from_millis(1_900);
+/// So many calls may be executed at once; more are refused.
+const MOST_EXECUTIONS: usize = 64;

@@ -1,0 +1,463 @@
+//! The skills of a component as values and calls of the space: skill k has the identifiers `100*k + n`.
+
+use std::collections::VecDeque;
+use std::num::NonZeroU16;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use bridge_core::{CallDescription, CallField, Offered, ValueDescription};
+use bridge_node::{PortEvent, now};
+use bytes::Bytes;
+use mappings::{Overflow, TopicId};
+use messages::{Leaf, Rank, TypeName};
+use program::{Method, State};
+use skills::{Builtin, Facts, Observer, Outcome, Parameters, Shown, Told, Transitioned, Value};
+use tokio::sync::Notify;
+use uadp::{BuiltinType, Timestamp};
+
+use crate::fields;
+
+/// What each of the nine identifiers of a skill is.
+pub(crate) const STATE: u16 = 1;
+pub(crate) const EVENTS: u16 = 2;
+pub(crate) const PARAMETERS: u16 = 3;
+pub(crate) const RESULT: u16 = 4;
+/// The methods, by their identifiers.
+pub(crate) const CALLS: [(u16, Method); 5] = [
+    (5, Method::Start),
+    (6, Method::Halt),
+    (7, Method::Suspend),
+    (8, Method::Resume),
+    (9, Method::Reset),
+];
+
+/// Where a component is in the space.
+#[derive(Debug, Clone)]
+pub(crate) struct Place {
+    /// Its name there.
+    pub(crate) component: String,
+    /// Its number.
+    pub(crate) namespace: u16,
+    /// Whether its calls are open to other hosts.
+    pub(crate) open: bool,
+}
+
+impl Place {
+    /// The name of a value or call of skill `number`. `None` for a namespace 0.
+    pub(crate) fn topic(&self, number: u16, n: u16) -> Option<TopicId> {
+        TopicId::new(
+            0,
+            self.namespace,
+            number.checked_mul(PER_SKILL)?.checked_add(n)?,
+        )
+    }
+
+    /// The skill and the call behind a name.
+    pub(crate) fn call(topic: TopicId) -> Option<(u16, Method)> {
+        let identifier = topic.identifier.get();
+        let (number, n) = (identifier / PER_SKILL, identifier % PER_SKILL);
+        let (_, method) = CALLS.into_iter().find(|(known, _)| *known == n)?;
+        Some((number, method))
+    }
+
+    /// What is said of a skill before anything is sent of it.
+    pub(crate) fn announce(&self, number: u16, facts: &Facts) -> Vec<PortEvent> {
+        let mut events = Vec::new();
+        for (n, description) in self.values(facts) {
+            if let Some(topic) = self.topic(number, n) {
+                events.push(PortEvent::Described { topic, description });
+                events.push(PortEvent::Live { topic, live: true });
+            }
+        }
+        for (n, method) in CALLS {
+            if let Some(topic) = self.topic(number, n) {
+                let description = self.method(facts, method);
+                let open = self.open;
+                events.push(PortEvent::Offer {
+                    topic,
+                    offered: Offered { description, open },
+                });
+            }
+        }
+        events
+    }
+
+    fn values(&self, facts: &Facts) -> [(u16, ValueDescription); 4] {
+        let name = |what: &str| format!("{}.{}.{what}", self.component, facts.name);
+        let own_type = facts.types.first();
+        let of_type = own_type
+            .map(|of| format!("{} nsu={}", of.name, of.namespace))
+            .unwrap_or_default();
+        let described = |what: &str, message: &str, about: String, fields: Vec<Leaf>, overflow| {
+            ValueDescription {
+                name: name(what),
+                message_type: TypeName::new("ua_msgs", message).ok(),
+                about,
+                fields,
+                overflow,
+            }
+        };
+        let (text, texts) = (
+            (BuiltinType::String, Rank::Scalar),
+            (BuiltinType::String, Rank::Array { fixed: None }),
+        );
+        let run = ("run", (BuiltinType::UInt32, Rank::Scalar));
+        let byte = (BuiltinType::Byte, Rank::Scalar);
+        let state = leaves([
+            ("state", text),
+            ("number", byte),
+            ("last_transition", text),
+            ("progress", (BuiltinType::Float, Rank::Scalar)),
+            ("step", text),
+            run,
+        ]);
+        let event = leaves([
+            ("transition", text),
+            ("number", byte),
+            ("from_state", text),
+            ("to_state", text),
+            run,
+            ("message", text),
+        ]);
+        let parameters = leaves([run, ("names", texts), ("values", texts)]);
+        let result = leaves([
+            run,
+            ("succeeded", (BuiltinType::Boolean, Rank::Scalar)),
+            ("message", text),
+            ("names", texts),
+            ("values", texts),
+        ]);
+        let queue = Overflow::DropOldest(NonZeroU16::MIN.saturating_add(QUEUED_EVENTS));
+        [
+            (
+                STATE,
+                described("State", "SkillState", of_type, state, Overflow::KeepLatest),
+            ),
+            (
+                EVENTS,
+                described("Events", "SkillEvent", String::new(), event, queue),
+            ),
+            (
+                PARAMETERS,
+                described(
+                    "Parameters",
+                    "SkillParameters",
+                    String::new(),
+                    parameters,
+                    Overflow::KeepLatest,
+                ),
+            ),
+            (
+                RESULT,
+                described(
+                    "Result",
+                    "SkillResult",
+                    String::new(),
+                    result,
+                    Overflow::KeepLatest,
+                ),
+            ),
+        ]
+    }
+
+    fn method(&self, facts: &Facts, method: Method) -> CallDescription {
+        let request = match method {
+            Method::Start => facts
+                .parameters
+                .iter()
+                .map(|parameter| {
+                    let field = CallField {
+                        rank: fields::rank(parameter.shape),
+                        ..CallField::scalar(
+                            &parameter.name,
+                            fields::builtin(parameter.shape.builtin),
+                        )
+                    };
+                    if parameter.default.is_some() {
+                        field.optional()
+                    } else {
+                        field
+                    }
+                })
+                .collect(),
+            _ => Vec::new(),
+        };
+        CallDescription {
+            name: format!("{}.{}.{method}", self.component, facts.name),
+            about: format!(
+                "{method} of {}",
+                facts.types.first().map_or("a skill", |of| of.name.as_str())
+            ),
+            request,
+            response: vec![
+                CallField::scalar("success", BuiltinType::Boolean),
+                CallField::scalar("message", BuiltinType::String),
+                CallField::scalar("run", BuiltinType::UInt32),
+            ],
+        }
+    }
+}
+
+fn leaves<const N: usize>(fields: [(&str, (BuiltinType, Rank)); N]) -> Vec<Leaf> {
+    let leaf = |(name, (builtin, rank)): (&str, (BuiltinType, Rank))| Leaf {
+        path: name.to_owned(),
+        builtin,
+        rank,
+    };
+    fields.into_iter().map(leaf).collect()
+}
+
+/// Values on their way to the space, in the order in which they came to be. Bounded: when it is full the oldest goes, and is
+/// counted.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Outbox {
+    inner: Arc<Mutex<Waiting>>,
+    more: Arc<Notify>,
+}
+
+#[derive(Debug, Default)]
+struct Waiting {
+    samples: VecDeque<Sample>,
+    lost: VecDeque<(TopicId, u64)>,
+}
+
+#[derive(Debug)]
+struct Sample {
+    topic: TopicId,
+    payload: Bytes,
+    at: Timestamp,
+    /// A newer one of the topic may take its place.
+    passing: bool,
+}
+
+impl Outbox {
+    /// The next value, or what was lost before it.
+    pub(crate) async fn next(&self) -> PortEvent {
+        loop {
+            let more = self.more.notified();
+            if let Some(event) = self.take() {
+                return event;
+            }
+            more.await;
+        }
+    }
+
+    fn take(&self) -> Option<PortEvent> {
+        let mut waiting = self.lock();
+        if let Some((topic, count)) = waiting.lost.pop_front() {
+            return Some(PortEvent::Lost {
+                topic: Some(topic),
+                why: "the space is slow",
+                count,
+            });
+        }
+        let Sample {
+            topic, payload, at, ..
+        } = waiting.samples.pop_front()?;
+        Some(PortEvent::Sample {
+            topic,
+            payload,
+            received: at,
+            latched_by: None,
+        })
+    }
+
+    fn put(&self, topic: TopicId, values: &[Value], passing: bool) {
+        let payload = Bytes::from(fields::block(values));
+        let sample = Sample {
+            topic,
+            payload,
+            at: now().utc,
+            passing,
+        };
+        let mut waiting = self.lock();
+        if passing
+            && waiting
+                .samples
+                .back()
+                .is_some_and(|last| last.topic == topic && last.passing)
+        {
+            waiting.samples.pop_back();
+        }
+        if waiting.samples.len() >= MOST_WAITING
+            && let Some(gone) = waiting.samples.pop_front()
+        {
+            match waiting
+                .lost
+                .iter_mut()
+                .find(|(topic, _)| *topic == gone.topic)
+            {
+                Some((_, count)) => *count += 1,
+                None => waiting.lost.push_back((gone.topic, 1)),
+            }
+        }
+        waiting.samples.push_back(sample);
+        drop(waiting);
+        self.more.notify_one();
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Waiting> {
+        // Each change is whole before the lock is given back.
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Puts what happens to one skill into the outbox.
+#[derive(Debug)]
+pub(crate) struct Speaker {
+    outbox: Outbox,
+    topics: [TopicId; 4],
+    /// When progress alone was last said.
+    progressed: Mutex<Option<Instant>>,
+}
+
+impl Speaker {
+    /// Of skill `number`. `None` where it has no place in the space.
+    pub(crate) fn new(outbox: Outbox, place: &Place, number: u16) -> Option<Self> {
+        let topic = |n| place.topic(number, n);
+        let topics = [
+            topic(STATE)?,
+            topic(EVENTS)?,
+            topic(PARAMETERS)?,
+            topic(RESULT)?,
+        ];
+        Some(Self {
+            outbox,
+            topics,
+            progressed: Mutex::new(None),
+        })
+    }
+
+    /// How it is before anything has happened.
+    pub(crate) fn at_first(&self, facts: &Facts) {
+        let defaults = facts
+            .parameters
+            .iter()
+            .filter_map(|of| Some((of.name.clone(), of.default.clone()?)));
+        self.parameters(0, &defaults.collect::<Vec<_>>());
+        self.result(&Outcome {
+            run: 0,
+            succeeded: false,
+            message: String::new(),
+            results: Vec::new(),
+        });
+        let [state, ..] = self.topics;
+        let halted = State::Halted;
+        self.outbox
+            .put(state, &state_of(halted, "", (0.0, "", 0)), false);
+    }
+
+    fn state(&self, shown: &Shown, passing: bool) {
+        let [state, ..] = self.topics;
+        let last = shown.last.map_or("", |last| last.name);
+        let values = state_of(shown.state, last, (shown.progress, &shown.step, shown.run));
+        self.outbox.put(state, &values, passing);
+    }
+
+    fn parameters(&self, run: u32, of: &[(String, Value)]) {
+        let [_, _, parameters, _] = self.topics;
+        let [names, values] = named(of);
+        self.outbox
+            .put(parameters, &[run.into(), names, values], false);
+    }
+
+    fn result(&self, outcome: &Outcome) {
+        let [.., result] = self.topics;
+        let [names, values] = named(&outcome.results);
+        let Outcome {
+            run,
+            succeeded,
+            message,
+            ..
+        } = outcome;
+        let values = [
+            (*run).into(),
+            (*succeeded).into(),
+            message.as_str().into(),
+            names,
+            values,
+        ];
+        self.outbox.put(result, &values, false);
+    }
+
+    fn event(&self, happened: &Transitioned) {
+        let [_, event, ..] = self.topics;
+        let Transitioned {
+            transition,
+            run,
+            message,
+            ..
+        } = happened;
+        let values = [
+            transition.name.into(),
+            Value::Byte(u8::try_from(transition.number).unwrap_or_default()),
+            transition.from.name().into(),
+            transition.to.name().into(),
+            (*run).into(),
+            message.as_str().into(),
+        ];
+        self.outbox.put(event, &values, false);
+    }
+}
+
+impl Observer for Speaker {
+    fn told(&self, what: Told<'_>, shown: &Shown) {
+        match what {
+            Told::Parameters(parameters) => self.parameters(shown.run, Parameters::all(parameters)),
+            Told::Transition(happened) => {
+                self.event(happened);
+                self.state(shown, false);
+            }
+            Told::Step => self.state(shown, false),
+            Told::Progress => {
+                let mut progressed = self
+                    .progressed
+                    .lock()
+                    .unwrap_or_else(PoisonError::into_inner);
+                if progressed.is_none_or(|last| last.elapsed() >= BETWEEN_PROGRESS) {
+                    *progressed = Some(Instant::now());
+                    drop(progressed);
+                    self.state(shown, true);
+                }
+            }
+            Told::Outcome(outcome) => self.result(outcome),
+            Told::Called => {}
+        }
+    }
+}
+
+fn state_of(state: State, last: &str, (progress, step, run): (f32, &str, u32)) -> [Value; 6] {
+    [
+        state.name().into(),
+        Value::Byte(u8::try_from(state.number()).unwrap_or_default()),
+        last.into(),
+        progress.into(),
+        step.into(),
+        run.into(),
+    ]
+}
+
+/// Names and values, each of them as JSON.
+fn named(of: &[(String, Value)]) -> [Value; 2] {
+    let names = of
+        .iter()
+        .map(|(name, _)| Value::from(name.as_str()))
+        .collect();
+    let values = of
+        .iter()
+        .map(|(_, value)| Value::String(value.to_string()))
+        .collect();
+    [
+        Value::Array(Builtin::String, names),
+        Value::Array(Builtin::String, values),
+    ]
+}
+
+/// Identifiers of a skill.
+const PER_SKILL: u16 = 100;
+/// So many events of a skill wait for the network beside the first.
+const QUEUED_EVENTS: u16 = 63;
+/// So many values of a component wait for the run loop.
+const MOST_WAITING: usize = 1_024;
+/// Progress alone is said no more often: 20 times a second.
+const BETWEEN_PROGRESS: Duration = Duration::from_millis(50);
