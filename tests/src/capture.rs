@@ -114,6 +114,20 @@ impl Cell {
         output.lines().map(str::to_owned).collect()
     }
 
+    /// These fields of each datagram of a capture, with a tab between; several of one field with a comma.
+    ///
+    /// # Panics
+    /// As for [`dissect`](Self::dissect).
+    #[must_use]
+    pub fn fields(&self, capture: &Capture, fields: &[&str]) -> Vec<String> {
+        let mut args = vec!["-T", "fields"];
+        for field in fields {
+            args.extend(["-e", field]);
+        }
+        let output = self.tshark(capture, &args);
+        output.lines().map(str::to_owned).collect()
+    }
+
     fn tshark(&self, capture: &Capture, args: &[&str]) -> String {
         let path = self.folder().join("datagrams.pcap");
         fs::write(&path, capture.bytes()).unwrap();

@@ -23,7 +23,9 @@ enum What {
     Announce {
         /// The ApplicationName; the ApplicationUri is `urn:who:` with it
         name: String,
-        /// Where to listen on 127.0.0.1
+        /// Where to listen, and on which interface to be announced
+        #[arg(long, default_value = "127.0.0.1")]
+        address: Ipv4Addr,
         #[arg(long, default_value = "0")]
         port: u16,
         /// The path of the URL
@@ -56,13 +58,13 @@ impl Service for Who {
         match self.what {
             What::Announce {
                 name,
+                address,
                 port,
                 path,
                 lds,
                 no_mdns,
             } => {
-                let listener =
-                    TcpListener::bind(SocketAddr::from((Ipv4Addr::LOCALHOST, port))).await;
+                let listener = TcpListener::bind(SocketAddr::from((address, port))).await;
                 let listener = listener.map_err(|error| unavailable(&error))?;
                 let at = listener.local_addr().map_err(|error| unavailable(&error))?;
                 let server = Server {
@@ -74,7 +76,7 @@ impl Service for Who {
                 };
                 let settings = AnnounceSettings {
                     lds,
-                    mdns: (!no_mdns).then_some(Interface::LOOPBACK),
+                    mdns: (!no_mdns).then(|| Interface::parse(&address.to_string())),
                     ..AnnounceSettings::default()
                 };
                 let told = announce(server, settings).map_err(|error| unavailable(&error))?;

@@ -1,0 +1,95 @@
+"""Asks a discovery server without a session, or registers a server with it: one JSON line an answer."""
+
+import argparse
+import asyncio
+
+from asyncua import Client, ua
+
+import lifetime
+
+
+def described(error):
+    return {"status": type(error).__name__, "code": getattr(error, "code", None)}
+
+
+async def find(client, args):
+    servers = await client.find_servers()
+    lifetime.say(
+        registered=[
+            {"uri": one.ApplicationUri, "name": one.ApplicationName.Text, "urls": one.DiscoveryUrls} for one in servers
+        ]
+    )
+    network = await client.find_servers_on_network()
+    lifetime.say(
+        network=[
+            {
+                "id": one.RecordId,
+                "name": one.ServerName,
+                "url": one.DiscoveryUrl,
+                "capabilities": one.ServerCapabilities,
+            }
+            for one in network.Servers
+        ]
+    )
+    endpoints = await client.get_endpoints()
+    lifetime.say(endpoints=[one.EndpointUrl for one in endpoints])
+
+
+async def register(client, args):
+    server = ua.RegisteredServer()
+    server.ServerUri = args.uri
+    server.DiscoveryUrls = args.url
+    server.ServerType = ua.ApplicationType.Server
+    server.ServerNames = [ua.LocalizedText(args.name)] if args.name else []
+    server.IsOnline = not args.offline
+    try:
+        if args.old:
+            await client.uaclient.register_server(server)
+            lifetime.say(status="Good")
+            return
+        configuration = ua.MdnsDiscoveryConfiguration()
+        configuration.MdnsServerName = args.mdns
+        configuration.ServerCapabilities = ["DA", "AC"]
+        parameters = ua.RegisterServer2Parameters()
+        parameters.Server = server
+        parameters.DiscoveryConfiguration = [configuration] if args.mdns else []
+        results = await client.uaclient.register_server2(parameters)
+        lifetime.say(status="Good", results=[one.name for one in results or []])
+    except ua.UaStatusCodeError as error:
+        lifetime.say(**described(error))
+
+
+async def session(client, args):
+    try:
+        await client.create_session()
+        lifetime.say(status="Good")
+    except ua.UaStatusCodeError as error:
+        lifetime.say(**described(error))
+
+
+async def run(args):
+    client = Client(args.endpoint, timeout=10)
+    await client.connect_sessionless()
+    try:
+        await {"find": find, "register": register, "session": session}[args.what](client, args)
+    finally:
+        await client.disconnect_sessionless()
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("what", choices=["find", "register", "session"])
+    parser.add_argument("endpoint")
+    parser.add_argument("--uri", default="urn:asyncua:arm")
+    parser.add_argument("--url", action="append", default=[])
+    parser.add_argument("--name", default="arm")
+    parser.add_argument("--mdns", help="the name to be announced under")
+    parser.add_argument("--offline", action="store_true")
+    parser.add_argument("--old", action="store_true", help="RegisterServer instead of RegisterServer2")
+    parser.add_argument("--limit", type=float, default=60.0)
+    args = parser.parse_args()
+    lifetime.bound(args.limit)
+    asyncio.run(run(args))
+
+
+main()
