@@ -1,11 +1,16 @@
 //! The words of the command line.
 
+mod live;
+
+pub(crate) use live::{Ask, Call, Echo, Group, Hz, Info, List, Skills, Target, Trace};
+
 use std::path::PathBuf;
 
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use mappings::{Code, SpaceId};
 
-/// Looks into the space: mappings and what is wrong with them, datagrams of OPC UA PubSub as JSON and back.
+/// Looks into the space: topics, values, skills and calls of one that runs, mappings and what is wrong with them,
+/// datagrams of OPC UA PubSub as JSON and back.
 #[derive(Debug, Parser)]
 #[command(name = "ua-space", version)]
 pub(crate) struct Arguments {
@@ -64,6 +69,55 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, 65 JSON that is no datagram, 74 a file that cannot be read or an output that cannot
     /// be written.
     Encode(Encode),
+    /// List the topics and calls of a running space
+    ///
+    /// What was heard in the group or announced there: name, origin, rate and what it consists of. Needs no mapping.
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 an interface or group that cannot be had, 74 an output that cannot be written.
+    List(List),
+    /// Tell all that is known of a topic or call
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 nothing came of it, or an interface or group cannot be had, 74 an output that
+    /// cannot be written.
+    Info(Info),
+    /// Show the values of a topic
+    ///
+    /// Field by field, by the names its writer announces; as YAML, or with --json a JSON object a value.
+    ///
+    /// Exit codes: 0 done, 64 usage, 65 nothing that came can be read, 69 nothing came, or an interface or group cannot be
+    /// had, 74 an output that cannot be written.
+    Echo(Echo),
+    /// Tell how often the values of a topic come
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 nothing came, or an interface or group cannot be had, 74 an output that cannot be
+    /// written.
+    Hz(Hz),
+    /// List the skills of all components, with their states and how to start them
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 an interface or group that cannot be had, 74 an output that cannot be written.
+    Skills(Skills),
+    /// Ask for a call: a skill of a component, a service of a robot, a method
+    ///
+    /// Values are typed by what the call is announced to take. A skill that is started is followed to the end of its run,
+    /// with its states, progress and result; Ctrl-C halts it, and once more leaves at once.
+    ///
+    /// Exit codes: 0 answered, and the run succeeded, 1 refused, or the run did not succeed, 64 usage, or a parameter that is
+    /// missing or wrong, 69 nobody offers the call, or how it ended is not known, 74 an output that cannot be written, 130
+    /// interrupted.
+    Call(Call),
+    /// Tell how long values take, hop by hop
+    ///
+    /// The delays that programs measured (--metrics, as they were started with), and those of each topic on its way to
+    /// here, read off the times in its messages.
+    ///
+    /// Exit codes: 0 done, 64 usage, 69 a program that does not answer, or an interface or group that cannot be had, 74 an
+    /// output that cannot be written.
+    Trace(Trace),
+    /// Ask what is known of the plant: which skills can do what, who is there, what ran
+    ///
+    /// Exit codes: 0 done, 64 usage, or a question there is not, 65 a query that is wrong, 69 nobody answers, or not in time,
+    /// 74 a file that cannot be read or an output that cannot be written.
+    Ask(Ask),
 }
 
 #[derive(Debug, Args)]

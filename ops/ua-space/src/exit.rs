@@ -27,6 +27,12 @@ pub(crate) enum Failure {
     /// Somebody of an environment is not there, which was told.
     #[error("not all of the environment is there")]
     NotThere,
+    /// What was asked for was answered with a no, or did not succeed.
+    #[error("{0}")]
+    Failed(String),
+    /// Whoever started it wants it to end, and it had not come to an end.
+    #[error("interrupted")]
+    Interrupted,
     /// A file that cannot be read, or an output that cannot be written.
     #[error("{0}")]
     Io(String),
@@ -60,6 +66,8 @@ impl From<&Failure> for ExitCode {
             Failure::Usage(_) => Self::from(USAGE),
             Failure::Unavailable(_) | Failure::NotThere => Self::from(69),
             Failure::Io(_) => Self::from(74),
+            Failure::Failed(_) => Self::FAILURE,
+            Failure::Interrupted => Self::from(130),
             Failure::Closed => Self::SUCCESS,
         }
     }

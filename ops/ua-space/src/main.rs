@@ -2,6 +2,7 @@
 
 mod actions;
 mod arguments;
+mod ask;
 mod capture;
 mod check;
 mod decode;
@@ -12,12 +13,14 @@ mod exit;
 mod explain;
 mod fault;
 mod hex;
+mod http;
 mod init;
 mod input;
 mod iso_time;
 mod json_file;
 mod keys;
 mod layout;
+mod live;
 mod messages;
 mod metadata;
 mod node_ids;
@@ -60,6 +63,14 @@ fn main() -> ExitCode {
         Verb::Schema => explain::schema(),
         Verb::Decode(arguments) => session::decode(arguments),
         Verb::Encode(arguments) => session::encode(arguments),
+        Verb::List(arguments) => live::list(arguments),
+        Verb::Info(arguments) => live::info(arguments),
+        Verb::Echo(arguments) => live::echo(arguments),
+        Verb::Hz(arguments) => live::hz(arguments),
+        Verb::Skills(arguments) => live::skills(arguments),
+        Verb::Call(arguments) => live::call(arguments),
+        Verb::Trace(arguments) => live::trace(arguments),
+        Verb::Ask(arguments) => ask::ask(arguments),
     };
     match ended {
         Ok(()) => ExitCode::SUCCESS,
@@ -68,6 +79,7 @@ fn main() -> ExitCode {
             | Failure::Io(what)
             | Failure::Usage(what)
             | Failure::Unavailable(what)
+            | Failure::Failed(what)
             | Failure::Unconfigured(what) = &failure
             {
                 report::warn(what);

@@ -6,6 +6,7 @@ mod actions;
 mod captures;
 mod check;
 mod init;
+mod live;
 mod malformed;
 mod normal;
 mod program;

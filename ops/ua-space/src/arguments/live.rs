@@ -1,0 +1,222 @@
+//! The words of the verbs that look into a running space.
+
+use std::fmt;
+use std::str::FromStr;
+
+use clap::Args;
+use mappings::{SpaceId, TopicId};
+
+/// Where the space is.
+#[derive(Debug, Args)]
+pub(crate) struct Group {
+    /// The network interface of the PubSub group, by name or address
+    #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
+    pub(crate) interface: Option<String>,
+    /// The PubSub group, as opc.udp://239.192.0.40:4840
+    #[arg(long, value_name = "URL", env = "UA_ADDRESS")]
+    pub(crate) address: Option<String>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct List {
+    /// Only topics of this origin: 0 the OPC UA side, 1 ROS 1, 2 to 232 a ROS 2 space
+    #[arg(long, value_name = "SPACE", value_parser = super::space)]
+    pub(crate) space: Option<SpaceId>,
+    /// How long to listen
+    #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
+    pub(crate) seconds: f64,
+    /// One JSON array
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) group: Group,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Info {
+    /// Such as ua_1_2_10
+    #[arg(value_name = "TOPIC", value_parser = topic)]
+    pub(crate) topic: TopicId,
+    /// How long to listen
+    #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
+    pub(crate) seconds: f64,
+    /// One JSON object
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) group: Group,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Echo {
+    /// Such as ua_1_2_10
+    #[arg(value_name = "TOPIC", value_parser = topic)]
+    pub(crate) topic: TopicId,
+    /// End after so many values
+    #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    pub(crate) count: Option<u64>,
+    /// End after so long. Without it and -n: at Ctrl-C
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    pub(crate) seconds: Option<f64>,
+    /// One JSON object a value
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) group: Group,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Hz {
+    /// Such as ua_1_2_10
+    #[arg(value_name = "TOPIC", value_parser = topic)]
+    pub(crate) topic: TopicId,
+    /// Of how many values at most the figures are
+    #[arg(long, value_name = "N", default_value_t = 10_000, value_parser = window)]
+    pub(crate) window: usize,
+    /// End after so long. Without it: at Ctrl-C
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    pub(crate) seconds: Option<f64>,
+    /// One JSON object a second
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) group: Group,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Skills {
+    /// Only those of this component
+    #[arg(value_name = "COMPONENT")]
+    pub(crate) component: Option<String>,
+    /// How long to listen
+    #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
+    pub(crate) seconds: f64,
+    /// One JSON array
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) group: Group,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Call {
+    /// A topic as ua_0_7_105, or a name as gripper.Grasp.Halt; gripper.Grasp is gripper.Grasp.Start
+    #[arg(value_name = "TOPIC|NAME")]
+    pub(crate) target: Target,
+    /// What the call takes, as Force=12.5 TargetPosition=0.4,0,0.2,0,0,0
+    #[arg(value_name = "NAME=VALUE")]
+    pub(crate) parameters: Vec<String>,
+    /// How long to wait for the call to be announced
+    #[arg(long, value_name = "SECONDS", default_value = "5", value_parser = seconds)]
+    pub(crate) wait: f64,
+    /// How long to wait for an answer, which the one that executes the call is told
+    #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = seconds)]
+    pub(crate) timeout: f64,
+    /// Call Halt when the run of a skill takes longer. Without it: at Ctrl-C
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    pub(crate) run_timeout: Option<f64>,
+    /// End with the answer, and leave the run of a skill alone
+    #[arg(long)]
+    pub(crate) no_wait: bool,
+    /// One JSON object for the answer and each step of the run
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) group: Group,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Trace {
+    /// Ask this program, by the address it was given with --metrics. May be repeated
+    #[arg(long, value_name = "URL")]
+    pub(crate) metrics: Vec<String>,
+    /// How long to listen in the group; 0 asks the programs alone
+    #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds_or_none)]
+    pub(crate) seconds: f64,
+    /// One JSON object
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) group: Group,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Ask {
+    /// Such as what-can-run. Without it all questions are listed
+    #[arg(value_name = "QUESTION", conflicts_with = "sparql")]
+    pub(crate) question: Option<String>,
+    /// What the question takes, as capability=urn:example:grasp, or values in its order
+    #[arg(value_name = "NAME=VALUE", requires = "question")]
+    pub(crate) arguments: Vec<String>,
+    /// Ask this query of SPARQL 1.1 in a file, or - for stdin
+    #[arg(long, value_name = "FILE")]
+    pub(crate) sparql: Option<String>,
+    /// Whom to ask
+    #[arg(
+        long,
+        value_name = "URL",
+        env = "UA_SPARQL",
+        default_value = "http://127.0.0.1:8087"
+    )]
+    pub(crate) url: String,
+    /// The answer as it came
+    #[arg(long)]
+    pub(crate) json: bool,
+}
+
+/// What is called.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Target {
+    Topic(TopicId),
+    Name(String),
+}
+
+impl FromStr for Target {
+    type Err = &'static str;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match topic(text) {
+            Ok(topic) => Ok(Self::Topic(topic)),
+            Err(_) if text.is_empty() => Err("a topic as ua_0_7_105, or a name as gripper.Grasp"),
+            Err(_) => Ok(Self::Name(text.to_owned())),
+        }
+    }
+}
+
+impl fmt::Display for Target {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Topic(topic) => topic.fmt(f),
+            Self::Name(name) => f.write_str(name),
+        }
+    }
+}
+
+/// As ROS has it or without the slash.
+fn topic(text: &str) -> Result<TopicId, &'static str> {
+    let name = text.strip_prefix('/').unwrap_or(text);
+    name.parse()
+        .map_err(|_| "a topic of the space is ua_<space>_<namespace>_<identifier>, as ua_1_2_10")
+}
+
+fn seconds(text: &str) -> Result<f64, &'static str> {
+    let seconds = seconds_or_none(text)?;
+    (seconds > 0.0).then_some(seconds).ok_or(A_TIME)
+}
+
+fn seconds_or_none(text: &str) -> Result<f64, &'static str> {
+    let seconds = text.parse().ok();
+    seconds
+        .filter(|seconds| (0.0..=MOST_SECONDS).contains(seconds))
+        .ok_or(A_TIME)
+}
+
+fn window(text: &str) -> Result<usize, &'static str> {
+    let window = text.parse().ok();
+    window
+        .filter(|window| (2..=1_000_000).contains(window))
+        .ok_or("a number from 2 to 1000000")
+}
+
+const A_TIME: &str = "seconds, up to a million, as 2.5";
+const MOST_SECONDS: f64 = 1e6;

@@ -1,0 +1,247 @@
+//! `ua-space ask`: questions to what is known of the plant.
+
+use std::fs::File;
+use std::io::{self, Read, Write as _};
+
+use serde::Deserialize;
+use serde_json::{Map, Value};
+
+use crate::arguments::Ask;
+use crate::exit::Failure;
+use crate::http::{Answer, Server, encoded};
+use crate::live::{Table, harmless, is_coloured};
+use crate::survey::look;
+
+/// `ua-space ask`.
+pub(crate) fn ask(arguments: &Ask) -> Result<(), Failure> {
+    let server = Server::parse(&arguments.url)?;
+    let query = arguments.sparql.as_deref().map(read).transpose()?;
+    look(async {
+        let answer = match (query, &arguments.question) {
+            (Some(query), _) => {
+                server
+                    .post("/sparql", ("application/sparql-query", query.into()))
+                    .await?
+            }
+            (None, None) => server.get("/ask").await?,
+            (None, Some(question)) => {
+                let path = path(&server, question, &arguments.arguments).await?;
+                server.get(&path).await?
+            }
+        };
+        if answer.status != 200 {
+            return Err(refusal(&server, &answer, arguments.question.as_deref()).await);
+        }
+        show(&answer, arguments)
+    })
+}
+
+fn read(file: &str) -> Result<String, Failure> {
+    let mut text = String::new();
+    let read = match file {
+        "-" => io::stdin()
+            .lock()
+            .take(MOST_QUERY)
+            .read_to_string(&mut text),
+        path => File::open(path).and_then(|file| file.take(MOST_QUERY).read_to_string(&mut text)),
+    };
+    read.map_err(|error| Failure::reading(crate::input::name(file), &error))?;
+    Ok(text)
+}
+
+/// The questions there are.
+#[derive(Debug, Deserialize)]
+struct Questions {
+    questions: Vec<Question>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Question {
+    name: String,
+    #[serde(default)]
+    about: String,
+    #[serde(default)]
+    parameters: Vec<String>,
+}
+
+/// Rows of named values.
+#[derive(Debug, Deserialize)]
+struct Rows {
+    columns: Vec<String>,
+    rows: Vec<Map<String, Value>>,
+}
+
+/// The standard form of SPARQL 1.1.
+#[derive(Debug, Deserialize)]
+struct Results {
+    #[serde(default)]
+    head: Head,
+    #[serde(default)]
+    results: Option<Bindings>,
+    #[serde(default)]
+    boolean: Option<bool>,
+}
+
+#[derive(Debug, Default, Deserialize)]
+struct Head {
+    #[serde(default)]
+    vars: Vec<String>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Bindings {
+    bindings: Vec<Map<String, Value>>,
+}
+
+/// Where a question is asked, with its parameters; values without a name are those of the question in its order.
+async fn path(server: &Server, question: &str, words: &[String]) -> Result<String, Failure> {
+    let is_named = |word: &String| {
+        let name = word.split_once('=').map(|(name, _)| name);
+        let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_');
+        name.is_some_and(|name| !name.is_empty() && name.chars().all(plain))
+    };
+    let mut places = Vec::new();
+    if !words.iter().all(is_named) {
+        let all = questions(server).await?;
+        let known = all.questions.into_iter().find(|it| it.name == question);
+        let known =
+            known.ok_or_else(|| Failure::Usage(format!("there is no question {question}")))?;
+        places = known.parameters;
+    }
+    let mut places = places.into_iter();
+    let mut pairs = Vec::new();
+    for word in words {
+        let pair = match word.split_once('=') {
+            Some((name, value)) if is_named(word) => format!("{name}={}", encoded(value)),
+            Some(_) | None => {
+                let name = places.next();
+                let name = name.ok_or_else(|| {
+                    Failure::Usage(format!("{question} does not take so many values: {word}"))
+                })?;
+                format!("{}={}", encoded(&name), encoded(word))
+            }
+        };
+        pairs.push(pair);
+    }
+    let query = match pairs.is_empty() {
+        true => String::new(),
+        false => format!("?{}", pairs.join("&")),
+    };
+    Ok(format!("/ask/{}{query}", encoded(question)))
+}
+
+async fn questions(server: &Server) -> Result<Questions, Failure> {
+    let answer = server.get("/ask").await?;
+    parsed(&answer.body)
+}
+
+fn parsed<'a, T: Deserialize<'a>>(body: &'a str) -> Result<T, Failure> {
+    serde_json::from_str(body)
+        .map_err(|error| Failure::Data(format!("the answer was not understood: {error}")))
+}
+
+/// Why there is no answer.
+async fn refusal(server: &Server, answer: &Answer, question: Option<&str>) -> Failure {
+    #[derive(Deserialize)]
+    struct Told {
+        error: String,
+        message: String,
+    }
+    let told: Option<Told> = serde_json::from_str(&answer.body).ok();
+    let why = match &told {
+        Some(told) => format!("{}: {}", harmless(&told.error), harmless(&told.message)),
+        None => format!("HTTP status {}", answer.status),
+    };
+    match (answer.status, question) {
+        (404, Some(question)) => {
+            let known = questions(server).await.map(|known| known.questions);
+            let known = known.unwrap_or_default();
+            let names: Vec<&str> = known.iter().map(|it| it.name.as_str()).collect();
+            let help = match names.as_slice() {
+                [] => String::new(),
+                names => format!("\n  = help: there are {}", harmless(&names.join(", "))),
+            };
+            Failure::Usage(format!("{}: {why}{help}", harmless(question)))
+        }
+        (400 | 406 | 413 | 415, _) => Failure::Data(why),
+        _ => Failure::Unavailable(why),
+    }
+}
+
+fn show(answer: &Answer, arguments: &Ask) -> Result<(), Failure> {
+    let mut out = io::stdout().lock();
+    let is_json = answer.content_type.contains("json");
+    if arguments.json || !is_json {
+        let text = answer.body.trim_end();
+        // What is not JSON has no escapes of its own.
+        match is_json {
+            true => writeln!(out, "{text}")?,
+            false => {
+                for line in text.lines() {
+                    writeln!(out, "{}", harmless(line))?;
+                }
+            }
+        }
+        return Ok(());
+    }
+    let table = match (&arguments.sparql, &arguments.question) {
+        (Some(_), _) => {
+            let results: Results = parsed(&answer.body)?;
+            if let Some(yes) = results.boolean {
+                writeln!(out, "{}", if yes { "yes" } else { "no" })?;
+                return Ok(());
+            }
+            let found = results.results.map(|found| found.bindings);
+            of_rows(&results.head.vars, &found.unwrap_or_default())
+        }
+        (None, Some(_)) => {
+            let rows: Rows = parsed(&answer.body)?;
+            of_rows(&rows.columns, &rows.rows)
+        }
+        (None, None) => {
+            let all: Questions = parsed(&answer.body)?;
+            let mut table = Table::new(["QUESTION", "TAKES", "ABOUT"].map(str::to_owned));
+            for question in all.questions {
+                table.row([
+                    question.name,
+                    question.parameters.join(", "),
+                    question.about,
+                ]);
+            }
+            table
+        }
+    };
+    table.write(&mut out, is_coloured())?;
+    Ok(())
+}
+
+fn of_rows(columns: &[String], rows: &[Map<String, Value>]) -> Table {
+    let mut table = Table::new(columns.iter().map(|name| name.to_uppercase()));
+    for row in rows {
+        table.row(
+            columns
+                .iter()
+                .map(|name| row.get(name).map_or_else(dash, cell)),
+        );
+    }
+    table
+}
+
+fn dash() -> String {
+    "-".to_owned()
+}
+
+/// A value in a cell; of the standard form its `value`.
+fn cell(value: &Value) -> String {
+    match value {
+        Value::Null => dash(),
+        Value::String(text) => text.clone(),
+        Value::Array(all) if all.is_empty() => dash(),
+        Value::Array(all) => all.iter().map(cell).collect::<Vec<_>>().join(", "),
+        Value::Object(term) => term.get("value").map_or_else(|| value.to_string(), cell),
+        Value::Bool(_) | Value::Number(_) => value.to_string(),
+    }
+}
+
+/// More than any query.
+const MOST_QUERY: u64 = 1 << 20;

@@ -1,0 +1,195 @@
+//! Asking over HTTP, bounded in bytes and time.
+
+use std::time::Duration;
+
+use http_body_util::{BodyExt as _, Full, Limited};
+use hyper::body::Bytes;
+use hyper::header::{ACCEPT, CONTENT_TYPE, HOST};
+use hyper::{Method, Request};
+use hyper_util::rt::TokioIo;
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+
+use crate::exit::Failure;
+
+/// What was answered.
+pub(crate) struct Answer {
+    pub(crate) status: u16,
+    pub(crate) content_type: String,
+    pub(crate) body: String,
+}
+
+/// Who is asked: `http://host:port`, or `host:port` alone.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Server {
+    /// `host:port`.
+    authority: String,
+    /// What stands in front of every path; no slash at its end.
+    prefix: String,
+}
+
+impl Server {
+    /// # Errors
+    /// [`Failure::Usage`] for what is no such URL.
+    pub(crate) fn parse(url: &str) -> Result<Self, Failure> {
+        let rest = url.strip_prefix("http://").unwrap_or(url);
+        let (authority, path) = rest.split_once('/').unwrap_or((rest, ""));
+        let (host, port) = match authority.rsplit_once(':') {
+            Some((host, port)) if !host.is_empty() => (host, port.parse::<u16>().ok()),
+            Some(_) | None => (authority, Some(80)),
+        };
+        let plain = |c: char| c.is_ascii_graphic() && !matches!(c, '@' | '?' | '#' | '/');
+        match port {
+            Some(port) if !host.is_empty() && host.chars().all(plain) => Ok(Self {
+                authority: format!("{host}:{port}"),
+                prefix: path.trim_end_matches('/').to_owned(),
+            }),
+            Some(_) | None => Err(Failure::Usage(format!(
+                "{url}: for example http://127.0.0.1:8087"
+            ))),
+        }
+    }
+
+    /// Asks for a path, which begins with a slash.
+    ///
+    /// # Errors
+    /// [`Failure::Unavailable`] when nobody answers in time.
+    pub(crate) async fn get(&self, path: &str) -> Result<Answer, Failure> {
+        self.request(Method::GET, path, ("", Bytes::new())).await
+    }
+
+    /// Sends a text of that type.
+    ///
+    /// # Errors
+    /// As [`get`](Self::get).
+    pub(crate) async fn post(&self, path: &str, content: (&str, Bytes)) -> Result<Answer, Failure> {
+        self.request(Method::POST, path, content).await
+    }
+
+    async fn request(
+        &self,
+        method: Method,
+        path: &str,
+        content: (&str, Bytes),
+    ) -> Result<Answer, Failure> {
+        let asked = timeout(LIMIT, self.asked(method, path, content)).await;
+        let answer = asked.unwrap_or_else(|_| Err(format!("no answer within {LIMIT:?}")));
+        answer.map_err(|why| {
+            let help = "is it running, and is this its address?";
+            Failure::Unavailable(format!(
+                "http://{}: {why}\n  = help: {help}",
+                self.authority
+            ))
+        })
+    }
+
+    async fn asked(
+        &self,
+        method: Method,
+        path: &str,
+        (content_type, body): (&str, Bytes),
+    ) -> Result<Answer, String> {
+        let stream = TcpStream::connect(&self.authority)
+            .await
+            .map_err(|error| format!("nobody listens there ({error})"))?;
+        let text = |error: hyper::Error| error.to_string();
+        let (mut sender, connection) = hyper::client::conn::http1::handshake(TokioIo::new(stream))
+            .await
+            .map_err(text)?;
+        let mut request = Request::builder()
+            .method(method)
+            .uri(format!("{}{path}", self.prefix_path()))
+            .header(HOST, &self.authority)
+            .header(ACCEPT, "application/json, application/sparql-results+json, application/n-triples, */*;q=0.1");
+        if !content_type.is_empty() {
+            request = request.header(CONTENT_TYPE, content_type);
+        }
+        let request = request
+            .body(Full::new(body))
+            .map_err(|error| error.to_string())?;
+        let answer = async {
+            let response = sender.send_request(request).await.map_err(text)?;
+            let status = response.status().as_u16();
+            let content_type = response.headers().get(CONTENT_TYPE);
+            let content_type = content_type.and_then(|value| value.to_str().ok());
+            let content_type = content_type.unwrap_or_default().to_owned();
+            let body = Limited::new(response.into_body(), MOST_BYTES)
+                .collect()
+                .await;
+            let body = body.map_err(|error| error.to_string())?.to_bytes();
+            let body = String::from_utf8(body.into()).map_err(|_| "an answer that is no text")?;
+            Ok(Answer {
+                status,
+                content_type,
+                body,
+            })
+        };
+        tokio::pin!(connection, answer);
+        tokio::select! {
+            biased;
+            answer = &mut answer => answer,
+            // The connection is done when the last byte is read; the answer may not be.
+            ended = &mut connection => {
+                ended.map_err(text)?;
+                answer.await
+            }
+        }
+    }
+
+    fn prefix_path(&self) -> String {
+        match self.prefix.as_str() {
+            "" => String::new(),
+            prefix => format!("/{prefix}"),
+        }
+    }
+}
+
+/// A value as it stands in a query.
+pub(crate) fn encoded(value: &str) -> String {
+    let mut text = String::with_capacity(value.len());
+    for byte in value.bytes() {
+        match byte {
+            b'A'..=b'Z' | b'a'..=b'z' | b'0'..=b'9' | b'-' | b'.' | b'_' | b'~' => {
+                text.push(byte.into())
+            }
+            _ => text.push_str(&format!("%{byte:02X}")),
+        }
+    }
+    text
+}
+
+/// Longer than the longest query may take.
+const LIMIT: Duration = Duration::from_secs(15);
+const MOST_BYTES: usize = 32 << 20;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_server_is_an_url_or_an_address() {
+        let of = |url: &str| Server::parse(url).map(|it| (it.authority.clone(), it.prefix_path()));
+        for url in [
+            "http://127.0.0.1:9100",
+            "127.0.0.1:9100",
+            "http://127.0.0.1:9100/",
+        ] {
+            assert_eq!(
+                of(url).unwrap(),
+                ("127.0.0.1:9100".to_owned(), String::new())
+            );
+        }
+        assert_eq!(
+            of("http://mes/knowledge/").unwrap(),
+            ("mes:80".to_owned(), "/knowledge".to_owned())
+        );
+        for url in ["", "http://", "http://a:b", "http://u@h:1", "http://h:1 2"] {
+            assert!(of(url).is_err(), "{url}");
+        }
+    }
+
+    #[test]
+    fn values_of_a_query_are_escaped() {
+        assert_eq!(encoded("urn:a b&c=ü"), "urn%3Aa%20b%26c%3D%C3%BC");
+    }
+}

@@ -1,0 +1,263 @@
+//! Looking into a running space: what is heard in its group, without a mapping.
+
+mod book;
+mod call;
+mod described;
+mod echo;
+mod list;
+mod parameters;
+mod plain;
+mod prober;
+mod run;
+mod skills;
+mod text;
+mod trace;
+
+pub(crate) use call::call;
+pub(crate) use echo::{echo, hz};
+pub(crate) use list::{info, list};
+pub(crate) use skills::skills;
+pub(crate) use text::{Table, harmless, is_coloured};
+pub(crate) use trace::trace;
+
+use std::collections::BTreeSet;
+use std::net::SocketAddr;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use mappings::{PubSub, TopicId};
+use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::time::Instant;
+use transport::{Options, Udp};
+
+use crate::arguments::Group;
+use crate::exit::Failure;
+use crate::report::warn;
+use crate::survey::look;
+use book::{Book, News};
+use prober::Prober;
+
+/// A place in the group.
+pub(crate) struct Live {
+    udp: Udp,
+    /// What its times count from.
+    start: Instant,
+    /// The same in nanoseconds since 1970.
+    start_utc: i128,
+    pub(crate) book: Book,
+    prober: Prober,
+    wants_calls: bool,
+    interrupt: Signal,
+    terminate: Signal,
+    buffer: Vec<u8>,
+    shown_group: SocketAddr,
+}
+
+/// Why listening came to an end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Ended {
+    /// It is time.
+    Time,
+    /// The closure said so.
+    Enough,
+    /// SIGINT or SIGTERM.
+    Interrupted,
+}
+
+/// What to do after a message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Go {
+    On,
+    Enough,
+}
+
+/// Joins the group, and looks into it until `looking` is done.
+pub(crate) fn in_group<T>(
+    group: &Group,
+    looking: impl AsyncFnOnce(Live) -> Result<T, Failure>,
+) -> Result<T, Failure> {
+    look(async {
+        let live = Live::join(group)?;
+        looking(live).await
+    })
+}
+
+impl Live {
+    fn join(group: &Group) -> Result<Self, Failure> {
+        let address = match &group.address {
+            None => PubSub::ADDRESS,
+            Some(url) => PubSub::parse_address(url).ok_or_else(|| {
+                let example = PubSub::ADDRESS;
+                Failure::Usage(format!("--address {url}: for example opc.udp://{example}"))
+            })?,
+        };
+        let options = Options {
+            interface: group.interface.clone(),
+            ..Options::new(address)
+        };
+        let udp = Udp::open(&options).map_err(|error| Failure::Unavailable(error.to_string()))?;
+        let on = |kind| {
+            signal(kind).map_err(|error| Failure::Io(format!("cannot catch signals: {error}")))
+        };
+        Ok(Self {
+            udp,
+            start: Instant::now(),
+            start_utc: unix_nanos(),
+            book: Book::new(),
+            prober: Prober::default(),
+            wants_calls: false,
+            interrupt: on(SignalKind::interrupt())?,
+            terminate: on(SignalKind::terminate())?,
+            buffer: vec![0; 65_536],
+            shown_group: address,
+        })
+    }
+
+    /// Time since it joined.
+    pub(crate) fn now(&self) -> Duration {
+        self.start.elapsed()
+    }
+
+    /// When it joined, in nanoseconds since 1970.
+    pub(crate) const fn start_utc(&self) -> i128 {
+        self.start_utc
+    }
+
+    /// The group, for people.
+    pub(crate) const fn group(&self) -> SocketAddr {
+        self.shown_group
+    }
+
+    /// Asks the spaces that are heard of, and these, which calls they have.
+    pub(crate) fn want_calls(&mut self, spaces: impl IntoIterator<Item = u16>) {
+        self.wants_calls = true;
+        for space in spaces {
+            self.prober.want_calls(space, self.start.elapsed());
+        }
+    }
+
+    /// Asks what a topic or call consists of.
+    pub(crate) fn want(&mut self, topic: TopicId) {
+        let (space, _, writer_id) = topic.triple();
+        self.prober.want(space, writer_id, self.start.elapsed());
+    }
+
+    pub(crate) fn send(&self, datagram: &[u8]) {
+        if let Err(error) = self.udp.try_send(datagram) {
+            warn(&format!("a datagram was not sent: {error}"));
+        }
+    }
+
+    /// Hears what comes until then, or until `each` has enough. Whatever is heard is asked for what it consists of.
+    pub(crate) async fn listen(
+        &mut self,
+        until: Duration,
+        each: &mut dyn FnMut(News<'_>, Duration) -> Go,
+    ) -> Result<Ended, Failure> {
+        let mut asked = Duration::ZERO;
+        loop {
+            let now = self.now();
+            if now >= asked {
+                asked = now + LOOK;
+                self.ask_for_all(now);
+                self.probe_what_is_due(now);
+            }
+            if now >= until {
+                return Ok(Ended::Time);
+            }
+            if let Some(ended) = self.step(until.min(now + LOOK), each).await? {
+                return Ok(ended);
+            }
+        }
+    }
+
+    /// Takes one datagram, or waits until then.
+    async fn step(
+        &mut self,
+        until: Duration,
+        each: &mut dyn FnMut(News<'_>, Duration) -> Go,
+    ) -> Result<Option<Ended>, Failure> {
+        let until = self.start + until;
+        tokio::select! {
+            biased;
+            Some(()) = self.interrupt.recv() => Ok(Some(Ended::Interrupted)),
+            Some(()) = self.terminate.recv() => Ok(Some(Ended::Interrupted)),
+            () = tokio::time::sleep_until(until) => Ok(None),
+            received = self.udp.recv(&mut self.buffer) => {
+                let (length, from) = received
+                    .map_err(|error| Failure::Io(format!("cannot hear the group: {error}")))?;
+                let datagram = self.buffer.get(..length).unwrap_or_default();
+                Ok(take(&mut self.book, (datagram, from), self.start.elapsed(), each))
+            }
+        }
+    }
+
+    /// Whatever has values and no description is asked for.
+    fn ask_for_all(&mut self, now: Duration) {
+        let (mut known, mut wanted) = (BTreeSet::new(), BTreeSet::new());
+        for (topic, _) in self.book.topics().filter(|(_, heard)| !heard.secured) {
+            let (space, _, writer_id) = topic.triple();
+            let is_known = self.book.described(topic).is_some();
+            let writers = if is_known { &mut known } else { &mut wanted };
+            writers.insert((space, writer_id));
+        }
+        for (space, writer_id) in &wanted {
+            self.prober.want(*space, *writer_id, now);
+        }
+        // Of a DataSetWriterId that several programs have all are waited for.
+        for (space, writer_id) in known.difference(&wanted) {
+            self.prober.answered(*space, *writer_id);
+        }
+        if self.wants_calls {
+            for space in self.book.spaces() {
+                self.prober.want_calls(space, now);
+            }
+        }
+    }
+
+    fn probe_what_is_due(&mut self, now: Duration) {
+        if let Some(datagram) = self.prober.poll(now) {
+            self.send(&datagram);
+        }
+    }
+
+    /// Tells of what was not taken.
+    pub(crate) fn tell_dropped(&self) {
+        for (drop, count) in self.book.dropped() {
+            warn(&format!("{count} left out: {}", drop.label()));
+        }
+    }
+}
+
+/// Whether `each` has enough after a datagram.
+fn take(
+    book: &mut Book,
+    datagram: (&[u8], SocketAddr),
+    now: Duration,
+    each: &mut dyn FnMut(News<'_>, Duration) -> Go,
+) -> Option<Ended> {
+    let mut go = Go::On;
+    book.handle(datagram, now, &mut |news| {
+        if go == Go::On {
+            go = each(news, now);
+        }
+    });
+    (go == Go::Enough).then_some(Ended::Enough)
+}
+
+#[expect(clippy::disallowed_methods, reason = "the one read of this clock")]
+fn unix_nanos() -> i128 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH);
+    i128::try_from(since.unwrap_or_default().as_nanos()).unwrap_or_default()
+}
+
+/// When so many seconds are over; without them, never.
+pub(crate) fn until(now: Duration, seconds: Option<f64>) -> Duration {
+    let seconds = seconds.map(Duration::try_from_secs_f64);
+    match seconds {
+        None | Some(Err(_)) => Duration::MAX / 4,
+        Some(Ok(seconds)) => now.saturating_add(seconds),
+    }
+}
+
+/// How often is looked what to ask.
+const LOOK: Duration = Duration::from_millis(100);

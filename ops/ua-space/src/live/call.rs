@@ -1,0 +1,475 @@
+//! `ua-space call`: asks for a call of the space, and follows the run of a skill to its end.
+
+use std::hash::{BuildHasher as _, Hasher as _, RandomState};
+use std::io::{self, Write as _};
+use std::sync::Arc;
+use std::time::Duration;
+
+use mappings::TopicId;
+use serde::Serialize;
+use uadp::action::{
+    ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionRequest, Heard, Outcome,
+    Requestor, RequestorSettings,
+};
+use uadp::{Extras, NetworkHeader, OwnedPublisherId, StatusCode};
+
+use super::book::{Kind, News};
+use super::described::{self, Described};
+use super::list::json;
+use super::plain::{self, Named};
+use super::run::{End, Places, Run, Step};
+use super::text::harmless;
+use super::{Ended, Go, Live, in_group, parameters, until};
+use crate::arguments::{Call, Target};
+use crate::exit::Failure;
+use crate::report::warn;
+use crate::status;
+
+/// `ua-space call`.
+pub(crate) fn call(arguments: &Call) -> Result<(), Failure> {
+    in_group(&arguments.group, async |live| {
+        let mut asking = Asking {
+            live,
+            requestor: requestor(),
+            arguments,
+        };
+        let (topic, described) = asking.find().await?;
+        let places = Places::of(topic, &described.name);
+        let takes = described.call().map_or(&[][..], |call| &call.request);
+        let request = parameters::request(&arguments.parameters, takes)
+            .map_err(|wrong| Failure::Usage(format!("{}: {wrong}", called(topic, &described))))?;
+        let answer = asking
+            .ask((topic, &described), &request, places.as_ref())
+            .await?;
+        asking.tell_answer((topic, &described), &answer)?;
+        refused((topic, &described), &answer)?;
+        match (places, answer.fields.number("run")) {
+            (Some(places), Some(run)) if !arguments.no_wait && run > 0 => {
+                asking.follow(&places, run).await
+            }
+            (Some(_) | None, Some(_) | None) => Ok(()),
+        }
+    })
+}
+
+/// Who asks is named in every request. A tool is no space: a String can be no number of one, not even where peers take
+/// PublisherIds of any width. It says what it is, and by chance which: process ids of two hosts may be equal.
+fn requestor() -> Requestor {
+    let random = || RandomState::new().build_hasher().finish();
+    let id = format!("ua-space-{}-{:08x}", std::process::id(), random() >> 32);
+    let mut instance = [0; 16];
+    for (place, bytes) in instance.chunks_exact_mut(8).zip([random(), random()]) {
+        place.copy_from_slice(&bytes.to_le_bytes());
+    }
+    Requestor::new(
+        OwnedPublisherId::String(id.into()),
+        instance,
+        RequestorSettings::default(),
+    )
+}
+
+/// A call, for people.
+fn called(topic: TopicId, described: &Described) -> String {
+    match described.name.as_str() {
+        "" => topic.to_string(),
+        name => format!("{topic} {}", harmless(name)),
+    }
+}
+
+/// What a call was answered.
+struct Answer {
+    status: StatusCode,
+    fields: Named,
+}
+
+#[derive(Serialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+enum Shown<'a> {
+    Answer {
+        topic: String,
+        name: &'a str,
+        status: u32,
+        fields: &'a Named,
+    },
+}
+
+/// What came of one call.
+enum Came {
+    Answer(Answer),
+    Lost(String),
+    Refused(String),
+}
+
+struct Asking<'a> {
+    live: Live,
+    requestor: Requestor,
+    arguments: &'a Call,
+}
+
+impl Asking<'_> {
+    /// Waits until the call is announced.
+    async fn find(&mut self) -> Result<(TopicId, Arc<Described>), Failure> {
+        let target = &self.arguments.target;
+        match target {
+            Target::Topic(topic) => self.live.want(*topic),
+            Target::Name(_) => self.live.want_calls([0]),
+        }
+        let start = format!("{target}.Start");
+        let fits = |topic: TopicId, described: &Described| match target {
+            Target::Topic(wanted) => topic == *wanted,
+            Target::Name(name) => described.name == *name || described.name == start,
+        };
+        let end = until(self.live.now(), Some(self.arguments.wait));
+        let mut found = None;
+        let mut each = |news: News<'_>, _| match news {
+            News::Announced(topic, Kind::Call, described) if fits(topic, described) => {
+                found = Some((topic, Arc::clone(described)));
+                Go::Enough
+            }
+            News::Announced(..) | News::Sample(_) | News::Response(_) => Go::On,
+        };
+        let ended = self.live.listen(end, &mut each).await?;
+        match (found, ended) {
+            (Some((topic, described)), _) => {
+                if self.live.book.announcers(topic) > 1 {
+                    warn(&format!(
+                        "{topic} is announced from several addresses; the first one counts"
+                    ));
+                }
+                Ok((topic, described))
+            }
+            (None, Ended::Interrupted) => Err(Failure::Interrupted),
+            (None, Ended::Time | Ended::Enough) => Err(self.not_found()),
+        }
+    }
+
+    fn not_found(&self) -> Failure {
+        let calls = self.live.book.calls();
+        let calls = calls.map(|(topic, described)| called(topic, described));
+        let calls: Vec<String> = calls.take(SHOWN).collect();
+        let help = match (calls.as_slice(), &self.arguments.target) {
+            ([], Target::Topic(topic)) if self.live.book.heard(*topic).is_some() => {
+                "values come under that name; it is no call".to_owned()
+            }
+            ([], _) => "no call was announced; is this the group and the interface (--address, --interface)?".to_owned(),
+            (some, _) => format!("there are {}", some.join(", ")),
+        };
+        let (target, group, wait) = (
+            &self.arguments.target,
+            self.live.group(),
+            self.arguments.wait,
+        );
+        Failure::Unavailable(format!(
+            "nobody in {group} offers the call {target}, asked for {wait} s\n  = help: {help}"
+        ))
+    }
+
+    /// Asks, and waits for the answer. At the first interruption a skill is halted and the answer still waited for.
+    async fn ask(
+        &mut self,
+        (topic, described): (TopicId, &Described),
+        request: &[u8],
+        places: Option<&Places>,
+    ) -> Result<Answer, Failure> {
+        let mut halts_at = places;
+        let mut came = None;
+        self.begin((topic, described), request)?;
+        loop {
+            let ended = self.turn(described, Duration::MAX, &mut came).await?;
+            match came.take() {
+                Some(Came::Answer(answer)) => return Ok(answer),
+                Some(Came::Refused(why)) => {
+                    return Err(Failure::Failed(format!(
+                        "{}: {why}",
+                        called(topic, described)
+                    )));
+                }
+                Some(Came::Lost(why)) => {
+                    return Err(Failure::Unavailable(format!(
+                        "{}: {why}; whether it was executed is not known",
+                        called(topic, described)
+                    )));
+                }
+                None => {}
+            }
+            if ended == Ended::Interrupted {
+                let Some(places) = halts_at.take() else {
+                    return Err(Failure::Interrupted);
+                };
+                self.halt(places)?;
+            }
+        }
+    }
+
+    fn begin(
+        &mut self,
+        (topic, described): (TopicId, &Described),
+        request: &[u8],
+    ) -> Result<(), Failure> {
+        let (space, namespace, writer_id) = topic.triple();
+        let targets = described.call().map_or(&[][..], |call| &call.targets);
+        let request = ActionRequest {
+            address: ActionAddress {
+                publisher_id: OwnedPublisherId::UInt16(space),
+                writer_group_id: Some(namespace),
+                writer_id,
+                target_id: targets.first().copied().unwrap_or(1),
+            },
+            dialect: ActionDialect::Standard,
+            fields: ActionFields::Variants(request),
+            timeout: Duration::try_from_secs_f64(self.arguments.timeout).unwrap_or(Duration::MAX),
+        };
+        let begun = self.requestor.call(request, self.live.now());
+        begun
+            .map(|_| ())
+            .map_err(|error| Failure::Usage(format!("{topic}: {error}")))
+    }
+
+    /// Calls Halt. What it is answered is of no interest: its effect is, which is followed.
+    fn halt(&mut self, places: &Places) -> Result<(), Failure> {
+        warn("interrupted: calling Halt (once more to leave at once)");
+        let halt = Described {
+            name: String::new(),
+            description: String::new(),
+            what: described::What::Value(Vec::new()),
+        };
+        self.begin((places.halt, &halt), &[0, 0])
+    }
+
+    /// Sends what is due and listens until more is, something came of the call, or `until`.
+    async fn turn(
+        &mut self,
+        described: &Described,
+        until: Duration,
+        came: &mut Option<Came>,
+    ) -> Result<Ended, Failure> {
+        self.transmit()?;
+        let Self {
+            live, requestor, ..
+        } = self;
+        let next = requestor.poll_timeout().unwrap_or(until).min(until);
+        let ended = {
+            let mut each = |news: News<'_>, now| {
+                if let News::Response(response) = &news {
+                    *came = hear(requestor, response, (described, now));
+                }
+                if came.is_some() { Go::Enough } else { Go::On }
+            };
+            live.listen(next, &mut each).await?
+        };
+        requestor.handle_timeout(live.now());
+        if let Some((_, why)) = requestor.poll_given_up()
+            && came.is_none()
+        {
+            *came = Some(Came::Lost(why.to_string()));
+        }
+        Ok(ended)
+    }
+
+    fn transmit(&mut self) -> Result<(), Failure> {
+        let now = self.live.now();
+        while let Some(request) = self.requestor.poll_transmit(now) {
+            let mut datagram = Vec::new();
+            let encoded =
+                request.encode(&mut datagram, &NetworkHeader::default(), &Extras::default());
+            encoded
+                .and_then(uadp::action::ActionEncoder::finish)
+                .map_err(|error| Failure::Usage(format!("cannot be asked for: {error}")))?;
+            self.live.send(&datagram);
+        }
+        Ok(())
+    }
+
+    fn tell_answer(
+        &self,
+        (topic, described): (TopicId, &Described),
+        answer: &Answer,
+    ) -> Result<(), Failure> {
+        let mut out = io::stdout().lock();
+        if self.arguments.json {
+            let shown = Shown::Answer {
+                topic: topic.to_string(),
+                name: &described.name,
+                status: answer.status.0,
+                fields: &answer.fields,
+            };
+            writeln!(out, "{}", json(&shown)?)?;
+        } else {
+            out.write_all(answer.fields.yaml().as_bytes())?;
+        }
+        out.flush()?;
+        Ok(())
+    }
+
+    fn tell(&self, step: &Step) -> Result<(), Failure> {
+        let mut out = io::stdout().lock();
+        match self.arguments.json {
+            true => writeln!(out, "{}", json(step)?)?,
+            false => {
+                for line in step.told().lines() {
+                    writeln!(out, "  {}", harmless(line))?;
+                }
+            }
+        }
+        out.flush()?;
+        Ok(())
+    }
+
+    /// Follows a run to its end.
+    async fn follow(&mut self, places: &Places, number: u64) -> Result<(), Failure> {
+        let mut run = Run::new(number, self.live.now());
+        let mut halted = false;
+        let limit = until(self.live.now(), self.arguments.run_timeout);
+        let end = loop {
+            if let Some(end) = run.end(self.live.now()) {
+                break end;
+            }
+            let mut steps = Vec::new();
+            let ended = self.hear_run(places, &mut run, &mut steps).await?;
+            for step in &steps {
+                self.tell(step)?;
+            }
+            let is_over = !halted && self.live.now() >= limit;
+            if is_over {
+                warn("the time for the run is over");
+            }
+            if ended == Ended::Interrupted || is_over {
+                if halted {
+                    return Err(Failure::Interrupted);
+                }
+                halted = true;
+                self.halt(places)?;
+            }
+        };
+        self.acknowledge().await?;
+        let unknown = |why| {
+            Err(Failure::Unavailable(format!(
+                "run {number}: {why}; how it ended is not known"
+            )))
+        };
+        match end {
+            End::Succeeded => Ok(()),
+            End::Failed => Err(Failure::Failed(format!("run {number} did not succeed"))),
+            End::Overtaken => unknown("another one began"),
+            End::NoResult => unknown("it ended and no result came"),
+            End::Silent => unknown("nothing was heard of the component"),
+        }
+    }
+
+    /// Hears a moment of what the component says.
+    async fn hear_run(
+        &mut self,
+        places: &Places,
+        run: &mut Run,
+        steps: &mut Vec<Step>,
+    ) -> Result<Ended, Failure> {
+        self.transmit()?;
+        let Self {
+            live, requestor, ..
+        } = self;
+        let next = requestor.poll_timeout().unwrap_or(Duration::MAX);
+        let next = next.min(live.now() + LOOK);
+        let mut each = |news: News<'_>, now| {
+            match &news {
+                News::Response(response) => {
+                    // Acknowledgements, and the answer of Halt.
+                    let _heard = requestor.handle_response(response, now).is_ok();
+                }
+                News::Sample(sample) if places.has(sample.topic) => {
+                    let described = sample.described.as_deref();
+                    if let Ok(value) = plain::message(&sample.message, described)
+                        && described.is_some()
+                        && !value.0.is_empty()
+                    {
+                        steps.extend(run.handle(places, (sample.topic, &value), now));
+                    }
+                }
+                News::Sample(_) | News::Announced(..) => {}
+            }
+            if steps.is_empty() { Go::On } else { Go::Enough }
+        };
+        let ended = live.listen(next, &mut each).await?;
+        requestor.handle_timeout(live.now());
+        while requestor.poll_given_up().is_some() {}
+        Ok(ended)
+    }
+
+    /// Lets the Responder forget what was asked, as far as that takes no time.
+    async fn acknowledge(&mut self) -> Result<(), Failure> {
+        let end = self.live.now() + ACKNOWLEDGE;
+        while self.requestor.open_calls() > 0 && self.live.now() < end {
+            let mut came = None;
+            let none = Described {
+                name: String::new(),
+                description: String::new(),
+                what: described::What::Value(Vec::new()),
+            };
+            if self.turn(&none, end, &mut came).await? == Ended::Interrupted {
+                break;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// What a response says of the call, if it ends it.
+fn hear(
+    requestor: &mut Requestor,
+    response: &ActionMessage<'_>,
+    (described, now): (&Described, Duration),
+) -> Option<Came> {
+    let Ok(Heard::Done(_, outcome)) = requestor.handle_response(response, now) else {
+        return None;
+    };
+    Some(match outcome {
+        Outcome::Answered { status, fields } => match plain::response(fields, described.fields()) {
+            Ok(fields) => Came::Answer(Answer { status, fields }),
+            Err(error) => Came::Lost(format!("an answer that cannot be read: {error}")),
+        },
+        Outcome::Refused(why) => Came::Refused(format!("refused: {why}")),
+        Outcome::Unknown(why) => Came::Lost(why.to_string()),
+    })
+}
+
+/// An answer that is a no.
+fn refused((topic, described): (TopicId, &Described), answer: &Answer) -> Result<(), Failure> {
+    let bad = answer.status.0 & BAD != 0;
+    let no = answer
+        .fields
+        .get("success")
+        .and_then(serde_json::Value::as_bool)
+        == Some(false);
+    if !bad && !no {
+        return Ok(());
+    }
+    let mut why = match answer.fields.text("message") {
+        Some(message) if !message.is_empty() => message.to_owned(),
+        Some(_) | None => "it did not succeed".to_owned(),
+    };
+    if bad {
+        let code = answer.status;
+        let symbol =
+            status::symbol(code).map_or_else(|| format!("{:#010x}", code.0), str::to_owned);
+        why = format!("{symbol}: {why}");
+    }
+    let takes = described.call().map_or(&[][..], |call| &call.request);
+    let help = match why.contains("BadInvalidArgument") && !takes.is_empty() {
+        true => format!("\n  = help: this call takes {}", described::list(takes)),
+        false => String::new(),
+    };
+    let name = called(topic, described);
+    Err(Failure::Failed(format!(
+        "{name}: {}{}",
+        harmless(&why),
+        harmless(&help).replace("\\u{a}", "\n")
+    )))
+}
+
+/// Of the two upper bits of a StatusCode.
+const BAD: u32 = 0x8000_0000;
+/// Calls that are named where one is not found.
+const SHOWN: usize = 20;
+/// How often is looked whether a run has ended.
+const LOOK: Duration = Duration::from_millis(100);
+/// How long an acknowledgement may take.
+const ACKNOWLEDGE: Duration = Duration::from_millis(500);

@@ -1,0 +1,296 @@
+//! What topics and calls consist of, as their writers announce it, in a form of our own.
+//!
+//! The name of what is announced begins with its topic, since an announcement has no WriterGroupId; behind a space
+//! stands what people call it: `ua_0_7_101 gripper.Grasp.State`. The description is the ROS type that the fields make,
+//! and behind `; ` whatever else there is to say, such as the type of a skill.
+
+use mappings::TopicId;
+use serde::Serialize;
+use uadp::discovery::{ActionMetaData, DataSetMetaDataType, FieldMetaData};
+use uadp::{BuiltinType, Scalar, Variant};
+
+/// A topic or call as it was announced.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Described {
+    /// What people call the DataSet or Action; may be empty.
+    pub(crate) name: String,
+    /// What its writer says of it.
+    pub(crate) description: String,
+    pub(crate) what: What,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum What {
+    Value(Vec<Field>),
+    Call(Call),
+}
+
+/// What goes into a call, what comes out, and on what it can be called.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Call {
+    pub(crate) request: Vec<Field>,
+    pub(crate) response: Vec<Field>,
+    /// ActionTargetIds; never empty.
+    pub(crate) targets: Vec<u16>,
+}
+
+/// One field of a DataSet.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Field {
+    pub(crate) name: String,
+    /// `None` for an id that is no builtin type.
+    pub(crate) builtin: Option<BuiltinType>,
+    /// As in the standard: -1 for a scalar, else the number of dimensions or which numbers are allowed.
+    pub(crate) rank: i32,
+    /// Most elements in each dimension, 0 where that is open.
+    pub(crate) dimensions: Vec<u32>,
+    pub(crate) max_string_length: u32,
+    /// What it is, for people.
+    pub(crate) description: String,
+    /// May be left out of a request.
+    pub(crate) optional: bool,
+}
+
+/// A field as `--json` shows it.
+#[derive(Debug, Serialize)]
+pub(crate) struct ShownField<'a> {
+    name: &'a str,
+    #[serde(rename = "type")]
+    kind: String,
+    #[serde(skip_serializing_if = "str::is_empty")]
+    description: &'a str,
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    optional: bool,
+}
+
+impl Described {
+    /// Of a DataSet.
+    ///
+    /// # Errors
+    /// In words, what is too much.
+    pub(crate) fn of_value(meta_data: &DataSetMetaDataType<'_>) -> Result<Self, &'static str> {
+        Ok(Self {
+            name: called(meta_data.name)?,
+            description: bounded(meta_data.description.text, "the description")?,
+            what: What::Value(fields(meta_data)?),
+        })
+    }
+
+    /// Of an Action.
+    ///
+    /// # Errors
+    /// In words, what is too much.
+    pub(crate) fn of_call(meta_data: &ActionMetaData<'_>) -> Result<Self, &'static str> {
+        let targets = meta_data.action_targets.iter().take(MOST_TARGETS);
+        let targets: Vec<u16> = targets.map(|target| target.action_target_id).collect();
+        if targets.is_empty() {
+            return Err("a call on nothing");
+        }
+        Ok(Self {
+            name: called(meta_data.request.name)?,
+            description: bounded(meta_data.request.description.text, "the description")?,
+            what: What::Call(Call {
+                request: fields(&meta_data.request)?,
+                response: fields(&meta_data.response)?,
+                targets,
+            }),
+        })
+    }
+
+    /// The fields of the values, or of what comes out of the call.
+    pub(crate) fn fields(&self) -> &[Field] {
+        match &self.what {
+            What::Value(fields) => fields,
+            What::Call(call) => &call.response,
+        }
+    }
+
+    pub(crate) fn call(&self) -> Option<&Call> {
+        match &self.what {
+            What::Value(_) => None,
+            What::Call(call) => Some(call),
+        }
+    }
+
+    /// The ROS type that the fields make, where the description begins with one.
+    pub(crate) fn ros_type(&self) -> Option<&str> {
+        let first = self.description.split([';', ' ']).next()?;
+        let is_type = first.parse::<messages::TypeName>().is_ok();
+        is_type.then_some(first)
+    }
+
+    /// The type of the skill whose state it is: `GraspSkillType nsu=urn:ua-bridge:skills` somewhere in the description.
+    pub(crate) fn skill_type(&self) -> Option<(&str, &str)> {
+        let (before, after) = self.description.split_once("nsu=")?;
+        let name = before.split_whitespace().next_back()?;
+        let namespace = after.split_whitespace().next().unwrap_or_default();
+        Some((name, namespace))
+    }
+
+    /// What it takes and gives, in a line.
+    pub(crate) fn summary(&self) -> String {
+        match &self.what {
+            What::Value(fields) => match (self.ros_type(), fields.as_slice()) {
+                (Some(name), _) => name.to_owned(),
+                (None, [one]) => one.kind(),
+                (None, []) => "-".to_owned(),
+                (None, many) => format!("{} fields", many.len()),
+            },
+            What::Call(call) => format!("({}) -> ({})", list(&call.request), list(&call.response)),
+        }
+    }
+
+    /// Roughly the bytes it takes up.
+    pub(crate) fn weight(&self) -> usize {
+        let of = |fields: &[Field]| -> usize {
+            let texts = fields.iter().map(|field| {
+                field.name.len() + field.description.len() + field.dimensions.len() * 4
+            });
+            texts.sum::<usize>() + size_of_val(fields)
+        };
+        let what = match &self.what {
+            What::Value(fields) => of(fields),
+            What::Call(call) => of(&call.request) + of(&call.response) + call.targets.len() * 2,
+        };
+        size_of::<Self>() + self.name.len() + self.description.len() + what
+    }
+}
+
+impl Field {
+    /// As `Double[6]`.
+    pub(crate) fn kind(&self) -> String {
+        let name = self.builtin.map_or("?", BuiltinType::name);
+        match (self.rank, self.dimensions.as_slice()) {
+            (-1, _) => name.to_owned(),
+            (_, [] | [0]) => format!("{name}[]"),
+            (_, sizes) => {
+                let sizes: Vec<String> = sizes.iter().map(ToString::to_string).collect();
+                format!("{name}[{}]", sizes.join(","))
+            }
+        }
+    }
+
+    pub(crate) const fn is_array(&self) -> bool {
+        self.rank != -1
+    }
+
+    pub(crate) fn shown(&self) -> ShownField<'_> {
+        ShownField {
+            name: &self.name,
+            kind: self.kind(),
+            description: &self.description,
+            optional: self.optional,
+        }
+    }
+}
+
+/// As `TargetPosition: Double[6], [MaxVelocity: Double]`, in brackets what may be left out.
+pub(crate) fn list(fields: &[Field]) -> String {
+    let each = fields.iter().map(|field| {
+        let text = format!("{}: {}", field.name, field.kind());
+        match field.optional {
+            true => format!("[{text}]"),
+            false => text,
+        }
+    });
+    each.collect::<Vec<_>>().join(", ")
+}
+
+/// The topic at the beginning of a name.
+pub(super) fn topic_of(name: Option<&str>) -> Option<TopicId> {
+    name?.split(' ').next()?.parse().ok()
+}
+
+/// What stands behind the topic.
+fn called(name: Option<&str>) -> Result<String, &'static str> {
+    let rest = name.and_then(|name| name.split_once(' '));
+    bounded(rest.map(|(_, rest)| rest), "the name")
+}
+
+fn fields(meta_data: &DataSetMetaDataType<'_>) -> Result<Vec<Field>, &'static str> {
+    if meta_data.fields.len() > MOST_FIELDS {
+        return Err("too many fields");
+    }
+    meta_data.fields.iter().map(|field| read(&field)).collect()
+}
+
+fn read(field: &FieldMetaData<'_>) -> Result<Field, &'static str> {
+    if field.array_dimensions.len() > MOST_DIMENSIONS {
+        return Err("too many dimensions");
+    }
+    Ok(Field {
+        name: bounded(field.name, "the name of a field")?,
+        builtin: field.builtin_type(),
+        rank: field.value_rank,
+        dimensions: field.array_dimensions.iter().collect(),
+        max_string_length: field.max_string_length,
+        description: bounded(field.description.text, "the description of a field")?,
+        optional: field
+            .properties
+            .iter()
+            .take(MOST_PROPERTIES)
+            .any(|property| {
+                let yes = Variant::Scalar(Scalar::Boolean(true));
+                property.key.name == Some(OPTIONAL) && property.value == yes
+            }),
+    })
+}
+
+fn bounded(text: Option<&str>, what: &'static str) -> Result<String, &'static str> {
+    let text = text.unwrap_or_default();
+    match text.len() <= MOST_TEXT {
+        true => Ok(text.to_owned()),
+        false => Err(what),
+    }
+}
+
+/// Of a field that may be left out of a request.
+const OPTIONAL: &str = "Optional";
+const MOST_PROPERTIES: usize = 64;
+const MOST_TEXT: usize = 1024;
+const MOST_FIELDS: usize = 1000;
+const MOST_DIMENSIONS: usize = 8;
+const MOST_TARGETS: usize = 64;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn described(description: &str) -> Described {
+        Described {
+            name: "gripper.Grasp.State".to_owned(),
+            description: description.to_owned(),
+            what: What::Value(Vec::new()),
+        }
+    }
+
+    #[test]
+    fn a_description_says_the_ros_type_the_skill_type_or_both() {
+        let both = described("ua_msgs/SkillState; GraspSkillType nsu=urn:ua-bridge:skills");
+        assert_eq!(both.ros_type(), Some("ua_msgs/SkillState"));
+        let skill = Some(("GraspSkillType", "urn:ua-bridge:skills"));
+        assert_eq!(both.skill_type(), skill);
+        let one = described("; GraspSkillType nsu=urn:ua-bridge:skills");
+        assert_eq!((one.ros_type(), one.skill_type()), (None, skill));
+        let other = described("geometry_msgs/Twist as bytes");
+        assert_eq!(other.ros_type(), Some("geometry_msgs/Twist"));
+        assert_eq!(other.skill_type(), None);
+    }
+
+    #[test]
+    fn a_field_is_called_by_its_type_and_sizes() {
+        let field = |rank, dimensions: &[u32]| Field {
+            name: "TargetPosition".to_owned(),
+            builtin: Some(BuiltinType::Double),
+            rank,
+            dimensions: dimensions.to_vec(),
+            max_string_length: 0,
+            description: String::new(),
+            optional: false,
+        };
+        assert_eq!(field(-1, &[]).kind(), "Double");
+        assert_eq!(field(1, &[6]).kind(), "Double[6]");
+        assert_eq!(field(1, &[0]).kind(), "Double[]");
+        assert_eq!(field(2, &[2, 3]).kind(), "Double[2,3]");
+    }
+}

@@ -1,0 +1,329 @@
+//! `ua-space echo` and `ua-space hz`: the values of a topic, and how often they come.
+
+use std::collections::VecDeque;
+use std::io::{self, Write as _};
+use std::time::Duration;
+
+use serde::Serialize;
+use uadp::MessageKind;
+
+use super::book::{News, Sample};
+use super::described::Described;
+use super::list::{json, unheard};
+use super::plain::{self, Named};
+use super::{Ended, Go, Live, in_group, until};
+use crate::arguments::{Echo, Hz};
+use crate::exit::Failure;
+use crate::iso_time;
+use crate::report::warn;
+
+/// `ua-space echo`.
+pub(crate) fn echo(arguments: &Echo) -> Result<(), Failure> {
+    in_group(&arguments.group, async |mut live| {
+        live.want(arguments.topic);
+        let mut echo = Printing {
+            arguments,
+            shown: 0,
+            waiting: Some(VecDeque::new()),
+            left_out: 0,
+            unread: None,
+        };
+        // Its names may come a moment after its first value.
+        let named = until(live.now(), Some(NAMED_WITHIN));
+        let end = until(live.now(), arguments.seconds);
+        let mut ended = echo.listen(&mut live, named.min(end)).await?;
+        echo.print_waiting(live.book.described(arguments.topic).map(AsRef::as_ref))?;
+        if ended == Ended::Time && named < end && !echo.is_enough() {
+            ended = echo.listen(&mut live, end).await?;
+        }
+        live.tell_dropped();
+        match (echo.shown, ended) {
+            (0, Ended::Time) => Err(echo.nothing(&live)),
+            (_, Ended::Time | Ended::Enough | Ended::Interrupted) => Ok(()),
+        }
+    })
+}
+
+struct Printing<'a> {
+    arguments: &'a Echo,
+    shown: u64,
+    /// Lines that wait for names; `None` when nothing waits any more.
+    waiting: Option<VecDeque<Raw>>,
+    left_out: u64,
+    /// Why a value could not be shown.
+    unread: Option<String>,
+}
+
+/// A value as it came, to be shown when its names are known.
+struct Raw {
+    shown: Named,
+    has_names: bool,
+    at: Option<String>,
+    kind: MessageKind,
+}
+
+#[derive(Serialize)]
+struct Shown<'a> {
+    topic: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    time: Option<&'a str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    kind: Option<&'static str>,
+    value: &'a Named,
+}
+
+impl Printing<'_> {
+    async fn listen(&mut self, live: &mut Live, end: Duration) -> Result<Ended, Failure> {
+        let mut fault = None;
+        let mut each = |news: News<'_>, _| {
+            let News::Sample(sample) = news else {
+                return Go::On;
+            };
+            if sample.topic != self.arguments.topic {
+                return Go::On;
+            }
+            match self.take(&sample) {
+                Ok(go) => go,
+                Err(failure) => {
+                    fault = Some(failure);
+                    Go::Enough
+                }
+            }
+        };
+        let ended = live.listen(end, &mut each).await?;
+        fault.map_or(Ok(ended), Err)
+    }
+
+    fn is_enough(&self) -> bool {
+        let waiting = self.waiting.as_ref().map_or(0, VecDeque::len);
+        let waiting = u64::try_from(waiting).unwrap_or(u64::MAX);
+        let most = self.arguments.count;
+        most.is_some_and(|most| self.shown.saturating_add(waiting) >= most)
+    }
+
+    fn take(&mut self, sample: &Sample<'_>) -> Result<Go, Failure> {
+        if sample.message.kind == MessageKind::KeepAlive {
+            return Ok(Go::On);
+        }
+        let described = sample.described.as_deref();
+        let shown = match plain::message(&sample.message, described) {
+            Ok(shown) => shown,
+            Err(error) => {
+                if self.unread.is_none() {
+                    warn(&format!("{}: {error}", sample.topic));
+                }
+                self.unread = Some(error.to_string());
+                return Ok(Go::On);
+            }
+        };
+        let header = sample.message.header();
+        let time = header.timestamp.or(sample.network.timestamp);
+        let raw = Raw {
+            shown,
+            has_names: described.is_some(),
+            at: time.map(iso_time::of_date_time),
+            kind: sample.message.kind,
+        };
+        match &mut self.waiting {
+            Some(waiting) if !raw.has_names && waiting.len() < MOST_WAITING => {
+                waiting.push_back(raw);
+            }
+            Some(waiting) if !raw.has_names => {
+                waiting.pop_front();
+                self.left_out += 1;
+                waiting.push_back(raw);
+            }
+            Some(_) => {
+                self.print_waiting(described)?;
+                if !self.is_enough() {
+                    self.print(&raw)?;
+                }
+            }
+            None => self.print(&raw)?,
+        }
+        let printed = self.waiting.is_none() && self.is_enough();
+        Ok(if printed { Go::Enough } else { Go::On })
+    }
+
+    /// Shows what waited for names, by those that have come or by numbers.
+    fn print_waiting(&mut self, described: Option<&Described>) -> Result<(), Failure> {
+        let waiting = self.waiting.take().unwrap_or_default();
+        for mut raw in waiting {
+            if let Some(described) = described {
+                raw.shown.rename(described.fields());
+            }
+            if !self.is_enough() {
+                self.print(&raw)?;
+            }
+        }
+        if self.left_out > 0 {
+            warn(&format!(
+                "{} values came before their names and are left out",
+                self.left_out
+            ));
+        }
+        Ok(())
+    }
+
+    fn print(&mut self, raw: &Raw) -> Result<(), Failure> {
+        self.shown += 1;
+        let mut out = io::stdout().lock();
+        let kind = match raw.kind {
+            MessageKind::DeltaFrame => Some("delta"),
+            MessageKind::Event => Some("event"),
+            MessageKind::KeyFrame | MessageKind::KeepAlive => None,
+        };
+        if self.arguments.json {
+            let shown = Shown {
+                topic: self.arguments.topic.to_string(),
+                time: raw.at.as_deref(),
+                kind,
+                value: &raw.shown,
+            };
+            writeln!(out, "{}", json(&shown)?)?;
+        } else {
+            let at = raw.at.as_deref().unwrap_or("without a time");
+            let kind = kind.map(|kind| format!(", {kind}")).unwrap_or_default();
+            write!(out, "--- # {at}{kind}\n{}", raw.shown.yaml())?;
+        }
+        out.flush()?;
+        Ok(())
+    }
+
+    fn nothing(&self, live: &Live) -> Failure {
+        let topic = self.arguments.topic;
+        let secured = live.book.heard(topic).is_some_and(|heard| heard.secured);
+        match &self.unread {
+            Some(why) => Failure::Data(format!("{topic}: nothing that came can be read: {why}")),
+            None if secured => Failure::Data(format!(
+                "{topic} is secured, and cannot be read without its keys"
+            )),
+            None => unheard(live, topic, self.arguments.seconds.unwrap_or_default()),
+        }
+    }
+}
+
+/// `ua-space hz`.
+pub(crate) fn hz(arguments: &Hz) -> Result<(), Failure> {
+    in_group(&arguments.group, async |mut live| {
+        let end = until(live.now(), arguments.seconds);
+        let mut times: VecDeque<Duration> = VecDeque::new();
+        let mut all = 0_u64;
+        loop {
+            let next = until(live.now(), Some(REPORT)).min(end);
+            let mut each = |news: News<'_>, now| {
+                if let News::Sample(sample) = news
+                    && sample.topic == arguments.topic
+                    && sample.message.kind != MessageKind::KeepAlive
+                {
+                    all += 1;
+                    if times.len() >= arguments.window {
+                        times.pop_front();
+                    }
+                    times.push_back(now);
+                }
+                Go::On
+            };
+            let ended = live.listen(next, &mut each).await?;
+            let last = ended == Ended::Interrupted || live.now() >= end;
+            if let Some(rhythm) = Rhythm::of(&times, all) {
+                rhythm.print(arguments)?;
+            } else if !arguments.json && !last {
+                warn("no two values yet");
+            }
+            if last && all == 0 && ended == Ended::Time {
+                return Err(unheard(
+                    &live,
+                    arguments.topic,
+                    arguments.seconds.unwrap_or_default(),
+                ));
+            }
+            if last {
+                return Ok(());
+            }
+        }
+    })
+}
+
+/// How values follow each other.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+struct Rhythm {
+    rate_hz: f64,
+    min_s: f64,
+    max_s: f64,
+    std_dev_s: f64,
+    /// Gaps the figures are of.
+    window: usize,
+    /// Values heard in all.
+    values: u64,
+}
+
+impl Rhythm {
+    #[expect(clippy::cast_precision_loss, reason = "figures shown to people")]
+    fn of(times: &VecDeque<Duration>, values: u64) -> Option<Self> {
+        let gaps = times.iter().zip(times.iter().skip(1));
+        let gaps: Vec<f64> = gaps
+            .map(|(one, next)| next.saturating_sub(*one).as_secs_f64())
+            .collect();
+        let count = gaps.len();
+        let sum: f64 = gaps.iter().sum();
+        if count == 0 || sum <= 0.0 {
+            return None;
+        }
+        let mean = sum / count as f64;
+        let variance = gaps.iter().map(|gap| (gap - mean).powi(2)).sum::<f64>() / count as f64;
+        Some(Self {
+            rate_hz: 1.0 / mean,
+            min_s: gaps.iter().copied().fold(f64::INFINITY, f64::min),
+            max_s: gaps.iter().copied().fold(0.0, f64::max),
+            std_dev_s: variance.sqrt(),
+            window: count,
+            values,
+        })
+    }
+
+    fn print(&self, arguments: &Hz) -> Result<(), Failure> {
+        let mut out = io::stdout().lock();
+        if arguments.json {
+            writeln!(out, "{}", json(self)?)?;
+        } else {
+            let Self {
+                rate_hz,
+                min_s,
+                max_s,
+                std_dev_s,
+                window,
+                ..
+            } = self;
+            writeln!(out, "average rate: {rate_hz:.3}")?;
+            writeln!(
+                out,
+                "\tmin: {min_s:.4}s max: {max_s:.4}s std dev: {std_dev_s:.5}s window: {window}"
+            )?;
+        }
+        out.flush()?;
+        Ok(())
+    }
+}
+
+/// Seconds that values wait for their names.
+const NAMED_WITHIN: f64 = 1.2;
+/// Values that wait for them.
+const MOST_WAITING: usize = 256;
+/// Seconds between two lines of `hz`.
+const REPORT: f64 = 1.0;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_rate_is_that_of_the_gaps_between_values() {
+        let times = [0, 100, 200, 320].map(Duration::from_millis).into();
+        let rhythm = Rhythm::of(&times, 4).unwrap();
+        assert!((rhythm.rate_hz - 9.375).abs() < 1e-9, "{rhythm:?}");
+        assert!((rhythm.min_s - 0.1).abs() < 1e-9 && (rhythm.max_s - 0.12).abs() < 1e-9);
+        assert_eq!((rhythm.window, rhythm.values), (3, 4));
+        assert_eq!(Rhythm::of(&[Duration::ZERO].into(), 1), None);
+    }
+}

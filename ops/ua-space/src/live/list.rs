@@ -1,0 +1,304 @@
+//! `ua-space list` and `ua-space info`: which topics and calls there are.
+
+use std::collections::BTreeMap;
+use std::io::{self, Write as _};
+use std::time::Duration;
+
+use mappings::{SpaceId, TopicId};
+use serde::Serialize;
+
+use super::book::{Book, Heard, Kind};
+use super::described::{Described, Field, ShownField, What};
+use super::text::{Table, age, harmless, is_coloured};
+use super::{Go, Live, in_group, until};
+use crate::arguments::{Info, List};
+use crate::exit::Failure;
+
+/// `ua-space list`.
+pub(crate) fn list(arguments: &List) -> Result<(), Failure> {
+    in_group(&arguments.group, async |mut live| {
+        let end = until(live.now(), Some(arguments.seconds));
+        live.want_calls(
+            FIRST_ASKED
+                .into_iter()
+                .chain(arguments.space.map(u16::from)),
+        );
+        live.listen(end, &mut |_, _| Go::On).await?;
+        let now = live.now();
+        let mut lines = lines(&live.book, now);
+        if let Some(space) = arguments.space {
+            lines.retain(|line| line.topic.space == space);
+        }
+        let mut out = io::stdout().lock();
+        if arguments.json {
+            let shown: Vec<Shown<'_>> = lines.iter().map(Line::shown).collect();
+            writeln!(out, "{}", json(&shown)?)?;
+        } else if lines.is_empty() {
+            writeln!(
+                out,
+                "nothing was heard in {} for {} s",
+                live.group(),
+                arguments.seconds
+            )?;
+        } else {
+            table(&lines).write(&mut out, is_coloured())?;
+        }
+        live.tell_dropped();
+        Ok(())
+    })
+}
+
+/// `ua-space info`.
+pub(crate) fn info(arguments: &Info) -> Result<(), Failure> {
+    in_group(&arguments.group, async |mut live| {
+        let end = until(live.now(), Some(arguments.seconds));
+        live.want(arguments.topic);
+        live.listen(end, &mut |_, _| Go::On).await?;
+        let lines = lines(&live.book, live.now());
+        let Some(line) = lines.iter().find(|line| line.topic == arguments.topic) else {
+            return Err(unheard(&live, arguments.topic, arguments.seconds));
+        };
+        let mut out = io::stdout().lock();
+        match arguments.json {
+            true => writeln!(out, "{}", json(&line.shown())?)?,
+            false => out.write_all(line.told().as_bytes())?,
+        }
+        Ok(())
+    })
+}
+
+/// Nothing came of a topic.
+pub(super) fn unheard(live: &Live, topic: TopicId, seconds: f64) -> Failure {
+    let group = live.group();
+    let heard = live.book.topics().count();
+    let what = format!("{topic} was not heard in {group} for {seconds} s");
+    let help = match heard {
+        0 => "nothing else was heard either; is this the group and the interface (--address, --interface)?".to_owned(),
+        1 => "one other topic was heard; `ua-space list` shows it".to_owned(),
+        many => format!("{many} other topics were heard; `ua-space list` shows them"),
+    };
+    Failure::Unavailable(format!("{what}\n  = help: {help}"))
+}
+
+pub(super) fn json(shown: &impl Serialize) -> Result<String, Failure> {
+    serde_json::to_string(shown).map_err(|error| Failure::Data(error.to_string()))
+}
+
+/// A topic or call as it is listed.
+struct Line<'b> {
+    topic: TopicId,
+    described: Option<&'b Described>,
+    heard: Option<&'b Heard>,
+    is_call: bool,
+    from: String,
+    /// Since it was heard last.
+    age: Option<Duration>,
+    /// Values a second.
+    rate: Option<f64>,
+}
+
+#[derive(Serialize)]
+struct Shown<'l> {
+    topic: String,
+    kind: &'static str,
+    space: u8,
+    origin: &'static str,
+    name: Option<&'l str>,
+    #[serde(rename = "type")]
+    type_name: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    description: Option<&'l str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    fields: Option<Vec<ShownField<'l>>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    takes: Option<Vec<ShownField<'l>>>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    gives: Option<Vec<ShownField<'l>>>,
+    values: u64,
+    keep_alives: u64,
+    rate_hz: Option<f64>,
+    age_s: Option<f64>,
+    secured: bool,
+    sender: &'l str,
+    sender_changed: u64,
+}
+
+fn lines(book: &Book, now: Duration) -> Vec<Line<'_>> {
+    let mut lines = BTreeMap::new();
+    for (topic, heard) in book.topics() {
+        let line = Line {
+            topic,
+            described: book.described(topic).map(AsRef::as_ref),
+            heard: Some(heard),
+            is_call: false,
+            from: heard.from.to_string(),
+            age: Some(now.saturating_sub(heard.last)),
+            rate: rate(heard),
+        };
+        lines.insert((topic, false), line);
+    }
+    for (topic, kind, described, from) in book.announced() {
+        let is_call = kind == Kind::Call;
+        lines.entry((topic, is_call)).or_insert_with(|| Line {
+            topic,
+            described: Some(described),
+            heard: None,
+            is_call,
+            from: from.to_string(),
+            age: None,
+            rate: None,
+        });
+    }
+    lines.into_values().collect()
+}
+
+#[expect(clippy::cast_precision_loss, reason = "a rate shown to people")]
+fn rate(heard: &Heard) -> Option<f64> {
+    let span = heard.last.saturating_sub(heard.first).as_secs_f64();
+    let gaps = heard.values.checked_sub(1).filter(|gaps| *gaps > 0)?;
+    (span > 0.0).then(|| gaps as f64 / span)
+}
+
+const HEAD: [&str; 7] = ["TOPIC", "KIND", "ORIGIN", "NAME", "RATE", "LAST", "TYPE"];
+
+fn table(lines: &[Line<'_>]) -> Table {
+    let mut table = Table::new(HEAD.map(str::to_owned));
+    for line in lines {
+        let dash = || "-".to_owned();
+        table.row([
+            line.topic.to_string(),
+            line.kind().to_owned(),
+            origin(line.topic.space).to_owned(),
+            line.name().map_or_else(dash, str::to_owned),
+            line.rate.map_or_else(dash, |rate| format!("{rate:.1}/s")),
+            line.age.map_or_else(dash, age),
+            line.type_name().unwrap_or_else(dash),
+        ]);
+    }
+    table
+}
+
+/// Spaces that are asked for their calls before anything is heard of them.
+const FIRST_ASKED: [u16; 3] = [0, 1, 2];
+
+fn origin(space: SpaceId) -> &'static str {
+    match space {
+        SpaceId::UA => "OPC UA",
+        SpaceId::ROS1 => "ROS 1",
+        _ => "ROS 2",
+    }
+}
+
+impl Line<'_> {
+    const fn kind(&self) -> &'static str {
+        match self.is_call {
+            true => "call",
+            false => "value",
+        }
+    }
+
+    /// What people call it.
+    fn name(&self) -> Option<&str> {
+        let name = self.described?.name.as_str();
+        (!name.is_empty()).then_some(name)
+    }
+
+    fn type_name(&self) -> Option<String> {
+        if let Some(described) = self.described {
+            return Some(described.summary());
+        }
+        let heard = self.heard?;
+        if heard.secured {
+            return Some("(secured)".to_owned());
+        }
+        let (builtin, is_array) = heard.only?;
+        let array = if is_array { "[]" } else { "" };
+        Some(format!("{}{array}", builtin.name()))
+    }
+
+    fn shown(&self) -> Shown<'_> {
+        fn shown(fields: &[Field]) -> Vec<ShownField<'_>> {
+            fields.iter().map(Field::shown).collect()
+        }
+        let call = self.described.and_then(Described::call);
+        let fields = self.described.and_then(|described| match &described.what {
+            What::Value(fields) => Some(shown(fields)),
+            What::Call(_) => None,
+        });
+        let description = self
+            .described
+            .map(|described| described.description.as_str());
+        Shown {
+            topic: self.topic.to_string(),
+            kind: self.kind(),
+            space: self.topic.space.get(),
+            origin: origin(self.topic.space),
+            name: self.name(),
+            type_name: self.type_name(),
+            description: description.filter(|text| !text.is_empty()),
+            fields,
+            takes: call.map(|call| shown(&call.request)),
+            gives: call.map(|call| shown(&call.response)),
+            values: self.heard.map_or(0, |heard| heard.values),
+            keep_alives: self.heard.map_or(0, |heard| heard.keep_alives),
+            rate_hz: self.rate,
+            age_s: self.age.map(|age| age.as_secs_f64()),
+            secured: self.heard.is_some_and(|heard| heard.secured),
+            sender: &self.from,
+            sender_changed: self.heard.map_or(0, |heard| heard.changed_hands),
+        }
+    }
+
+    /// All of it, a line each.
+    fn told(&self) -> String {
+        let mut text = String::new();
+        let mut line = |name: &str, value: &str| {
+            text.push_str(&harmless(&format!("{:<12} {value}", format!("{name}:"))));
+            text.push('\n');
+        };
+        line("topic", &self.topic.to_string());
+        line("kind", self.kind());
+        line("origin", origin(self.topic.space));
+        if let Some(name) = self.name() {
+            line("name", name);
+        }
+        if let Some(described) = self.described.filter(|it| !it.description.is_empty()) {
+            line("description", &described.description);
+        }
+        line(
+            "type",
+            &self
+                .type_name()
+                .unwrap_or_else(|| "not announced".to_owned()),
+        );
+        line("sender", &self.from);
+        if let Some(heard) = self.heard {
+            line("values", &heard.values.to_string());
+            if let Some(rate) = self.rate {
+                line("rate", &format!("{rate:.1}/s"));
+            }
+            if heard.changed_hands > 0 {
+                let changed = format!(
+                    "changed {} times: do two programs send it?",
+                    heard.changed_hands
+                );
+                line("sender", &changed);
+            }
+        }
+        let parts = match self.described.map(|described| &described.what) {
+            None => Vec::new(),
+            Some(What::Value(fields)) => vec![("field", fields)],
+            Some(What::Call(call)) => vec![("takes", &call.request), ("gives", &call.response)],
+        };
+        for (what, fields) in parts {
+            for field in fields {
+                let about = match field.description.as_str() {
+                    "" => String::new(),
+                    about => format!("  # {about}"),
+                };
+                line(what, &format!("{}: {}{about}", field.name, field.kind()));
+            }
+        }
+        text
+    }
+}

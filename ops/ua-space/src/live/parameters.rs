@@ -1,0 +1,243 @@
+//! `name=value` of a command line as the request of a call, by what the call takes.
+
+use serde_json::{Value, json};
+use uadp::BuiltinType;
+
+use super::described::{Field, list};
+use crate::shape::FieldValue;
+use crate::values::variant_bytes;
+
+/// What is wrong with the words, and what there should be.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{what}\n  = help: {help}")]
+pub(crate) struct WrongParameter {
+    what: String,
+    help: String,
+}
+
+/// The request: a FieldCount and so many Variants, in the order of the call. What may be left out and is, is a null
+/// Variant; with nothing given at all there are no fields.
+///
+/// # Errors
+/// [`WrongParameter`] names the first word that is wrong, or what is missing, and says what the call takes.
+pub(crate) fn request(words: &[String], takes: &[Field]) -> Result<Vec<u8>, WrongParameter> {
+    let wrong = |what: String| WrongParameter {
+        what,
+        help: match takes {
+            [] => "this call takes nothing".to_owned(),
+            _ => format!("this call takes {}", list(takes)),
+        },
+    };
+    let mut given: Vec<Option<Value>> = vec![None; takes.len()];
+    for word in words {
+        let (name, text) = word
+            .split_once('=')
+            .ok_or_else(|| wrong(format!("`{word}` is no name=value")))?;
+        let at = takes.iter().position(|field| field.name == name);
+        let place = at.and_then(|at| Some((takes.get(at)?, given.get_mut(at)?)));
+        let Some((field, place)) = place else {
+            return Err(wrong(format!("there is no parameter `{name}`")));
+        };
+        if place.is_some() {
+            return Err(wrong(format!("`{name}` is given twice")));
+        }
+        *place = Some(value(field, text).map_err(|why| wrong(format!("{name}: {why}")))?);
+    }
+    let missing = takes.iter().zip(&given);
+    let missing: Vec<&str> = missing
+        .filter(|(field, value)| value.is_none() && !field.optional)
+        .map(|(field, _)| field.name.as_str())
+        .collect();
+    if !missing.is_empty() {
+        return Err(wrong(format!("{} is missing", missing.join(", "))));
+    }
+    if given.iter().all(Option::is_none) {
+        return Ok(vec![0, 0]);
+    }
+    let count = u16::try_from(takes.len()).map_err(|_| wrong("too many parameters".to_owned()))?;
+    let mut block = count.to_le_bytes().to_vec();
+    for (field, value) in takes.iter().zip(given) {
+        let shown = FieldValue {
+            ua_type: value
+                .is_some()
+                .then_some(field.builtin)
+                .flatten()
+                .map(BuiltinType::id),
+            value,
+            ..FieldValue::default()
+        };
+        let bytes = variant_bytes(&shown).map_err(|why| {
+            wrong(format!("{}: {why}", field.name).replace(": .Value", ": value"))
+        })?;
+        block.extend(bytes);
+    }
+    Ok(block)
+}
+
+fn value(field: &Field, text: &str) -> Result<Value, String> {
+    let Some(builtin) = field.builtin else {
+        return Err("it is of a type that is not known here".to_owned());
+    };
+    if !field.is_array() {
+        return scalar(builtin, text);
+    }
+    if field.rank > 1 {
+        return Err(format!("{} cannot be given here", field.kind()));
+    }
+    let elements = match text.trim().starts_with('[') {
+        true => match serde_json::from_str(text) {
+            Ok(Value::Array(elements)) => elements,
+            Ok(_) | Err(_) => return Err(format!("`{text}` is no list as [1, 2, 3]")),
+        },
+        false if text.is_empty() => Vec::new(),
+        false => text.split(',').map(|text| json!(text.trim())).collect(),
+    };
+    if let [size] = field.dimensions.as_slice()
+        && *size > 0
+        && usize::try_from(*size) != Ok(elements.len())
+    {
+        let given = elements.len();
+        return Err(format!(
+            "{} takes {size} values, and {given} are given",
+            field.kind()
+        ));
+    }
+    let elements = elements.iter().map(|element| match element.as_str() {
+        Some(text) => scalar(builtin, text),
+        None => scalar(builtin, &element.to_string()),
+    });
+    elements.collect::<Result<_, _>>()
+}
+
+/// A text as it is typed, as the JSON of its type.
+fn scalar(builtin: BuiltinType, text: &str) -> Result<Value, String> {
+    let expected = || format!("expected a {}, found `{text}`", builtin.name());
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "all others are typed as JSON, or as texts"
+    )]
+    match builtin {
+        BuiltinType::Boolean => text
+            .parse::<bool>()
+            .map(Value::from)
+            .map_err(|_| expected()),
+        BuiltinType::SByte
+        | BuiltinType::Byte
+        | BuiltinType::Int16
+        | BuiltinType::UInt16
+        | BuiltinType::Int32
+        | BuiltinType::UInt32
+        | BuiltinType::Int64
+        | BuiltinType::UInt64 => match text.parse::<i128>() {
+            Ok(_) => Ok(json!(text)),
+            Err(_) => Err(expected()),
+        },
+        BuiltinType::Float | BuiltinType::Double => match text.parse::<f64>() {
+            Ok(number) if number.is_finite() => Ok(json!(number)),
+            Ok(number) if number.is_nan() => Ok(json!("NaN")),
+            Ok(number) => Ok(json!(if number > 0.0 {
+                "Infinity"
+            } else {
+                "-Infinity"
+            })),
+            Err(_) => Err(expected()),
+        },
+        BuiltinType::String => Ok(json!(text)),
+        _ => Ok(serde_json::from_str(text).unwrap_or_else(|_| json!(text))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use uadp::action::ActionFields;
+
+    use super::super::plain;
+    use super::*;
+
+    fn field(name: &str, builtin: BuiltinType, size: Option<u32>, optional: bool) -> Field {
+        Field {
+            name: name.to_owned(),
+            builtin: Some(builtin),
+            rank: size.map_or(-1, |_| 1),
+            dimensions: size.into_iter().collect(),
+            max_string_length: 0,
+            description: String::new(),
+            optional,
+        }
+    }
+
+    fn takes() -> [Field; 4] {
+        [
+            field("TargetPosition", BuiltinType::Double, Some(6), false),
+            field("MaxVelocity", BuiltinType::Double, None, true),
+            field("ToolFrame", BuiltinType::String, None, true),
+            field("Tries", BuiltinType::Byte, None, true),
+        ]
+    }
+
+    fn of(words: &[&str], takes: &[Field]) -> Result<String, String> {
+        let words: Vec<String> = words.iter().map(|word| (*word).to_owned()).collect();
+        let block = request(&words, takes).map_err(|wrong| wrong.to_string())?;
+        let named = plain::response(ActionFields::Variants(&block), takes).unwrap();
+        Ok(serde_json::to_string(&named).unwrap())
+    }
+
+    #[test]
+    fn words_become_values_of_the_types_the_call_takes_in_its_order() {
+        let words = [
+            "ToolFrame=a=b, c",
+            "TargetPosition=0,0,.5,0,0,3e0",
+            "Tries=3",
+        ];
+        let wanted = r#"{"TargetPosition":[0.0,0.0,0.5,0.0,0.0,3.0],"MaxVelocity":null,"ToolFrame":"a=b, c","Tries":3}"#;
+        assert_eq!(of(&words, &takes()).unwrap(), wanted);
+        let json = ["TargetPosition=[1, 2, 3, 4, 5, 6.5]"];
+        assert!(
+            of(&json, &takes())
+                .unwrap()
+                .contains("[1.0,2.0,3.0,4.0,5.0,6.5]")
+        );
+        assert_eq!(of(&[], &takes()[1..]).unwrap(), "{}");
+    }
+
+    #[test]
+    fn what_is_wrong_is_named_and_the_call_says_what_it_takes() {
+        let help = "\n  = help: this call takes TargetPosition: Double[6], [MaxVelocity: Double], \
+                    [ToolFrame: String], [Tries: Byte]";
+        let place = "TargetPosition=1,2,3,4,5,6";
+        for (words, what) in [
+            (&[][..], "TargetPosition is missing"),
+            (&["MaxVelocity=1"], "TargetPosition is missing"),
+            (&[place, "Speed=1"], "there is no parameter `Speed`"),
+            (&[place, "Tries"], "`Tries` is no name=value"),
+            (&[place, "Tries=1", "Tries=2"], "`Tries` is given twice"),
+            (
+                &[place, "Tries=much"],
+                "Tries: expected a Byte, found `much`",
+            ),
+            (
+                &[place, "Tries=256"],
+                "Tries: value: expected Byte, found \"256\"",
+            ),
+            (
+                &[place, "MaxVelocity=fast"],
+                "MaxVelocity: expected a Double, found `fast`",
+            ),
+            (
+                &["TargetPosition=1,2"],
+                "TargetPosition: Double[6] takes 6 values, and 2 are given",
+            ),
+            (
+                &["TargetPosition=[1,"],
+                "TargetPosition: `[1,` is no list as [1, 2, 3]",
+            ),
+        ] {
+            assert_eq!(of(words, &takes()).unwrap_err(), format!("{what}{help}"));
+        }
+        let nothing = of(&["Force=1"], &[]).unwrap_err();
+        assert!(
+            nothing.ends_with("= help: this call takes nothing"),
+            "{nothing}"
+        );
+    }
+}

@@ -1,0 +1,373 @@
+//! A run of a skill, followed from its start to its end by what the component publishes.
+
+use std::time::Duration;
+
+use mappings::TopicId;
+use serde::Serialize;
+use serde_json::Value;
+
+use super::plain::Named;
+
+/// Which values tell of the runs of a skill. Their identifiers follow from that of its Start.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Places {
+    state: TopicId,
+    events: TopicId,
+    result: TopicId,
+    /// The call that ends a run.
+    pub(super) halt: TopicId,
+}
+
+/// What there is to tell of a run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub(super) enum Step {
+    /// It came into another state.
+    State {
+        state: String,
+        #[serde(skip_serializing_if = "Option::is_none")]
+        transition: Option<String>,
+    },
+    /// How far it is.
+    Progress { progress: f64, step: String },
+    /// How it ended.
+    Result {
+        succeeded: bool,
+        message: String,
+        results: Named,
+    },
+}
+
+/// How a run went.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum End {
+    Succeeded,
+    Failed,
+    /// Another run began, and the result of this one was not heard.
+    Overtaken,
+    /// It ended, and its result was not heard.
+    NoResult,
+    /// Nothing is heard of the component.
+    Silent,
+}
+
+/// A run that is followed.
+#[derive(Debug)]
+pub(super) struct Run {
+    number: u64,
+    state: Option<String>,
+    progress: Option<(u32, String)>,
+    ended: Option<(End, Duration)>,
+    heard: Duration,
+    succeeded: Option<bool>,
+}
+
+impl Places {
+    /// Of a call that starts a skill; `None` for a call that is none.
+    pub(super) fn of(start: TopicId, name: &str) -> Option<Self> {
+        let (space, namespace, id) = start.triple();
+        if !name.ends_with(".Start") || id % 100 != START {
+            return None;
+        }
+        let skill = id - START;
+        let place = |part| TopicId::new(space, namespace, skill.checked_add(part)?);
+        Some(Self {
+            state: place(1)?,
+            events: place(2)?,
+            result: place(4)?,
+            halt: place(6)?,
+        })
+    }
+
+    /// Whether something comes there that a run is followed by.
+    pub(super) fn has(&self, topic: TopicId) -> bool {
+        [self.state, self.events, self.result].contains(&topic)
+    }
+}
+
+impl Run {
+    pub(super) fn new(number: u64, now: Duration) -> Self {
+        Self {
+            number,
+            state: None,
+            progress: None,
+            ended: None,
+            heard: now,
+            succeeded: None,
+        }
+    }
+
+    /// What a value says that is new.
+    pub(super) fn handle(
+        &mut self,
+        places: &Places,
+        (topic, value): (TopicId, &Named),
+        now: Duration,
+    ) -> Vec<Step> {
+        self.heard = now;
+        if topic == places.result {
+            self.result(value, now)
+        } else if topic == places.events {
+            self.event(value)
+        } else {
+            self.state(value, now)
+        }
+    }
+
+    fn event(&mut self, value: &Named) -> Vec<Step> {
+        if value.number("run") != Some(self.number) {
+            return Vec::new();
+        }
+        let transition = value.text("transition").map(str::to_owned);
+        match value.text("to_state") {
+            Some(state) => self.reach(state, transition),
+            None => Vec::new(),
+        }
+    }
+
+    fn state(&mut self, value: &Named, now: Duration) -> Vec<Step> {
+        match value.number("run") {
+            Some(run) if run == self.number => {}
+            // Runs are counted.
+            Some(run) if run > self.number => {
+                self.ended.get_or_insert((End::Overtaken, now));
+                return Vec::new();
+            }
+            Some(_) | None => return Vec::new(),
+        }
+        let state = value.text("state").unwrap_or_default();
+        let transition = value
+            .text("last_transition")
+            .filter(|text| !text.is_empty());
+        let mut steps = self.reach(state, transition.map(str::to_owned));
+        let progress = value
+            .get("progress")
+            .and_then(Value::as_f64)
+            .unwrap_or_default();
+        let step = value.text("step").unwrap_or_default().to_owned();
+        let reached = (percent(progress), step);
+        let is_news = self.progress.as_ref() != Some(&reached);
+        if is_news && reached != (0, String::new()) {
+            steps.push(Step::Progress {
+                progress,
+                step: reached.1.clone(),
+            });
+        }
+        self.progress = Some(reached);
+        if !matches!(state, "Running" | "Suspended") {
+            self.ended.get_or_insert((End::NoResult, now));
+        }
+        steps
+    }
+
+    fn reach(&mut self, state: &str, transition: Option<String>) -> Vec<Step> {
+        if self.state.as_deref() == Some(state) {
+            return Vec::new();
+        }
+        self.state = Some(state.to_owned());
+        vec![Step::State {
+            state: state.to_owned(),
+            transition,
+        }]
+    }
+
+    fn result(&mut self, value: &Named, now: Duration) -> Vec<Step> {
+        if value.number("run") != Some(self.number) || self.succeeded.is_some() {
+            return Vec::new();
+        }
+        let succeeded = value.get("succeeded").and_then(Value::as_bool) == Some(true);
+        self.succeeded = Some(succeeded);
+        self.ended.get_or_insert((End::NoResult, now));
+        vec![Step::Result {
+            succeeded,
+            message: value.text("message").unwrap_or_default().to_owned(),
+            results: results(value),
+        }]
+    }
+
+    /// How it ended, when all is told that there is to tell.
+    pub(super) fn end(&self, now: Duration) -> Option<End> {
+        let stands = self
+            .state
+            .as_deref()
+            .is_some_and(|state| state != "Running" && state != "Suspended");
+        let since = self.ended.map(|(_, at)| now.saturating_sub(at));
+        match (self.succeeded, self.ended) {
+            // The last transition may follow its result.
+            (Some(succeeded), _) if stands || since >= Some(LAST) => Some(match succeeded {
+                true => End::Succeeded,
+                false => End::Failed,
+            }),
+            (None, Some((end, _))) if since >= Some(LATE) => Some(end),
+            (Some(_) | None, _) if now.saturating_sub(self.heard) >= SILENT => Some(End::Silent),
+            (Some(_) | None, _) => None,
+        }
+    }
+}
+
+/// What came out, by name.
+fn results(value: &Named) -> Named {
+    let list = |name: &str| {
+        let found = value.get(name).and_then(Value::as_array);
+        found.map_or(&[][..], Vec::as_slice)
+    };
+    let pairs = list("names").iter().zip(list("values"));
+    let pairs = pairs.filter_map(|(name, json)| {
+        let (name, json) = (name.as_str()?, json.as_str()?);
+        let value = serde_json::from_str(json).unwrap_or_else(|_| json.into());
+        Some((name.to_owned(), value))
+    });
+    Named(pairs.collect())
+}
+
+#[expect(
+    clippy::cast_possible_truncation,
+    clippy::cast_sign_loss,
+    reason = "between 0 and 100"
+)]
+fn percent(progress: f64) -> u32 {
+    (progress.clamp(0.0, 1.0) * 100.0).round() as u32
+}
+
+impl Step {
+    /// For people, a line.
+    pub(super) fn told(&self) -> String {
+        match self {
+            Self::State { state, transition } => match transition {
+                Some(transition) => format!("{state} ({transition})"),
+                None => state.clone(),
+            },
+            Self::Progress { progress, step } => match step.as_str() {
+                "" => format!("{} %", percent(*progress)),
+                step => format!("{} %, {step}", percent(*progress)),
+            },
+            Self::Result {
+                succeeded,
+                message,
+                results,
+            } => {
+                let mut text = match succeeded {
+                    true => "succeeded".to_owned(),
+                    false => "failed".to_owned(),
+                };
+                if !message.is_empty() {
+                    text.push_str(&format!(": {message}"));
+                }
+                for (name, value) in &results.0 {
+                    text.push_str(&format!("\n{name}: {value}"));
+                }
+                text
+            }
+        }
+    }
+}
+
+/// Place of Start among the identifiers of a skill.
+const START: u16 = 5;
+/// After the result, for the last transition.
+const LAST: Duration = Duration::from_millis(500);
+/// For the result of a run that ended: two of its repetitions.
+const LATE: Duration = Duration::from_secs(3);
+/// States are repeated every second.
+const SILENT: Duration = Duration::from_secs(5);
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    const START: &str = "gripper.Grasp.Start";
+
+    fn places() -> Places {
+        Places::of("ua_0_7_105".parse().unwrap(), START).unwrap()
+    }
+
+    fn at(seconds: u64) -> Duration {
+        Duration::from_secs(seconds)
+    }
+
+    fn named(json: &Value) -> Named {
+        let object = json.as_object().unwrap();
+        Named(
+            object
+                .iter()
+                .map(|(name, value)| (name.clone(), value.clone()))
+                .collect(),
+        )
+    }
+
+    fn state(run: &mut Run, of: u64, state: &str, progress: f64, now: u64) -> Vec<String> {
+        let value = json!({"run": of, "state": state, "progress": progress, "step": "Closing", "last_transition": "X"});
+        let steps = run.handle(&places(), (places().state, &named(&value)), at(now));
+        steps.iter().map(Step::told).collect()
+    }
+
+    fn result(run: &mut Run, of: u64, succeeded: bool, now: u64) -> Vec<String> {
+        let value = json!({
+            "run": of, "succeeded": succeeded, "message": "why", "names": ["Gripped"], "values": ["true"]
+        });
+        let steps = run.handle(&places(), (places().result, &named(&value)), at(now));
+        steps.iter().map(Step::told).collect()
+    }
+
+    #[test]
+    fn a_start_says_where_its_skill_tells_of_its_runs() {
+        let topic = |text: &str| text.parse::<TopicId>().unwrap();
+        assert!(places().has(topic("ua_0_7_101")) && places().has(topic("ua_0_7_104")));
+        assert_eq!(places().halt, topic("ua_0_7_106"));
+        assert!(!places().has(topic("ua_0_8_101")));
+        assert_eq!(Places::of(topic("ua_0_7_106"), "gripper.Grasp.Halt"), None);
+        assert_eq!(Places::of(topic("ua_0_7_61"), "reset.Start"), None);
+    }
+
+    #[test]
+    fn only_the_own_run_counts_and_it_ends_with_its_result() {
+        let mut run = Run::new(3, at(0));
+        assert!(state(&mut run, 2, "Ready", 1.0, 0).is_empty());
+        assert!(
+            result(&mut run, 2, false, 0).is_empty(),
+            "of an earlier run"
+        );
+        assert_eq!(
+            state(&mut run, 3, "Running", 0.4, 1),
+            ["Running (X)", "40 %, Closing"]
+        );
+        assert!(
+            state(&mut run, 3, "Running", 0.4, 2).is_empty(),
+            "nothing new"
+        );
+        assert_eq!(run.end(at(2)), None);
+        assert_eq!(
+            result(&mut run, 3, true, 3),
+            ["succeeded: why\nGripped: true"]
+        );
+        assert_eq!(run.end(at(3)), None, "it is running still");
+        assert_eq!(state(&mut run, 3, "Ready", 0.4, 3), ["Ready (X)"]);
+        assert_eq!(run.end(at(3)), Some(End::Succeeded));
+    }
+
+    #[test]
+    fn a_failure_is_no_success_and_the_last_transition_is_not_waited_for_long() {
+        let mut run = Run::new(1, at(0));
+        state(&mut run, 1, "Running", 0.0, 0);
+        result(&mut run, 1, false, 1);
+        assert_eq!(run.end(at(2)), Some(End::Failed));
+    }
+
+    #[test]
+    fn a_run_whose_result_never_comes_has_an_end_all_the_same() {
+        let mut run = Run::new(1, at(0));
+        state(&mut run, 1, "Running", 0.0, 0);
+        assert_eq!(run.end(at(4)), None);
+        assert_eq!(run.end(at(5)), Some(End::Silent));
+        state(&mut run, 1, "Halted", 0.0, 6);
+        assert_eq!(run.end(at(6)), None, "its result may be late");
+        state(&mut run, 1, "Halted", 0.0, 9);
+        assert_eq!(run.end(at(9)), Some(End::NoResult));
+        let mut other = Run::new(1, at(0));
+        state(&mut other, 2, "Running", 0.0, 1);
+        state(&mut other, 2, "Running", 0.0, 4);
+        assert_eq!(other.end(at(4)), Some(End::Overtaken));
+    }
+}

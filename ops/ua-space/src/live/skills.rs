@@ -1,0 +1,180 @@
+//! `ua-space skills`: the skills of all components, and how they are.
+
+use std::collections::BTreeMap;
+use std::io::{self, Write as _};
+use std::time::Duration;
+
+use mappings::TopicId;
+use serde::Serialize;
+use uadp::MessageKind;
+
+use super::book::{Book, News};
+use super::list::json;
+use super::plain::{self, Named};
+use super::text::{Table, age, is_coloured};
+use super::{Go, in_group, until};
+use crate::arguments::Skills;
+use crate::exit::Failure;
+
+/// Behind `<component>.<skill>` in the name of the value that says how a skill is.
+const STATE: &str = ".State";
+
+/// Methods of a skill, in the order of their identifiers.
+const METHODS: [&str; 5] = ["Start", "Halt", "Suspend", "Resume", "Reset"];
+
+/// `ua-space skills`.
+pub(crate) fn skills(arguments: &Skills) -> Result<(), Failure> {
+    in_group(&arguments.group, async |mut live| {
+        live.want_calls([0]);
+        let mut states = States::default();
+        let end = until(live.now(), Some(arguments.seconds));
+        live.listen(end, &mut |news, _| {
+            states.take(&news);
+            Go::On
+        })
+        .await?;
+        let mut found = find(&live.book, &states, live.now());
+        if let Some(component) = &arguments.component {
+            found.retain(|skill| skill.component == *component);
+        }
+        let mut out = io::stdout().lock();
+        if arguments.json {
+            writeln!(out, "{}", json(&found)?)?;
+        } else if found.is_empty() {
+            writeln!(
+                out,
+                "no skills were heard in {} for {} s",
+                live.group(),
+                arguments.seconds
+            )?;
+        } else {
+            table(&found).write(&mut out, is_coloured())?;
+        }
+        live.tell_dropped();
+        Ok(())
+    })
+}
+
+/// What skills last said of their states.
+#[derive(Default)]
+struct States(BTreeMap<TopicId, Named>);
+
+impl States {
+    fn take(&mut self, news: &News<'_>) {
+        let News::Sample(sample) = news else {
+            return;
+        };
+        let described = sample.described.as_deref();
+        let is_state = described.is_some_and(|it| it.name.ends_with(STATE));
+        let has_room = self.0.len() < MOST || self.0.contains_key(&sample.topic);
+        if is_state
+            && has_room
+            && sample.message.kind == MessageKind::KeyFrame
+            && let Ok(state) = plain::message(&sample.message, described)
+        {
+            self.0.insert(sample.topic, state);
+        }
+    }
+}
+
+/// A skill as it is listed.
+#[derive(Debug, Serialize)]
+struct Skill {
+    component: String,
+    skill: String,
+    #[serde(rename = "type")]
+    type_name: Option<String>,
+    type_namespace: Option<String>,
+    /// The topic of its state.
+    topic: String,
+    state: Option<String>,
+    run: Option<u64>,
+    progress: Option<f64>,
+    step: Option<String>,
+    /// Seconds since its state was heard last.
+    age_s: f64,
+    /// Topic of each method.
+    calls: BTreeMap<&'static str, String>,
+    /// What Start takes.
+    takes: Option<String>,
+}
+
+fn find(book: &Book, states: &States, now: Duration) -> Vec<Skill> {
+    // By the place of the state, since two components may have one name.
+    let mut calls: BTreeMap<(u16, u16, String), _> = BTreeMap::new();
+    for (topic, described) in book.calls() {
+        let (space, namespace, _) = topic.triple();
+        calls.insert(
+            (space, namespace, described.name.clone()),
+            (topic, described),
+        );
+    }
+    let skills = book.topics().filter_map(|(topic, heard)| {
+        let described = book.described(topic)?;
+        let name = described.name.strip_suffix(STATE)?;
+        let (component, skill) = name.rsplit_once('.')?;
+        let (space, namespace, _) = topic.triple();
+        let of = |method: &str| calls.get(&(space, namespace, format!("{name}.{method}")));
+        let state = states.0.get(&topic);
+        let text = |field: &str| state.and_then(|state| state.text(field));
+        let skill_type = described.skill_type();
+        Some(Skill {
+            component: component.to_owned(),
+            skill: skill.to_owned(),
+            type_name: skill_type.map(|(name, _)| name.to_owned()),
+            type_namespace: skill_type.map(|(_, namespace)| namespace.to_owned()),
+            topic: topic.to_string(),
+            state: text("state").map(str::to_owned),
+            run: state.and_then(|state| state.number("run")),
+            progress: state.and_then(|state| state.get("progress")?.as_f64()),
+            step: text("step").map(str::to_owned),
+            age_s: now.saturating_sub(heard.last).as_secs_f64(),
+            calls: METHODS
+                .into_iter()
+                .filter_map(|method| Some((method, of(method)?.0.to_string())))
+                .collect(),
+            takes: of("Start").and_then(|(_, start)| {
+                let takes = &start.call()?.request;
+                Some(format!("({})", super::described::list(takes)))
+            }),
+        })
+    });
+    let mut skills: Vec<Skill> = skills.collect();
+    skills.sort_by(|a, b| {
+        (&a.component, &a.topic, &a.skill).cmp(&(&b.component, &b.topic, &b.skill))
+    });
+    skills
+}
+
+const HEAD: [&str; 6] = ["COMPONENT", "SKILL", "TYPE", "STATE", "RUN", "CALL"];
+
+fn table(skills: &[Skill]) -> Table {
+    let mut table = Table::new(HEAD.map(str::to_owned));
+    for skill in skills {
+        let dash = || "-".to_owned();
+        let silent = Duration::try_from_secs_f64(skill.age_s).unwrap_or_default();
+        let state = skill.state.clone().unwrap_or_else(dash);
+        let state = match silent > SILENT {
+            true => format!("{state} {} ago", age(silent)),
+            false => state,
+        };
+        let call = skill.calls.get("Start").map(|topic| {
+            let takes = skill.takes.as_deref().unwrap_or_default();
+            format!("{topic} {takes}")
+        });
+        table.row([
+            skill.component.clone(),
+            skill.skill.clone(),
+            skill.type_name.clone().unwrap_or_else(dash),
+            state,
+            skill.run.map_or_else(dash, |run| run.to_string()),
+            call.unwrap_or_else(dash),
+        ]);
+    }
+    table
+}
+
+/// States that are kept.
+const MOST: usize = 4096;
+/// Three times what a state is repeated in.
+const SILENT: Duration = Duration::from_secs(3);

@@ -1,0 +1,334 @@
+//! `ua-space trace`: how long values take, hop by hop.
+//!
+//! Programs measure their own hops over all topics (`/status`); what each topic takes on its way to here is read off the
+//! times in its messages: when its writer had the value, when it sent it, and when it came.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::io::{self, Write as _};
+
+use mappings::TopicId;
+use serde::{Deserialize, Serialize};
+use uadp::{MessageKind, Timestamp};
+
+use super::book::{News, Sample};
+use super::list::json;
+use super::text::{Table, is_coloured, micros};
+use super::{Go, in_group, until};
+use crate::arguments::Trace;
+use crate::exit::Failure;
+use crate::http::Server;
+use crate::report::warn;
+use crate::survey::look;
+
+/// `ua-space trace`.
+pub(crate) fn trace(arguments: &Trace) -> Result<(), Failure> {
+    let mut topics = Vec::new();
+    if arguments.seconds > 0.0 {
+        topics = in_group(&arguments.group, async |mut live| {
+            let end = until(live.now(), Some(arguments.seconds));
+            let start = live.start_utc();
+            let mut delays = Delays::default();
+            live.listen(end, &mut |news, now| {
+                if let News::Sample(sample) = &news {
+                    let arrived = start + i128::try_from(now.as_nanos()).unwrap_or(i128::MAX / 2);
+                    delays.take(sample, arrived);
+                }
+                Go::On
+            })
+            .await?;
+            live.tell_dropped();
+            Ok(delays.rows())
+        })?;
+    }
+    let servers: Vec<Server> = arguments
+        .metrics
+        .iter()
+        .map(|url| Server::parse(url))
+        .collect::<Result<_, _>>()?;
+    let (mut programs, mut away) = (Vec::new(), None);
+    for (server, url) in servers.iter().zip(&arguments.metrics) {
+        match look(status(server, url)) {
+            Ok(found) => programs.extend(found),
+            Err(failure) => {
+                warn(&failure.to_string());
+                away = Some(failure);
+            }
+        }
+    }
+    print(arguments, &programs, &topics)?;
+    match away {
+        Some(_) => Err(Failure::NotThere),
+        None => Ok(()),
+    }
+}
+
+/// A program's own figures.
+#[derive(Debug, Deserialize, Serialize)]
+struct Program {
+    program: String,
+    space: u8,
+    hops: BTreeMap<String, Hop>,
+}
+
+/// The delays of one hop.
+#[derive(Debug, Clone, Copy, PartialEq, Deserialize, Serialize)]
+struct Hop {
+    p50_us: f64,
+    p99_us: f64,
+    max_us: f64,
+    count: u64,
+    /// Delays below zero, which only clocks that disagree can make.
+    negative: u64,
+}
+
+/// One hop of one topic.
+#[derive(Debug, Serialize)]
+struct Row {
+    topic: String,
+    hop: &'static str,
+    #[serde(flatten)]
+    delays: Hop,
+}
+
+#[derive(Serialize)]
+struct Shown<'a> {
+    programs: &'a [Program],
+    topics: &'a [Row],
+}
+
+/// One object for each space a program serves.
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum Status {
+    One(Box<Program>),
+    Several(Vec<Program>),
+}
+
+async fn status(server: &Server, url: &str) -> Result<Vec<Program>, Failure> {
+    let answer = server.get("/status").await?;
+    if answer.status != 200 {
+        let status = answer.status;
+        return Err(Failure::Unavailable(format!("{url}: HTTP status {status}")));
+    }
+    match serde_json::from_str(&answer.body) {
+        Ok(Status::One(program)) => Ok(vec![*program]),
+        Ok(Status::Several(programs)) => Ok(programs),
+        Err(_) => Err(Failure::Data(format!("{url}/status has no hops"))),
+    }
+}
+
+/// Delays of topics, those that came last.
+#[derive(Default)]
+struct Delays {
+    topics: BTreeMap<TopicId, Topic>,
+}
+
+#[derive(Default)]
+struct Topic {
+    /// The message before: a value that is repeated has the number of the first time.
+    last: Option<u16>,
+    origin: Window,
+    network: Window,
+}
+
+#[derive(Default)]
+struct Window {
+    nanos: VecDeque<u64>,
+    count: u64,
+    negative: u64,
+}
+
+impl Delays {
+    /// Takes note of a message that arrived at that time, in nanoseconds since 1970.
+    fn take(&mut self, sample: &Sample<'_>, arrived: i128) {
+        if sample.message.kind == MessageKind::KeepAlive
+            || (self.topics.len() >= MOST_TOPICS && !self.topics.contains_key(&sample.topic))
+        {
+            return;
+        }
+        let topic = self.topics.entry(sample.topic).or_default();
+        let header = sample.message.header();
+        let is_repeated = header.sequence_number.is_some() && header.sequence_number == topic.last;
+        topic.last = header.sequence_number;
+        if is_repeated {
+            return;
+        }
+        let nanos = |time: Option<uadp::DateTime>, picoseconds: Option<u16>| {
+            let stamp = Timestamp {
+                time: time?,
+                picoseconds: picoseconds.unwrap_or_default(),
+            };
+            Some(stamp.unix_nanos())
+        };
+        let had = nanos(header.timestamp, header.picoseconds);
+        let sent = nanos(sample.network.timestamp, sample.network.picoseconds);
+        if let (Some(had), Some(sent)) = (had, sent) {
+            topic.origin.record(sent - had);
+        }
+        if let Some(sent) = sent {
+            topic.network.record(arrived - sent);
+        }
+    }
+
+    fn rows(&self) -> Vec<Row> {
+        let hops = self.topics.iter().flat_map(|(topic, delays)| {
+            [
+                (*topic, ORIGIN, &delays.origin),
+                (*topic, NETWORK, &delays.network),
+            ]
+        });
+        hops.filter_map(|(topic, hop, window)| {
+            Some(Row {
+                topic: topic.to_string(),
+                hop,
+                delays: window.hop()?,
+            })
+        })
+        .collect()
+    }
+}
+
+impl Window {
+    fn record(&mut self, nanos: i128) {
+        match u64::try_from(nanos) {
+            Ok(nanos) => {
+                self.count += 1;
+                if self.nanos.len() >= MOST_DELAYS {
+                    self.nanos.pop_front();
+                }
+                self.nanos.push_back(nanos);
+            }
+            Err(_) => self.negative += 1,
+        }
+    }
+
+    fn hop(&self) -> Option<Hop> {
+        if self.count + self.negative == 0 {
+            return None;
+        }
+        let mut sorted: Vec<u64> = self.nanos.iter().copied().collect();
+        sorted.sort_unstable();
+        // The smallest that `percent` of all do not exceed.
+        let quantile = |percent: usize| {
+            let rank = (sorted.len() * percent).div_ceil(100);
+            let nanos = sorted.get(rank.saturating_sub(1)).copied();
+            in_micros(nanos.unwrap_or_default())
+        };
+        Some(Hop {
+            p50_us: quantile(50),
+            p99_us: quantile(99),
+            max_us: quantile(100),
+            count: self.count,
+            negative: self.negative,
+        })
+    }
+}
+
+#[expect(clippy::cast_precision_loss, reason = "a delay shown to people")]
+fn in_micros(nanos: u64) -> f64 {
+    nanos as f64 / 1000.0
+}
+
+fn print(arguments: &Trace, programs: &[Program], topics: &[Row]) -> Result<(), Failure> {
+    let mut out = io::stdout().lock();
+    if arguments.json {
+        writeln!(out, "{}", json(&Shown { programs, topics })?)?;
+        return Ok(());
+    }
+    let figures = |hop: &Hop| {
+        let negative = match hop.negative {
+            0 => "-".to_owned(),
+            count => count.to_string(),
+        };
+        let [p50, p99, max] = match hop.count {
+            0 => ["-", "-", "-"].map(str::to_owned),
+            _ => [hop.p50_us, hop.p99_us, hop.max_us].map(micros),
+        };
+        [p50, p99, max, hop.count.to_string(), negative]
+    };
+    let head = |first: &[&str]| {
+        let rest = ["P50", "P99", "MAX", "COUNT", "NEGATIVE"];
+        Table::new(first.iter().chain(&rest).map(|name| (*name).to_owned()))
+    };
+    let bold = is_coloured();
+    if !programs.is_empty() {
+        let mut table = head(&["PROGRAM", "SPACE", "HOP"]);
+        for program in programs {
+            for (hop, delays) in &program.hops {
+                let first = [
+                    program.program.clone(),
+                    program.space.to_string(),
+                    called(hop),
+                ];
+                table.row(first.into_iter().chain(figures(delays)));
+            }
+        }
+        table.write(&mut out, bold)?;
+    }
+    if !topics.is_empty() {
+        if !programs.is_empty() {
+            writeln!(out)?;
+        }
+        let mut table = head(&["TOPIC", "HOP"]);
+        for row in topics {
+            let first = [row.topic.clone(), called(row.hop)];
+            table.row(first.into_iter().chain(figures(&row.delays)));
+        }
+        table.write(&mut out, bold)?;
+    } else if programs.is_empty() {
+        writeln!(out, "nothing that says its times was heard")?;
+    }
+    Ok(())
+}
+
+/// What a hop is, for people.
+fn called(hop: &str) -> String {
+    match hop {
+        "out" => "out: from here into the space".to_owned(),
+        ORIGIN => "origin: in the writer's program".to_owned(),
+        NETWORK => "network: from there to here".to_owned(),
+        "in" => "in: from the space to here".to_owned(),
+        other => other.to_owned(),
+    }
+}
+
+const ORIGIN: &str = "origin";
+const NETWORK: &str = "network";
+const MOST_TOPICS: usize = 1024;
+/// Delays of one hop of one topic that the figures are of.
+const MOST_DELAYS: usize = 2048;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn figures_are_of_what_came_last_and_clocks_that_disagree_are_told() {
+        let mut window = Window::default();
+        assert_eq!(window.hop(), None);
+        window.record(-5);
+        for nanos in 1..=100 {
+            window.record(nanos * 1000);
+        }
+        let hop = window.hop().unwrap();
+        assert_eq!((hop.p50_us, hop.p99_us, hop.max_us), (50.0, 99.0, 100.0));
+        assert_eq!((hop.count, hop.negative), (100, 1));
+        for _ in 0..MOST_DELAYS {
+            window.record(1000);
+        }
+        assert_eq!(window.hop().unwrap().max_us, 1.0);
+    }
+
+    #[test]
+    fn a_program_of_one_space_and_one_of_several_are_read() {
+        let hops = r#"{"out":{"count":1,"negative":0,"p50_us":1.5,"p99_us":2,"max_us":2}}"#;
+        let one = format!(r#"{{"program":"bridge-ros2","space":2,"topics":{{}},"hops":{hops}}}"#);
+        for (text, wanted) in [(one.clone(), 1), (format!("[{one},{one}]"), 2)] {
+            let found = match serde_json::from_str(&text).unwrap() {
+                Status::One(_) => 1,
+                Status::Several(all) => all.len(),
+            };
+            assert_eq!(found, wanted);
+        }
+    }
+}
