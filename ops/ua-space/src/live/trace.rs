@@ -125,8 +125,8 @@ struct Delays {
 
 #[derive(Default)]
 struct Topic {
-    /// The message before: a value that is repeated has the number of the first time.
-    last: Option<u16>,
+    /// When the value of the message before was taken: one that is repeated keeps that time.
+    taken: Option<i128>,
     origin: Window,
     network: Window,
 }
@@ -148,11 +148,6 @@ impl Delays {
         }
         let topic = self.topics.entry(sample.topic).or_default();
         let header = sample.message.header();
-        let is_repeated = header.sequence_number.is_some() && header.sequence_number == topic.last;
-        topic.last = header.sequence_number;
-        if is_repeated {
-            return;
-        }
         let nanos = |time: Option<uadp::DateTime>, picoseconds: Option<u16>| {
             let stamp = Timestamp {
                 time: time?,
@@ -160,10 +155,14 @@ impl Delays {
             };
             Some(stamp.unix_nanos())
         };
-        let had = nanos(header.timestamp, header.picoseconds);
+        let taken = nanos(header.timestamp, header.picoseconds);
         let sent = nanos(sample.network.timestamp, sample.network.picoseconds);
-        if let (Some(had), Some(sent)) = (had, sent) {
-            topic.origin.record(sent - had);
+        let before = std::mem::replace(&mut topic.taken, taken);
+        if let (Some(taken), Some(sent)) = (taken, sent)
+            // The first that is heard may be a repetition too.
+            && before.is_some_and(|before| before != taken)
+        {
+            topic.origin.record(sent - taken);
         }
         if let Some(sent) = sent {
             topic.network.record(arrived - sent);

@@ -1,0 +1,163 @@
+//! `ua-space` beside programs that run: what it lists, echoes and measures of a bridge, and a skill it finds and starts.
+
+use std::path::Path;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use system_tests::{Cell, METRICS_ROS1, Peer, Started, eventually, program};
+
+const SOON: Duration = Duration::from_secs(30);
+const TWIST: &str = "geometry_msgs/Twist";
+
+/// Exit code and output of `ua-space` in the cell's network.
+fn ua_space(words: &[&str]) -> (i32, Vec<String>) {
+    let mut child = Started::new("ua-space", &program("ua-space"))
+        .args(words)
+        .args(["--interface", "lo"])
+        .start();
+    let code = child.wait_for_end(SOON).code().unwrap();
+    (code, child.lines())
+}
+
+fn objects(lines: &[String]) -> Vec<Value> {
+    let lines = lines
+        .iter()
+        .filter_map(|line| serde_json::from_str(line).ok());
+    lines.collect()
+}
+
+#[test]
+fn what_a_ros_1_node_publishes_is_listed_echoed_and_measured_without_a_mapping() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let _master = cell.roscore();
+    let _bridge = cell.bridge_ros1(&[]);
+    let twist = json!({"linear": {"x": 0.5, "y": 0.0, "z": 0.0}, "angular": {"x": 0.0, "y": 0.0, "z": -0.125}});
+    let value = twist.to_string();
+    let repeat = ["--repeat", "0", "--value", &value];
+    let _node = cell.rospy(
+        "ros1_pub.py",
+        &[&["/ua_1_2_10", TWIST], &repeat[..]].concat(),
+    );
+    let listed = eventually("the topic is listed with its type", SOON, || {
+        let (code, lines) = ua_space(&["list", "--seconds", "1", "--json"]);
+        assert_eq!(code, 0, "{lines:?}");
+        let all = objects(&lines).pop()?;
+        let all = all.as_array()?.iter();
+        let mut found = all.filter(|line| line["topic"] == "ua_1_2_10" && line["type"] == TWIST);
+        found.next().cloned()
+    });
+    assert_eq!(
+        (&listed["kind"], &listed["origin"]),
+        (&json!("value"), &json!("ROS 1"))
+    );
+    let (code, lines) = ua_space(&["echo", "/ua_1_2_10", "-n", "1"]);
+    assert_eq!(code, 0, "{lines:?}");
+    for line in ["linear.x: 0.5", "angular.z: -0.125"] {
+        assert!(
+            lines.iter().any(|found| found == line),
+            "{line} in {lines:?}"
+        );
+    }
+    let (code, lines) = ua_space(&["hz", "ua_1_2_10", "--seconds", "1.5", "--json"]);
+    let rate = objects(&lines)
+        .pop()
+        .and_then(|rhythm| rhythm["rate_hz"].as_f64());
+    assert!(
+        code == 0 && rate.is_some_and(|rate| rate > 2.0),
+        "{lines:?}"
+    );
+    let (code, lines) = ua_space(&[
+        "trace",
+        "--metrics",
+        METRICS_ROS1,
+        "--seconds",
+        "1",
+        "--json",
+    ]);
+    let traced = objects(&lines).pop().unwrap_or_default();
+    let program = &traced["programs"][0];
+    assert_eq!(
+        (code, &program["program"]),
+        (0, &json!("bridge-ros1")),
+        "{lines:?}"
+    );
+    assert!(
+        program["hops"]["out"]["p50_us"].as_f64() > Some(0.0),
+        "{program}"
+    );
+    let hops = traced["topics"].as_array().unwrap();
+    for hop in ["origin", "network"] {
+        let is_it = |row: &&Value| row["topic"] == "ua_1_2_10" && row["hop"] == hop;
+        let row = hops.iter().find(is_it).unwrap_or(&Value::Null);
+        assert!(
+            row["max_us"].as_f64() >= row["p50_us"].as_f64() && row["count"].as_u64() > Some(0),
+            "{row}"
+        );
+    }
+}
+
+#[test]
+fn a_skill_of_a_component_is_found_and_run_to_its_result() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let yaml =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/plant/parallel-gripper.yaml");
+    let _component = Started::new("ua-component", &program("ua-component"))
+        .args([yaml.to_str().unwrap(), "--interface", "lo", "--lds", "none"])
+        .args(["--pki".into(), cell.folder().join("pki")])
+        .start();
+    let skill = eventually(
+        "the skill is listed with its state and its call",
+        SOON,
+        || {
+            let (_, lines) = ua_space(&["skills", "parallel-gripper", "--seconds", "1", "--json"]);
+            let all = objects(&lines).pop()?;
+            let grasp = all
+                .as_array()?
+                .iter()
+                .find(|skill| skill["skill"] == "Grasp")?;
+            let is_whole = grasp["state"].is_string() && grasp["calls"]["Start"].is_string();
+            is_whole.then(|| grasp.clone())
+        },
+    );
+    assert_eq!(
+        (&skill["type"], &skill["topic"], &skill["calls"]["Start"]),
+        (
+            &json!("GraspSkillType"),
+            &json!("ua_0_7_101"),
+            &json!("ua_0_7_105")
+        )
+    );
+    if skill["state"] == "Halted" {
+        let (code, lines) = ua_space(&["call", "parallel-gripper.Grasp.Reset"]);
+        assert_eq!(code, 0, "{lines:?}");
+    }
+    let (code, lines) = ua_space(&["call", "parallel-gripper.Grasp", "Force=12.5", "--json"]);
+    let events = objects(&lines);
+    assert_eq!(
+        (code, &events[0]["fields"]["success"]),
+        (0, &json!(true)),
+        "{lines:?}"
+    );
+    let states = events.iter().filter(|event| event["event"] == "state");
+    let states: Vec<&str> = states.filter_map(|event| event["state"].as_str()).collect();
+    assert_eq!(states, ["Running", "Ready"], "{lines:?}");
+    let result = events
+        .iter()
+        .find(|event| event["event"] == "result")
+        .unwrap_or(&Value::Null);
+    assert_eq!(
+        (&result["succeeded"], &result["results"]),
+        (&json!(true), &json!({"Gripped": true}))
+    );
+    let (code, lines) = ua_space(&["call", "parallel-gripper.Grasp", "Force=hard"]);
+    assert_eq!(code, 64, "{lines:?}");
+    let (code, lines) = ua_space(&["call", "parallel-gripper.Grasp.Resume"]);
+    assert!(
+        code == 1 && lines.iter().any(|line| line.contains("BadInvalidState")),
+        "{lines:?}"
+    );
+}
