@@ -10,8 +10,16 @@ use crate::{
     workspace::{SHIPPED, Workspace},
 };
 
-/// Packages with one program each, of the same name.
-const PROGRAMS: [&str; 4] = ["bridge-ros1", "bridge-ros2", "ua-server", "ua-space"];
+/// Packages, and the program of each that is handed out.
+const PROGRAMS: [(&str, &str); 7] = [
+    ("bridge-ros1", "bridge-ros1"),
+    ("bridge-ros2", "bridge-ros2"),
+    ("discovery", "ua-lds"),
+    ("ua-component", "ua-component"),
+    ("ua-mes", "ua-mes"),
+    ("ua-server", "ua-server"),
+    ("ua-space", "ua-space"),
+];
 
 /// Builds the programs with optimisation and puts them into `target/dist`.
 pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
@@ -21,13 +29,13 @@ pub(crate) fn run(workspace: &Workspace) -> anyhow::Result<Ended> {
         workspace,
         &["build", "--profile", SHIPPED, "--locked", "--bins"],
     );
-    for package in PROGRAMS {
+    for (package, _) in PROGRAMS {
         build.args(["--package", package]);
     }
     must(&mut build)?;
     let folder = workspace.target.join("dist");
     fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
-    for program in PROGRAMS {
+    for (_, program) in PROGRAMS {
         let target = folder.join(program);
         fs::copy(workspace.target.join(SHIPPED).join(program), &target)
             .with_context(|| target.display().to_string())?;
