@@ -114,7 +114,7 @@ proptest! {
         let mut wanted = BTreeMap::new();
         for (id, (asker, executor)) in (0_u32..).zip(&asked) {
             let (asker, executor) = (asker.index(spaces.len()), executor.index(spaces.len()));
-            cell.ask(asker, AskId(id.into()), call(executor), &number(id), ms(3_000));
+            cell.ask(asker, AskId(id.into()), (call(executor), &number(id)), ms(3_000));
             wanted.insert(id, (asker, executor));
         }
         for _ in 0..100 {

@@ -99,7 +99,7 @@ fn a_ros_service_call_starts_a_skill_and_is_answered() {
         let now = cell.now();
         let bridge = &mut cell.programs[BRIDGE].router;
         assert_eq!(bridge.bind_call(start(), &trigger, now), Ok(()));
-        cell.ask(BRIDGE, AskId(1), start(), request, ms(3_000));
+        cell.ask(BRIDGE, AskId(1), (start(), request), ms(3_000));
         cell.run(ms(50));
         let execution = cell.executions(GRIPPER).pop().unwrap();
         assert_eq!(execution.topic, start());
@@ -122,7 +122,7 @@ fn a_ros_service_call_starts_a_skill_and_is_answered() {
 fn a_block_of_fields_is_asked_with_as_it_is() {
     let mut cell = plugged_in(Local::Fields);
     let request = cell::block(&[Variant::Scalar(Scalar::Double(2.5))]);
-    cell.ask(BRIDGE, AskId(1), start(), &request, ms(3_000));
+    cell.ask(BRIDGE, AskId(1), (start(), &request), ms(3_000));
     cell.run(ms(50));
     let execution = cell.executions(GRIPPER).pop().unwrap();
     assert_eq!(execution.request, request);
@@ -162,7 +162,7 @@ fn a_type_that_lacks_what_the_call_wants_is_refused_with_the_name_of_the_field()
             .bind_call(start(), &trigger, now)
             .is_err()
     );
-    cell.ask(BRIDGE, AskId(1), start(), &[], ms(3_000));
+    cell.ask(BRIDGE, AskId(1), (start(), &[]), ms(3_000));
     cell.run(ms(50));
     let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
     let error = answer.unwrap_err();
@@ -182,7 +182,7 @@ fn answers_in_another_order_are_sorted_by_name_and_further_fields_left_out() {
     let trigger = service(Dialect::Ros1, "std_srvs/Trigger");
     let bridge = &mut cell.programs[BRIDGE].router;
     bridge.bind_call(start(), &trigger, now).unwrap();
-    cell.ask(BRIDGE, AskId(1), start(), &[], ms(3_000));
+    cell.ask(BRIDGE, AskId(1), (start(), &[]), ms(3_000));
     cell.run(ms(50));
     let execution = cell.executions(GRIPPER).pop().unwrap();
     let fields = [
@@ -216,11 +216,11 @@ fn a_call_that_changes_all_the_time_is_not_offered_anew_each_time() {
 #[test]
 fn what_nobody_executes_is_refused_and_what_dies_midway_is_unknown() {
     let mut cell = plugged_in(Local::Fields);
-    cell.ask(BRIDGE, AskId(1), topic(0, 9, 105), &[0, 0], ms(3_000));
+    cell.ask(BRIDGE, AskId(1), (topic(0, 9, 105), &[0, 0]), ms(3_000));
     let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
     assert_eq!(answer.unwrap_err().kind, AskErrorKind::Refused);
 
-    cell.ask(BRIDGE, AskId(2), start(), &[0, 0], ms(10_000));
+    cell.ask(BRIDGE, AskId(2), (start(), &[0, 0]), ms(10_000));
     cell.run(ms(50));
     assert_eq!(cell.executions(GRIPPER).len(), 1);
     cell.kill(GRIPPER);
@@ -250,7 +250,7 @@ fn bad_outcomes_are_told_as_what_they_are() {
         (Executed::Answered(vec![1]), AskErrorKind::Failed),
     ];
     for (number, (outcome, kind)) in (1..).zip(outcomes) {
-        cell.ask(BRIDGE, AskId(number), start(), &[0, 0], ms(3_000));
+        cell.ask(BRIDGE, AskId(number), (start(), &[0, 0]), ms(3_000));
         cell.run(ms(50));
         let execution = cell.executions(GRIPPER).pop().unwrap();
         cell.executed(GRIPPER, execution.id, outcome);
@@ -268,7 +268,7 @@ fn requests_from_other_hosts_are_executed_only_where_that_is_allowed() {
         let description = grasp();
         cell.offer(GRIPPER, start(), Offered { description, open });
         cell.run(ms(200));
-        cell.ask(BRIDGE, AskId(1), start(), &[0, 0], ms(3_000));
+        cell.ask(BRIDGE, AskId(1), (start(), &[0, 0]), ms(3_000));
         cell.run(ms(50));
         let executions = cell.executions(GRIPPER);
         assert_eq!(executions.len(), usize::from(open));
@@ -290,7 +290,7 @@ fn a_forged_answer_is_not_believed_whether_from_a_third_space_or_a_third_address
     ]);
     cell.offer(GRIPPER, start(), offered(grasp()));
     cell.run(ms(200));
-    cell.ask(BRIDGE, AskId(1), start(), &[0, 0], ms(3_000));
+    cell.ask(BRIDGE, AskId(1), (start(), &[0, 0]), ms(3_000));
     cell.run(ms(50));
     let execution = cell.executions(GRIPPER).pop().unwrap();
     cell.executed(GRIPPER, execution.id, succeeded(1));
@@ -321,7 +321,7 @@ fn a_forged_answer_is_not_believed_whether_from_a_third_space_or_a_third_address
 #[test]
 fn who_gives_up_gets_no_answer_and_who_executes_is_told() {
     let mut cell = plugged_in(Local::Fields);
-    cell.ask(BRIDGE, AskId(1), start(), &[0, 0], ms(3_000));
+    cell.ask(BRIDGE, AskId(1), (start(), &[0, 0]), ms(3_000));
     cell.run(ms(50));
     let execution = cell.executions(GRIPPER).pop().unwrap();
     let now = cell.now();
@@ -337,7 +337,7 @@ fn who_gives_up_gets_no_answer_and_who_executes_is_told() {
 fn no_more_requests_are_open_than_there_is_room_for() {
     let mut cell = plugged_in(Local::Fields);
     for number in 0..300 {
-        cell.ask(BRIDGE, AskId(number), start(), &[0, 0], ms(60_000));
+        cell.ask(BRIDGE, AskId(number), (start(), &[0, 0]), ms(60_000));
     }
     let refused = cell.answers(BRIDGE);
     assert_eq!(refused.len(), 44);
@@ -367,7 +367,7 @@ fn calls_of_several_components_with_equal_identifiers_are_told_apart() {
         known.name.clone()
     });
     assert_eq!(names, ["gripper.Grasp.Start", "vacuum.Grasp.Start"]);
-    cell.ask(BRIDGE, AskId(1), topic(0, 8, 105), &[0, 0], ms(3_000));
+    cell.ask(BRIDGE, AskId(1), (topic(0, 8, 105), &[0, 0]), ms(3_000));
     cell.run(ms(100));
     assert_eq!(cell.executions(1).len(), 0);
     assert_eq!(cell.executions(2).len(), 1);
@@ -385,7 +385,7 @@ fn a_component_that_dies_is_gone_when_its_values_are_missing_and_back_when_it_is
     assert_eq!(cell.gone(BRIDGE), [], "a datagram or two may be lost");
     cell.run(ms(1_800));
     assert_eq!(cell.gone(BRIDGE), [start()]);
-    cell.ask(BRIDGE, AskId(1), start(), &[0, 0], ms(3_000));
+    cell.ask(BRIDGE, AskId(1), (start(), &[0, 0]), ms(3_000));
     let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
     assert_eq!(answer.unwrap_err().kind, AskErrorKind::Refused);
 
@@ -395,7 +395,7 @@ fn a_component_that_dies_is_gone_when_its_values_are_missing_and_back_when_it_is
     cell.offer(GRIPPER, start(), offered(grasp()));
     cell.run(ms(500));
     assert_eq!(cell.known(BRIDGE), [start()]);
-    cell.ask(BRIDGE, AskId(2), start(), &[0, 0], ms(3_000));
+    cell.ask(BRIDGE, AskId(2), (start(), &[0, 0]), ms(3_000));
     cell.run(ms(50));
     assert_eq!(cell.executions(GRIPPER).len(), 1);
 }
@@ -414,7 +414,7 @@ fn a_component_that_is_started_anew_at_once_is_asked_as_soon_as_its_past_is_over
         (cell.gone(BRIDGE), cell.known(BRIDGE)),
         (vec![start()], vec![start()])
     );
-    cell.ask(BRIDGE, AskId(2), start(), &[0, 0], ms(3_000));
+    cell.ask(BRIDGE, AskId(2), (start(), &[0, 0]), ms(3_000));
     cell.run(ms(50));
     assert_eq!(cell.executions(GRIPPER).len(), 1);
 }

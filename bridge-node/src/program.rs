@@ -79,6 +79,10 @@ pub trait Program: Parser {
 
 /// What a program with a configuration of its own comes to.
 #[derive(Debug)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "there is one, and it is moved once"
+)]
 pub enum Made {
     /// This is to run.
     Run(Mapping),

@@ -1,5 +1,7 @@
 //! The run loop: the only place where a bridge waits.
 
+mod calls;
+
 use std::collections::BTreeMap;
 use std::future::poll_fn;
 use std::io;
@@ -8,7 +10,7 @@ use std::sync::Arc;
 use std::task::Poll;
 use std::time::Duration;
 
-use bridge_core::{Executed, Heard, Notice, Output, Owned, Reason, Refusal, Router};
+use bridge_core::{Heard, Notice, Output, Owned, Reason, Router};
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId};
 use tokio::sync::watch;
@@ -21,7 +23,7 @@ use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
 use crate::mapping_file::Running;
 use crate::metrics::{Requests, Told as _};
-use crate::port::{Delivery, Execution, Port, PortEvent};
+use crate::port::{Delivery, Port, PortEvent};
 use crate::status::{Interfaces, Readiness, Status};
 
 /// A bridge in the middle: router, port and socket, and who asks for the status.
@@ -334,32 +336,15 @@ impl<P: Port> Shell<P> {
             PortEvent::Dropped { reason, why, count } => self.router.dropped(reason, count, why),
             PortEvent::Unmatched { topic } => self.router.unmatched(topic),
             PortEvent::CallFailed { topic, detail } => self.router.call_failed(topic, &detail),
-            PortEvent::Described { topic, description } => {
-                self.router.describe_value(topic, description, now());
-            }
-            PortEvent::CallBound {
-                topic,
-                service_type,
-            } => match self.router.bind_call(topic, &service_type, now()) {
-                Ok(()) => info!(%topic, service_type = %service_type.name(), "call bound"),
-                Err(why) => {
-                    warn!(%topic, service_type = %service_type.name(), "cannot be asked for: {why}")
-                }
-            },
-            PortEvent::CallUnbound { topic } => self.router.unbind_call(topic),
-            PortEvent::CallWanted { topic } => self.router.want_call(topic, now()),
-            PortEvent::Ask {
-                ask,
-                topic,
-                request,
-                timeout,
-            } => self.router.ask(ask, topic, &request, timeout, now()),
-            PortEvent::AskGivenUp { ask } => self.router.give_up(ask, now()),
-            PortEvent::Offer { topic, offered } => self.router.offer(topic, offered, now()),
-            PortEvent::Withdrawn { topic } => self.router.withdraw(topic, now()),
-            PortEvent::Executed { execution, outcome } => {
-                self.router.executed(execution, outcome, now());
-            }
+            event @ (PortEvent::Described { .. }
+            | PortEvent::CallBound { .. }
+            | PortEvent::CallUnbound { .. }
+            | PortEvent::CallWanted { .. }
+            | PortEvent::Ask { .. }
+            | PortEvent::AskGivenUp { .. }
+            | PortEvent::Offer { .. }
+            | PortEvent::Withdrawn { .. }
+            | PortEvent::Executed { .. }) => self.call_event(event),
             PortEvent::Ended(why) => return Err(Failure::new(FailureKind::Unavailable, why)),
         }
         Ok(())
@@ -371,6 +356,10 @@ impl<P: Port> Shell<P> {
     }
 
     /// Carries out what the Router wants done, a bounded number of things; says whether more may wait.
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "those of calls, and those this program does not know"
+    )]
     fn drain(&mut self) -> bool {
         for _ in 0..DRAINED_AT_ONCE {
             let Some(output) = self.router.poll_output(now()) else {
@@ -405,72 +394,11 @@ impl<P: Port> Shell<P> {
                     dropped,
                 } => self.silent(topic, silent, dropped),
                 Output::Retired { topic, instance } => self.port.retired(topic, instance),
-                Output::Action { topic, bytes } => {
-                    if let Err(error) = self.send(&bytes) {
-                        self.router
-                            .not_called(topic, not_sent(error), &error.to_string());
-                    }
-                    self.router.recycle(bytes);
-                }
-                Output::Answer { ask, topic, answer } => {
-                    self.port.answered(ask, topic, answer.map(Bytes::from));
-                }
-                Output::CallKnown { topic, description } => {
-                    info!(%topic, name = description.name, "a call can be asked for");
-                    self.port.call_known(topic, &description);
-                }
-                Output::CallGone { topic } => {
-                    info!(%topic, "a call is gone");
-                    self.port.call_gone(topic);
-                }
-                Output::Execute(execution) => self.execute(execution),
-                Output::Abandoned { execution, topic } => self.port.abandoned(execution, topic),
-                Output::Taken { namespace, by } => self.taken(namespace, by),
                 Output::Notice(notice) => tell(&notice),
-                other => debug!(?other, "an output this program does not know"),
+                other => self.call_output(other),
             }
         }
         true
-    }
-
-    fn execute(&mut self, execution: bridge_core::Execution) {
-        let bridge_core::Execution {
-            id,
-            topic,
-            request,
-            requestor,
-            deadline,
-        } = execution;
-        let execution = Execution {
-            id,
-            topic,
-            request: Bytes::from(request),
-            requestor,
-            deadline,
-        };
-        if self.dry_run || !self.port.execute(execution) {
-            let refused = Executed::Refused(Refusal::NotExecutable);
-            self.router.executed(id, refused, now());
-        }
-    }
-
-    fn taken(&mut self, namespace: u16, by: Option<std::net::SocketAddr>) {
-        match by {
-            Some(by) => {
-                let why = format!(
-                    "namespace {namespace} of space {} is in use from {by}: nothing is published in it; give this \
-                     program another number, or end the other one",
-                    self.own
-                );
-                warn!("{why}");
-                self.taken.insert(namespace, why);
-            }
-            None => {
-                info!(namespace, "the namespace is free again: publishing in it");
-                self.taken.remove(&namespace);
-            }
-        }
-        self.port.taken(namespace, by);
     }
 
     fn silent(&mut self, topic: TopicId, silent: bool, dropped: Option<Reason>) {

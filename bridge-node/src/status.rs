@@ -358,7 +358,7 @@ mod tests {
         let mut router = Router::new(settings, std::sync::Arc::default());
         let call = "ua_0_7_105".parse().unwrap();
         let timeout = std::time::Duration::from_secs(1);
-        router.ask(AskId(1), call, &[0, 0], timeout, crate::clock::now());
+        router.ask(AskId(1), (call, &[0, 0]), timeout, crate::clock::now());
         let ready = Readiness {
             not_ready: Vec::new(),
             interfaces: Interfaces {

@@ -236,7 +236,13 @@ impl Router {
 
     /// Asks for a call. What becomes of it comes as an [`Output::Answer`], within `timeout` or soon after, unless it is
     /// [given up](Self::give_up). `ask` is used once.
-    pub fn ask(&mut self, ask: AskId, topic: TopicId, request: &[u8], timeout: Duration, now: Now) {
+    pub fn ask(
+        &mut self,
+        ask: AskId,
+        (topic, request): (TopicId, &[u8]),
+        timeout: Duration,
+        now: Now,
+    ) {
         let begun = self.begin(topic, request, timeout, now);
         let calls = self.calls_mut(now);
         let call = calls.table.entry(topic).or_default();
@@ -267,7 +273,7 @@ impl Router {
         request: &[u8],
         timeout: Duration,
         now: Now,
-    ) -> Result<(CallId, Option<Arc<CallPlan>>), (Cause, AskError)> {
+    ) -> Result<Begun, (Cause, AskError)> {
         let refuse = |refusal: Refusal, case: &'static str, text: String| {
             (
                 (Reason::CallRefused, case).into(),
@@ -593,6 +599,9 @@ impl Router {
         self.tell_of_drop(about, cause, (total.saturating_sub(1), total), detail);
     }
 }
+
+/// A request, and what its response is read with.
+type Begun = (CallId, Option<Arc<CallPlan>>);
 
 /// What comes of a look at the calls.
 enum Told {

@@ -10,7 +10,7 @@ use uadp::discovery::{
     AnnounceLimits, Announced, Announcement, Announcer, DataSetMetaDataType, Included, List, Probe,
     ProbeLimits, ProbeStep, ProbeTimer, Subject,
 };
-use uadp::{NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader};
+use uadp::{NetworkMessage, NetworkMessageType, PublisherId, SecurityHeader, StatusCode};
 
 use super::receive::DISCOVERY;
 use super::{About, Router};
@@ -321,24 +321,8 @@ impl Router {
             self.drop_undecoded(None, from, &DISCOVERY);
             return;
         };
-        let named = meta_data.name.and_then(split_name);
-        let named = named.map(|(topic, _)| topic);
-        let topic =
-            named.filter(|topic: &TopicId| topic.space == space && topic.triple().2 == *writer_id);
-        if let Some(topic) = topic.filter(|topic| self.is_home(*topic)) {
-            let (_, namespace, _) = topic.triple();
-            self.drop_own(Some(namespace), from, now);
-            return;
-        }
-        if status.0 & STATUS_BAD != 0 {
-            match topic {
-                Some(topic) => self.unlearn(topic, from, now),
-                None => self.learn_of_none(*writer_id, (space, from), now),
-            }
-            return;
-        }
-        let Some(topic) = topic else {
-            self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
+        let Some(topic) = self.subject_of((*writer_id, *status), meta_data, (space, from), now)
+        else {
             return;
         };
         let about = About {
@@ -391,6 +375,32 @@ impl Router {
                 }
             }
         }
+    }
+
+    /// The topic of another program that is announced; what says that there is none is taken in, and what is nonsense counted.
+    fn subject_of(
+        &mut self,
+        (writer_id, status): (u16, StatusCode),
+        meta_data: &DataSetMetaDataType<'_>,
+        (space, from): (SpaceId, SocketAddr),
+        now: Now,
+    ) -> Option<TopicId> {
+        let named = meta_data.name.and_then(split_name);
+        let topic = named.map(|(topic, _)| topic);
+        let topic = topic.filter(|topic| topic.space == space && topic.triple().2 == writer_id);
+        if let Some(topic) = topic.filter(|topic| self.is_home(*topic)) {
+            let (_, namespace, _) = topic.triple();
+            self.drop_own(Some(namespace), from, now);
+            return None;
+        }
+        let bad = status.0 & STATUS_BAD != 0;
+        match topic {
+            Some(topic) if bad => self.unlearn(topic, from, now),
+            None if bad => self.learn_of_none(writer_id, (space, from), now),
+            None => self.count(About::sender(from), Reason::NotInSpace, 1, String::new),
+            Some(topic) => return Some(topic),
+        }
+        None
     }
 
     /// Whether what is said of a topic from there may be the word of its writer.

@@ -166,7 +166,9 @@ impl Router {
             return;
         };
         let over = |claim: &Claim| claim.ends(silence) <= now.monotonic;
-        let free: Vec<(u16, Claim)> = claims.of.extract_if(.., |_, claim| over(claim)).collect();
+        let free = claims.of.iter().filter(|(_, claim)| over(claim));
+        let free: Vec<(u16, Claim)> = free.map(|(of, claim)| (*of, *claim)).collect();
+        claims.of.retain(|_, claim| !over(claim));
         if claims.of.is_empty() {
             self.claims = None;
         }

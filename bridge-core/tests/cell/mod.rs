@@ -222,13 +222,12 @@ impl Cell {
         &mut self,
         at: usize,
         ask: AskId,
-        topic: TopicId,
-        request: &[u8],
+        (topic, request): (TopicId, &[u8]),
         timeout: Duration,
     ) {
         let now = self.now();
         let router = &mut self.programs[at].router;
-        router.ask(ask, topic, request, timeout, now);
+        router.ask(ask, (topic, request), timeout, now);
         self.drain(at);
     }
 

@@ -1,0 +1,134 @@
+//! What passes between the port and the Router about calls, and about what a program without a mapping has.
+
+use std::sync::Arc;
+
+use bridge_core::{CallDescription, Executed, Output, Refusal};
+use bytes::Bytes;
+use mappings::TopicId;
+use messages::ServiceType;
+use tracing::{debug, info, warn};
+
+use super::{Shell, not_sent};
+use crate::clock::now;
+use crate::port::{Execution, Port, PortEvent};
+
+impl<P: Port> Shell<P> {
+    /// Takes in what the port reports of calls, and of values that it describes itself.
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "all others are taken in by who hands these on"
+    )]
+    pub(super) fn call_event(&mut self, event: PortEvent) {
+        match event {
+            PortEvent::Described { topic, description } => {
+                self.router.describe_value(topic, description, now());
+            }
+            PortEvent::CallBound {
+                topic,
+                service_type,
+            } => self.bind_call(topic, &service_type),
+            PortEvent::CallUnbound { topic } => self.router.unbind_call(topic),
+            PortEvent::CallWanted { topic } => self.router.want_call(topic, now()),
+            PortEvent::Ask {
+                ask,
+                topic,
+                request,
+                timeout,
+            } => self.router.ask(ask, (topic, &request), timeout, now()),
+            PortEvent::AskGivenUp { ask } => self.router.give_up(ask, now()),
+            PortEvent::Offer { topic, offered } => self.router.offer(topic, offered, now()),
+            PortEvent::Withdrawn { topic } => self.router.withdraw(topic, now()),
+            PortEvent::Executed { execution, outcome } => {
+                self.router.executed(execution, outcome, now());
+            }
+            _ => {}
+        }
+    }
+
+    fn bind_call(&mut self, topic: TopicId, service_type: &Arc<ServiceType>) {
+        let bound = self.router.bind_call(topic, service_type, now());
+        let service_type = service_type.name();
+        match bound {
+            Ok(()) => info!(%topic, %service_type, "call bound"),
+            Err(why) => warn!(%topic, %service_type, "cannot be asked for: {why}"),
+        }
+    }
+
+    /// Carries out what the Router wants done about calls and namespaces.
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "all others are carried out by who hands these on"
+    )]
+    pub(super) fn call_output(&mut self, output: Output) {
+        match output {
+            Output::Action { topic, bytes } => self.send_action(topic, bytes),
+            Output::Answer { ask, topic, answer } => {
+                self.port.answered(ask, topic, answer.map(Bytes::from));
+            }
+            Output::CallKnown { topic, description } => self.call_known(topic, &description),
+            Output::CallGone { topic } => self.call_gone(topic),
+            Output::Execute(execution) => self.execute(execution),
+            Output::Abandoned { execution, topic } => self.port.abandoned(execution, topic),
+            Output::Taken { namespace, by } => self.taken(namespace, by),
+            other => debug!(?other, "an output this program does not know"),
+        }
+    }
+
+    fn send_action(&mut self, topic: TopicId, bytes: Vec<u8>) {
+        if let Err(error) = self.send(&bytes) {
+            self.router
+                .not_called(topic, not_sent(error), &error.to_string());
+        }
+        self.router.recycle(bytes);
+    }
+
+    fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
+        info!(%topic, name = description.name, "a call can be asked for");
+        self.port.call_known(topic, description);
+    }
+
+    fn call_gone(&mut self, topic: TopicId) {
+        info!(%topic, "a call is gone");
+        self.port.call_gone(topic);
+    }
+
+    fn execute(&mut self, execution: bridge_core::Execution) {
+        let bridge_core::Execution {
+            id,
+            topic,
+            request,
+            requestor,
+            deadline,
+        } = execution;
+        let execution = Execution {
+            id,
+            topic,
+            request: Bytes::from(request),
+            requestor,
+            deadline,
+        };
+        if self.dry_run || !self.port.execute(execution) {
+            let refused = Executed::Refused(Refusal::NotExecutable);
+            self.router.executed(id, refused, now());
+        }
+    }
+
+    fn taken(&mut self, namespace: u16, by: Option<std::net::SocketAddr>) {
+        match by {
+            Some(by) => {
+                let why = format!(
+                    "namespace {namespace} of space {} is in use from {by}: nothing is published in it; give this \
+                     program another number, or end the other one",
+                    self.own
+                );
+                warn!("{why}");
+                self.taken.insert(namespace, why);
+            }
+            None => {
+                info!(namespace, "the namespace is free again: publishing in it");
+                self.taken.remove(&namespace);
+            }
+        }
+        self.port.taken(namespace, by);
+    }
+}
