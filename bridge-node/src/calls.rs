@@ -428,7 +428,7 @@ mod tests {
     use uadp::{BuiltinType, StatusCode};
 
     use super::*;
-    use crate::{CallFault, ServiceCall};
+    use crate::{CallFault, ServiceCall, now};
 
     type Offered = Arc<Mutex<BTreeMap<String, Asker>>>;
 
@@ -534,10 +534,11 @@ mod tests {
 
         /// The number and topic of what is asked next.
         async fn asked(&mut self) -> (AskId, TopicId) {
-            match self.heard().await {
-                PortEvent::Ask { ask, topic, .. } => (ask, topic),
-                other => panic!("{other:?}"),
-            }
+            let event = self.heard().await;
+            let PortEvent::Ask { ask, topic, .. } = event else {
+                panic!("{event:?}");
+            };
+            (ask, topic)
         }
     }
 
@@ -599,7 +600,7 @@ mod tests {
         bench.calls.known(topic(105), start(&[]));
         assert!(bench.calls.is_waiting());
         assert_eq!(bench.offer().len(), 1);
-        bench.calls.gone(topic(105), Instant::now());
+        bench.calls.gone(topic(105), now().monotonic);
         assert_eq!(bench.services(), [""; 0]);
     }
 
@@ -610,7 +611,7 @@ mod tests {
         bench.offer();
         let waits = tokio::spawn(bench.asker("/ua_0_7_105").ask(Bytes::new()));
         bench.asked().await;
-        let now = Instant::now();
+        let now = now().monotonic;
         bench.calls.gone(topic(105), now);
         bench.calls.tidy(now);
         assert!(!waits.is_finished());

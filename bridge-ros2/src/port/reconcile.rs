@@ -203,9 +203,10 @@ impl Ros2Port {
         let found = self
             .policy
             .found(&format!("/{name}"), message_type.as_ref());
-        match found {
-            Found::Made(_) | Found::Fault(_) if message_type.is_none() => Found::Nothing,
-            found => found,
+        let by_pattern = matches!(found, Found::Made(_) | Found::Fault(_));
+        match by_pattern && message_type.is_none() {
+            true => Found::Nothing,
+            false => found,
         }
     }
 
