@@ -118,9 +118,8 @@ impl NodeSet {
             Source::File(path) => {
                 let file = path.display().to_string();
                 let mut xml = String::new();
-                let read = File::open(&path).and_then(|opened| {
-                    opened.take(LARGEST_NODESET + 1).read_to_string(&mut xml)
-                });
+                let read = File::open(&path)
+                    .and_then(|opened| opened.take(LARGEST_NODESET + 1).read_to_string(&mut xml));
                 match read {
                     Ok(bytes) if bytes as u64 > LARGEST_NODESET => {
                         let reason = format!("it has more than {} MiB", LARGEST_NODESET >> 20);
@@ -346,7 +345,11 @@ fn ordered(sets: Vec<NodeSet>) -> Result<Vec<NodeSet>, NodeSetError> {
         }
     }
     for set in &sets {
-        if let Some(uri) = set.needs.iter().find(|uri| !owners.contains_key(uri.as_str())) {
+        if let Some(uri) = set
+            .needs
+            .iter()
+            .find(|uri| !owners.contains_key(uri.as_str()))
+        {
             return Err(NodeSetError::Missing {
                 file: set.file.clone(),
                 uri: uri.clone(),

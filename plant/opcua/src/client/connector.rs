@@ -3,11 +3,11 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use opcua::client::ConnectionSource;
 use opcua::client::transport::{
     Connector, RequestRecv, SecureChannelState, StreamConnection, StreamConnector, TcpTransport,
     TransportConfiguration,
 };
-use opcua::client::ConnectionSource;
 use opcua::core::comms::tcp_codec::TcpCodec;
 use opcua::types::{DecodingOptions, EndpointDescription, Error, StatusCode};
 use tokio::io::{ReadHalf, WriteHalf};

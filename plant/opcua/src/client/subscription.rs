@@ -154,7 +154,10 @@ impl Queue {
         if let Err(mpsc::error::TrySendError::Full(_)) = self.notices.try_send(notice) {
             let total = self.dropped.fetch_add(1, Ordering::Relaxed) + 1;
             if 10_u64.pow(total.ilog10()) == total {
-                warn!(total, "notices of a subscription are thrown away: nobody takes them");
+                warn!(
+                    total,
+                    "notices of a subscription are thrown away: nobody takes them"
+                );
             }
         }
     }
@@ -237,7 +240,12 @@ pub(crate) async fn renew(shared: &Shared, connected: &Connected) -> Result<(), 
                 .find(|(_, one)| one.state == State::Waiting)
             {
                 one.state = State::Making;
-                new = Some((*id, Arc::clone(&one.watches), one.interval, one.queue.clone()));
+                new = Some((
+                    *id,
+                    Arc::clone(&one.watches),
+                    one.interval,
+                    one.queue.clone(),
+                ));
             }
         }
         match (gone, new) {
@@ -301,10 +309,16 @@ async fn make(
             Ok(items) => items.iter().map(|item| item.result.status_code).collect(),
             Err(error) => match failed(&error) {
                 ClientError::Status(status) => vec![status; requests.len()],
-                lost => return Err(lost.to_string()),
+                lost @ (ClientError::NotConnected(_)
+                | ClientError::Lost(_)
+                | ClientError::Answer(_)) => return Err(lost.to_string()),
             },
         };
-        for (at, status) in each.into_iter().enumerate().filter(|(_, status)| status.is_bad()) {
+        for (at, status) in each
+            .into_iter()
+            .enumerate()
+            .filter(|(_, status)| status.is_bad())
+        {
             let watch = page * MOST_PER_REQUEST + at;
             queue.put(Notice::Refused { watch, status });
         }

@@ -20,7 +20,7 @@ use opcua::types::{
 use tokio::sync::{Notify, mpsc, oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, timeout};
-use tracing::{debug, info, warn};
+use tracing::{debug, info};
 
 use super::connector::Direct;
 use super::subscription::Wanted;
@@ -79,6 +79,15 @@ impl Shared {
         connected.ok_or_else(|| self.not_connected())
     }
 
+    fn down(&self, reason: String) {
+        let down = Link::Down { reason };
+        if self.link.send_replace(down.clone()) != down
+            && let Link::Down { reason } = down
+        {
+            info!(url = self.url, reason, "not connected");
+        }
+    }
+
     pub(crate) fn not_connected(&self) -> ClientError {
         let reason = match &*self.link.borrow() {
             Link::Down { reason } => reason.clone(),
@@ -114,50 +123,58 @@ async fn live(shared: &Shared) {
     let client = match library_client(&shared.config) {
         Ok(client) => client,
         Err(reason) => {
-            warn!(url = shared.url, reason, "no client can be made");
-            shared.link.send_replace(Link::Down { reason });
+            shared.down(reason);
             return std::future::pending().await;
         }
     };
-    let mut connects = 0;
-    let mut started = None;
+    let mut life = Life::default();
     let (first, longest) = shared.config.backoff;
     let mut wait = first;
     loop {
         let reason = match connect(shared, &client).await {
-            Ok(mut connection) => {
-                connects += 1;
+            Ok(connection) => {
                 wait = first;
-                let restarted = started.is_some_and(|before| before != connection.started);
-                started = Some(connection.started);
-                for wanted in shared.wanted.lock().values_mut() {
-                    wanted.forget();
-                }
-                *shared.connected.lock() = Some(Arc::clone(&connection.connected));
-                let endpoint = &connection.endpoint;
-                info!(url = shared.url, connects, restarted, "connected");
-                shared.link.send_replace(Link::Up {
-                    restarted,
-                    connects,
-                    endpoint: endpoint.endpoint_url.as_ref().to_owned(),
-                    secured: endpoint.security_mode == MessageSecurityMode::SignAndEncrypt,
-                    application_uri: endpoint.server.application_uri.as_ref().to_owned(),
-                });
-                let reason = watch_over(shared, &mut connection).await;
-                *shared.connected.lock() = None;
-                // Who waits for an answer is told at once.
-                connection.connected.driving.abort();
-                reason
+                hold(shared, &mut life, connection).await
             }
             Err(reason) => reason,
         };
-        if *shared.link.borrow() != (Link::Down { reason: reason.clone() }) {
-            info!(url = shared.url, reason, "not connected");
-        }
-        shared.link.send_replace(Link::Down { reason });
+        shared.down(reason);
         sleep(wait).await;
         wait = (wait * 2).min(longest);
     }
+}
+
+/// What outlives each connection.
+#[derive(Default)]
+struct Life {
+    connects: u64,
+    started: Option<DateTime>,
+}
+
+/// Has a connection until it is lost, and tells why.
+async fn hold(shared: &Shared, life: &mut Life, mut connection: Connection) -> String {
+    life.connects += 1;
+    let before = life.started.replace(connection.started);
+    let restarted = before.is_some_and(|before| before != connection.started);
+    for wanted in shared.wanted.lock().values_mut() {
+        wanted.forget();
+    }
+    *shared.connected.lock() = Some(Arc::clone(&connection.connected));
+    let endpoint = &connection.endpoint;
+    let connects = life.connects;
+    info!(url = shared.url, connects, restarted, "connected");
+    shared.link.send_replace(Link::Up {
+        restarted,
+        connects,
+        endpoint: endpoint.endpoint_url.as_ref().to_owned(),
+        secured: endpoint.security_mode == MessageSecurityMode::SignAndEncrypt,
+        application_uri: endpoint.server.application_uri.as_ref().to_owned(),
+    });
+    let reason = watch_over(shared, &mut connection).await;
+    *shared.connected.lock() = None;
+    // Who waits for an answer is told at once.
+    connection.connected.driving.abort();
+    reason
 }
 
 fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, String> {
@@ -173,28 +190,28 @@ fn library_client(config: &ClientConfig) -> Result<opcua::client::Client, String
     };
     let make = || {
         ClientBuilder::new()
-        .application_name(&config.application_name)
-        .application_uri(&config.application_uri)
-        .product_uri("urn:ua-bridge:plant")
-        .session_name(&config.application_name)
-        .certificate_path(Path::new(OWN_CERTIFICATE))
-        .private_key_path(Path::new(OWN_KEY))
-        .trust_server_certs(config.accept_untrusted)
-        .verify_server_certs(true)
-        .pki_dir(&root)
-        .session_retry_limit(0)
-        .session_timeout(30_000)
-        .request_timeout(config.timeout)
-        .keep_alive_interval(config.keep_alive)
-        .max_failed_keep_alive_count(0)
-        .recreate_subscriptions(false)
-        .min_publish_interval(limits::SHORTEST_PUBLISHING)
-        .max_array_length(limits::LARGEST_ARRAY)
-        .max_string_length(limits::LARGEST_VALUE)
-        .max_byte_string_length(limits::LARGEST_VALUE)
-        .max_message_size(limits::LARGEST_MESSAGE)
-        .max_chunk_count(limits::MOST_CHUNKS)
-        .client()
+            .application_name(&config.application_name)
+            .application_uri(&config.application_uri)
+            .product_uri("urn:ua-bridge:plant")
+            .session_name(&config.application_name)
+            .certificate_path(Path::new(OWN_CERTIFICATE))
+            .private_key_path(Path::new(OWN_KEY))
+            .trust_server_certs(config.accept_untrusted)
+            .verify_server_certs(true)
+            .pki_dir(&root)
+            .session_retry_limit(0)
+            .session_timeout(30_000)
+            .request_timeout(config.timeout)
+            .keep_alive_interval(config.keep_alive)
+            .max_failed_keep_alive_count(0)
+            .recreate_subscriptions(false)
+            .min_publish_interval(limits::SHORTEST_PUBLISHING)
+            .max_array_length(limits::LARGEST_ARRAY)
+            .max_string_length(limits::LARGEST_VALUE)
+            .max_byte_string_length(limits::LARGEST_VALUE)
+            .max_message_size(limits::LARGEST_MESSAGE)
+            .max_chunk_count(limits::MOST_CHUNKS)
+            .client()
     };
     // Without certificates the library complains of them though nobody asks for any.
     let made = if config.pki.is_some() {
@@ -258,7 +275,10 @@ async fn connect(shared: &Shared, client: &opcua::client::Client) -> Result<Conn
                 Err(status) => break status.to_string(),
             };
             if tell.try_send(happened).is_err() {
-                debug!(?happened, "nobody looks at the connection; it tells again a moment later");
+                debug!(
+                    ?happened,
+                    "nobody looks at the connection; it tells again a moment later"
+                );
             }
         };
         drop(end.send(reason));
@@ -356,7 +376,9 @@ async fn what_it_is(session: &Session) -> Result<(Vec<String>, DateTime), String
         attribute_id: AttributeId::Value as u32,
         ..ReadValueId::default()
     });
-    let read = session.read(&wanted, TimestampsToReturn::Neither, 0.0).await;
+    let read = session
+        .read(&wanted, TimestampsToReturn::Neither, 0.0)
+        .await;
     let mut values = read.map_err(|error| error.to_string())?.into_iter();
     let namespaces = values.next().and_then(strings);
     let started = values.next().and_then(|value| {

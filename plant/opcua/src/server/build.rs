@@ -11,9 +11,7 @@ use opcua::server::diagnostics::NamespaceMetadata;
 use opcua::server::node_manager::memory::{
     CoreNodeManager, CoreNodeManagerBuilder, InMemoryNodeManager, InMemoryNodeManagerBuilder,
 };
-use opcua::server::node_manager::{
-    DynNodeManager, NodeManagerBuilder, ServerContext,
-};
+use opcua::server::node_manager::{DynNodeManager, NodeManagerBuilder, ServerContext};
 use opcua::server::{ANONYMOUS_USER_TOKEN_ID, ServerEndpoint};
 use opcua::sync::Mutex;
 use opcua::types::{BuildInfo, DateTime, MessageSecurityMode, UAString};
@@ -320,7 +318,9 @@ impl NodeManagerBuilder for Own {
             {
                 address_space.add_namespace(uri, map.add_namespace(uri));
             }
-            let imported = sets.iter().try_for_each(|set| set.import(address_space, map));
+            let imported = sets
+                .iter()
+                .try_for_each(|set| set.import(address_space, map));
             if let Err(error) = imported {
                 *made.error.lock() = Some(error);
             }

@@ -139,7 +139,7 @@ impl Calls {
         let mut others = Vec::new();
         let end = Instant::now() + LONGEST_REQUEST;
         for call in methods {
-            let call: &'a mut MethodCall = &mut **call;
+            let call: &'a mut MethodCall = call;
             match self.route(call) {
                 Some(Err(status)) => call.set_status(status),
                 Some(Ok((method, name, handler))) => {
@@ -171,7 +171,10 @@ impl Calls {
     }
 
     /// Where a call goes; `None` for objects that are not ours.
-    #[expect(clippy::type_complexity, reason = "said in one place, taken apart in one place")]
+    #[expect(
+        clippy::type_complexity,
+        reason = "said in one place, taken apart in one place"
+    )]
     fn route(
         &self,
         call: &MethodCall,
@@ -248,7 +251,10 @@ pub(crate) fn fits(value: &Variant, data_type: &NodeId, rank: i32, types: &dyn T
         return *data_type == DataTypeId::BaseDataType;
     }
     let fits_rank = if let Variant::Array(array) = value {
-        let dimensions = array.dimensions.as_ref().map_or(1, |sizes| sizes.len().max(1));
+        let dimensions = array
+            .dimensions
+            .as_ref()
+            .map_or(1, |sizes| sizes.len().max(1));
         match rank {
             -2 | 0 => true,
             -3 => dimensions == 1,

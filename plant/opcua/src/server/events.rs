@@ -92,7 +92,11 @@ impl Raised {
     fn field(&self, path: &[QualifiedName]) -> Option<Variant> {
         let names: Vec<&str> = path.iter().map(|name| name.name.as_ref()).collect();
         let core = path.iter().all(|name| name.namespace_index == 0);
-        let own = self.event.fields.iter().find(|(name, _)| path == [name.clone()]);
+        let own = self
+            .event
+            .fields
+            .iter()
+            .find(|(name, _)| path == [name.clone()]);
         if let Some((_, value)) = own {
             return Some(value.clone());
         }
@@ -149,7 +153,8 @@ impl EventField for Raised {
         {
             return value.range_of_owned(index_range).unwrap_or(Variant::Empty);
         }
-        self.base.get_value(attribute_id, index_range, remaining_path)
+        self.base
+            .get_value(attribute_id, index_range, remaining_path)
     }
 }
 

@@ -3,13 +3,11 @@
 
 use std::collections::BTreeMap;
 
-use opcua::nodes::{
-    Base, EventNotifier, Method, Node, NodeType, Object, Variable,
-};
+use opcua::nodes::{Base, EventNotifier, Method, Node, NodeType, Object, Variable};
 use opcua::server::address_space::{AccessLevel, AddressSpace};
 use opcua::types::{
-    DataValue, LocalizedText, NodeClass, NodeId, ObjectId, QualifiedName,
-    ReferenceTypeId, StatusCode, Variant,
+    DataValue, LocalizedText, NodeClass, NodeId, ObjectId, QualifiedName, ReferenceTypeId,
+    StatusCode, Variant,
 };
 
 use super::view::{Declared, View};
@@ -273,7 +271,13 @@ impl Server {
         let mut nodes = BTreeMap::new();
         for planned in planned {
             let id = planned.node.as_node().node_id().clone();
-            let name = planned.node.as_node().browse_name().name.as_ref().to_owned();
+            let name = planned
+                .node
+                .as_node()
+                .browse_name()
+                .name
+                .as_ref()
+                .to_owned();
             if planned.node.node_class() == NodeClass::Method {
                 let calls = &self.inner.calls;
                 calls.add(&planned.parent, &id, &name, &planned.declared);
@@ -301,7 +305,12 @@ impl Server {
             spec.display_name.clone(),
             notifier(spec.event_notifier),
         );
-        self.add(object.into(), &spec.parent, &spec.reference, &spec.type_definition)?;
+        self.add(
+            object.into(),
+            &spec.parent,
+            &spec.reference,
+            &spec.type_definition,
+        )?;
         if spec.event_notifier {
             let server: NodeId = ObjectId::Server.into();
             self.add_reference(&server, &ReferenceTypeId::HasNotifier.into(), &spec.node_id);
@@ -333,7 +342,12 @@ impl Server {
             None,
         );
         set_writable(&mut variable, spec.writable);
-        self.add(variable.into(), &spec.parent, &spec.reference, &spec.type_definition)
+        self.add(
+            variable.into(),
+            &spec.parent,
+            &spec.reference,
+            &spec.type_definition,
+        )
     }
 
     fn add(
@@ -424,7 +438,10 @@ fn notifier(events: bool) -> EventNotifier {
 
 fn insert(own: &mut AddressSpace, node: NodeType, parent: &NodeId, reference: &NodeId) {
     let id = node.as_node().node_id().clone();
-    own.insert(node, None::<&[(&NodeId, &NodeId, opcua::nodes::ReferenceDirection)]>);
+    own.insert(
+        node,
+        None::<&[(&NodeId, &NodeId, opcua::nodes::ReferenceDirection)]>,
+    );
     own.insert_reference(parent, &id, reference.clone());
 }
 
@@ -460,7 +477,11 @@ impl Plan<'_> {
             let Some(first) = child.nodes.first() else {
                 continue;
             };
-            let Some(node) = self.view.node(first).and_then(|node| copy(node, id.clone())) else {
+            let Some(node) = self
+                .view
+                .node(first)
+                .and_then(|node| copy(node, id.clone()))
+            else {
                 continue;
             };
             let mut definitions = child.nodes.iter();
@@ -473,7 +494,10 @@ impl Plan<'_> {
                 type_definition: type_definition.cloned(),
                 node,
             });
-            let parental = child.nodes.iter().find_map(|node| self.view.parental_type(node));
+            let parental = child
+                .nodes
+                .iter()
+                .find_map(|node| self.view.parental_type(node));
             let below = self.view.declared(&child.nodes, parental, &[]);
             self.add(&below, &id, &path, depth + 1)?;
         }
@@ -482,8 +506,8 @@ impl Plan<'_> {
 
     fn wanted(&self, child: &Declared, path: &str) -> bool {
         let name = child.name.name.as_ref();
-        let arguments = matches!(name, "InputArguments" | "OutputArguments")
-            && child.name.namespace_index == 0;
+        let arguments =
+            matches!(name, "InputArguments" | "OutputArguments") && child.name.namespace_index == 0;
         let named = self.spec.optional.iter().any(|wanted| {
             wanted
                 .strip_prefix(path)
@@ -521,7 +545,11 @@ fn copy(node: &NodeType, id: NodeId) -> Option<NodeType> {
         }
         NodeType::Variable(variable) => {
             let mut value = value_of(variable);
-            if value.value.as_ref().is_none_or(|value| *value == Variant::Empty) {
+            if value
+                .value
+                .as_ref()
+                .is_none_or(|value| *value == Variant::Empty)
+            {
                 // The library tells a status only beside a value.
                 value = DataValue {
                     value: Some(Variant::Empty),

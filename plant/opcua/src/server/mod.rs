@@ -20,8 +20,8 @@ use opcua::server::ServerHandle;
 use opcua::server::node_manager::memory::InMemoryNodeManager;
 use opcua::sync::Mutex;
 use opcua::types::{
-    AttributeId, ByteString, DataEncoding, DataValue, LocalizedText, NodeId, NumericRange, QualifiedName,
-    StatusCode, TimestampsToReturn, Variant,
+    AttributeId, ByteString, DataEncoding, DataValue, LocalizedText, NodeId, NumericRange,
+    QualifiedName, StatusCode, TimestampsToReturn, Variant,
 };
 use tokio::net::TcpListener;
 use tokio::task::JoinHandle;
@@ -154,7 +154,14 @@ impl Server {
     #[must_use]
     pub fn namespaces(&self) -> Vec<String> {
         let mut all = Vec::new();
-        for (uri, index) in self.inner.handle.type_tree().read().namespaces().known_namespaces() {
+        for (uri, index) in self
+            .inner
+            .handle
+            .type_tree()
+            .read()
+            .namespaces()
+            .known_namespaces()
+        {
             let index = usize::from(*index);
             if all.len() <= index {
                 all.resize(index + 1, String::new());
@@ -177,7 +184,9 @@ impl Server {
     #[must_use]
     pub fn find_type(&self, namespace_uri: &str, browse_name: &str) -> Option<NodeId> {
         let index = self.namespace(namespace_uri)?;
-        self.inner.spaces.with(|view| view.find_type(index, browse_name))
+        self.inner
+            .spaces
+            .with(|view| view.find_type(index, browse_name))
     }
 
     /// The supertypes of a type, nearest first, without itself.
@@ -190,7 +199,9 @@ impl Server {
     /// Whether a type is another one or a subtype of it.
     #[must_use]
     pub fn is_subtype_of(&self, type_id: &NodeId, base: &NodeId) -> bool {
-        self.inner.spaces.with(|view| view.is_subtype_of(type_id, base))
+        self.inner
+            .spaces
+            .with(|view| view.is_subtype_of(type_id, base))
     }
 
     /// What is directly below a node, in no order that means anything.
@@ -303,7 +314,8 @@ impl Server {
         let raised = events::Raised::new(event, types, id);
         let subscriptions = self.inner.handle.subscriptions();
         // Who watches the Server object is told by the same.
-        subscriptions.notify_events([(&raised as &dyn opcua::nodes::Event, &event.source)].into_iter());
+        subscriptions
+            .notify_events([(&raised as &dyn opcua::nodes::Event, &event.source)].into_iter());
     }
 }
 

@@ -5,14 +5,15 @@ use std::sync::Arc;
 
 use async_trait::async_trait;
 use opcua::nodes::{DefaultTypeTree, NodeType};
-use opcua::server::SubscriptionCache;
 use opcua::server::address_space::{AccessLevel, AddressSpace, user_access_level};
 use opcua::server::diagnostics::NamespaceMetadata;
 use opcua::server::node_manager::memory::{CoreNodeManager, InMemoryNodeManagerImpl};
 use opcua::server::node_manager::{ParsedWriteValue, RequestContext, ServerContext, WriteNode};
+use opcua::server::{CreateMonitoredItem, SubscriptionCache};
 use opcua::sync::RwLock;
 use opcua::types::{
     Argument, AttributeId, DataValue, DateTime, NodeId, ObjectTypeId, ReferenceTypeId, StatusCode,
+    TimestampsToReturn,
 };
 use tokio::time::{Instant, timeout_at};
 
@@ -187,7 +188,10 @@ impl Nodes {
             return Err(StatusCode::BadUserAccessDenied);
         }
         let given = &write.value;
-        if given.status.is_some_and(|status| status != StatusCode::Good) {
+        if given
+            .status
+            .is_some_and(|status| status != StatusCode::Good)
+        {
             return Err(StatusCode::BadWriteNotSupported);
         }
         let value = given.value.clone().ok_or(StatusCode::BadTypeMismatch)?;
@@ -200,7 +204,12 @@ impl Nodes {
             value
         };
         let types = context.type_tree.read();
-        if !fits(&whole, &variable.data_type(), variable.value_rank(), &*types) {
+        if !fits(
+            &whole,
+            &variable.data_type(),
+            variable.value_rank(),
+            &*types,
+        ) {
             return Err(StatusCode::BadTypeMismatch);
         }
         Ok(DataValue {
@@ -245,12 +254,7 @@ pub(crate) fn show(
         shown.iter().map(|node| (node, AttributeId::Value)),
         |node, attribute, range, encoding| {
             let node = address_space.find(node)?.as_node();
-            node.get_attribute(
-                opcua::types::TimestampsToReturn::Both,
-                attribute,
-                range,
-                encoding,
-            )
+            node.get_attribute(TimestampsToReturn::Both, attribute, range, encoding)
         },
     );
     Ok(())
@@ -266,6 +270,26 @@ impl InMemoryNodeManagerImpl for Nodes {
 
     fn namespaces(&self) -> Vec<NamespaceMetadata> {
         self.namespaces.clone()
+    }
+
+    async fn create_value_monitored_items(
+        &self,
+        context: &RequestContext,
+        address_space: &RwLock<AddressSpace>,
+        items: &mut [&mut &mut CreateMonitoredItem],
+    ) {
+        let address_space = address_space.read();
+        for item in items {
+            let what = item.item_to_monitor();
+            let value = address_space.read(context, what, 0.0, TimestampsToReturn::Both);
+            let refused = value.status().is_bad() && value.value.is_none();
+            if refused && value.status() != StatusCode::BadIndexRangeNoData {
+                item.set_status(value.status());
+                continue;
+            }
+            item.set_initial_value(value);
+            item.set_status(StatusCode::Good);
+        }
     }
 
     async fn write(

@@ -33,7 +33,10 @@ pub(crate) struct Routed {
 
 type Done = Result<(), StatusCode>;
 
-#[expect(elided_lifetimes_in_paths, reason = "the trait leaves them out, and has to be met exactly")]
+#[expect(
+    elided_lifetimes_in_paths,
+    reason = "the trait leaves them out, and has to be met exactly"
+)]
 #[async_trait]
 impl NodeManager for Routed {
     fn owns_node(&self, id: &NodeId) -> bool {

@@ -5,7 +5,9 @@ use std::collections::{BTreeMap, HashSet};
 
 use opcua::nodes::{DefaultTypeTree, HasNodeId as _, NodeType};
 use opcua::server::address_space::AddressSpace;
-use opcua::types::{BrowseDirection, Identifier, NodeClass, NodeId, QualifiedName, ReferenceTypeId, VariableTypeId};
+use opcua::types::{
+    BrowseDirection, Identifier, NodeClass, NodeId, QualifiedName, ReferenceTypeId, VariableTypeId,
+};
 
 /// The core namespace and our own namespaces.
 #[derive(Clone, Copy)]
@@ -60,11 +62,9 @@ impl<'a> View<'a> {
         };
         let mut found: Vec<(&NodeId, &NodeId)> = Vec::new();
         for space in [self.core, self.own] {
-            let all =
-                space.find_references(id, None::<(NodeId, bool)>, self.no_types, direction);
+            let all = space.find_references(id, None::<(NodeId, bool)>, self.no_types, direction);
             // Some nodes of the core namespace have thousands.
-            let wanted =
-                all.filter(|one| kinds.iter().any(|kind| *one.reference_type == *kind));
+            let wanted = all.filter(|one| kinds.iter().any(|kind| *one.reference_type == *kind));
             found.extend(wanted.map(|one| (one.reference_type, one.target_node)));
         }
         found.sort_by_cached_key(|(kind, target)| (order(kind), order(target)));

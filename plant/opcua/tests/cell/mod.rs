@@ -1,6 +1,11 @@
 //! A server with two NodeSets, and clients of it.
 
-#![allow(dead_code, reason = "each test takes what it needs")]
+#![allow(
+    dead_code,
+    clippy::allow_attributes,
+    clippy::expect_used,
+    reason = "each test takes what it needs"
+)]
 
 use std::time::Duration;
 
@@ -28,7 +33,11 @@ impl Cell {
     }
 
     pub(crate) fn at(url: &str) -> Self {
-        Self::with(ServerConfig::new("urn:test:cell", "Cell", url.parse().unwrap()))
+        Self::with(ServerConfig::new(
+            "urn:test:cell",
+            "Cell",
+            url.parse().unwrap(),
+        ))
     }
 
     pub(crate) fn with(config: ServerConfig) -> Self {
@@ -88,7 +97,9 @@ pub(crate) fn variable(node: &NodeId, parent: &NodeId, n: usize) -> VariableSpec
 
 pub(crate) async fn next(subscription: &mut Subscription) -> Notice {
     let next = tokio::time::timeout(PATIENCE, subscription.next());
-    next.await.expect("nothing comes").expect("the client is closed")
+    next.await
+        .expect("nothing comes")
+        .expect("the client is closed")
 }
 
 /// The next value.

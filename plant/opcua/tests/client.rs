@@ -1,0 +1,331 @@
+//! Clients whose servers die, come back, want certificates, or are pestered by others.
+
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::expect_used,
+    reason = "test code"
+)]
+
+mod cell;
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use cell::{Cell, PATIENCE, config, next, next_value, press};
+use opcua::types::{NodeId, ObjectId, QualifiedName, StatusCode, VariableId, Variant};
+use plant_opcua::client::{Client, ClientConfig, ClientError, Link, Notice, SecurityChoice, Watch};
+use plant_opcua::server::{Security, Server, ServerConfig};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio::net::{TcpListener, TcpStream};
+
+fn quick() -> ClientConfig {
+    let mut config = config();
+    config.timeout = Duration::from_secs(2);
+    config.keep_alive = Duration::from_millis(100);
+    config.backoff = (Duration::from_millis(20), Duration::from_millis(100));
+    config
+}
+
+async fn until(client: &Client, wanted: impl FnMut(&Link) -> bool) -> Link {
+    let mut link = client.link();
+    let waited = tokio::time::timeout(PATIENCE, link.wait_for(wanted)).await;
+    waited.expect("the link never gets there").unwrap().clone()
+}
+
+fn is_up(link: &Link) -> bool {
+    matches!(link, Link::Up { .. })
+}
+
+fn is_down(link: &Link) -> bool {
+    matches!(link, Link::Down { .. })
+}
+
+#[tokio::test]
+async fn a_server_that_is_started_again_is_found_with_all_subscriptions() {
+    let first = Cell::new();
+    let url = first.server.url().to_owned();
+    press(&first.server, 100, &[]);
+    let client = Client::open(quick(), &url);
+    let link = until(&client, is_up).await;
+    assert!(
+        matches!(&link, Link::Up { restarted: false, connects: 1, secured: false, application_uri, .. }
+        if application_uri == "urn:test:cell"),
+        "{link:?}"
+    );
+    let namespaces = client.namespaces();
+    assert_eq!(namespaces[1], "urn:test:cell", "{namespaces:?}");
+
+    let machines = client.namespace(cell::MACHINES).unwrap();
+    let path = ["ParameterSet", "Force"].map(|name| QualifiedName::new(machines, name));
+    let force = client.translate(&NodeId::new(1, 100), &path).await.unwrap();
+    let watches = vec![
+        Watch::Value(force.clone()),
+        Watch::Value(NodeId::new(1, 77)),
+    ];
+    let mut subscription = client.subscribe(watches, Duration::from_millis(10), 64);
+    assert_eq!(next(&mut subscription).await, Notice::Subscribed);
+    let mut told = [next(&mut subscription).await, next(&mut subscription).await];
+    told.sort_by_key(|notice| matches!(notice, Notice::Refused { .. }));
+    assert!(
+        matches!(&told[0], Notice::Value { watch: 0, value }
+        if value.value == Some(Variant::Double(12.5))),
+        "{told:?}"
+    );
+    assert_eq!(
+        told[1],
+        Notice::Refused {
+            watch: 1,
+            status: StatusCode::BadNodeIdUnknown
+        }
+    );
+
+    first.server.stop().await;
+    until(&client, is_down).await;
+    let refused = client.read(std::slice::from_ref(&force)).await.unwrap_err();
+    assert!(matches!(refused, ClientError::NotConnected(_)), "{refused}");
+
+    let again = Cell::at(&url);
+    press(&again.server, 100, &[]);
+    again.server.show(&force, 1.5).unwrap();
+    let link = until(&client, is_up).await;
+    assert!(
+        matches!(
+            link,
+            Link::Up {
+                restarted: true,
+                connects: 2,
+                ..
+            }
+        ),
+        "{link:?}"
+    );
+    assert_eq!(next(&mut subscription).await, Notice::Subscribed);
+    while next(&mut subscription).await
+        != (Notice::Refused {
+            watch: 1,
+            status: StatusCode::BadNodeIdUnknown,
+        })
+    {}
+    again.server.show(&force, 2.5).unwrap();
+    while next_value(&mut subscription).await != (0, Some(Variant::Double(2.5))) {}
+    assert_eq!(subscription.dropped(), 0);
+    client.close().await;
+    assert_eq!(*client.link().borrow(), Link::Closed);
+    assert_eq!(subscription.next().await, None);
+}
+
+#[tokio::test]
+async fn a_server_that_says_nothing_more_is_taken_for_down() {
+    let cell = Cell::new();
+    // Between the two is a line that falls silent, as when a cable is pulled.
+    let line = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("opc.tcp://{}", line.local_addr().unwrap());
+    let (cut, is_cut) = tokio::sync::watch::channel(false);
+    let server = format!("127.0.0.1:{}", cell.server.port());
+    let relaying = tokio::spawn(async move {
+        loop {
+            let (mut near, _) = line.accept().await.unwrap();
+            let mut far = TcpStream::connect(&server).await.unwrap();
+            let mut is_cut = is_cut.clone();
+            tokio::spawn(async move {
+                let silent = tokio::select! {
+                    _ = tokio::io::copy_bidirectional(&mut near, &mut far) => false,
+                    _ = is_cut.wait_for(|cut| *cut) => true,
+                };
+                if silent {
+                    std::future::pending::<()>().await;
+                }
+            });
+        }
+    });
+    let mut config = quick();
+    config.timeout = Duration::from_millis(500);
+    let client = Client::open(config, &url);
+    until(&client, is_up).await;
+    cut.send_replace(true);
+    let Link::Down { reason } = until(&client, is_down).await else {
+        panic!()
+    };
+    assert!(reason.contains("does not answer"), "{reason}");
+    cut.send_replace(false);
+    until(&client, is_up).await;
+    relaying.abort();
+}
+
+#[tokio::test]
+async fn a_queue_that_is_full_loses_notices_and_counts_them() {
+    let cell = Cell::new();
+    let press = press(&cell.server, 100, &[]);
+    let client = cell.client().await;
+    let force = press.node("ParameterSet/Force").unwrap().clone();
+    let watches = vec![Watch::Value(force.clone())];
+    let mut full = client.subscribe(watches.clone(), Duration::from_millis(10), 2);
+    let mut roomy = client.subscribe(watches, Duration::from_millis(10), 64);
+    next_value(&mut roomy).await;
+    let mut n = 0.0;
+    while full.dropped() == 0 {
+        n += 1.0;
+        cell.server.show(&force, n).unwrap();
+        assert_eq!(next_value(&mut roomy).await, (0, Some(Variant::Double(n))));
+    }
+    // What was there first is still there.
+    assert_eq!(next(&mut full).await, Notice::Subscribed);
+    assert_eq!(roomy.dropped(), 0);
+}
+
+fn scratch(name: &str) -> PathBuf {
+    let path = std::env::temp_dir().join(format!("plant-opcua-{}-{name}", std::process::id()));
+    drop(std::fs::remove_dir_all(&path));
+    path
+}
+
+fn secured(name: &str, trust: bool) -> (Cell, PathBuf) {
+    let pki = scratch(name);
+    let url = "opc.tcp://127.0.0.1:0".parse().unwrap();
+    let config = ServerConfig {
+        security: vec![Security::None, Security::Basic256Sha256],
+        pki: Some(pki.clone()),
+        trust_unknown_clients: trust,
+        ..ServerConfig::new("urn:test:cell", "Cell", url)
+    };
+    (Cell::with(config), pki)
+}
+
+#[tokio::test]
+async fn a_client_with_certificates_has_the_best_security_there_is() {
+    let (cell, server_pki) = secured("server", false);
+    let client_pki = scratch("client");
+    let mut config = config();
+    config.pki = Some(client_pki.clone());
+    config.backoff = (Duration::from_millis(20), Duration::from_millis(100));
+    let strict = Client::open(config.clone(), cell.server.url());
+    let is_refused = |link: &Link| matches!(link, Link::Down { reason } if !reason.is_empty());
+    until(&strict, is_refused).await;
+    strict.close().await;
+    config.accept_untrusted = true;
+    let client = Client::open(config, cell.server.url());
+    until(&client, is_refused).await;
+    // The server does not know the client either, until somebody trusts it.
+    for rejected in std::fs::read_dir(server_pki.join("rejected")).unwrap() {
+        let path = rejected.unwrap().path();
+        std::fs::rename(
+            &path,
+            server_pki.join("trusted").join(path.file_name().unwrap()),
+        )
+        .unwrap();
+    }
+    let link = until(&client, is_up).await;
+    assert!(matches!(link, Link::Up { secured: true, .. }), "{link:?}");
+    let start: NodeId = VariableId::Server_ServerStatus_StartTime.into();
+    let read = client.read(&[start]).await.unwrap();
+    assert!(
+        matches!(read[0].value, Some(Variant::DateTime(_))),
+        "{read:?}"
+    );
+    client.close().await;
+
+    let mut plain = cell::config();
+    plain.security = SecurityChoice::None;
+    let client = Client::open(plain, cell.server.url());
+    let link = until(&client, is_up).await;
+    assert!(matches!(link, Link::Up { secured: false, .. }), "{link:?}");
+    for path in [server_pki, client_pki] {
+        std::fs::remove_dir_all(path).unwrap();
+    }
+}
+
+/// What a peer sends that is no client.
+fn garbage(url: &str) -> Vec<Vec<u8>> {
+    let message = |kind: &[u8], size: u32, rest: &[u8]| {
+        let mut bytes = kind.to_vec();
+        bytes.extend(size.to_le_bytes());
+        bytes.extend(rest);
+        bytes
+    };
+    let mut hello = Vec::new();
+    for number in [0_u32, 65_536, 65_536, 0, 0] {
+        hello.extend(number.to_le_bytes());
+    }
+    hello.extend(u32::try_from(url.len()).unwrap().to_le_bytes());
+    hello.extend(url.as_bytes());
+    let size = u32::try_from(hello.len() + 8).unwrap();
+    let hello_of = |size| message(b"HELF", size, &hello);
+    let after = |rest: Vec<u8>| [hello_of(size), rest].concat();
+    vec![
+        b"GET / HTTP/1.1\r\nHost: cell\r\n\r\n".to_vec(),
+        vec![0; 64],
+        vec![0xff; 4_096],
+        message(b"HELF", 8, &[]),
+        message(b"HELF", u32::MAX, &[0; 32]),
+        hello_of(size - 5),
+        hello_of(size + 1_000_000),
+        // A URL longer than the message.
+        message(
+            b"HELF",
+            32,
+            &[[0_u8; 20].as_slice(), &[0xff, 0xff, 0xff, 0x7f]].concat(),
+        ),
+        after(message(b"OPNF", 8, &[])),
+        after(message(b"OPNF", 0, &[0; 64])),
+        after(message(b"OPNF", 64, &[0xff; 56])),
+        after(message(b"OPNC", 65_000, &[0; 2_000])),
+        after(message(b"MSGF", 24, &[0; 16])),
+        after(message(b"MSGF", 7, &[])),
+        after(message(b"CLOF", 24, &[0x7f; 16])),
+        after(message(b"XXXF", 16, &[0; 8])),
+        after(hello_of(size)),
+    ]
+}
+
+#[tokio::test]
+async fn a_peer_that_sends_garbage_disturbs_nobody() {
+    let cell = Cell::new();
+    let press = press(&cell.server, 100, &[]);
+    let force = press.node("ParameterSet/Force").unwrap().clone();
+    let client = Client::open(quick(), cell.server.url());
+    client.up(PATIENCE).await.unwrap();
+    let watches = vec![Watch::Value(force.clone())];
+    let mut subscription = client.subscribe(watches, Duration::from_millis(10), 256);
+    assert_eq!(
+        next_value(&mut subscription).await.1,
+        Some(Variant::Double(12.5))
+    );
+    let authority = format!("127.0.0.1:{}", cell.server.port());
+    let garbage = garbage(cell.server.url());
+    for (n, bytes) in garbage.iter().enumerate() {
+        let mut peer = TcpStream::connect(&authority).await.unwrap();
+        // It may close before it has read everything.
+        drop(peer.write_all(bytes).await);
+        // A reader sees every value meanwhile.
+        let shown = f64::from(u32::try_from(n).unwrap());
+        cell.server.show(&force, shown).unwrap();
+        assert_eq!(
+            next_value(&mut subscription).await,
+            (0, Some(Variant::Double(shown)))
+        );
+        let read = client.read(std::slice::from_ref(&force)).await.unwrap();
+        assert_eq!(read[0].value, Some(Variant::Double(shown)), "beside {n}");
+        drop(peer.shutdown().await);
+        let mut answer = Vec::new();
+        let closed = tokio::time::timeout(PATIENCE, peer.read_to_end(&mut answer)).await;
+        assert!(closed.is_ok(), "{n} is held open");
+        assert!(answer.len() < 1_024, "{n} gets {} bytes", answer.len());
+    }
+    assert!(matches!(
+        *client.link().borrow(),
+        Link::Up { connects: 1, .. }
+    ));
+    still_serves(&cell.server).await;
+}
+
+async fn still_serves(server: &Server) {
+    let client = Client::open(quick(), server.url());
+    client.up(PATIENCE).await.unwrap();
+    let root: NodeId = ObjectId::ObjectsFolder.into();
+    let below = client
+        .browse(&root, plant_opcua::client::Browse::hierarchical())
+        .await
+        .unwrap();
+    assert!(!below.is_empty());
+}
