@@ -1,7 +1,7 @@
 //! From a configuration to a server that listens.
 
 use std::io;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
@@ -19,7 +19,7 @@ use opcua::types::{BuildInfo, DateTime, MessageSecurityMode, UAString};
 use super::calls::Calls;
 use super::nodes::{Nodes, Spaces};
 use super::routed::Routed;
-use super::{Inner, Server};
+use super::{Inner, Server, Waiting};
 use crate::endpoint::{BindError, EndpointUrl};
 use crate::limits;
 use crate::nodeset::{self, NodeSet, NodeSetError, Source};
@@ -160,10 +160,10 @@ impl ServerBuilder {
             Some(root) => {
                 let pki = Pki::open(root.clone())?;
                 pki.ensure_own(&config.application_uri, host.trim_matches(['[', ']']))?;
-                root.clone()
+                Some(pki)
             }
             None if secured => return Err(ServerError::NoPki),
-            None => PathBuf::from(NO_PKI),
+            None => None,
         };
         let listener = config.endpoint.bind()?;
         let port = listener.local_addr()?.port();
@@ -172,7 +172,7 @@ impl ServerBuilder {
         let made = Arc::new(Made::default());
         let calls = Arc::new(Calls::default());
         let builder = described(&config, port)
-            .pki_dir(pki)
+            .pki_dir(pki.as_ref().map_or(Path::new(NO_PKI), Pki::root))
             .with_node_manager(Core {
                 made: Arc::clone(&made),
                 calls: Arc::clone(&calls),
@@ -209,7 +209,11 @@ impl ServerBuilder {
                 url: config.endpoint.advertised(port),
                 port,
                 making: Mutex::new(()),
-                waiting: Mutex::new(Some((server, listener))),
+                waiting: Mutex::new(Some(Waiting {
+                    server,
+                    listener,
+                    pki,
+                })),
                 running: Mutex::default(),
             }),
         })

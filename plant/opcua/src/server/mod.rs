@@ -41,6 +41,7 @@ pub use crate::endpoint::EndpointUrl;
 
 use self::calls::Calls;
 use self::nodes::{Nodes, Spaces};
+use crate::pki::Pki;
 
 /// What is known of a variable, or of a variable in a type.
 #[derive(Debug, Clone)]
@@ -72,8 +73,15 @@ struct Inner {
     /// One at a time makes or removes nodes.
     making: Mutex<()>,
     /// Until it is started.
-    waiting: Mutex<Option<(opcua::server::Server, TcpListener)>>,
+    waiting: Mutex<Option<Waiting>>,
     running: Mutex<Vec<JoinHandle<()>>>,
+}
+
+/// What serves when it is started.
+struct Waiting {
+    server: opcua::server::Server,
+    listener: TcpListener,
+    pki: Option<Pki>,
 }
 
 impl Drop for Inner {
@@ -89,9 +97,14 @@ impl Drop for Inner {
 impl Server {
     /// Serves clients from now on. The second time does nothing.
     pub fn start(&self) {
-        let Some((server, listener)) = self.inner.waiting.lock().take() else {
+        let Some(waiting) = self.inner.waiting.lock().take() else {
             return;
         };
+        let Waiting {
+            server,
+            listener,
+            mut pki,
+        } = waiting;
         let serving = tokio::spawn(async move {
             if let Err(error) = server.run_with(listener).await {
                 error!(error, "the OPC UA server has ended");
@@ -101,9 +114,14 @@ impl Server {
         let looking = tokio::spawn(async move {
             let mut look = tokio::time::interval(sessions::LOOK);
             look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-            loop {
+            for looks in 1_u64.. {
                 look.tick().await;
                 sessions.look();
+                if let Some(pki) = &mut pki
+                    && looks.is_multiple_of(LOOKS_AT_REJECTED)
+                {
+                    pki.report_rejected();
+                }
             }
         });
         self.inner.running.lock().extend([serving, looking]);
@@ -329,5 +347,7 @@ pub(crate) fn value_of(variable: &Variable) -> DataValue {
     )
 }
 
+/// How many looks at sessions there are to one at refused certificates.
+const LOOKS_AT_REJECTED: u64 = 20;
 /// How long stopping may take.
 pub const LONGEST_STOP: Duration = Duration::from_secs(2);

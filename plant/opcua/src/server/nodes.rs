@@ -133,8 +133,9 @@ impl Spaces {
         self.with(|view| {
             let base: NodeId = ObjectTypeId::BaseEventType.into();
             let event_types: Vec<NodeId> = view.subtypes(&base).into_iter().cloned().collect();
+            let mut known = HashMap::new();
             for event_type in &event_types {
-                for (path, node) in view.event_fields(event_type) {
+                for (path, node) in view.event_fields(event_type, &mut known) {
                     if let Some(class) = view.class(&node) {
                         let path: Vec<_> = path.iter().collect();
                         types.add_type_property(&node, event_type, &path, class);

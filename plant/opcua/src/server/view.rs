@@ -1,7 +1,7 @@
 //! The nodes of both node managers as one: types of the core namespace beside those of NodeSets, and what instances
 //! of a type are made of.
 
-use std::collections::{BTreeMap, HashSet};
+use std::collections::{BTreeMap, HashMap, HashSet};
 
 use opcua::nodes::{DefaultTypeTree, HasNodeId as _, NodeType};
 use opcua::server::address_space::AddressSpace;
@@ -227,15 +227,27 @@ impl<'a> View<'a> {
         })
     }
 
-    /// The fields of an event type by their path, those of its supertypes too, with the ones that are optional.
-    pub(crate) fn event_fields(self, event_type: &NodeId) -> Vec<(Vec<QualifiedName>, NodeId)> {
+    /// The fields of an event type by their path, those of its supertypes too, with the ones that are optional. What
+    /// the types of fields have is kept in `known`: it is the same for each.
+    pub(crate) fn event_fields(
+        self,
+        event_type: &NodeId,
+        known: &mut HashMap<NodeId, Vec<Declared>>,
+    ) -> Vec<(Vec<QualifiedName>, NodeId)> {
         let mut found = Vec::new();
         for field in self.declared(&[], Some(event_type), &[]) {
             let Some(first) = field.nodes.first() else {
                 continue;
             };
             found.push((vec![field.name.clone()], first.clone()));
-            for below in self.declared(&field.nodes, self.parental_type(first), &[]) {
+            let Some(type_id) = self.parental_type(first) else {
+                continue;
+            };
+            let below = known
+                .entry(type_id.clone())
+                .or_insert_with(|| self.declared(&[], Some(type_id), &[]));
+            let declared = self.declared(&field.nodes, None, &[]);
+            for below in below.iter().chain(&declared) {
                 if let Some(node) = below.nodes.first() {
                     found.push((vec![field.name.clone(), below.name.clone()], node.clone()));
                 }
