@@ -247,7 +247,7 @@ impl Driver for PickAndPlace {
     }
 }
 
-fn job(parameters: &Parameters) -> Result<Job, String> {
+pub(crate) fn job(parameters: &Parameters) -> Result<Job, String> {
     let six = |name: &str| {
         parameters
             .six(name)

@@ -5,6 +5,7 @@
 
 mod actor;
 mod authority;
+pub mod client;
 mod component;
 mod composite;
 pub mod conformance;
@@ -22,6 +23,9 @@ mod variant;
 pub mod yaml;
 
 pub use authority::{Authority, Owner};
+pub use client::{
+    ClientOptions, FoundParameter, FoundSkill, FoundType, RemoteState, SkillClient, SkillHandle,
+};
 pub use component::{
     Component, DriverFault, DriverSetup, Drivers, Lds, MOST_SKILLS, Partners, Security, Simulation,
     SkillSetup,

@@ -20,6 +20,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 
 use self::show::{Nodes, Shower};
+pub(crate) use self::types::OUTCOME;
 use crate::authority::{Authority, Owner};
 use crate::component::{Component, Drivers, Security, SkillSetup};
 use crate::driver::Driver;

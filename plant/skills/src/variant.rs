@@ -66,11 +66,6 @@ pub(crate) fn from_variant(variant: &Variant) -> Option<Value> {
     })
 }
 
-/// The data type's node in namespace 0.
-pub(crate) fn data_type(builtin: Builtin) -> NodeId {
-    NodeId::new(0, u32::from(builtin.id()))
-}
-
 /// The builtin type of a data type that is one.
 pub(crate) fn builtin_of(data_type: &NodeId) -> Option<Builtin> {
     let id = (data_type.namespace == 0).then(|| data_type.as_u32())??;
@@ -116,6 +111,6 @@ mod tests {
             dimensions: None,
         };
         assert_eq!(from_variant(&Variant::Array(Box::new(mixed))), None);
-        assert_eq!(builtin_of(&data_type(Builtin::Float)), Some(Builtin::Float));
+        assert_eq!(builtin_of(&NodeId::new(0, 10_u32)), Some(Builtin::Float));
     }
 }

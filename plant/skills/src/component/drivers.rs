@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use super::{DriverSetup, Simulation};
+use crate::client::Remote;
 use crate::driver::Driver;
 use crate::model::NAMESPACE;
 use crate::parameters::TypeName;
@@ -44,6 +45,9 @@ impl Drivers {
         let own = types.first().map(TypeName::to_string).unwrap_or_default();
         match setup {
             DriverSetup::Given(driver) => Ok(Arc::clone(driver)),
+            DriverSetup::PickAndPlace(partners) if is("PickAndPlaceSkillType") => {
+                Ok(Arc::new(Remote::new(partners.clone())))
+            }
             DriverSetup::PickAndPlace(_) => Err(DriverFault(format!(
                 "`pick_and_place` does the work of PickAndPlaceSkillType, and this is {own}"
             ))),

@@ -102,4 +102,4 @@ fn range(server: &Server, node: &NodeId) -> Option<(f64, f64)> {
 }
 
 /// What SkillType itself has among its results.
-pub(super) const OUTCOME: [&str; 3] = ["Run", "Succeeded", "Message"];
+pub(crate) const OUTCOME: [&str; 3] = ["Run", "Succeeded", "Message"];

@@ -1,0 +1,399 @@
+//! The skills of other components: found by their types, run to their end.
+//!
+//! Reading order: this, `find` (which skills a server has), `handle` (one of them), `remote` (a composite of several).
+
+mod find;
+mod handle;
+mod remote;
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use plant_opcua::client::{CallError, Client, ClientConfig, ClientError, Link};
+use plant_opcua::types::StatusCode;
+
+pub use find::{FoundParameter, FoundSkill, FoundType};
+pub use handle::{RemoteState, SkillHandle};
+pub use remote::Remote;
+
+use crate::parameters::TypeName;
+use crate::runs::SkillFault;
+
+/// Who a client is.
+#[derive(Debug, Clone)]
+pub struct ClientOptions {
+    /// Its ApplicationUri.
+    pub application_uri: String,
+    /// Its name for people.
+    pub application_name: String,
+    /// The directory of certificates; without one nothing is secured.
+    pub pki: Option<PathBuf>,
+    /// How long a server may take to answer.
+    pub within: Duration,
+}
+
+impl Default for ClientOptions {
+    fn default() -> Self {
+        Self {
+            application_uri: "urn:ua-bridge:skills:client".to_owned(),
+            application_name: "skills client".to_owned(),
+            pki: None,
+            within: Duration::from_secs(2),
+        }
+    }
+}
+
+/// A connection to one server. It comes back by itself; clones are of the same one.
+///
+/// The first write or call of a session takes the lease of the component until that session closes; looking takes none.
+/// So whoever only looks and whoever runs something has one of its own, and closes it.
+#[derive(Clone)]
+pub struct SkillClient {
+    client: Client,
+    endpoint: String,
+}
+
+impl SkillClient {
+    /// Connects.
+    ///
+    /// # Errors
+    /// [`SkillFault::Lost`] where there is no connection in time.
+    pub async fn connect(endpoint: &str, options: &ClientOptions) -> Result<Self, SkillFault> {
+        let config = ClientConfig {
+            pki: options.pki.clone(),
+            timeout: options.within,
+            ..ClientConfig::new(&options.application_uri, &options.application_name)
+        };
+        let client = Client::open(config, endpoint);
+        client
+            .up(options.within)
+            .await
+            .map_err(|error| lost(&error))?;
+        Ok(Self {
+            client,
+            endpoint: endpoint.to_owned(),
+        })
+    }
+
+    /// Where.
+    #[must_use]
+    pub fn endpoint(&self) -> &str {
+        &self.endpoint
+    }
+
+    /// The ApplicationUri of the server; empty while there is no connection.
+    #[must_use]
+    pub fn application_uri(&self) -> String {
+        match &*self.client.link().borrow() {
+            Link::Up {
+                application_uri, ..
+            } => application_uri.clone(),
+            _ => String::new(),
+        }
+    }
+
+    /// All skills of the server: instances of SkillType and its subtypes, of whatever namespace.
+    ///
+    /// # Errors
+    /// No answer. A server that does not know SkillType has none.
+    pub async fn skills(&self) -> Result<Vec<FoundSkill>, SkillFault> {
+        self.skills_of(&TypeName::own(crate::model::SKILL_TYPE))
+            .await
+    }
+
+    /// Those of a type and its subtypes.
+    ///
+    /// # Errors
+    /// No answer. A server that does not know the type has none.
+    pub async fn skills_of(&self, wanted: &TypeName) -> Result<Vec<FoundSkill>, SkillFault> {
+        find::skills(&self.client, wanted).await
+    }
+
+    /// A skill to run.
+    #[must_use]
+    pub fn handle(&self, found: &FoundSkill) -> SkillHandle {
+        SkillHandle::new(self.client.clone(), found.clone())
+    }
+
+    /// Ready when there is no connection, with the reason.
+    pub async fn lost(&self) -> String {
+        let mut link = self.client.link();
+        let down = link
+            .wait_for(|link| matches!(link, Link::Down { .. } | Link::Closed))
+            .await;
+        match down.as_deref() {
+            Ok(Link::Down { reason }) => reason.clone(),
+            Ok(_) | Err(_) => "the connection is closed".to_owned(),
+        }
+    }
+
+    /// Ends the session, and with it the lease.
+    pub async fn close(&self) {
+        self.client.close().await;
+    }
+}
+
+fn lost(error: &ClientError) -> SkillFault {
+    match error {
+        ClientError::Status(status) => refused(*status, "the server refuses"),
+        other => SkillFault::Lost(other.to_string()),
+    }
+}
+
+fn called(error: &CallError, what: &str) -> SkillFault {
+    match error {
+        CallError::Refused { status, .. } => refused(*status, what),
+        CallError::Client(error) => lost(error),
+    }
+}
+
+fn refused(status: StatusCode, what: &str) -> SkillFault {
+    SkillFault::Refused {
+        status: status.to_string(),
+        text: what.to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+    use std::sync::Arc;
+
+    use program::{Method, State};
+
+    use super::*;
+    use crate::component::{Component, Partners};
+    use crate::conformance;
+    use crate::runs::Runs;
+    use crate::server::{ComponentServer, ServeSettings};
+    use crate::value::{Builtin, Shape, Value};
+
+    const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/plant");
+
+    fn serve(name: &str, changes: &[(&str, &str)]) -> ComponentServer {
+        let folder = Path::new(EXAMPLES);
+        let text = std::fs::read_to_string(folder.join(name)).unwrap();
+        let text = changes
+            .iter()
+            .fold(text, |text, (from, to)| text.replace(from, to));
+        let component = Component::from_yaml(&text, folder).unwrap();
+        let server =
+            ComponentServer::build(&component, &ServeSettings::default(), |_, _| Vec::new())
+                .unwrap();
+        server.start();
+        server
+    }
+
+    async fn client(server: &ComponentServer) -> SkillClient {
+        let patient = ClientOptions {
+            within: Duration::from_secs(10),
+            ..ClientOptions::default()
+        };
+        SkillClient::connect(server.url(), &patient).await.unwrap()
+    }
+
+    fn of(name: &str) -> TypeName {
+        TypeName::own(name)
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_skill_of_another_maker_is_found_by_the_type_it_is_a_subtype_of_and_run() {
+        let server = serve("vacuum-gripper.yaml", &[("300 ms", "30 ms")]);
+        let client = client(&server).await;
+        let all = client.skills().await.unwrap();
+        let names: Vec<&str> = all.iter().map(|found| found.name.as_str()).collect();
+        assert_eq!(names, ["VacuumGrasp", "BlowOff"]);
+        let found = client.skills_of(&of("GraspSkillType")).await.unwrap();
+        assert_eq!(found, all[..1]);
+        let grasp = &found[0];
+        assert_eq!(
+            (grasp.component.as_str(), grasp.namespace, grasp.number),
+            ("vacuum-gripper", Some(8), Some(1))
+        );
+        assert_eq!(grasp.node, "nsu=urn:example:vacuum-gripper;i=100");
+        let types: Vec<String> = grasp
+            .types
+            .iter()
+            .map(|of| format!("{} {}", of.name, of.identifier))
+            .collect();
+        assert_eq!(
+            types,
+            [
+                "nsu=urn:example:vacuum;VacuumGraspSkillType i=1",
+                "nsu=urn:ua-bridge:skills;GraspSkillType i=1200",
+                "nsu=urn:ua-bridge:skills;GripperSkillType i=1100",
+                "nsu=urn:ua-bridge:skills;SkillType i=1000",
+            ]
+        );
+        let parameters: Vec<(&str, Shape, Option<&str>)> = grasp
+            .parameters
+            .iter()
+            .map(|of| (of.name.as_str(), of.shape, of.unit.as_deref()))
+            .collect();
+        let double = Shape::scalar(Builtin::Double);
+        assert_eq!(parameters.len(), 2);
+        assert!(
+            parameters.contains(&("Force", double, Some("N")))
+                && parameters.contains(&("Vacuum", double, None))
+        );
+        assert_eq!(
+            grasp.capabilities,
+            ["urn:example:capability:hold-by-vacuum"]
+        );
+
+        let handle = client.handle(grasp);
+        let given = vec![("Force".to_owned(), Value::from(7.0))];
+        let outcome = handle.run(given, Duration::from_secs(10)).await.unwrap();
+        assert_eq!((outcome.run, outcome.succeeded), (1, true));
+        assert_eq!(outcome.results, [("Gripped".to_owned(), Value::from(true))]);
+        assert_eq!(
+            server.skills()[0].shown().parameters.number("Force"),
+            Some(7.0)
+        );
+        assert!(
+            client
+                .skills_of(&of("MoveSkillType"))
+                .await
+                .unwrap()
+                .is_empty()
+        );
+        assert!(
+            client
+                .skills_of(&of("NoSkillType"))
+                .await
+                .unwrap()
+                .is_empty()
+        );
+        client.close().await;
+        server.stop().await;
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_lease_ends_with_its_session_and_a_refusal_has_its_code() {
+        let server = serve("parallel-gripper.yaml", &[]);
+        let (first, second) = (client(&server).await, client(&server).await);
+        let grasp = |client: &SkillClient, found: &[FoundSkill]| client.handle(&found[0]);
+        let found = first.skills().await.unwrap();
+        let (mine, theirs) = (
+            grasp(&first, &found),
+            grasp(&second, &second.skills().await.unwrap()),
+        );
+        mine.call(Method::Reset).await.unwrap();
+        let status = |fault: SkillFault| match fault {
+            SkillFault::Refused { status, .. } => status,
+            other => panic!("{other}"),
+        };
+        assert_eq!(
+            status(theirs.call(Method::Start).await.unwrap_err()),
+            "BadLocked"
+        );
+        let locked = theirs
+            .start(vec![("Force".to_owned(), 1.0.into())])
+            .await
+            .unwrap_err();
+        assert_eq!(status(locked), "BadLocked");
+        assert_eq!(
+            status(mine.call(Method::Resume).await.unwrap_err()),
+            "BadInvalidState"
+        );
+        let weak = mine
+            .start(vec![("Force".to_owned(), (-1.0).into())])
+            .await
+            .unwrap_err();
+        assert_eq!(status(weak), "BadInvalidArgument");
+        let strange = mine
+            .start(vec![("Strength".to_owned(), 1.0.into())])
+            .await
+            .unwrap_err();
+        assert_eq!(status(strange), "BadInvalidArgument");
+        assert_eq!(mine.state().await.unwrap().state, State::Ready);
+        // The run goes on when the session that began it is gone, and its outcome is there for the next.
+        mine.start(vec![("Force".to_owned(), 9.0.into())])
+            .await
+            .unwrap();
+        first.close().await;
+        let taken = async {
+            while theirs
+                .call(Method::Reset)
+                .await
+                .is_err_and(|fault| status(fault) == "BadLocked")
+            {
+                tokio::time::sleep(Duration::from_millis(10)).await;
+            }
+        };
+        tokio::time::timeout(Duration::from_secs(5), taken)
+            .await
+            .unwrap();
+        let mut watch = server.skills()[0].watch();
+        let done = watch.wait_for(|shown| {
+            shown
+                .outcome
+                .as_ref()
+                .is_some_and(|outcome| outcome.run == 1)
+        });
+        tokio::time::timeout(Duration::from_secs(5), done)
+            .await
+            .unwrap()
+            .unwrap();
+        let again = theirs
+            .run(Vec::new(), Duration::from_secs(10))
+            .await
+            .unwrap();
+        assert_eq!((again.run, again.succeeded), (2, true));
+        assert_eq!(
+            server.skills()[0].shown().parameters.number("Force"),
+            Some(20.0),
+            "what the first wrote is forgotten"
+        );
+        second.close().await;
+        server.stop().await;
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_composite_runs_the_skills_of_two_servers_and_gives_their_leases_back() {
+        let robot = serve(
+            "robot.yaml",
+            &[("{reach: 1.3}", "{reach: 1.3, time_scale: 20}")],
+        );
+        let gripper = serve("parallel-gripper.yaml", &[("400 ms", "20 ms")]);
+        let partners = Partners {
+            robot: robot.url().to_owned(),
+            gripper: gripper.url().to_owned(),
+            within: Duration::from_secs(20),
+        };
+        let parameters = vec![
+            (
+                "PickPosition".to_owned(),
+                Value::from([0.4, 0.2, 0.1, 0.0, 0.0, 0.0]),
+            ),
+            (
+                "PlacePosition".to_owned(),
+                Value::from([0.4, -0.2, 0.1, 0.0, 0.0, 0.0]),
+            ),
+        ];
+        let driver = Arc::new(Remote::new(partners));
+        let outcome =
+            conformance::run_once("PickAndPlaceSkillType", driver.clone(), parameters.clone())
+                .await
+                .unwrap();
+        assert!(outcome.succeeded, "{}", outcome.message);
+        let free = |server: &ComponentServer| server.authority().holder();
+        for mut holder in [free(&robot), free(&gripper)] {
+            let freed = holder.wait_for(Option::is_none);
+            tokio::time::timeout(Duration::from_secs(5), freed)
+                .await
+                .unwrap()
+                .unwrap();
+        }
+        gripper.stop().await;
+        let outcome = conformance::run_once("PickAndPlaceSkillType", driver, parameters)
+            .await
+            .unwrap();
+        assert!(
+            !outcome.succeeded && outcome.message.contains("opc.tcp://"),
+            "{}",
+            outcome.message
+        );
+        robot.stop().await;
+    }
+}

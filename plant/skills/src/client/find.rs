@@ -1,0 +1,440 @@
+//! Which skills a server has, by their types.
+
+use std::collections::HashSet;
+
+use plant_opcua::client::{Browse, Client};
+use plant_opcua::types::{
+    AttributeId, EUInformation, NodeClass, NodeClassMask, NodeId, ObjectId, QualifiedName,
+    ReferenceDescription, Variant,
+};
+
+use super::lost;
+use crate::model::{NAMESPACE, SKILL_TYPE};
+use crate::parameters::TypeName;
+use crate::runs::SkillFault;
+use crate::server::OUTCOME;
+use crate::value::{Shape, Value};
+use crate::variant::{builtin_of, from_variant};
+
+/// A skill of a server.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FoundSkill {
+    /// The name of the component it is of.
+    pub component: String,
+    /// The number of that in the space, where it says so.
+    pub namespace: Option<u16>,
+    /// Its own number there, from 1.
+    pub number: Option<u16>,
+    /// What its component calls it.
+    pub name: String,
+    /// Its node, as `nsu=<namespace uri>;i=100`.
+    pub node: String,
+    /// Its type and all supertypes up to SkillType, nearest first.
+    pub types: Vec<FoundType>,
+    /// What a run is told.
+    pub parameters: Vec<FoundParameter>,
+    /// What a run says at its end.
+    pub results: Vec<FoundParameter>,
+    /// The IRIs of the capabilities it provides.
+    pub capabilities: Vec<String>,
+    pub(super) nodes: Nodes,
+}
+
+/// A type of a skill.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FoundType {
+    /// Its name.
+    pub name: TypeName,
+    /// The identifier of its node in the namespace of its name, as `i=1200`.
+    pub identifier: String,
+}
+
+/// A parameter or result of a skill.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FoundParameter {
+    /// Its BrowseName.
+    pub name: String,
+    /// Type and rank.
+    pub shape: Shape,
+    /// What it shows: of a parameter what counts where nothing is written; without it something must be.
+    pub default: Option<Value>,
+    /// Its unit, by the symbol.
+    pub unit: Option<String>,
+    /// Its node, as `nsu=<namespace uri>;i=10017`.
+    pub node: String,
+    pub(super) id: NodeId,
+}
+
+/// The nodes that a skill is run by.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub(super) struct Nodes {
+    pub(super) skill: NodeId,
+    /// Children by name, those of CurrentState and FinalResultData by paths.
+    pub(super) children: Vec<(String, NodeId)>,
+}
+
+impl Nodes {
+    pub(super) fn get(&self, path: &str) -> Option<&NodeId> {
+        self.children
+            .iter()
+            .find(|(name, _)| name == path)
+            .map(|(_, node)| node)
+    }
+}
+
+/// All instances of a type and its subtypes.
+pub(super) async fn skills(
+    client: &Client,
+    wanted: &TypeName,
+) -> Result<Vec<FoundSkill>, SkillFault> {
+    let Some(root) = type_id(client, &TypeName::own(SKILL_TYPE)).await? else {
+        return Ok(Vec::new());
+    };
+    let all = client.subtypes(&root).await.map_err(|error| lost(&error))?;
+    let wanted = if *wanted == TypeName::own(SKILL_TYPE) {
+        Some(root.clone())
+    } else {
+        named(client, wanted, &all).await?
+    };
+    let Some(wanted) = wanted else {
+        return Ok(Vec::new());
+    };
+    let types: HashSet<NodeId> = client
+        .subtypes(&wanted)
+        .await
+        .map_err(|error| lost(&error))?
+        .into_iter()
+        .collect();
+    let mut found = Vec::new();
+    for instance in instances(client, &types).await? {
+        found.push(read(client, &root, instance).await?);
+    }
+    Ok(found)
+}
+
+/// SkillType, by its place in the namespace of ours.
+async fn type_id(client: &Client, of: &TypeName) -> Result<Option<NodeId>, SkillFault> {
+    let id = crate::model::find(&of.name).map(|known| known.id);
+    let (Some(namespace), Some(id)) = (client.namespace(&of.namespace), id) else {
+        return Ok(None);
+    };
+    let node = NodeId::new(namespace, id);
+    let class = client
+        .read_attributes(&[(node.clone(), AttributeId::NodeClass)])
+        .await
+        .map_err(|error| lost(&error))?;
+    let is_there = class.first().is_some_and(|class| class.value.is_some());
+    Ok(is_there.then_some(node))
+}
+
+/// The type of that name among these.
+async fn named(
+    client: &Client,
+    wanted: &TypeName,
+    among: &[NodeId],
+) -> Result<Option<NodeId>, SkillFault> {
+    let names = names(client, among).await?;
+    let found = among
+        .iter()
+        .zip(names)
+        .find(|(_, name)| name.as_ref() == Some(wanted));
+    Ok(found.map(|(node, _)| node.clone()))
+}
+
+async fn names(client: &Client, nodes: &[NodeId]) -> Result<Vec<Option<TypeName>>, SkillFault> {
+    let what: Vec<_> = nodes
+        .iter()
+        .map(|node| (node.clone(), AttributeId::BrowseName))
+        .collect();
+    let values = client
+        .read_attributes(&what)
+        .await
+        .map_err(|error| lost(&error))?;
+    let namespaces = client.namespaces();
+    let name = |value: Option<Variant>| match value {
+        Some(Variant::QualifiedName(name)) => Some(TypeName {
+            namespace: namespaces.get(usize::from(name.namespace_index))?.clone(),
+            name: name.name.as_ref().to_owned(),
+        }),
+        _ => None,
+    };
+    Ok(values.into_iter().map(|value| name(value.value)).collect())
+}
+
+/// An instance and the objects above it.
+struct Instance {
+    reference: ReferenceDescription,
+    above: Vec<(NodeId, String)>,
+}
+
+/// The objects of those types below Objects, in the order in which the server has them, level by level.
+async fn instances(client: &Client, types: &HashSet<NodeId>) -> Result<Vec<Instance>, SkillFault> {
+    let mut found = Vec::new();
+    let mut seen: HashSet<NodeId> = HashSet::from([ObjectId::Server.into()]);
+    let mut level: Vec<Vec<(NodeId, String)>> =
+        vec![vec![(ObjectId::ObjectsFolder.into(), "Objects".to_owned())]];
+    for _ in 0..DEEPEST {
+        let mut next = Vec::new();
+        for above in level {
+            let Some((node, _)) = above.last() else {
+                continue;
+            };
+            let what = Browse {
+                classes: NodeClassMask::OBJECT,
+                ..Browse::hierarchical()
+            };
+            let mut below = client
+                .browse(node, what)
+                .await
+                .map_err(|error| lost(&error))?;
+            below.sort_by_key(|reference| order(&reference.node_id.node_id));
+            for reference in below {
+                let id = reference.node_id.node_id.clone();
+                if seen.len() >= MOST_OBJECTS || !seen.insert(id.clone()) {
+                    continue;
+                }
+                if types.contains(&reference.type_definition.node_id) {
+                    found.push(Instance {
+                        reference,
+                        above: above.clone(),
+                    });
+                    continue;
+                }
+                let name = reference.browse_name.name.as_ref().to_owned();
+                next.push(above.iter().cloned().chain([(id, name)]).collect());
+            }
+        }
+        level = next;
+    }
+    Ok(found)
+}
+
+/// By number where it has one.
+fn order(id: &NodeId) -> (u16, u32, String) {
+    (
+        id.namespace,
+        id.as_u32().unwrap_or(u32::MAX),
+        id.to_string(),
+    )
+}
+
+async fn read(
+    client: &Client,
+    root: &NodeId,
+    instance: Instance,
+) -> Result<FoundSkill, SkillFault> {
+    let Instance { reference, above } = instance;
+    let skill = reference.node_id.node_id.clone();
+    let mut nodes = Nodes {
+        skill: skill.clone(),
+        children: Vec::new(),
+    };
+    let children = client
+        .browse(&skill, Browse::hierarchical())
+        .await
+        .map_err(|error| lost(&error))?;
+    for child in &children {
+        nodes
+            .children
+            .push((name_of(child), child.node_id.node_id.clone()));
+    }
+    for group in ["CurrentState", "FinalResultData"] {
+        let Some(node) = nodes.get(group).cloned() else {
+            continue;
+        };
+        let below = client
+            .browse(&node, Browse::hierarchical())
+            .await
+            .map_err(|error| lost(&error))?;
+        for child in below {
+            nodes.children.push((
+                format!("{group}/{}", name_of(&child)),
+                child.node_id.node_id.clone(),
+            ));
+        }
+    }
+    let parameters = group(client, nodes.get("ParameterSet"), &[]).await?;
+    let results = group(client, nodes.get("FinalResultData"), &OUTCOME).await?;
+    let capabilities = match nodes.get("Capabilities") {
+        Some(node) => texts(value(client, node).await?),
+        None => Vec::new(),
+    };
+    let (component, namespace) = component(client, &above).await?;
+    let own = skill
+        .as_u32()
+        .filter(|_| client.namespaces().get(usize::from(skill.namespace)) == Some(&uri(client)));
+    let number = own
+        .filter(|id| id % IDS_PER_SKILL == 0)
+        .and_then(|id| u16::try_from(id / IDS_PER_SKILL).ok());
+    Ok(FoundSkill {
+        component,
+        namespace,
+        number: number.filter(|number| *number > 0),
+        name: name_of(&reference),
+        node: text_of(client, &skill),
+        types: chain(client, root, &reference.type_definition.node_id).await?,
+        parameters,
+        results,
+        capabilities,
+        nodes,
+    })
+}
+
+/// The object above the folder Skills, and what it says is its number in the space.
+async fn component(
+    client: &Client,
+    above: &[(NodeId, String)],
+) -> Result<(String, Option<u16>), SkillFault> {
+    let Some((node, name)) = above.iter().rev().find(|(_, name)| name != "Skills") else {
+        return Ok((String::new(), None));
+    };
+    let Some(index) = client.namespace(NAMESPACE) else {
+        return Ok((name.clone(), None));
+    };
+    let path = [QualifiedName::new(index, "NamespaceNumber")];
+    let number = match client.translate(node, &path).await {
+        Ok(node) => value(client, &node).await?,
+        // Another maker's component has none.
+        Err(_) => None,
+    };
+    let number = match number {
+        Some(Value::UInt16(number)) => Some(number),
+        _ => None,
+    };
+    Ok((name.clone(), number))
+}
+
+async fn chain(client: &Client, root: &NodeId, own: &NodeId) -> Result<Vec<FoundType>, SkillFault> {
+    let mut ids = vec![own.clone()];
+    ids.extend(client.supertypes(own).await.map_err(|error| lost(&error))?);
+    if let Some(last) = ids.iter().position(|id| id == root) {
+        ids.truncate(last + 1);
+    }
+    let names = names(client, &ids).await?;
+    let found = |(id, name): (&NodeId, Option<TypeName>)| {
+        Some(FoundType {
+            name: name?,
+            identifier: id.identifier.to_string(),
+        })
+    };
+    Ok(ids.iter().zip(names).filter_map(found).collect())
+}
+
+/// The variables of a group, with what they show.
+async fn group(
+    client: &Client,
+    node: Option<&NodeId>,
+    without: &[&str],
+) -> Result<Vec<FoundParameter>, SkillFault> {
+    let Some(node) = node else {
+        return Ok(Vec::new());
+    };
+    let below = client
+        .browse(node, Browse::hierarchical())
+        .await
+        .map_err(|error| lost(&error))?;
+    let mut variables: Vec<ReferenceDescription> = below
+        .into_iter()
+        .filter(|child| {
+            child.node_class == NodeClass::Variable
+                && !without.contains(&child.browse_name.name.as_ref())
+        })
+        .collect();
+    variables.sort_by_key(|child| order(&child.node_id.node_id));
+    let mut found = Vec::new();
+    for child in variables {
+        let id = child.node_id.node_id.clone();
+        let attributes = [
+            AttributeId::DataType,
+            AttributeId::ValueRank,
+            AttributeId::Value,
+        ];
+        let what = attributes.map(|attribute| (id.clone(), attribute));
+        let mut values = client
+            .read_attributes(&what)
+            .await
+            .map_err(|error| lost(&error))?
+            .into_iter();
+        let mut next = || values.next().and_then(|value| value.value);
+        let builtin = match next() {
+            Some(Variant::NodeId(of)) => builtin_of(&of),
+            _ => None,
+        };
+        let array = matches!(next(), Some(Variant::Int32(rank)) if rank >= 0);
+        let default = next().as_ref().and_then(from_variant);
+        let Some(builtin) = builtin else {
+            continue;
+        };
+        found.push(FoundParameter {
+            name: name_of(&child),
+            shape: Shape { builtin, array },
+            default,
+            unit: unit(client, &id).await?,
+            node: text_of(client, &id),
+            id,
+        });
+    }
+    Ok(found)
+}
+
+async fn unit(client: &Client, node: &NodeId) -> Result<Option<String>, SkillFault> {
+    let Ok(node) = client
+        .translate(node, &[QualifiedName::new(0, "EngineeringUnits")])
+        .await
+    else {
+        return Ok(None);
+    };
+    let read = client.read(&[node]).await.map_err(|error| lost(&error))?;
+    let value = read.into_iter().next().and_then(|value| value.value);
+    let Some(Variant::ExtensionObject(object)) = value else {
+        return Ok(None);
+    };
+    Ok(object
+        .inner_as::<EUInformation>()
+        .map(|unit| unit.display_name.text.as_ref().to_owned()))
+}
+
+async fn value(client: &Client, node: &NodeId) -> Result<Option<Value>, SkillFault> {
+    let values = client
+        .read(std::slice::from_ref(node))
+        .await
+        .map_err(|error| lost(&error))?;
+    Ok(values
+        .first()
+        .and_then(|value| value.value.as_ref())
+        .and_then(from_variant))
+}
+
+fn texts(value: Option<Value>) -> Vec<String> {
+    match value {
+        Some(Value::Array(_, texts)) => texts
+            .iter()
+            .filter_map(|text| text.as_str().map(str::to_owned))
+            .collect(),
+        _ => Vec::new(),
+    }
+}
+
+fn name_of(reference: &ReferenceDescription) -> String {
+    reference.browse_name.name.as_ref().to_owned()
+}
+
+/// A node with the URI of its namespace.
+fn text_of(client: &Client, node: &NodeId) -> String {
+    match client.namespaces().get(usize::from(node.namespace)) {
+        Some(uri) => format!("nsu={uri};{}", node.identifier),
+        None => node.to_string(),
+    }
+}
+
+/// The namespace of a server's own nodes: the one with index 1.
+fn uri(client: &Client) -> String {
+    client.namespaces().into_iter().nth(1).unwrap_or_default()
+}
+
+/// Identifiers of a skill.
+const IDS_PER_SKILL: u32 = 100;
+/// So many levels below Objects skills are looked for.
+const DEEPEST: usize = 8;
+/// And among so many objects.
+const MOST_OBJECTS: usize = 4_096;

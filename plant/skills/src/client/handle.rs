@@ -1,0 +1,326 @@
+//! One skill of another component.
+
+use std::time::Duration;
+
+use async_trait::async_trait;
+use plant_opcua::client::{CallError, Client, ClientError, Link, Notice, Watch};
+use plant_opcua::types::{NodeId, Variant};
+use program::{Method, State};
+
+use super::find::FoundSkill;
+use super::{called, lost, refused};
+use crate::runs::{Runs, SkillFault};
+use crate::shown::Outcome;
+use crate::value::Value;
+use crate::variant::{from_variant, to_variant};
+
+/// A skill of another component, to be run. Clones are of the same one.
+#[derive(Clone)]
+pub struct SkillHandle {
+    client: Client,
+    found: FoundSkill,
+}
+
+/// How a skill is now.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RemoteState {
+    /// Its state.
+    pub state: State,
+    /// Its newest run; 0 before the first, or where it has no numbers.
+    pub run: u32,
+    /// How much of that is done, 0 to 1.
+    pub progress: f32,
+    /// What that is about.
+    pub step: String,
+}
+
+impl SkillHandle {
+    pub(super) fn new(client: Client, found: FoundSkill) -> Self {
+        Self { client, found }
+    }
+
+    /// What it is.
+    #[must_use]
+    pub fn found(&self) -> &FoundSkill {
+        &self.found
+    }
+
+    /// How it is now.
+    ///
+    /// # Errors
+    /// No answer, or it is no Program.
+    pub async fn state(&self) -> Result<RemoteState, SkillFault> {
+        let paths = ["CurrentState/Id", "RunId", "Progress", "SkillStep"];
+        let [state, run, progress, step] = self.read(paths).await?;
+        Ok(RemoteState {
+            state: state
+                .as_ref()
+                .and_then(state_of)
+                .ok_or_else(|| self.unexpected("its state is none of a Program"))?,
+            run: run.as_ref().map_or(0, number),
+            progress: match progress {
+                Some(Variant::Float(progress)) => progress,
+                _ => 0.0,
+            },
+            step: step.as_ref().map(text).unwrap_or_default(),
+        })
+    }
+
+    /// Calls a method.
+    ///
+    /// # Errors
+    /// A refusal, or no answer.
+    pub async fn call(&self, method: Method) -> Result<(), SkillFault> {
+        let node = self.found.nodes.get(method.name());
+        let node = node.ok_or_else(|| self.unexpected(&format!("it has no {method}")))?;
+        let call = self
+            .client
+            .call(&self.found.nodes.skill, node, Vec::new())
+            .await;
+        match call {
+            Ok(_) => Ok(()),
+            Err(error) => Err(called(&error, &format!("{method} of {}", self.name()))),
+        }
+    }
+
+    /// Writes parameters and starts a run: gives its number, 0 where the skill has none. What is not written is as before.
+    ///
+    /// # Errors
+    /// A refusal, or no answer. With [`SkillFault::Lost`] nobody knows whether it has begun.
+    pub async fn start(&self, parameters: Vec<(String, Value)>) -> Result<u32, SkillFault> {
+        self.write(parameters).await?;
+        self.call(Method::Start).await?;
+        let [run] = self.read(["RunId"]).await?;
+        Ok(run.as_ref().map_or(0, number))
+    }
+
+    async fn write(&self, parameters: Vec<(String, Value)>) -> Result<(), SkillFault> {
+        let mut writes = Vec::new();
+        let mut names = Vec::new();
+        for (name, value) in parameters {
+            let declared = self.found.parameters.iter().find(|of| of.name == name);
+            let wrong = |status: &str, text: String| SkillFault::Refused {
+                status: status.to_owned(),
+                text,
+            };
+            let declared = declared.ok_or_else(|| {
+                wrong(
+                    "BadInvalidArgument",
+                    format!("{} has no parameter {name}", self.name()),
+                )
+            })?;
+            let given = value.shape();
+            let value = declared.shape.take(value).ok_or_else(|| {
+                wrong(
+                    "BadTypeMismatch",
+                    format!("{name} is {}, and {given} was given", declared.shape),
+                )
+            })?;
+            writes.push((declared.id.clone(), to_variant(&value)));
+            names.push(name);
+        }
+        if writes.is_empty() {
+            return Ok(());
+        }
+        let written = self
+            .client
+            .write(&writes)
+            .await
+            .map_err(|error| lost(&error))?;
+        match names
+            .iter()
+            .zip(written)
+            .find(|(_, status)| status.is_bad())
+        {
+            Some((name, status)) => Err(refused(status, &format!("{name} of {}", self.name()))),
+            None => Ok(()),
+        }
+    }
+
+    /// Waits until the skill is neither Running nor Suspended.
+    async fn ended(&self) -> Result<State, SkillFault> {
+        let node = self
+            .found
+            .nodes
+            .get("CurrentState/Id")
+            .ok_or_else(|| self.unexpected("it has no state"))?;
+        let mut watch = self
+            .client
+            .subscribe(vec![Watch::Value(node.clone())], PUBLISHING, QUEUE);
+        let mut look = tokio::time::interval(LOOK);
+        let mut gone = Runs::lost(self);
+        loop {
+            let state = tokio::select! {
+                _ = look.tick() => self.state().await?.state,
+                notice = watch.next() => match notice {
+                    Some(Notice::Value { value, .. }) => match value.value.as_ref().and_then(state_of) {
+                        Some(state) => state,
+                        None => continue,
+                    },
+                    Some(_) => continue,
+                    None => return Err(SkillFault::Lost("the connection is closed".to_owned())),
+                },
+                why = &mut gone => return Err(SkillFault::Lost(why)),
+            };
+            if matches!(state, State::Ready | State::Halted) {
+                // What a subscription tells may be older than the run.
+                let now = self.state().await?.state;
+                if matches!(now, State::Ready | State::Halted) {
+                    return Ok(now);
+                }
+            }
+        }
+    }
+
+    async fn outcome(&self, run: u32, state: State) -> Result<Outcome, SkillFault> {
+        let paths = [
+            "FinalResultData/Succeeded",
+            "FinalResultData/Message",
+            "FinalResultData/Run",
+        ];
+        let [succeeded, message, of] = self.read(paths).await?;
+        if of.as_ref().is_some_and(|of| run != 0 && number(of) != run) {
+            return Err(self.unexpected(&format!("its outcome is of another run than {run}")));
+        }
+        let ids: Vec<NodeId> = self
+            .found
+            .results
+            .iter()
+            .map(|result| result.id.clone())
+            .collect();
+        let values = self.client.read(&ids).await.map_err(|error| lost(&error))?;
+        let succeeded = match succeeded {
+            Some(Variant::Boolean(succeeded)) => succeeded,
+            // Where nothing says so, it has failed if a Reset must come first.
+            _ => state == State::Ready,
+        };
+        let results = self.found.results.iter().zip(values);
+        let results = results.filter_map(|(result, value)| {
+            Some((result.name.clone(), from_variant(value.value.as_ref()?)?))
+        });
+        Ok(Outcome {
+            run,
+            succeeded,
+            message: message.as_ref().map(text).unwrap_or_default(),
+            results: if succeeded {
+                results.collect()
+            } else {
+                Vec::new()
+            },
+        })
+    }
+
+    /// What variables show; `None` for those that are not there.
+    async fn read<const N: usize>(
+        &self,
+        paths: [&str; N],
+    ) -> Result<[Option<Variant>; N], SkillFault> {
+        let nodes: Vec<(usize, NodeId)> = paths
+            .iter()
+            .enumerate()
+            .filter_map(|(at, path)| Some((at, self.found.nodes.get(path)?.clone())))
+            .collect();
+        let ids: Vec<NodeId> = nodes.iter().map(|(_, node)| node.clone()).collect();
+        let values = self.client.read(&ids).await.map_err(|error| lost(&error))?;
+        let mut all = [const { None }; N];
+        for ((at, _), value) in nodes.into_iter().zip(values) {
+            if let Some(slot) = all.get_mut(at) {
+                *slot = value.value;
+            }
+        }
+        Ok(all)
+    }
+
+    fn unexpected(&self, what: &str) -> SkillFault {
+        SkillFault::Unexpected(format!("{}: {what}", self.name()))
+    }
+}
+
+#[async_trait]
+impl Runs for SkillHandle {
+    fn name(&self) -> String {
+        format!("{}.{}", self.found.component, self.found.name)
+    }
+
+    async fn run(
+        &self,
+        parameters: Vec<(String, Value)>,
+        within: Duration,
+    ) -> Result<Outcome, SkillFault> {
+        if self.state().await?.state == State::Halted {
+            self.call(Method::Reset).await?;
+        }
+        let run = self.start(parameters).await?;
+        let ended = tokio::time::timeout(within, self.ended()).await;
+        let Ok(state) = ended else {
+            self.halt().await?;
+            return Err(SkillFault::TimedOut(within));
+        };
+        self.outcome(run, state?).await
+    }
+
+    async fn halt(&self) -> Result<(), SkillFault> {
+        let Some(node) = self.found.nodes.get(Method::Halt.name()) else {
+            return Err(self.unexpected("it has no Halt"));
+        };
+        let halted = self
+            .client
+            .call(&self.found.nodes.skill, node, Vec::new())
+            .await;
+        let error = match halted {
+            Ok(_) => return Ok(()),
+            Err(error) => error,
+        };
+        // It may be Halted already, which is all that is wanted.
+        match &error {
+            CallError::Refused { .. } if self.state().await?.state == State::Halted => Ok(()),
+            CallError::Client(ClientError::Lost(_))
+            | CallError::Client(_)
+            | CallError::Refused { .. } => Err(called(&error, &format!("Halt of {}", self.name()))),
+        }
+    }
+
+    async fn lost(&self) -> String {
+        let mut link = self.client.link();
+        let down = link
+            .wait_for(|link| matches!(link, Link::Down { .. } | Link::Closed))
+            .await;
+        why(down.as_deref().ok())
+    }
+}
+
+fn why(link: Option<&Link>) -> String {
+    match link {
+        Some(Link::Down { reason }) => reason.clone(),
+        _ => "the connection is closed".to_owned(),
+    }
+}
+
+fn state_of(id: &Variant) -> Option<State> {
+    let Variant::NodeId(id) = id else {
+        return None;
+    };
+    let id = (id.namespace == 0).then(|| id.as_u32())??;
+    State::ALL.into_iter().find(|state| state.node_id() == id)
+}
+
+fn number(value: &Variant) -> u32 {
+    match value {
+        Variant::UInt32(number) => *number,
+        _ => 0,
+    }
+}
+
+fn text(value: &Variant) -> String {
+    match value {
+        Variant::String(text) => text.as_ref().to_owned(),
+        Variant::LocalizedText(text) => text.text.as_ref().to_owned(),
+        _ => String::new(),
+    }
+}
+
+/// How often a server tells of changes.
+const PUBLISHING: Duration = Duration::from_millis(20);
+/// How often it is asked, in case it does not.
+const LOOK: Duration = Duration::from_millis(500);
+const QUEUE: usize = 16;
