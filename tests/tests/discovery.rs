@@ -262,7 +262,7 @@ fn node_opcuas_discovery_server_and_ours_see_what_the_other_announces() {
         let network = status["network"].as_array()?.clone();
         network
             .into_iter()
-            .find(|record| record["url"] == format!("opc.tcp://{THERE}:4841/"))
+            .find(|record| record["url"] == format!("opc.tcp://{THERE}:4841/DiscoveryServer"))
     });
     assert_eq!(seen["capabilities"], json!(["LDS"]));
     let before = Instant::now();

@@ -98,7 +98,7 @@ impl Mdns {
             warn!(
                 name = ours.announcement.instance,
                 url = ours.announcement.url,
-                "a server cannot be announced on {}: no address there",
+                "a server cannot be announced on {}: it listens on no address there",
                 self.interface
             );
             return;
@@ -270,6 +270,7 @@ impl Mdns {
         } = &ours.announcement;
         let url = Url::parse(url)?;
         let addresses = match url.ip() {
+            Some(IpAddr::V4(ip)) if ip.is_loopback() && !self.interface.is_loopback() => return None,
             Some(IpAddr::V4(ip)) if !ip.is_unspecified() => vec![ip],
             Some(IpAddr::V6(ip)) if !ip.is_unspecified() => return None,
             _ => self.interface.addresses(),
