@@ -34,6 +34,11 @@ impl EndpointUrl {
         }
     }
 
+    /// The URL clients are told, with the port that is listened on.
+    pub(crate) fn advertised(&self, port: u16) -> String {
+        format!("opc.tcp://{}:{port}{}", self.advertised_host(), self.path)
+    }
+
     /// Opens the listening socket.
     ///
     /// # Errors
@@ -224,7 +229,7 @@ const LARGEST_VALUE: usize = 64 << 20;
 /// Each element takes up 24 bytes and more while a message is read.
 const LARGEST_ARRAY: usize = 4 << 20;
 const APPLICATION_NAME: &str = "UA bridge server";
-const PRODUCT_URI: &str = "urn:ua-bridge:server";
+pub(crate) const PRODUCT_URI: &str = "urn:ua-bridge:server";
 /// The port of OPC UA Connection Protocol registered with IANA.
 const DEFAULT_PORT: u16 = 4840;
 /// How often subscriptions are looked at: how late a notification may be beyond its publishing interval.

@@ -26,6 +26,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use bridge_node::{Arguments, Context, Failure, FailureKind, Owned, Program};
+use discovery::{AnnounceSettings, Interface};
 use mappings::{Mapping, SpaceId};
 
 use crate::endpoint::EndpointUrl;
@@ -48,10 +49,31 @@ struct UaServer {
     /// Trust every client certificate, and keep it as trusted. For tests and demonstrations only
     #[arg(long)]
     trust_any_client_certificate: bool,
+    /// Register with this Local Discovery Server, now or when it comes, as opc.tcp://127.0.0.1:4840
+    #[arg(long, value_name = "URL", env = "UA_LDS")]
+    lds: Option<String>,
+    /// Announce the server by mDNS on the network interface of --interface; without that, to this host
+    #[arg(long)]
+    announce: bool,
 }
 
 fn main() -> ExitCode {
     bridge_node::run::<UaServer>()
+}
+
+impl UaServer {
+    /// To whom the server is told of, if to anybody.
+    fn announcement(&self) -> Option<AnnounceSettings> {
+        let interface = self.arguments.flags.interface.as_deref().map(Interface::parse);
+        let settings = AnnounceSettings {
+            lds: self.lds.clone(),
+            mdns: self
+                .announce
+                .then(|| interface.unwrap_or(Interface::LOOPBACK)),
+            ..AnnounceSettings::default()
+        };
+        (self.announce || self.lds.is_some()).then_some(settings)
+    }
 }
 
 impl Program for UaServer {
@@ -101,6 +123,7 @@ impl Program for UaServer {
             trust_any_client: self.trust_any_client_certificate,
             types: Types::new(&context.types),
             mapped_url: self.endpoint.is_none(),
+            announce: self.announcement(),
         };
         ServerPort::start(&context.mapping, setup)
     }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::{Delivery, Described, Failure, FailureKind, Kept, Port, PortEvent, TypePaths};
+use discovery::{AnnounceSettings, Announced, announce};
 use mappings::{Mapping, Server, SpaceId, TopicId};
 use opcua::server::ServerHandle;
 use opcua::server::address_space::AddressSpace;
@@ -35,6 +36,8 @@ pub(crate) struct Setup {
     pub(crate) types: Types,
     /// Whether the mapping says the endpoint; else the command line does.
     pub(crate) mapped_url: bool,
+    /// To whom the server is told of.
+    pub(crate) announce: Option<AnnounceSettings>,
 }
 
 /// The OPC UA side of the space.
@@ -56,6 +59,8 @@ pub(crate) struct ServerPort {
     types: Types,
     pki: Pki,
     look: Interval,
+    /// Who is told of the server is until the end. Taken then.
+    told: Option<Announced>,
 }
 
 impl ServerPort {
@@ -126,6 +131,11 @@ impl ServerPort {
             "serving at {} (port {port})",
             setup.url
         );
+        let told = setup
+            .announce
+            .map(|settings| announce(told_of(described, setup.url.advertised(port)), settings))
+            .transpose()
+            .map_err(|error| unavailable(error.to_string()))?;
         let mut look = tokio::time::interval(LOOK_AT_REJECTED);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         Ok(Self {
@@ -142,6 +152,7 @@ impl ServerPort {
             types,
             pki: setup.pki,
             look,
+            told,
         })
     }
 }
@@ -228,6 +239,10 @@ impl Port for ServerPort {
     }
 
     async fn shutdown(mut self) {
+        if let Some(told) = self.told.take() {
+            // Late: others find out by themselves.
+            let _late = tokio::time::timeout(GOODBYE, told.leave()).await;
+        }
         self.handle.cancel();
         if let Some(serving) = &mut self.serving
             && tokio::time::timeout(SHUTDOWN, serving).await.is_err()
@@ -246,6 +261,17 @@ impl Drop for ServerPort {
             // A runtime may not be waited for inside another one.
             runtime.shutdown_background();
         }
+    }
+}
+
+/// The server as others are told of it.
+fn told_of(described: &Server, url: String) -> discovery::Server {
+    discovery::Server {
+        application_uri: described.application_uri.clone(),
+        product_uri: endpoint::PRODUCT_URI.to_owned(),
+        name: "ua-server".to_owned(),
+        url,
+        capabilities: vec!["DA".to_owned()],
     }
 }
 
@@ -335,3 +361,5 @@ const MOST_CREATED: usize = 10_000;
 const LOOK_AT_REJECTED: Duration = Duration::from_secs(1);
 /// Within the 2 s a port has to end.
 const SHUTDOWN: Duration = Duration::from_millis(1_500);
+/// Of those, to say goodbye.
+const GOODBYE: Duration = Duration::from_millis(400);
