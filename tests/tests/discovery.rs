@@ -280,6 +280,44 @@ fn node_opcuas_discovery_server_and_ours_see_what_the_other_announces() {
 }
 
 #[test]
+fn the_cells_server_is_found_and_shows_who_is_there() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _lds = lds(&[]);
+    let endpoint = "opc.tcp://127.0.0.1:4841/";
+    let mut server = cell.ua_server(&["--endpoint", endpoint, "--lds", LDS, "--announce"]);
+    let found = eventually("the server is found", SOON, || on_network("ua-server"));
+    assert_eq!(found["url"], endpoint);
+    let uri = eventually("it is registered", SOON, || {
+        let status = metrics(STATUS)?;
+        status["servers"][0]["uri"].as_str().map(str::to_owned)
+    });
+    let gripper = announced("gripper", &[]);
+    server.wait_for_line("a server is seen", SOON);
+    let name = on_network("gripper").unwrap()["name"]
+        .as_str()
+        .unwrap()
+        .to_owned();
+    let node = format!("ns=1;s=UaSpace.Components.{name}");
+    let [url, online] = ["Url", "Online"].map(|property| format!("{node}.{property}"));
+    let read = || cell.asyncua_once("opcua_read.py", &[endpoint, &url, &online]);
+    let shown = read();
+    assert!(
+        shown[0]["value"]
+            .as_str()
+            .is_some_and(|url| url.starts_with("opc.tcp://127.0.0.1:")),
+        "{shown:?}"
+    );
+    assert_eq!(shown[1]["value"], true);
+    gripper.signal(Signal::SIGKILL);
+    server.wait_for_line("a server is gone", SOON);
+    assert_eq!(read()[1]["value"], false);
+    server.end();
+    assert_eq!(registered(&uri), None, "it said so before it ended");
+}
+
+#[test]
 fn tshark_reads_the_announcement_and_the_goodbye() {
     let Some(cell) = Cell::with(&[Peer::Tshark]) else {
         return;

@@ -270,7 +270,9 @@ impl Mdns {
         } = &ours.announcement;
         let url = Url::parse(url)?;
         let addresses = match url.ip() {
-            Some(IpAddr::V4(ip)) if ip.is_loopback() && !self.interface.is_loopback() => return None,
+            Some(IpAddr::V4(ip)) if ip.is_loopback() && !self.interface.is_loopback() => {
+                return None;
+            }
             Some(IpAddr::V4(ip)) if !ip.is_unspecified() => vec![ip],
             Some(IpAddr::V6(ip)) if !ip.is_unspecified() => return None,
             _ => self.interface.addresses(),

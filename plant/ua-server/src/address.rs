@@ -92,7 +92,11 @@ pub(crate) fn add_folders(layout: &Layout, address_space: &mut AddressSpace) {
 /// Where each node is among those with its parent: the spaces by their numbers, variables as in the mapping, and fields
 /// as in the message.
 pub(crate) fn order(layout: &Layout) -> HashMap<NodeId, usize> {
-    let mut order = HashMap::from([(root(), 1), (unmapped_folder(), usize::MAX)]);
+    let mut order = HashMap::from([
+        (root(), 1),
+        (components_folder(), usize::MAX - 1),
+        (unmapped_folder(), usize::MAX),
+    ]);
     for (at, topic) in (1..).zip(&layout.topics) {
         let space = topic.topic.space;
         order.insert(origin_folder(space), usize::from(space.get()) + 1);
@@ -136,6 +140,11 @@ pub(crate) fn origin_folder(space: SpaceId) -> NodeId {
 
 pub(crate) fn unmapped_folder() -> NodeId {
     NodeId::new(APPLICATION, "UaSpace.Unmapped")
+}
+
+/// Of the servers that are there.
+pub(crate) fn components_folder() -> NodeId {
+    NodeId::new(APPLICATION, "UaSpace.Components")
 }
 
 /// The node of a topic that the mapping does not name.

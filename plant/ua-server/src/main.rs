@@ -5,12 +5,14 @@
 //! no ROS.
 //!
 //! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show),
-//! `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in), `port` (the shell's side),
+//! `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in),
+//! `components` (which servers are there), `port` (the shell's side),
 //! `endpoint` and `pki` (how clients get in), `value` (between the two codecs).
 
 mod address;
 mod browse;
 mod budget;
+mod components;
 mod endpoint;
 mod layout;
 mod nodes;
@@ -52,7 +54,8 @@ struct UaServer {
     /// Register with this Local Discovery Server, now or when it comes, as opc.tcp://127.0.0.1:4840
     #[arg(long, value_name = "URL", env = "UA_LDS")]
     lds: Option<String>,
-    /// Announce the server by mDNS on the network interface of --interface; without that, to this host
+    /// Announce the server by mDNS on the network interface of --interface, and show the servers that are there; without
+    /// an interface, to this host and of this host
     #[arg(long)]
     announce: bool,
 }
@@ -64,7 +67,12 @@ fn main() -> ExitCode {
 impl UaServer {
     /// To whom the server is told of, if to anybody.
     fn announcement(&self) -> Option<AnnounceSettings> {
-        let interface = self.arguments.flags.interface.as_deref().map(Interface::parse);
+        let interface = self
+            .arguments
+            .flags
+            .interface
+            .as_deref()
+            .map(Interface::parse);
         let settings = AnnounceSettings {
             lds: self.lds.clone(),
             mdns: self

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::{Delivery, Described, Failure, FailureKind, Kept, Port, PortEvent, TypePaths};
-use discovery::{AnnounceSettings, Announced, announce};
+use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
 use mappings::{Mapping, Server, SpaceId, TopicId};
 use opcua::server::ServerHandle;
 use opcua::server::address_space::AddressSpace;
@@ -21,6 +21,7 @@ use tracing::{info, warn};
 use uadp::BuiltinType;
 
 use crate::browse::Ordered;
+use crate::components::Components;
 use crate::endpoint::{self, EndpointUrl};
 use crate::layout::Layout;
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
@@ -59,8 +60,9 @@ pub(crate) struct ServerPort {
     types: Types,
     pki: Pki,
     look: Interval,
-    /// Who is told of the server is until the end. Taken then.
+    /// Tells of the server until the end. Taken then.
     told: Option<Announced>,
+    components: Option<Components>,
 }
 
 impl ServerPort {
@@ -131,6 +133,19 @@ impl ServerPort {
             "serving at {} (port {port})",
             setup.url
         );
+        let heard = setup.announce.as_ref().and_then(|told| told.mdns.clone());
+        let components = heard.map(|interface| {
+            let mdns = Some(interface);
+            let watcher = watch(WatchSettings {
+                mdns,
+                ..WatchSettings::default()
+            })?;
+            let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
+            Ok(Components::new(watcher, nodes, &described.application_uri))
+        });
+        let components = components
+            .transpose()
+            .map_err(|error: MdnsFault| unavailable(error.to_string()))?;
         let told = setup
             .announce
             .map(|settings| announce(told_of(described, setup.url.advertised(port)), settings))
@@ -153,6 +168,7 @@ impl ServerPort {
             pki: setup.pki,
             look,
             told,
+            components,
         })
     }
 }
@@ -174,6 +190,7 @@ impl Port for ServerPort {
                     return PortEvent::Sample { topic, payload: block, received: source, latched_by: None };
                 }
                 ended = ended(&mut self.serving) => return PortEvent::Ended(ended),
+                () = next(&mut self.components) => {}
                 _ = self.look.tick() => self.pki.report_rejected(),
             }
         }
@@ -261,6 +278,14 @@ impl Drop for ServerPort {
             // A runtime may not be waited for inside another one.
             runtime.shutdown_background();
         }
+    }
+}
+
+/// What happens next to the servers that are there.
+async fn next(components: &mut Option<Components>) {
+    match components {
+        Some(components) => components.next().await,
+        None => std::future::pending().await,
     }
 }
 

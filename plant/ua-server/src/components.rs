@@ -1,0 +1,171 @@
+//! The servers that are there, as objects: what each is called, where it is, and whether it still is.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use discovery::{Found, Known, Watcher};
+use opcua::nodes::{ObjectBuilder, VariableBuilder};
+use opcua::server::SubscriptionCache;
+use opcua::server::address_space::AddressSpace;
+use opcua::types::{
+    AttributeId, DataTypeId, DataValue, DateTime, LocalizedText, NodeId, ObjectTypeId,
+    QualifiedName, VariableTypeId, Variant,
+};
+use tracing::info;
+
+use crate::address;
+use crate::nodes::SpaceManager;
+
+/// Shows each server that a watcher tells of, and those that have gone for some time after.
+pub(crate) struct Components {
+    watcher: Watcher,
+    manager: Arc<SpaceManager>,
+    subscriptions: Arc<SubscriptionCache>,
+    /// This server itself is none of them.
+    own_uri: String,
+    /// Those that are gone, the one that has been so longest first.
+    gone: VecDeque<String>,
+}
+
+impl Components {
+    pub(crate) fn new(
+        watcher: Watcher,
+        (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
+        own_uri: &str,
+    ) -> Self {
+        address::add_folder(
+            &address::components_folder(),
+            "Components",
+            address::root(),
+            &mut manager.address_space().write(),
+        );
+        Self {
+            watcher,
+            manager,
+            subscriptions,
+            own_uri: own_uri.to_owned(),
+            gone: VecDeque::new(),
+        }
+    }
+
+    /// Waits for the next thing to happen, and shows it. Whoever drops it before loses nothing.
+    pub(crate) async fn next(&mut self) {
+        match self.watcher.next().await {
+            Some(found) => self.show(&found),
+            None => std::future::pending().await,
+        }
+    }
+
+    fn show(&mut self, found: &Found) {
+        let known = found.known();
+        if known.is_lds() || known.application_uri.as_ref() == Some(&self.own_uri) {
+            return;
+        }
+        let name = &known.name;
+        let online = match found {
+            Found::Seen(_) | Found::Restarted(_) => {
+                info!(
+                    ?name,
+                    url = known.url,
+                    uri = known.application_uri,
+                    "a server is seen"
+                );
+                self.gone.retain(|gone| gone != name);
+                true
+            }
+            Found::Gone { loss, .. } => {
+                info!(
+                    ?name,
+                    url = known.url,
+                    loss = loss.label(),
+                    "a server is gone"
+                );
+                self.gone.push_back(name.clone());
+                false
+            }
+        };
+        let oldest = (self.gone.len() > MOST_GONE)
+            .then(|| self.gone.pop_front())
+            .flatten();
+        let values = values(known, online);
+        {
+            let mut address_space = self.manager.address_space().write();
+            if let Some(oldest) = oldest {
+                drop(address_space.delete(&node(&oldest, ""), true));
+            }
+            add(&mut address_space, name, &values);
+        }
+        let values = values.map(|(property, _, _, value)| (node(name, property), value));
+        let mut notifier = self.subscriptions.data_notifier();
+        for (node, value) in &values {
+            let value = DataValue::new_now(value.clone());
+            notifier.notify(node, AttributeId::Value, value);
+        }
+    }
+}
+
+type Property = (&'static str, DataTypeId, i32, Variant);
+
+fn values(known: &Known, online: bool) -> [Property; 5] {
+    let capabilities: Vec<_> = known
+        .capabilities
+        .iter()
+        .map(|code| code.as_str().into())
+        .collect();
+    let capabilities: Vec<opcua::types::UAString> = capabilities;
+    let uri = known.application_uri.as_deref().unwrap_or_default();
+    [
+        ("ApplicationUri", DataTypeId::String, -1, uri.into()),
+        ("Url", DataTypeId::String, -1, known.url.as_str().into()),
+        ("Capabilities", DataTypeId::String, 1, capabilities.into()),
+        ("Online", DataTypeId::Boolean, -1, online.into()),
+        ("Since", DataTypeId::UtcTime, -1, time(known.since).into()),
+    ]
+}
+
+/// Puts the object of a server in the place of what it was.
+fn add(address_space: &mut AddressSpace, name: &str, values: &[Property]) {
+    let object = node(name, "");
+    drop(address_space.delete(&object, true));
+    let names = QualifiedName::new(object.namespace, name);
+    ObjectBuilder::new(&object, names, LocalizedText::from(name))
+        .has_type_definition(ObjectTypeId::BaseObjectType)
+        .organized_by(address::components_folder())
+        .insert(address_space);
+    for (property, data_type, rank, value) in values {
+        let id = node(name, property);
+        drop(address_space.delete(&id, true));
+        let names = QualifiedName::new(id.namespace, *property);
+        VariableBuilder::new(&id, names, LocalizedText::from(*property))
+            .data_type(*data_type)
+            .value_rank(*rank)
+            .value(value.clone())
+            .has_type_definition(VariableTypeId::PropertyType)
+            .property_of(object.clone())
+            .insert(address_space);
+    }
+}
+
+/// The object of a server, or one of its properties.
+fn node(name: &str, property: &str) -> NodeId {
+    let folder = address::components_folder();
+    let dot = if property.is_empty() { "" } else { "." };
+    NodeId::new(
+        folder.namespace,
+        format!("UaSpace.Components.{name}{dot}{property}"),
+    )
+}
+
+fn time(at: SystemTime) -> DateTime {
+    let since = at
+        .duration_since(SystemTime::UNIX_EPOCH)
+        .unwrap_or_default()
+        + TO_1970;
+    DateTime::from(i64::try_from(since.as_nanos() / 100).unwrap_or(i64::MAX))
+}
+
+/// How many that are gone are still shown.
+const MOST_GONE: usize = 64;
+/// From 1601 to 1970.
+const TO_1970: Duration = Duration::from_secs(11_644_473_600);
