@@ -1,3 +1,8 @@
 //! The semantic MES.
 
+mod execute;
+mod plan;
+mod process;
+mod record;
+
 fn main() {}

@@ -1,0 +1,415 @@
+//! A process from its plan to its end: planned with what the plant offers, run, and planned anew when a component is lost.
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use async_trait::async_trait;
+use skills::{Outcome, PickAndPlace, Runs, SkillFault, Teller, Value};
+use tokio::sync::watch;
+use tracing::{info, warn};
+
+use crate::plan::{Fallen, Offer, Plan, plan};
+use crate::process::{Job, Process, Role};
+use crate::record::{How, Planned, Ran, Run};
+
+/// The plant as a process sees it.
+#[async_trait]
+pub(crate) trait Plant: Send + Sync {
+    /// What is there now.
+    fn offers(&self) -> Vec<Offer>;
+
+    /// Rises with each change of that.
+    fn changes(&self) -> watch::Receiver<u64>;
+
+    /// Gets ready to run these skills, in the order of the offers. Who runs them has them for himself until it is closed.
+    async fn open(&self, offers: &[Offer]) -> Result<Box<dyn Opened>, OpenFault>;
+
+    /// What a step gives a skill, as the skill wants it.
+    fn values(&self, skill: &str, given: &[(String, serde_json::Value)]) -> Result<Vec<(String, Value)>, String>;
+
+    /// Keeps what has become of a run.
+    fn keep(&self, run: &Run);
+
+    /// The time in ms since 1970.
+    fn now(&self) -> u64;
+}
+
+/// Skills that can be run.
+#[async_trait]
+pub(crate) trait Opened: Send + Sync {
+    /// In the order in which they were asked for.
+    fn skills(&self) -> Vec<Arc<dyn Runs>>;
+
+    /// Gives them back.
+    async fn close(self: Box<Self>);
+}
+
+/// Which offer could not be opened, and why.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct OpenFault {
+    pub(crate) component: String,
+    pub(crate) why: String,
+}
+
+/// Runs a process to its end. `teller` hears of each step, and may want all to stop.
+pub(crate) async fn execute(plant: &Arc<dyn Plant>, process: &Process, number: u64, teller: &dyn Teller) -> Run {
+    let run = Run::begins(process, plant.now(), number);
+    plant.keep(&run);
+    info!(process = process.iri, run = run.run, "a process begins");
+    let log = Arc::new(Log { plant: Arc::clone(plant), kept: Mutex::new(Kept { run, step: String::new(), fallen: Vec::new() }) });
+    let ended = Execution { plant: &**plant, process, log: &log, teller }.run().await;
+    log.change(|kept, now| {
+        kept.run.ended_ms = Some(now);
+        kept.run.waits_for = None;
+        (kept.run.outcome, kept.run.reason) = match ended {
+            Ok(()) => (How::Done, None),
+            Err(why) => (How::Failed, Some(why)),
+        };
+    });
+    let run = log.run();
+    match &run.reason {
+        None => info!(process = process.iri, run = run.run, plans = run.plans.len(), "a process is done"),
+        Some(reason) => warn!(process = process.iri, run = run.run, "a process failed: {reason}"),
+    }
+    run
+}
+
+/// Plans a process and does nothing.
+pub(crate) fn dry_run(plant: &dyn Plant, process: &Process) -> Plan {
+    plan(process, &plant.offers(), &[])
+}
+
+struct Execution<'a> {
+    plant: &'a dyn Plant,
+    process: &'a Process,
+    log: &'a Arc<Log>,
+    teller: &'a dyn Teller,
+}
+
+/// How a plan ended.
+enum Ended {
+    Done,
+    /// Another plan may do it.
+    Broken(String),
+    /// None may.
+    Over(String),
+}
+
+impl Execution<'_> {
+    async fn run(&self) -> Result<(), String> {
+        let mut last = String::new();
+        for number in 1..=MOST_PLANS {
+            let (plan, offers) = self.planned(&last).await?;
+            self.log.change(|kept, now| {
+                kept.run.waits_for = None;
+                kept.run.plans.push(Planned {
+                    number,
+                    at_ms: now,
+                    ended_ms: None,
+                    plan,
+                    ran: Vec::new(),
+                    outcome: How::Running,
+                    reason: None,
+                    retreated: None,
+                });
+            });
+            let ended = self.carry_out(&offers).await;
+            let (outcome, reason) = match &ended {
+                Ended::Done => (How::Done, None),
+                Ended::Broken(why) | Ended::Over(why) => (How::Failed, Some(why.clone())),
+            };
+            self.log.change(|kept, now| {
+                if let Some(plan) = kept.run.plan() {
+                    plan.end(now, outcome, reason);
+                }
+            });
+            match ended {
+                Ended::Done => return Ok(()),
+                Ended::Over(why) => return Err(why),
+                Ended::Broken(why) => {
+                    warn!(plan = number, "a plan broke: {why}");
+                    last = why;
+                }
+            }
+        }
+        Err(format!("{MOST_PLANS} plans broke; the last: {last}"))
+    }
+
+    /// A plan that has somebody for all, as soon as there is one, with the offers chosen by their roles.
+    async fn planned(&self, last: &str) -> Result<(Plan, Vec<(Role, Offer)>), String> {
+        let mut changes = self.plant.changes();
+        let wait = tokio::time::sleep(self.process.wait);
+        tokio::pin!(wait);
+        loop {
+            changes.mark_unchanged();
+            let offers = self.plant.offers();
+            let plan = plan(self.process, &offers, &self.log.fallen());
+            if plan.is_complete() {
+                let mut chosen: Vec<(Role, Offer)> = Vec::new();
+                for role in self.process.steps.iter().flat_map(|step| &step.needs).map(|need| need.role) {
+                    let offer = plan.chosen(role).and_then(|skill| offers.iter().find(|offer| offer.skill == skill));
+                    if let Some(offer) = offer.filter(|_| chosen.iter().all(|(known, _)| *known != role)) {
+                        chosen.push((role, offer.clone()));
+                    }
+                }
+                return Ok((plan, chosen));
+            }
+            let missing = plan.missing();
+            self.log.change(|kept, _| kept.run.waits_for = Some(missing.clone()));
+            self.teller.step("Wait").await;
+            tokio::select! {
+                changed = changes.changed() => {
+                    if changed.is_err() {
+                        return Err("the plant is not watched any more".to_owned());
+                    }
+                }
+                () = &mut wait => {
+                    let after = if last.is_empty() { String::new() } else { format!("{last}; ") };
+                    return Err(format!("{after}nobody came in {} s: {missing}", self.process.wait.as_secs_f64()));
+                }
+                () = self.teller.stopped() => return Err("stopped".to_owned()),
+            }
+        }
+    }
+
+    async fn carry_out(&self, chosen: &[(Role, Offer)]) -> Ended {
+        let offers: Vec<Offer> = chosen.iter().map(|(_, offer)| offer.clone()).collect();
+        let opened = match self.plant.open(&offers).await {
+            Ok(opened) => opened,
+            Err(fault) => {
+                let since_ms = offers.iter().find(|offer| offer.component == fault.component).map_or(0, |offer| offer.since_ms);
+                let why = format!("it cannot be reached: {}", fault.why);
+                self.log.fell(Fallen { component: fault.component.clone(), since_ms, skill: None, why });
+                return Ended::Broken(format!("{} cannot be reached: {}", fault.component, fault.why));
+            }
+        };
+        let watched = opened.skills().into_iter().zip(&offers).map(|(skill, offer)| {
+            let watched = Watched { inner: skill, offer: offer.clone(), log: Arc::clone(self.log), process: self.process.clone() };
+            Arc::new(watched) as Arc<dyn Runs>
+        });
+        let roles: Vec<(Role, Arc<dyn Runs>)> = chosen.iter().map(|(role, _)| *role).zip(watched).collect();
+        let ended = match &self.process.work {
+            Job::PickAndPlace(job) => self.pick_and_place(job, &roles).await,
+            Job::Sequence(parameters) => self.sequence(parameters, chosen, &roles).await,
+        };
+        drop(roles);
+        // Who is lost does not say goodbye.
+        if tokio::time::timeout(CLOSE, opened.close()).await.is_err() {
+            warn!("the components of a plan were not given back in time");
+        }
+        ended
+    }
+
+    async fn pick_and_place(&self, job: &skills::Job, roles: &[(Role, Arc<dyn Runs>)]) -> Ended {
+        let of = |wanted: Role| roles.iter().find(|(role, _)| *role == wanted).map(|(_, skill)| Arc::clone(skill));
+        let (Some(ptp), Some(linear), Some(grasp), Some(release)) = (of(Role::Ptp), of(Role::Linear), of(Role::Grasp), of(Role::Release)) else {
+            return Ended::Over("the process does not say who moves, grasps and releases".to_owned());
+        };
+        let composite = PickAndPlace { ptp, linear, grasp, release, within: self.process.within };
+        match composite.run(job, self).await {
+            Ok(()) => Ended::Done,
+            Err(broken) => {
+                let has_retreated = broken.retreated.is_ok();
+                self.log.change(|kept, _| {
+                    if let Some(plan) = kept.run.plan() {
+                        plan.retreated = Some(has_retreated);
+                    }
+                });
+                // With a robot over the place, or nobody knows where, no other begins.
+                if has_retreated { Ended::Broken(broken.to_string()) } else { Ended::Over(broken.to_string()) }
+            }
+        }
+    }
+
+    async fn sequence(&self, parameters: &[Vec<(String, serde_json::Value)>], chosen: &[(Role, Offer)], roles: &[(Role, Arc<dyn Runs>)]) -> Ended {
+        for (((_, skill), (_, offer)), (step, given)) in roles.iter().zip(chosen).zip(self.process.steps.iter().zip(parameters)) {
+            self.log.step(&step.name);
+            self.teller.step("Step").await;
+            let values = match self.plant.values(&offer.skill, given) {
+                Ok(values) => values,
+                Err(why) => return Ended::Over(format!("{}: {why}", step.name)),
+            };
+            let outcome = tokio::select! {
+                outcome = skill.run(values, self.process.within) => outcome,
+                why = skill.lost() => Err(SkillFault::Lost(why)),
+                () = self.teller.stopped() => {
+                    return match skill.halt().await {
+                        Ok(()) => Ended::Over("stopped".to_owned()),
+                        Err(fault) => Ended::Over(format!("stopped, but {} may go on: {fault}", skill.name())),
+                    };
+                }
+            };
+            let why = match outcome {
+                Ok(outcome) if outcome.succeeded => continue,
+                Ok(outcome) => outcome.message,
+                Err(fault) => fault.to_string(),
+            };
+            // What was done before would be done twice by another plan.
+            let why = format!("{}: {} {why}", step.name, skill.name());
+            let is_first = self.process.steps.first() == Some(step);
+            return if is_first { Ended::Broken(why) } else { Ended::Over(why) };
+        }
+        Ended::Done
+    }
+}
+
+/// The composite tells its steps to the log and to who asked.
+#[async_trait]
+impl Teller for Execution<'_> {
+    async fn step(&self, step: &'static str) {
+        self.log.step(step);
+        self.teller.step(step).await;
+    }
+
+    async fn stopped(&self) {
+        self.teller.stopped().await;
+    }
+}
+
+/// What becomes of a run.
+struct Log {
+    plant: Arc<dyn Plant>,
+    kept: Mutex<Kept>,
+}
+
+struct Kept {
+    run: Run,
+    step: String,
+    fallen: Vec<Fallen>,
+}
+
+impl Log {
+    /// Changes the record and keeps it. Nobody is waited for with the lock held.
+    fn change(&self, change: impl FnOnce(&mut Kept, u64)) {
+        let now = self.plant.now();
+        let run = {
+            let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
+            change(&mut kept, now);
+            kept.run.clone()
+        };
+        self.plant.keep(&run);
+    }
+
+    fn run(&self) -> Run {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner).run.clone()
+    }
+
+    fn fallen(&self) -> Vec<Fallen> {
+        self.kept.lock().unwrap_or_else(PoisonError::into_inner).fallen.clone()
+    }
+
+    fn step(&self, step: &str) {
+        step.clone_into(&mut self.kept.lock().unwrap_or_else(PoisonError::into_inner).step);
+    }
+
+    fn fell(&self, fallen: Fallen) {
+        self.change(|kept, now| {
+            if let Some(plan) = kept.run.plan().filter(|_| fallen.skill.is_none()) {
+                plan.lost(now, &fallen);
+            }
+            if kept.fallen.len() < MOST_FALLEN && !kept.fallen.contains(&fallen) {
+                kept.fallen.push(fallen);
+            }
+        });
+    }
+}
+
+/// A skill whose runs are kept in the log.
+struct Watched {
+    inner: Arc<dyn Runs>,
+    offer: Offer,
+    process: Process,
+    log: Arc<Log>,
+}
+
+impl Watched {
+    fn begins(&self) {
+        self.log.change(|kept, now| {
+            let step = kept.step.clone();
+            let of = of_step(&self.process, &step);
+            if let Some(plan) = kept.run.plan() {
+                plan.ran.push(Ran {
+                    step,
+                    of,
+                    skill: self.offer.skill.clone(),
+                    component: self.offer.component.clone(),
+                    started_ms: now,
+                    ended_ms: None,
+                    outcome: How::Running,
+                    reason: None,
+                });
+            }
+        });
+    }
+
+    fn ends(&self, outcome: How, reason: Option<String>) {
+        self.log.change(|kept, now| {
+            let is_this = |ran: &&mut Ran| ran.ended_ms.is_none() && ran.skill == self.offer.skill;
+            if let Some(ran) = kept.run.plan().and_then(|plan| plan.ran.iter_mut().rev().find(is_this)) {
+                ran.ended_ms = Some(now);
+                ran.outcome = outcome;
+                ran.reason = reason;
+            }
+        });
+    }
+
+    fn fell(&self, is_lost: bool, why: &str) {
+        let skill = (!is_lost).then(|| self.offer.skill.clone());
+        let why = if is_lost { format!("it was lost in this run: {why}") } else { format!("it failed in this run: {why}") };
+        self.log.fell(Fallen { component: self.offer.component.clone(), since_ms: self.offer.since_ms, skill, why });
+    }
+}
+
+#[async_trait]
+impl Runs for Watched {
+    fn name(&self) -> String {
+        self.inner.name()
+    }
+
+    async fn run(&self, parameters: Vec<(String, Value)>, within: Duration) -> Result<Outcome, SkillFault> {
+        self.begins();
+        let outcome = self.inner.run(parameters, within).await;
+        match &outcome {
+            Ok(outcome) if outcome.succeeded => self.ends(How::Done, None),
+            Ok(outcome) => {
+                self.fell(false, &outcome.message);
+                self.ends(How::Failed, Some(outcome.message.clone()));
+            }
+            Err(SkillFault::Lost(why)) => self.fell(true, why),
+            Err(fault) => {
+                self.fell(false, &fault.to_string());
+                self.ends(How::Failed, Some(fault.to_string()));
+            }
+        }
+        outcome
+    }
+
+    async fn halt(&self) -> Result<(), SkillFault> {
+        self.inner.halt().await
+    }
+
+    async fn lost(&self) -> String {
+        let why = self.inner.lost().await;
+        self.fell(true, &why);
+        why
+    }
+}
+
+/// The step of the process that a step of the composite belongs to: picking up to where the thing is lifted, then placing.
+fn of_step(process: &Process, step: &str) -> String {
+    let is_picking = step.starts_with("MovePick") || matches!(step, "Init" | "Grasp");
+    let of = match (&process.work, process.steps.as_slice()) {
+        (Job::PickAndPlace(_), [picks, .., places]) => if is_picking { Some(picks) } else { Some(places) },
+        (Job::PickAndPlace(_), [all]) => Some(all),
+        (Job::PickAndPlace(_), []) | (Job::Sequence(_), _) => None,
+    };
+    of.map_or_else(|| step.to_owned(), |of| of.name.clone())
+}
+
+/// How many plans of a run may break.
+const MOST_PLANS: usize = 10;
+const MOST_FALLEN: usize = 100;
+const CLOSE: Duration = Duration::from_secs(3);
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,310 @@
+//! From what a process needs and what the plant offers to who does what, and why. A pure function: the rows of one question in,
+//! a plan with its reasons out.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
+
+use knowledge::Answer;
+use serde::Serialize;
+
+use crate::process::{Group, Need, Process, Role};
+
+/// A skill that is there, as the question `candidates` tells it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Offer {
+    /// Whether it is one of a component, and not of a module.
+    pub(crate) is_skill: bool,
+    /// IRIs.
+    pub(crate) component: String,
+    pub(crate) skill: String,
+    pub(crate) component_name: String,
+    pub(crate) name: String,
+    /// Its type and those above it, as `nsu=<namespace>;<BrowseName>`.
+    pub(crate) types: Vec<String>,
+    /// The classes of capability it realises.
+    pub(crate) capabilities: Vec<String>,
+    /// Those, and all above them.
+    pub(crate) closure: Vec<String>,
+    pub(crate) endpoint: String,
+    pub(crate) node: String,
+    /// Since when its component is in the graph, ms since 1970.
+    pub(crate) since_ms: u64,
+}
+
+/// What is not to be chosen although it may be there, and why.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Fallen {
+    /// The IRI of the component.
+    pub(crate) component: String,
+    /// Of the component's stay in the graph; when it has come anew, it is as good as new.
+    pub(crate) since_ms: u64,
+    /// The skill that failed; `None` where all of the component is lost.
+    pub(crate) skill: Option<String>,
+    pub(crate) why: String,
+}
+
+/// Who does what, and why not another.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(crate) struct Plan {
+    pub(crate) steps: Vec<PlannedStep>,
+}
+
+/// A step of a plan.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(crate) struct PlannedStep {
+    pub(crate) step: String,
+    pub(crate) needs: Vec<PlannedNeed>,
+}
+
+/// What a step needs, and who was looked at for it.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(crate) struct PlannedNeed {
+    pub(crate) role: &'static str,
+    pub(crate) capability: Option<String>,
+    #[serde(rename = "type")]
+    pub(crate) skill_type: Option<String>,
+    /// The IRI of the skill that was chosen.
+    pub(crate) chosen: Option<String>,
+    pub(crate) candidates: Vec<Candidate>,
+    #[serde(skip)]
+    role_is: Role,
+}
+
+/// A skill that was looked at.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub(crate) struct Candidate {
+    pub(crate) skill: String,
+    pub(crate) name: String,
+    pub(crate) component: String,
+    pub(crate) component_name: String,
+    pub(crate) chosen: bool,
+    pub(crate) why: String,
+}
+
+impl Offer {
+    /// Of the answer to `candidates`. `since` tells since when a component is there, by its IRI.
+    pub(crate) fn all(answer: &Answer, since: &dyn Fn(&str) -> u64) -> Vec<Self> {
+        let offer = |row| {
+            let text = |column| Answer::text(row, column).to_owned();
+            let component = text("component");
+            Self {
+                is_skill: Answer::text(row, "kind") == "skill",
+                skill: text("skill"),
+                component_name: text("component_name"),
+                name: text("name"),
+                types: Answer::texts(row, "types"),
+                capabilities: Answer::texts(row, "capabilities"),
+                closure: Answer::texts(row, "closure"),
+                endpoint: text("endpoint"),
+                node: text("node"),
+                since_ms: since(&component),
+                component,
+            }
+        };
+        answer.rows.iter().map(offer).collect()
+    }
+}
+
+/// Plans a process with what is offered, without those that have fallen out.
+pub(crate) fn plan(process: &Process, offers: &[Offer], fallen: &[Fallen]) -> Plan {
+    let mut roles: BTreeMap<Role, Vec<&Need>> = BTreeMap::new();
+    for need in process.steps.iter().flat_map(|step| &step.needs) {
+        roles.entry(need.role).or_default().push(need);
+    }
+    let fitting: BTreeMap<Role, Vec<&Offer>> = roles
+        .iter()
+        .map(|(role, needs)| {
+            let fits = |offer: &&Offer| needs.iter().all(|need| judge(need, offer, fallen).is_ok());
+            (*role, offers.iter().filter(fits).collect())
+        })
+        .collect();
+    let groups: BTreeSet<Group> = roles.keys().map(|role| role.group()).collect();
+    let teams: BTreeMap<Group, Team<'_>> = groups.into_iter().map(|group| (group, Team::of(group, &roles, &fitting))).collect();
+    let steps = process.steps.iter().map(|step| PlannedStep {
+        step: step.name.clone(),
+        needs: step.needs.iter().map(|need| planned(need, offers, fallen, teams.get(&need.role.group()))).collect(),
+    });
+    Plan { steps: steps.collect() }
+}
+
+impl Plan {
+    /// Whether there is somebody for all.
+    pub(crate) fn is_complete(&self) -> bool {
+        self.needs().all(|(_, need)| need.chosen.is_some())
+    }
+
+    /// What nobody can do, for people.
+    pub(crate) fn missing(&self) -> String {
+        let missing = self.needs().filter(|(_, need)| need.chosen.is_none());
+        let told = missing.map(|(step, need)| {
+            let wanted = match (&need.capability, &need.skill_type) {
+                (Some(capability), Some(of)) => format!("{capability} by a skill of {of}"),
+                (Some(capability), None) => capability.clone(),
+                (None, Some(of)) => format!("a skill of {of}"),
+                (None, None) => "a skill".to_owned(),
+            };
+            let looked_at: Vec<_> = need.candidates.iter().map(|candidate| format!("{}.{}: {}", candidate.component_name, candidate.name, candidate.why)).collect();
+            let looked_at = if looked_at.is_empty() { "there is none".to_owned() } else { looked_at.join("; ") };
+            format!("{step} needs {wanted} for {} ({looked_at})", need.role)
+        });
+        told.collect::<Vec<_>>().join(", ")
+    }
+
+    /// The IRI of the skill for a role.
+    pub(crate) fn chosen(&self, role: Role) -> Option<&str> {
+        self.needs().find(|(_, need)| need.role_is == role).and_then(|(_, need)| need.chosen.as_deref())
+    }
+
+    fn needs(&self) -> impl Iterator<Item = (&str, &PlannedNeed)> {
+        self.steps.iter().flat_map(|step| step.needs.iter().map(|need| (step.step.as_str(), need)))
+    }
+}
+
+/// The component that fills the roles of a group.
+struct Team<'a> {
+    /// Who does what; empty where no component can do all.
+    chosen: BTreeMap<Role, &'a Offer>,
+    /// What a component that cannot do all lacks.
+    lacks: BTreeMap<&'a str, Vec<Role>>,
+}
+
+impl<'a> Team<'a> {
+    fn of(group: Group, roles: &BTreeMap<Role, Vec<&Need>>, fitting: &BTreeMap<Role, Vec<&'a Offer>>) -> Self {
+        let roles: Vec<(Role, &Vec<&Need>)> = roles.iter().filter(|(role, _)| role.group() == group).map(|(role, needs)| (*role, needs)).collect();
+        let of_role = |role: &Role| fitting.get(role).into_iter().flatten().copied();
+        let components: BTreeSet<&str> = roles.iter().flat_map(|(role, _)| of_role(role)).map(|offer| offer.component.as_str()).collect();
+        let mut lacks = BTreeMap::new();
+        let mut teams = Vec::new();
+        for component in components {
+            let mut chosen = BTreeMap::new();
+            let mut exact = 0;
+            for (role, needs) in &roles {
+                let of_component = of_role(role).filter(|offer| offer.component == component);
+                let best = of_component.min_by_key(|offer| (Reverse(is_exact(needs, offer)), offer.skill.as_str()));
+                if let Some(best) = best {
+                    exact += usize::from(is_exact(needs, best));
+                    chosen.insert(*role, best);
+                }
+            }
+            if chosen.len() == roles.len() {
+                teams.push((exact, chosen));
+            } else {
+                let missing = roles.iter().map(|(role, _)| *role).filter(|role| !chosen.contains_key(role)).collect();
+                lacks.insert(component, missing);
+            }
+        }
+        // Who is called what is asked for, before who is it by a subclass; then who is there the longest.
+        let rank = |(exact, chosen): &(usize, BTreeMap<Role, &'a Offer>)| {
+            let first = chosen.values().next();
+            (Reverse(*exact), first.map(|offer| offer.since_ms), first.map(|offer| offer.component.as_str()))
+        };
+        let best = teams.into_iter().min_by(|one, other| rank(one).cmp(&rank(other)));
+        Self { chosen: best.map(|(_, chosen)| chosen).unwrap_or_default(), lacks }
+    }
+}
+
+fn planned(need: &Need, offers: &[Offer], fallen: &[Fallen], team: Option<&Team<'_>>) -> PlannedNeed {
+    let chosen = team.and_then(|team| team.chosen.get(&need.role)).copied();
+    let mut candidates = Vec::new();
+    for offer in offers {
+        let judged = judge(need, offer, fallen);
+        // Who has neither the capability nor the type is not asked at all.
+        if judged == Err(NotFit::Unrelated) {
+            continue;
+        }
+        let is_chosen = chosen.is_some_and(|chosen| chosen.skill == offer.skill);
+        let why = match judged {
+            Ok(fit) if is_chosen => fit,
+            Ok(_) => why_not(need, offer, chosen, team),
+            Err(NotFit::Unrelated) => String::new(),
+            Err(NotFit::Because(why)) => why,
+        };
+        candidates.push(Candidate {
+            skill: offer.skill.clone(),
+            name: offer.name.clone(),
+            component: offer.component.clone(),
+            component_name: offer.component_name.clone(),
+            chosen: is_chosen,
+            why,
+        });
+    }
+    candidates.sort_by(|one, other| (Reverse(one.chosen), &one.skill).cmp(&(Reverse(other.chosen), &other.skill)));
+    PlannedNeed {
+        role: need.role.name(),
+        capability: need.capability.clone(),
+        skill_type: need.skill_type.as_ref().map(ToString::to_string),
+        chosen: chosen.map(|offer| offer.skill.clone()),
+        candidates,
+        role_is: need.role,
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum NotFit {
+    Unrelated,
+    Because(String),
+}
+
+/// Whether an offer can do what is needed, and why.
+fn judge(need: &Need, offer: &Offer, fallen: &[Fallen]) -> Result<String, NotFit> {
+    let has_capability = need.capability.as_ref().is_none_or(|wanted| offer.closure.contains(wanted));
+    let has_type = need.skill_type.as_ref().is_none_or(|wanted| offer.types.contains(&wanted.to_string()));
+    let is_related = (need.capability.is_some() && has_capability) || (need.skill_type.is_some() && has_type);
+    if !is_related {
+        return Err(NotFit::Unrelated);
+    }
+    let because = |why: String| Err(NotFit::Because(why));
+    if !offer.is_skill {
+        return because("it is a service of a module, and those are not run from here".to_owned());
+    }
+    if let (false, Some(wanted)) = (has_capability, &need.capability) {
+        let has = if offer.capabilities.is_empty() { "no capability".to_owned() } else { offer.capabilities.join(", ") };
+        return because(format!("it realises {has}, and none of that is {wanted} or below it"));
+    }
+    if let (false, Some(wanted)) = (has_type, &need.skill_type) {
+        return because(format!("its type is not {wanted} or below it"));
+    }
+    let fell = fallen.iter().find(|fallen| {
+        fallen.component == offer.component && fallen.since_ms == offer.since_ms && fallen.skill.as_ref().is_none_or(|skill| *skill == offer.skill)
+    });
+    if let Some(fallen) = fell {
+        return because(fallen.why.clone());
+    }
+    let capability = need.capability.as_ref().map(|wanted| {
+        if offer.capabilities.contains(wanted) {
+            format!("it realises {wanted}")
+        } else {
+            format!("it realises {}, which is below {wanted}", offer.capabilities.join(", "))
+        }
+    });
+    let of_type = need.skill_type.as_ref().map(|wanted| format!("its type is {} or below it", wanted.name));
+    let reasons: Vec<String> = capability.into_iter().chain(of_type).collect();
+    Ok(reasons.join(", "))
+}
+
+/// Why one that would fit is not chosen.
+fn why_not(need: &Need, offer: &Offer, chosen: Option<&Offer>, team: Option<&Team<'_>>) -> String {
+    if let Some(lacking) = team.and_then(|team| team.lacks.get(offer.component.as_str())) {
+        let lacking: Vec<_> = lacking.iter().map(|role| role.name()).collect();
+        return format!("it would fit, but its component has nothing for {}", lacking.join(" and "));
+    }
+    let Some(chosen) = chosen else {
+        return "it would fit this step".to_owned();
+    };
+    let better = if is_exact(&[need], chosen) && !is_exact(&[need], offer) {
+        "is of just this capability"
+    } else if chosen.since_ms < offer.since_ms {
+        "has been there for longer"
+    } else {
+        "comes first by its name"
+    };
+    format!("it would fit, but {}.{} {better}", chosen.component_name, chosen.name)
+}
+
+/// Whether it realises just the capabilities that are needed, and not only some below them.
+fn is_exact(needs: &[&Need], offer: &Offer) -> bool {
+    needs.iter().filter_map(|need| need.capability.as_ref()).all(|wanted| offer.capabilities.contains(wanted))
+}
+
+#[cfg(test)]
+mod tests;

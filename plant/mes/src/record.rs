@@ -1,0 +1,229 @@
+//! What was planned and run, for /status and for the graph.
+
+use std::collections::VecDeque;
+use std::sync::{Mutex, PoisonError};
+
+use mtp::{Object, Triple};
+use knowledge::vocabulary as v;
+use serde::Serialize;
+
+use crate::plan::{Fallen, Plan};
+use crate::process::{Process, step_iri};
+
+/// How something ended, or that it goes on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(crate) enum How {
+    Running,
+    Done,
+    Failed,
+    /// Its component was lost in the middle.
+    Lost,
+    /// It was halted because of something else.
+    Stopped,
+}
+
+/// A run of a process. Times are in ms since 1970.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Run {
+    /// Its IRI.
+    pub(crate) run: String,
+    pub(crate) process: String,
+    pub(crate) started_ms: u64,
+    pub(crate) ended_ms: Option<u64>,
+    pub(crate) outcome: How,
+    pub(crate) reason: Option<String>,
+    /// What it waits for; nothing where it does not.
+    pub(crate) waits_for: Option<String>,
+    pub(crate) plans: Vec<Planned>,
+}
+
+/// A plan of a run, and what was run by it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Planned {
+    pub(crate) number: usize,
+    pub(crate) at_ms: u64,
+    pub(crate) ended_ms: Option<u64>,
+    #[serde(flatten)]
+    pub(crate) plan: Plan,
+    pub(crate) ran: Vec<Ran>,
+    pub(crate) outcome: How,
+    pub(crate) reason: Option<String>,
+    /// After a fault: whether the robot is away from the place.
+    pub(crate) retreated: Option<bool>,
+}
+
+/// One skill that was run.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub(crate) struct Ran {
+    /// The step of the composite, or the name of the step.
+    pub(crate) step: String,
+    /// The step of the process.
+    pub(crate) of: String,
+    pub(crate) skill: String,
+    pub(crate) component: String,
+    pub(crate) started_ms: u64,
+    pub(crate) ended_ms: Option<u64>,
+    pub(crate) outcome: How,
+    pub(crate) reason: Option<String>,
+}
+
+/// The runs there were, the newest last; the oldest go.
+#[derive(Debug, Default)]
+pub(crate) struct Runs(Mutex<VecDeque<Run>>);
+
+impl Runs {
+    /// Takes a run in, or what has become of it. Gives the runs that had to go for it.
+    pub(crate) fn put(&self, run: &Run) -> Vec<String> {
+        let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        match all.iter_mut().find(|known| known.run == run.run) {
+            Some(known) => *known = run.clone(),
+            None => all.push_back(run.clone()),
+        }
+        let mut gone = Vec::new();
+        while all.len() > MOST_RUNS {
+            gone.extend(all.pop_front().map(|run| run.run));
+        }
+        gone
+    }
+
+    /// All of them.
+    pub(crate) fn all(&self) -> Vec<Run> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
+    }
+}
+
+impl Run {
+    /// A run that begins. `number` tells runs of one millisecond apart.
+    pub(crate) fn begins(process: &Process, at: u64, number: u64) -> Self {
+        Self {
+            run: format!("urn:ua-bridge:run:{at}-{number}"),
+            process: process.iri.clone(),
+            started_ms: at,
+            ended_ms: None,
+            outcome: How::Running,
+            reason: None,
+            waits_for: None,
+            plans: Vec::new(),
+        }
+    }
+
+    /// In the terms of the graph.
+    pub(crate) fn triples(&self) -> Vec<Triple> {
+        let mut graph = Graph(Vec::new());
+        let run = &self.run;
+        graph.say(run, v::RDF_TYPE, iri(v::RUN));
+        graph.say(run, v::OF_PROCESS, iri(&self.process));
+        graph.ends(run, self.started_ms, (self.ended_ms, self.outcome), self.reason.as_deref());
+        for plan in &self.plans {
+            let plan_iri = format!("{run}/plan/{}", plan.number);
+            graph.say(run, v::HAS_PLAN, iri(&plan_iri));
+            graph.say(&plan_iri, v::RDF_TYPE, iri(v::PLAN));
+            graph.say(&plan_iri, v::NUMBER, Object::Integer(i64::try_from(plan.number).unwrap_or(i64::MAX)));
+            graph.ends(&plan_iri, plan.at_ms, (plan.ended_ms, plan.outcome), plan.reason.as_deref());
+            for (ran, position) in plan.ran.iter().zip(1_i64..) {
+                let part = format!("{plan_iri}/{position}");
+                graph.say(&plan_iri, v::HAS_STEP, iri(&part));
+                graph.say(&part, v::RDF_TYPE, iri(v::STEP_RUN));
+                graph.say(&part, v::RDFS_LABEL, Object::Text(ran.step.clone()));
+                graph.say(&part, v::OF_STEP, iri(&step_iri(&self.process, &ran.of)));
+                graph.say(&part, v::POSITION, Object::Integer(position));
+                graph.say(&part, v::USES_SKILL, iri(&ran.skill));
+                graph.say(&part, v::USES_COMPONENT, iri(&ran.component));
+                graph.ends(&part, ran.started_ms, (ran.ended_ms, ran.outcome), ran.reason.as_deref());
+            }
+        }
+        graph.0
+    }
+
+    /// The plan that is carried out.
+    pub(crate) fn plan(&mut self) -> Option<&mut Planned> {
+        self.plans.last_mut()
+    }
+}
+
+impl Planned {
+    /// Ends it. What still ran was stopped.
+    pub(crate) fn end(&mut self, at: u64, outcome: How, reason: Option<String>) {
+        self.ended_ms = Some(at);
+        self.outcome = outcome;
+        self.reason = reason;
+        for ran in self.ran.iter_mut().filter(|ran| ran.ended_ms.is_none()) {
+            ran.ended_ms = Some(at);
+            ran.outcome = How::Stopped;
+        }
+    }
+
+    /// A component is lost: what it ran has no other end.
+    pub(crate) fn lost(&mut self, at: u64, fallen: &Fallen) {
+        let of_component = |ran: &&mut Ran| ran.ended_ms.is_none() && ran.component == fallen.component;
+        for ran in self.ran.iter_mut().filter(of_component) {
+            ran.ended_ms = Some(at);
+            ran.outcome = How::Lost;
+            ran.reason = Some(fallen.why.clone());
+        }
+    }
+}
+
+struct Graph(Vec<Triple>);
+
+impl Graph {
+    fn say(&mut self, subject: &str, predicate: &str, object: Object) {
+        self.0.push(Triple { subject: subject.to_owned(), predicate: predicate.to_owned(), object });
+    }
+
+    fn ends(&mut self, what: &str, started: u64, (ended, outcome): (Option<u64>, How), reason: Option<&str>) {
+        self.say(what, v::STARTED, Object::Time(date_time(started)));
+        if let Some(ended) = ended {
+            self.say(what, v::ENDED, Object::Time(date_time(ended)));
+        }
+        let outcome = match outcome {
+            How::Running => "running",
+            How::Done => "done",
+            How::Failed => "failed",
+            How::Lost => "lost",
+            How::Stopped => "stopped",
+        };
+        self.say(what, v::OUTCOME, Object::Text(outcome.to_owned()));
+        if let Some(reason) = reason {
+            self.say(what, v::REASON, Object::Text(reason.to_owned()));
+        }
+    }
+}
+
+fn iri(iri: &str) -> Object {
+    Object::Iri(iri.to_owned())
+}
+
+/// ms since 1970 as an xsd:dateTime in UTC.
+pub(crate) fn date_time(ms: u64) -> String {
+    let (seconds, ms) = (ms / 1000, ms % 1000);
+    let (days, second) = (seconds / 86_400, seconds % 86_400);
+    // Years begin in March here, so that the day that not all of them have is their last.
+    let days = days + 719_468;
+    let (era, of_era) = (days / 146_097, days % 146_097);
+    let year_of_era = (of_era - of_era / 1460 + of_era / 36_524 - of_era / 146_096) / 365;
+    let day_of_year = of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let month = (5 * day_of_year + 2) / 153;
+    let day = day_of_year - (153 * month + 2) / 5 + 1;
+    let month = if month < 10 { month + 3 } else { month - 9 };
+    let year = era * 400 + year_of_era + u64::from(month <= 2);
+    let (hour, minute, second) = (second / 3600, second / 60 % 60, second % 60);
+    format!("{year:04}-{month:02}-{day:02}T{hour:02}:{minute:02}:{second:02}.{ms:03}Z")
+}
+
+const MOST_RUNS: usize = 100;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_are_written_as_the_calendar_has_them() {
+        assert_eq!(date_time(0), "1970-01-01T00:00:00.000Z");
+        assert_eq!(date_time(951_782_399_999), "2000-02-28T23:59:59.999Z");
+        assert_eq!(date_time(951_782_400_000), "2000-02-29T00:00:00.000Z");
+        assert_eq!(date_time(1_795_574_096_007), "2026-11-25T02:34:56.007Z");
+        assert_eq!(date_time(4_107_542_400_000), "2100-03-01T00:00:00.000Z");
+    }
+}
