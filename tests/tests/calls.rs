@@ -4,7 +4,9 @@ use std::time::{Duration, Instant};
 
 use messages::{Dialect, Registry};
 use serde_json::{Value, json};
-use system_tests::{Cell, Distribution, Executes, Executor, Judge, Peer, eventually};
+use system_tests::{
+    Cell, Distribution, Executes, Executor, Judge, Peer, Started, eventually, program,
+};
 
 const START: (u16, u16, u16) = (0, 7, 105);
 const SERVICE: &str = "/ua_0_7_105";
@@ -116,6 +118,48 @@ fn an_rclpy_client_sees_and_asks_for_a_call_and_is_told_when_its_executor_is_kil
     assert_eq!(told["success"], false);
     let why = told["message"].as_str().unwrap();
     assert!(why.contains("known"), "{why}");
+}
+
+#[test]
+fn a_skill_of_a_component_is_started_from_ros_2_and_from_ros_1() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let _bridges = (cell.bridge_ros1(&[]), cell.bridge_ros2(&[]));
+    let yaml = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../examples/plant/parallel-gripper.yaml"
+    );
+    let _component = Started::new("ua-component", &program("ua-component"))
+        .args([yaml, "--interface", "lo", "--lds", "none"])
+        .args(["--pki".into(), cell.folder().join("pki")])
+        .start();
+    let mut judge = cell.judge(Distribution::Jazzy, &["judge"]);
+    judge.until(&json!({"topics": 1}), |topics| {
+        (topics["/ua_0_7_101"] == json!(["ua_msgs/msg/SkillState"])).then_some(())
+    });
+    let mut call = |id: u16| {
+        let service = format!("/ua_0_7_{id}");
+        judge.ask(json!({"call": service, "type": "std_srvs/srv/Trigger", "value": {}}))
+    };
+    let [start, halt, reset] = [105, 106, 109];
+    // Whether it begins in Halted or in Ready.
+    call(reset);
+    let started = call(start);
+    assert_eq!(started["success"], true, "{started}");
+    let refused = call(start);
+    let why = refused["message"].as_str().unwrap();
+    assert!(
+        refused["success"] == false && why.starts_with("BadInvalidState"),
+        "{refused}"
+    );
+    for id in [halt, reset] {
+        let answer = call(id);
+        assert_eq!(answer["success"], true, "{answer}");
+    }
+    let answers = rospy_calls(&cell, 1);
+    assert_eq!(answers[0]["success"], true, "{answers:?}");
 }
 
 /// Within that a caller is told that the one who executes is gone.
