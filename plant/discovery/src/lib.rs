@@ -3,7 +3,7 @@
 //! [`announce`] tells of a server: by mDNS to whoever is on the network, and by registration to the Local Discovery
 //! Server. [`watch`] tells who is there. [`lds`] is the Local Discovery Server itself, the program `ua-lds`.
 //!
-//! Reading order: `url` and `interface` (where), `mdns` (announcements and what is heard of others), `probe` (who still
+//! Reading order: `url` and `interface` (where), `mdns` and `goodbye` (announcements and what is heard of others), `probe` (who still
 //! answers), `keeper` (all of that around one registry), `watch` and `announce` (for programs), `wire` (OPC UA over TCP
 //! without sessions), `client` (asking by it), `endpoint`, `connection` and `services` (answering by it), `lds`.
 
@@ -12,6 +12,7 @@ pub mod client;
 mod clock;
 mod connection;
 mod endpoint;
+mod goodbye;
 mod interface;
 mod keeper;
 pub mod lds;

@@ -8,12 +8,15 @@ use std::net::{IpAddr, Ipv4Addr};
 use std::time::Duration;
 
 use mdns_sd::{
-    DaemonEvent, IfKind, Receiver, ResolvedService, ServiceDaemon, ServiceEvent, ServiceInfo,
+    DaemonEvent, IfKind, MDNS_PORT, Receiver, ResolvedService, ServiceDaemon, ServiceEvent,
+    ServiceInfo,
 };
 use registry::{Announcement, label, renamed};
+use tokio::net::UdpSocket;
 use tokio::time::{Instant, sleep_until};
 use tracing::{debug, info, warn};
 
+use crate::goodbye::{goodbyes, listen};
 use crate::interface::Interface;
 use crate::url::Url;
 
@@ -57,6 +60,11 @@ pub(crate) struct Mdns {
     monitor: Option<Receiver<DaemonEvent>>,
     ours: BTreeMap<String, Announced>,
     announce_at: Instant,
+    /// Hears goodbyes before the daemon tells of them; without it they come a second later.
+    goodbyes: Option<UdpSocket>,
+    packet: Vec<u8>,
+    /// Goodbyes that have not been told of yet.
+    left: Vec<String>,
     /// Instances that are there: a new one has not heard of ours.
     there: BTreeMap<String, ()>,
     ignored: u64,
@@ -71,11 +79,15 @@ struct Announced {
 impl Mdns {
     /// Starts to hear at once.
     pub(crate) fn open(interface: &Interface) -> Result<Self, MdnsFault> {
+        Self::open_at(interface, MDNS_PORT)
+    }
+
+    fn open_at(interface: &Interface, port: u16) -> Result<Self, MdnsFault> {
         let fault = |source| MdnsFault {
             interface: interface.to_string(),
             source,
         };
-        let daemon = ServiceDaemon::new().map_err(fault)?;
+        let daemon = ServiceDaemon::new_with_port(port).map_err(fault)?;
         daemon.disable_interface(IfKind::All).map_err(fault)?;
         daemon.enable_interface(interface.kind()).map_err(fault)?;
         let events = daemon.browse(SERVICE).map_err(fault)?;
@@ -87,6 +99,9 @@ impl Mdns {
             monitor,
             ours: BTreeMap::new(),
             announce_at: Instant::now() + ANNOUNCE_EVERY,
+            goodbyes: hear_goodbyes(interface),
+            packet: vec![0; PACKET],
+            left: Vec::new(),
             there: BTreeMap::new(),
             ignored: 0,
         })
@@ -130,9 +145,31 @@ impl Mdns {
     /// What is heard next. Whoever drops it before loses nothing.
     pub(crate) async fn next(&mut self) -> Heard {
         loop {
+            while let Some(instance) = self.left.pop() {
+                if !self.ours.contains_key(&instance) && self.there.remove(&instance).is_some() {
+                    return Heard::Withdrawn { instance };
+                }
+            }
+            let announce_at = self.announce_at;
+            let Self {
+                goodbyes,
+                packet,
+                events,
+                ..
+            } = &mut *self;
+            let heard = async {
+                match goodbyes {
+                    Some(socket) => socket.recv(packet).await,
+                    None => std::future::pending().await,
+                }
+            };
             let event = tokio::select! {
-                event = self.events.recv_async() => event,
-                () = sleep_until(self.announce_at) => {
+                event = events.recv_async() => event,
+                heard = heard => {
+                    self.take_goodbyes(heard);
+                    continue;
+                }
+                () = sleep_until(announce_at) => {
                     self.announce_again();
                     continue;
                 }
@@ -144,6 +181,17 @@ impl Mdns {
                     }
                 }
                 Err(_closed) => self.browse_again().await,
+            }
+        }
+    }
+
+    fn take_goodbyes(&mut self, heard: std::io::Result<usize>) {
+        match heard {
+            Ok(length) => self.left = goodbyes(self.packet.get(..length).unwrap_or_default()),
+            // Opened again with the next announcement.
+            Err(error) => {
+                debug!(%error, "goodbyes on {} are heard a second late", self.interface);
+                self.goodbyes = None;
             }
         }
     }
@@ -165,6 +213,9 @@ impl Mdns {
     fn announce_again(&mut self) {
         self.announce_at = Instant::now() + ANNOUNCE_EVERY;
         self.follow_renames();
+        if self.goodbyes.is_none() {
+            self.goodbyes = hear_goodbyes(&self.interface);
+        }
         let infos: Vec<ServiceInfo> = self
             .ours
             .values()
@@ -309,6 +360,15 @@ impl Drop for Mdns {
     }
 }
 
+fn hear_goodbyes(interface: &Interface) -> Option<UdpSocket> {
+    let socket = listen(interface);
+    let why = socket.as_ref().err();
+    if let Some(error) = why {
+        debug!(%error, "goodbyes on {interface} are heard a second late");
+    }
+    socket.ok()
+}
+
 /// Whether two URLs are of one endpoint.
 pub(crate) fn same_place(one: &str, other: &str) -> bool {
     one.trim_end_matches('/') == other.trim_end_matches('/')
@@ -381,6 +441,8 @@ const SERVICE: &str = "_opcua-tcp._tcp.local.";
 const START: &str = "start";
 const ANNOUNCE_EVERY: Duration = Duration::from_secs(5);
 const SETTLE: Duration = Duration::from_millis(200);
+/// The largest packet of mDNS (RFC 6762, 17).
+const PACKET: usize = 9000;
 /// Instances that are kept in mind.
 const MOST: usize = 4096;
 const MOST_CAPABILITIES: usize = 32;
@@ -448,5 +510,42 @@ mod tests {
         let all = || ["127.0.0.1", "169.254.7.7", "10.0.0.2"].map(|ip| ip.parse().unwrap());
         assert_eq!(address(all(), false), Some(Ipv4Addr::new(10, 0, 0, 2)));
         assert_eq!(address(all(), true), Some(Ipv4Addr::LOCALHOST));
+    }
+
+    #[tokio::test]
+    async fn of_two_servers_with_one_name_one_is_called_otherwise() {
+        // On a port of its own, so that no other program on this host takes part.
+        let port = 20_000 + u16::try_from(std::process::id() % 20_000).unwrap();
+        let open = |url: &str| {
+            let mut mdns = Mdns::open_at(&Interface::LOOPBACK, port).unwrap();
+            mdns.put(Ours {
+                announcement: Announcement {
+                    instance: "arm".to_owned(),
+                    url: url.to_owned(),
+                    capabilities: Vec::new(),
+                },
+                start_time: None,
+            });
+            mdns
+        };
+        let (mut one, mut other) = (
+            open("opc.tcp://127.0.0.1:1001/"),
+            open("opc.tcp://127.0.0.1:1002/"),
+        );
+        let renamed = async {
+            loop {
+                let (heard, first) = tokio::select! {
+                    heard = one.next() => (heard, true),
+                    heard = other.next() => (heard, false),
+                };
+                if let Heard::Renamed { from, to } = heard {
+                    return (from, to, first);
+                }
+            }
+        };
+        let limit = Duration::from_secs(20);
+        let (from, to, first) = tokio::time::timeout(limit, renamed).await.unwrap();
+        assert_eq!((&*from, &*to), ("arm", "arm (2)"));
+        assert!(!first, "the one whose URL comes later gives way");
     }
 }
