@@ -25,7 +25,11 @@ pub(crate) trait Plant: Send + Sync {
     async fn open(&self, offers: &[Offer]) -> Result<Box<dyn Opened>, OpenFault>;
 
     /// What a step gives a skill, as the skill wants it.
-    fn values(&self, skill: &str, given: &[(String, serde_json::Value)]) -> Result<Vec<(String, Value)>, String>;
+    fn values(
+        &self,
+        skill: &str,
+        given: &[(String, serde_json::Value)],
+    ) -> Result<Vec<(String, Value)>, String>;
 
     /// Keeps what has become of a run.
     fn keep(&self, run: &Run);
@@ -52,12 +56,31 @@ pub(crate) struct OpenFault {
 }
 
 /// Runs a process to its end. `teller` hears of each step, and may want all to stop.
-pub(crate) async fn execute(plant: &Arc<dyn Plant>, process: &Process, number: u64, teller: &dyn Teller) -> Run {
+pub(crate) async fn execute(
+    plant: &Arc<dyn Plant>,
+    process: &Process,
+    number: u64,
+    teller: &dyn Teller,
+) -> Run {
     let run = Run::begins(process, plant.now(), number);
     plant.keep(&run);
     info!(process = process.iri, run = run.run, "a process begins");
-    let log = Arc::new(Log { plant: Arc::clone(plant), kept: Mutex::new(Kept { run, step: String::new(), fallen: Vec::new() }) });
-    let ended = Execution { plant: &**plant, process, log: &log, teller }.run().await;
+    let log = Arc::new(Log {
+        plant: Arc::clone(plant),
+        kept: Mutex::new(Kept {
+            run,
+            step: String::new(),
+            fallen: Vec::new(),
+        }),
+    });
+    let ended = Execution {
+        plant: &**plant,
+        process,
+        log: &log,
+        teller,
+    }
+    .run()
+    .await;
     log.change(|kept, now| {
         kept.run.ended_ms = Some(now);
         kept.run.waits_for = None;
@@ -68,8 +91,17 @@ pub(crate) async fn execute(plant: &Arc<dyn Plant>, process: &Process, number: u
     });
     let run = log.run();
     match &run.reason {
-        None => info!(process = process.iri, run = run.run, plans = run.plans.len(), "a process is done"),
-        Some(reason) => warn!(process = process.iri, run = run.run, "a process failed: {reason}"),
+        None => info!(
+            process = process.iri,
+            run = run.run,
+            plans = run.plans.len(),
+            "a process is done"
+        ),
+        Some(reason) => warn!(
+            process = process.iri,
+            run = run.run,
+            "a process failed: {reason}"
+        ),
     }
     run
 }
@@ -146,16 +178,27 @@ impl Execution<'_> {
             let plan = plan(self.process, &offers, &self.log.fallen());
             if plan.is_complete() {
                 let mut chosen: Vec<(Role, Offer)> = Vec::new();
-                for role in self.process.steps.iter().flat_map(|step| &step.needs).map(|need| need.role) {
-                    let offer = plan.chosen(role).and_then(|skill| offers.iter().find(|offer| offer.skill == skill));
-                    if let Some(offer) = offer.filter(|_| chosen.iter().all(|(known, _)| *known != role)) {
+                for role in self
+                    .process
+                    .steps
+                    .iter()
+                    .flat_map(|step| &step.needs)
+                    .map(|need| need.role)
+                {
+                    let offer = plan
+                        .chosen(role)
+                        .and_then(|skill| offers.iter().find(|offer| offer.skill == skill));
+                    if let Some(offer) =
+                        offer.filter(|_| chosen.iter().all(|(known, _)| *known != role))
+                    {
                         chosen.push((role, offer.clone()));
                     }
                 }
                 return Ok((plan, chosen));
             }
             let missing = plan.missing();
-            self.log.change(|kept, _| kept.run.waits_for = Some(missing.clone()));
+            self.log
+                .change(|kept, _| kept.run.waits_for = Some(missing.clone()));
             self.teller.step("Wait").await;
             tokio::select! {
                 changed = changes.changed() => {
@@ -177,17 +220,38 @@ impl Execution<'_> {
         let opened = match self.plant.open(&offers).await {
             Ok(opened) => opened,
             Err(fault) => {
-                let since_ms = offers.iter().find(|offer| offer.component == fault.component).map_or(0, |offer| offer.since_ms);
+                let since_ms = offers
+                    .iter()
+                    .find(|offer| offer.component == fault.component)
+                    .map_or(0, |offer| offer.since_ms);
                 let why = format!("it cannot be reached: {}", fault.why);
-                self.log.fell(Fallen { component: fault.component.clone(), since_ms, skill: None, why });
-                return Ended::Broken(format!("{} cannot be reached: {}", fault.component, fault.why));
+                self.log.fell(Fallen {
+                    component: fault.component.clone(),
+                    since_ms,
+                    skill: None,
+                    why,
+                });
+                return Ended::Broken(format!(
+                    "{} cannot be reached: {}",
+                    fault.component, fault.why
+                ));
             }
         };
-        let watched = opened.skills().into_iter().zip(&offers).map(|(skill, offer)| {
-            let watched = Watched { inner: skill, offer: offer.clone(), log: Arc::clone(self.log), process: self.process.clone() };
-            Arc::new(watched) as Arc<dyn Runs>
-        });
-        let roles: Vec<(Role, Arc<dyn Runs>)> = chosen.iter().map(|(role, _)| *role).zip(watched).collect();
+        let watched = opened
+            .skills()
+            .into_iter()
+            .zip(&offers)
+            .map(|(skill, offer)| {
+                let watched = Watched {
+                    inner: skill,
+                    offer: offer.clone(),
+                    log: Arc::clone(self.log),
+                    process: self.process.clone(),
+                };
+                Arc::new(watched) as Arc<dyn Runs>
+            });
+        let roles: Vec<(Role, Arc<dyn Runs>)> =
+            chosen.iter().map(|(role, _)| *role).zip(watched).collect();
         let ended = match &self.process.work {
             Job::PickAndPlace(job) => self.pick_and_place(job, &roles).await,
             Job::Sequence(parameters) => self.sequence(parameters, chosen, &roles).await,
@@ -201,11 +265,29 @@ impl Execution<'_> {
     }
 
     async fn pick_and_place(&self, job: &skills::Job, roles: &[(Role, Arc<dyn Runs>)]) -> Ended {
-        let of = |wanted: Role| roles.iter().find(|(role, _)| *role == wanted).map(|(_, skill)| Arc::clone(skill));
-        let (Some(ptp), Some(linear), Some(grasp), Some(release)) = (of(Role::Ptp), of(Role::Linear), of(Role::Grasp), of(Role::Release)) else {
-            return Ended::Over("the process does not say who moves, grasps and releases".to_owned());
+        let of = |wanted: Role| {
+            roles
+                .iter()
+                .find(|(role, _)| *role == wanted)
+                .map(|(_, skill)| Arc::clone(skill))
         };
-        let composite = PickAndPlace { ptp, linear, grasp, release, within: self.process.within };
+        let (Some(ptp), Some(linear), Some(grasp), Some(release)) = (
+            of(Role::Ptp),
+            of(Role::Linear),
+            of(Role::Grasp),
+            of(Role::Release),
+        ) else {
+            return Ended::Over(
+                "the process does not say who moves, grasps and releases".to_owned(),
+            );
+        };
+        let composite = PickAndPlace {
+            ptp,
+            linear,
+            grasp,
+            release,
+            within: self.process.within,
+        };
         match composite.run(job, self).await {
             Ok(()) => Ended::Done,
             Err(broken) => {
@@ -216,13 +298,26 @@ impl Execution<'_> {
                     }
                 });
                 // With a robot over the place, or nobody knows where, no other begins.
-                if has_retreated { Ended::Broken(broken.to_string()) } else { Ended::Over(broken.to_string()) }
+                if has_retreated {
+                    Ended::Broken(broken.to_string())
+                } else {
+                    Ended::Over(broken.to_string())
+                }
             }
         }
     }
 
-    async fn sequence(&self, parameters: &[Vec<(String, serde_json::Value)>], chosen: &[(Role, Offer)], roles: &[(Role, Arc<dyn Runs>)]) -> Ended {
-        for (((_, skill), (_, offer)), (step, given)) in roles.iter().zip(chosen).zip(self.process.steps.iter().zip(parameters)) {
+    async fn sequence(
+        &self,
+        parameters: &[Vec<(String, serde_json::Value)>],
+        chosen: &[(Role, Offer)],
+        roles: &[(Role, Arc<dyn Runs>)],
+    ) -> Ended {
+        for (((_, skill), (_, offer)), (step, given)) in roles
+            .iter()
+            .zip(chosen)
+            .zip(self.process.steps.iter().zip(parameters))
+        {
             self.log.step(&step.name);
             self.teller.step("Step").await;
             let values = match self.plant.values(&offer.skill, given) {
@@ -247,7 +342,11 @@ impl Execution<'_> {
             // What was done before would be done twice by another plan.
             let why = format!("{}: {} {why}", step.name, skill.name());
             let is_first = self.process.steps.first() == Some(step);
-            return if is_first { Ended::Broken(why) } else { Ended::Over(why) };
+            return if is_first {
+                Ended::Broken(why)
+            } else {
+                Ended::Over(why)
+            };
         }
         Ended::Done
     }
@@ -291,15 +390,29 @@ impl Log {
     }
 
     fn run(&self) -> Run {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner).run.clone()
+        self.kept
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .run
+            .clone()
     }
 
     fn fallen(&self) -> Vec<Fallen> {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner).fallen.clone()
+        self.kept
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .fallen
+            .clone()
     }
 
     fn step(&self, step: &str) {
-        step.clone_into(&mut self.kept.lock().unwrap_or_else(PoisonError::into_inner).step);
+        step.clone_into(
+            &mut self
+                .kept
+                .lock()
+                .unwrap_or_else(PoisonError::into_inner)
+                .step,
+        );
     }
 
     fn fell(&self, fallen: Fallen) {
@@ -345,7 +458,11 @@ impl Watched {
     fn ends(&self, outcome: How, reason: Option<String>) {
         self.log.change(|kept, now| {
             let is_this = |ran: &&mut Ran| ran.ended_ms.is_none() && ran.skill == self.offer.skill;
-            if let Some(ran) = kept.run.plan().and_then(|plan| plan.ran.iter_mut().rev().find(is_this)) {
+            if let Some(ran) = kept
+                .run
+                .plan()
+                .and_then(|plan| plan.ran.iter_mut().rev().find(is_this))
+            {
                 ran.ended_ms = Some(now);
                 ran.outcome = outcome;
                 ran.reason = reason;
@@ -355,8 +472,17 @@ impl Watched {
 
     fn fell(&self, is_lost: bool, why: &str) {
         let skill = (!is_lost).then(|| self.offer.skill.clone());
-        let why = if is_lost { format!("it was lost in this run: {why}") } else { format!("it failed in this run: {why}") };
-        self.log.fell(Fallen { component: self.offer.component.clone(), since_ms: self.offer.since_ms, skill, why });
+        let why = if is_lost {
+            format!("it was lost in this run: {why}")
+        } else {
+            format!("it failed in this run: {why}")
+        };
+        self.log.fell(Fallen {
+            component: self.offer.component.clone(),
+            since_ms: self.offer.since_ms,
+            skill,
+            why,
+        });
     }
 }
 
@@ -366,7 +492,11 @@ impl Runs for Watched {
         self.inner.name()
     }
 
-    async fn run(&self, parameters: Vec<(String, Value)>, within: Duration) -> Result<Outcome, SkillFault> {
+    async fn run(
+        &self,
+        parameters: Vec<(String, Value)>,
+        within: Duration,
+    ) -> Result<Outcome, SkillFault> {
         self.begins();
         let outcome = self.inner.run(parameters, within).await;
         match &outcome {
@@ -399,7 +529,13 @@ impl Runs for Watched {
 fn of_step(process: &Process, step: &str) -> String {
     let is_picking = step.starts_with("MovePick") || matches!(step, "Init" | "Grasp");
     let of = match (&process.work, process.steps.as_slice()) {
-        (Job::PickAndPlace(_), [picks, .., places]) => if is_picking { Some(picks) } else { Some(places) },
+        (Job::PickAndPlace(_), [picks, .., places]) => {
+            if is_picking {
+                Some(picks)
+            } else {
+                Some(places)
+            }
+        }
         (Job::PickAndPlace(_), [all]) => Some(all),
         (Job::PickAndPlace(_), []) | (Job::Sequence(_), _) => None,
     };

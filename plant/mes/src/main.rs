@@ -1,8 +1,329 @@
-//! The semantic MES.
+//! The semantic MES: it keeps what is known of the plant, answers questions about it, and runs processes with whatever
+//! components there are.
+//!
+//! Reading order: `settings` (its YAML), `process`, `plan` (who does what, and why), `execute` (a plan carried out, and planned
+//! anew), `record` (what became of it), `cell` (the plant as it is), `follow` (from discovery to the graph), `import` (files to the
+//! graph), `execution_skill` (its own skill).
 
+mod cell;
 mod execute;
+mod execution_skill;
+mod follow;
+mod import;
 mod plan;
 mod process;
 mod record;
+mod settings;
 
-fn main() {}
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::atomic::AtomicU64;
+use std::sync::{Arc, OnceLock};
+use std::time::Duration;
+
+use bridge_node::{Arguments, Context, Failure, FailureKind, Made, Owned, Program, WithoutMapping};
+use knowledge::{Endpoint, Knowledge, Limits};
+use mappings::{Mapping, SpaceId};
+use skills::yaml::Place;
+use skills::{
+    ClientOptions, Component, DriverSetup, Lds, LocalRun, Owner, Runs as _, Security, Skill,
+    SkillSetup, TypeName, Value,
+};
+use tracing::{error, info};
+use ua_component::{ComponentPort, Options, made};
+
+use crate::cell::Cell;
+use crate::execution_skill::ExecuteProcess;
+use crate::settings::Settings;
+
+/// The semantic MES: knows the components of the plant, answers questions about them, and runs processes with them.
+#[derive(Debug, clap::Parser)]
+#[command(name = "ua-mes", version)]
+struct UaMes {
+    /// The YAML of the MES
+    #[arg(value_name = "MES", env = "UA_MES")]
+    mes: PathBuf,
+    /// Check the YAML and the files it names, print every finding, and exit
+    #[arg(long)]
+    check: bool,
+    /// Run this process as soon as there is somebody for it, and go on serving
+    #[arg(long, value_name = "IRI")]
+    run: Option<String>,
+    /// Where questions are answered, in place of what the YAML says; loopback only
+    #[arg(long, value_name = "ADDRESS:PORT", env = "UA_SPARQL")]
+    sparql: Option<SocketAddr>,
+    /// Where clients connect, as opc.tcp://127.0.0.1:0, in place of what the YAML says
+    #[arg(long, value_name = "URL", env = "UA_ENDPOINT")]
+    endpoint: Option<String>,
+    /// The local discovery server it registers with, or `none`, in place of what the YAML says
+    #[arg(long, value_name = "URL", env = "UA_LDS")]
+    lds: Option<String>,
+    /// The certificate store: own, private, trusted and rejected under one directory
+    #[arg(long, value_name = "DIR", env = "UA_PKI")]
+    pki: Option<PathBuf>,
+    /// Trust every client certificate, and keep it as trusted. For tests and demonstrations only
+    #[arg(long)]
+    trust_any_client_certificate: bool,
+    #[command(flatten)]
+    arguments: WithoutMapping,
+    #[arg(skip)]
+    ready: OnceLock<Ready>,
+    #[arg(skip)]
+    serving: OnceLock<Endpoint>,
+}
+
+/// What is made of the YAML.
+struct Ready {
+    settings: Settings,
+    component: Component,
+    cell: Arc<Cell>,
+    knowledge: Arc<Knowledge>,
+    options: Options,
+}
+
+impl std::fmt::Debug for Ready {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Ready")
+            .field("settings", &self.settings)
+            .finish_non_exhaustive()
+    }
+}
+
+fn main() -> ExitCode {
+    bridge_node::run::<UaMes>()
+}
+
+impl UaMes {
+    fn ready(&self) -> Result<&Ready, Failure> {
+        if let Some(ready) = self.ready.get() {
+            return Ok(ready);
+        }
+        let settings = self.settings()?;
+        let knowledge =
+            Knowledge::new().map_err(|fault| Failure::new(FailureKind::Io, fault.to_string()))?;
+        import::all(&knowledge, &settings, cell::now())?;
+        let knowledge = Arc::new(knowledge);
+        let options = self.options(&settings);
+        let client = ClientOptions {
+            application_uri: format!("{}:client", settings.application_uri),
+            application_name: format!("{} client", settings.name),
+            pki: options.pki.clone(),
+            within: WITHIN,
+        };
+        let cell = Arc::new(Cell::new(
+            Arc::clone(&knowledge),
+            settings.processes.clone(),
+            client,
+        ));
+        if let Some(iri) = self
+            .run
+            .as_deref()
+            .filter(|iri| cell.process(iri).is_none())
+        {
+            return Err(Failure::new(
+                FailureKind::Usage,
+                format!("--run {iri}: {} has no such process", self.mes.display()),
+            ));
+        }
+        let driver = ExecuteProcess {
+            cell: Arc::clone(&cell),
+            runs: AtomicU64::new(1),
+        };
+        let component = component(&settings, driver);
+        Ok(self.ready.get_or_init(|| Ready {
+            settings,
+            component,
+            cell,
+            knowledge,
+            options,
+        }))
+    }
+
+    fn settings(&self) -> Result<Settings, Failure> {
+        let file = self.mes.display().to_string();
+        let text = std::fs::read_to_string(&self.mes).map_err(|error| {
+            Failure::new(FailureKind::Io, format!("cannot read {file}: {error}"))
+        })?;
+        let folder = self.mes.parent().unwrap_or_else(|| Path::new(""));
+        let mut settings = Settings::from_yaml(&text, folder).map_err(|findings| {
+            let count = findings.len();
+            ua_component::print(&findings.render(&file, &text));
+            Failure::new(
+                FailureKind::Configuration,
+                format!("{file}: {count} errors"),
+            )
+        })?;
+        if let Some(endpoint) = &self.endpoint {
+            settings.endpoint.clone_from(endpoint);
+        }
+        if let Some(sparql) = self.sparql {
+            settings.sparql = sparql;
+        }
+        match self.lds.as_deref() {
+            Some("none") => settings.lds = Lds::Nowhere,
+            Some(url) => settings.lds = Lds::At(url.to_owned()),
+            None => {}
+        }
+        Ok(settings)
+    }
+
+    fn options(&self, settings: &Settings) -> Options {
+        let secured = settings.security.contains(&Security::Basic256Sha256);
+        let usual =
+            || plant_opcua::pki::default_root(|name| std::env::var(name).ok()).join(&settings.name);
+        Options {
+            pki: self.pki.clone().or_else(|| secured.then(usual)),
+            trust_any_client: self.trust_any_client_certificate,
+            mdns: Some(self.interface()),
+            capabilities: vec!["DA".to_owned()],
+            source: None,
+        }
+    }
+
+    fn interface(&self) -> discovery::Interface {
+        match self.arguments.0.flags.interface.as_deref() {
+            None => discovery::Interface::LOOPBACK,
+            Some(interface) => discovery::Interface::parse(interface),
+        }
+    }
+
+    /// Answers questions, and follows who comes and goes.
+    async fn serve(&self, ready: &Ready) -> Result<(), Failure> {
+        let page = page(&ready.cell);
+        let address = ready.settings.sparql;
+        let endpoint = Endpoint::bind(
+            address,
+            Arc::clone(&ready.knowledge),
+            Limits::default(),
+            page,
+        )
+        .await;
+        let endpoint = endpoint.map_err(|error| {
+            Failure::new(
+                FailureKind::Unavailable,
+                format!(
+                    "cannot answer questions at {address}: {error}; give another --sparql address"
+                ),
+            )
+        })?;
+        info!(
+            "questions are answered at http://{}/ask and /sparql, status at /status",
+            endpoint.address()
+        );
+        drop(self.serving.set(endpoint));
+        let interface = self.interface();
+        let only_loopback = self.arguments.0.flags.interface.is_none()
+            || interface == discovery::Interface::LOOPBACK;
+        let watcher = discovery::watch(discovery::WatchSettings {
+            mdns: Some(interface),
+            ..discovery::WatchSettings::default()
+        });
+        let watcher =
+            watcher.map_err(|fault| Failure::new(FailureKind::Unavailable, fault.to_string()))?;
+        drop(tokio::spawn(follow::follow(
+            Arc::clone(&ready.cell),
+            watcher,
+            only_loopback,
+        )));
+        Ok(())
+    }
+}
+
+impl Program for UaMes {
+    type Port = ComponentPort;
+
+    const NAME: &'static str = "ua-mes";
+    const LOCAL: bridge_core::Local = bridge_core::Local::Fields;
+    const QUIET: &'static str = plant_opcua::QUIET;
+    const CLAIMS: bool = true;
+
+    fn arguments(&self) -> &Arguments {
+        &self.arguments.0
+    }
+
+    fn made(&self) -> Result<Option<Made>, Failure> {
+        let ready = self.ready()?;
+        if self.check {
+            ua_component::check(&ready.component, &ready.options)?;
+            return Ok(Some(Made::Checked));
+        }
+        Ok(Some(Made::Run(made(&ready.component))))
+    }
+
+    fn owned(mapping: &Mapping) -> Owned {
+        Owned::Only(mapping.namespaces().keys().copied().collect())
+    }
+
+    fn spaces(&self, _mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
+        Ok(vec![SpaceId::UA])
+    }
+
+    async fn start(&self, _context: Context) -> Result<ComponentPort, Failure> {
+        let ready = self.ready()?;
+        self.serve(ready).await?;
+        let port = ComponentPort::start(&ready.component, &ready.options)?;
+        if let (Some(iri), Some(skill)) = (&self.run, port.skills().first()) {
+            drop(tokio::spawn(run(skill.clone(), iri.clone())));
+        }
+        Ok(port)
+    }
+}
+
+/// The MES as a component of the plant.
+fn component(settings: &Settings, driver: ExecuteProcess) -> Component {
+    Component {
+        name: settings.name.clone(),
+        application_uri: settings.application_uri.clone(),
+        namespace: settings.namespace,
+        endpoint: settings.endpoint.clone(),
+        security: settings.security.clone(),
+        nodesets: Vec::new(),
+        lds: settings.lds.clone(),
+        open: settings.open,
+        skills: vec![SkillSetup {
+            name: "ExecuteProcess".to_owned(),
+            skill_type: TypeName::own("ExecuteProcessSkillType"),
+            driver: DriverSetup::Given(Arc::new(driver)),
+            capabilities: Vec::new(),
+            timeout: None,
+            place: Place::START,
+        }],
+    }
+}
+
+/// `/status`, and `/plan/IRI`: what would be done now, and why.
+fn page(cell: &Arc<Cell>) -> knowledge::Page {
+    let cell = Arc::clone(cell);
+    Arc::new(move |path| {
+        if path == "/status" {
+            return Some(cell.status().to_string());
+        }
+        let iri = path.strip_prefix("/plan/")?;
+        let process = cell
+            .processes
+            .iter()
+            .find(|process| process.iri == iri || mtp::escaped(&process.iri) == iri)?;
+        let plan = execute::dry_run(&*cell, process);
+        Some(serde_json::json!({ "process": process.iri, "complete": plan.is_complete(), "missing": plan.missing(), "plan": plan }).to_string())
+    })
+}
+
+/// Starts a process by the skill, as anybody would.
+async fn run(skill: Skill, iri: String) {
+    let run = LocalRun {
+        skill,
+        by: Owner::Local("the command line"),
+    };
+    let parameters = vec![("ProcessIri".to_owned(), Value::String(iri.clone()))];
+    match run.run(parameters, RUN).await {
+        Ok(outcome) if outcome.succeeded => info!(process = iri, "the process is done"),
+        Ok(outcome) => error!(process = iri, "the process failed: {}", outcome.message),
+        Err(fault) => error!(process = iri, "the process was not run: {fault}"),
+    }
+}
+
+/// How long a component may take to answer.
+const WITHIN: Duration = Duration::from_secs(2);
+/// How long a process started by the command line may take.
+const RUN: Duration = Duration::from_secs(24 * 3600);

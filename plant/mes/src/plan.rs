@@ -119,12 +119,21 @@ pub(crate) fn plan(process: &Process, offers: &[Offer], fallen: &[Fallen]) -> Pl
         })
         .collect();
     let groups: BTreeSet<Group> = roles.keys().map(|role| role.group()).collect();
-    let teams: BTreeMap<Group, Team<'_>> = groups.into_iter().map(|group| (group, Team::of(group, &roles, &fitting))).collect();
+    let teams: BTreeMap<Group, Team<'_>> = groups
+        .into_iter()
+        .map(|group| (group, Team::of(group, &roles, &fitting)))
+        .collect();
     let steps = process.steps.iter().map(|step| PlannedStep {
         step: step.name.clone(),
-        needs: step.needs.iter().map(|need| planned(need, offers, fallen, teams.get(&need.role.group()))).collect(),
+        needs: step
+            .needs
+            .iter()
+            .map(|need| planned(need, offers, fallen, teams.get(&need.role.group())))
+            .collect(),
     });
-    Plan { steps: steps.collect() }
+    Plan {
+        steps: steps.collect(),
+    }
 }
 
 impl Plan {
@@ -143,8 +152,21 @@ impl Plan {
                 (None, Some(of)) => format!("a skill of {of}"),
                 (None, None) => "a skill".to_owned(),
             };
-            let looked_at: Vec<_> = need.candidates.iter().map(|candidate| format!("{}.{}: {}", candidate.component_name, candidate.name, candidate.why)).collect();
-            let looked_at = if looked_at.is_empty() { "there is none".to_owned() } else { looked_at.join("; ") };
+            let looked_at: Vec<_> = need
+                .candidates
+                .iter()
+                .map(|candidate| {
+                    format!(
+                        "{}.{}: {}",
+                        candidate.component_name, candidate.name, candidate.why
+                    )
+                })
+                .collect();
+            let looked_at = if looked_at.is_empty() {
+                "there is none".to_owned()
+            } else {
+                looked_at.join("; ")
+            };
             format!("{step} needs {wanted} for {} ({looked_at})", need.role)
         });
         told.collect::<Vec<_>>().join(", ")
@@ -152,11 +174,15 @@ impl Plan {
 
     /// The IRI of the skill for a role.
     pub(crate) fn chosen(&self, role: Role) -> Option<&str> {
-        self.needs().find(|(_, need)| need.role_is == role).and_then(|(_, need)| need.chosen.as_deref())
+        self.needs()
+            .find(|(_, need)| need.role_is == role)
+            .and_then(|(_, need)| need.chosen.as_deref())
     }
 
     fn needs(&self) -> impl Iterator<Item = (&str, &PlannedNeed)> {
-        self.steps.iter().flat_map(|step| step.needs.iter().map(|need| (step.step.as_str(), need)))
+        self.steps
+            .iter()
+            .flat_map(|step| step.needs.iter().map(|need| (step.step.as_str(), need)))
     }
 }
 
@@ -169,10 +195,22 @@ struct Team<'a> {
 }
 
 impl<'a> Team<'a> {
-    fn of(group: Group, roles: &BTreeMap<Role, Vec<&Need>>, fitting: &BTreeMap<Role, Vec<&'a Offer>>) -> Self {
-        let roles: Vec<(Role, &Vec<&Need>)> = roles.iter().filter(|(role, _)| role.group() == group).map(|(role, needs)| (*role, needs)).collect();
+    fn of(
+        group: Group,
+        roles: &BTreeMap<Role, Vec<&Need>>,
+        fitting: &BTreeMap<Role, Vec<&'a Offer>>,
+    ) -> Self {
+        let roles: Vec<(Role, &Vec<&Need>)> = roles
+            .iter()
+            .filter(|(role, _)| role.group() == group)
+            .map(|(role, needs)| (*role, needs))
+            .collect();
         let of_role = |role: &Role| fitting.get(role).into_iter().flatten().copied();
-        let components: BTreeSet<&str> = roles.iter().flat_map(|(role, _)| of_role(role)).map(|offer| offer.component.as_str()).collect();
+        let components: BTreeSet<&str> = roles
+            .iter()
+            .flat_map(|(role, _)| of_role(role))
+            .map(|offer| offer.component.as_str())
+            .collect();
         let mut lacks = BTreeMap::new();
         let mut teams = Vec::new();
         for component in components {
@@ -180,7 +218,8 @@ impl<'a> Team<'a> {
             let mut exact = 0;
             for (role, needs) in &roles {
                 let of_component = of_role(role).filter(|offer| offer.component == component);
-                let best = of_component.min_by_key(|offer| (Reverse(is_exact(needs, offer)), offer.skill.as_str()));
+                let best = of_component
+                    .min_by_key(|offer| (Reverse(is_exact(needs, offer)), offer.skill.as_str()));
                 if let Some(best) = best {
                     exact += usize::from(is_exact(needs, best));
                     chosen.insert(*role, best);
@@ -189,21 +228,39 @@ impl<'a> Team<'a> {
             if chosen.len() == roles.len() {
                 teams.push((exact, chosen));
             } else {
-                let missing = roles.iter().map(|(role, _)| *role).filter(|role| !chosen.contains_key(role)).collect();
+                let missing = roles
+                    .iter()
+                    .map(|(role, _)| *role)
+                    .filter(|role| !chosen.contains_key(role))
+                    .collect();
                 lacks.insert(component, missing);
             }
         }
         // Who is called what is asked for, before who is it by a subclass; then who is there the longest.
         let rank = |(exact, chosen): &(usize, BTreeMap<Role, &'a Offer>)| {
             let first = chosen.values().next();
-            (Reverse(*exact), first.map(|offer| offer.since_ms), first.map(|offer| offer.component.as_str()))
+            (
+                Reverse(*exact),
+                first.map(|offer| offer.since_ms),
+                first.map(|offer| offer.component.as_str()),
+            )
         };
-        let best = teams.into_iter().min_by(|one, other| rank(one).cmp(&rank(other)));
-        Self { chosen: best.map(|(_, chosen)| chosen).unwrap_or_default(), lacks }
+        let best = teams
+            .into_iter()
+            .min_by(|one, other| rank(one).cmp(&rank(other)));
+        Self {
+            chosen: best.map(|(_, chosen)| chosen).unwrap_or_default(),
+            lacks,
+        }
     }
 }
 
-fn planned(need: &Need, offers: &[Offer], fallen: &[Fallen], team: Option<&Team<'_>>) -> PlannedNeed {
+fn planned(
+    need: &Need,
+    offers: &[Offer],
+    fallen: &[Fallen],
+    team: Option<&Team<'_>>,
+) -> PlannedNeed {
     let chosen = team.and_then(|team| team.chosen.get(&need.role)).copied();
     let mut candidates = Vec::new();
     for offer in offers {
@@ -228,7 +285,9 @@ fn planned(need: &Need, offers: &[Offer], fallen: &[Fallen], team: Option<&Team<
             why,
         });
     }
-    candidates.sort_by(|one, other| (Reverse(one.chosen), &one.skill).cmp(&(Reverse(other.chosen), &other.skill)));
+    candidates.sort_by(|one, other| {
+        (Reverse(one.chosen), &one.skill).cmp(&(Reverse(other.chosen), &other.skill))
+    });
     PlannedNeed {
         role: need.role.name(),
         capability: need.capability.clone(),
@@ -247,9 +306,16 @@ enum NotFit {
 
 /// Whether an offer can do what is needed, and why.
 fn judge(need: &Need, offer: &Offer, fallen: &[Fallen]) -> Result<String, NotFit> {
-    let has_capability = need.capability.as_ref().is_none_or(|wanted| offer.closure.contains(wanted));
-    let has_type = need.skill_type.as_ref().is_none_or(|wanted| offer.types.contains(&wanted.to_string()));
-    let is_related = (need.capability.is_some() && has_capability) || (need.skill_type.is_some() && has_type);
+    let has_capability = need
+        .capability
+        .as_ref()
+        .is_none_or(|wanted| offer.closure.contains(wanted));
+    let has_type = need
+        .skill_type
+        .as_ref()
+        .is_none_or(|wanted| offer.types.contains(&wanted.to_string()));
+    let is_related =
+        (need.capability.is_some() && has_capability) || (need.skill_type.is_some() && has_type);
     if !is_related {
         return Err(NotFit::Unrelated);
     }
@@ -258,14 +324,25 @@ fn judge(need: &Need, offer: &Offer, fallen: &[Fallen]) -> Result<String, NotFit
         return because("it is a service of a module, and those are not run from here".to_owned());
     }
     if let (false, Some(wanted)) = (has_capability, &need.capability) {
-        let has = if offer.capabilities.is_empty() { "no capability".to_owned() } else { offer.capabilities.join(", ") };
-        return because(format!("it realises {has}, and none of that is {wanted} or below it"));
+        let has = if offer.capabilities.is_empty() {
+            "no capability".to_owned()
+        } else {
+            offer.capabilities.join(", ")
+        };
+        return because(format!(
+            "it realises {has}, and none of that is {wanted} or below it"
+        ));
     }
     if let (false, Some(wanted)) = (has_type, &need.skill_type) {
         return because(format!("its type is not {wanted} or below it"));
     }
     let fell = fallen.iter().find(|fallen| {
-        fallen.component == offer.component && fallen.since_ms == offer.since_ms && fallen.skill.as_ref().is_none_or(|skill| *skill == offer.skill)
+        fallen.component == offer.component
+            && fallen.since_ms == offer.since_ms
+            && fallen
+                .skill
+                .as_ref()
+                .is_none_or(|skill| *skill == offer.skill)
     });
     if let Some(fallen) = fell {
         return because(fallen.why.clone());
@@ -274,10 +351,16 @@ fn judge(need: &Need, offer: &Offer, fallen: &[Fallen]) -> Result<String, NotFit
         if offer.capabilities.contains(wanted) {
             format!("it realises {wanted}")
         } else {
-            format!("it realises {}, which is below {wanted}", offer.capabilities.join(", "))
+            format!(
+                "it realises {}, which is below {wanted}",
+                offer.capabilities.join(", ")
+            )
         }
     });
-    let of_type = need.skill_type.as_ref().map(|wanted| format!("its type is {} or below it", wanted.name));
+    let of_type = need
+        .skill_type
+        .as_ref()
+        .map(|wanted| format!("its type is {} or below it", wanted.name));
     let reasons: Vec<String> = capability.into_iter().chain(of_type).collect();
     Ok(reasons.join(", "))
 }
@@ -286,7 +369,10 @@ fn judge(need: &Need, offer: &Offer, fallen: &[Fallen]) -> Result<String, NotFit
 fn why_not(need: &Need, offer: &Offer, chosen: Option<&Offer>, team: Option<&Team<'_>>) -> String {
     if let Some(lacking) = team.and_then(|team| team.lacks.get(offer.component.as_str())) {
         let lacking: Vec<_> = lacking.iter().map(|role| role.name()).collect();
-        return format!("it would fit, but its component has nothing for {}", lacking.join(" and "));
+        return format!(
+            "it would fit, but its component has nothing for {}",
+            lacking.join(" and ")
+        );
     }
     let Some(chosen) = chosen else {
         return "it would fit this step".to_owned();
@@ -298,12 +384,18 @@ fn why_not(need: &Need, offer: &Offer, chosen: Option<&Offer>, team: Option<&Tea
     } else {
         "comes first by its name"
     };
-    format!("it would fit, but {}.{} {better}", chosen.component_name, chosen.name)
+    format!(
+        "it would fit, but {}.{} {better}",
+        chosen.component_name, chosen.name
+    )
 }
 
 /// Whether it realises just the capabilities that are needed, and not only some below them.
 fn is_exact(needs: &[&Need], offer: &Offer) -> bool {
-    needs.iter().filter_map(|need| need.capability.as_ref()).all(|wanted| offer.capabilities.contains(wanted))
+    needs
+        .iter()
+        .filter_map(|need| need.capability.as_ref())
+        .all(|wanted| offer.capabilities.contains(wanted))
 }
 
 #[cfg(test)]

@@ -64,7 +64,8 @@ pub(crate) enum Role {
 
 impl Role {
     /// Those of the composite.
-    pub(crate) const OF_COMPOSITE: [Self; 4] = [Self::Ptp, Self::Linear, Self::Grasp, Self::Release];
+    pub(crate) const OF_COMPOSITE: [Self; 4] =
+        [Self::Ptp, Self::Linear, Self::Grasp, Self::Release];
 
     /// As the YAML and the graph have it.
     pub(crate) fn name(self) -> &'static str {
@@ -112,7 +113,11 @@ impl Process {
     pub(crate) fn triples(&self, type_iri: &dyn Fn(&TypeName) -> Option<String>) -> Vec<Triple> {
         let mut all = Vec::new();
         let mut say = |subject: &str, predicate: &str, object: Object| {
-            all.push(Triple { subject: subject.to_owned(), predicate: predicate.to_owned(), object });
+            all.push(Triple {
+                subject: subject.to_owned(),
+                predicate: predicate.to_owned(),
+                object,
+            });
         };
         let iri = |iri: &str| Object::Iri(iri.to_owned());
         say(&self.iri, v::RDF_TYPE, iri(v::PROCESS));
@@ -127,7 +132,11 @@ impl Process {
                 let need_iri = format!("{step_iri}/{}", need.role.name());
                 say(&step_iri, v::REQUIRES_CAPABILITY, iri(&need_iri));
                 say(&need_iri, v::RDF_TYPE, iri(v::REQUIRED_CAPABILITY));
-                say(&need_iri, v::ROLE, Object::Text(need.role.name().to_owned()));
+                say(
+                    &need_iri,
+                    v::ROLE,
+                    Object::Text(need.role.name().to_owned()),
+                );
                 if let Some(class) = need.capability.as_ref().filter(|class| is_iri(class)) {
                     say(&need_iri, v::RDF_TYPE, iri(class));
                     say(class, v::RDFS_SUB_CLASS_OF, iri(v::CAPABILITY));

@@ -3,8 +3,8 @@
 use std::collections::VecDeque;
 use std::sync::{Mutex, PoisonError};
 
-use mtp::{Object, Triple};
 use knowledge::vocabulary as v;
+use mtp::{Object, Triple};
 use serde::Serialize;
 
 use crate::plan::{Fallen, Plan};
@@ -89,7 +89,12 @@ impl Runs {
 
     /// All of them.
     pub(crate) fn all(&self) -> Vec<Run> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
+        self.0
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .iter()
+            .cloned()
+            .collect()
     }
 }
 
@@ -114,13 +119,27 @@ impl Run {
         let run = &self.run;
         graph.say(run, v::RDF_TYPE, iri(v::RUN));
         graph.say(run, v::OF_PROCESS, iri(&self.process));
-        graph.ends(run, self.started_ms, (self.ended_ms, self.outcome), self.reason.as_deref());
+        graph.ends(
+            run,
+            self.started_ms,
+            (self.ended_ms, self.outcome),
+            self.reason.as_deref(),
+        );
         for plan in &self.plans {
             let plan_iri = format!("{run}/plan/{}", plan.number);
             graph.say(run, v::HAS_PLAN, iri(&plan_iri));
             graph.say(&plan_iri, v::RDF_TYPE, iri(v::PLAN));
-            graph.say(&plan_iri, v::NUMBER, Object::Integer(i64::try_from(plan.number).unwrap_or(i64::MAX)));
-            graph.ends(&plan_iri, plan.at_ms, (plan.ended_ms, plan.outcome), plan.reason.as_deref());
+            graph.say(
+                &plan_iri,
+                v::NUMBER,
+                Object::Integer(i64::try_from(plan.number).unwrap_or(i64::MAX)),
+            );
+            graph.ends(
+                &plan_iri,
+                plan.at_ms,
+                (plan.ended_ms, plan.outcome),
+                plan.reason.as_deref(),
+            );
             for (ran, position) in plan.ran.iter().zip(1_i64..) {
                 let part = format!("{plan_iri}/{position}");
                 graph.say(&plan_iri, v::HAS_STEP, iri(&part));
@@ -130,7 +149,12 @@ impl Run {
                 graph.say(&part, v::POSITION, Object::Integer(position));
                 graph.say(&part, v::USES_SKILL, iri(&ran.skill));
                 graph.say(&part, v::USES_COMPONENT, iri(&ran.component));
-                graph.ends(&part, ran.started_ms, (ran.ended_ms, ran.outcome), ran.reason.as_deref());
+                graph.ends(
+                    &part,
+                    ran.started_ms,
+                    (ran.ended_ms, ran.outcome),
+                    ran.reason.as_deref(),
+                );
             }
         }
         graph.0
@@ -156,7 +180,8 @@ impl Planned {
 
     /// A component is lost: what it ran has no other end.
     pub(crate) fn lost(&mut self, at: u64, fallen: &Fallen) {
-        let of_component = |ran: &&mut Ran| ran.ended_ms.is_none() && ran.component == fallen.component;
+        let of_component =
+            |ran: &&mut Ran| ran.ended_ms.is_none() && ran.component == fallen.component;
         for ran in self.ran.iter_mut().filter(of_component) {
             ran.ended_ms = Some(at);
             ran.outcome = How::Lost;
@@ -169,10 +194,20 @@ struct Graph(Vec<Triple>);
 
 impl Graph {
     fn say(&mut self, subject: &str, predicate: &str, object: Object) {
-        self.0.push(Triple { subject: subject.to_owned(), predicate: predicate.to_owned(), object });
+        self.0.push(Triple {
+            subject: subject.to_owned(),
+            predicate: predicate.to_owned(),
+            object,
+        });
     }
 
-    fn ends(&mut self, what: &str, started: u64, (ended, outcome): (Option<u64>, How), reason: Option<&str>) {
+    fn ends(
+        &mut self,
+        what: &str,
+        started: u64,
+        (ended, outcome): (Option<u64>, How),
+        reason: Option<&str>,
+    ) {
         self.say(what, v::STARTED, Object::Time(date_time(started)));
         if let Some(ended) = ended {
             self.say(what, v::ENDED, Object::Time(date_time(ended)));

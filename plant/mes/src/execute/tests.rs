@@ -38,15 +38,41 @@ impl Plant for Arc<Fakes> {
     }
 
     async fn open(&self, offers: &[Offer]) -> Result<Box<dyn Opened>, OpenFault> {
-        if let Some(offer) = offers.iter().find(|offer| Some(offer.component_name.as_str()) == self.unreachable) {
-            return Err(OpenFault { component: offer.component.clone(), why: "no route".into() });
+        if let Some(offer) = offers
+            .iter()
+            .find(|offer| Some(offer.component_name.as_str()) == self.unreachable)
+        {
+            return Err(OpenFault {
+                component: offer.component.clone(),
+                why: "no route".into(),
+            });
         }
-        let skill = |offer: &Offer| Arc::new(FakeSkill { plant: Arc::clone(self), offer: offer.clone() }) as Arc<dyn Runs>;
-        Ok(Box::new(FakeOpened(offers.iter().map(skill).collect(), Arc::clone(self))))
+        let skill = |offer: &Offer| {
+            Arc::new(FakeSkill {
+                plant: Arc::clone(self),
+                offer: offer.clone(),
+            }) as Arc<dyn Runs>
+        };
+        Ok(Box::new(FakeOpened(
+            offers.iter().map(skill).collect(),
+            Arc::clone(self),
+        )))
     }
 
-    fn values(&self, _skill: &str, given: &[(String, serde_json::Value)]) -> Result<Vec<(String, Value)>, String> {
-        given.iter().map(|(name, value)| Ok((name.clone(), Value::Double(value.as_f64().ok_or("no number")?)))).collect()
+    fn values(
+        &self,
+        _skill: &str,
+        given: &[(String, serde_json::Value)],
+    ) -> Result<Vec<(String, Value)>, String> {
+        given
+            .iter()
+            .map(|(name, value)| {
+                Ok((
+                    name.clone(),
+                    Value::Double(value.as_f64().ok_or("no number")?),
+                ))
+            })
+            .collect()
     }
 
     fn keep(&self, run: &Run) {
@@ -77,20 +103,50 @@ impl Runs for FakeSkill {
         format!("{}.{}", self.offer.component_name, self.offer.name)
     }
 
-    async fn run(&self, parameters: Vec<(String, Value)>, _within: Duration) -> Result<Outcome, SkillFault> {
+    async fn run(
+        &self,
+        parameters: Vec<(String, Value)>,
+        _within: Duration,
+    ) -> Result<Outcome, SkillFault> {
         let name = self.name();
-        let told = if parameters.is_empty() { name.clone() } else { format!("{name} {}", parameters.len()) };
+        let told = if parameters.is_empty() {
+            name.clone()
+        } else {
+            format!("{name} {}", parameters.len())
+        };
         self.plant.journal.lock().unwrap().push(told);
-        let dies = self.plant.dies_at.lock().unwrap().take_if(|at| *at == name).is_some();
+        let dies = self
+            .plant
+            .dies_at
+            .lock()
+            .unwrap()
+            .take_if(|at| *at == name)
+            .is_some();
         if dies {
-            self.plant.offers.lock().unwrap().retain(|offer| offer.component != self.offer.component);
-            self.plant.lost.send_modify(|lost| lost.push(self.offer.component.clone()));
+            self.plant
+                .offers
+                .lock()
+                .unwrap()
+                .retain(|offer| offer.component != self.offer.component);
+            self.plant
+                .lost
+                .send_modify(|lost| lost.push(self.offer.component.clone()));
             std::future::pending::<()>().await;
         }
         if self.plant.fails_at == Some(&*name) {
-            return Ok(Outcome { run: 1, succeeded: false, message: "nothing was gripped".into(), results: vec![] });
+            return Ok(Outcome {
+                run: 1,
+                succeeded: false,
+                message: "nothing was gripped".into(),
+                results: vec![],
+            });
         }
-        Ok(Outcome { run: 1, succeeded: true, message: String::new(), results: vec![] })
+        Ok(Outcome {
+            run: 1,
+            succeeded: true,
+            message: String::new(),
+            results: vec![],
+        })
     }
 
     async fn halt(&self) -> Result<(), SkillFault> {
@@ -99,7 +155,10 @@ impl Runs for FakeSkill {
 
     async fn lost(&self) -> String {
         let mut lost = self.plant.lost.subscribe();
-        let is_lost = lost.wait_for(|lost| lost.contains(&self.offer.component)).await.is_ok();
+        let is_lost = lost
+            .wait_for(|lost| lost.contains(&self.offer.component))
+            .await
+            .is_ok();
         assert!(is_lost, "the plant of the test is gone");
         let spare: Vec<_> = self.plant.spare.lock().unwrap().drain(..).collect();
         if !spare.is_empty() {
@@ -132,11 +191,17 @@ fn offer(component: &str, name: &str, of: &str) -> Offer {
 }
 
 fn gripper(name: &str) -> Vec<Offer> {
-    vec![offer(name, "Grasp", "GraspSkillType"), offer(name, "Release", "ReleaseSkillType")]
+    vec![
+        offer(name, "Grasp", "GraspSkillType"),
+        offer(name, "Release", "ReleaseSkillType"),
+    ]
 }
 
 fn plant(offers: Vec<Offer>) -> Fakes {
-    let robot = [offer("robot", "Ptp", "PtpMoveSkillType"), offer("robot", "Lin", "LinearMoveSkillType")];
+    let robot = [
+        offer("robot", "Ptp", "PtpMoveSkillType"),
+        offer("robot", "Lin", "LinearMoveSkillType"),
+    ];
     Fakes {
         offers: Mutex::new(robot.into_iter().chain(offers).collect()),
         changed: watch::channel(0).0,
@@ -152,12 +217,23 @@ fn plant(offers: Vec<Offer>) -> Fakes {
 }
 
 fn process() -> Process {
-    let need = |role: Role| Need { role, capability: None, skill_type: role.skill_type() };
-    let step = |name: &str, last| Step { name: name.into(), needs: [Role::Ptp, Role::Linear, last].map(need).into() };
+    let need = |role: Role| Need {
+        role,
+        capability: None,
+        skill_type: role.skill_type(),
+    };
+    let step = |name: &str, last| Step {
+        name: name.into(),
+        needs: [Role::Ptp, Role::Linear, last].map(need).into(),
+    };
     Process {
         iri: "urn:example:process:move-part".into(),
         name: "Move a part".into(),
-        work: Job::PickAndPlace(skills::Job { pick: [0.0; 6], place: [1.0; 6], approach: 0.05 }),
+        work: Job::PickAndPlace(skills::Job {
+            pick: [0.0; 6],
+            place: [1.0; 6],
+            approach: 0.05,
+        }),
         steps: vec![step("pick", Role::Grasp), step("place", Role::Release)],
         within: Duration::from_secs(5),
         wait: Duration::from_millis(300),
@@ -169,13 +245,27 @@ async fn executed(fakes: Fakes, process: &Process) -> (Run, Arc<Fakes>, Vec<&'st
     let steps = Mutex::new(Vec::new());
     let plant: Arc<dyn Plant> = Arc::new(Arc::clone(&fakes));
     let teller = |step: &'static str| steps.lock().unwrap().push(step);
-    let run = tokio::time::timeout(Duration::from_secs(20), execute(&plant, process, 1, &teller)).await.unwrap();
+    let run = tokio::time::timeout(
+        Duration::from_secs(20),
+        execute(&plant, process, 1, &teller),
+    )
+    .await
+    .unwrap();
     let told = steps.into_inner().unwrap();
     (run, fakes, told)
 }
 
 fn outcomes(run: &Run) -> Vec<(usize, How, Vec<(String, How)>)> {
-    let plan = |plan: &Planned| (plan.number, plan.outcome, plan.ran.iter().map(|ran| (ran.step.clone(), ran.outcome)).collect());
+    let plan = |plan: &Planned| {
+        (
+            plan.number,
+            plan.outcome,
+            plan.ran
+                .iter()
+                .map(|ran| (ran.step.clone(), ran.outcome))
+                .collect(),
+        )
+    };
     run.plans.iter().map(plan).collect()
 }
 
@@ -185,13 +275,34 @@ async fn a_process_is_planned_and_run_to_its_end() {
     assert_eq!((run.outcome, &run.reason), (How::Done, &None));
     assert_eq!(
         *fakes.journal.lock().unwrap(),
-        ["robot.Ptp 1", "robot.Lin 1", "gripper.Grasp", "robot.Lin 1", "robot.Ptp 1", "robot.Lin 1", "gripper.Release", "robot.Lin 1", "closed"]
+        [
+            "robot.Ptp 1",
+            "robot.Lin 1",
+            "gripper.Grasp",
+            "robot.Lin 1",
+            "robot.Ptp 1",
+            "robot.Lin 1",
+            "gripper.Release",
+            "robot.Lin 1",
+            "closed"
+        ]
     );
     assert_eq!((told.first(), told.last()), (Some(&"Init"), Some(&"Idle")));
-    let [plan] = run.plans.as_slice() else { panic!("{run:?}") };
+    let [plan] = run.plans.as_slice() else {
+        panic!("{run:?}")
+    };
     let of: Vec<_> = plan.ran.iter().map(|ran| ran.of.as_str()).collect();
-    assert_eq!(of, ["pick", "pick", "pick", "pick", "place", "place", "place", "place"]);
-    assert!(plan.ran.iter().all(|ran| ran.outcome == How::Done && ran.ended_ms >= Some(ran.started_ms)));
+    assert_eq!(
+        of,
+        [
+            "pick", "pick", "pick", "pick", "place", "place", "place", "place"
+        ]
+    );
+    assert!(
+        plan.ran
+            .iter()
+            .all(|ran| ran.outcome == How::Done && ran.ended_ms >= Some(ran.started_ms))
+    );
 }
 
 #[tokio::test]
@@ -201,15 +312,47 @@ async fn a_gripper_lost_in_the_middle_is_replaced_by_one_that_comes() {
     *fakes.spare.lock().unwrap() = gripper("vacuum");
     let (run, fakes, told) = executed(fakes, &process()).await;
     assert_eq!((run.outcome, run.plans.len()), (How::Done, 2), "{run:?}");
-    let [first, second] = run.plans.as_slice() else { panic!("{run:?}") };
+    let [first, second] = run.plans.as_slice() else {
+        panic!("{run:?}")
+    };
     assert_eq!((first.outcome, first.retreated), (How::Failed, Some(true)));
-    let ended: Vec<_> = first.ran.iter().map(|ran| (&*ran.step, ran.outcome)).collect();
-    assert_eq!(ended, [("MovePickApproachBefore", How::Done), ("MovePick", How::Done), ("Grasp", How::Lost), ("MovePickApproachError", How::Done)]);
-    assert!(first.reason.as_ref().is_some_and(|why| why.contains("Grasp") && why.contains("the connection broke")), "{first:?}");
+    let ended: Vec<_> = first
+        .ran
+        .iter()
+        .map(|ran| (&*ran.step, ran.outcome))
+        .collect();
+    assert_eq!(
+        ended,
+        [
+            ("MovePickApproachBefore", How::Done),
+            ("MovePick", How::Done),
+            ("Grasp", How::Lost),
+            ("MovePickApproachError", How::Done)
+        ]
+    );
+    assert!(
+        first
+            .reason
+            .as_ref()
+            .is_some_and(|why| why.contains("Grasp") && why.contains("the connection broke")),
+        "{first:?}"
+    );
     assert_eq!(second.outcome, How::Done);
-    assert!(told.contains(&"Wait") && told.contains(&"MovePickApproachError"), "{told:?}");
-    let waited = fakes.kept.lock().unwrap().iter().find_map(|run| run.waits_for.clone()).unwrap();
-    assert!(waited.starts_with("pick needs a skill of nsu=urn:ua-bridge:skills;GraspSkillType"), "{waited}");
+    assert!(
+        told.contains(&"Wait") && told.contains(&"MovePickApproachError"),
+        "{told:?}"
+    );
+    let waited = fakes
+        .kept
+        .lock()
+        .unwrap()
+        .iter()
+        .find_map(|run| run.waits_for.clone())
+        .unwrap();
+    assert!(
+        waited.starts_with("pick needs a skill of nsu=urn:ua-bridge:skills;GraspSkillType"),
+        "{waited}"
+    );
     assert_eq!(run.waits_for, None);
 }
 
@@ -220,28 +363,56 @@ async fn a_lost_gripper_that_nothing_replaces_ends_the_run_with_both_reasons() {
     let (run, ..) = executed(fakes, &process()).await;
     assert_eq!(run.outcome, How::Failed);
     let reason = run.reason.unwrap();
-    assert!(reason.contains("the connection broke") && reason.contains("nobody came in 0.3 s"), "{reason}");
+    assert!(
+        reason.contains("the connection broke") && reason.contains("nobody came in 0.3 s"),
+        "{reason}"
+    );
 }
 
 #[tokio::test]
 async fn no_other_robot_begins_where_one_may_still_stand() {
     let fakes = plant(gripper("gripper"));
     *fakes.dies_at.lock().unwrap() = Some("robot.Lin");
-    fakes.spare.lock().unwrap().extend([offer("other", "Ptp", "PtpMoveSkillType"), offer("other", "Lin", "LinearMoveSkillType")]);
+    fakes.spare.lock().unwrap().extend([
+        offer("other", "Ptp", "PtpMoveSkillType"),
+        offer("other", "Lin", "LinearMoveSkillType"),
+    ]);
     let (run, ..) = executed(fakes, &process()).await;
-    assert_eq!((run.outcome, run.plans.len(), run.plans[0].retreated), (How::Failed, 1, Some(false)), "{run:?}");
+    assert_eq!(
+        (run.outcome, run.plans.len(), run.plans[0].retreated),
+        (How::Failed, 1, Some(false)),
+        "{run:?}"
+    );
     assert!(run.reason.unwrap().contains("has not retreated"));
 }
 
 #[tokio::test]
 async fn a_skill_that_fails_or_cannot_be_reached_is_not_tried_again() {
-    let mut fakes = plant([gripper("a-gripper"), gripper("b-gripper"), gripper("c-gripper")].concat());
+    let mut fakes = plant(
+        [
+            gripper("a-gripper"),
+            gripper("b-gripper"),
+            gripper("c-gripper"),
+        ]
+        .concat(),
+    );
     fakes.unreachable = Some("a-gripper");
     fakes.fails_at = Some("b-gripper.Grasp");
     let (run, ..) = executed(fakes, &process()).await;
     assert_eq!(run.outcome, How::Done);
-    let used: Vec<_> = run.plans.iter().map(|plan| plan.plan.chosen(Role::Grasp).unwrap()).collect();
-    assert_eq!(used, ["urn:example:a-gripper#Grasp", "urn:example:b-gripper#Grasp", "urn:example:c-gripper#Grasp"]);
+    let used: Vec<_> = run
+        .plans
+        .iter()
+        .map(|plan| plan.plan.chosen(Role::Grasp).unwrap())
+        .collect();
+    assert_eq!(
+        used,
+        [
+            "urn:example:a-gripper#Grasp",
+            "urn:example:b-gripper#Grasp",
+            "urn:example:c-gripper#Grasp"
+        ]
+    );
     assert_eq!(outcomes(&run)[1].2[2], ("Grasp".to_owned(), How::Failed));
 }
 
@@ -249,7 +420,11 @@ async fn a_skill_that_fails_or_cannot_be_reached_is_not_tried_again() {
 async fn a_sequence_gives_each_step_what_it_needs_and_never_does_one_twice() {
     let alone = |step: usize, of: &str| Step {
         name: format!("step {step}"),
-        needs: vec![Need { role: Role::Alone(step), capability: None, skill_type: Some(TypeName::own(of)) }],
+        needs: vec![Need {
+            role: Role::Alone(step),
+            capability: None,
+            skill_type: Some(TypeName::own(of)),
+        }],
     };
     let given = vec![("Force".to_owned(), serde_json::json!(12))];
     let process = Process {
@@ -259,12 +434,19 @@ async fn a_sequence_gives_each_step_what_it_needs_and_never_does_one_twice() {
     };
     let (run, fakes, _) = executed(plant(gripper("gripper")), &process).await;
     assert_eq!(run.outcome, How::Done, "{run:?}");
-    assert_eq!(*fakes.journal.lock().unwrap(), ["gripper.Grasp 1", "gripper.Release", "closed"]);
+    assert_eq!(
+        *fakes.journal.lock().unwrap(),
+        ["gripper.Grasp 1", "gripper.Release", "closed"]
+    );
     let mut fakes = plant([gripper("gripper"), gripper("other")].concat());
     fakes.fails_at = Some("gripper.Release");
     let (run, ..) = executed(fakes, &process).await;
     assert_eq!((run.outcome, run.plans.len()), (How::Failed, 1));
-    assert!(run.reason.unwrap().contains("step 1: gripper.Release nothing was gripped"));
+    assert!(
+        run.reason
+            .unwrap()
+            .contains("step 1: gripper.Release nothing was gripped")
+    );
 }
 
 /// Wants all to stop with the first step.
@@ -289,8 +471,13 @@ impl Teller for StopAt {
 async fn who_asked_can_stop_it_also_while_it_waits() {
     let teller = StopAt("Wait", watch::channel(false).0);
     let plant: Arc<dyn Plant> = Arc::new(Arc::new(plant(vec![])));
-    let slow = Process { wait: Duration::from_secs(600), ..process() };
-    let run = tokio::time::timeout(Duration::from_secs(5), execute(&plant, &slow, 1, &teller)).await.unwrap();
+    let slow = Process {
+        wait: Duration::from_secs(600),
+        ..process()
+    };
+    let run = tokio::time::timeout(Duration::from_secs(5), execute(&plant, &slow, 1, &teller))
+        .await
+        .unwrap();
     assert_eq!(run.reason.as_deref(), Some("stopped"));
 }
 
@@ -301,13 +488,31 @@ async fn what_became_of_a_run_can_be_asked_for() {
     *fakes.spare.lock().unwrap() = gripper("vacuum");
     let (run, ..) = executed(fakes, &process()).await;
     let knowledge = Knowledge::new().unwrap();
-    knowledge.replace(&Source::new(SourceKind::Run, &run.run), &run.triples(), 1).unwrap();
-    knowledge.replace(&Source::new(SourceKind::Process, "p"), &process().triples(&|_| None), 1).unwrap();
+    knowledge
+        .replace(&Source::new(SourceKind::Run, &run.run), &run.triples(), 1)
+        .unwrap();
+    knowledge
+        .replace(
+            &Source::new(SourceKind::Process, "p"),
+            &process().triples(&|_| None),
+            1,
+        )
+        .unwrap();
     let runs = knowledge.ask("runs", &[]).unwrap();
-    assert_eq!((&runs.rows[0]["outcome"], &runs.rows[0]["plans"]), (&"done".into(), &2.into()));
-    let steps = knowledge.ask("run-steps", &[("run".into(), run.run.clone())]).unwrap();
+    assert_eq!(
+        (&runs.rows[0]["outcome"], &runs.rows[0]["plans"]),
+        (&"done".into(), &2.into())
+    );
+    let steps = knowledge
+        .ask("run-steps", &[("run".into(), run.run.clone())])
+        .unwrap();
     assert_eq!(steps.rows.len(), 12);
-    let lost: Vec<_> = steps.rows.iter().filter(|row| row["outcome"] == "lost").map(|row| &row["skill"]).collect();
+    let lost: Vec<_> = steps
+        .rows
+        .iter()
+        .filter(|row| row["outcome"] == "lost")
+        .map(|row| &row["skill"])
+        .collect();
     assert_eq!(lost, ["urn:example:gripper#Grasp"]);
     assert_eq!(knowledge.ask("processes", &[]).unwrap().rows.len(), 6);
 }

@@ -1,0 +1,450 @@
+//! The plant as it is: who is in the graph, how its skills are opened, and what becomes of runs.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::SystemTime;
+
+use async_trait::async_trait;
+use knowledge::{
+    ComponentFacts, Knowledge, NodeName, ParameterFacts, SkillFacts, Source, SourceKind, TypeFacts,
+};
+use serde::Serialize;
+use skills::{ClientOptions, FoundParameter, FoundSkill, Runs as RunsOfSkill, SkillClient, Value};
+use tokio::sync::watch;
+use tracing::{error, info, warn};
+
+use crate::execute::{OpenFault, Opened, Plant};
+use crate::plan::Offer;
+use crate::process::Process;
+use crate::record::{Run, Runs};
+
+/// The plant.
+pub(crate) struct Cell {
+    knowledge: Arc<Knowledge>,
+    pub(crate) processes: Vec<Process>,
+    client: ClientOptions,
+    present: Mutex<Present>,
+    changed: watch::Sender<u64>,
+    runs: Runs,
+}
+
+#[derive(Default)]
+struct Present {
+    /// By their IRIs.
+    components: BTreeMap<String, Component>,
+    gone: VecDeque<Gone>,
+}
+
+/// A component that is in the graph.
+#[derive(Debug, Clone, Serialize)]
+struct Component {
+    application_uri: String,
+    name: String,
+    endpoint: String,
+    namespace: Option<u16>,
+    /// When it was discovered, when its skills were asked for, and since when it is in the graph; ms since 1970.
+    seen_ms: u64,
+    listed_ms: u64,
+    since_ms: u64,
+    skills: Vec<String>,
+    /// By which discovery knows it.
+    #[serde(skip)]
+    discovered: String,
+    /// By the IRIs of the skills.
+    #[serde(skip)]
+    found: BTreeMap<String, FoundSkill>,
+}
+
+/// A component that was lost.
+#[derive(Debug, Clone, Serialize)]
+struct Gone {
+    application_uri: String,
+    name: String,
+    at_ms: u64,
+    why: String,
+}
+
+/// What discovery knows of a server.
+#[derive(Debug, Clone)]
+pub(crate) struct Seen {
+    pub(crate) name: String,
+    pub(crate) url: String,
+    pub(crate) at_ms: u64,
+}
+
+impl Cell {
+    pub(crate) fn new(
+        knowledge: Arc<Knowledge>,
+        processes: Vec<Process>,
+        client: ClientOptions,
+    ) -> Self {
+        Self {
+            knowledge,
+            processes,
+            client,
+            present: Mutex::default(),
+            changed: watch::channel(0).0,
+            runs: Runs::default(),
+        }
+    }
+
+    pub(crate) fn client(&self) -> &ClientOptions {
+        &self.client
+    }
+
+    /// The process of an IRI.
+    pub(crate) fn process(&self, iri: &str) -> Option<&Process> {
+        self.processes.iter().find(|process| process.iri == iri)
+    }
+
+    /// A server has told its skills: it is in the graph from now on.
+    pub(crate) fn came(
+        &self,
+        seen: &Seen,
+        application_uri: &str,
+        found: Vec<FoundSkill>,
+        listed_ms: u64,
+    ) {
+        let Some(first) = found.first() else { return };
+        let facts = ComponentFacts {
+            application_uri: application_uri.to_owned(),
+            name: first.component.clone(),
+            endpoint: seen.url.clone(),
+            namespace: first.namespace,
+            skills: found.iter().filter_map(skill_facts).collect(),
+        };
+        let (triples, left_out) = facts.triples();
+        for iri in left_out {
+            warn!(
+                component = facts.name,
+                capability = iri,
+                "a capability is no IRI and is left out"
+            );
+        }
+        let iri = facts.iri();
+        let now = now();
+        // Who comes under a URI that another has takes its place.
+        self.remove(
+            |component| component.application_uri == application_uri,
+            "another came under its ApplicationUri",
+        );
+        if let Err(fault) = self.knowledge.replace(
+            &Source::new(SourceKind::Component, application_uri),
+            &triples,
+            now,
+        ) {
+            error!(
+                component = facts.name,
+                "what a component says is not taken into the graph: {fault}"
+            );
+            return;
+        }
+        let by_iri = |found: FoundSkill| {
+            NodeName::parse(&found.node).map(|node| (facts.skill_iri(&node), found))
+        };
+        let component = Component {
+            application_uri: application_uri.to_owned(),
+            name: facts.name.clone(),
+            endpoint: seen.url.clone(),
+            namespace: facts.namespace,
+            seen_ms: seen.at_ms,
+            listed_ms,
+            since_ms: now,
+            skills: facts
+                .skills
+                .iter()
+                .map(|skill| skill.name.clone())
+                .collect(),
+            discovered: seen.name.clone(),
+            found: found.into_iter().filter_map(by_iri).collect(),
+        };
+        info!(
+            component = component.name,
+            skills = component.skills.len(),
+            endpoint = component.endpoint,
+            "a component is in the graph"
+        );
+        self.present().components.insert(iri, component);
+        self.changed.send_modify(|changes| *changes += 1);
+    }
+
+    /// A server that discovery knew is gone.
+    pub(crate) fn went(&self, discovered: &str, why: &str) {
+        self.remove(|component| component.discovered == discovered, why);
+    }
+
+    fn remove(&self, which: impl Fn(&Component) -> bool, why: &str) {
+        let removed: Vec<Component> = {
+            let mut present = self.present();
+            let iris: Vec<String> = present
+                .components
+                .iter()
+                .filter(|(_, component)| which(component))
+                .map(|(iri, _)| iri.clone())
+                .collect();
+            iris.iter()
+                .filter_map(|iri| present.components.remove(iri))
+                .collect()
+        };
+        for component in removed {
+            let source = Source::new(SourceKind::Component, &component.application_uri);
+            if let Err(fault) = self.knowledge.remove(&source) {
+                error!(
+                    component = component.name,
+                    "a component that is gone stays in the graph: {fault}"
+                );
+            }
+            info!(component = component.name, "a component is gone: {why}");
+            let mut present = self.present();
+            present.gone.push_back(Gone {
+                application_uri: component.application_uri,
+                name: component.name,
+                at_ms: now(),
+                why: why.to_owned(),
+            });
+            if present.gone.len() > MOST_GONE {
+                present.gone.pop_front();
+            }
+            drop(present);
+            self.changed.send_modify(|changes| *changes += 1);
+        }
+    }
+
+    /// What there is to be seen of it, as JSON.
+    pub(crate) fn status(&self) -> serde_json::Value {
+        let present = self.present();
+        let components: Vec<_> = present.components.values().collect();
+        let processes = self.processes.iter().map(|process| {
+            let steps: Vec<_> = process.steps.iter().map(|step| &step.name).collect();
+            serde_json::json!({ "process": process.iri, "name": process.name, "steps": steps })
+        });
+        serde_json::json!({
+            "program": "ua-mes",
+            "components": components,
+            "gone": present.gone,
+            "graphs": self.knowledge.sources(),
+            "processes": processes.collect::<Vec<_>>(),
+            "runs": self.runs.all(),
+        })
+    }
+
+    fn present(&self) -> MutexGuard<'_, Present> {
+        self.present.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[async_trait]
+impl Plant for Cell {
+    fn offers(&self) -> Vec<Offer> {
+        match self.knowledge.ask("candidates", &[]) {
+            Ok(answer) => {
+                let present = self.present();
+                Offer::all(&answer, &|component| {
+                    present
+                        .components
+                        .get(component)
+                        .map_or(0, |component| component.since_ms)
+                })
+            }
+            Err(fault) => {
+                error!("{fault}");
+                Vec::new()
+            }
+        }
+    }
+
+    fn changes(&self) -> watch::Receiver<u64> {
+        self.changed.subscribe()
+    }
+
+    async fn open(&self, offers: &[Offer]) -> Result<Box<dyn Opened>, OpenFault> {
+        let mut clients: BTreeMap<String, SkillClient> = BTreeMap::new();
+        let mut skills: Vec<Arc<dyn RunsOfSkill>> = Vec::new();
+        let mut fault = None;
+        for offer in offers {
+            let found = {
+                let present = self.present();
+                let component = present.components.get(&offer.component);
+                component.and_then(|component| {
+                    Some((
+                        component.endpoint.clone(),
+                        component.found.get(&offer.skill)?.clone(),
+                    ))
+                })
+            };
+            let broken = |why: String| {
+                Some(OpenFault {
+                    component: offer.component.clone(),
+                    why,
+                })
+            };
+            let Some((endpoint, found)) = found else {
+                fault = broken("it is gone".to_owned());
+                break;
+            };
+            if !clients.contains_key(&endpoint) {
+                match SkillClient::connect(&endpoint, &self.client).await {
+                    Ok(client) => drop(clients.insert(endpoint.clone(), client)),
+                    Err(why) => {
+                        fault = broken(why.to_string());
+                        break;
+                    }
+                }
+            }
+            if let Some(client) = clients.get(&endpoint) {
+                skills.push(Arc::new(client.handle(&found)));
+            }
+        }
+        let opened = OpenedSkills {
+            clients: clients.into_values().collect(),
+            skills,
+        };
+        match fault {
+            None => Ok(Box::new(opened)),
+            Some(fault) => {
+                Box::new(opened).close().await;
+                Err(fault)
+            }
+        }
+    }
+
+    fn values(
+        &self,
+        skill: &str,
+        given: &[(String, serde_json::Value)],
+    ) -> Result<Vec<(String, Value)>, String> {
+        let present = self.present();
+        let found = present
+            .components
+            .values()
+            .find_map(|component| component.found.get(skill));
+        let found = found.ok_or("its component is gone")?;
+        let value = |(name, value): &(String, serde_json::Value)| {
+            let known = || {
+                found
+                    .parameters
+                    .iter()
+                    .map(|parameter| parameter.name.as_str())
+                    .collect::<Vec<_>>()
+                    .join(", ")
+            };
+            let parameter = found
+                .parameters
+                .iter()
+                .find(|parameter| parameter.name == *name);
+            let parameter = parameter.ok_or_else(|| {
+                format!("{} has no parameter {name}; it has {}", found.name, known())
+            })?;
+            let value = parameter
+                .shape
+                .read_json(value)
+                .map_err(|why| format!("{name}: {why}"))?;
+            Ok((name.clone(), value))
+        };
+        given.iter().map(value).collect()
+    }
+
+    fn keep(&self, run: &Run) {
+        for gone in self.runs.put(run) {
+            if let Err(fault) = self.knowledge.remove(&Source::new(SourceKind::Run, &gone)) {
+                error!(
+                    run = gone,
+                    "a run that is too old stays in the graph: {fault}"
+                );
+            }
+        }
+        if let Err(fault) = self.knowledge.replace(
+            &Source::new(SourceKind::Run, &run.run),
+            &run.triples(),
+            run.started_ms,
+        ) {
+            error!(run = run.run, "a run is not taken into the graph: {fault}");
+        }
+    }
+
+    fn now(&self) -> u64 {
+        now()
+    }
+}
+
+struct OpenedSkills {
+    clients: Vec<SkillClient>,
+    skills: Vec<Arc<dyn RunsOfSkill>>,
+}
+
+#[async_trait]
+impl Opened for OpenedSkills {
+    fn skills(&self) -> Vec<Arc<dyn RunsOfSkill>> {
+        self.skills.clone()
+    }
+
+    async fn close(self: Box<Self>) {
+        drop(self.skills);
+        for client in self.clients {
+            client.close().await;
+        }
+    }
+}
+
+fn skill_facts(found: &FoundSkill) -> Option<SkillFacts> {
+    let parameters = found
+        .parameters
+        .iter()
+        .map(|parameter| parameter_facts(parameter, false));
+    let results = found
+        .results
+        .iter()
+        .map(|parameter| parameter_facts(parameter, true));
+    let of_type = |of: &skills::FoundType| TypeFacts {
+        node: NodeName {
+            namespace: of.name.namespace.clone(),
+            identifier: of.identifier.clone(),
+        },
+        browse_name: of.name.name.clone(),
+    };
+    Some(SkillFacts {
+        name: found.name.clone(),
+        number: found.number.map(u32::from),
+        node: NodeName::parse(&found.node)?,
+        types: found.types.iter().map(of_type).collect(),
+        capabilities: found.capabilities.clone(),
+        parameters: parameters.chain(results).collect(),
+    })
+}
+
+fn parameter_facts(parameter: &FoundParameter, is_output: bool) -> ParameterFacts {
+    let rank = if parameter.shape.array { "[]" } else { "" };
+    ParameterFacts {
+        name: parameter.name.clone(),
+        is_output,
+        data_type: format!("{:?}{rank}", parameter.shape.builtin),
+        is_required: !is_output && parameter.default.is_none(),
+        default: parameter
+            .default
+            .as_ref()
+            .filter(|_| !is_output)
+            .map(|value| value.to_json().to_string()),
+        unit: parameter.unit.clone(),
+        node: NodeName::parse(&parameter.node),
+        ..ParameterFacts::default()
+    }
+}
+
+/// ms since 1970.
+#[expect(
+    clippy::disallowed_methods,
+    reason = "this is the shell; what plans and records takes its time from here"
+)]
+pub(crate) fn now() -> u64 {
+    since_1970(SystemTime::now())
+}
+
+/// ms since 1970.
+pub(crate) fn since_1970(at: SystemTime) -> u64 {
+    let since = at
+        .duration_since(SystemTime::UNIX_EPOCH)
+        .unwrap_or_default();
+    u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
+}
+
+const MOST_GONE: usize = 100;

@@ -1,0 +1,103 @@
+//! ExecuteProcess: what the MES does as a skill of its own.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use async_trait::async_trait;
+use skills::{Driver, Parameters, Results, Teller, Value, Work};
+
+use crate::cell::Cell;
+use crate::execute::{Plant, dry_run, execute};
+use crate::record::How;
+
+/// Plans and runs the process it is started with.
+pub(crate) struct ExecuteProcess {
+    pub(crate) cell: Arc<Cell>,
+    pub(crate) runs: AtomicU64,
+}
+
+#[async_trait]
+impl Driver for ExecuteProcess {
+    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+        let iri = parameters.text("ProcessIri").unwrap_or_default();
+        if self.cell.process(iri).is_none() {
+            let known: Vec<_> = self
+                .cell
+                .processes
+                .iter()
+                .map(|process| process.iri.as_str())
+                .collect();
+            return Err(format!(
+                "ProcessIri: `{iri}` is no process here; known are {}",
+                known.join(", ")
+            ));
+        }
+        match parameters.text("ExecutionMode") {
+            Some("execute" | "plan") | None => Ok(()),
+            Some(other) => Err(format!(
+                "ExecutionMode: `{other}` is neither execute nor plan"
+            )),
+        }
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let iri = work
+            .parameters()
+            .text("ProcessIri")
+            .unwrap_or_default()
+            .to_owned();
+        let process = self.cell.process(&iri).ok_or("there is no such process")?;
+        let report = |report: &serde_json::Value| {
+            Ok(vec![(
+                "Report".to_owned(),
+                Value::String(report.to_string()),
+            )])
+        };
+        if work.parameters().text("ExecutionMode") == Some("plan") {
+            let plan = dry_run(&*self.cell, process);
+            return report(
+                &serde_json::json!({ "process": iri, "complete": plan.is_complete(), "missing": plan.missing(), "plan": plan }),
+            );
+        }
+        let plant: Arc<dyn Plant> = Arc::clone(&self.cell) as Arc<dyn Plant>;
+        let number = self.runs.fetch_add(1, Ordering::Relaxed);
+        let run = execute(&plant, process, number, &Telling(&work)).await;
+        match (run.outcome, run.reason) {
+            (How::Done, _) => report(
+                &serde_json::json!({ "run": run.run, "process": iri, "plans": run.plans.len(), "outcome": "done" }),
+            ),
+            (_, reason) => Err(reason.unwrap_or_default()),
+        }
+    }
+}
+
+/// Tells the skill its steps, and how much is done.
+struct Telling<'a>(&'a Work);
+
+#[async_trait]
+impl Teller for Telling<'_> {
+    async fn step(&self, step: &'static str) {
+        if let Some((_, done)) = DONE.iter().find(|(known, _)| *known == step) {
+            self.0.progress(*done);
+        }
+        self.0.step(step).await;
+    }
+
+    async fn stopped(&self) {
+        self.0.stopped().await;
+    }
+}
+
+/// How much is done when a step of the composite begins.
+const DONE: [(&str, f32); 10] = [
+    ("Init", 0.0),
+    ("MovePickApproachBefore", 0.05),
+    ("MovePick", 0.2),
+    ("Grasp", 0.3),
+    ("MovePickApproachAfter", 0.4),
+    ("MovePlaceApproachBefore", 0.5),
+    ("MovePlace", 0.7),
+    ("Release", 0.8),
+    ("MovePlaceApproachAfter", 0.9),
+    ("Idle", 1.0),
+];

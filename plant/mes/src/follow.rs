@@ -1,0 +1,136 @@
+//! From discovery to the graph: who is seen is asked for its skills, who is gone is forgotten.
+
+use std::collections::HashMap;
+use std::net::IpAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use discovery::{Found, Known, Watcher};
+use skills::{SkillClient, SkillFault};
+use tokio::task::{AbortHandle, JoinSet};
+use tracing::{debug, warn};
+
+use crate::cell::{Cell, Seen, now, since_1970};
+
+/// Follows discovery for as long as it goes on. With `only_loopback`, servers elsewhere are left alone.
+pub(crate) async fn follow(cell: Arc<Cell>, mut watcher: Watcher, only_loopback: bool) {
+    let mut looks = JoinSet::new();
+    let mut looking: HashMap<String, AbortHandle> = HashMap::new();
+    loop {
+        let found = tokio::select! {
+            found = watcher.next() => found,
+            Some(_) = looks.join_next() => continue,
+        };
+        let Some(found) = found else { return };
+        let known = found.known();
+        if known.is_lds() {
+            continue;
+        }
+        if let Some(earlier) = looking.remove(&known.name) {
+            earlier.abort();
+        }
+        match found {
+            Found::Gone { known, loss } => cell.went(&known.name, loss.label()),
+            Found::Restarted(known) => {
+                cell.went(&known.name, "it started anew");
+                looking.insert(
+                    known.name.clone(),
+                    looks.spawn(look(Arc::clone(&cell), known, only_loopback)),
+                );
+            }
+            Found::Seen(known) => {
+                looking.insert(
+                    known.name.clone(),
+                    looks.spawn(look(Arc::clone(&cell), known, only_loopback)),
+                );
+            }
+        }
+    }
+}
+
+/// Asks a server for its skills until it has answered.
+async fn look(cell: Arc<Cell>, known: Known, only_loopback: bool) {
+    if only_loopback && !is_loopback(&known.url) {
+        warn!(
+            url = known.url,
+            "a server that is not on loopback is left alone; say --interface to look there"
+        );
+        return;
+    }
+    let seen = Seen {
+        name: known.name,
+        url: known.url,
+        at_ms: since_1970(known.since),
+    };
+    let mut again = AGAIN;
+    loop {
+        match once(&cell, &seen).await {
+            Ok(()) => return,
+            Err(fault) => debug!(url = seen.url, "a server does not tell its skills: {fault}"),
+        }
+        tokio::time::sleep(again).await;
+        again = (again * 2).min(AGAIN_AT_MOST);
+    }
+}
+
+async fn once(cell: &Cell, seen: &Seen) -> Result<(), SkillFault> {
+    let client = SkillClient::connect(&seen.url, cell.client()).await?;
+    let found = client.skills().await;
+    let uri = client.application_uri();
+    let listed = now();
+    client.close().await;
+    let found = found?;
+    if found.is_empty() {
+        debug!(url = seen.url, "a server has no skills");
+    } else if uri.is_empty() {
+        return Err(SkillFault::Unexpected(
+            "it does not say who it is".to_owned(),
+        ));
+    } else {
+        cell.came(seen, &uri, found, listed);
+    }
+    Ok(())
+}
+
+fn is_loopback(url: &str) -> bool {
+    let Some(rest) = url.strip_prefix("opc.tcp://") else {
+        return false;
+    };
+    let authority = rest.split('/').next().unwrap_or_default();
+    let host = match authority.strip_prefix('[') {
+        Some(rest) => rest.split(']').next().unwrap_or_default(),
+        None => authority.split(':').next().unwrap_or_default(),
+    };
+    host == "localhost"
+        || host
+            .parse::<IpAddr>()
+            .is_ok_and(|address| address.is_loopback())
+}
+
+const AGAIN: Duration = Duration::from_millis(100);
+const AGAIN_AT_MOST: Duration = Duration::from_secs(5);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn loopback_is_told_from_elsewhere() {
+        for url in [
+            "opc.tcp://127.0.0.1:4840/",
+            "opc.tcp://localhost:1",
+            "opc.tcp://[::1]:4840/x",
+            "opc.tcp://127.9.9.9",
+        ] {
+            assert!(is_loopback(url), "{url}");
+        }
+        for url in [
+            "opc.tcp://10.0.0.1:4840",
+            "http://127.0.0.1",
+            "opc.tcp://127.0.0.1.example.com:1",
+            "opc.tcp://localhost@evil:1",
+        ] {
+            assert!(!is_loopback(url), "{url}");
+        }
+    }
+}

@@ -1,0 +1,123 @@
+//! Files to the graph: what capabilities are, which types there are, what modules can do, which processes are known.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs;
+
+use bridge_node::{Failure, FailureKind};
+use knowledge::{Knowledge, Source, SourceKind, nodeset, vocabulary as v};
+use mtp::{Module, Object, Triple};
+use skills::TypeName;
+use tracing::{info, warn};
+
+use crate::settings::{self, Settings};
+
+/// Takes in all files that the YAML names.
+///
+/// # Errors
+/// The first that cannot be read, with its name.
+pub(crate) fn all(knowledge: &Knowledge, settings: &Settings, at: u64) -> Result<(), Failure> {
+    let mut types = BTreeMap::new();
+    let ours = skills::model::nodeset();
+    put_node_set(knowledge, "the NodeSet of skills", &ours, (at, &mut types))?;
+    for file in &settings.nodesets {
+        put_node_set(knowledge, &file.name, &read(file)?, (at, &mut types))?;
+    }
+    for file in &settings.knowledge {
+        let source = Source::new(SourceKind::File, &file.name);
+        knowledge
+            .replace_turtle(&source, &read(file)?, at)
+            .map_err(|fault| refused(&file.name, &fault))?;
+    }
+    for manifest in &settings.manifests {
+        let name = &manifest.source.name;
+        let module =
+            Module::read(&read(&manifest.source)?).map_err(|fault| refused(name, &fault))?;
+        for finding in &module.findings {
+            warn!(manifest = name, "{}: {}", finding.about, finding.what);
+        }
+        let triples = module.triples(&manifest.iri, &manifest.capabilities);
+        knowledge
+            .replace(&Source::new(SourceKind::Mtp, name), &triples, at)
+            .map_err(|fault| refused(name, &fault))?;
+        info!(
+            manifest = name,
+            module = module.name,
+            services = module.services.len(),
+            "a module is in the graph"
+        );
+    }
+    for process in &settings.processes {
+        let triples = process.triples(&|name: &TypeName| {
+            types
+                .get(&(name.namespace.clone(), name.name.clone()))
+                .cloned()
+        });
+        knowledge
+            .replace(
+                &Source::new(SourceKind::Process, &process.iri),
+                &triples,
+                at,
+            )
+            .map_err(|fault| refused(&process.iri, &fault))?;
+    }
+    Ok(())
+}
+
+/// The IRIs of types by namespace and BrowseName.
+type Types = BTreeMap<(String, String), String>;
+
+fn put_node_set(
+    knowledge: &Knowledge,
+    name: &str,
+    text: &str,
+    (at, types): (u64, &mut Types),
+) -> Result<(), Failure> {
+    let read = nodeset::read(text).map_err(|fault| refused(name, &fault))?;
+    let said = |triple: &Triple, predicate: &str| match &triple.object {
+        Object::Text(text) if triple.predicate == predicate => Some(text.clone()),
+        _ => None,
+    };
+    let namespaces: BTreeMap<&str, String> = read
+        .triples
+        .iter()
+        .filter_map(|triple| Some((triple.subject.as_str(), said(triple, v::NODE_NAMESPACE)?)))
+        .collect();
+    let classes: BTreeSet<&str> = read
+        .triples
+        .iter()
+        .filter(|triple| {
+            triple.predicate == v::RDF_TYPE
+                && triple.object == Object::Iri(v::RDFS_CLASS.to_owned())
+        })
+        .map(|triple| triple.subject.as_str())
+        .collect();
+    for triple in read
+        .triples
+        .iter()
+        .filter(|triple| classes.contains(triple.subject.as_str()))
+    {
+        if let (Some(name), Some(namespace)) = (
+            said(triple, v::BROWSE_NAME),
+            namespaces.get(triple.subject.as_str()),
+        ) {
+            types.insert((namespace.clone(), name), triple.subject.clone());
+        }
+    }
+    knowledge
+        .replace(
+            &Source::new(SourceKind::NodeSet, &read.namespace),
+            &read.triples,
+            at,
+        )
+        .map_err(|fault| refused(name, &fault))
+}
+
+fn read(file: &settings::Source) -> Result<String, Failure> {
+    let path = file.path.display();
+    fs::read_to_string(&file.path)
+        .map_err(|error| Failure::new(FailureKind::Io, format!("cannot read {path}: {error}")))
+}
+
+fn refused(name: &str, fault: &dyn std::fmt::Display) -> Failure {
+    Failure::new(FailureKind::Configuration, format!("{name}: {fault}"))
+}

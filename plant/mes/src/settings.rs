@@ -1,0 +1,651 @@
+//! The YAML of the MES.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use knowledge::is_iri;
+use skills::yaml::{Code, Findings, Kind, Node, Reader, parse};
+use skills::{Lds, Security, TypeName};
+
+use crate::process::{Job, Need, Process, Role, Step};
+
+/// What the MES is started with.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Settings {
+    /// Its name as a component.
+    pub(crate) name: String,
+    pub(crate) application_uri: String,
+    /// Its number in the space.
+    pub(crate) namespace: u16,
+    pub(crate) endpoint: String,
+    pub(crate) security: Vec<Security>,
+    pub(crate) lds: Lds,
+    pub(crate) open: bool,
+    /// Where questions are answered.
+    pub(crate) sparql: SocketAddr,
+    /// Turtle files.
+    pub(crate) knowledge: Vec<Source>,
+    pub(crate) nodesets: Vec<Source>,
+    pub(crate) manifests: Vec<Manifest>,
+    pub(crate) processes: Vec<Process>,
+}
+
+/// A file, by what the YAML calls it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Source {
+    pub(crate) name: String,
+    pub(crate) path: PathBuf,
+}
+
+/// The manifest of a module.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Manifest {
+    pub(crate) source: Source,
+    /// The IRI of the module.
+    pub(crate) iri: String,
+    /// Classes of capability by the name of a service, or of `service/procedure`.
+    pub(crate) capabilities: BTreeMap<String, Vec<String>>,
+}
+
+impl Settings {
+    /// Reads the text; paths in it are relative to `folder`. All that is wrong is told at once.
+    pub(crate) fn from_yaml(text: &str, folder: &Path) -> Result<Self, Findings> {
+        let mut findings = Findings::default();
+        let read = match parse(text) {
+            Ok(root) => Reading {
+                reader: Reader::new(&mut findings),
+                folder,
+            }
+            .settings(&root),
+            Err(finding) => {
+                findings.push(finding);
+                None
+            }
+        };
+        match read {
+            Some(settings) if findings.is_empty() => Ok(settings),
+            _ => Err(findings),
+        }
+    }
+}
+
+struct Reading<'a> {
+    reader: Reader<'a>,
+    folder: &'a Path,
+}
+
+impl Reading<'_> {
+    fn settings(&mut self, root: &Node) -> Option<Settings> {
+        let keys = [
+            "mes",
+            "application_uri",
+            "namespace",
+            "endpoint",
+            "security",
+            "lds",
+            "open",
+            "sparql",
+            "knowledge",
+            "nodesets",
+            "manifests",
+            "processes",
+        ];
+        let [
+            name,
+            uri,
+            namespace,
+            endpoint,
+            security,
+            lds,
+            open,
+            sparql,
+            knowledge,
+            nodesets,
+            manifests,
+            processes,
+        ] = self.reader.map(root, keys)?;
+        let name = self
+            .reader
+            .needed(name, "mes", root.place)
+            .and_then(|node| self.name(node));
+        let uri = self
+            .reader
+            .needed(uri, "application_uri", root.place)
+            .and_then(|node| self.iri(node, Code::Uri));
+        let namespace = self
+            .reader
+            .needed(namespace, "namespace", root.place)
+            .and_then(|node| self.namespace(node));
+        let endpoint = endpoint.map_or(Some(DEFAULT_ENDPOINT.to_owned()), |node| {
+            self.endpoint(node)
+        });
+        let security = security.map_or(Some(vec![Security::None]), |node| self.security(node));
+        let lds = match lds {
+            None => Some(Lds::Local),
+            Some(node) => match self.reader.text(node, "an endpoint or `none`") {
+                Some("none") => Some(Lds::Nowhere),
+                _ => self.endpoint(node).map(Lds::At),
+            },
+        };
+        let open = open.map_or(Some(false), |node| self.reader.boolean(node));
+        let sparql = sparql.map_or(Some(DEFAULT_SPARQL), |node| self.address(node));
+        let knowledge = knowledge.map_or_else(Vec::new, |node| self.files(node));
+        let nodesets = nodesets.map_or_else(Vec::new, |node| self.files(node));
+        let manifests = manifests
+            .map(|node| self.each(node, Self::manifest))
+            .unwrap_or_default();
+        let processes = processes
+            .map(|node| self.each(node, Self::process))
+            .unwrap_or_default();
+        self.once(
+            root,
+            manifests.iter().map(|manifest| &*manifest.source.name),
+            "manifest",
+        );
+        self.once(
+            root,
+            processes.iter().map(|process| &*process.iri),
+            "process",
+        );
+        Some(Settings {
+            name: name?,
+            application_uri: uri?,
+            namespace: namespace?,
+            endpoint: endpoint?,
+            security: security?,
+            lds: lds?,
+            open: open?,
+            sparql: sparql?,
+            knowledge,
+            nodesets,
+            manifests,
+            processes,
+        })
+    }
+
+    fn each<T>(&mut self, node: &Node, read: fn(&mut Self, &Node) -> Option<T>) -> Vec<T> {
+        let nodes = self.reader.list(node);
+        nodes.iter().filter_map(|node| read(self, node)).collect()
+    }
+
+    fn once<'n>(&mut self, root: &Node, names: impl Iterator<Item = &'n str>, what: &str) {
+        let mut seen: Vec<&str> = Vec::new();
+        for name in names {
+            if seen.contains(&name) {
+                self.reader.findings().error(
+                    Code::DuplicateKey,
+                    root.place,
+                    format!("there are two of the {what} `{name}`"),
+                );
+            }
+            seen.push(name);
+        }
+    }
+
+    fn files(&mut self, node: &Node) -> Vec<Source> {
+        self.each(node, |reading, node| {
+            let name = reading.reader.text(node, "the path of a file")?;
+            Some(reading.source(name, name))
+        })
+    }
+
+    fn source(&self, name: &str, path: &str) -> Source {
+        Source {
+            name: name.to_owned(),
+            path: self.folder.join(path),
+        }
+    }
+
+    fn manifest(&mut self, node: &Node) -> Option<Manifest> {
+        let [name, file, iri, capabilities] = self
+            .reader
+            .map(node, ["name", "file", "iri", "capabilities"])?;
+        let file = self
+            .reader
+            .needed(file, "file", node.place)
+            .and_then(|node| self.reader.text(node, "the path of a file"));
+        let name = match name {
+            Some(node) => self.name(node),
+            None => file.map(str::to_owned),
+        };
+        let iri = match iri {
+            Some(node) => self.iri(node, Code::Uri),
+            None => name
+                .as_deref()
+                .map(|name| format!("urn:ua-bridge:mtp:{}", mtp::escaped(name))),
+        };
+        let mut told = BTreeMap::new();
+        if let Some(node) = capabilities {
+            let Kind::Map(pairs) = &node.kind else {
+                self.reader.wrong(
+                    node,
+                    "a map from the name of a service to IRIs of capabilities",
+                );
+                return None;
+            };
+            for (service, classes) in pairs {
+                let Some(service) = self.reader.text(service, "the name of a service") else {
+                    continue;
+                };
+                let classes =
+                    self.each(classes, |reading, node| reading.iri(node, Code::Capability));
+                told.insert(service.to_owned(), classes);
+            }
+        }
+        Some(Manifest {
+            source: self.source(&name?, file?),
+            iri: iri?,
+            capabilities: told,
+        })
+    }
+
+    fn process(&mut self, node: &Node) -> Option<Process> {
+        let keys = [
+            "process",
+            "name",
+            "pick_and_place",
+            "within",
+            "wait",
+            "steps",
+        ];
+        let [iri, name, composite, within, wait, steps] = self.reader.map(node, keys)?;
+        let iri = self
+            .reader
+            .needed(iri, "process", node.place)
+            .and_then(|node| self.iri(node, Code::Uri));
+        let name = match name {
+            Some(node) => self.reader.text(node, "a name").map(str::to_owned),
+            None => iri.clone(),
+        };
+        let within = within.map_or(Some(USUALLY_WITHIN), |node| self.reader.duration(node));
+        let wait = wait.map_or(Some(USUALLY_WAIT), |node| self.reader.duration(node));
+        let nodes = self
+            .reader
+            .needed(steps, "steps", node.place)
+            .map_or(&[][..], |node| self.reader.list(node));
+        if steps.is_some() && (nodes.is_empty() || nodes.len() > MOST_STEPS) {
+            self.reader.refuse::<()>(
+                node,
+                Code::WrongValue,
+                format!(
+                    "a process has from 1 to {MOST_STEPS} steps, and this one {}",
+                    nodes.len()
+                ),
+            );
+        }
+        let is_composite = composite.is_some();
+        let read: Vec<_> = nodes
+            .iter()
+            .take(MOST_STEPS)
+            .enumerate()
+            .filter_map(|(number, node)| {
+                self.step(node, is_composite.then_some(()).map_or(Err(number), Ok))
+            })
+            .collect();
+        let (steps, parameters): (Vec<Step>, Vec<_>) = read.into_iter().unzip();
+        let work = match composite {
+            Some(composite) => {
+                let roles: Vec<Role> = steps
+                    .iter()
+                    .flat_map(|step| &step.needs)
+                    .map(|need| need.role)
+                    .collect();
+                for role in Role::OF_COMPOSITE
+                    .iter()
+                    .filter(|role| !roles.contains(role))
+                {
+                    self.reader.refuse::<()>(
+                        composite,
+                        Code::MissingKey,
+                        format!("no step says who is to be `{}`", role.name()),
+                    );
+                }
+                self.job(composite).map(Job::PickAndPlace)
+            }
+            None => Some(Job::Sequence(parameters)),
+        };
+        Some(Process {
+            iri: iri?,
+            name: name?,
+            work: work?,
+            steps,
+            within: within?,
+            wait: wait?,
+        })
+    }
+
+    fn job(&mut self, node: &Node) -> Option<skills::Job> {
+        let [pick, place, approach] = self.reader.map(node, ["pick", "place", "approach"])?;
+        let pick = self
+            .reader
+            .needed(pick, "pick", node.place)
+            .and_then(|node| self.position(node));
+        let place = self
+            .reader
+            .needed(place, "place", node.place)
+            .and_then(|node| self.position(node));
+        let approach = approach.map_or(Some(USUALLY_APPROACH), |node| {
+            self.reader.number(node, (0.0, 10.0))
+        });
+        Some(skills::Job {
+            pick: pick?,
+            place: place?,
+            approach: approach?,
+        })
+    }
+
+    fn position(&mut self, node: &Node) -> Option<[f64; 6]> {
+        let numbers: Vec<f64> = self.each(node, |reading, node| {
+            reading.reader.number(node, (-1000.0, 1000.0))
+        });
+        numbers.try_into().ok().or_else(|| {
+            self.reader.refuse(
+                node,
+                Code::WrongValue,
+                "a position is six numbers: m, m, m, rad, rad, rad".to_owned(),
+            )
+        })
+    }
+
+    /// A step of a composite, or the one of a number that is done by itself.
+    fn step(
+        &mut self,
+        node: &Node,
+        kind: Result<(), usize>,
+    ) -> Option<(Step, Vec<(String, serde_json::Value)>)> {
+        let [name, needs, parameters] = self.reader.map(node, ["step", "needs", "parameters"])?;
+        let name = self
+            .reader
+            .needed(name, "step", node.place)
+            .and_then(|node| self.reader.text(node, "a name"));
+        let needs = self.reader.needed(needs, "needs", node.place)?;
+        let roles: Vec<Role> = match kind {
+            Ok(()) => Role::OF_COMPOSITE.to_vec(),
+            Err(number) => vec![Role::Alone(number)],
+        };
+        let Kind::Map(pairs) = &needs.kind else {
+            self.reader.wrong(needs, "a map from what a skill is for to the capability it needs, as `grasp: urn:example:capability:grasp`");
+            return None;
+        };
+        let mut read = Vec::new();
+        for (key, need) in pairs {
+            let Some(text) = self.reader.text(key, "what a skill is for") else {
+                continue;
+            };
+            let Some(role) = roles.iter().find(|role| role.name() == text) else {
+                let known: Vec<_> = roles.iter().map(|role| role.name()).collect();
+                self.reader.refuse::<()>(
+                    key,
+                    Code::UnknownKey,
+                    format!("`{text}` is not known here; known are {}", known.join(", ")),
+                );
+                continue;
+            };
+            read.extend(self.need(need, *role));
+        }
+        if read.is_empty() {
+            self.reader
+                .refuse::<()>(needs, Code::MissingKey, "a step needs a skill".to_owned());
+        }
+        let mut given = Vec::new();
+        if let Some(parameters) = parameters {
+            if kind.is_ok() {
+                self.reader.refuse::<()>(
+                    parameters,
+                    Code::UnknownKey,
+                    "`pick_and_place` gives its skills their parameters".to_owned(),
+                );
+            }
+            let Kind::Map(pairs) = &parameters.kind else {
+                self.reader
+                    .wrong(parameters, "a map from names of parameters to values");
+                return None;
+            };
+            for (key, value) in pairs {
+                if let Some(name) = self.reader.text(key, "the name of a parameter") {
+                    given.push((name.to_owned(), json(value)));
+                }
+            }
+        }
+        Some((
+            Step {
+                name: name?.to_owned(),
+                needs: read,
+            },
+            given,
+        ))
+    }
+
+    fn need(&mut self, node: &Node, role: Role) -> Option<Need> {
+        if matches!(node.kind, Kind::Scalar(_)) {
+            return Some(Need {
+                role,
+                capability: Some(self.iri(node, Code::Capability)?),
+                skill_type: role.skill_type(),
+            });
+        }
+        let [capability, of] = self.reader.map(node, ["capability", "type"])?;
+        let capability = match capability {
+            Some(node) => Some(self.iri(node, Code::Capability)?),
+            None => None,
+        };
+        let skill_type = match of {
+            Some(node) => {
+                let text = self.reader.text(node, "a skill type")?;
+                match text.parse::<TypeName>() {
+                    Ok(name) => Some(name),
+                    Err(error) => {
+                        return self.reader.refuse(node, Code::SkillType, error.to_string());
+                    }
+                }
+            }
+            None => role.skill_type(),
+        };
+        if capability.is_none() && skill_type.is_none() {
+            return self.reader.refuse(
+                node,
+                Code::MissingKey,
+                "say a `capability`, a `type` or both".to_owned(),
+            );
+        }
+        Some(Need {
+            role,
+            capability,
+            skill_type,
+        })
+    }
+
+    fn name(&mut self, node: &Node) -> Option<String> {
+        let text = self.reader.text(node, "a name")?;
+        let fits = (1..=64).contains(&text.len())
+            && text
+                .bytes()
+                .all(|byte| byte.is_ascii_alphanumeric() || matches!(byte, b'-' | b'_'));
+        if fits {
+            Some(text.to_owned())
+        } else {
+            self.reader.refuse(
+                node,
+                Code::Name,
+                format!("`{}` is no name", shortened(text)),
+            )
+        }
+    }
+
+    fn iri(&mut self, node: &Node, code: Code) -> Option<String> {
+        let text = self.reader.text(node, "an IRI")?;
+        if is_iri(text) && text.len() <= 256 {
+            Some(text.to_owned())
+        } else {
+            self.reader.refuse(
+                node,
+                code,
+                format!(
+                    "`{}` is no IRI, as urn:example:capability:grasp is one",
+                    shortened(text)
+                ),
+            )
+        }
+    }
+
+    fn namespace(&mut self, node: &Node) -> Option<u16> {
+        let text = self.reader.text(node, "a number")?;
+        let number = text.parse().ok().filter(|number| *number > 0);
+        number.or_else(|| {
+            self.reader.refuse(
+                node,
+                Code::Namespace,
+                format!(
+                    "expected a number from 1 to 65535, found `{}`",
+                    shortened(text)
+                ),
+            )
+        })
+    }
+
+    fn endpoint(&mut self, node: &Node) -> Option<String> {
+        let text = self.reader.text(node, "an endpoint")?;
+        match text.parse::<plant_opcua::server::EndpointUrl>() {
+            Ok(_) => Some(text.to_owned()),
+            Err(error) => self.reader.refuse(
+                node,
+                Code::Endpoint,
+                format!("`{}` is no endpoint: {error}", shortened(text)),
+            ),
+        }
+    }
+
+    fn security(&mut self, node: &Node) -> Option<Vec<Security>> {
+        let read = self.each(node, |reading, node| {
+            match reading.reader.text(node, "None or Basic256Sha256")? {
+                "None" => Some(Security::None),
+                "Basic256Sha256" => Some(Security::Basic256Sha256),
+                other => reading.reader.refuse(
+                    node,
+                    Code::WrongValue,
+                    format!(
+                        "expected None or Basic256Sha256, found `{}`",
+                        shortened(other)
+                    ),
+                ),
+            }
+        });
+        Some(read).filter(|read| !read.is_empty())
+    }
+
+    fn address(&mut self, node: &Node) -> Option<SocketAddr> {
+        let text = self.reader.text(node, "an address with a port")?;
+        let address = text
+            .parse::<SocketAddr>()
+            .ok()
+            .filter(|address| address.ip().is_loopback());
+        address.or_else(|| {
+            self.reader.refuse(
+                node,
+                Code::WrongValue,
+                format!(
+                    "expected an address of loopback, as 127.0.0.1:8087, found `{}`",
+                    shortened(text)
+                ),
+            )
+        })
+    }
+}
+
+/// A value as JSON: a number or truth value where it reads as one.
+fn json(node: &Node) -> serde_json::Value {
+    match &node.kind {
+        Kind::Scalar(text) => serde_json::from_str(text)
+            .ok()
+            .filter(|value: &serde_json::Value| value.is_number() || value.is_boolean())
+            .unwrap_or_else(|| text.clone().into()),
+        Kind::List(nodes) => nodes.iter().map(json).collect(),
+        Kind::Map(_) | Kind::Null => serde_json::Value::Null,
+    }
+}
+
+fn shortened(text: &str) -> String {
+    text.chars().take(60).collect()
+}
+
+const DEFAULT_ENDPOINT: &str = "opc.tcp://127.0.0.1:0";
+const DEFAULT_SPARQL: SocketAddr =
+    SocketAddr::new(std::net::IpAddr::V4(std::net::Ipv4Addr::LOCALHOST), 8087);
+const USUALLY_WITHIN: Duration = Duration::from_secs(30);
+const USUALLY_WAIT: Duration = Duration::from_secs(60);
+const USUALLY_APPROACH: f64 = 0.05;
+const MOST_STEPS: usize = 100;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const EXAMPLE: &str = include_str!("../../../examples/plant/mes.yaml");
+
+    #[test]
+    fn the_example_is_read_as_it_stands() {
+        let settings = Settings::from_yaml(EXAMPLE, Path::new("examples/plant"))
+            .unwrap_or_else(|findings| panic!("{}", findings.render("mes.yaml", EXAMPLE)));
+        let [process] = settings.processes.as_slice() else {
+            panic!("{settings:?}")
+        };
+        assert_eq!(process.iri, "urn:example:process:move-part");
+        let steps: Vec<_> = process
+            .steps
+            .iter()
+            .map(|step| step.name.as_str())
+            .collect();
+        assert_eq!(steps, ["pick", "place"]);
+        let grasp = process.steps[0]
+            .needs
+            .iter()
+            .find(|need| need.role == Role::Grasp)
+            .unwrap();
+        assert_eq!(
+            grasp.capability.as_deref(),
+            Some("urn:example:capability:grasp")
+        );
+        assert_eq!(grasp.skill_type, Some(TypeName::own("GraspSkillType")));
+        assert_eq!(
+            settings.knowledge[0].path,
+            Path::new("examples/plant/capabilities.ttl")
+        );
+    }
+
+    #[test]
+    fn all_that_is_wrong_is_told_at_once_with_its_line() {
+        let text = "mes: a b\napplication_uri: urn:x\nnamespace: 0\nsparql: 0.0.0.0:80\nmanifests:\n  - {name: m}\nprocesses:\n  - process: not an iri\n    pick_and_place: {pick: [1, 2], place: [0, 0, 0, 0, 0, 0]}\n    steps:\n      - step: pick\n        needs: {grip: urn:x}\n";
+        let told = Settings::from_yaml(text, Path::new(""))
+            .unwrap_err()
+            .render("mes.yaml", text);
+        for wanted in [
+            "mes.yaml:1:6",
+            "mes.yaml:3:12",
+            "address of loopback",
+            "`file` is missing",
+            "`not an iri` is no IRI",
+            "six numbers",
+            "`grip` is not known here; known are ptp, linear, grasp, release",
+            "no step says who is to be `grasp`",
+        ] {
+            assert!(told.contains(wanted), "{wanted}:\n{told}");
+        }
+    }
+
+    #[test]
+    fn steps_that_are_done_by_themselves_have_parameters() {
+        let text = "mes: m\napplication_uri: urn:x\nnamespace: 5\nprocesses:\n  - process: urn:p\n    steps:\n      - {step: grip, needs: {skill: {type: GraspSkillType}}, parameters: {Force: 12.5, Name: a, All: [1, true]}}\n";
+        let settings = Settings::from_yaml(text, Path::new("")).unwrap();
+        let Job::Sequence(parameters) = &settings.processes[0].work else {
+            panic!()
+        };
+        let expected = [
+            ("Force".to_owned(), serde_json::json!(12.5)),
+            ("Name".to_owned(), "a".into()),
+            ("All".to_owned(), serde_json::json!([1, true])),
+        ];
+        assert_eq!(parameters, &[expected.to_vec()]);
+    }
+}

@@ -1,0 +1,225 @@
+//! The MES beside components that come, are killed and are replaced: what it knows, and what becomes of a process.
+
+use std::fs;
+use std::path::Path;
+use std::time::Duration;
+
+use nix::sys::signal::Signal;
+use serde_json::Value;
+use system_tests::{Cell, Child, Started, eventually, http_get, program};
+
+const SOON: Duration = Duration::from_secs(30);
+const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/plant");
+const MANIFEST: &str = concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/../../shared/data/mtp/pimad-core/PiMAd-core.0-0-1.aml"
+);
+const AT: &str = "127.0.0.1:8087";
+const PROCESS: &str = "urn:example:process:move-part";
+
+/// A program of the plant with a file of the examples, of which some is changed.
+fn start(cell: &Cell, name: &str, file: &str, changes: &[(&str, &str)], more: &[&str]) -> Child {
+    let text = fs::read_to_string(Path::new(EXAMPLES).join(file)).unwrap();
+    let text = changes.iter().fold(text, |text, (from, to)| {
+        assert!(text.contains(from), "{file} has no {from}");
+        text.replace(from, to)
+    });
+    let path = cell.file(file, &text);
+    Started::new(file, &program(name))
+        .args([path.to_str().unwrap(), "--interface", "lo", "--lds", "none"])
+        .args(more)
+        .start()
+}
+
+fn get(path: &str) -> Option<Value> {
+    serde_json::from_str(&http_get(AT, path)?).ok()
+}
+
+fn rows(question: &str) -> Vec<Value> {
+    let answer = get(&format!("/ask/{question}")).unwrap_or_default();
+    answer["rows"].as_array().cloned().unwrap_or_default()
+}
+
+/// The run of the process, when it is as wanted.
+fn run(what: &str, wanted: impl Fn(&Value) -> bool) -> Value {
+    eventually(what, SOON, || {
+        let run = get("/status")?["runs"][0].clone();
+        wanted(&run).then_some(run)
+    })
+}
+
+#[test]
+fn a_gripper_that_is_killed_in_the_middle_is_replaced_by_another_makers() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    for file in ["capabilities.ttl", "vacuum-gripper.xml"] {
+        fs::copy(Path::new(EXAMPLES).join(file), cell.folder().join(file)).unwrap();
+    }
+    let manifests = format!("manifests: [{{name: dancer, file: {MANIFEST}}}]\nprocesses:\n");
+    let changes: &[(&str, &str)] = if Path::new(MANIFEST).exists() {
+        &[("processes:\n", &manifests)]
+    } else {
+        &[]
+    };
+    let _mes = start(&cell, "ua-mes", "mes.yaml", changes, &["--run", PROCESS]);
+    let waiting = run("the process waits for somebody", |run| {
+        run["waits_for"].is_string()
+    });
+    assert!(
+        waiting["waits_for"]
+            .as_str()
+            .unwrap()
+            .contains("urn:example:capability:grasp"),
+        "{waiting}"
+    );
+
+    let _robot = start(
+        &cell,
+        "ua-component",
+        "robot.yaml",
+        &[("{reach: 1.3}", "{reach: 1.3, time_scale: 20}")],
+        &[],
+    );
+    let gripper = start(
+        &cell,
+        "ua-component",
+        "parallel-gripper.yaml",
+        &[("400 ms", "60 s")],
+        &[],
+    );
+    run("the gripper grasps", |run| {
+        let ran = run["plans"][0]["ran"]
+            .as_array()
+            .and_then(|ran| ran.last().cloned())
+            .unwrap_or_default();
+        ran["step"] == "Grasp" && ran["outcome"] == "running"
+    });
+    let can_run = rows("what-can-run");
+    let of = |component: &str| {
+        can_run
+            .iter()
+            .filter(|row| row["component"] == component)
+            .count()
+    };
+    assert_eq!(
+        (of("robot"), of("parallel-gripper"), of("mes")),
+        (2, 2, 1),
+        "{can_run:?}"
+    );
+    assert_eq!(
+        of("PiMAd-core:0.0.1"),
+        if changes.is_empty() { 0 } else { 6 }
+    );
+    let plan = get(&format!("/plan/{PROCESS}")).unwrap();
+    assert_eq!(plan["complete"], true, "{plan}");
+
+    gripper.signal(Signal::SIGKILL);
+    let broken = run("the plan is broken and another is waited for", |run| {
+        run["plans"][0]["outcome"] == "failed" && run["waits_for"].is_string()
+    });
+    assert_eq!(broken["plans"][0]["retreated"], true, "{broken}");
+    let ran: Vec<&str> = broken["plans"][0]["ran"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .filter_map(|ran| ran["step"].as_str())
+        .collect();
+    assert_eq!(
+        ran,
+        [
+            "MovePickApproachBefore",
+            "MovePick",
+            "Grasp",
+            "MovePickApproachError"
+        ]
+    );
+    eventually("the gripper is gone from the graph", SOON, || {
+        rows("components")
+            .iter()
+            .all(|row| row["name"] != "parallel-gripper")
+            .then_some(())
+    });
+
+    let _vacuum = start(
+        &cell,
+        "ua-component",
+        "vacuum-gripper.yaml",
+        &[("300 ms", "50 ms"), ("200 ms", "50 ms")],
+        &[],
+    );
+    let done = run("the process is done", |run| run["outcome"] == "done");
+    let plans = done["plans"].as_array().unwrap();
+    assert_eq!(
+        (plans.len(), &plans[1]["outcome"]),
+        (2, &"done".into()),
+        "{done}"
+    );
+    let vacuum = "urn:example:vacuum-gripper#i=100";
+    let grasp = plans[1]["steps"][0]["needs"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .find(|need| need["role"] == "grasp")
+        .unwrap();
+    assert_eq!(grasp["chosen"], vacuum);
+    let why = grasp["candidates"][0]["why"].as_str().unwrap();
+    assert!(
+        why.contains("hold-by-vacuum, which is below urn:example:capability:grasp"),
+        "{why}"
+    );
+    let by_type = rows("skills?type=urn:ua-bridge:skills%23i=1200");
+    let types: Vec<&Value> = by_type.iter().map(|row| &row["type"]).collect();
+    assert_eq!(
+        types,
+        ["VacuumGraspSkillType"],
+        "found by the type above its own"
+    );
+    let lost: Vec<Value> = rows("run-steps")
+        .into_iter()
+        .filter(|row| row["outcome"] == "lost")
+        .collect();
+    assert_eq!(
+        (lost.len(), &lost[0]["component"]),
+        (1, &"urn:example:gripper".into()),
+        "{lost:?}"
+    );
+    assert_eq!(rows("runs")[0]["outcome"], "done");
+}
+
+#[test]
+fn a_manifest_cut_in_half_and_an_unknown_process_are_told_with_their_names() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let half = "<CAEXFile>\n<InstanceHierarchy Name=\"a\">\n<InternalElement";
+    let half = cell.file("half.aml", half);
+    fs::copy(
+        Path::new(EXAMPLES).join("capabilities.ttl"),
+        cell.folder().join("capabilities.ttl"),
+    )
+    .unwrap();
+    let manifests = format!(
+        "manifests: [{{name: half, file: {}}}]\nprocesses:\n",
+        half.display()
+    );
+    let mut mes = start(
+        &cell,
+        "ua-mes",
+        "mes.yaml",
+        &[("processes:\n", &manifests)],
+        &[],
+    );
+    assert_eq!(mes.wait_for_end(SOON).code(), Some(78));
+    let told = mes.to_string();
+    assert!(told.contains("half: line 3:"), "{told}");
+    let mut mes = start(
+        &cell,
+        "ua-mes",
+        "mes.yaml",
+        &[],
+        &["--run", "urn:example:process:nothing"],
+    );
+    assert!(!mes.wait_for_end(SOON).success());
+    assert!(
+        mes.to_string()
+            .contains("--run urn:example:process:nothing"),
+        "{mes}"
+    );
+}
