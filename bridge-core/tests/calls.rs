@@ -510,6 +510,8 @@ fn a_namespace_that_somebody_else_writes_is_left_alone_until_it_is_free() {
     cell.say(2, value, "second");
     cell.run(ms(1_000));
     assert_eq!(cell.taken(2), [(7, true)]);
+    let notices = |output: &Output| matches!(output, Output::Notice(_));
+    assert!(!cell.outputs(2).iter().any(notices), "it is told once");
     cell.say(2, value, "third");
     cell.run(ms(5_000));
     assert_eq!(

@@ -136,6 +136,13 @@ impl Router {
         })
     }
 
+    /// Whether somebody else was there first in a namespace of ours.
+    pub(super) fn is_taken(&self, namespace: u16) -> bool {
+        let claims = self.claims.as_ref();
+        let claim = claims.and_then(|claims| claims.of.get(&namespace));
+        matches!(claim, Some(Claim::Taken { .. }))
+    }
+
     /// Leaves what waits of the topic where it is, while it is not known whether the namespace is free, or drops it.
     pub(super) fn withhold(&mut self, topic: TopicId) {
         let (_, namespace, _) = topic.triple();

@@ -124,7 +124,10 @@ impl Router {
         if let Some(namespace) = shared {
             self.contend(namespace, from, now);
         }
+        // That nothing of ours is sent for it was told with that.
+        let told = shared.is_some_and(|namespace| self.is_taken(namespace));
         self.count(About::sender(from), Reason::SpaceTaken, 1, || match shared {
+            Some(_) if told => String::new(),
             Some(namespace) => format!(
                 "another program writes namespace {namespace} of space {own}: every sample is doubled; give one of \
                  them another number"
