@@ -3,9 +3,10 @@
 import argparse
 import asyncio
 
-from asyncua import Client, ua
+from asyncua import ua
 
 import lifetime
+import opcua_session
 
 
 def described(error):
@@ -68,8 +69,12 @@ async def session(client, args):
 
 
 async def run(args):
-    client = Client(args.endpoint, timeout=10)
-    await client.connect_sessionless()
+    try:
+        client = await opcua_session.client_of(args)
+        await client.connect_sessionless()
+    except (ua.UaError, OSError, asyncio.TimeoutError) as error:
+        lifetime.say(**described(error))
+        return
     try:
         await {"find": find, "register": register, "session": session}[args.what](client, args)
     finally:
@@ -79,14 +84,13 @@ async def run(args):
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("what", choices=["find", "register", "session"])
-    parser.add_argument("endpoint")
+    opcua_session.add_arguments(parser)
     parser.add_argument("--uri", default="urn:asyncua:arm")
     parser.add_argument("--url", action="append", default=[])
     parser.add_argument("--name", default="arm")
     parser.add_argument("--mdns", help="the name to be announced under")
     parser.add_argument("--offline", action="store_true")
     parser.add_argument("--old", action="store_true", help="RegisterServer instead of RegisterServer2")
-    parser.add_argument("--limit", type=float, default=60.0)
     args = parser.parse_args()
     lifetime.bound(args.limit)
     asyncio.run(run(args))

@@ -10,7 +10,7 @@ use opcua::core::comms::tcp_types::{AcknowledgeMessage, HelloMessage};
 use opcua::core::{RequestMessage, ResponseMessage};
 use opcua::crypto::SecurityPolicy;
 use opcua::types::{
-    ByteString, ChannelSecurityToken, DateTime, MessageSecurityMode, OpenSecureChannelRequest,
+    ChannelSecurityToken, DateTime, MessageSecurityMode, OpenSecureChannelRequest,
     OpenSecureChannelResponse, ResponseHeader, SecurityTokenRequestType, ServiceFault, StatusCode,
 };
 use registry::Channel;
@@ -19,6 +19,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 use tracing::debug;
 
+use crate::security::Security;
 use crate::services::{self, Answer, Own, Question};
 use crate::wire::{
     Conversation, Kind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, Received, WireFault, policy,
@@ -31,6 +32,8 @@ pub(crate) type Asking = (Question, Channel, oneshot::Sender<Answer>);
 #[derive(Debug)]
 pub(crate) struct Shared {
     pub(crate) own: Own,
+    /// `None`: no channel is secured.
+    pub(crate) security: Option<Security>,
     pub(crate) ask: mpsc::Sender<Asking>,
     pub(crate) counters: Counters,
     last_channel: AtomicU32,
@@ -52,9 +55,10 @@ pub(crate) fn count(counter: &AtomicU64) {
 }
 
 impl Shared {
-    pub(crate) fn new(own: Own, ask: mpsc::Sender<Asking>) -> Self {
+    pub(crate) fn new(own: Own, security: Option<Security>, ask: mpsc::Sender<Asking>) -> Self {
         Self {
             own,
+            security,
             ask,
             counters: Counters::default(),
             last_channel: AtomicU32::new(0),
@@ -82,8 +86,14 @@ pub(crate) async fn serve<S>(stream: S, peer: SocketAddr, shared: &Shared)
 where
     S: AsyncRead + AsyncWrite + Unpin,
 {
+    let mut conversation = Conversation::new(stream, Role::Server);
+    if let Some(security) = &shared.security {
+        let channel = &mut conversation.channel;
+        channel.set_cert(Some(security.certificate.clone()));
+        channel.set_private_key(Some(security.key.clone()));
+    }
     let mut connection = Connection {
-        conversation: Conversation::new(stream, Role::Server),
+        conversation,
         peer,
         shared,
         lifetime: FIRST_IDLE,
@@ -124,7 +134,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         let hello = timeout(HELLO_LIMIT, hello).await.map_err(|_| LATE)??;
         self.acknowledge(&hello).await?;
         loop {
-            let request = self.conversation.receive::<RequestMessage>(admit);
+            let shared = self.shared;
+            let request = self
+                .conversation
+                .receive::<RequestMessage>(|header| admit(header, shared));
             let received = match timeout(self.lifetime, request).await {
                 Ok(received) => received,
                 Err(_) => return Err(LATE),
@@ -137,7 +150,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
                 Ok(Received {
                     message,
                     request_id,
-                }) => (self.answer(message).await?, request_id),
+                    opening,
+                }) => (self.answer(message, opening).await?, request_id),
                 Err(WireFault::Unreadable {
                     status,
                     request_id,
@@ -187,9 +201,18 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         self.conversation.greet(&acknowledge).await
     }
 
-    async fn answer(&mut self, request: RequestMessage) -> Result<ResponseMessage, WireFault> {
+    async fn answer(
+        &mut self,
+        request: RequestMessage,
+        opening: Option<AsymmetricSecurityHeader>,
+    ) -> Result<ResponseMessage, WireFault> {
         match &request {
-            RequestMessage::OpenSecureChannel(open) => return self.open(open),
+            RequestMessage::OpenSecureChannel(open) => {
+                return self.open(
+                    open,
+                    &opening.unwrap_or_else(AsymmetricSecurityHeader::none),
+                );
+            }
             // The channel's own message is opened before anything else is asked on it.
             _ if self.conversation.channel.secure_channel_id() == 0 => {
                 return Err(WireFault::Bad {
@@ -209,13 +232,34 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
             return Ok(services::fault(&request, StatusCode::BadServiceUnsupported));
         };
         count(&self.shared.counters.questions);
-        let channel = Channel {
-            // Who is on this host may register: what it could forge it could also do.
-            is_secured: self.peer.ip().to_canonical().is_loopback(),
-            certificate_uri: None,
-        };
+        let channel = self.channel(&question);
         let answer = self.shared.answer(question, channel).await;
         Ok(services::response(&request, answer, &self.own()))
+    }
+
+    /// How the question came.
+    fn channel(&self, question: &Question) -> Channel {
+        let channel = &self.conversation.channel;
+        let is_secured = channel.security_mode() != MessageSecurityMode::None;
+        let certificate = channel.remote_cert().filter(|_| is_secured);
+        let certificate_uri = match (certificate, question) {
+            (Some(certificate), Question::Register { asked, .. }) => {
+                let uri = &asked.server_uri;
+                let is_its = certificate.is_application_uri_valid(uri).is_ok();
+                // The crate tells whether a URI is the certificate's, and not which one that is.
+                Some(if is_its {
+                    uri.clone()
+                } else {
+                    "another application".to_owned()
+                })
+            }
+            _ => None,
+        };
+        Channel {
+            // Who is on this host may register: what it could forge it could also do.
+            is_secured: is_secured || self.peer.ip().to_canonical().is_loopback(),
+            certificate_uri,
+        }
     }
 
     fn own(&self) -> Own {
@@ -226,9 +270,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
     }
 
     /// Issues or renews the token of the channel (OPC 10000-4, 5.5.2).
-    fn open(&mut self, request: &OpenSecureChannelRequest) -> Result<ResponseMessage, WireFault> {
+    fn open(
+        &mut self,
+        request: &OpenSecureChannelRequest,
+        header: &AsymmetricSecurityHeader,
+    ) -> Result<ResponseMessage, WireFault> {
         let channel = &mut self.conversation.channel;
-        let refused = |status| Ok(ServiceFault::new(&request.request_header, status).into());
+        let bad = |status, what| WireFault::Bad { status, what };
         let id = channel.secure_channel_id();
         let id = match request.request_type {
             SecurityTokenRequestType::Issue if id == 0 => self.shared.next_channel(),
@@ -240,8 +288,31 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
                 });
             }
         };
-        if request.security_mode != MessageSecurityMode::None {
-            return refused(StatusCode::BadSecurityModeRejected);
+        let is_secured = channel.security_policy() != SecurityPolicy::None;
+        let fits = match request.security_mode {
+            MessageSecurityMode::None => !is_secured,
+            MessageSecurityMode::Sign | MessageSecurityMode::SignAndEncrypt => is_secured,
+            MessageSecurityMode::Invalid => false,
+        };
+        if !fits {
+            return Err(bad(
+                StatusCode::BadSecurityModeRejected,
+                "the mode does not fit the policy",
+            ));
+        }
+        if is_secured {
+            let nonce = &request.client_nonce;
+            if nonce.as_ref() == channel.remote_nonce() {
+                return Err(bad(
+                    StatusCode::BadNonceInvalid,
+                    "the nonce is that of before",
+                ));
+            }
+            let taken = channel
+                .set_remote_cert_from_byte_string(&header.sender_certificate)
+                .and_then(|()| channel.validate_secure_channel_nonce_length(nonce))
+                .and_then(|()| channel.set_remote_nonce_from_byte_string(nonce));
+            taken.map_err(|error| bad(error.status(), "no nonce or certificate"))?;
         }
         let asked = Duration::from_millis(request.requested_lifetime.into());
         let lifetime = match asked.is_zero() {
@@ -255,24 +326,29 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
             created_at: DateTime::now(),
             revised_lifetime,
         };
-        channel.set_security_mode(MessageSecurityMode::None);
+        channel.set_security_mode(request.security_mode);
         channel.set_security_token(token.clone());
+        if is_secured {
+            channel.create_random_nonce();
+            channel.derive_keys();
+        }
         // A quarter more, as the standard has it for what was on its way.
         self.lifetime = lifetime + lifetime / 4;
         let response = OpenSecureChannelResponse {
             response_header: ResponseHeader::new_good(&request.request_header),
             server_protocol_version: 0,
             security_token: token,
-            server_nonce: ByteString::null(),
+            server_nonce: channel.local_nonce_as_byte_string(),
         };
         Ok(response.into())
     }
 }
 
 /// Without a certificate there are no channels but those of policy None.
-fn admit(header: &AsymmetricSecurityHeader) -> Result<(), StatusCode> {
-    match policy(header) {
-        Some(SecurityPolicy::None) => Ok(()),
+fn admit(header: &AsymmetricSecurityHeader, shared: &Shared) -> Result<(), StatusCode> {
+    match (policy(header), &shared.security) {
+        (Some(SecurityPolicy::None), _) => Ok(()),
+        (Some(_), Some(security)) => security.admit(header.sender_certificate.as_ref()),
         _ => Err(StatusCode::BadSecurityPolicyRejected),
     }
 }
@@ -294,7 +370,7 @@ mod tests {
 
     use opcua::core::comms::tcp_types::ErrorMessage;
     use opcua::types::{
-        FindServersRequest, NodeId, ReadRequest, RequestHeader, SimpleBinaryEncodable,
+        ByteString, FindServersRequest, NodeId, ReadRequest, RequestHeader, SimpleBinaryEncodable,
     };
     use tokio::io::{AsyncReadExt, AsyncWriteExt, DuplexStream, duplex};
 
@@ -315,8 +391,9 @@ mod tests {
             application_uri: "urn:lds".to_owned(),
             name: "lds".to_owned(),
             url: "opc.tcp://h:4840".to_owned(),
+            certificate: ByteString::null(),
         };
-        Arc::new(Shared::new(own, ask))
+        Arc::new(Shared::new(own, None, ask))
     }
 
     fn connect(shared: &Arc<Shared>) -> DuplexStream {

@@ -1,6 +1,7 @@
 //! The Local Discovery Server: the registry behind an endpoint of OPC UA, and mDNS on one interface.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
@@ -20,6 +21,7 @@ use crate::host_name;
 use crate::interface::Interface;
 use crate::keeper::Keeper;
 use crate::mdns::{Mdns, Ours};
+use crate::security::Security;
 use crate::services::{Answer, Own, Question, semaphore};
 use crate::url::Url;
 
@@ -32,6 +34,10 @@ pub struct LdsSettings {
     pub interface: Interface,
     /// Whether servers of other hosts may register over a channel that is not secured.
     pub allow_unsecured: bool,
+    /// The certificate store for secured channels; without it there are none.
+    pub pki: Option<PathBuf>,
+    /// Whether any client certificate will do. For tests only.
+    pub trust_any: bool,
 }
 
 /// What it knows at one moment.
@@ -197,10 +203,20 @@ impl Lds {
             path: place.path.clone(),
         }
         .to_string();
+        let application_uri = format!("urn:{}:ua-lds", host_name());
+        let security = settings.pki.as_deref().map(|root| {
+            let host = Url::parse(&url).map_or_else(host_name, |url| url.host);
+            Security::open(root, &application_uri, &host, settings.trust_any)
+        });
+        let security = security.transpose()?;
+        let certificate = security
+            .as_ref()
+            .map(|own| own.certificate.as_byte_string());
         let own = Own {
-            application_uri: format!("urn:{}:ua-lds", host_name()),
+            application_uri,
             name: "UA bridge discovery server".to_owned(),
             url: url.clone(),
+            certificate: certificate.unwrap_or_default(),
         };
         let started = clock::wall();
         let instance = instance_name("ua-lds", &host_name(), at.port());
@@ -213,7 +229,7 @@ impl Lds {
             start_time: Some(clock::ticks(started)),
         });
         let (ask, questions) = mpsc::channel(64);
-        let shared = Arc::new(Shared::new(own, ask));
+        let shared = Arc::new(Shared::new(own, security, ask));
         tokio::spawn(endpoint::accept(listener, Arc::clone(&shared)));
         info!(url, interface = %settings.interface, "ua-lds listens");
         let registry = Settings {

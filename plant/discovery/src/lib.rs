@@ -5,7 +5,7 @@
 //!
 //! Reading order: `url` and `interface` (where), `mdns` and `goodbye` (announcements and what is heard of others), `probe` (who still
 //! answers), `keeper` (all of that around one registry), `watch` and `announce` (for programs), `wire` (OPC UA over TCP
-//! without sessions), `client` (asking by it), `endpoint`, `connection` and `services` (answering by it), `lds`.
+//! without sessions), `client` (asking by it), `endpoint`, `connection`, `security` and `services` (answering by it), `lds`.
 
 mod announce;
 pub mod client;
@@ -18,6 +18,7 @@ mod keeper;
 pub mod lds;
 mod mdns;
 mod probe;
+mod security;
 mod services;
 mod url;
 mod watch;

@@ -51,6 +51,8 @@ pub(crate) struct Own {
     pub(crate) name: String,
     /// As clients reach it.
     pub(crate) url: String,
+    /// Null without secured channels.
+    pub(crate) certificate: ByteString,
 }
 
 impl Own {
@@ -69,20 +71,32 @@ impl Own {
         let profiles = request.profile_uris.as_deref().unwrap_or_default();
         let wanted =
             profiles.is_empty() || profiles.iter().any(|profile| profile.as_ref() == UATCP);
-        let endpoint = || EndpointDescription {
-            endpoint_url: self.url.as_str().into(),
-            server: self.description(),
-            server_certificate: ByteString::null(),
-            security_mode: MessageSecurityMode::None,
-            security_policy_uri: POLICY_NONE.into(),
-            // None at all: there are no sessions.
-            user_identity_tokens: Some(Vec::new()),
-            transport_profile_uri: UATCP.into(),
-            security_level: 0,
-        };
+        let endpoint =
+            |(mode, policy, level): (MessageSecurityMode, &str, u8)| EndpointDescription {
+                endpoint_url: self.url.as_str().into(),
+                server: self.description(),
+                server_certificate: self.certificate.clone(),
+                security_mode: mode,
+                security_policy_uri: policy.into(),
+                // None at all: there are no sessions.
+                user_identity_tokens: Some(Vec::new()),
+                transport_profile_uri: UATCP.into(),
+                security_level: level,
+            };
+        let secured = [
+            (MessageSecurityMode::Sign, POLICY_BASIC256SHA256, 1),
+            (
+                MessageSecurityMode::SignAndEncrypt,
+                POLICY_BASIC256SHA256,
+                2,
+            ),
+        ];
+        let all = [(MessageSecurityMode::None, POLICY_NONE, 0)].into_iter();
+        let all = all.chain(secured.into_iter().filter(|_| !self.certificate.is_null()));
+        let endpoints = all.filter(|_| wanted).map(endpoint);
         let response = GetEndpointsResponse {
             response_header: ResponseHeader::new_good(&request.request_header),
-            endpoints: Some(wanted.then(endpoint).into_iter().collect()),
+            endpoints: Some(endpoints.collect()),
         };
         response.into()
     }
@@ -253,3 +267,4 @@ fn texts(all: Option<&[UAString]>) -> Vec<String> {
 
 const UATCP: &str = "http://opcfoundation.org/UA-Profile/Transport/uatcp-uasc-uabinary";
 const POLICY_NONE: &str = "http://opcfoundation.org/UA/SecurityPolicy#None";
+const POLICY_BASIC256SHA256: &str = "http://opcfoundation.org/UA/SecurityPolicy#Basic256Sha256";

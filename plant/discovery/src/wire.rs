@@ -19,8 +19,8 @@ use opcua::core::comms::tcp_types::{ErrorMessage, MIN_CHUNK_SIZE};
 use opcua::crypto::{CertificateStore, SecurityPolicy};
 use opcua::sync::RwLock;
 use opcua::types::{
-    ContextOwned, DecodingOptions, DepthGauge, Error, NamespaceMap, SimpleBinaryDecodable,
-    SimpleBinaryEncodable, StatusCode,
+    ContextOwned, DecodingOptions, DepthGauge, Error, MessageSecurityMode, NamespaceMap,
+    SimpleBinaryDecodable, SimpleBinaryEncodable, StatusCode,
 };
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tracing::subscriber::NoSubscriber;
@@ -96,6 +96,8 @@ pub(crate) struct Frame {
 pub(crate) struct Received<M> {
     pub(crate) message: M,
     pub(crate) request_id: u32,
+    /// Of a message that opens the channel, or renews it.
+    pub(crate) opening: Option<AsymmetricSecurityHeader>,
 }
 
 /// One connection.
@@ -220,6 +222,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
     ) -> Result<Received<M>, WireFault> {
         let mut chunks: Vec<MessageChunk> = Vec::new();
         let mut size = 0;
+        let mut opened = None;
         loop {
             let frame = self.frame().await?;
             match frame.kind {
@@ -232,8 +235,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
                 }
                 Kind::Open => {
                     let header = opening(&frame.bytes)?;
+                    self.check_renewal(&header)?;
                     admit(&header)
                         .map_err(|status| WireFault::bad(status, "the channel is not admitted"))?;
+                    opened = Some(header);
                     if !chunks.is_empty() {
                         return Err(WireFault::bad(
                             StatusCode::BadCommunicationError,
@@ -259,7 +264,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
                 ));
             }
             if last == b'F' {
-                return self.decode(&chunks);
+                return self.decode(&chunks, opened);
             }
         }
     }
@@ -295,6 +300,26 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         Ok(())
     }
 
+    /// Whether whoever renews the channel is who opened it: nobody takes its security away.
+    fn check_renewal(&self, header: &AsymmetricSecurityHeader) -> Result<(), WireFault> {
+        let channel = &self.channel;
+        if channel.secure_channel_id() == 0 || channel.is_client_role() {
+            return Ok(());
+        }
+        let same_policy = policy(header) == Some(channel.security_policy());
+        let same_sender = match channel.remote_cert() {
+            Some(certificate) => certificate.as_byte_string() == header.sender_certificate,
+            None => true,
+        };
+        match same_policy && same_sender {
+            true => Ok(()),
+            false => Err(WireFault::bad(
+                StatusCode::BadSecurityChecksFailed,
+                "the channel is another's",
+            )),
+        }
+    }
+
     /// Whether a chunk belongs to the channel that is open.
     fn check_channel(&self, frame: &[u8]) -> Result<(), WireFault> {
         let number = |at: usize| {
@@ -324,6 +349,16 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
     /// The chunk as it was before it was signed and encrypted.
     fn unsecured(&mut self, frame: Bytes) -> Result<MessageChunk, WireFault> {
         let channel = &mut self.channel;
+        let signed = match channel.security_mode() {
+            MessageSecurityMode::Sign | MessageSecurityMode::SignAndEncrypt => SIGNED,
+            MessageSecurityMode::None | MessageSecurityMode::Invalid => 0,
+        };
+        if frame.len() < signed {
+            return Err(WireFault::bad(
+                StatusCode::BadSecurityChecksFailed,
+                "a chunk without its signature",
+            ));
+        }
         // The crate's arithmetic on what a peer encrypted has not been held against every length.
         let verified = catch_unwind(AssertUnwindSafe(|| match channel.is_client_role() {
             true => channel.verify_and_remove_security(frame),
@@ -348,7 +383,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         Ok(chunk)
     }
 
-    fn decode<M: Message>(&self, chunks: &[MessageChunk]) -> Result<Received<M>, WireFault> {
+    fn decode<M: Message>(
+        &self,
+        chunks: &[MessageChunk],
+        opening: Option<AsymmetricSecurityHeader>,
+    ) -> Result<Received<M>, WireFault> {
         let checked = Chunker::validate_chunks(&self.channel, chunks);
         checked.map_err(|error| WireFault::of(&error, "chunks that do not belong together"))?;
         let first = chunks
@@ -366,6 +405,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         Ok(Received {
             message,
             request_id,
+            opening,
         })
     }
 }
@@ -420,6 +460,8 @@ fn options() -> DecodingOptions {
 }
 
 const HEADER: usize = 8;
+/// Headers and the signature of a chunk.
+const SIGNED: usize = 12 + 4 + 8 + 32;
 /// The largest chunk that is taken and sent.
 pub(crate) const MOST_CHUNK: usize = 65_536;
 pub(crate) const MOST_CHUNKS: usize = 64;

@@ -1,6 +1,7 @@
 //! The Local Discovery Server of a host: the program around [`discovery::lds`].
 
 use std::net::SocketAddr;
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use bridge_node::{Failure, LogFormat, Service, run_service, serve_pages};
@@ -21,10 +22,17 @@ struct UaLds {
     /// The network interface of mDNS, by name or address. Without it only this host is told and heard
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
     interface: Option<String>,
-    /// Let servers of other hosts register. Without it only those of this host may, over a loopback address: channels are
-    /// not secured here
+    /// Let servers of other hosts register over channels that are not secured. Without it only those of this host may, over
+    /// a loopback address
     #[arg(long)]
     allow_unsecured: bool,
+    /// The certificate store, for secured channels (Basic256Sha256): own, private and trusted under one directory. Without
+    /// it no channel is secured
+    #[arg(long, value_name = "DIR", env = "UA_LDS_PKI")]
+    pki: Option<PathBuf>,
+    /// Trust every client certificate. For tests and demonstrations only
+    #[arg(long, requires = "pki")]
+    trust_any_client_certificate: bool,
     /// Serve what is known at this address: /status as JSON, /metrics for Prometheus, and whether the program can do its
     /// work: /readyz
     #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
@@ -58,6 +66,8 @@ impl Service for UaLds {
             endpoint: self.endpoint,
             interface: interface.unwrap_or(Interface::LOOPBACK),
             allow_unsecured: self.allow_unsecured,
+            pki: self.pki,
+            trust_any: self.trust_any_client_certificate,
         };
         lds::run(settings, pages, stop).await
     }

@@ -1,0 +1,132 @@
+//! Whom a secured channel is opened for, and with which certificate of ours (OPC 10000-6, 6.2 and 6.7).
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use bridge_node::{Failure, FailureKind};
+use opcua::crypto::{CertificateStore, PrivateKey, SecurityPolicy, X509, X509Data};
+use opcua::types::StatusCode;
+use tracing::{debug, info, warn};
+
+/// The certificate store of a discovery server: `own`, `private` and `trusted` under one directory.
+#[derive(Debug)]
+pub(crate) struct Security {
+    pub(crate) certificate: X509,
+    pub(crate) key: PrivateKey,
+    trusted: PathBuf,
+    trust_any: bool,
+}
+
+impl Security {
+    /// Uses the store under `root`, and makes what is missing of it.
+    pub(crate) fn open(
+        root: &Path,
+        application_uri: &str,
+        host: &str,
+        trust_any: bool,
+    ) -> Result<Self, Failure> {
+        let failed = |what: &dyn std::fmt::Display| {
+            let message = format!(
+                "the certificate store {} cannot be used: {what}",
+                root.display()
+            );
+            Failure::new(FailureKind::Io, message)
+        };
+        for folder in ["own", "private", "trusted"] {
+            fs::create_dir_all(root.join(folder)).map_err(|error| failed(&error))?;
+        }
+        owner_only(&root.join("private")).map_err(|error| failed(&error))?;
+        let (certificate, key) = (root.join("own/cert.der"), root.join("private/private.pem"));
+        if !certificate.exists() && !key.exists() {
+            let made = CertificateStore::create_certificate_and_key(
+                &data(application_uri, host),
+                false,
+                &certificate,
+                &key,
+            );
+            made.map_err(|error| failed(&error))?;
+            info!(certificate = %certificate.display(), application_uri, "made a certificate");
+        }
+        if trust_any {
+            warn!("every client certificate is trusted: for tests only");
+        }
+        Ok(Self {
+            certificate: CertificateStore::read_cert(&certificate)
+                .map_err(|error| failed(&error))?,
+            key: CertificateStore::read_pkey(&key).map_err(|error| failed(&error))?,
+            trusted: root.join("trusted"),
+            trust_any,
+        })
+    }
+
+    /// Whether a channel may be opened with this certificate.
+    pub(crate) fn admit(&self, der: &[u8]) -> Result<(), StatusCode> {
+        let certificate = X509::from_der(der).map_err(|_| StatusCode::BadCertificateInvalid)?;
+        let now = opcua::types::DateTime::now().as_chrono();
+        let length = certificate
+            .key_length()
+            .map_err(|_| StatusCode::BadCertificateInvalid)?;
+        if !SecurityPolicy::Basic256Sha256.is_valid_keylength(length) {
+            return Err(StatusCode::BadCertificatePolicyCheckFailed);
+        }
+        certificate
+            .is_time_valid(&now)
+            .map_err(|error| error.status())?;
+        if self.trust_any || self.is_trusted(der) {
+            return Ok(());
+        }
+        warn!(
+            thumbprint = certificate.thumbprint().as_hex_string(),
+            "a client was refused because its certificate is not trusted; to trust it, put it into {}",
+            self.trusted.display()
+        );
+        // Not which of the checks it was (OPC 10000-4, 6.1.3).
+        Err(StatusCode::BadSecurityChecksFailed)
+    }
+
+    fn is_trusted(&self, der: &[u8]) -> bool {
+        let files = fs::read_dir(&self.trusted)
+            .into_iter()
+            .flatten()
+            .take(MOST_TRUSTED);
+        let mut files = files.filter_map(Result::ok);
+        let same = |file: fs::DirEntry| match fs::read(file.path()) {
+            Ok(bytes) => bytes == der,
+            Err(error) => {
+                debug!(%error, file = %file.path().display(), "not a certificate");
+                false
+            }
+        };
+        files.any(same)
+    }
+}
+
+fn data(application_uri: &str, host: &str) -> X509Data {
+    let mut addresses = vec![host.to_owned(), "127.0.0.1".to_owned()];
+    addresses.dedup();
+    X509Data {
+        key_size: 2048,
+        common_name: "UA bridge discovery server".to_owned(),
+        organization: "UA bridge".to_owned(),
+        organizational_unit: "UA bridge".to_owned(),
+        country: "XX".to_owned(),
+        state: "-".to_owned(),
+        alt_host_names: X509Data::alt_host_names(
+            application_uri,
+            Some(addresses),
+            true,
+            true,
+            false,
+        ),
+        certificate_duration_days: CERTIFICATE_DAYS,
+    }
+}
+
+fn owner_only(path: &Path) -> std::io::Result<()> {
+    use std::os::unix::fs::PermissionsExt as _;
+    fs::set_permissions(path, fs::Permissions::from_mode(0o700))
+}
+
+const MOST_TRUSTED: usize = 1000;
+/// Five years, as other stacks make them.
+const CERTIFICATE_DAYS: u32 = 1826;
