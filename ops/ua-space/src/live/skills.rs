@@ -9,6 +9,7 @@ use serde::Serialize;
 use uadp::MessageKind;
 
 use super::book::{Book, News};
+use super::described::Described;
 use super::list::json;
 use super::plain::{self, Named};
 use super::text::{Table, age, is_coloured};
@@ -60,20 +61,31 @@ pub(crate) fn skills(arguments: &Skills) -> Result<(), Failure> {
 struct States(BTreeMap<TopicId, Named>);
 
 impl States {
+    /// Takes in a state, or what may be one: of a value that comes before its name the identifier tells.
     fn take(&mut self, news: &News<'_>) {
         let News::Sample(sample) = news else {
             return;
         };
         let described = sample.described.as_deref();
-        let is_state = described.is_some_and(|it| it.name.ends_with(STATE));
+        let may_be = match described {
+            Some(described) => described.name.ends_with(STATE),
+            None => sample.topic.identifier.get() % 100 == STATE_ID,
+        };
         let has_room = self.0.len() < MOST || self.0.contains_key(&sample.topic);
-        if is_state
+        if may_be
             && has_room
             && sample.message.kind == MessageKind::KeyFrame
             && let Ok(state) = plain::message(&sample.message, described)
         {
             self.0.insert(sample.topic, state);
         }
+    }
+
+    /// The state of a skill, by the names that are known by now.
+    fn of(&self, topic: TopicId, described: &Described) -> Option<Named> {
+        let mut state = self.0.get(&topic)?.clone();
+        state.rename(described.fields());
+        Some(state)
     }
 }
 
@@ -115,7 +127,8 @@ fn find(book: &Book, states: &States, now: Duration) -> Vec<Skill> {
         let (component, skill) = name.rsplit_once('.')?;
         let (space, namespace, _) = topic.triple();
         let of = |method: &str| calls.get(&(space, namespace, format!("{name}.{method}")));
-        let state = states.0.get(&topic);
+        let state = states.of(topic, described);
+        let state = state.as_ref();
         let text = |field: &str| state.and_then(|state| state.text(field));
         let skill_type = described.skill_type();
         Some(Skill {
@@ -174,6 +187,8 @@ fn table(skills: &[Skill]) -> Table {
     table
 }
 
+/// Place of the state among the identifiers of a skill.
+const STATE_ID: u16 = 1;
 /// States that are kept.
 const MOST: usize = 4096;
 /// Three times what a state is repeated in.
