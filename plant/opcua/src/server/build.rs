@@ -172,7 +172,7 @@ impl ServerBuilder {
         let made = Arc::new(Made::default());
         let calls = Arc::new(Calls::default());
         let builder = described(&config, port)
-            .pki_dir(pki.as_ref().map_or(Path::new(NO_PKI), Pki::root))
+            .pki_dir(pki.as_ref().map_or_else(|| Path::new(NO_PKI), Pki::root))
             .with_node_manager(Core {
                 made: Arc::clone(&made),
                 calls: Arc::clone(&calls),
