@@ -18,11 +18,8 @@ pub(crate) fn ask(arguments: &Ask) -> Result<(), Failure> {
     let query = arguments.sparql.as_deref().map(read).transpose()?;
     look(async {
         let answer = match (query, &arguments.question) {
-            (Some(query), _) => {
-                server
-                    .post("/sparql", ("application/sparql-query", query.into()))
-                    .await?
-            }
+            (Some(query), _) => server.query("/sparql", query).await?,
+
             (None, None) => server.get("/ask").await?,
             (None, Some(question)) => {
                 let path = path(&server, question, &arguments.arguments).await?;
@@ -30,7 +27,7 @@ pub(crate) fn ask(arguments: &Ask) -> Result<(), Failure> {
             }
         };
         if answer.status != 200 {
-            return Err(refusal(&server, &answer, arguments.question.as_deref()).await);
+            return Err(refusal(&answer));
         }
         show(&answer, arguments)
     })
@@ -141,7 +138,7 @@ fn parsed<'a, T: Deserialize<'a>>(body: &'a str) -> Result<T, Failure> {
 }
 
 /// Why there is no answer.
-async fn refusal(server: &Server, answer: &Answer, question: Option<&str>) -> Failure {
+fn refusal(answer: &Answer) -> Failure {
     #[derive(Deserialize)]
     struct Told {
         error: String,
@@ -152,18 +149,9 @@ async fn refusal(server: &Server, answer: &Answer, question: Option<&str>) -> Fa
         Some(told) => format!("{}: {}", harmless(&told.error), harmless(&told.message)),
         None => format!("HTTP status {}", answer.status),
     };
-    match (answer.status, question) {
-        (404, Some(question)) => {
-            let known = questions(server).await.map(|known| known.questions);
-            let known = known.unwrap_or_default();
-            let names: Vec<&str> = known.iter().map(|it| it.name.as_str()).collect();
-            let help = match names.as_slice() {
-                [] => String::new(),
-                names => format!("\n  = help: there are {}", harmless(&names.join(", "))),
-            };
-            Failure::Usage(format!("{}: {why}{help}", harmless(question)))
-        }
-        (400 | 406 | 413 | 415, _) => Failure::Data(why),
+    match answer.status {
+        404 => Failure::Usage(why),
+        400 | 406 | 413 | 415 => Failure::Data(why),
         _ => Failure::Unavailable(why),
     }
 }

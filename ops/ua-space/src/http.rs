@@ -55,14 +55,16 @@ impl Server {
     /// # Errors
     /// [`Failure::Unavailable`] when nobody answers in time.
     pub(crate) async fn get(&self, path: &str) -> Result<Answer, Failure> {
-        self.request(Method::GET, path, ("", Bytes::new())).await
+        self.request(Method::GET, path, (JSON, "", Bytes::new()))
+            .await
     }
 
-    /// Sends a text of that type.
+    /// Asks a query of SPARQL.
     ///
     /// # Errors
     /// As [`get`](Self::get).
-    pub(crate) async fn post(&self, path: &str, content: (&str, Bytes)) -> Result<Answer, Failure> {
+    pub(crate) async fn query(&self, path: &str, query: String) -> Result<Answer, Failure> {
+        let content = (RESULTS, "application/sparql-query", query.into());
         self.request(Method::POST, path, content).await
     }
 
@@ -70,7 +72,7 @@ impl Server {
         &self,
         method: Method,
         path: &str,
-        content: (&str, Bytes),
+        content: (&str, &str, Bytes),
     ) -> Result<Answer, Failure> {
         let asked = timeout(LIMIT, self.asked(method, path, content)).await;
         let answer = asked.unwrap_or_else(|_| Err(format!("no answer within {LIMIT:?}")));
@@ -87,7 +89,7 @@ impl Server {
         &self,
         method: Method,
         path: &str,
-        (content_type, body): (&str, Bytes),
+        (accept, content_type, body): (&str, &str, Bytes),
     ) -> Result<Answer, String> {
         let stream = TcpStream::connect(&self.authority)
             .await
@@ -100,7 +102,7 @@ impl Server {
             .method(method)
             .uri(format!("{}{path}", self.prefix_path()))
             .header(HOST, &self.authority)
-            .header(ACCEPT, "application/json, application/sparql-results+json, application/n-triples, */*;q=0.1");
+            .header(ACCEPT, accept);
         if !content_type.is_empty() {
             request = request.header(CONTENT_TYPE, content_type);
         }
@@ -158,6 +160,9 @@ pub(crate) fn encoded(value: &str) -> String {
     text
 }
 
+/// Plain JSON, where the standard form of results is to be had too.
+const JSON: &str = "application/json";
+const RESULTS: &str = "application/sparql-results+json, application/n-triples";
 /// Longer than the longest query may take.
 const LIMIT: Duration = Duration::from_secs(15);
 const MOST_BYTES: usize = 32 << 20;
