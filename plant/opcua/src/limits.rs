@@ -12,8 +12,8 @@ pub const LARGEST_ARRAY: usize = 4 << 20;
 pub const LARGEST_MESSAGE: usize = LARGEST_VALUE + (1 << 20);
 /// Chunks of a message, with room for peers that send chunks of half the usual size.
 pub const MOST_CHUNKS: usize = 2_100;
-/// How often subscriptions are looked at: how late a notification may be beyond its publishing interval.
-pub const POLL: Duration = Duration::from_millis(5);
+/// How often subscriptions are looked at, in milliseconds: how late a notification may be beyond its publishing interval.
+pub const POLL_MS: u64 = 5;
 /// The shortest publishing interval a client gets.
 pub const SHORTEST_PUBLISHING: Duration = Duration::from_millis(10);
 /// Notifications in one response. Clients commonly refuse arrays of more than 1000 elements, and then hear nothing more.

@@ -230,8 +230,10 @@ fn owner_only(_path: &Path) -> io::Result<()> {
     Ok(())
 }
 
-pub(crate) const OWN_CERTIFICATE: &str = "own/cert.der";
-pub(crate) const OWN_KEY: &str = "private/private.pem";
+/// The application's own certificate, below the root.
+pub const OWN_CERTIFICATE: &str = "own/cert.der";
+/// Its private key, below the root.
+pub const OWN_KEY: &str = "private/private.pem";
 /// Held while the pair is looked for and made.
 const LOCK: &str = "private/lock";
 /// Five years, as other stacks make them: clients trust this very file, so a new one is work for people.

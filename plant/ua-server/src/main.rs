@@ -7,7 +7,7 @@
 //! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show),
 //! `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in),
 //! `components` (which servers are there), `port` (the shell's side),
-//! `endpoint` and `pki` (how clients get in), `value` (between the two codecs).
+//! `endpoint` (how clients get in), `value` (between the two codecs).
 
 mod address;
 mod browse;
@@ -16,7 +16,6 @@ mod components;
 mod endpoint;
 mod layout;
 mod nodes;
-mod pki;
 mod port;
 mod properties;
 mod space;
@@ -30,9 +29,9 @@ use std::process::ExitCode;
 use bridge_node::{Arguments, Context, Failure, FailureKind, Owned, Program};
 use discovery::{AnnounceSettings, Interface};
 use mappings::{Mapping, SpaceId};
+use plant_opcua::endpoint::EndpointUrl;
+use plant_opcua::pki::{self, Pki};
 
-use crate::endpoint::EndpointUrl;
-use crate::pki::Pki;
 use crate::port::{ServerPort, Setup};
 use crate::structures::Types;
 
@@ -123,8 +122,8 @@ impl Program for UaServer {
             .pki
             .clone()
             .unwrap_or_else(|| pki::default_root(|name| std::env::var(name).ok()));
-        let pki =
-            Pki::open(root).map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
+        let pki = Pki::open(root)
+            .map_err(|error| Failure::new(FailureKind::Io, format!("{error} (--pki)")))?;
         let setup = Setup {
             url,
             pki,

@@ -13,6 +13,8 @@ use opcua::server::node_manager::ServerContext;
 use opcua::server::node_manager::memory::{
     CoreNodeManagerBuilder, InMemoryNodeManagerBuilder, InMemoryNodeManagerImplBuilder,
 };
+use plant_opcua::endpoint::EndpointUrl;
+use plant_opcua::pki::Pki;
 use tokio::runtime::Runtime;
 use tokio::sync::{Semaphore, mpsc};
 use tokio::task::JoinHandle;
@@ -22,10 +24,9 @@ use uadp::BuiltinType;
 
 use crate::browse::Ordered;
 use crate::components::Components;
-use crate::endpoint::{self, EndpointUrl};
+use crate::endpoint;
 use crate::layout::Layout;
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
-use crate::pki::Pki;
 use crate::space::Space;
 use crate::structures::Types;
 
@@ -87,7 +88,7 @@ impl ServerPort {
         let listener = setup
             .url
             .bind()
-            .map_err(|error| unavailable(error.to_string()))?;
+            .map_err(|error| unavailable(format!("{error} (--endpoint)")))?;
         let port = listener
             .local_addr()
             .map_err(|error| io(error.to_string()))?

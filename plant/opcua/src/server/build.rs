@@ -223,7 +223,6 @@ impl ServerBuilder {
 fn described(config: &ServerConfig, port: u16) -> opcua::server::ServerBuilder {
     let anonymous = [ANONYMOUS_USER_TOKEN_ID.to_owned()];
     let timeout = u64::try_from(config.session_timeout.as_millis()).unwrap_or(u64::MAX);
-    let poll = u64::try_from(limits::POLL.as_millis()).unwrap_or(u64::MAX);
     let mut builder = opcua::server::ServerBuilder::new()
         .without_node_managers()
         .application_name(&config.application_name)
@@ -243,7 +242,7 @@ fn described(config: &ServerConfig, port: u16) -> opcua::server::ServerBuilder {
         .certificate_path(OWN_CERTIFICATE)
         .private_key_path(OWN_KEY)
         .trust_client_certs(config.trust_unknown_clients)
-        .subscription_poll_interval_ms(poll)
+        .subscription_poll_interval_ms(limits::POLL_MS)
         .max_session_timeout_ms(timeout)
         .limits(limits::server());
     for security in &config.security {
