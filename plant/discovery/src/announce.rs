@@ -303,9 +303,10 @@ impl Telling {
                     state.registered = None;
                     // Once for each reason: it is tried again and again.
                     if state.fault.as_ref() != Some(&fault) {
-                        match error {
-                            AskFault::Refused(_) => warn!(lds, "not registered: {fault}"),
-                            _ => info!(lds, "not registered yet: {fault}"),
+                        if matches!(error, AskFault::Refused(_)) {
+                            warn!(lds, "not registered: {fault}");
+                        } else {
+                            info!(lds, "not registered yet: {fault}");
                         }
                         state.fault = Some(fault);
                     }

@@ -1,5 +1,10 @@
 //! Asking a server or a Local Discovery Server without a session.
 
+#![expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "of the messages of all services some are those of discovery"
+)]
+
 use std::time::Duration;
 
 use opcua::core::comms::secure_channel::Role;

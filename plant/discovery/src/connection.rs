@@ -1,5 +1,10 @@
 //! One client's connection to the discovery server: HEL, OPN, questions, CLO (OPC 10000-6, 6.7 and 7.1).
 
+#![expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "of the messages of all services some are those of discovery"
+)]
+
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicU32, AtomicU64, Ordering};
 use std::time::Duration;
@@ -138,9 +143,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
             let request = self
                 .conversation
                 .receive::<RequestMessage>(|header| admit(header, shared));
-            let received = match timeout(self.lifetime, request).await {
-                Ok(received) => received,
-                Err(_) => return Err(LATE),
+            let Ok(received) = timeout(self.lifetime, request).await else {
+                return Err(LATE);
             };
             let (response, request_id) = match received {
                 Ok(Received {

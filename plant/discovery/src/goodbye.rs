@@ -131,7 +131,7 @@ mod tests {
             }
         }
         // A name that goes on in itself.
-        let mut around = whole.clone();
+        let mut around = whole;
         around.truncate(12);
         around.extend([0xC0, 12]);
         assert!(goodbyes(&around).is_empty());

@@ -162,20 +162,7 @@ struct Lds {
 
 impl Lds {
     async fn start(settings: &LdsSettings) -> Result<(Self, mpsc::Receiver<Asking>), Failure> {
-        let place = Url::parse(&settings.endpoint).ok_or_else(|| {
-            let message = format!(
-                "--endpoint {}: for example opc.tcp://127.0.0.1:4840",
-                settings.endpoint
-            );
-            Failure::new(FailureKind::Usage, message)
-        })?;
-        let listener = TcpListener::bind((place.host.as_str(), place.port)).await.map_err(|error| {
-            let message = format!(
-                "cannot listen at {}: {error}; if another discovery server runs on this host, give another --endpoint",
-                settings.endpoint
-            );
-            Failure::new(FailureKind::Unavailable, message)
-        })?;
+        let (listener, place) = listen(&settings.endpoint).await?;
         let at = listener.local_addr().map_err(|error| {
             Failure::new(
                 FailureKind::Io,
@@ -200,7 +187,7 @@ impl Lds {
         let url = Url {
             host,
             port: at.port(),
-            path: place.path.clone(),
+            path: place.path,
         }
         .to_string();
         let application_uri = format!("urn:{}:ua-lds", host_name());
@@ -285,6 +272,10 @@ impl Lds {
         }
     }
 
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "what is to be announced has been by then"
+    )]
     fn take(&mut self, event: Event) {
         match event {
             Event::Registered {
@@ -294,16 +285,7 @@ impl Lds {
                 info!(uri = ?server_uri, urls = ?discovery_urls, "registered");
                 self.since.entry(server_uri).or_insert_with(clock::wall);
             }
-            Event::Seen(record) => {
-                let Announcement { instance, url, .. } = record.announcement;
-                let now = clock::wall();
-                let started = self.keeper.started(&url).map(clock::of_ticks);
-                let after_ms = started
-                    .and_then(|at| now.duration_since(at).ok())
-                    .map(|after| after.as_millis());
-                info!(name = ?instance, url, after_ms, "seen on the network");
-                self.since.entry(instance).or_insert(now);
-            }
+            Event::Seen(record) => self.seen(record.announcement),
             Event::Restarted { url } => info!(url, "restarted"),
             Event::Gone { server_uri, loss } => self.lose(server_uri, String::new(), loss),
             Event::Vanished { record, loss } => {
@@ -312,6 +294,16 @@ impl Lds {
             }
             _ => {}
         }
+    }
+
+    fn seen(&mut self, announcement: Announcement) {
+        let Announcement { instance, url, .. } = announcement;
+        let now = clock::wall();
+        let started = self.keeper.started(&url).map(clock::of_ticks);
+        let after = started.and_then(|at| now.duration_since(at).ok());
+        let after_ms = after.map(|after| after.as_millis());
+        info!(name = ?instance, url, after_ms, "seen on the network");
+        self.since.entry(instance).or_insert(now);
     }
 
     fn lose(&mut self, name: String, url: String, loss: Loss) {
@@ -421,6 +413,24 @@ impl Lds {
         }
         self.keeper.mdns = None;
     }
+}
+
+async fn listen(endpoint: &str) -> Result<(TcpListener, Url), Failure> {
+    let place = Url::parse(endpoint).ok_or_else(|| {
+        let message = format!(
+            "--endpoint {}: for example opc.tcp://127.0.0.1:4840",
+            endpoint
+        );
+        Failure::new(FailureKind::Usage, message)
+    })?;
+    let listener = TcpListener::bind((place.host.as_str(), place.port)).await.map_err(|error| {
+            let message = format!(
+                "cannot listen at {}: {error}; if another discovery server runs on this host, give another --endpoint",
+                endpoint
+            );
+            Failure::new(FailureKind::Unavailable, message)
+        })?;
+    Ok((listener, place))
 }
 
 /// As much of a text from outside as a log line is to hold.

@@ -247,6 +247,10 @@ impl Mdns {
         }
     }
 
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "the crate may tell more, and two say who is there"
+    )]
     fn take(&mut self, event: ServiceEvent) -> Option<Heard> {
         match event {
             ServiceEvent::ServiceResolved(service) => {

@@ -1,5 +1,10 @@
 //! Requests of OPC UA to the registry, and what it says as responses (OPC 10000-4, 5.5).
 
+#![expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "of the messages of all services some are those of discovery"
+)]
+
 use std::path::Path;
 use std::time::SystemTime;
 
@@ -220,7 +225,7 @@ fn description(server: &Asked, request: &FindServersRequest) -> ApplicationDescr
         let mut names = server.names.iter();
         names.find(|(of, _)| of.eq_ignore_ascii_case(locale.as_ref()))
     });
-    let (locale, name) = match in_locale.or(server.names.first()) {
+    let (locale, name) = match in_locale.or_else(|| server.names.first()) {
         Some((locale, name)) => (locale.as_str(), name.as_str()),
         None => ("", ""),
     };

@@ -160,6 +160,7 @@ impl Watching {
         }
     }
 
+    #[expect(clippy::wildcard_enum_match_arm, reason = "nobody registers here")]
     fn take(&mut self, event: Event) {
         match event {
             Event::Seen(record) => {
@@ -170,7 +171,6 @@ impl Watching {
                 self.servers.vanished(&record.announcement.instance, loss);
             }
             Event::Restarted { url } => self.servers.restarted(&url),
-            // Nobody registers here.
             _ => {}
         }
     }
@@ -189,7 +189,7 @@ async fn application_uri(url: String) -> (String, Option<String>) {
             .filter_map(|url| Url::parse(url));
         ports.map(|url| Some(url.port)).any(|its| its == port)
     };
-    let own = found.iter().find(of_port).or(found.first());
+    let own = found.iter().find(of_port).or_else(|| found.first());
     let uri = own.map(|application| application.application_uri.clone());
     (url, uri.filter(|uri| !uri.is_empty()))
 }

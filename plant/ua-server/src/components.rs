@@ -32,7 +32,7 @@ impl Components {
     pub(crate) fn new(
         watcher: Watcher,
         (manager, subscriptions): (Arc<SpaceManager>, Arc<SubscriptionCache>),
-        own_uri: &str,
+        own_uri: String,
     ) -> Self {
         address::add_folder(
             &address::components_folder(),
@@ -44,7 +44,7 @@ impl Components {
             watcher,
             manager,
             subscriptions,
-            own_uri: own_uri.to_owned(),
+            own_uri,
             gone: VecDeque::new(),
         }
     }

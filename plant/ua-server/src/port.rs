@@ -7,12 +7,12 @@ use std::time::Duration;
 use bridge_node::{Delivery, Described, Failure, FailureKind, Kept, Port, PortEvent, TypePaths};
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
 use mappings::{Mapping, Server, SpaceId, TopicId};
-use opcua::server::ServerHandle;
 use opcua::server::address_space::AddressSpace;
 use opcua::server::node_manager::ServerContext;
 use opcua::server::node_manager::memory::{
     CoreNodeManagerBuilder, InMemoryNodeManagerBuilder, InMemoryNodeManagerImplBuilder,
 };
+use opcua::server::{ServerHandle, SubscriptionCache};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::pki::Pki;
 use tokio::runtime::Runtime;
@@ -134,24 +134,9 @@ impl ServerPort {
             "serving at {} (port {port})",
             setup.url
         );
-        let heard = setup.announce.as_ref().and_then(|told| told.mdns.clone());
-        let components = heard.map(|interface| {
-            let mdns = Some(interface);
-            let watcher = watch(WatchSettings {
-                mdns,
-                ..WatchSettings::default()
-            })?;
-            let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
-            Ok(Components::new(watcher, nodes, &described.application_uri))
-        });
-        let components = components
-            .transpose()
-            .map_err(|error: MdnsFault| unavailable(error.to_string()))?;
-        let told = setup
-            .announce
-            .map(|settings| announce(told_of(described, setup.url.advertised(port)), settings))
-            .transpose()
-            .map_err(|error| unavailable(error.to_string()))?;
+        let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
+        let server = told_of(described, setup.url.advertised(port));
+        let (told, components) = tell(server, setup.announce, nodes)?;
         let mut look = tokio::time::interval(LOOK_AT_REJECTED);
         look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         Ok(Self {
@@ -288,6 +273,31 @@ async fn next(components: &mut Option<Components>) {
         Some(components) => components.next().await,
         None => std::future::pending().await,
     }
+}
+
+/// Tells of the server where that is asked for, and hears of others where it is announced.
+fn tell(
+    server: discovery::Server,
+    settings: Option<AnnounceSettings>,
+    nodes: (Arc<SpaceManager>, Arc<SubscriptionCache>),
+) -> Result<(Option<Announced>, Option<Components>), Failure> {
+    let unavailable = |error: MdnsFault| Failure::new(FailureKind::Unavailable, error.to_string());
+    let Some(settings) = settings else {
+        return Ok((None, None));
+    };
+    let own_uri = server.application_uri.clone();
+    let heard = settings.mdns.clone().map(|interface| {
+        watch(WatchSettings {
+            mdns: Some(interface),
+            ..WatchSettings::default()
+        })
+    });
+    let components = heard
+        .transpose()
+        .map_err(unavailable)?
+        .map(|watcher| Components::new(watcher, nodes, own_uri));
+    let told = announce(server, settings).map_err(unavailable)?;
+    Ok((Some(told), components))
 }
 
 /// The server as others are told of it.
