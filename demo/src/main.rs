@@ -14,6 +14,7 @@ mod master;
 mod orchestra;
 mod pace;
 mod robots;
+mod stage;
 mod stop;
 mod supervisor;
 

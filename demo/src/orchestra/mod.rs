@@ -1,30 +1,27 @@
 //! The demo itself: starts the programs of the cell, watches the story they make together, and ends them.
 
-mod failure;
-mod programs;
-mod report;
-mod status;
+mod describe;
+pub(crate) mod report;
 mod story;
-mod timeline;
 
 use std::fs;
-use std::net::{Ipv4Addr, TcpListener};
 use std::path::PathBuf;
 use std::time::Duration;
 
-use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, interval, sleep_until, timeout_at};
 
-use self::failure::Failure;
-use self::programs::{Program, Programs, Stage};
-use self::report::Hops;
+use self::describe::describe;
+use self::report::{Hops, Status};
 use self::story::Story;
-use self::timeline::{Timeline, Who};
 use crate::clock::wall_nanos;
 use crate::event::{Event, MasterEvent};
 use crate::line::{DOMAIN, ENDPOINT};
 use crate::pace::{Speed, overdue_after};
+use crate::stage::{
+    Failure, Interrupt, LOOPBACK, Program, Programs, Report, Stage, Timeline, Who, fetch, find,
+    free_port, must_be_free,
+};
 
 /// What the story is to be.
 #[derive(Clone, Copy, Debug)]
@@ -57,7 +54,7 @@ fn conclude(
     (story, hops): (&Story, Hops),
     failure: Option<&Failure>,
 ) -> std::io::Result<()> {
-    timeline.print_all(story)?;
+    timeline.print_all(&|at| story.seconds(at))?;
     let report = report::Report::of(story, hops);
     if story.delivered() > 0 {
         timeline.print_text(&report.table(story))?;
@@ -81,10 +78,16 @@ async fn perform(
     story: &mut Story,
     hops: &mut Hops,
 ) -> Result<(), Failure> {
-    let binaries = Binaries::find()?;
+    let (demo, [bridge_ros1, bridge_ros2, server]) =
+        find(["bridge-ros1", "bridge-ros2", "ua-server"])?;
+    let binaries = Binaries {
+        demo,
+        bridge_ros1,
+        bridge_ros2,
+        server,
+    };
     let interrupt = Interrupt::listen()?;
-    // Found out here, where it can be said in one line.
-    drop(TcpListener::bind((Ipv4Addr::LOCALHOST, 4840)).map_err(|_| Failure::PortTaken)?);
+    must_be_free(4840, "OPC UA server")?;
     let (programs, reports) =
         Programs::prepare().map_err(Failure::io("cannot make a directory for the logs"))?;
     let mut stage = Director {
@@ -117,64 +120,12 @@ struct Binaries {
     server: PathBuf,
 }
 
-impl Binaries {
-    /// Those beside this one.
-    fn find() -> Result<Self, Failure> {
-        let demo = std::env::current_exe().map_err(Failure::io("the demo cannot find itself"))?;
-        let beside =
-            |name: &str| demo.with_file_name(format!("{name}{}", std::env::consts::EXE_SUFFIX));
-        let (bridge_ros1, bridge_ros2) = (beside("bridge-ros1"), beside("bridge-ros2"));
-        let server = beside("ua-server");
-        let missing: Vec<PathBuf> = [&bridge_ros1, &bridge_ros2, &server]
-            .into_iter()
-            .filter(|path| !path.is_file())
-            .cloned()
-            .collect();
-        if missing.is_empty() {
-            Ok(Self {
-                demo,
-                bridge_ros1,
-                bridge_ros2,
-                server,
-            })
-        } else {
-            Err(Failure::Missing(missing))
-        }
-    }
-}
-
-struct Interrupt {
-    interrupt: Signal,
-    terminate: Signal,
-}
-
-impl Interrupt {
-    fn listen() -> Result<Self, Failure> {
-        let listen = |kind| signal(kind).map_err(Failure::io("cannot listen for Ctrl-C"));
-        let (interrupt, terminate) = (
-            listen(SignalKind::interrupt())?,
-            listen(SignalKind::terminate())?,
-        );
-        Ok(Self {
-            interrupt,
-            terminate,
-        })
-    }
-
-    async fn come(&mut self) {
-        tokio::select! {
-            _ = self.interrupt.recv() => {}
-            _ = self.terminate.recv() => {}
-        }
-    }
-}
-
 /// Everything the run has at hand.
 struct Director<'a> {
     plan: Plan,
     binaries: Binaries,
     programs: Programs,
-    reports: mpsc::Receiver<programs::Report>,
+    reports: mpsc::Receiver<Report>,
     interrupt: Interrupt,
     timeline: &'a mut Timeline,
     story: &'a mut Story,
@@ -289,8 +240,10 @@ impl Director<'_> {
             arguments: arguments.iter().copied().map(str::to_owned).collect(),
             environment: owned(environment),
             tells: true,
+            hears: false,
             stage,
-        })
+        })?;
+        Ok(())
     }
 
     fn start(
@@ -306,8 +259,10 @@ impl Director<'_> {
             arguments: arguments.iter().copied().map(str::to_owned).collect(),
             environment: owned(environment),
             tells: false,
+            hears: false,
             stage: Stage::Bridges,
-        })
+        })?;
+        Ok(())
     }
 
     /// Takes events until the story has come to where it should be.
@@ -330,19 +285,23 @@ impl Director<'_> {
         loop {
             tokio::select! {
                 report = self.reports.recv() => match report {
-                    Some(programs::Report::Told(stamped)) => {
+                    Some(Report::Told(stamped)) => {
                         self.story.observe(&stamped);
-                        self.timeline.add(&stamped);
+                        if let Some((who, what)) = describe(&stamped.event) {
+                            self.timeline.note(stamped.at_ns, who, what);
+                        }
                         return Ok(Some(stamped.event));
                     }
-                    Some(programs::Report::Garbled { name, line }) => {
+                    Some(Report::Garbled { name, line }) => {
                         self.note(format!("{name} says what is no event: {line}"));
                     }
-                    Some(programs::Report::Ended { name, status }) => {
+                    Some(Report::Ended { name, status }) => {
                         let last_lines = self.programs.last_lines(name);
                         let logs = self.programs.directory().to_owned();
                         return Err(Failure::ChildEnded { name, status, last_lines, logs });
                     }
+                    // Nothing of the line is killed.
+                    Some(Report::Killed { .. }) => {}
                     // The programs hold a sender, so it does not end before them.
                     None => return Ok(None),
                 },
@@ -352,7 +311,7 @@ impl Director<'_> {
                 }
                 _ = print.tick() => {
                     self.timeline
-                        .print_before(wall_nanos(), self.story)
+                        .print_before(wall_nanos(), &|at| self.story.seconds(at))
                         .map_err(Failure::io("cannot print"))?;
                 }
             }
@@ -362,7 +321,7 @@ impl Director<'_> {
     /// The hops, of which each bridge has measured its own.
     async fn ask_bridges(&mut self, ros1_port: u16, ros2_port: u16) -> Hops {
         let by = Instant::now() + SPARE;
-        let both = async { tokio::join!(status::fetch(ros1_port), status::fetch(ros2_port)) };
+        let both = async { tokio::join!(fetch::<Status>(ros1_port), fetch::<Status>(ros2_port)) };
         let Ok((ros1, ros2)) = timeout_at(by, both).await else {
             return Hops::default();
         };
@@ -382,7 +341,7 @@ impl Director<'_> {
     }
 
     fn note(&mut self, what: String) {
-        self.timeline.note(wall_nanos(), Who::Demo, what);
+        self.timeline.note(wall_nanos(), Who::DEMO, what);
     }
 
     fn not_begun(&self) -> Failure {
@@ -408,18 +367,7 @@ fn owned(environment: &[(&'static str, &str)]) -> Vec<(&'static str, String)> {
         .collect()
 }
 
-/// A port that nobody listens on now.
-fn free_port() -> Result<u16, Failure> {
-    let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0));
-    let address = listener.and_then(|listener| listener.local_addr());
-    Ok(address
-        .map_err(Failure::io("no free port on 127.0.0.1"))?
-        .port())
-}
-
 const MAPPING: &str = include_str!("../../../mappings/assembly-line.yaml");
-/// The interface of the PubSub group, by address, because its name is not the same everywhere.
-const LOOPBACK: &str = "127.0.0.1";
 /// How long the programs may take to find one another.
 const BEGIN_WITHIN: Duration = Duration::from_secs(60);
 /// For what does not get faster with the story.

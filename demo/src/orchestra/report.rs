@@ -1,10 +1,17 @@
 //! What is printed at the end: the outcome, and the delays beside those of the paper.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use serde::{Deserialize, Serialize};
 
 use super::story::Story;
+
+/// Of a bridge's status page, the delays per hop by its own names: `out`, `origin`, `network`, `in`.
+#[derive(Debug, Default, Deserialize)]
+pub(crate) struct Status {
+    pub(crate) hops: BTreeMap<String, Hop>,
+}
 
 /// The delays of one hop as the bridges give them out.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]

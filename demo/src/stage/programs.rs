@@ -4,12 +4,13 @@ use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
+use std::sync::Arc;
 use std::time::Duration;
 
 use rustix::process::{Pid, Signal, kill_process};
-use tokio::io::{AsyncBufReadExt as _, BufReader};
-use tokio::process::{Child, ChildStdout, Command};
-use tokio::sync::{mpsc, watch};
+use tokio::io::{AsyncBufReadExt as _, AsyncWriteExt as _, BufReader};
+use tokio::process::{Child, ChildStdin, ChildStdout, Command};
+use tokio::sync::{Notify, mpsc, watch};
 use tokio::task::JoinSet;
 use tokio::time::timeout;
 
@@ -30,6 +31,11 @@ pub(crate) enum Report {
         name: &'static str,
         status: ExitStatus,
     },
+    /// It was killed, as was asked for; the time is that of the signal.
+    Killed {
+        name: &'static str,
+        at_ns: i64,
+    },
 }
 
 /// One program to start.
@@ -40,6 +46,8 @@ pub(crate) struct Program {
     pub(crate) environment: Vec<(&'static str, String)>,
     /// It tells events on its standard output; else that goes into its log.
     pub(crate) tells: bool,
+    /// It is told things on its standard input; else that is closed.
+    pub(crate) hears: bool,
     /// When it is to end.
     pub(crate) stage: Stage,
 }
@@ -48,8 +56,17 @@ pub(crate) struct Program {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Stage {
     Robots,
+    Components,
     Bridges,
     Master,
+}
+
+struct Running {
+    name: &'static str,
+    stage: Stage,
+    tasks: JoinSet<()>,
+    kill: Arc<Notify>,
+    stdin: Option<ChildStdin>,
 }
 
 /// The running programs. Dropping it kills what still runs.
@@ -57,7 +74,7 @@ pub(crate) struct Programs {
     directory: PathBuf,
     reports: mpsc::Sender<Report>,
     end: watch::Sender<Option<Stage>>,
-    running: Vec<(Stage, JoinSet<()>)>,
+    running: Vec<Running>,
     listeners: JoinSet<()>,
 }
 
@@ -92,7 +109,8 @@ impl Programs {
         &self.directory
     }
 
-    pub(crate) fn start(&mut self, program: Program) -> Result<(), Failure> {
+    /// Starts a program. Returns when that was, in nanoseconds since 1970.
+    pub(crate) fn start(&mut self, program: Program) -> Result<i64, Failure> {
         let log =
             File::create(self.log(program.name)).map_err(Failure::io("cannot write a log"))?;
         let stdout = if program.tells {
@@ -102,25 +120,18 @@ impl Programs {
                 .map_err(Failure::io("cannot write a log"))?
                 .into()
         };
-        let mut command = Command::new(&program.path);
-        for (key, _) in std::env::vars_os() {
-            // The demo's ROS and OPC UA sides are its own, whatever this terminal is set up for.
-            if key
-                .to_str()
-                .is_some_and(|key| key.starts_with("ROS_") || key.starts_with("UA_"))
-            {
-                command.env_remove(key);
-            }
-        }
-        let mut child = command
+        let stdin = if program.hears {
+            Stdio::piped()
+        } else {
+            Stdio::null()
+        };
+        let started = wall_nanos();
+        let mut child = command(&program.path)
             .args(&program.arguments)
             .envs(program.environment)
-            .stdin(Stdio::null())
+            .stdin(stdin)
             .stdout(stdout)
             .stderr(log)
-            // Ctrl-C is for the demo, which then ends them in order.
-            .process_group(0)
-            .kill_on_drop(true)
             .spawn()
             .map_err(Failure::io("cannot start a program"))?;
         let mut tasks = JoinSet::new();
@@ -128,23 +139,56 @@ impl Programs {
             self.listeners
                 .spawn(listen(program.name, stdout, self.reports.clone()));
         }
+        let kill = Arc::new(Notify::new());
+        let stdin = child.stdin.take();
         let end = self.end.subscribe();
         tasks.spawn(attend(
             program.name,
             child,
-            (program.stage, end),
+            (program.stage, end, Arc::clone(&kill)),
             self.reports.clone(),
         ));
-        self.running.push((program.stage, tasks));
-        Ok(())
+        self.running.push(Running {
+            name: program.name,
+            stage: program.stage,
+            tasks,
+            kill,
+            stdin,
+        });
+        Ok(started)
+    }
+
+    /// SIGKILL to a program, as when its power goes. [`Report::Killed`] says when it was; nothing if it has ended.
+    pub(crate) fn kill(&self, name: &str) {
+        for running in self.running.iter().filter(|running| running.name == name) {
+            running.kill.notify_one();
+        }
+    }
+
+    /// Writes a line to the standard input of a program that hears.
+    pub(crate) async fn tell(&mut self, name: &str, line: &str) -> io::Result<()> {
+        let mut running = self.running.iter_mut();
+        let stdin = running
+            .find(|running| running.name == name)
+            .and_then(|running| running.stdin.as_mut())
+            .ok_or(io::ErrorKind::NotFound)?;
+        stdin.write_all(line.as_bytes()).await?;
+        stdin.write_all(b"\n").await?;
+        stdin.flush().await
     }
 
     /// Ends all programs, in order; each has [`GRACE`] from SIGTERM to SIGKILL.
     pub(crate) async fn end(&mut self) {
-        for stage in [Stage::Robots, Stage::Bridges, Stage::Master] {
+        for stage in [
+            Stage::Robots,
+            Stage::Components,
+            Stage::Bridges,
+            Stage::Master,
+        ] {
             self.end.send_replace(Some(stage));
-            for (_, tasks) in self.running.iter_mut().filter(|(of, _)| *of == stage) {
-                while tasks.join_next().await.is_some() {}
+            let of_stage = self.running.iter_mut().filter(|of| of.stage == stage);
+            for running in of_stage {
+                while running.tasks.join_next().await.is_some() {}
             }
         }
         self.running.clear();
@@ -173,6 +217,22 @@ impl Programs {
     }
 }
 
+/// A program that is to be ended by us alone, without the environment of this terminal's ROS and OPC UA.
+pub(crate) fn command(path: &Path) -> Command {
+    let mut command = Command::new(path);
+    for (key, _) in std::env::vars_os() {
+        if key
+            .to_str()
+            .is_some_and(|key| key.starts_with("ROS_") || key.starts_with("UA_"))
+        {
+            command.env_remove(key);
+        }
+    }
+    // Ctrl-C is for the demo, which then ends them in order.
+    command.process_group(0).kill_on_drop(true);
+    command
+}
+
 /// Passes on what a child tells, until it closes its standard output.
 async fn listen(name: &'static str, stdout: ChildStdout, reports: mpsc::Sender<Report>) {
     let mut lines = BufReader::new(stdout).lines();
@@ -191,7 +251,7 @@ async fn listen(name: &'static str, stdout: ChildStdout, reports: mpsc::Sender<R
 async fn attend(
     name: &'static str,
     mut child: Child,
-    (stage, mut end): (Stage, watch::Receiver<Option<Stage>>),
+    (stage, mut end, kill): (Stage, watch::Receiver<Option<Stage>>, Arc<Notify>),
     reports: mpsc::Sender<Report>,
 ) {
     let ended = async {
@@ -205,6 +265,12 @@ async fn attend(
             if let Ok(status) = status {
                 // When nobody listens, nobody wonders.
                 reports.send(Report::Ended { name, status }).await.ok();
+            }
+        }
+        () = kill.notified() => {
+            let at_ns = wall_nanos();
+            if child.kill().await.is_ok() {
+                reports.send(Report::Killed { name, at_ns }).await.ok();
             }
         }
         _ = ended => {
@@ -245,6 +311,7 @@ mod tests {
             arguments: vec!["-c".to_owned(), script.to_owned()],
             environment: Vec::new(),
             tells,
+            hears: false,
             stage: Stage::Robots,
         }
     }
@@ -298,6 +365,23 @@ mod tests {
                 ..
             }
         ));
+        programs
+            .start(Program {
+                hears: true,
+                ..shell(
+                    "listener",
+                    "read line; echo \"\\\"$line\\\"\"; sleep 60",
+                    true,
+                )
+            })
+            .unwrap();
+        programs.tell("listener", "grasp").await.unwrap();
+        let heard = next(&mut reports).await;
+        assert!(matches!(heard, Report::Garbled { name: "listener", line } if line == "\"grasp\""));
+        programs.kill("listener");
+        let killed = next(&mut reports).await;
+        assert!(matches!(killed, Report::Killed { name: "listener", at_ns } if at_ns > 0));
+
         timeout(GRACE * 3, programs.end())
             .await
             .expect("all are ended, one way or another");

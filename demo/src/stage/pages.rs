@@ -1,6 +1,5 @@
-//! The figures that the bridges give out over HTTP.
+//! What programs say of themselves over HTTP.
 
-use std::collections::BTreeMap;
 use std::net::{Ipv4Addr, SocketAddr};
 use std::time::Duration;
 
@@ -9,47 +8,39 @@ use hyper::Request;
 use hyper::body::Bytes;
 use hyper::header::HOST;
 use hyper_util::rt::TokioIo;
-use serde::Deserialize;
+use serde::de::DeserializeOwned;
 use thiserror::Error;
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
-use super::report::Hop;
-
-/// Delays per hop, by the bridges' own names: `out`, `origin`, `network`, `in`.
-#[derive(Debug, Default, Deserialize)]
-pub(crate) struct Status {
-    pub(crate) hops: BTreeMap<String, Hop>,
-}
-
-/// Asks a bridge for its status page.
-pub(crate) async fn fetch(port: u16) -> Result<Status, StatusError> {
+/// Asks a program on this host for its status page.
+pub(crate) async fn fetch<T: DeserializeOwned>(port: u16) -> Result<T, PageError> {
     timeout(LIMIT, request(port))
         .await
-        .map_err(|_| StatusError::Timeout)?
+        .map_err(|_| PageError::Timeout)?
 }
 
-async fn request(port: u16) -> Result<Status, StatusError> {
+async fn request<T: DeserializeOwned>(port: u16) -> Result<T, PageError> {
     let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
     let stream = TcpStream::connect(address)
         .await
-        .map_err(StatusError::Connect)?;
+        .map_err(PageError::Connect)?;
     let (mut sender, connection) =
         hyper::client::conn::http1::handshake(TokioIo::new(stream)).await?;
     let request = Request::get("/status")
         .header(HOST, address.to_string())
         .body(Empty::<Bytes>::new())
-        .map_err(|error| StatusError::Answer(error.to_string()))?;
+        .map_err(|error| PageError::Answer(error.to_string()))?;
     let answer = async {
         let response = sender.send_request(request).await?;
         if !response.status().is_success() {
-            return Err(StatusError::Answer(response.status().to_string()));
+            return Err(PageError::Answer(response.status().to_string()));
         }
         let body = Limited::new(response.into_body(), MAX_BODY).collect().await;
         let body = body
-            .map_err(|error| StatusError::Answer(error.to_string()))?
+            .map_err(|error| PageError::Answer(error.to_string()))?
             .to_bytes();
-        serde_json::from_slice(&body).map_err(|error| StatusError::Answer(error.to_string()))
+        serde_json::from_slice(&body).map_err(|error| PageError::Answer(error.to_string()))
     };
     tokio::pin!(connection, answer);
     tokio::select! {
@@ -60,9 +51,9 @@ async fn request(port: u16) -> Result<Status, StatusError> {
     }
 }
 
-/// Why there are no figures.
+/// Why there is no page.
 #[derive(Debug, Error)]
-pub(crate) enum StatusError {
+pub(crate) enum PageError {
     #[error("nobody listens there: {0}")]
     Connect(#[source] std::io::Error),
     #[error("HTTP failed: {0}")]
@@ -82,8 +73,9 @@ mod tests {
     use tokio::net::TcpListener;
 
     use super::*;
+    use crate::orchestra::report::{Hop, Status};
 
-    async fn answered(answer: &'static str) -> Result<Status, StatusError> {
+    async fn answered(answer: &'static str) -> Result<Status, PageError> {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
         let port = listener.local_addr().unwrap().port();
         let serve = async {
@@ -114,7 +106,7 @@ mod tests {
     #[tokio::test]
     async fn a_page_that_is_not_there_is_an_error() {
         let page = "HTTP/1.1 404 Not Found\r\ncontent-length: 0\r\n\r\n";
-        assert!(matches!(answered(page).await, Err(StatusError::Answer(_))));
-        assert!(matches!(answered("").await, Err(StatusError::Http(_))));
+        assert!(matches!(answered(page).await, Err(PageError::Answer(_))));
+        assert!(matches!(answered("").await, Err(PageError::Http(_))));
     }
 }

@@ -1,4 +1,4 @@
-//! Why the demo did not come to its end.
+//! Why a scenario did not come to its end.
 
 use std::io;
 use std::path::PathBuf;
@@ -15,10 +15,10 @@ pub(crate) enum Failure {
     )]
     Missing(Vec<PathBuf>),
     #[error(
-        "127.0.0.1:4840 is taken, where the demo's OPC UA server is to listen; end the program \
-         that listens there (`ss -ltnp 'sport = :4840'` names it)"
+        "127.0.0.1:{port} is taken, where the demo's {program} is to listen; end the program that \
+         listens there (`ss -ltnp 'sport = :{port}'` names it)"
     )]
-    PortTaken,
+    PortTaken { port: u16, program: &'static str },
     #[error("{what}: {source}")]
     Io {
         what: &'static str,
@@ -26,7 +26,7 @@ pub(crate) enum Failure {
         source: io::Error,
     },
     #[error(
-        "{name} ended before the line was done ({status}){}\nthe logs of all programs are in {}",
+        "{name} ended before the demo was done ({status}){}\nthe logs of all programs are in {}",
         indented(.last_lines), .logs.display()
     )]
     ChildEnded {
@@ -43,6 +43,14 @@ pub(crate) enum Failure {
     },
     #[error("the line is stuck: {standing}\nthe logs are in {}", .logs.display())]
     Stuck { standing: String, logs: PathBuf },
+    #[error("after {seconds} s this has not happened:{}\nthe logs are in {}", items(.lacks), .logs.display())]
+    Missed {
+        seconds: u64,
+        lacks: Vec<String>,
+        logs: PathBuf,
+    },
+    #[error("{why}\nthe logs are in {}", .logs.display())]
+    Broken { why: String, logs: PathBuf },
     #[error("interrupted: {standing}")]
     Interrupted { standing: String },
 }
@@ -53,15 +61,23 @@ impl Failure {
         move |source| Self::Io { what, source }
     }
 
-    /// The exit code of `sysexits.h` that says whose it is to mend; 1 for a line that did not finish.
+    /// The exit code of `sysexits.h` that says whose it is to mend; 1 for a story that did not finish.
     pub(crate) const fn exit_code(&self) -> u8 {
         match self {
-            Self::Missing(_) | Self::PortTaken => 69,
+            Self::Missing(_) | Self::PortTaken { .. } => 69,
             Self::Io { .. } => 74,
-            Self::ChildEnded { .. } | Self::NotBegun { .. } | Self::Stuck { .. } => 1,
+            Self::ChildEnded { .. }
+            | Self::NotBegun { .. }
+            | Self::Stuck { .. }
+            | Self::Missed { .. }
+            | Self::Broken { .. } => 1,
             Self::Interrupted { .. } => 130,
         }
     }
+}
+
+fn items(lacks: &[String]) -> String {
+    lacks.iter().map(|what| format!("\n  - {what}")).collect()
 }
 
 fn list(paths: &[PathBuf]) -> String {

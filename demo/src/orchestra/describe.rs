@@ -1,0 +1,69 @@
+//! What the timeline says of the events of the line.
+
+use crate::event::{Event, SupervisorEvent};
+use crate::robots::niryo::{NiryoEvent, WaitCause};
+use crate::robots::turtlebot::TurtlebotEvent;
+use crate::stage::Who;
+
+/// Whose event it is and what to say of it, unless it is not for people.
+pub(crate) fn describe(event: &Event) -> Option<(Who, String)> {
+    match event {
+        Event::Master(_) | Event::Supervisor(SupervisorEvent::Awaits { .. }) => None,
+        Event::Niryo(event) => Some((NIRYO, niryo(*event))),
+        Event::Turtlebot(event) => Some((TURTLEBOT, turtlebot(*event))),
+        Event::Supervisor(SupervisorEvent::Connected) => Some((
+            SUPERVISOR,
+            "has a session with the OPC UA server".to_owned(),
+        )),
+        Event::Supervisor(SupervisorEvent::Switched { on }) => {
+            let state = if *on { "on" } else { "off" };
+            Some((SUPERVISOR, format!("switches the conveyor {state}")))
+        }
+        Event::Supervisor(SupervisorEvent::Saw { name, value }) => {
+            Some((SERVER, format!("{name} = {value}")))
+        }
+    }
+}
+
+fn niryo(event: NiryoEvent) -> String {
+    match event {
+        NiryoEvent::ConveyorStarted => "the conveyor starts".to_owned(),
+        NiryoEvent::ConveyorStopped {
+            holding_cover: true,
+        } => "the conveyor stops, with a cover in the gripper".to_owned(),
+        NiryoEvent::ConveyorStopped {
+            holding_cover: false,
+        } => "the conveyor stops".to_owned(),
+        NiryoEvent::Picked { left } => format!("picks a cover; {left} left in the storage"),
+        NiryoEvent::PlacedOnConveyor { total } => {
+            format!("places it on the conveyor: number {total} there")
+        }
+        NiryoEvent::PlacedOnTurtlebot { total } => {
+            format!("places it on TurtleBot3: number {total} there")
+        }
+        NiryoEvent::Waits {
+            cause: WaitCause::ParkFree,
+        } => "waits: TurtleBot3 is not at the park".to_owned(),
+        NiryoEvent::Waits {
+            cause: WaitCause::BucketBusy,
+        } => "waits: the bucket is busy".to_owned(),
+        NiryoEvent::Waits {
+            cause: WaitCause::Unknown,
+        } => "waits: nothing has been heard of TurtleBot3".to_owned(),
+        NiryoEvent::StorageEmpty => "is done: the storage is empty".to_owned(),
+    }
+}
+
+fn turtlebot(event: TurtlebotEvent) -> String {
+    match event {
+        TurtlebotEvent::CoverInBucket { .. } => "feels a cover in the bucket".to_owned(),
+        TurtlebotEvent::LeavesPark { .. } => "drives to the worker".to_owned(),
+        TurtlebotEvent::Unloaded { total } => format!("is unloaded; {total} delivered so far"),
+        TurtlebotEvent::BackAtPark => "stands at the park again".to_owned(),
+    }
+}
+
+const SUPERVISOR: Who = Who("supervisor", "35");
+const NIRYO: Who = Who("Niryo Ned", "33");
+const TURTLEBOT: Who = Who("TurtleBot3", "36");
+const SERVER: Who = Who("OPC UA server", "32");

@@ -1,0 +1,173 @@
+//! The timeline: a line per event, in the order in which things happened.
+
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+use std::io::{self, IsTerminal as _, Write};
+
+/// Prints events. Those of several processes are held back for a moment, to be put in order.
+pub(crate) struct Timeline {
+    out: Box<dyn Write>,
+    colour: bool,
+    held: BinaryHeap<Reverse<Entry>>,
+    /// Keeps events of one instant in the order of their reading.
+    number: u64,
+}
+
+#[derive(PartialEq, Eq, PartialOrd, Ord)]
+struct Entry {
+    at_ns: i64,
+    number: u64,
+    who: Who,
+    what: String,
+}
+
+/// Whose event it is: the name, and its colour as a code of SGR.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) struct Who(pub(crate) &'static str, pub(crate) &'static str);
+
+impl Who {
+    pub(crate) const DEMO: Self = Self("demo", "2");
+}
+
+impl Timeline {
+    /// On standard output, or on standard error when that is for JSON.
+    pub(crate) fn open(json: bool) -> Self {
+        let (out, terminal): (Box<dyn Write>, bool) = if json {
+            (Box::new(io::stderr()), io::stderr().is_terminal())
+        } else {
+            (Box::new(io::stdout()), io::stdout().is_terminal())
+        };
+        let colour = terminal && std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
+        Self {
+            out,
+            colour,
+            held: BinaryHeap::new(),
+            number: 0,
+        }
+    }
+
+    /// Takes a line.
+    pub(crate) fn note(&mut self, at_ns: i64, who: Who, what: String) {
+        self.number += 1;
+        self.held.push(Reverse(Entry {
+            at_ns,
+            number: self.number,
+            who,
+            what,
+        }));
+    }
+
+    /// Prints what is older than the moment for which events are held back.
+    /// `seconds` says which second of the story a moment is.
+    pub(crate) fn print_before(&mut self, now_ns: i64, seconds: Seconds<'_>) -> io::Result<()> {
+        self.print_while(seconds, |entry| entry.at_ns + HELD_NS <= now_ns)
+    }
+
+    /// Prints all there is.
+    pub(crate) fn print_all(&mut self, seconds: Seconds<'_>) -> io::Result<()> {
+        self.print_while(seconds, |_| true)
+    }
+
+    /// Prints text as it is.
+    pub(crate) fn print_text(&mut self, text: &str) -> io::Result<()> {
+        self.out.write_all(text.as_bytes())?;
+        self.out.flush()
+    }
+
+    fn print_while(
+        &mut self,
+        seconds: Seconds<'_>,
+        due: impl Fn(&Entry) -> bool,
+    ) -> io::Result<()> {
+        let mut printed = false;
+        while self.held.peek().is_some_and(|Reverse(entry)| due(entry)) {
+            let Some(Reverse(entry)) = self.held.pop() else {
+                break;
+            };
+            let line = line(&entry, seconds, self.colour);
+            self.out.write_all(line.as_bytes())?;
+            printed = true;
+        }
+        if printed { self.out.flush() } else { Ok(()) }
+    }
+}
+
+/// The second of the story that a moment is, in nanoseconds since 1970; `None` before it began.
+pub(crate) type Seconds<'a> = &'a dyn Fn(i64) -> Option<f64>;
+
+fn line(entry: &Entry, seconds: Seconds<'_>, colour: bool) -> String {
+    let time = match seconds(entry.at_ns) {
+        // What led to the start was before it.
+        Some(seconds) if seconds >= 0.0 => format!("{seconds:>9.3}"),
+        Some(_) | None => format!("{:>9}", "-"),
+    };
+    let Who(who, code) = entry.who;
+    if colour {
+        format!(
+            "\x1b[2m{time}\x1b[0m  \x1b[{code}m{who:<13}\x1b[0m  {}\n",
+            entry.what
+        )
+    } else {
+        format!("{time}  {who:<13}  {}\n", entry.what)
+    }
+}
+
+/// How long events wait for those that happened before them: several times what a child takes to tell.
+const HELD_NS: i64 = 200_000_000;
+
+#[cfg(test)]
+mod tests {
+    use std::sync::{Arc, Mutex};
+
+    use super::*;
+
+    #[derive(Clone, Default)]
+    struct Page(Arc<Mutex<Vec<u8>>>);
+
+    impl Write for Page {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0.lock().unwrap().write(bytes)
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn events_are_printed_in_the_order_in_which_they_happened() {
+        let page = Page::default();
+        let out = Box::new(page.clone());
+        let mut timeline = Timeline {
+            out,
+            colour: false,
+            held: BinaryHeap::new(),
+            number: 0,
+        };
+        let robot = Who("Niryo Ned", "33");
+        for (at_ns, who, what) in [
+            (5_000_000_000, Who::DEMO, "begins"),
+            (5_902_000_000, Who("OPC UA server", "32"), "has the count"),
+            (5_900_000_000, robot, "places a cover"),
+            (4_000_000_000, robot, "is there"),
+        ] {
+            timeline.note(at_ns, who, what.to_owned());
+        }
+        // At ten times the speed.
+        let seconds = |at_ns: i64| Some(((at_ns - 5_000_000_000) / 1_000_000) as f64 / 100.0);
+        timeline
+            .print_before(5_000_000_000 + HELD_NS, &seconds)
+            .unwrap();
+        let early = page.0.lock().unwrap().len();
+        timeline.print_all(&seconds).unwrap();
+        let text = String::from_utf8(page.0.lock().unwrap().clone()).unwrap();
+        assert_eq!(text[..early].lines().count(), 2);
+        assert_eq!(
+            text,
+            "        -  Niryo Ned      is there\n    \
+             0.000  demo           begins\n    \
+             9.000  Niryo Ned      places a cover\n    \
+             9.020  OPC UA server  has the count\n"
+        );
+    }
+}
