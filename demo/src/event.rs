@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::clock::wall_nanos;
 use crate::line::Name;
+use crate::plug::NodeEvent;
 use crate::robots::niryo::NiryoEvent;
 use crate::robots::turtlebot::TurtlebotEvent;
 
@@ -26,6 +27,7 @@ pub(crate) enum Event {
     Niryo(NiryoEvent),
     Turtlebot(TurtlebotEvent),
     Supervisor(SupervisorEvent),
+    Node(NodeEvent),
 }
 
 /// From the ROS master.
@@ -110,6 +112,12 @@ impl From<TurtlebotEvent> for Event {
 impl From<SupervisorEvent> for Event {
     fn from(event: SupervisorEvent) -> Self {
         Self::Supervisor(event)
+    }
+}
+
+impl From<NodeEvent> for Event {
+    fn from(event: NodeEvent) -> Self {
+        Self::Node(event)
     }
 }
 

@@ -1,11 +1,12 @@
-//! The fault-tolerant product assembly line, with simulated robots and the programs people run.
+//! Two stories with simulated robots and the programs people run: the fault-tolerant product assembly line, and plug and
+//! produce.
 //!
 //! One binary is all the demo's own processes: started plainly it starts the others, which are hidden subcommands of
-//! it, and the two bridges and the OPC UA server that stand beside it. The robots know one another through the topics
-//! of the space alone; what they print is for the timeline.
+//! it, and the programs that stand beside it. The robots know one another, and components, through the topics of the space
+//! alone; what they print is for the timeline.
 //!
 //! Reading order: `robots::niryo` and `robots::turtlebot` (what the robots decide), `line` (the values they share),
-//! `supervisor`, `orchestra` (who starts and watches them all).
+//! `supervisor`, `orchestra` (who starts and watches them all); `plug` (the other story); `stage` (what both stand on).
 
 mod clock;
 mod event;
@@ -13,6 +14,7 @@ mod line;
 mod master;
 mod orchestra;
 mod pace;
+mod plug;
 mod robots;
 mod stage;
 mod stop;
@@ -27,8 +29,7 @@ use clap::{Args, Parser, Subcommand};
 use crate::orchestra::Plan;
 use crate::pace::Speed;
 
-/// Plays the fault-tolerant product assembly line on this machine: a ROS 1 arm and a ROS 2 robot that know one another
-/// through the space alone. Nothing leaves the loopback interface.
+/// Plays a story with simulated robots on this machine. Nothing leaves the loopback interface.
 #[derive(Debug, Parser)]
 #[command(name = "demo", version, args_conflicts_with_subcommands = true)]
 struct Arguments {
@@ -40,18 +41,33 @@ struct Arguments {
 
 #[derive(Debug, Args)]
 struct PlanArguments {
-    /// Divides all times of the story
+    /// Which story
+    #[arg(long, value_enum, default_value_t = Scenario::AssemblyLine)]
+    scenario: Scenario,
+    /// Divides all times of the robots' and components' work
     #[arg(long, value_name = "FACTOR", default_value = "1")]
     speed: Speed,
-    /// How many covers lie in the storage
+    /// Of the assembly line: how many covers lie in the storage
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(1..=1000))]
     covers: u32,
-    /// The second of the story at which the supervisor switches the conveyor off
+    /// Of the assembly line: the second of the story at which the supervisor switches the conveyor off
     #[arg(long, value_name = "SECONDS", default_value = "25", value_parser = seconds)]
     conveyor_off_at: f64,
+    /// Of plug and produce: the manifest (MTP) of the module that is imported, in place of that of the example plant
+    #[arg(long, value_name = "FILE")]
+    manifest: Option<PathBuf>,
     /// Print one JSON object on standard output, and the timeline on standard error
     #[arg(long)]
     json: bool,
+}
+
+/// A story.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Scenario {
+    /// A ROS 1 arm and a ROS 2 robot that know one another through the space alone
+    AssemblyLine,
+    /// Components that are plugged in, found, started from ROS, run by the MES, lost and replaced
+    PlugAndProduce,
 }
 
 /// The demo's own processes.
@@ -80,6 +96,10 @@ enum Role {
         #[arg(long)]
         pki: PathBuf,
     },
+    #[command(hide = true)]
+    Ros1Node,
+    #[command(hide = true)]
+    Ros2Node,
 }
 
 fn seconds(text: &str) -> Result<f64, &'static str> {
@@ -111,18 +131,33 @@ fn main() -> ExitCode {
     match arguments.role {
         None => {
             let PlanArguments {
+                scenario,
                 speed,
                 covers,
                 conveyor_off_at,
+                manifest,
                 json,
             } = arguments.plan;
-            let plan = Plan {
-                covers,
-                speed,
-                conveyor_off_at,
-                json,
+            let code = match scenario {
+                Scenario::AssemblyLine => {
+                    let plan = Plan {
+                        covers,
+                        speed,
+                        conveyor_off_at,
+                        json,
+                    };
+                    runtime.block_on(Box::pin(orchestra::play(plan)))
+                }
+                Scenario::PlugAndProduce => {
+                    let plan = plug::Plan {
+                        speed,
+                        json,
+                        manifest,
+                    };
+                    runtime.block_on(Box::pin(plug::play(plan)))
+                }
             };
-            ExitCode::from(runtime.block_on(Box::pin(orchestra::play(plan))))
+            ExitCode::from(code)
         }
         Some(role) => match runtime.block_on(Box::pin(play_role(role))) {
             Ok(()) => ExitCode::SUCCESS,
@@ -147,6 +182,8 @@ async fn play_role(role: Role) -> anyhow::Result<()> {
             speed,
             pki,
         } => supervisor::run(speed.real(conveyor_off_at), pki).await,
+        Role::Ros1Node => plug::ros1_node::run().await,
+        Role::Ros2Node => plug::ros2_node::run().await,
     }
 }
 

@@ -1,4 +1,4 @@
-//! `cargo xtask demo`: the assembly line in one command.
+//! `cargo xtask demo`: a story with the programs people run, in one command.
 
 use std::process::Command;
 
@@ -10,19 +10,20 @@ use crate::{
 
 pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     step("building the programs (some minutes the first time)");
-    let packages = [
-        "-p",
-        "bridge-ros1",
-        "-p",
-        "bridge-ros2",
-        "-p",
-        "ua-server",
-        "-p",
-        "demo",
-    ];
+    let mut build = vec!["build", "--locked"];
+    let is_plug_and_produce = arguments.iter().any(|argument| argument.ends_with("plug-and-produce"));
+    let others: &[&str] = if is_plug_and_produce { &PLUG_AND_PRODUCE } else { &[] };
+    for package in LINE.iter().chain(others) {
+        build.extend(["-p", package]);
+    }
     let rustdds = Rustdds::prepare(workspace)?;
-    must(&mut rustdds.cargo(workspace, &[&["build", "--locked"][..], &packages].concat()))?;
+    must(&mut rustdds.cargo(workspace, &build))?;
     step("running the demo");
     let mut demo = Command::new(workspace.target.join("debug/demo"));
     Ok(status(demo.current_dir(&workspace.root).args(arguments))?.into())
 }
+
+/// The packages of the assembly line, which every story needs.
+const LINE: [&str; 4] = ["bridge-ros1", "bridge-ros2", "ua-server", "demo"];
+/// Those of plug and produce beside them.
+const PLUG_AND_PRODUCE: [&str; 4] = ["discovery", "ua-component", "ua-mes", "ua-space"];

@@ -1,0 +1,212 @@
+//! What the timeline says of what was seen.
+
+use super::fact::{Fact, Level, NodeEvent, Part, Ros, Run};
+use super::story::Story;
+use crate::stage::Who;
+
+/// Whose a fact is and what to say of it, unless it is not for people or known. To be asked before the story takes it.
+pub(crate) fn describe(story: &Story, fact: &Fact) -> Vec<(Who, String)> {
+    match fact {
+        Fact::Ready(program) => vec![(Who::DEMO, format!("{program} runs"))],
+        Fact::Started(part) => vec![(who(*part), "is plugged in: its process starts".to_owned())],
+        Fact::Reached(part, level) if !story.reached.contains_key(&(*part, *level)) => {
+            vec![(who(*part), reached(*part, *level))]
+        }
+        Fact::Left(part, level) if story.loses(*part, *level) => {
+            vec![(who(*part), format!("is gone: no longer {}", level.label()))]
+        }
+        Fact::Reached(..) | Fact::Left(..) => Vec::new(),
+        Fact::Node(event) => node(story, event),
+        Fact::Killed(part) => vec![(who(*part), "is killed (SIGKILL)".to_owned())],
+        Fact::Run(number, run) => changes(story.runs.get(number), run)
+            .into_iter()
+            .map(|what| (MES, what))
+            .collect(),
+        Fact::CallEnded { succeeded, why, .. } => {
+            let what = if *succeeded {
+                "ua-space call: the process is done".to_owned()
+            } else {
+                format!("ua-space call: {why}")
+            };
+            vec![(Who::DEMO, what)]
+        }
+        Fact::Asked(asked) => vec![(
+            MES,
+            format!(
+                "what can run: {} skills and {} services, with capability, parameters and endpoint",
+                asked.skills, asked.services
+            ),
+        )],
+    }
+}
+
+fn reached(part: Part, level: Level) -> String {
+    let namespace = part.namespace();
+    match level {
+        Level::Announced | Level::Registered | Level::Listed | Level::InGraph => {
+            level.label().to_owned()
+        }
+        Level::InSpace => format!("{}: ua_0_{namespace}_101 ...", level.label()),
+        Level::AtServer => level.label().to_owned(),
+        Level::Ros1 | Level::Ros2 => format!("/ua_0_{namespace}_101 is {}", level.label()),
+    }
+}
+
+fn node(story: &Story, event: &NodeEvent) -> Vec<(Who, String)> {
+    let (ros, what) = match event {
+        NodeEvent::Up { ros } => (*ros, "listens".to_owned()),
+        NodeEvent::State {
+            ros,
+            namespace,
+            state,
+            ..
+        } => {
+            let Some(part) = Part::of_namespace(*namespace) else {
+                return Vec::new();
+            };
+            let level = match ros {
+                Ros::Ros1 => Level::Ros1,
+                Ros::Ros2 => Level::Ros2,
+            };
+            if !story.reached.contains_key(&(part, level)) {
+                return vec![(who(part), reached(part, level))];
+            }
+            if part != Part::Gripper || !story.is_new_state(*ros, state) {
+                return Vec::new();
+            }
+            (*ros, format!("/ua_0_7_101: {state}"))
+        }
+        NodeEvent::Resets { ros } => (*ros, "calls /ua_0_7_109: the skill is Halted".to_owned()),
+        NodeEvent::Asks { ros } => (*ros, "calls /ua_0_7_105 (std_srvs/Trigger)".to_owned()),
+        NodeEvent::Answered {
+            ros,
+            success,
+            message,
+        } => {
+            let what = if *success {
+                "is answered: success".to_owned()
+            } else {
+                format!("is answered: {message}")
+            };
+            (*ros, what)
+        }
+        NodeEvent::Result {
+            ros,
+            run,
+            succeeded,
+            ..
+        } => {
+            if !story.awaits_result(*ros) {
+                return Vec::new();
+            }
+            let how = if *succeeded { "succeeded" } else { "failed" };
+            (*ros, format!("/ua_0_7_104: run {run} {how}"))
+        }
+    };
+    vec![(node_of(ros), what)]
+}
+
+/// What is new in a run.
+fn changes(known: Option<&Run>, run: &Run) -> Vec<String> {
+    let mut new = Vec::new();
+    if known.is_none() {
+        new.push(format!("runs {}", run.process));
+    }
+    let known_plans = known.map(|known| known.plans.as_slice()).unwrap_or_default();
+    if let Some(what) = &run.waits_for
+        && known.and_then(|known| known.waits_for.as_ref()) != Some(what)
+    {
+        new.push(format!("waits for {what}"));
+    }
+    for (number, plan) in run.plans.iter().enumerate() {
+        let known = known_plans.get(number);
+        if known.is_none() {
+            new.push(format!("has plan {}", number + 1));
+        }
+        let known_ran = known.map_or(0, |known| known.ran.len());
+        for ran in plan.ran.iter().skip(known_ran) {
+            let part = Part::of_uri(&ran.component);
+            let component = part.map_or(ran.component.as_str(), |part| part.name());
+            new.push(format!("{} by {component}", ran.step));
+        }
+        let was_retreated = known.and_then(|known| known.retreated);
+        if plan.retreated != was_retreated
+            && let Some(retreated) = plan.retreated
+        {
+            let how = if retreated { "is away from the place" } else { "could not retreat" };
+            new.push(format!("the robot {how}"));
+        }
+        if plan.outcome == "failed"
+            && known.is_none_or(|known| known.outcome != "failed")
+            && let Some(reason) = &plan.reason
+        {
+            new.push(format!("plan {} broke: {reason}", number + 1));
+        }
+    }
+    if run.outcome != "running" && known.is_none_or(|known| known.outcome == "running") {
+        let plans = run.plans.len();
+        new.push(format!("the process is {} after {plans} plan(s)", run.outcome));
+    }
+    new
+}
+
+const fn who(part: Part) -> Who {
+    match part {
+        Part::Robot => Who("robot", "33"),
+        Part::Gripper => Who("gripper", "36"),
+        Part::Vacuum => Who("vacuum gripper", "34"),
+    }
+}
+
+const fn node_of(ros: Ros) -> Who {
+    match ros {
+        Ros::Ros1 => Who("ROS 1 node", "32"),
+        Ros::Ros2 => Who("ROS 2 node", "32"),
+    }
+}
+
+const MES: Who = Who("ua-mes", "35");
+
+#[cfg(test)]
+mod tests {
+    use super::super::fact::{Plan, Ran};
+    use super::*;
+
+    #[test]
+    fn of_a_run_only_what_is_new_is_said() {
+        let ran = |step: &str| Ran {
+            step: step.to_owned(),
+            component: Part::Gripper.uri().to_owned(),
+            ..Ran::default()
+        };
+        let mut run = Run {
+            process: "urn:p".to_owned(),
+            outcome: "running".to_owned(),
+            plans: vec![Plan {
+                outcome: "running".to_owned(),
+                ran: vec![ran("Grasp")],
+                ..Plan::default()
+            }],
+            ..Run::default()
+        };
+        assert_eq!(
+            changes(None, &run),
+            ["runs urn:p", "has plan 1", "Grasp by parallel-gripper"]
+        );
+        let before = run.clone();
+        assert!(changes(Some(&before), &run).is_empty());
+        let plan = &mut run.plans[0];
+        plan.ran.push(ran("Release"));
+        "failed".clone_into(&mut plan.outcome);
+        plan.reason = Some("it is lost".to_owned());
+        plan.retreated = Some(true);
+        assert_eq!(
+            changes(Some(&before), &run),
+            [
+                "Release by parallel-gripper",
+                "the robot is away from the place",
+                "plan 1 broke: it is lost"
+            ]
+        );
+    }
+}

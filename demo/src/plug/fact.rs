@@ -1,0 +1,273 @@
+//! What can be seen of a cell in which components are plugged in.
+
+use serde::{Deserialize, Serialize};
+
+use super::skill_messages::{SkillResult, SkillState};
+
+/// A component of the story.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Part {
+    Robot,
+    Gripper,
+    Vacuum,
+}
+
+impl Part {
+    pub(crate) const ALL: [Self; 3] = [Self::Robot, Self::Gripper, Self::Vacuum];
+
+    /// Its name as its YAML has it, and that of its log.
+    pub(crate) const fn name(self) -> &'static str {
+        match self {
+            Self::Robot => "robot",
+            Self::Gripper => "parallel-gripper",
+            Self::Vacuum => "vacuum-gripper",
+        }
+    }
+
+    /// Its ApplicationUri.
+    pub(crate) const fn uri(self) -> &'static str {
+        match self {
+            Self::Robot => "urn:example:robot",
+            Self::Gripper => "urn:example:gripper",
+            Self::Vacuum => "urn:example:vacuum-gripper",
+        }
+    }
+
+    /// Its namespace number in the space.
+    pub(crate) const fn namespace(self) -> u16 {
+        match self {
+            Self::Robot => 6,
+            Self::Gripper => 7,
+            Self::Vacuum => 8,
+        }
+    }
+
+    pub(crate) fn of_uri(uri: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|part| part.uri() == uri)
+    }
+
+    pub(crate) fn of_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|part| part.name() == name)
+    }
+
+    pub(crate) fn of_namespace(namespace: u16) -> Option<Self> {
+        Self::ALL
+            .into_iter()
+            .find(|part| part.namespace() == namespace)
+    }
+}
+
+/// Where a component that was plugged in is known, or not any more.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Level {
+    /// Its mDNS announcement was heard.
+    Announced,
+    /// It is in the list of the discovery server.
+    Registered,
+    /// The MES has listed its skills.
+    Listed,
+    /// It is in the graph.
+    InGraph,
+    /// A value of it was on the network.
+    InSpace,
+    /// The OPC UA server of the cell has a value of it.
+    AtServer,
+    /// A ROS 1 node has a value of it.
+    Ros1,
+    /// A ROS 2 node has a value of it.
+    Ros2,
+}
+
+impl Level {
+    pub(crate) const ALL: [Self; 8] = [
+        Self::Announced,
+        Self::Registered,
+        Self::Listed,
+        Self::InGraph,
+        Self::InSpace,
+        Self::AtServer,
+        Self::Ros1,
+        Self::Ros2,
+    ];
+
+    /// What is said when it is reached, or is not.
+    pub(crate) const fn label(self) -> &'static str {
+        match self {
+            Self::Announced => "heard by mDNS",
+            Self::Registered => "in the list of ua-lds",
+            Self::Listed => "skills listed by ua-mes",
+            Self::InGraph => "in the graph",
+            Self::InSpace => "values in the space",
+            Self::AtServer => "seen by ua-server",
+            Self::Ros1 => "a topic in ROS 1",
+            Self::Ros2 => "a topic in ROS 2",
+        }
+    }
+}
+
+/// Which of the two nodes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub(crate) enum Ros {
+    Ros1,
+    Ros2,
+}
+
+impl Ros {
+    /// The name of its process.
+    pub(crate) const fn node(self) -> &'static str {
+        match self {
+            Self::Ros1 => "ros1-node",
+            Self::Ros2 => "ros2-node",
+        }
+    }
+
+    pub(crate) const fn label(self) -> &'static str {
+        match self {
+            Self::Ros1 => "the ROS 1 node",
+            Self::Ros2 => "the ROS 2 node",
+        }
+    }
+}
+
+/// What the two nodes tell.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(tag = "node", rename_all = "snake_case")]
+pub(crate) enum NodeEvent {
+    /// It is in its graph and listens.
+    Up { ros: Ros },
+    /// A state of a skill came: skill `number` of the component with this namespace.
+    State {
+        ros: Ros,
+        namespace: u16,
+        state: String,
+        run: u32,
+    },
+    /// It asks for Reset of the gripper's first skill, which is Halted.
+    Resets { ros: Ros },
+    /// It asks for Start of the gripper's first skill.
+    Asks { ros: Ros },
+    /// What became of that, or of the Reset that was refused.
+    Answered {
+        ros: Ros,
+        success: bool,
+        message: String,
+    },
+    /// The final result of a run came.
+    Result {
+        ros: Ros,
+        namespace: u16,
+        run: u32,
+        succeeded: bool,
+        message: String,
+    },
+}
+
+impl NodeEvent {
+    pub(crate) fn state(ros: Ros, namespace: u16, state: SkillState) -> Self {
+        Self::State {
+            ros,
+            namespace,
+            state: state.state,
+            run: state.run,
+        }
+    }
+
+    /// Whether it says that the gripper's first skill has to be reset before it can be started.
+    pub(crate) fn halted(&self) -> Option<bool> {
+        match self {
+            Self::State {
+                namespace, state, ..
+            } if *namespace == Part::Gripper.namespace() => Some(state == "Halted"),
+            Self::State { .. }
+            | Self::Up { .. }
+            | Self::Resets { .. }
+            | Self::Asks { .. }
+            | Self::Answered { .. }
+            | Self::Result { .. } => None,
+        }
+    }
+
+    pub(crate) fn result(ros: Ros, namespace: u16, result: SkillResult) -> Self {
+        Self::Result {
+            ros,
+            namespace,
+            run: result.run,
+            succeeded: result.succeeded,
+            message: result.message,
+        }
+    }
+}
+
+/// Something that was seen. Its time is beside it, in nanoseconds since 1970.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Fact {
+    /// A program answers at its status page.
+    Ready(&'static str),
+    /// The process of a component was started.
+    Started(Part),
+    Reached(Part, Level),
+    /// A component is not known there any more.
+    Left(Part, Level),
+    Node(NodeEvent),
+    /// A component was killed.
+    Killed(Part),
+    /// The MES has another state of a run, counted from 0.
+    Run(usize, Run),
+    /// `ua-space call` has ended, for the run of this number.
+    CallEnded {
+        run: usize,
+        succeeded: bool,
+        why: String,
+    },
+    /// What the question answered.
+    Asked(Asked),
+}
+
+/// A run of the MES, of its status page what the story needs.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(default)]
+pub(crate) struct Run {
+    pub(crate) process: String,
+    pub(crate) started_ms: u64,
+    pub(crate) ended_ms: Option<u64>,
+    pub(crate) outcome: String,
+    pub(crate) reason: Option<String>,
+    pub(crate) waits_for: Option<String>,
+    pub(crate) plans: Vec<Plan>,
+}
+
+/// A plan of a run.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(default)]
+pub(crate) struct Plan {
+    pub(crate) at_ms: u64,
+    pub(crate) ended_ms: Option<u64>,
+    pub(crate) outcome: String,
+    pub(crate) reason: Option<String>,
+    pub(crate) retreated: Option<bool>,
+    pub(crate) ran: Vec<Ran>,
+}
+
+/// A skill that a plan has run.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(default)]
+pub(crate) struct Ran {
+    pub(crate) step: String,
+    /// The ApplicationUri.
+    pub(crate) component: String,
+    pub(crate) started_ms: u64,
+    pub(crate) ended_ms: Option<u64>,
+    pub(crate) outcome: String,
+}
+
+/// What `ua-space ask what-can-run` has answered.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub(crate) struct Asked {
+    pub(crate) skills: usize,
+    pub(crate) services: usize,
+    /// Rows that lack capabilities, or an endpoint, or are without a name.
+    pub(crate) incomplete: Vec<String>,
+}

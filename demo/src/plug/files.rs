@@ -1,0 +1,114 @@
+//! The YAML files of the story: those that the project shows to integrators, at the speed of the story.
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::fs;
+
+use super::fact::Part;
+use crate::pace::Speed;
+
+/// The manifest of a module.
+#[derive(Clone, Debug)]
+pub(crate) struct Manifest {
+    /// As it is told.
+    pub(crate) name: String,
+    pub(crate) text: Vec<u8>,
+}
+
+impl Manifest {
+    /// The one in a file, or that of the example plant.
+    ///
+    /// # Errors
+    /// The file cannot be read.
+    pub(crate) fn read(file: Option<&Path>) -> io::Result<Self> {
+        match file {
+            None => Ok(Self {
+                name: "examples/plant/dosing.aml".to_owned(),
+                text: DOSING.into(),
+            }),
+            Some(file) => Ok(Self {
+                name: file.display().to_string(),
+                text: fs::read(file)?,
+            }),
+        }
+    }
+}
+
+/// Writes what the programs are started with into a directory.
+///
+/// # Errors
+/// A file cannot be written.
+pub(crate) fn write(directory: &Path, speed: Speed, manifest: &Manifest) -> io::Result<()> {
+    for part in Part::ALL {
+        fs::write(of_part(directory, part), scaled(yaml(part), speed))?;
+    }
+    fs::write(directory.join("vacuum-gripper.xml"), VACUUM_NODESET)?;
+    fs::write(directory.join("capabilities.ttl"), CAPABILITIES)?;
+    fs::write(directory.join("module.aml"), &manifest.text)?;
+    fs::write(of_mes(directory), with_manifest(MES))
+}
+
+/// The YAML of a component.
+pub(crate) fn of_part(directory: &Path, part: Part) -> PathBuf {
+    directory.join(format!("{}.yaml", part.name()))
+}
+
+/// The YAML of the MES.
+pub(crate) fn of_mes(directory: &Path) -> PathBuf {
+    directory.join("mes.yaml")
+}
+
+const fn yaml(part: Part) -> &'static str {
+    match part {
+        Part::Robot => include_str!("../../../examples/plant/robot.yaml"),
+        Part::Gripper => include_str!("../../../examples/plant/parallel-gripper.yaml"),
+        Part::Vacuum => include_str!("../../../examples/plant/vacuum-gripper.yaml"),
+    }
+}
+
+/// With the work of simulated drivers that many times as fast.
+fn scaled(yaml: &str, speed: Speed) -> String {
+    let scale = format!("{SIMULATED}time_scale: {}, ", speed.factor());
+    yaml.replace(SIMULATED, &scale)
+}
+
+/// With the module of the story beside those it has.
+fn with_manifest(mes: &str) -> String {
+    let module = "manifests:\n  - {name: module, file: module.aml}\n";
+    match mes.split_once("processes:\n") {
+        Some((before, after)) => format!("{before}{module}processes:\n{after}"),
+        None => format!("{mes}{module}"),
+    }
+}
+
+const SIMULATED: &str = "{simulated: {";
+const VACUUM_NODESET: &str = include_str!("../../../examples/plant/vacuum-gripper.xml");
+const CAPABILITIES: &str = include_str!("../../../examples/plant/capabilities.ttl");
+const MES: &str = include_str!("../../../examples/plant/mes.yaml");
+const DOSING: &str = include_str!("../../../examples/plant/dosing.aml");
+/// The process that the MES runs.
+pub(crate) const PROCESS: &str = "urn:example:process:move-part";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_examples_are_those_of_the_story() {
+        for part in Part::ALL {
+            let text = yaml(part);
+            for line in [
+                format!("component: {}", part.name()),
+                format!("application_uri: {}", part.uri()),
+                format!("namespace: {}", part.namespace()),
+            ] {
+                assert!(text.lines().any(|known| known == line), "{part:?}: {line}");
+            }
+            let scaled = scaled(text, Speed::new(4.0).unwrap());
+            let drivers = text.matches("driver:").count();
+            assert_eq!(scaled.matches("time_scale: 4, ").count(), drivers, "{part:?}");
+        }
+        assert!(MES.contains(&format!("process: {PROCESS}\n")));
+        assert_eq!(MES.lines().filter(|line| *line == "processes:").count(), 1);
+    }
+}

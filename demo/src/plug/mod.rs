@@ -1,0 +1,647 @@
+//! Plug and produce: components are plugged in, found, started from ROS, run by the MES, lost and replaced.
+//!
+//! Reading order: `fact` (what can be seen), `story` (what has to be seen, and what follows), `pages` and `watchers` (who
+//! looks), `ros1_node` and `ros2_node` (the robots that listen), `files` (what the programs are started with), `report`.
+
+mod describe;
+mod fact;
+mod files;
+mod pages;
+mod report;
+pub(crate) mod ros1_node;
+pub(crate) mod ros2_node;
+mod skill_messages;
+mod story;
+mod watchers;
+
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::time::Duration;
+
+use serde::Deserialize;
+use serde_json::{Map, Value};
+use tokio::sync::mpsc;
+use tokio::time::{Instant, interval, sleep_until, timeout};
+
+pub(crate) use self::fact::NodeEvent;
+use self::describe::describe;
+use self::fact::{Asked, Fact, Part};
+use self::files::{Manifest, PROCESS};
+use self::pages::{Dated, Page};
+use self::story::{Act, Order, Story};
+use self::watchers::Watchers;
+use crate::clock::wall_nanos;
+use crate::event::{Event, MasterEvent};
+use crate::line::DOMAIN;
+use crate::pace::Speed;
+use crate::stage::{
+    Failure, Interrupt, LOOPBACK, Program, Programs, Report, Stage, Timeline, Who, command, find,
+    free_port, must_be_free,
+};
+
+/// What the story is to be.
+#[derive(Clone, Debug)]
+pub(crate) struct Plan {
+    pub(crate) speed: Speed,
+    pub(crate) json: bool,
+    /// The manifest of a module, in place of that of the example plant.
+    pub(crate) manifest: Option<PathBuf>,
+}
+
+/// Plays the story and prints it. Returns the exit code.
+pub(crate) async fn play(plan: Plan) -> u8 {
+    let mut show = Show {
+        timeline: Timeline::open(plan.json),
+        story: Story::new(),
+        began_at: wall_nanos(),
+    };
+    let manifest = Manifest::read(plan.manifest.as_deref())
+        .map_err(Failure::io("cannot read the manifest"));
+    let (name, outcome) = match manifest {
+        Ok(manifest) => {
+            let outcome = perform(&plan, &manifest, &mut show).await;
+            (manifest.name, outcome)
+        }
+        Err(failure) => (String::new(), Err(failure)),
+    };
+    let failure = outcome.as_ref().err();
+    let report = report::Report::of(
+        &show.story,
+        plan.speed,
+        &name,
+        failure.map(ToString::to_string),
+    );
+    let printed = conclude(&mut show, &report, failure, plan.json);
+    match (outcome, printed) {
+        (Err(failure), _) => failure.exit_code(),
+        // Nobody reads any more, as with `| head`.
+        (Ok(()), Err(_)) => 74,
+        (Ok(()), Ok(())) => 0,
+    }
+}
+
+fn conclude(
+    show: &mut Show,
+    report: &report::Report,
+    failure: Option<&Failure>,
+    json: bool,
+) -> std::io::Result<()> {
+    show.print(None)?;
+    if show.story.act() > Act::Cell {
+        show.timeline.print_text(&report.table())?;
+    }
+    if let Some(failure) = failure {
+        show.timeline.print_text(&format!("error: {failure}\n"))?;
+    }
+    if json {
+        use std::io::Write as _;
+        let mut out = std::io::stdout().lock();
+        serde_json::to_writer(&mut out, report)?;
+        out.write_all(b"\n")?;
+        out.flush()?;
+    }
+    Ok(())
+}
+
+/// The story, and what people see of it.
+struct Show {
+    timeline: Timeline,
+    story: Story,
+    began_at: i64,
+}
+
+impl Show {
+    fn takes(&mut self, at_ns: i64, fact: &Fact) {
+        for (who, what) in describe(&self.story, fact) {
+            self.timeline.note(at_ns, who, what);
+        }
+        self.story.observe(at_ns, fact);
+    }
+
+    /// Prints what is due at a moment, or all.
+    fn print(&mut self, now_ns: Option<i64>) -> std::io::Result<()> {
+        let began_at = self.began_at;
+        let seconds = |at_ns: i64| Some(report::millis(at_ns - began_at) / 1e3);
+        match now_ns {
+            Some(now_ns) => self.timeline.print_before(now_ns, &seconds),
+            None => self.timeline.print_all(&seconds),
+        }
+    }
+}
+
+async fn perform(plan: &Plan, manifest: &Manifest, show: &mut Show) -> Result<(), Failure> {
+    let (demo, [lds, server, component, mes, bridge_ros1, bridge_ros2, tool]) = find([
+        "ua-lds",
+        "ua-server",
+        "ua-component",
+        "ua-mes",
+        "bridge-ros1",
+        "bridge-ros2",
+        "ua-space",
+    ])?;
+    let binaries = Binaries {
+        demo,
+        lds,
+        server,
+        component,
+        mes,
+        bridge_ros1,
+        bridge_ros2,
+        tool,
+    };
+    let interrupt = Interrupt::listen()?;
+    must_be_free(LDS_PORT, "discovery server")?;
+    must_be_free(SERVER_PORT, "OPC UA server")?;
+    let (programs, reports) =
+        Programs::prepare().map_err(Failure::io("cannot make a directory for the logs"))?;
+    let (watchers, facts) = Watchers::new();
+    let mut director = Director {
+        plan,
+        manifest,
+        binaries,
+        programs,
+        reports,
+        watchers,
+        facts,
+        interrupt,
+        questions: 0,
+        show,
+    };
+    let outcome = director.direct().await;
+    // Nothing is heard from here on, and nobody is to wait with telling it.
+    director.reports.close();
+    director.facts.close();
+    director.programs.end().await;
+    // The logs are for those who wonder what went wrong.
+    if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
+        && let Err(error) = director.programs.clean_up()
+    {
+        tracing::debug!(%error, "the logs were not removed");
+    }
+    outcome
+}
+
+/// The programs that are started.
+struct Binaries {
+    demo: PathBuf,
+    lds: PathBuf,
+    server: PathBuf,
+    component: PathBuf,
+    mes: PathBuf,
+    bridge_ros1: PathBuf,
+    bridge_ros2: PathBuf,
+    tool: PathBuf,
+}
+
+/// Everything the run has at hand.
+struct Director<'a> {
+    plan: &'a Plan,
+    manifest: &'a Manifest,
+    binaries: Binaries,
+    programs: Programs,
+    reports: mpsc::Receiver<Report>,
+    watchers: Watchers,
+    facts: mpsc::Receiver<Dated>,
+    interrupt: Interrupt,
+    /// The port where the MES answers questions.
+    questions: u16,
+    show: &'a mut Show,
+}
+
+impl Director<'_> {
+    async fn direct(&mut self) -> Result<(), Failure> {
+        self.introduce()?;
+        let begin_by = Instant::now() + limit(Act::Cell);
+        self.start_own("ros-master", &["master"], &[], Stage::Master)?;
+        let master = self.master_uri(begin_by).await?;
+        self.start_cell(&master)?;
+        loop {
+            self.watch().await?;
+            let order = self.show.story.advance();
+            if order == Order::End {
+                return Ok(());
+            }
+            self.obey(order).await?;
+        }
+    }
+
+    fn introduce(&mut self) -> Result<(), Failure> {
+        let text = format!(
+            "Plug and produce: a robot and a gripper are plugged into a cell that knows nothing of \
+             them; speed {}.\nTimes are seconds since the beginning; the module is {}, the logs \
+             are in {}.\n\n",
+            self.plan.speed.factor(),
+            self.manifest.name,
+            self.programs.directory().display()
+        );
+        self.show
+            .timeline
+            .print_text(&text)
+            .map_err(Failure::io("cannot print"))
+    }
+
+    async fn master_uri(&mut self, by: Instant) -> Result<String, Failure> {
+        loop {
+            match self.next(by).await? {
+                Next::Told(Event::Master(MasterEvent::Listening { uri })) => return Ok(uri),
+                Next::Told(_) | Next::Seen => {}
+                Next::Late => {
+                    let lacks = vec!["the ROS master does not listen".to_owned()];
+                    return Err(self.missed(Act::Cell, lacks));
+                }
+            }
+        }
+    }
+
+    /// Starts all that is there before a component comes.
+    fn start_cell(&mut self, master: &str) -> Result<(), Failure> {
+        let directory = self.programs.directory().to_owned();
+        files::write(&directory, self.plan.speed, self.manifest)
+            .map_err(Failure::io("cannot write the files of the programs"))?;
+        self.questions = free_port()?;
+        let path = |name: &str| directory.join(name).display().to_string();
+
+        let port = free_port()?;
+        let metrics = format!("{LOOPBACK}:{port}");
+        let endpoint = format!("opc.tcp://{LOOPBACK}:{LDS_PORT}");
+        let binary = self.binaries.lds.clone();
+        let arguments = ["--endpoint", &endpoint, "--metrics", &metrics];
+        self.start("ua-lds", binary, &arguments, &[])?;
+        self.watchers.page("ua-lds", Page::Lds, port);
+
+        let port = free_port()?;
+        let metrics = format!("{LOOPBACK}:{port}");
+        let endpoint = format!("opc.tcp://{LOOPBACK}:{SERVER_PORT}");
+        let pki = path("server-pki");
+        let binary = self.binaries.server.clone();
+        let arguments = ["--interface", LOOPBACK, "--metrics", &metrics];
+        let own = ["--endpoint", &endpoint, "--pki", &pki, "--announce"];
+        self.start("ua-server", binary, &[&arguments[..], &own].concat(), &[])?;
+        self.watchers.page("ua-server", Page::Server, port);
+
+        let binary = self.binaries.mes.clone();
+        let yaml = files::of_mes(&directory).display().to_string();
+        let sparql = format!("{LOOPBACK}:{}", self.questions);
+        let arguments = [&yaml, "--interface", LOOPBACK, "--sparql", &sparql];
+        self.start("ua-mes", binary, &arguments, &[])?;
+        self.watchers.page("ua-mes", Page::Mes, self.questions);
+
+        let ros1 = [("ROS_MASTER_URI", master), ("ROS_HOSTNAME", LOOPBACK)];
+        let domain = DOMAIN.to_string();
+        let ros2 = [("ROS_LOCALHOST_ONLY", "1"), ("ROS_DOMAIN_ID", &domain)];
+        for (name, binary, environment) in [
+            ("bridge-ros1", self.binaries.bridge_ros1.clone(), ros1),
+            ("bridge-ros2", self.binaries.bridge_ros2.clone(), ros2),
+        ] {
+            let port = free_port()?;
+            let metrics = format!("{LOOPBACK}:{port}");
+            let arguments = ["--interface", LOOPBACK, "--metrics", &metrics];
+            self.start(name, binary, &arguments, &environment)?;
+            self.watchers.page(name, Page::Bridge, port);
+        }
+        self.start_own("ros1-node", &["ros1-node"], &ros1, Stage::Robots)?;
+        self.start_own("ros2-node", &["ros2-node"], &ros2, Stage::Robots)?;
+        self.watchers
+            .group()
+            .map_err(Failure::io("cannot listen in the PubSub group"))?;
+        self.watchers.graph(master.to_owned());
+        Ok(())
+    }
+
+    async fn obey(&mut self, order: Order) -> Result<(), Failure> {
+        match order {
+            Order::Plug(part) => self.plug(part),
+            Order::Grasp(ros) => self
+                .programs
+                .tell(ros.node(), "grasp")
+                .await
+                .map_err(Failure::io("a node cannot be told what to do")),
+            Order::Run(number) => {
+                let tool = self.binaries.tool.clone();
+                let facts = self.watchers.facts();
+                self.watchers.spawn(async move {
+                    let (succeeded, why) = call(&tool).await;
+                    let ended = Fact::CallEnded {
+                        run: number,
+                        succeeded,
+                        why,
+                    };
+                    // When nobody listens, nobody wonders.
+                    facts.send((wall_nanos(), ended)).await.ok();
+                });
+                Ok(())
+            }
+            Order::Kill(part) => {
+                self.programs.kill(part.name());
+                Ok(())
+            }
+            Order::Ask => {
+                let tool = self.binaries.tool.clone();
+                let url = format!("http://{LOOPBACK}:{}", self.questions);
+                let asked = timeout(TOOL_LIMIT, ask(&tool, &url)).await;
+                let asked = asked.unwrap_or_else(|_| Err("it does not end".to_owned()));
+                match asked {
+                    Ok(asked) => self.show.takes(wall_nanos(), &Fact::Asked(asked)),
+                    Err(why) => return Err(self.broken(format!("`ua-space ask` failed: {why}"))),
+                }
+                Ok(())
+            }
+            Order::End => Ok(()),
+        }
+    }
+
+    fn plug(&mut self, part: Part) -> Result<(), Failure> {
+        let yaml = files::of_part(self.programs.directory(), part);
+        let arguments = [yaml.display().to_string()]
+            .into_iter()
+            .chain(["--interface", LOOPBACK].map(str::to_owned));
+        let started = self.programs.start(Program {
+            name: part.name(),
+            path: self.binaries.component.clone(),
+            arguments: arguments.collect(),
+            environment: Vec::new(),
+            tells: false,
+            hears: false,
+            stage: Stage::Components,
+        })?;
+        self.show.takes(started, &Fact::Started(part));
+        Ok(())
+    }
+
+    fn start(
+        &mut self,
+        name: &'static str,
+        path: PathBuf,
+        arguments: &[&str],
+        environment: &[(&'static str, &str)],
+    ) -> Result<(), Failure> {
+        self.programs.start(Program {
+            name,
+            path,
+            arguments: arguments.iter().copied().map(str::to_owned).collect(),
+            environment: owned(environment),
+            tells: false,
+            hears: false,
+            stage: Stage::Bridges,
+        })?;
+        Ok(())
+    }
+
+    fn start_own(
+        &mut self,
+        name: &'static str,
+        arguments: &[&str],
+        environment: &[(&'static str, &str)],
+        stage: Stage,
+    ) -> Result<(), Failure> {
+        self.programs.start(Program {
+            name,
+            path: self.binaries.demo.clone(),
+            arguments: arguments.iter().copied().map(str::to_owned).collect(),
+            environment: owned(environment),
+            tells: true,
+            hears: stage == Stage::Robots,
+            stage,
+        })?;
+        Ok(())
+    }
+
+    /// Takes what is seen until the act is over.
+    async fn watch(&mut self) -> Result<(), Failure> {
+        let act = self.show.story.act();
+        let by = Instant::now() + limit(act);
+        loop {
+            let lacks = self
+                .show
+                .story
+                .missing()
+                .map_err(|why| self.broken(why))?;
+            if lacks.is_empty() {
+                return Ok(());
+            }
+            if let Next::Late = self.next(by).await? {
+                return Err(self.missed(act, lacks));
+            }
+        }
+    }
+
+    /// The next thing that happens. Prints what is due meanwhile.
+    async fn next(&mut self, by: Instant) -> Result<Next, Failure> {
+        let mut print = interval(PRINT_EVERY);
+        loop {
+            tokio::select! {
+                report = self.reports.recv() => match report {
+                    Some(Report::Told(told)) => {
+                        if let Event::Node(event) = &told.event {
+                            self.show.takes(told.at_ns, &Fact::Node(event.clone()));
+                        }
+                        return Ok(Next::Told(told.event));
+                    }
+                    Some(Report::Garbled { name, line }) => {
+                        self.note(format!("{name} says what is no event: {line}"));
+                    }
+                    Some(Report::Killed { name, at_ns }) => {
+                        if let Some(part) = Part::of_name(name) {
+                            self.show.takes(at_ns, &Fact::Killed(part));
+                            return Ok(Next::Seen);
+                        }
+                    }
+                    Some(Report::Ended { name, status }) => {
+                        let last_lines = self.programs.last_lines(name);
+                        let logs = self.programs.directory().to_owned();
+                        return Err(Failure::ChildEnded { name, status, last_lines, logs });
+                    }
+                    // The programs hold a sender, so it does not end before them.
+                    None => return Ok(Next::Late),
+                },
+                Some((at_ns, fact)) = self.facts.recv() => {
+                    self.show.takes(at_ns, &fact);
+                    return Ok(Next::Seen);
+                }
+                () = sleep_until(by) => return Ok(Next::Late),
+                () = self.interrupt.come() => {
+                    let standing = self.show.story.missing().map_or_else(|why| why, |lacks| lacks.join("; "));
+                    return Err(Failure::Interrupted { standing });
+                }
+                _ = print.tick() => {
+                    self.show
+                        .print(Some(wall_nanos()))
+                        .map_err(Failure::io("cannot print"))?;
+                }
+            }
+        }
+    }
+
+    fn note(&mut self, what: String) {
+        self.show.timeline.note(wall_nanos(), Who::DEMO, what);
+    }
+
+    fn missed(&self, act: Act, lacks: Vec<String>) -> Failure {
+        Failure::Missed {
+            seconds: limit(act).as_secs(),
+            lacks,
+            logs: self.programs.directory().to_owned(),
+        }
+    }
+
+    fn broken(&self, why: String) -> Failure {
+        Failure::Broken {
+            why,
+            logs: self.programs.directory().to_owned(),
+        }
+    }
+}
+
+/// What has happened.
+enum Next {
+    /// A process of the demo has told something.
+    Told(Event),
+    /// Something was seen from outside, and the story has it.
+    Seen,
+    /// Nothing, and the time is over.
+    Late,
+}
+
+/// Has the MES run the process, and follows it to its end. Whether it succeeded, and why not.
+async fn call(tool: &Path) -> (bool, String) {
+    let process = format!("ProcessIri={PROCESS}");
+    let limit = RUN_LIMIT.as_secs().to_string();
+    let call = |arguments: &[&str]| {
+        command(tool)
+            .arg("call")
+            .args(arguments)
+            .args(["--interface", LOOPBACK, "--json"])
+            .stdin(Stdio::null())
+            .output()
+    };
+    // It is Halted at first; when it is not, it says so, and Start tells the rest.
+    drop(call(&["mes.ExecuteProcess.Reset"]).await);
+    let start = ["mes.ExecuteProcess", &process, "--run-timeout", &limit];
+    match call(&start).await {
+        Ok(output) if output.status.success() => (true, String::new()),
+        Ok(output) => (false, said(&output)),
+        Err(error) => (false, error.to_string()),
+    }
+}
+
+/// Asks what can run.
+async fn ask(tool: &Path, url: &str) -> Result<Asked, String> {
+    let output = command(tool)
+        .args(["ask", "what-can-run", "--url", url, "--json"])
+        .stdin(Stdio::null())
+        .output()
+        .await
+        .map_err(|error| error.to_string())?;
+    if !output.status.success() {
+        return Err(said(&output));
+    }
+    let answer: Answer = serde_json::from_slice(&output.stdout)
+        .map_err(|error| format!("its answer is not understood: {error}"))?;
+    Ok(answer.count())
+}
+
+/// The last line of what a program said.
+fn said(output: &std::process::Output) -> String {
+    let all = [&output.stdout[..], &output.stderr].concat();
+    let text = String::from_utf8_lossy(&all);
+    let last = text.lines().rev().find(|line| !line.trim().is_empty());
+    last.map_or_else(|| output.status.to_string(), str::to_owned)
+}
+
+/// The answer of `ua-space ask what-can-run --json`.
+#[derive(Debug, Deserialize)]
+struct Answer {
+    rows: Vec<Map<String, Value>>,
+}
+
+impl Answer {
+    /// How many skills and services there are, and of which something is missing: a capability or the endpoint.
+    fn count(&self) -> Asked {
+        let text = |row: &Map<String, Value>, column: &str| {
+            let value = row.get(column).and_then(Value::as_str);
+            value.unwrap_or_default().to_owned()
+        };
+        let of_kind = |kind: &str| self.rows.iter().filter(|row| text(row, "kind") == kind).count();
+        let lacks = |row: &&Map<String, Value>| {
+            let list = |column: &str| row.get(column).and_then(Value::as_array);
+            let has_capability = list("capabilities").is_some_and(|list| !list.is_empty());
+            !has_capability || list("parameters").is_none() || text(row, "endpoint").is_empty()
+        };
+        Asked {
+            skills: of_kind("skill"),
+            services: of_kind("service"),
+            incomplete: self
+                .rows
+                .iter()
+                .filter(lacks)
+                .map(|row| format!("{} {}", text(row, "component"), text(row, "name")))
+                .collect(),
+        }
+    }
+}
+
+fn owned(environment: &[(&'static str, &str)]) -> Vec<(&'static str, String)> {
+    environment
+        .iter()
+        .map(|(key, value)| (*key, (*value).to_owned()))
+        .collect()
+}
+
+/// A topic of space 0 as ROS has it.
+fn topic(namespace: u16, id: u16) -> String {
+    format!("/ua_0_{namespace}_{id}")
+}
+
+/// How long an act may take: what is counted in it does not get faster with the story.
+const fn limit(act: Act) -> Duration {
+    match act {
+        Act::Cell => Duration::from_secs(60),
+        Act::FirstRun | Act::SecondRun | Act::Vacuum => RUN_LIMIT,
+        Act::Robot
+        | Act::Gripper
+        | Act::GraspFromRos2
+        | Act::GraspFromRos1
+        | Act::Loss
+        | Act::Question
+        | Act::End => Duration::from_secs(30),
+    }
+}
+
+const LDS_PORT: u16 = 4840;
+const SERVER_PORT: u16 = 4841;
+/// Identifiers of a component's first skill: its state, its result, and the calls that start it and make it ready.
+const STATE: u16 = 101;
+const RESULT: u16 = 104;
+const START: u16 = 105;
+const RESET: u16 = 109;
+const CALL_LIMIT: Duration = Duration::from_secs(10);
+const TOOL_LIMIT: Duration = Duration::from_secs(15);
+const RUN_LIMIT: Duration = Duration::from_secs(120);
+const PRINT_EVERY: Duration = Duration::from_millis(50);
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn an_answer_is_counted_by_kind_and_what_is_incomplete_is_named() {
+        let row = |kind: &str, name: &str, capabilities: &[&str], endpoint: Option<&str>| {
+            json!({"kind": kind, "component": "c", "name": name, "capabilities": capabilities,
+                "parameters": [], "endpoint": endpoint})
+        };
+        let answer = json!({"question": "what-can-run", "columns": [], "rows": [
+            row("skill", "Grasp", &["urn:grasp"], Some("opc.tcp://127.0.0.1:1")),
+            row("skill", "Release", &[], Some("opc.tcp://127.0.0.1:1")),
+            row("service", "Dose", &["urn:dose"], None),
+        ]});
+        let answer: Answer = serde_json::from_value(answer).unwrap();
+        let expected = Asked {
+            skills: 2,
+            services: 1,
+            incomplete: vec!["c Release".to_owned(), "c Dose".to_owned()],
+        };
+        assert_eq!(answer.count(), expected);
+    }
+}

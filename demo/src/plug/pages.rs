@@ -1,0 +1,284 @@
+//! What the status pages of the programs say of the components, and what is new in it.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use serde::Deserialize;
+use serde_json::Value;
+
+use super::STATE;
+use super::fact::{Fact, Level, Part, Run};
+
+/// A fact and its time, in nanoseconds since 1970.
+pub(crate) type Dated = (i64, Fact);
+
+/// A program's page, and who can read it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Page {
+    Lds,
+    Mes,
+    Server,
+    /// A bridge: only whether it can do its work.
+    Bridge,
+}
+
+/// What one page said last.
+#[derive(Debug)]
+pub(crate) struct Reader {
+    program: &'static str,
+    page: Page,
+    ready: bool,
+    there: BTreeSet<(Part, Level)>,
+    runs: BTreeMap<usize, Run>,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct LdsPage {
+    servers: Vec<Registered>,
+    network: Vec<Announced>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Registered {
+    uri: String,
+    since_ms: u64,
+}
+
+#[derive(Debug, Deserialize)]
+struct Announced {
+    name: String,
+    since_ms: u64,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct MesPage {
+    components: Vec<Component>,
+    runs: Vec<Run>,
+}
+
+#[derive(Debug, Deserialize)]
+struct Component {
+    application_uri: String,
+    since_ms: u64,
+    #[serde(default)]
+    listed_ms: Option<u64>,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct ServerPage {
+    topics: BTreeMap<String, Topic>,
+}
+
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+struct Topic {
+    delivered: u64,
+}
+
+impl Reader {
+    pub(crate) const fn new(program: &'static str, page: Page) -> Self {
+        Self {
+            program,
+            page,
+            ready: false,
+            there: BTreeSet::new(),
+            runs: BTreeMap::new(),
+        }
+    }
+
+    /// Whether no more is to be learned of it.
+    pub(crate) fn is_done(&self) -> bool {
+        self.page == Page::Bridge && self.ready
+    }
+
+    /// What is new in the page as it is at `now_ns`.
+    pub(crate) fn read(&mut self, now_ns: i64, page: &Value) -> Vec<Dated> {
+        let mut facts = Vec::new();
+        // A bridge of several spaces has an object for each.
+        let objects = page.as_array().map_or(std::slice::from_ref(page), Vec::as_slice);
+        let is_ready = objects.iter().all(|object| {
+            let reasons = object.get("not_ready").and_then(Value::as_array);
+            reasons.is_none_or(Vec::is_empty)
+        });
+        if is_ready && !self.ready {
+            self.ready = true;
+            facts.push((now_ns, Fact::Ready(self.program)));
+        }
+        match self.page {
+            Page::Lds => self.read_lds(now_ns, &part(page), &mut facts),
+            Page::Mes => self.read_mes(now_ns, part(page), &mut facts),
+            Page::Server => self.read_server(now_ns, &part(page), &mut facts),
+            Page::Bridge => {}
+        }
+        facts
+    }
+
+    fn read_lds(&mut self, now_ns: i64, page: &LdsPage, facts: &mut Vec<Dated>) {
+        let registered = page
+            .servers
+            .iter()
+            .filter_map(|server| Some((Part::of_uri(&server.uri)?, server.since_ms)));
+        self.tell(now_ns, Level::Registered, registered, facts);
+        // The mDNS name is the name of the server, and what makes it the only one.
+        let announced = page.network.iter().filter_map(|record| {
+            let part = Part::ALL.into_iter().find(|part| {
+                let rest = record.name.strip_prefix(part.name());
+                rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('-'))
+            })?;
+            Some((part, record.since_ms))
+        });
+        self.tell(now_ns, Level::Announced, announced, facts);
+    }
+
+    fn read_mes(&mut self, now_ns: i64, page: MesPage, facts: &mut Vec<Dated>) {
+        let of = |component: &Component| Part::of_uri(&component.application_uri);
+        let listed = page.components.iter().filter_map(|component| {
+            Some((of(component)?, component.listed_ms.unwrap_or(component.since_ms)))
+        });
+        self.tell(now_ns, Level::Listed, listed, facts);
+        let known = page
+            .components
+            .iter()
+            .filter_map(|component| Some((of(component)?, component.since_ms)));
+        self.tell(now_ns, Level::InGraph, known, facts);
+        for (number, run) in page.runs.into_iter().enumerate() {
+            if self.runs.get(&number) != Some(&run) {
+                facts.push((now_ns, Fact::Run(number, run.clone())));
+                self.runs.insert(number, run);
+            }
+        }
+    }
+
+    fn read_server(&mut self, now_ns: i64, page: &ServerPage, facts: &mut Vec<Dated>) {
+        for part in Part::ALL {
+            let topic = format!("ua_0_{}_{STATE}", part.namespace());
+            let has_value = page
+                .topics
+                .get(&topic)
+                .is_some_and(|topic| topic.delivered > 0);
+            if has_value && self.there.insert((part, Level::AtServer)) {
+                facts.push((now_ns, Fact::Reached(part, Level::AtServer)));
+            }
+        }
+    }
+
+    fn tell(
+        &mut self,
+        now_ns: i64,
+        level: Level,
+        there: impl Iterator<Item = (Part, u64)>,
+        facts: &mut Vec<Dated>,
+    ) {
+        let there: BTreeMap<Part, u64> = there.collect();
+        for (part, since_ms) in &there {
+            if self.there.insert((*part, level)) {
+                facts.push((nanos(*since_ms), Fact::Reached(*part, level)));
+            }
+        }
+        for part in Part::ALL {
+            if !there.contains_key(&part) && self.there.remove(&(part, level)) {
+                facts.push((now_ns, Fact::Left(part, level)));
+            }
+        }
+    }
+}
+
+/// Of a page that is otherwise than thought nothing is known.
+fn part<T: Default + for<'de> Deserialize<'de>>(page: &Value) -> T {
+    T::deserialize(page).unwrap_or_else(|error| {
+        tracing::debug!(%error, "a page was not understood");
+        T::default()
+    })
+}
+
+pub(crate) fn nanos(ms: u64) -> i64 {
+    i64::try_from(ms).unwrap_or(i64::MAX).saturating_mul(1_000_000)
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn a_component_comes_once_and_goes_once() {
+        let mut lds = Reader::new("ua-lds", Page::Lds);
+        let page = json!({
+            "program": "ua-lds", "not_ready": [], "since_ms": 1,
+            "servers": [{"uri": "urn:example:gripper", "name": "parallel-gripper", "urls": [], "since_ms": 5}],
+            "network": [{"record_id": 1, "name": "parallel-gripper-host-4711", "url": "", "since_ms": 4}],
+        });
+        let gripper = Part::Gripper;
+        assert_eq!(
+            lds.read(9, &page),
+            [
+                (9, Fact::Ready("ua-lds")),
+                (5_000_000, Fact::Reached(gripper, Level::Registered)),
+                (4_000_000, Fact::Reached(gripper, Level::Announced)),
+            ]
+        );
+        assert_eq!(lds.read(10, &page), []);
+        let gone = json!({"not_ready": [], "servers": [], "network": []});
+        assert_eq!(
+            lds.read(11, &gone),
+            [
+                (11, Fact::Left(gripper, Level::Registered)),
+                (11, Fact::Left(gripper, Level::Announced)),
+            ]
+        );
+        assert_eq!(lds.read(12, &gone), []);
+    }
+
+    #[test]
+    fn names_that_only_begin_alike_are_others() {
+        let mut lds = Reader::new("ua-lds", Page::Lds);
+        let page = json!({"network": [{"name": "robotics-host-1", "since_ms": 4}]});
+        assert_eq!(lds.read(9, &page), [(9, Fact::Ready("ua-lds"))]);
+    }
+
+    #[test]
+    fn a_program_that_says_why_it_is_not_ready_is_not() {
+        let mut bridge = Reader::new("bridge-ros2", Page::Bridge);
+        let page = |why: &[&str]| json!([{"not_ready": []}, {"not_ready": why}]);
+        assert_eq!(bridge.read(1, &page(&["no master"])), []);
+        assert!(!bridge.is_done());
+        assert_eq!(bridge.read(2, &page(&[])), [(2, Fact::Ready("bridge-ros2"))]);
+        assert!(bridge.is_done());
+    }
+
+    #[test]
+    fn a_run_is_told_when_it_changes() {
+        let mut mes = Reader::new("ua-mes", Page::Mes);
+        let page = |outcome: &str| {
+            json!({
+                "components": [{"application_uri": "urn:example:robot", "name": "robot", "skills": 2, "since_ms": 8, "listed_ms": 7}],
+                "runs": [{"run": "urn:run:1", "process": "urn:p", "started_ms": 9, "ended_ms": null, "outcome": outcome,
+                    "plans": [{"number": 1, "retreated": null, "ran": [{"step": "Grasp", "component": "urn:example:gripper"}]}]}],
+            })
+        };
+        let facts = mes.read(1, &page("running"));
+        assert!(facts.contains(&(7_000_000, Fact::Reached(Part::Robot, Level::Listed))));
+        assert!(facts.contains(&(8_000_000, Fact::Reached(Part::Robot, Level::InGraph))));
+        let run = facts.iter().find_map(|(_, fact)| match fact {
+            Fact::Run(0, run) => Some(run),
+            _ => None,
+        });
+        assert_eq!(run.unwrap().plans[0].ran[0].step, "Grasp");
+        assert_eq!(mes.read(2, &page("running")), []);
+        assert!(matches!(mes.read(3, &page("done")).as_slice(), [(3, Fact::Run(0, _))]));
+    }
+
+    #[test]
+    fn the_server_has_seen_a_component_when_it_has_a_value_of_it() {
+        let mut server = Reader::new("ua-server", Page::Server);
+        let page = |delivered: u64| json!({"topics": {"ua_0_8_101": {"delivered": delivered, "sent": 0}}});
+        assert_eq!(server.read(1, &page(0)), [(1, Fact::Ready("ua-server"))]);
+        assert_eq!(
+            server.read(2, &page(1)),
+            [(2, Fact::Reached(Part::Vacuum, Level::AtServer))]
+        );
+    }
+}

@@ -1,0 +1,268 @@
+//! What is printed at the end: whether all happened, and how long it took beside what was published.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+
+use serde::Serialize;
+
+use super::fact::{Asked, Level, Part, Ros};
+use super::story::{Grasp, LOST_FROM, Story};
+use crate::pace::Speed;
+
+/// The outcome, as `--json` prints it. Times are in milliseconds; `null` is what has not happened.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub(crate) struct Report {
+    finished: bool,
+    failure: Option<String>,
+    speed: f64,
+    manifest: String,
+    /// By component, from the start of its process to where it is known.
+    components: BTreeMap<Part, BTreeMap<Level, Option<f64>>>,
+    /// By node, from its request.
+    grasps: BTreeMap<Ros, GraspTimes>,
+    runs: Vec<RunTimes>,
+    loss: Loss,
+    question: Option<Asked>,
+}
+
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+struct GraspTimes {
+    answered_ms: Option<f64>,
+    running_ms: Option<f64>,
+    ended_ms: Option<f64>,
+    result_ms: Option<f64>,
+    states: Vec<String>,
+}
+
+#[derive(Clone, Debug, PartialEq, Serialize)]
+struct RunTimes {
+    outcome: String,
+    plans: usize,
+    /// From its beginning to its end, with what was waited for.
+    lasted_ms: Option<u64>,
+    /// The reasons for which plans broke.
+    broke: Vec<String>,
+}
+
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+struct Loss {
+    /// From the signal to where the gripper is not known any more.
+    lost_ms: BTreeMap<Level, Option<f64>>,
+    /// From the signal to the end of the plan, with the retreat of the robot.
+    halted_and_retreated_ms: Option<f64>,
+    /// From the start of the other gripper's process to the next plan.
+    planned_anew_ms: Option<f64>,
+}
+
+impl Report {
+    pub(crate) fn of(story: &Story, speed: Speed, manifest: &str, failure: Option<String>) -> Self {
+        let levels = |part| {
+            let level = |level| (level, story.after_start(part, level));
+            Level::ALL.into_iter().map(level).collect()
+        };
+        let runs = story.runs.values().map(|run| RunTimes {
+            outcome: run.outcome.clone(),
+            plans: run.plans.len(),
+            lasted_ms: run.ended_ms.and_then(|end| end.checked_sub(run.started_ms)),
+            broke: run.plans.iter().filter_map(|plan| plan.reason.clone()).collect(),
+        });
+        Self {
+            finished: story.finished() && failure.is_none(),
+            failure,
+            speed: speed.factor(),
+            manifest: manifest.to_owned(),
+            components: Part::ALL.into_iter().map(|part| (part, levels(part))).collect(),
+            grasps: [Ros::Ros1, Ros::Ros2]
+                .into_iter()
+                .map(|ros| (ros, story.grasps.get(&ros).map(GraspTimes::of).unwrap_or_default()))
+                .collect(),
+            runs: runs.collect(),
+            loss: Loss {
+                lost_ms: LOST_FROM
+                    .into_iter()
+                    .map(|level| (level, story.after_kill(level)))
+                    .collect(),
+                halted_and_retreated_ms: story.halted_after(),
+                planned_anew_ms: story.planned_anew_after(),
+            },
+            question: story.asked.clone(),
+        }
+    }
+
+    /// The table for people.
+    pub(crate) fn table(&self) -> String {
+        let mut text = String::from("\n");
+        row(
+            &mut text,
+            "delay",
+            ["robot", "gripper", "vacuum"],
+            "published",
+        );
+        let known = |level: Level| Part::ALL.map(|part| self.known(part, level));
+        let published = |level| match level {
+            Level::Announced => "under 1 s, and 7 s",
+            _ => "-",
+        };
+        for level in Level::ALL {
+            let label = format!("process start to {}", short(level));
+            row(&mut text, &label, known(level).map(shown).each_ref().map(String::as_str), published(level));
+        }
+        let listed = Part::ALL.map(|part| {
+            let announced = self.known(part, Level::Announced)?;
+            let registered = self.known(part, Level::Registered)?;
+            Some((self.known(part, Level::Listed)? - announced.min(registered)).max(0.0))
+        });
+        row(
+            &mut text,
+            "announced to skills listed",
+            listed.map(shown).each_ref().map(String::as_str),
+            "211, 253, 313 ms",
+        );
+        for level in LOST_FROM {
+            let label = format!("killed to no longer {}", short(level));
+            let lost = self.loss.lost_ms.get(&level).copied().flatten();
+            row(&mut text, &label, ["", &shown(lost), ""], "2 s (client time-out)");
+        }
+        let halted = shown(self.loss.halted_and_retreated_ms);
+        row(&mut text, "killed to halted and robot away", ["", &halted, ""], "-");
+        let anew = shown(self.loss.planned_anew_ms);
+        row(&mut text, "process start to planned anew", ["", "", &anew], "-");
+        text.push('\n');
+        row(&mut text, "grasp started from", ["ROS 1", "ROS 2", ""], "");
+        let grasp = |of: fn(&GraspTimes) -> Option<f64>| {
+            [Ros::Ros1, Ros::Ros2].map(|ros| shown(self.grasps.get(&ros).and_then(of)))
+        };
+        for (label, [ros1, ros2]) in [
+            ("request to answer", grasp(|times| times.answered_ms)),
+            ("request to Running seen", grasp(|times| times.running_ms)),
+            ("request to result seen *", grasp(|times| times.result_ms)),
+        ] {
+            row(&mut text, label, [&ros1, &ros2, ""], "-");
+        }
+        text.push_str("* with the work of the gripper, divided by the speed\n");
+        text
+    }
+
+    fn known(&self, part: Part, level: Level) -> Option<f64> {
+        self.components.get(&part)?.get(&level).copied().flatten()
+    }
+}
+
+impl GraspTimes {
+    fn of(grasp: &Grasp) -> Self {
+        let after = |at: Option<i64>| Some(millis(at? - grasp.asked_at?));
+        let first = |state: &str| {
+            let mut states = grasp.states.iter();
+            states.find(|(_, known)| known == state).map(|(at, _)| *at)
+        };
+        let ended = grasp.has_run().then(|| grasp.states.last()).flatten();
+        Self {
+            answered_ms: after(grasp.answered.as_ref().map(|(at, _)| *at)),
+            running_ms: after(first("Running")),
+            ended_ms: after(ended.map(|(at, _)| *at)),
+            result_ms: after(grasp.result.as_ref().map(|(at, _)| *at)),
+            states: grasp.states.iter().map(|(_, state)| state.clone()).collect(),
+        }
+    }
+}
+
+/// A level in a word or two.
+const fn short(level: Level) -> &'static str {
+    match level {
+        Level::Announced => "heard by mDNS",
+        Level::Registered => "registered",
+        Level::Listed => "skills listed",
+        Level::InGraph => "in the graph",
+        Level::InSpace => "in the space",
+        Level::AtServer => "seen by ua-server",
+        Level::Ros1 => "in ROS 1",
+        Level::Ros2 => "in ROS 2",
+    }
+}
+
+fn row(text: &mut String, label: &str, cells: [&str; 3], published: &str) {
+    let [first, second, third] = cells;
+    let line = format!("{label:<40} {first:>9} {second:>9} {third:>9}   {published}");
+    // Writing to a string does not fail.
+    let _written = writeln!(text, "{}", line.trim_end());
+}
+
+fn shown(ms: Option<f64>) -> String {
+    ms.map_or_else(
+        || "-".to_owned(),
+        |ms| {
+            if ms < 1e3 {
+                format!("{ms:.0} ms")
+            } else {
+                format!("{:.2} s", ms / 1e3)
+            }
+        },
+    )
+}
+
+/// Milliseconds with three places.
+pub(crate) fn millis(nanos: i64) -> f64 {
+    #[expect(clippy::cast_precision_loss, reason = "a story lasts far less than 2^53 ns")]
+    let nanos = nanos as f64;
+    (nanos / 1e3).round() / 1e3
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::fact::{Fact, NodeEvent};
+    use super::*;
+
+    fn story() -> Story {
+        let mut story = Story::new();
+        let ms = 1_000_000;
+        for (at, fact) in [
+            (100, Fact::Started(Part::Gripper)),
+            (190, Fact::Reached(Part::Gripper, Level::Registered)),
+            (250, Fact::Reached(Part::Gripper, Level::Announced)),
+            (330, Fact::Reached(Part::Gripper, Level::Listed)),
+            (500, Fact::Node(NodeEvent::Asks { ros: Ros::Ros1 })),
+            (
+                512,
+                Fact::Node(NodeEvent::Answered {
+                    ros: Ros::Ros1,
+                    success: true,
+                    message: String::new(),
+                }),
+            ),
+        ] {
+            story.observe(at * ms, &fact);
+        }
+        story
+    }
+
+    #[test]
+    fn the_json_has_a_time_for_all_that_happened_and_null_for_the_rest() {
+        let speed = Speed::new(4.0).unwrap();
+        let report = Report::of(&story(), speed, "a.aml", Some("stuck".to_owned()));
+        let json = serde_json::to_value(&report).unwrap();
+        assert_eq!(json["finished"], false);
+        assert_eq!(json["failure"], "stuck");
+        assert_eq!(json["components"]["gripper"]["registered"], 90.0);
+        assert!(json["components"]["gripper"]["in_graph"].is_null());
+        assert!(json["components"]["robot"]["registered"].is_null());
+        assert_eq!(json["grasps"]["ros1"]["answered_ms"], 12.0);
+        assert!(json["grasps"]["ros2"]["answered_ms"].is_null());
+        assert!(json["loss"]["lost_ms"]["registered"].is_null());
+        assert!(json["question"].is_null());
+        let keys: Vec<&String> = json.as_object().unwrap().keys().collect();
+        let documented = [
+            "components", "failure", "finished", "grasps", "loss", "manifest", "question", "runs", "speed",
+        ];
+        let mut keys: Vec<&str> = keys.into_iter().map(String::as_str).collect();
+        keys.sort_unstable();
+        assert_eq!(keys, documented);
+    }
+
+    #[test]
+    fn skills_are_listed_after_the_first_word_of_the_component() {
+        let table = Report::of(&story(), Speed::new(1.0).unwrap(), "a.aml", None).table();
+        let line = table.lines().find(|line| line.starts_with("announced to skills listed"));
+        assert!(line.unwrap().contains("140 ms"), "{table}");
+        assert!(line.unwrap().ends_with("211, 253, 313 ms"), "{table}");
+    }
+}

@@ -1,0 +1,148 @@
+//! Who looks: at the status pages, at the datagrams of the group, and at the graph of ROS 1.
+
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4};
+use std::time::Duration;
+
+use serde_json::Value;
+use tcpros::Graph;
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use tokio::time::{MissedTickBehavior, interval};
+use transport::{Options, Udp};
+use uadp::{NetworkMessage, PublisherId};
+
+use super::fact::{Fact, Level, Part};
+use super::pages::{Dated, Page, Reader};
+use super::{START, topic};
+use crate::clock::wall_nanos;
+use crate::stage::{LOOPBACK, fetch};
+
+/// The tasks that look. Dropping it ends them.
+pub(crate) struct Watchers {
+    tasks: JoinSet<()>,
+    facts: mpsc::Sender<Dated>,
+}
+
+impl Watchers {
+    pub(crate) fn new() -> (Self, mpsc::Receiver<Dated>) {
+        // When nobody takes facts, those who look wait.
+        let (facts, receiver) = mpsc::channel(1024);
+        let tasks = JoinSet::new();
+        (Self { tasks, facts }, receiver)
+    }
+
+    /// Where other tasks may tell facts.
+    pub(crate) fn facts(&self) -> mpsc::Sender<Dated> {
+        self.facts.clone()
+    }
+
+    /// Runs a task for as long as the story.
+    pub(crate) fn spawn(&mut self, task: impl Future<Output = ()> + Send + 'static) {
+        self.tasks.spawn(task);
+    }
+
+    /// Looks at the page that a program serves at a port.
+    pub(crate) fn page(&mut self, program: &'static str, page: Page, port: u16) {
+        self.spawn(watch_page(Reader::new(program, page), port, self.facts()));
+    }
+
+    /// Listens in the PubSub group on the loopback interface.
+    ///
+    /// # Errors
+    /// The group cannot be joined.
+    pub(crate) fn group(&mut self) -> std::io::Result<()> {
+        let options = Options {
+            interface: Some(LOOPBACK.to_owned()),
+            ..Options::new(GROUP)
+        };
+        let udp = Udp::open(&options).map_err(std::io::Error::other)?;
+        self.spawn(listen(udp, self.facts()));
+        Ok(())
+    }
+
+    /// Looks who offers the gripper's first skill as a service of ROS 1.
+    pub(crate) fn graph(&mut self, master: String) {
+        self.spawn(watch_graph(master, self.facts()));
+    }
+}
+
+async fn watch_page(mut reader: Reader, port: u16, facts: mpsc::Sender<Dated>) {
+    let mut ticks = interval(LOOK_EVERY);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    while !reader.is_done() {
+        ticks.tick().await;
+        // Before it listens, and when it has ended, there is no page.
+        let Ok(page) = fetch::<Value>(port).await else {
+            continue;
+        };
+        for fact in reader.read(wall_nanos(), &page) {
+            if facts.send(fact).await.is_err() {
+                return;
+            }
+        }
+    }
+}
+
+async fn listen(udp: Udp, facts: mpsc::Sender<Dated>) {
+    let mut buffer = vec![0; MOST_BYTES];
+    let mut heard = Vec::new();
+    while heard.len() < Part::ALL.len() {
+        let Ok((length, _)) = udp.recv(&mut buffer).await else {
+            tokio::time::sleep(LOOK_EVERY).await;
+            continue;
+        };
+        let Some(part) = buffer.get(..length).and_then(value_of) else {
+            continue;
+        };
+        if !heard.contains(&part) {
+            heard.push(part);
+            let fact = (wall_nanos(), Fact::Reached(part, Level::InSpace));
+            if facts.send(fact).await.is_err() {
+                return;
+            }
+        }
+    }
+}
+
+/// The component of whose values a datagram is, if it is of one.
+fn value_of(datagram: &[u8]) -> Option<Part> {
+    let message = NetworkMessage::decode(datagram).ok()?;
+    if message.publisher_id() != Some(PublisherId::UInt16(0)) || message.is_action() {
+        return None;
+    }
+    let part = Part::of_namespace(message.group()?.writer_group_id?)?;
+    let mut messages = message.messages();
+    messages
+        .any(|message| {
+            let fields = message.ok().and_then(|message| message.fields().ok().map(|f| f.len()));
+            fields.is_some_and(|fields| fields > 0)
+        })
+        .then_some(part)
+}
+
+async fn watch_graph(master: String, facts: mpsc::Sender<Dated>) {
+    let service = topic(Part::Gripper.namespace(), START);
+    let mut ticks = interval(LOOK_EVERY);
+    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut was_there = false;
+    loop {
+        ticks.tick().await;
+        let Ok(graph) = Graph::of_master(&master, "/demo").await else {
+            continue;
+        };
+        let is_there = graph.services.contains_key(&service);
+        if was_there && !is_there {
+            let fact = (wall_nanos(), Fact::Left(Part::Gripper, Level::Ros1));
+            if facts.send(fact).await.is_err() {
+                return;
+            }
+        }
+        was_there = is_there;
+    }
+}
+
+/// The group that programs take unless they are told another.
+const GROUP: SocketAddr =
+    SocketAddr::V4(SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 40), 4840));
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+const MOST_BYTES: usize = 65_536;
