@@ -1,5 +1,6 @@
 //! A component of the cell, by its own YAML.
 
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::OnceLock;
@@ -14,8 +15,15 @@ use ua_component::{ComponentPort, Options, made};
 #[command(name = "ua-component", version)]
 struct UaComponent {
     /// The YAML of the component
-    #[arg(value_name = "COMPONENT", env = "UA_COMPONENT")]
-    component: PathBuf,
+    #[arg(
+        value_name = "COMPONENT",
+        env = "UA_COMPONENT",
+        required_unless_present = "nodeset"
+    )]
+    component: Option<PathBuf>,
+    /// Print the NodeSet with the skill types, and exit
+    #[arg(long)]
+    nodeset: bool,
     /// Check the YAML and the types it names, print every finding, and exit
     #[arg(long)]
     check: bool,
@@ -49,19 +57,20 @@ fn main() -> ExitCode {
 }
 
 impl UaComponent {
-    fn file(&self) -> String {
-        self.component.display().to_string()
+    /// The YAML; an empty path where the command line did not have to say one.
+    fn file(&self) -> &Path {
+        self.component.as_deref().unwrap_or_else(|| Path::new(""))
     }
 
     fn read(&self) -> Result<&Read, Failure> {
         if let Some(read) = self.read.get() {
             return Ok(read);
         }
-        let file = self.file();
-        let text = std::fs::read_to_string(&self.component).map_err(|error| {
+        let file = self.file().display().to_string();
+        let text = std::fs::read_to_string(self.file()).map_err(|error| {
             Failure::new(FailureKind::Io, format!("cannot read {file}: {error}"))
         })?;
-        let folder = self.component.parent().unwrap_or_else(|| Path::new(""));
+        let folder = self.file().parent().unwrap_or_else(|| Path::new(""));
         let mut component = Component::from_yaml(&text, folder).map_err(|findings| {
             let count = findings.len();
             ua_component::print(&findings.render(&file, &text));
@@ -98,7 +107,7 @@ impl UaComponent {
             trust_any_client: self.trust_any_client_certificate,
             mdns: Some(mdns),
             capabilities: vec!["DA".to_owned()],
-            source: Some((read.text.clone(), self.file())),
+            source: Some((read.text.clone(), self.file().display().to_string())),
         }
     }
 }
@@ -116,6 +125,12 @@ impl Program for UaComponent {
     }
 
     fn made(&self) -> Result<Option<Made>, Failure> {
+        if self.nodeset {
+            let mut out = std::io::stdout().lock();
+            let printed = out.write_all(skills::model::nodeset().as_bytes());
+            printed.map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
+            return Ok(Some(Made::Checked));
+        }
         let read = self.read()?;
         if self.check {
             ua_component::check(&read.component, &self.options(read))?;

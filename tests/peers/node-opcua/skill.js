@@ -32,7 +32,7 @@ async function main([url, uri, k]) {
     const { statusCode } = await session.call({ objectId: node(skill), methodId: node(id), inputArguments: [] });
     return statusCode.name;
   };
-  const subscription = ClientSubscription.create(session, { requestedPublishingInterval: 20 });
+  const subscription = ClientSubscription.create(session, { requestedPublishingInterval: 20, publishingEnabled: true });
   const seen = [];
   const item = ClientMonitoredItem.create(
     subscription,

@@ -462,7 +462,7 @@ const HEAD: &str = r#"<?xml version="1.0" encoding="utf-8"?>
   </NamespaceUris>
   <Models>
     <Model ModelUri="{NAMESPACE}" Version="0.1.0" PublicationDate="2026-11-25T00:00:00Z">
-      <RequiredModel ModelUri="http://opcfoundation.org/UA/" />
+      <RequiredModel ModelUri="http://opcfoundation.org/UA/" Version="1.05.02" PublicationDate="2022-11-01T00:00:00Z" />
     </Model>
   </Models>
   <Aliases>

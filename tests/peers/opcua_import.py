@@ -1,0 +1,45 @@
+"""Loads NodeSet files one after the other into a server of its own, and says which object types they bring.
+
+opcua_import.py FILE...
+"""
+
+import asyncio
+import json
+import logging
+import sys
+
+from asyncua import Server, ua
+
+
+class Complaints(logging.Handler):
+    def __init__(self):
+        super().__init__(logging.WARNING)
+        self.said = []
+
+    def emit(self, record):
+        self.said.append(record.getMessage())
+
+
+async def main():
+    server = Server()
+    await server.init()
+    complaints = Complaints()
+    logging.getLogger("asyncua.common.xmlimporter").addHandler(complaints)
+    logging.getLogger("asyncua.common.xmlparser").addHandler(complaints)
+    for file in sys.argv[1:]:
+        types, values = {}, {}
+        for node in await server.import_xml(file):
+            node = server.get_node(node)
+            name = (await node.read_browse_name()).Name
+            kind = await node.read_node_class()
+            if kind == ua.NodeClass.ObjectType:
+                above = await node.get_referenced_nodes(ua.ObjectIds.HasSubtype, ua.BrowseDirection.Inverse)
+                types[name] = [(await of.read_browse_name()).Name for of in above]
+            elif kind == ua.NodeClass.Variable:
+                value = (await node.read_data_value(raise_on_bad_status=False)).Value
+                if value is not None and isinstance(value.Value, (int, float, str)):
+                    values[name] = value.Value
+        print(json.dumps({"types": types, "values": values, "complaints": complaints.said}), flush=True)
+
+
+asyncio.run(main())

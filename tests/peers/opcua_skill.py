@@ -1,0 +1,214 @@
+"""Calls skills as a client does that knows Programs of OPC 10000-10 only, and says what it sees as JSON lines.
+
+opcua_skill.py ENDPOINT walk       all states and methods of skill 1, which does not end by itself, then a run of skill 2, which does
+opcua_skill.py ENDPOINT refused    what skill 3 says to a Start without a parameter, with wrong ones, and with good ones
+opcua_skill.py ENDPOINT find:TYPE  the objects whose type is that one of urn:ua-bridge:skills or a subtype
+"""
+
+import argparse
+import asyncio
+import json
+
+from asyncua import ua
+from opcua_session import add_arguments, client_of, plain
+
+STATES = {2406: "Halted", 2400: "Ready", 2402: "Running", 2404: "Suspended"}
+METHODS = {"Start": 5, "Halt": 6, "Suspend": 7, "Resume": 8, "Reset": 9}
+OF_THE_TYPE = {"Start": 2426, "Suspend": 2427, "Resume": 2428, "Halt": 2429, "Reset": 2430}
+WAYS = {
+    "Halted": [],
+    "Ready": ["Reset"],
+    "Running": ["Reset", "Start"],
+    "Suspended": ["Reset", "Start", "Suspend"],
+}
+FIELDS = [
+    ["EventType"], ["SourceName"], ["Severity"], ["Message"], ["FromState"], ["FromState", "Id"], ["FromState", "Number"],
+    ["ToState"], ["ToState", "Id"], ["ToState", "Number"], ["Transition"], ["Transition", "Id"], ["Transition", "Number"],
+]
+
+
+def say(**what):
+    print(json.dumps(what), flush=True)
+
+
+class Skill:
+    def __init__(self, client, ns, number):
+        self.client, self.ns, self.first = client, ns, 100 * number
+        self.node = self.at(0)
+
+    def at(self, offset):
+        return self.client.get_node(ua.NodeId(self.first + offset, self.ns))
+
+    async def child(self, *path):
+        node = self.node
+        for name in path:
+            children = await node.get_children()
+            names = [(await child.read_browse_name()).Name for child in children]
+            node = children[names.index(name)]
+        return node
+
+    async def state(self):
+        current = await self.child("CurrentState", "Id")
+        return STATES[(await current.read_value()).Identifier]
+
+    async def shown(self):
+        values = [await self.state()]
+        for path in [("CurrentState",), ("CurrentState", "Number"), ("RunId",), ("LastTransition",)]:
+            # There is no last transition before the first.
+            shown = await (await self.child(*path)).read_data_value(raise_on_bad_status=False)
+            value = shown.Value.Value if shown.Value else None
+            values.append(value.Text if isinstance(value, ua.LocalizedText) else plain(value))
+        return values
+
+    async def call(self, method, of_type=False):
+        node = ua.NodeId(OF_THE_TYPE[method], 0) if of_type else self.at(METHODS[method]).nodeid
+        try:
+            await self.node.call_method(node)
+            return "Good"
+        except ua.UaStatusCodeError as error:
+            return ua.status_codes.get_name_and_doc(error.code)[0]
+
+    async def executable(self, method):
+        return (await self.at(METHODS[method]).read_attribute(ua.AttributeIds.Executable)).Value.Value
+
+    async def write(self, name, value):
+        node = await self.child("ParameterSet", name)
+        try:
+            await node.write_value(value)
+            return "Good"
+        except ua.UaStatusCodeError as error:
+            return ua.status_codes.get_name_and_doc(error.code)[0]
+
+    async def result(self):
+        group = await self.child("FinalResultData")
+        result = {}
+        for child in await group.get_children():
+            result[(await child.read_browse_name()).Name] = plain(await child.read_value())
+        return result
+
+
+class Events:
+    """The transition events of skills."""
+
+    def __init__(self):
+        self.seen = []
+
+    async def begin(self, client, skills):
+        subscription = await client.create_subscription(20, self)
+        selects = [
+            ua.SimpleAttributeOperand(
+                TypeDefinitionId=ua.NodeId(ua.ObjectIds.BaseEventType),
+                BrowsePath=[ua.QualifiedName(name, 0) for name in path],
+                AttributeId=ua.AttributeIds.Value,
+            )
+            for path in FIELDS
+        ]
+        for skill in skills:
+            await subscription.subscribe_events(skill.node, evfilter=ua.EventFilter(SelectClauses=selects), queuesize=100)
+
+    def event_notification(self, event):
+        values = {}
+        for path, field in zip(FIELDS, event.event_fields):
+            value = field.Value
+            if isinstance(value, ua.NodeId):
+                value = value.to_string()
+            elif isinstance(value, ua.LocalizedText):
+                value = value.Text
+            values[".".join(path)] = value
+        self.seen.append(values)
+        say(event=values)
+
+
+async def until(what, seconds=20):
+    for _ in range(int(seconds / 0.02)):
+        if await what():
+            return
+        await asyncio.sleep(0.02)
+    raise TimeoutError
+
+
+async def walk(client, ns):
+    skill, quick = Skill(client, ns, 1), Skill(client, ns, 2)
+    events = Events()
+    await events.begin(client, [skill, quick])
+    for state, way in WAYS.items():
+        for method in METHODS:
+            if await skill.state() != "Halted":
+                await skill.call("Halt")
+            for step in way:
+                assert await skill.call(step) == "Good", (state, step)
+            before, executable = await skill.shown(), await skill.executable(method)
+            status = await skill.call(method, of_type=method == "Start")
+            after = await skill.shown()
+            say(state=state, method=method, executable=executable, status=status, before=before, after=after)
+    await quick.call("Reset")
+    await quick.call("Start")
+
+    async def ended():
+        return await quick.state() == "Ready"
+
+    await until(ended)
+    say(result=await quick.result(), state=await quick.state())
+    diagnostic = await (await quick.child("ProgramDiagnostic")).read_value()
+    say(diagnostic={"method": diagnostic.LastMethodCall, "status": diagnostic.LastMethodReturnStatus.name})
+
+    async def all_seen():
+        return {event["Transition.Number"] for event in events.seen} == set(range(1, 10))
+
+    await until(all_seen)
+
+
+async def refused(client, ns):
+    move = Skill(client, ns, 3)
+    await move.call("Reset")
+    double = lambda value, kind=ua.VariantType.Double: ua.Variant(value, kind)
+    say(what="without", status=await move.call("Start"), shown=await move.shown())
+    say(what="short", status=await move.write("TargetPosition", double([0.1] * 5)), shown=await move.shown())
+    say(what="text", status=await move.write("TargetPosition", ua.Variant("here")), shown=await move.shown())
+    say(what="fast", status=await move.write("MaxVelocity", double(99.0)), shown=await move.shown())
+    await move.write("TargetPosition", double([3.0] * 6))
+    say(what="far", status=await move.call("Start"), shown=await move.shown())
+    await move.write("TargetPosition", double([0.3, 0.1, 0.4, 0.0, 0.0, 0.0]))
+    say(what="good", status=await move.call("Start"), shown=await move.shown())
+    say(what="while it runs", status=await move.write("MaxVelocity", double(1.0)), shown=await move.shown())
+
+
+async def find(client, name):
+    """By the references of types alone: no name but that of the wanted type."""
+    ns = await client.get_namespace_index("urn:ua-bridge:skills")
+    path = ["0:Types", "0:ObjectTypes", "0:BaseObjectType"]
+    types, wanted = [await client.nodes.root.get_child(path)], None
+    for of in types:
+        if (await of.read_browse_name()) == ua.QualifiedName(name, ns):
+            wanted = of
+        types += await of.get_children(refs=ua.ObjectIds.HasSubtype)
+    closure = [wanted]
+    for of in closure:
+        closure += await of.get_children(refs=ua.ObjectIds.HasSubtype)
+    ids = [of.nodeid for of in closure]
+    objects = [client.nodes.objects]
+    for node in objects:
+        if node.nodeid == ua.NodeId(ua.ObjectIds.Server):
+            continue
+        definition = await node.read_type_definition()
+        if definition in ids:
+            of = (await client.get_node(definition).read_browse_name()).Name
+            say(name=(await node.read_browse_name()).Name, type=of, node=node.nodeid.to_string())
+        else:
+            objects += await node.get_children(nodeclassmask=ua.NodeClass.Object)
+
+
+async def main():
+    parser = argparse.ArgumentParser()
+    add_arguments(parser)
+    parser.add_argument("part")
+    args = parser.parse_args()
+    async with await client_of(args) as client:
+        if args.part.startswith("find:"):
+            await find(client, args.part.removeprefix("find:"))
+            return
+        ns = await client.get_namespace_index("urn:ua-bridge:system-tests:component")
+        await {"walk": walk, "refused": refused}[args.part](client, ns)
+
+
+asyncio.run(main())

@@ -1,0 +1,266 @@
+//! A component as clients of other makers see it: asyncua and node-opcua call its skills, which they know as Programs only.
+
+use std::fs;
+use std::path::Path;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use system_tests::{Cell, Child, Peer, Started, eventually, program};
+
+const SOON: Duration = Duration::from_secs(30);
+const ENDPOINT: &str = "opc.tcp://127.0.0.1:4855";
+const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/plant");
+const FAULTS: &str = concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/../plant/skills/tests/faults.yaml"
+);
+const FAULTS_TOLD: &str = concat!(
+    env!("CARGO_MANIFEST_DIR"),
+    "/../plant/skills/tests/faults.txt"
+);
+
+/// A skill that goes on until it is halted, one that is done at once, and one that must be told where to.
+const COMPONENT: &str = "
+component: bench
+application_uri: urn:ua-bridge:system-tests:component
+namespace: 9
+skills:
+  - {name: Hold, type: GraspSkillType, driver: {simulated: {duration: 10 min}}}
+  - {name: Let, type: ReleaseSkillType, driver: {simulated: {duration: 50 ms}}}
+  - {name: Move, type: PtpMoveSkillType, driver: simulated}
+";
+
+/// Transition, its node, from, to: by number, as OPC 10000-10 has them.
+const TRANSITIONS: [(&str, &str, &str, &str); 9] = [
+    ("HaltedToReady", "i=2408", "Halted", "Ready"),
+    ("ReadyToRunning", "i=2410", "Ready", "Running"),
+    ("RunningToHalted", "i=2412", "Running", "Halted"),
+    ("RunningToReady", "i=2414", "Running", "Ready"),
+    ("RunningToSuspended", "i=2416", "Running", "Suspended"),
+    ("SuspendedToRunning", "i=2418", "Suspended", "Running"),
+    ("SuspendedToHalted", "i=2420", "Suspended", "Halted"),
+    ("SuspendedToReady", "i=2422", "Suspended", "Ready"),
+    ("ReadyToHalted", "i=2424", "Ready", "Halted"),
+];
+
+fn component_started(file: &Path, args: &[&str]) -> Started {
+    Started::new("ua-component", &program("ua-component"))
+        .args([file])
+        .args(args)
+}
+
+fn component(file: &Path) -> Child {
+    let args = [
+        "--endpoint",
+        ENDPOINT,
+        "--lds",
+        "none",
+        "--interface",
+        "lo",
+        "--metrics",
+        "127.0.0.1:9855",
+    ];
+    let child = component_started(file, &args).start();
+    eventually("the component serves", SOON, || {
+        std::net::TcpStream::connect(ENDPOINT.trim_start_matches("opc.tcp://")).ok()
+    });
+    child
+}
+
+fn state(name: &str) -> (u32, &'static str) {
+    match name {
+        "Halted" => (11, "i=2406"),
+        "Ready" => (12, "i=2400"),
+        "Running" => (13, "i=2402"),
+        _ => (14, "i=2404"),
+    }
+}
+
+#[test]
+fn a_client_walks_all_states_and_methods_and_sees_nine_kinds_of_transition() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _component = component(&cell.file("component.yaml", COMPONENT));
+    let lines = cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "walk"]);
+
+    let cells: Vec<&Value> = lines
+        .iter()
+        .filter(|line| line.get("method").is_some())
+        .collect();
+    assert_eq!(cells.len(), 20);
+    let mut taken = Vec::new();
+    for cell in cells {
+        let (before, after) = (&cell["before"], &cell["after"]);
+        if cell["status"] == "Good" {
+            taken.push((
+                cell["state"].as_str().unwrap(),
+                cell["method"].as_str().unwrap(),
+                after[0].as_str().unwrap(),
+            ));
+        } else {
+            assert_eq!(
+                (&cell["status"], before),
+                (&json!("BadInvalidState"), after),
+                "{cell}"
+            );
+        }
+        assert_eq!(cell["executable"], cell["status"] == "Good", "{cell}");
+        let (number, _) = state(after[0].as_str().unwrap());
+        assert_eq!(
+            (&after[0], &after[2]),
+            (&after[1], &json!(number)),
+            "{cell}"
+        );
+    }
+    taken.sort_unstable();
+    let mut expected = [
+        ("Halted", "Reset", "Ready"),
+        ("Ready", "Start", "Running"),
+        ("Ready", "Halt", "Halted"),
+        ("Running", "Halt", "Halted"),
+        ("Running", "Suspend", "Suspended"),
+        ("Suspended", "Resume", "Running"),
+        ("Suspended", "Halt", "Halted"),
+        ("Suspended", "Reset", "Ready"),
+    ];
+    expected.sort_unstable();
+    assert_eq!(taken, expected);
+
+    for (number, (name, id, from, to)) in (1..).zip(TRANSITIONS) {
+        let seen = lines.iter().filter_map(|line| line.get("event"));
+        let seen = seen
+            .into_iter()
+            .find(|event| event["Transition.Number"] == number);
+        let event = seen.unwrap_or_else(|| panic!("no event of {name}"));
+        let ((from_number, from_id), (to_number, to_id)) = (state(from), state(to));
+        let fields = [
+            ("Transition", json!(name)),
+            ("Transition.Id", json!(id)),
+            ("FromState", json!(from)),
+            ("FromState.Id", json!(from_id)),
+            ("FromState.Number", json!(from_number)),
+            ("ToState", json!(to)),
+            ("ToState.Id", json!(to_id)),
+            ("ToState.Number", json!(to_number)),
+        ];
+        for (field, value) in fields {
+            assert_eq!(event[field], value, "{field} of {event}");
+        }
+        assert!(
+            event["EventType"]
+                .as_str()
+                .is_some_and(|of| of.ends_with("i=2000")),
+            "{event}"
+        );
+    }
+    let result = lines.iter().find_map(|line| line.get("result")).unwrap();
+    assert_eq!(
+        (&result["Run"], &result["Succeeded"]),
+        (&json!(1), &json!(true))
+    );
+    let diagnostic = lines
+        .iter()
+        .find_map(|line| line.get("diagnostic"))
+        .unwrap();
+    assert_eq!(*diagnostic, json!({"method": "Start", "status": "Good"}));
+}
+
+#[test]
+fn a_start_without_its_parameter_or_with_a_wrong_one_moves_nothing_and_says_which() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _component = component(&cell.file("component.yaml", COMPONENT));
+    let lines = cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "refused"]);
+    let told: Vec<(&str, &str, &str)> = lines
+        .iter()
+        .filter_map(|line| {
+            Some((
+                line["what"].as_str()?,
+                line["status"].as_str()?,
+                line["shown"][0].as_str()?,
+            ))
+        })
+        .collect();
+    let expected = [
+        ("without", "BadArgumentsMissing", "Ready"),
+        ("short", "BadInvalidArgument", "Ready"),
+        ("text", "BadTypeMismatch", "Ready"),
+        ("fast", "BadInvalidArgument", "Ready"),
+        ("far", "BadInvalidArgument", "Ready"),
+        ("good", "Good", "Running"),
+        ("while it runs", "BadInvalidState", "Running"),
+    ];
+    assert_eq!(told, expected);
+}
+
+#[test]
+fn a_type_of_another_maker_is_loaded_found_by_its_supertype_and_run_by_other_clients() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
+        return;
+    };
+    let mut printed = Started::new("ua-component", &program("ua-component"))
+        .args(["--nodeset"])
+        .start();
+    assert!(printed.wait_for_end(SOON).success());
+    let nodeset = cell.file("skills.xml", &printed.lines().join("\n"));
+    let vendor = Path::new(EXAMPLES).join("vacuum-gripper.xml");
+    let files = [nodeset.to_str().unwrap(), vendor.to_str().unwrap()];
+    let loaded = cell.asyncua_once("opcua_import.py", &files);
+    assert_eq!(loaded[0]["complaints"], json!([]));
+    assert_eq!(
+        loaded[0]["types"]["GraspSkillType"],
+        json!(["GripperSkillType"])
+    );
+    assert_eq!(
+        loaded[0]["types"]["SkillType"],
+        json!(["ProgramStateMachineType"])
+    );
+    assert_eq!(loaded[0]["values"]["Force"], json!(20.0));
+    assert_eq!(
+        loaded[1]["types"]["VacuumGraspSkillType"],
+        json!(["GraspSkillType"])
+    );
+
+    let _component = component(&Path::new(EXAMPLES).join("vacuum-gripper.yaml"));
+    let found = cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "find:GraspSkillType"]);
+    let found: Vec<(&Value, &Value)> = found
+        .iter()
+        .map(|line| (&line["name"], &line["type"]))
+        .collect();
+    assert_eq!(
+        found,
+        [(&json!("VacuumGrasp"), &json!("VacuumGraspSkillType"))]
+    );
+    let lines = cell.node_opcua_once("skill.js", &[ENDPOINT, "urn:example:vacuum-gripper", "1"]);
+    let numbers: Vec<&Value> = lines.iter().filter_map(|line| line.get("number")).collect();
+    assert_eq!(numbers, [&json!(1), &json!(2), &json!(4)]);
+    assert_eq!(
+        *lines.last().unwrap(),
+        json!({"reset": "Good", "start": "Good", "state": "Ready"})
+    );
+}
+
+#[test]
+fn a_yaml_with_faults_is_refused_with_all_of_them() {
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    for args in [&["--check"][..], &[]] {
+        let mut child = component_started(Path::new(FAULTS), args).start();
+        assert_eq!(child.wait_for_end(SOON).code(), Some(78));
+        let lines = child.lines();
+        let expected = fs::read_to_string(FAULTS_TOLD).unwrap();
+        for line in expected.lines().filter(|line| line.starts_with("error[")) {
+            assert!(
+                lines.iter().any(|told| told == line),
+                "{line} is not in {lines:#?}"
+            );
+        }
+    }
+    for example in ["parallel-gripper.yaml", "robot.yaml", "vacuum-gripper.yaml"] {
+        let mut child = component_started(&Path::new(EXAMPLES).join(example), &["--check"]).start();
+        assert!(child.wait_for_end(SOON).success(), "{child}");
+    }
+}
