@@ -48,67 +48,54 @@ fn run(what: &str, wanted: impl Fn(&Value) -> bool) -> Value {
     })
 }
 
-#[test]
-fn a_gripper_that_is_killed_in_the_middle_is_replaced_by_another_makers() {
-    let Some(cell) = Cell::with(&[]) else { return };
+/// A list in an answer.
+fn list<'a>(value: &'a Value, key: &str) -> &'a [Value] {
+    value[key].as_array().map_or(&[], Vec::as_slice)
+}
+
+/// The MES, asked for the process while nobody is there for it; and how many services its module has.
+fn mes(cell: &Cell) -> (Child, usize) {
     for file in ["capabilities.ttl", "vacuum-gripper.xml"] {
         fs::copy(Path::new(EXAMPLES).join(file), cell.folder().join(file)).unwrap();
     }
     let manifests = format!("manifests: [{{name: dancer, file: {MANIFEST}}}]\nprocesses:\n");
-    let changes: &[(&str, &str)] = if Path::new(MANIFEST).exists() {
-        &[("processes:\n", &manifests)]
+    let with_module = [("processes:\n", manifests.as_str())];
+    let changes = if Path::new(MANIFEST).exists() {
+        &with_module[..]
     } else {
         &[]
     };
-    let _mes = start(&cell, "ua-mes", "mes.yaml", changes, &["--run", PROCESS]);
+    let mes = start(cell, "ua-mes", "mes.yaml", changes, &["--run", PROCESS]);
     let waiting = run("the process waits for somebody", |run| {
         run["waits_for"].is_string()
     });
+    let waits_for = waiting["waits_for"].as_str().unwrap();
     assert!(
-        waiting["waits_for"]
-            .as_str()
-            .unwrap()
-            .contains("urn:example:capability:grasp"),
-        "{waiting}"
+        waits_for.contains("urn:example:capability:grasp"),
+        "{waits_for}"
     );
+    (mes, 6 * changes.len())
+}
 
-    let _robot = start(
-        &cell,
-        "ua-component",
-        "robot.yaml",
-        &[("{reach: 1.3}", "{reach: 1.3, time_scale: 20}")],
-        &[],
-    );
-    let gripper = start(
-        &cell,
-        "ua-component",
-        "parallel-gripper.yaml",
-        &[("400 ms", "60 s")],
-        &[],
-    );
+#[test]
+fn a_gripper_that_is_killed_in_the_middle_is_replaced_by_another_makers() {
+    let Some(cell) = Cell::with(&[]) else { return };
+    let (_mes, services) = mes(&cell);
+    let fast = [("{reach: 1.3}", "{reach: 1.3, time_scale: 20}")];
+    let _robot = start(&cell, "ua-component", "robot.yaml", &fast, &[]);
+    let slow = [("400 ms", "60 s")];
+    let gripper = start(&cell, "ua-component", "parallel-gripper.yaml", &slow, &[]);
     run("the gripper grasps", |run| {
-        let ran = run["plans"][0]["ran"]
-            .as_array()
-            .and_then(|ran| ran.last().cloned())
-            .unwrap_or_default();
-        ran["step"] == "Grasp" && ran["outcome"] == "running"
+        let last = list(&run["plans"][0], "ran").last();
+        last.is_some_and(|ran| ran["step"] == "Grasp" && ran["outcome"] == "running")
     });
     let can_run = rows("what-can-run");
     let of = |component: &str| {
-        can_run
-            .iter()
-            .filter(|row| row["component"] == component)
-            .count()
+        let rows = can_run.iter().filter(|row| row["component"] == component);
+        rows.count()
     };
-    assert_eq!(
-        (of("robot"), of("parallel-gripper"), of("mes")),
-        (2, 2, 1),
-        "{can_run:?}"
-    );
-    assert_eq!(
-        of("PiMAd-core:0.0.1"),
-        if changes.is_empty() { 0 } else { 6 }
-    );
+    let there = ["robot", "parallel-gripper", "mes", "PiMAd-core:0.0.1"].map(of);
+    assert_eq!(there, [2, 2, 1, services], "{can_run:?}");
     let plan = get(&format!("/plan/{PROCESS}")).unwrap();
     assert_eq!(plan["complete"], true, "{plan}");
 
@@ -116,72 +103,45 @@ fn a_gripper_that_is_killed_in_the_middle_is_replaced_by_another_makers() {
     let broken = run("the plan is broken and another is waited for", |run| {
         run["plans"][0]["outcome"] == "failed" && run["waits_for"].is_string()
     });
-    assert_eq!(broken["plans"][0]["retreated"], true, "{broken}");
-    let ran: Vec<&str> = broken["plans"][0]["ran"]
-        .as_array()
-        .unwrap()
+    let plan = &broken["plans"][0];
+    assert_eq!(plan["retreated"], true, "{broken}");
+    let ran: Vec<_> = list(plan, "ran")
         .iter()
         .filter_map(|ran| ran["step"].as_str())
         .collect();
-    assert_eq!(
-        ran,
-        [
-            "MovePickApproachBefore",
-            "MovePick",
-            "Grasp",
-            "MovePickApproachError"
-        ]
-    );
+    let steps = ["MovePickApproachBefore", "MovePick", "Grasp"];
+    assert_eq!(ran, [&steps[..], &["MovePickApproachError"]].concat());
     eventually("the gripper is gone from the graph", SOON, || {
-        rows("components")
-            .iter()
-            .all(|row| row["name"] != "parallel-gripper")
-            .then_some(())
+        let there = rows("components");
+        let mut names = there.iter().map(|row| &row["name"]);
+        names.all(|name| name != "parallel-gripper").then_some(())
     });
 
-    let _vacuum = start(
-        &cell,
-        "ua-component",
-        "vacuum-gripper.yaml",
-        &[("300 ms", "50 ms"), ("200 ms", "50 ms")],
-        &[],
-    );
+    let fast = [("300 ms", "50 ms"), ("200 ms", "50 ms")];
+    let _vacuum = start(&cell, "ua-component", "vacuum-gripper.yaml", &fast, &[]);
     let done = run("the process is done", |run| run["outcome"] == "done");
-    let plans = done["plans"].as_array().unwrap();
-    assert_eq!(
-        (plans.len(), &plans[1]["outcome"]),
-        (2, &"done".into()),
-        "{done}"
-    );
-    let vacuum = "urn:example:vacuum-gripper#i=100";
-    let grasp = plans[1]["steps"][0]["needs"]
-        .as_array()
-        .unwrap()
-        .iter()
-        .find(|need| need["role"] == "grasp")
-        .unwrap();
-    assert_eq!(grasp["chosen"], vacuum);
+    is_replaced(&done);
+}
+
+/// The vacuum gripper was chosen by what is above its type and capability, and the graph has all of it.
+fn is_replaced(run: &Value) {
+    let [_, plan] = list(run, "plans") else {
+        panic!("{run}")
+    };
+    assert_eq!(plan["outcome"], "done", "{run}");
+    let mut needs = list(&plan["steps"][0], "needs").iter();
+    let grasp = needs.find(|need| need["role"] == "grasp").unwrap();
+    assert_eq!(grasp["chosen"], "urn:example:vacuum-gripper#i=100");
     let why = grasp["candidates"][0]["why"].as_str().unwrap();
-    assert!(
-        why.contains("hold-by-vacuum, which is below urn:example:capability:grasp"),
-        "{why}"
-    );
+    let by_subclass = "hold-by-vacuum, which is below urn:example:capability:grasp";
+    assert!(why.contains(by_subclass), "{why}");
     let by_type = rows("skills?type=urn:ua-bridge:skills%23i=1200");
     let types: Vec<&Value> = by_type.iter().map(|row| &row["type"]).collect();
-    assert_eq!(
-        types,
-        ["VacuumGraspSkillType"],
-        "found by the type above its own"
-    );
-    let lost: Vec<Value> = rows("run-steps")
-        .into_iter()
-        .filter(|row| row["outcome"] == "lost")
-        .collect();
-    assert_eq!(
-        (lost.len(), &lost[0]["component"]),
-        (1, &"urn:example:gripper".into()),
-        "{lost:?}"
-    );
+    assert_eq!(types, ["VacuumGraspSkillType"], "by the type above its own");
+    let mut ran = rows("run-steps");
+    ran.retain(|row| row["outcome"] == "lost");
+    let lost: Vec<&Value> = ran.iter().map(|row| &row["component"]).collect();
+    assert_eq!(lost, ["urn:example:gripper"]);
     assert_eq!(rows("runs")[0]["outcome"], "done");
 }
 

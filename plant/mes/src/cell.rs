@@ -113,30 +113,19 @@ impl Cell {
             namespace: first.namespace,
             skills: found.iter().filter_map(skill_facts).collect(),
         };
-        let (triples, left_out) = facts.triples();
-        for iri in left_out {
-            warn!(
-                component = facts.name,
-                capability = iri,
-                "a capability is no IRI and is left out"
-            );
-        }
-        let iri = facts.iri();
-        let now = now();
-        // Who comes under a URI that another has takes its place.
+        // Who comes under a URI that another has takes its place; who says something else of itself keeps its own.
         self.remove(
-            |component| component.application_uri == application_uri,
+            |known| known.application_uri == application_uri && known.discovered != seen.name,
             "another came under its ApplicationUri",
         );
-        if let Err(fault) = self.knowledge.replace(
-            &Source::new(SourceKind::Component, application_uri),
-            &triples,
-            now,
-        ) {
-            error!(
-                component = facts.name,
-                "what a component says is not taken into the graph: {fault}"
-            );
+        let iri = facts.iri();
+        let since = self
+            .present()
+            .components
+            .get(&iri)
+            .map(|known| known.since_ms);
+        let since_ms = since.unwrap_or_else(now);
+        if !self.take_in(&facts, since_ms) {
             return;
         }
         let by_iri = |found: FoundSkill| {
@@ -149,7 +138,7 @@ impl Cell {
             namespace: facts.namespace,
             seen_ms: seen.at_ms,
             listed_ms,
-            since_ms: now,
+            since_ms,
             skills: facts
                 .skills
                 .iter()
@@ -158,14 +147,34 @@ impl Cell {
             discovered: seen.name.clone(),
             found: found.into_iter().filter_map(by_iri).collect(),
         };
+        let (skills, endpoint) = (component.skills.len(), &component.endpoint);
         info!(
             component = component.name,
-            skills = component.skills.len(),
-            endpoint = component.endpoint,
-            "a component is in the graph"
+            skills, endpoint, "a component is in the graph"
         );
         self.present().components.insert(iri, component);
         self.changed.send_modify(|changes| *changes += 1);
+    }
+
+    /// Puts what a component says into the graph, and tells whether it is there.
+    fn take_in(&self, facts: &ComponentFacts, at: u64) -> bool {
+        let (triples, left_out) = facts.triples();
+        if !left_out.is_empty() {
+            let left_out = left_out.join(", ");
+            warn!(
+                component = facts.name,
+                left_out, "capabilities that are no IRIs are left out"
+            );
+        }
+        let source = Source::new(SourceKind::Component, &facts.application_uri);
+        let taken = self.knowledge.replace(&source, &triples, at);
+        if let Err(fault) = &taken {
+            error!(
+                component = facts.name,
+                "what a component says is not taken into the graph: {fault}"
+            );
+        }
+        taken.is_ok()
     }
 
     /// A server that discovery knew is gone.

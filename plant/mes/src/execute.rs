@@ -90,20 +90,16 @@ pub(crate) async fn execute(
         };
     });
     let run = log.run();
-    match &run.reason {
-        None => info!(
-            process = process.iri,
-            run = run.run,
-            plans = run.plans.len(),
-            "a process is done"
-        ),
-        Some(reason) => warn!(
-            process = process.iri,
-            run = run.run,
-            "a process failed: {reason}"
-        ),
-    }
+    tell(&run);
     run
+}
+
+fn tell(run: &Run) {
+    let (plans, process) = (run.plans.len(), &run.process);
+    match &run.reason {
+        None => info!(process, run = run.run, plans, "a process is done"),
+        Some(reason) => warn!(process, run = run.run, "a process failed: {reason}"),
+    }
 }
 
 /// Plans a process and does nothing.

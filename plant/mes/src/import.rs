@@ -73,9 +73,13 @@ fn put_node_set(
     (at, types): (u64, &mut Types),
 ) -> Result<(), Failure> {
     let read = nodeset::read(text).map_err(|fault| refused(name, &fault))?;
-    let said = |triple: &Triple, predicate: &str| match &triple.object {
-        Object::Text(text) if triple.predicate == predicate => Some(text.clone()),
-        _ => None,
+    let said = |triple: &Triple, predicate: &str| {
+        if let Object::Text(text) = &triple.object
+            && triple.predicate == predicate
+        {
+            return Some(text.clone());
+        }
+        None
     };
     let namespaces: BTreeMap<&str, String> = read
         .triples

@@ -316,10 +316,9 @@ async fn run(skill: Skill, iri: String) {
         by: Owner::Local("the command line"),
     };
     let parameters = vec![("ProcessIri".to_owned(), Value::String(iri.clone()))];
-    match run.run(parameters, RUN).await {
-        Ok(outcome) if outcome.succeeded => info!(process = iri, "the process is done"),
-        Ok(outcome) => error!(process = iri, "the process failed: {}", outcome.message),
-        Err(fault) => error!(process = iri, "the process was not run: {fault}"),
+    // How a run ends is told by the run itself.
+    if let Err(fault) = run.run(parameters, RUN).await {
+        error!(process = iri, "the process was not run: {fault}");
     }
 }
 

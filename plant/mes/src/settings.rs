@@ -118,17 +118,15 @@ impl Reading<'_> {
             .reader
             .needed(namespace, "namespace", root.place)
             .and_then(|node| self.namespace(node));
-        let endpoint = endpoint.map_or(Some(DEFAULT_ENDPOINT.to_owned()), |node| {
-            self.endpoint(node)
-        });
-        let security = security.map_or(Some(vec![Security::None]), |node| self.security(node));
-        let lds = match lds {
-            None => Some(Lds::Local),
-            Some(node) => match self.reader.text(node, "an endpoint or `none`") {
-                Some("none") => Some(Lds::Nowhere),
-                _ => self.endpoint(node).map(Lds::At),
-            },
+        let endpoint = match endpoint {
+            Some(node) => self.endpoint(node),
+            None => Some(DEFAULT_ENDPOINT.to_owned()),
         };
+        let security = match security {
+            Some(node) => self.security(node),
+            None => Some(vec![Security::None]),
+        };
+        let lds = lds.map_or(Some(Lds::Local), |node| self.lds(node));
         let open = open.map_or(Some(false), |node| self.reader.boolean(node));
         let sparql = sparql.map_or(Some(DEFAULT_SPARQL), |node| self.address(node));
         let knowledge = knowledge.map_or_else(Vec::new, |node| self.files(node));
@@ -139,16 +137,10 @@ impl Reading<'_> {
         let processes = processes
             .map(|node| self.each(node, Self::process))
             .unwrap_or_default();
-        self.once(
-            root,
-            manifests.iter().map(|manifest| &*manifest.source.name),
-            "manifest",
-        );
-        self.once(
-            root,
-            processes.iter().map(|process| &*process.iri),
-            "process",
-        );
+        let names = manifests.iter().map(|manifest| &*manifest.source.name);
+        self.once(root, names, "manifest");
+        let iris = processes.iter().map(|process| &*process.iri);
+        self.once(root, iris, "process");
         Some(Settings {
             name: name?,
             application_uri: uri?,
@@ -163,6 +155,13 @@ impl Reading<'_> {
             manifests,
             processes,
         })
+    }
+
+    fn lds(&mut self, node: &Node) -> Option<Lds> {
+        match self.reader.text(node, "an endpoint or `none`")? {
+            "none" => Some(Lds::Nowhere),
+            _ => self.endpoint(node).map(Lds::At),
+        }
     }
 
     fn each<T>(&mut self, node: &Node, read: fn(&mut Self, &Node) -> Option<T>) -> Vec<T> {
@@ -280,9 +279,7 @@ impl Reading<'_> {
             .iter()
             .take(MOST_STEPS)
             .enumerate()
-            .filter_map(|(number, node)| {
-                self.step(node, is_composite.then_some(()).map_or(Err(number), Ok))
-            })
+            .filter_map(|(number, node)| self.step(node, is_composite.then_some(()).ok_or(number)))
             .collect();
         let (steps, parameters): (Vec<Step>, Vec<_>) = read.into_iter().unzip();
         let work = match composite {
