@@ -73,6 +73,7 @@ pub(crate) async fn execute(
             fallen: Vec::new(),
         }),
     });
+    let _whole = Whole(Arc::clone(&log));
     let ended = Execution {
         plant: &**plant,
         process,
@@ -92,6 +93,27 @@ pub(crate) async fn execute(
     let run = log.run();
     tell(&run);
     run
+}
+
+/// Ends the record of a run that nobody waits for any more, as when its skill is halted and does not come to its end in time.
+struct Whole(Arc<Log>);
+
+impl Drop for Whole {
+    fn drop(&mut self) {
+        if self.0.run().ended_ms.is_some() {
+            return;
+        }
+        self.0.change(|kept, now| {
+            let why = "it was given up in the middle";
+            if let Some(plan) = kept.run.plan().filter(|plan| plan.ended_ms.is_none()) {
+                plan.end(now, How::Failed, Some(why.to_owned()));
+            }
+            kept.run.ended_ms = Some(now);
+            kept.run.waits_for = None;
+            kept.run.outcome = How::Failed;
+            kept.run.reason = Some(why.to_owned());
+        });
+    }
 }
 
 fn tell(run: &Run) {

@@ -474,6 +474,29 @@ async fn who_asked_can_stop_it_also_while_it_waits() {
 }
 
 #[tokio::test]
+async fn a_run_that_is_given_up_does_not_go_on_in_the_records() {
+    let fakes = plant(gripper("gripper"));
+    *fakes.dies_at.lock().unwrap() = Some("gripper.Grasp");
+    let fakes = Arc::new(fakes);
+    let as_plant: Arc<dyn Plant> = Arc::new(Arc::clone(&fakes));
+    let slow = Process {
+        wait: Duration::from_secs(600),
+        ..process()
+    };
+    let told = |_: &'static str| {};
+    let run = execute(&as_plant, &slow, 1, &told);
+    let given_up = tokio::time::timeout(Duration::from_millis(200), run).await;
+    assert!(given_up.is_err());
+    let kept = fakes.kept.lock().unwrap();
+    let run = kept.last().unwrap();
+    assert_eq!(
+        (run.outcome, run.reason.as_deref()),
+        (How::Failed, Some("it was given up in the middle"))
+    );
+    assert!(run.ended_ms.is_some() && run.waits_for.is_none());
+}
+
+#[tokio::test]
 async fn what_became_of_a_run_can_be_asked_for() {
     let fakes = plant(gripper("gripper"));
     *fakes.dies_at.lock().unwrap() = Some("gripper.Grasp");
