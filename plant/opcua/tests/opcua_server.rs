@@ -356,8 +356,12 @@ async fn a_write_is_shown_unless_its_handler_refuses() {
         next_value(&mut watched).await,
         (0, Some(Variant::Double(99.0)))
     );
-    let value = cell.server.value(&depth).unwrap();
-    assert_eq!(value.value, Some(Variant::Double(3.0)));
+    cell.server.show(&depth, 3.5).unwrap();
+    let read = client.read(std::slice::from_ref(&depth)).await.unwrap();
+    assert_eq!(read[0].value, Some(Variant::Double(3.5)));
+    assert!(read[0].server_timestamp.is_some(), "{read:?}");
+    let picoseconds = (read[0].source_picoseconds, read[0].server_picoseconds);
+    assert_eq!(picoseconds, (None, None), "asyncua reads them wrong");
     cell.server.set_writable(&depth, false).unwrap();
     let refused = client
         .write(&[(depth, Variant::Double(4.0))])

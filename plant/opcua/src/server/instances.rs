@@ -10,6 +10,7 @@ use opcua::types::{
     StatusCode, Variant,
 };
 
+use super::nodes::plain;
 use super::view::{Declared, View};
 use super::{Server, value_of};
 
@@ -335,7 +336,7 @@ impl Server {
             spec.data_type.clone(),
             false,
             spec.value_rank,
-            spec.value.clone(),
+            plain(spec.value.clone()),
             readable,
             readable,
             None,

@@ -222,6 +222,14 @@ impl Nodes {
     }
 }
 
+/// The value without picoseconds that say nothing: asyncua takes them for a part of the next timestamp.
+pub(crate) fn plain(mut value: DataValue) -> DataValue {
+    for picoseconds in [&mut value.source_picoseconds, &mut value.server_picoseconds] {
+        picoseconds.take_if(|count| *count == 0);
+    }
+    value
+}
+
 /// Shows values, all or none, and tells who watches their nodes.
 ///
 /// # Errors
@@ -241,7 +249,8 @@ pub(crate) fn show(
     }
     let now = DateTime::now();
     let mut shown = Vec::with_capacity(values.len());
-    for (node, mut value) in values {
+    for (node, value) in values {
+        let mut value = plain(value);
         value.status.get_or_insert(StatusCode::Good);
         value.source_timestamp.get_or_insert(now);
         value.server_timestamp.get_or_insert(now);
