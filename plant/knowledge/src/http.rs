@@ -233,11 +233,11 @@ impl Site {
         let question = Question::of(name)?;
         let sparql = question.with(&pairs)?;
         let formats = Formats::of(&accepted);
-        // Plain JSON stands first with who takes both.
-        let is_standard = accepted
+        // What is named first of the two forms.
+        let wanted = accepted
             .iter()
-            .find(|media| QueryResultsFormat::from_media_type(media).is_some())
-            .is_some_and(|media| media != JSON);
+            .find(|media| QueryResultsFormat::from_media_type(media).is_some());
+        let is_standard = wanted.is_some_and(|media| media != JSON);
         let asked = if is_standard {
             Asked::Sparql(sparql, Dataset::default(), formats)
         } else {

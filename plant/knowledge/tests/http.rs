@@ -399,8 +399,7 @@ async fn named_questions_are_listed_shown_and_answered_in_two_forms() {
         plain,
         serde_json::json!({ "question": "sources", "columns": ["graph", "kind", "statements"], "rows": [{ "graph": "urn:ua-bridge:graph:file:many", "kind": "file", "statements": 300 }] })
     );
-    // Who takes both gets the one that stands first.
-    let both = "application/json, application/sparql-results+json, */*;q=0.1";
+    let both = "application/json, application/sparql-results+json;q=0.5, */*;q=0.1";
     assert_eq!(get(at, "/ask/sources", both).await.json(), plain);
     let standard = get(at, "/ask/sources", "application/sparql-results+json")
         .await

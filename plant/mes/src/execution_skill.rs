@@ -55,8 +55,15 @@ impl Driver for ExecuteProcess {
         };
         if work.parameters().text("ExecutionMode") == Some("plan") {
             let plan = dry_run(&*self.cell, process);
+            let (complete, missing) = (plan.is_complete(), plan.missing());
+            let whole = serde_json::json!({ "process": iri, "complete": complete, "missing": missing, "plan": plan });
+            if whole.to_string().len() <= MOST_REPORT {
+                return report(&whole);
+            }
+            // The reasons are on the page of the plan.
+            let short: String = missing.chars().take(1000).collect();
             return report(
-                &serde_json::json!({ "process": iri, "complete": plan.is_complete(), "missing": plan.missing(), "plan": plan }),
+                &serde_json::json!({ "process": iri, "complete": complete, "missing": short }),
             );
         }
         let plant: Arc<dyn Plant> = Arc::clone(&self.cell) as Arc<dyn Plant>;
@@ -87,6 +94,9 @@ impl Teller for Telling<'_> {
         self.0.stopped().await;
     }
 }
+
+/// Bytes of a report, which crosses the space as a value and is read by clients as a whole.
+const MOST_REPORT: usize = 32 << 10;
 
 /// How much is done when a step of the composite begins.
 const DONE: [(&str, f32); 10] = [
