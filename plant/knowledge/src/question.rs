@@ -197,10 +197,9 @@ impl Question {
                 NamedNode::new(value).map_err(why)?.into()
             };
             // The printed form of a term has escapes for all that could end it.
-            sparql = sparql.replacen(
+            sparql = sparql.replace(
                 &format!("VALUES ?for_{name} {{ UNDEF }}"),
                 &format!("VALUES ?for_{name} {{ {term} }}"),
-                1,
             );
         }
         Ok(sparql)
