@@ -33,7 +33,7 @@ pub(crate) fn describe(story: &Story, fact: &Fact) -> Vec<(Who, String)> {
         Fact::Asked(asked) => vec![(
             MES,
             format!(
-                "what can run: {} skills and {} services, with capability, parameters and endpoint",
+                "knows what can run: {} skills and {} services",
                 asked.skills, asked.services
             ),
         )],

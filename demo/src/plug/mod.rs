@@ -563,6 +563,10 @@ impl Answer {
         };
         let of_kind = |kind: &str| self.rows.iter().filter(|row| text(row, "kind") == kind).count();
         let lacks = |row: &&Map<String, Value>| {
+            // What the MES itself can do are processes, which stand elsewhere.
+            if text(row, "component") == MES {
+                return false;
+            }
             let list = |column: &str| row.get(column).and_then(Value::as_array);
             let has_capability = list("capabilities").is_some_and(|list| !list.is_empty());
             !has_capability || list("parameters").is_none() || text(row, "endpoint").is_empty()
@@ -607,6 +611,8 @@ const fn limit(act: Act) -> Duration {
     }
 }
 
+/// The name of the MES as a component.
+const MES: &str = "mes";
 const LDS_PORT: u16 = 4840;
 const SERVER_PORT: u16 = 4841;
 /// Identifiers of a component's first skill: its state, its result, and the calls that start it and make it ready.
@@ -628,17 +634,19 @@ mod tests {
     #[test]
     fn an_answer_is_counted_by_kind_and_what_is_incomplete_is_named() {
         let row = |kind: &str, name: &str, capabilities: &[&str], endpoint: Option<&str>| {
-            json!({"kind": kind, "component": "c", "name": name, "capabilities": capabilities,
+            let component = if name == "ExecuteProcess" { MES } else { "c" };
+            json!({"kind": kind, "component": component, "name": name, "capabilities": capabilities,
                 "parameters": [], "endpoint": endpoint})
         };
         let answer = json!({"question": "what-can-run", "columns": [], "rows": [
             row("skill", "Grasp", &["urn:grasp"], Some("opc.tcp://127.0.0.1:1")),
             row("skill", "Release", &[], Some("opc.tcp://127.0.0.1:1")),
+            row("skill", "ExecuteProcess", &[], Some("opc.tcp://127.0.0.1:2")),
             row("service", "Dose", &["urn:dose"], None),
         ]});
         let answer: Answer = serde_json::from_value(answer).unwrap();
         let expected = Asked {
-            skills: 2,
+            skills: 3,
             services: 1,
             incomplete: vec!["c Release".to_owned(), "c Dose".to_owned()],
         };

@@ -392,9 +392,9 @@ impl Story {
                 "`ua-space ask what-can-run` has not answered".to_owned(),
             ]);
         };
-        if asked.skills < 4 || asked.services == 0 {
+        if asked.skills < 5 || asked.services == 0 {
             return Err(format!(
-                "what-can-run lists {} skills and {} services; the robot and the gripper have 4 skills, the manifest services",
+                "what-can-run lists {} skills and {} services; robot, gripper and MES have 5 skills, the manifest some services",
                 asked.skills, asked.services
             ));
         }
