@@ -57,18 +57,15 @@ pub(crate) fn rank(of: Shape) -> Rank {
 }
 
 fn variant(value: &Value, out: &mut Vec<u8>) {
-    match value {
-        Value::Array(builtin, elements) => {
-            out.push(builtin.id() | ARRAY);
-            length(elements.len(), out);
-            for element in elements {
-                scalar(element, out);
-            }
-        }
-        single => {
-            out.push(single.shape().builtin.id());
-            scalar(single, out);
-        }
+    let Value::Array(builtin, elements) = value else {
+        out.push(value.shape().builtin.id());
+        scalar(value, out);
+        return;
+    };
+    out.push(builtin.id() | ARRAY);
+    length(elements.len(), out);
+    for element in elements {
+        scalar(element, out);
     }
 }
 
@@ -120,6 +117,10 @@ fn value(field: &Variant<'_>) -> Result<Option<Value>, String> {
     }
 }
 
+#[expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "of the types of the space those that a skill can be told in are named"
+)]
 fn single(scalar: &Scalar<'_>) -> Result<Value, String> {
     Ok(match scalar {
         Scalar::Boolean(value) => Value::Boolean(*value),

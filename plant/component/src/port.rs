@@ -231,8 +231,8 @@ async fn call(skill: &Skill, by: Owner, method: Method, request: &[u8]) -> [Valu
                 .map_err(|refusal| refusal.to_string()),
             Err(why) => Err(format!("BadInvalidArgument: {why}")),
         },
-        other => skill
-            .call(by, other)
+        Method::Suspend | Method::Resume | Method::Halt | Method::Reset => skill
+            .call(by, method)
             .await
             .map_err(|refusal: Refusal| refusal.to_string()),
     };
@@ -278,7 +278,10 @@ fn failure(fault: ServeFault, options: &Options) -> Failure {
                 plant_opcua::server::ServerError::Bind(_) => FailureKind::Unavailable,
                 plant_opcua::server::ServerError::Pki(_)
                 | plant_opcua::server::ServerError::Io(_) => FailureKind::Io,
-                _ => FailureKind::Configuration,
+                plant_opcua::server::ServerError::NodeSet(_)
+                | plant_opcua::server::ServerError::NoPki
+                | plant_opcua::server::ServerError::NoSecurity
+                | plant_opcua::server::ServerError::Configuration(_) => FailureKind::Configuration,
             };
             Failure::new(kind, error.to_string())
         }

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::num::NonZeroU16;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bridge_core::{CallDescription, CallField, Offered, ValueDescription};
 use bridge_node::{PortEvent, now};
@@ -13,6 +13,7 @@ use messages::{Leaf, Rank, TypeName};
 use program::{Method, State};
 use skills::{Builtin, Facts, Observer, Outcome, Parameters, Shown, Told, Transitioned, Value};
 use tokio::sync::Notify;
+use tokio::time::Instant;
 use uadp::{BuiltinType, Timestamp};
 
 use crate::fields;
@@ -180,7 +181,7 @@ impl Place {
                     }
                 })
                 .collect(),
-            _ => Vec::new(),
+            Method::Suspend | Method::Resume | Method::Halt | Method::Reset => Vec::new(),
         };
         CallDescription {
             name: format!("{}.{}.{method}", self.component, facts.name),

@@ -76,7 +76,7 @@ impl Actor {
             can_suspend: driver.can_suspend(),
             rests_in: Rest::Ready,
         });
-        let created = SystemTime::now();
+        let created = clock();
         let now = Shown {
             state: program.state(),
             last: None,
@@ -155,7 +155,7 @@ impl Actor {
         self.now.diagnostic.last_call = Some(LastCall {
             method,
             by: by.clone(),
-            at: SystemTime::now(),
+            at: clock(),
             refused: answer.as_ref().err().cloned(),
         });
         self.tell(Told::Called);
@@ -178,7 +178,8 @@ impl Actor {
         self.authority.claim(by)?;
         // Mode before capability: what cannot be suspended is refused as such only where it runs.
         let is_running = self.program.state() == State::Running;
-        if !self.program.is_executable(method) && !(method == Method::Suspend && is_running) {
+        let is_its_capability = method == Method::Suspend && is_running;
+        if !self.program.is_executable(method) && !is_its_capability {
             return Err(not_now(method, self.program.state()));
         }
         match method {
@@ -432,7 +433,7 @@ impl Actor {
     }
 
     fn transition(&mut self, transition: &'static Transition, message: String) {
-        let at = SystemTime::now();
+        let at = clock();
         self.now.state = transition.to;
         self.now.last = Some(transition);
         self.now.since = at;
@@ -551,14 +552,23 @@ fn text_of(panic: &(dyn Any + Send)) -> &str {
         .unwrap_or("no reason given")
 }
 
+#[expect(
+    clippy::disallowed_methods,
+    reason = "when a machine did something is told by the clock of its host"
+)]
+fn clock() -> SystemTime {
+    SystemTime::now()
+}
+
 fn not_now(method: Method, state: State) -> Refusal {
     refusal(Refused::State { method, state })
 }
 
 fn refusal(refused: Refused) -> Refusal {
-    let code = match refused {
-        Refused::CannotSuspend => Code::NotSupported,
-        _ => Code::InvalidState,
+    let code = if refused == Refused::CannotSuspend {
+        Code::NotSupported
+    } else {
+        Code::InvalidState
     };
     Refusal::new(code, refused.to_string())
 }

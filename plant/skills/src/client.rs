@@ -88,7 +88,7 @@ impl SkillClient {
             Link::Up {
                 application_uri, ..
             } => application_uri.clone(),
-            _ => String::new(),
+            Link::Connecting | Link::Down { .. } | Link::Closed => String::new(),
         }
     }
 
@@ -134,10 +134,10 @@ impl SkillClient {
 }
 
 fn lost(error: &ClientError) -> SkillFault {
-    match error {
-        ClientError::Status(status) => refused(*status, "the server refuses"),
-        other => SkillFault::Lost(other.to_string()),
+    if let ClientError::Status(status) = error {
+        return refused(*status, "the server refuses");
     }
+    SkillFault::Lost(error.to_string())
 }
 
 fn called(error: &CallError, what: &str) -> SkillFault {
@@ -279,9 +279,11 @@ mod tests {
             grasp(&second, &second.skills().await.unwrap()),
         );
         mine.call(Method::Reset).await.unwrap();
-        let status = |fault: SkillFault| match fault {
-            SkillFault::Refused { status, .. } => status,
-            other => panic!("{other}"),
+        let status = |fault: SkillFault| match &fault {
+            SkillFault::Refused { status, .. } => status.clone(),
+            SkillFault::Lost(_) | SkillFault::TimedOut(_) | SkillFault::Unexpected(_) => {
+                panic!("{fault}")
+            }
         };
         assert_eq!(
             status(theirs.call(Method::Start).await.unwrap_err()),

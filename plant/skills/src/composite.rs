@@ -82,6 +82,17 @@ impl<F: Fn(&'static str) + Send + Sync> Teller for F {
     }
 }
 
+/// A way back: what it is called, who moves, and where to.
+type Retreat<'s> = (&'static str, &'s Arc<dyn Runs>, [f64; 6]);
+
+/// A step: what it is called, who does it, where to if it is a move, and the way back from there.
+type Step<'s> = (
+    &'static str,
+    &'s Arc<dyn Runs>,
+    Option<[f64; 6]>,
+    Retreat<'s>,
+);
+
 /// How a step went wrong.
 enum Fault {
     /// Halt: everything stands still where it is.
@@ -107,7 +118,7 @@ impl PickAndPlace {
         let at_pick = ("MovePickApproachError", &self.linear, over_pick);
         let between = ("MovePlaceApproachError", &self.ptp, over_place);
         let at_place = ("MovePlaceApproachError", &self.linear, over_place);
-        let steps: [(&'static str, &Arc<dyn Runs>, Option<[f64; 6]>, _); 8] = [
+        let steps: [Step<'_>; 8] = [
             (
                 "MovePickApproachBefore",
                 &self.ptp,
@@ -194,7 +205,7 @@ impl PickAndPlace {
 
     async fn retreat(
         &self,
-        (step, skill, to): (&'static str, &Arc<dyn Runs>, [f64; 6]),
+        (step, skill, to): Retreat<'_>,
         teller: &dyn Teller,
     ) -> Result<(), String> {
         teller.step(step).await;

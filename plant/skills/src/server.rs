@@ -368,10 +368,12 @@ fn status(refusal: &Refusal) -> StatusCode {
 
 /// A session that is gone has no lease any more, and what it wrote counts for nothing.
 async fn free_when_closed(server: Server, served: Vec<(Skill, Arc<Nodes>)>, authority: Authority) {
-    let (closed, mut told) = mpsc::unbounded_channel();
+    let (closed, mut told) = mpsc::channel(MOST_CLOSED);
     server.on_session_closed(move |session| {
-        // Without the task nobody has a lease.
-        let _told = closed.send(session);
+        // The server has fewer sessions than this has room for.
+        if let Err(error) = closed.try_send(session) {
+            tracing::warn!(session, "the end of a session is not taken up: {error}");
+        }
     });
     while let Some(session) = told.recv().await {
         let owner = Owner::Session(session);
@@ -404,6 +406,8 @@ const OWN: u16 = 1;
 const COMPONENT_ID: u32 = 1;
 const IDS_PER_SKILL: u32 = 100;
 const FIRST_FREE_ID: u32 = 10_000;
+/// So many sessions may end at once.
+const MOST_CLOSED: usize = 1_024;
 
 #[cfg(test)]
 mod tests {

@@ -121,16 +121,18 @@ impl Shape {
         if value.shape() == self {
             return Some(value);
         }
-        match value {
-            Value::Array(_, elements) if self.array => {
-                let one = Self::scalar(self.builtin);
-                let elements = elements.into_iter().map(|element| one.take(element));
-                Some(Value::Array(self.builtin, elements.collect::<Option<_>>()?))
-            }
-            Value::String(_) | Value::Boolean(_) | Value::Array(..) => None,
-            number if !self.array => scalar_of_json(self.builtin, &number.to_json()).ok(),
-            _ => None,
+        if let Value::Array(_, elements) = value {
+            let one = Self::scalar(self.builtin);
+            let elements = elements.into_iter().map(|element| one.take(element));
+            return match self.array {
+                true => Some(Value::Array(self.builtin, elements.collect::<Option<_>>()?)),
+                false => None,
+            };
         }
+        if self.array || matches!(value, Value::String(_) | Value::Boolean(_)) {
+            return None;
+        }
+        scalar_of_json(self.builtin, &value.to_json()).ok()
     }
 }
 
@@ -221,46 +223,51 @@ impl Value {
             Self::Boolean(_) | Self::String(_) | Self::Array(..) => None,
             Self::Float(value) => Some(f64::from(*value)),
             Self::Double(value) => Some(*value),
-            whole => whole.to_json().as_f64(),
+            Self::SByte(_)
+            | Self::Byte(_)
+            | Self::Int16(_)
+            | Self::UInt16(_)
+            | Self::Int32(_)
+            | Self::UInt32(_)
+            | Self::Int64(_)
+            | Self::UInt64(_) => self.to_json().as_f64(),
         }
     }
 
     /// An array of numbers as Double.
     #[must_use]
     pub fn as_f64s(&self) -> Option<Vec<f64>> {
-        match self {
-            Self::Array(_, elements) => elements.iter().map(Self::as_f64).collect(),
-            _ => None,
-        }
+        let Self::Array(_, elements) = self else {
+            return None;
+        };
+        elements.iter().map(Self::as_f64).collect()
     }
 
     /// A text.
     #[must_use]
     pub fn as_str(&self) -> Option<&str> {
-        match self {
-            Self::String(text) => Some(text),
-            _ => None,
-        }
+        let Self::String(text) = self else {
+            return None;
+        };
+        Some(text)
     }
 
     /// A Boolean.
     #[must_use]
     pub fn as_bool(&self) -> Option<bool> {
-        match self {
-            Self::Boolean(value) => Some(*value),
-            _ => None,
-        }
+        let Self::Boolean(value) = self else {
+            return None;
+        };
+        Some(*value)
     }
 
     /// Whether a number in it is none, or has no end: nothing that a machine should be told.
     #[must_use]
     pub fn is_unreal(&self) -> bool {
-        match self {
-            Self::Float(value) => !value.is_finite(),
-            Self::Double(value) => !value.is_finite(),
-            Self::Array(_, elements) => elements.iter().any(Self::is_unreal),
-            _ => false,
+        if let Self::Array(_, elements) = self {
+            return elements.iter().any(Self::is_unreal);
         }
+        self.as_f64().is_some_and(|value| !value.is_finite())
     }
 }
 

@@ -31,6 +31,10 @@ pub(crate) fn to_variant(value: &Value) -> Variant {
 }
 
 /// From OPC UA; none for what skills have no values of: other types, arrays of several dimensions, nothing.
+#[expect(
+    clippy::wildcard_enum_match_arm,
+    reason = "of the types of OPC UA those that a skill can be told in are named"
+)]
 pub(crate) fn from_variant(variant: &Variant) -> Option<Value> {
     Some(match variant {
         Variant::Boolean(value) => Value::Boolean(*value),

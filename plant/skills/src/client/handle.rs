@@ -267,9 +267,8 @@ impl Runs for SkillHandle {
             .client
             .call(&self.found.nodes.skill, node, Vec::new())
             .await;
-        let error = match halted {
-            Ok(_) => return Ok(()),
-            Err(error) => error,
+        let Err(error) = halted else {
+            return Ok(());
         };
         // It may be Halted already, which is all that is wanted.
         match &error {
@@ -305,18 +304,22 @@ fn state_of(id: &Variant) -> Option<State> {
 }
 
 fn number(value: &Variant) -> u32 {
-    match value {
-        Variant::UInt32(number) => *number,
+    match from_variant(value) {
+        Some(Value::UInt32(number)) => number,
         _ => 0,
     }
 }
 
 fn text(value: &Variant) -> String {
-    match value {
-        Variant::String(text) => text.as_ref().to_owned(),
-        Variant::LocalizedText(text) => text.text.as_ref().to_owned(),
-        _ => String::new(),
+    if let Variant::LocalizedText(text) = value {
+        return text.text.as_ref().to_owned();
     }
+    let value = from_variant(value);
+    value
+        .as_ref()
+        .and_then(Value::as_str)
+        .unwrap_or_default()
+        .to_owned()
 }
 
 /// How often a server tells of changes.

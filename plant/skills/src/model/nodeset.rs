@@ -268,6 +268,11 @@ impl Nodes {
                 Rule::Mandatory,
             ));
         }
+        self.outcome_members(parent);
+    }
+
+    /// How a run has ended.
+    fn outcome_members(&mut self, parent: u32) {
         let outcome = [
             (
                 30,
@@ -389,20 +394,15 @@ struct Ids {
 fn xml_value(value: &Value) -> String {
     let one = |value: &Value, attributes: &str| {
         let name = value.shape().builtin.name();
-        let text = match value {
-            Value::String(text) => escaped(text),
-            other => other.to_string(),
-        };
+        let text = value.as_str().map_or_else(|| value.to_string(), escaped);
         format!("<{name}{attributes}>{text}</{name}>")
     };
-    match value {
-        Value::Array(builtin, elements) => {
-            let name = builtin.name();
-            let elements: String = elements.iter().map(|element| one(element, "")).collect();
-            format!("<ListOf{name}{TYPES_NAMESPACE}>{elements}</ListOf{name}>")
-        }
-        single => one(single, TYPES_NAMESPACE),
-    }
+    let Value::Array(builtin, elements) = value else {
+        return one(value, TYPES_NAMESPACE);
+    };
+    let name = builtin.name();
+    let elements: String = elements.iter().map(|element| one(element, "")).collect();
+    format!("<ListOf{name}{TYPES_NAMESPACE}>{elements}</ListOf{name}>")
 }
 
 fn engineering_unit(unit: &Unit) -> String {

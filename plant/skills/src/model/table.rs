@@ -85,7 +85,6 @@ const ACCELERATION: Unit = Unit {
     id: code(b"MSK"),
 };
 
-#[expect(clippy::indexing_slicing, reason = "evaluated while compiling")]
 const fn code(characters: &[u8; 3]) -> u32 {
     u32::from_be_bytes([0, characters[0], characters[1], characters[2]])
 }

@@ -1,7 +1,7 @@
 //! One skill and a driver, without a server.
 
 use std::sync::atomic::{AtomicU32, Ordering};
-use std::time::Instant;
+use tokio::time::Instant;
 
 use async_trait::async_trait;
 use program::TRANSITIONS;
@@ -52,10 +52,18 @@ impl Driver for Scripted {
             How::Panics => panic!("a wire is loose"),
             How::Fails => return Err("nothing is there".to_owned()),
             How::Deaf => std::future::pending().await,
-            How::Blocks(time) => std::thread::sleep(time),
+            How::Blocks(time) => block(time),
         }
         Ok(vec![("Gripped".to_owned(), true.into())])
     }
+}
+
+#[expect(
+    clippy::disallowed_methods,
+    reason = "a driver that does not give its thread back is what it is about"
+)]
+fn block(time: Duration) {
+    std::thread::sleep(time);
 }
 
 #[derive(Default)]

@@ -85,13 +85,11 @@ impl<'f> Reader<'f> {
 
     /// A single value as written.
     pub fn text<'n>(&mut self, node: &'n Node, wanted: &str) -> Option<&'n str> {
-        match &node.kind {
-            Kind::Scalar(text) => Some(text),
-            _ => {
-                self.wrong(node, wanted);
-                None
-            }
-        }
+        let Kind::Scalar(text) = &node.kind else {
+            self.wrong(node, wanted);
+            return None;
+        };
+        Some(text)
     }
 
     /// A list; a single value counts as a list of one.
