@@ -93,7 +93,11 @@ impl Runs for LocalRun {
         within: Duration,
     ) -> Result<Outcome, SkillFault> {
         if self.skill.shown().state == State::Halted {
-            self.skill.call(self.by.clone(), Method::Reset).await?;
+            let reset = self.skill.call(self.by.clone(), Method::Reset).await;
+            // One that was given up before may have come first.
+            if self.skill.shown().state != State::Ready {
+                reset?;
+            }
         }
         let run = self.skill.start_with(self.by.clone(), parameters).await?;
         let mut watch = self.skill.watch();

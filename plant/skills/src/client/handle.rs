@@ -248,7 +248,11 @@ impl Runs for SkillHandle {
         within: Duration,
     ) -> Result<Outcome, SkillFault> {
         if self.state().await?.state == State::Halted {
-            self.call(Method::Reset).await?;
+            let reset = self.call(Method::Reset).await;
+            // One that was given up before may have come first.
+            if reset.is_err() && self.state().await?.state != State::Ready {
+                reset?;
+            }
         }
         let run = self.start(parameters).await?;
         let ended = tokio::time::timeout(within, self.ended()).await;
