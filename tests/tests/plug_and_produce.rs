@@ -32,15 +32,27 @@ fn components_are_found_run_lost_and_replaced_within_the_published_times() {
     let ms = |value: &Value| value.as_f64().unwrap_or(f64::MAX);
     for part in ["robot", "gripper", "vacuum"] {
         let known = &report["components"][part];
-        assert_eq!(known.as_object().map(serde_json::Map::len), Some(8), "{known}");
-        assert!(known.as_object().unwrap().values().all(Value::is_number), "{known}");
+        assert_eq!(
+            known.as_object().map(serde_json::Map::len),
+            Some(8),
+            "{known}"
+        );
+        assert!(
+            known.as_object().unwrap().values().all(Value::is_number),
+            "{known}"
+        );
         let first = ms(&known["announced"]).min(ms(&known["registered"]));
         // 211 ms were published for the fastest of three components, on a machine of its own.
         assert!(ms(&known["listed"]) - first < 1000.0, "{part}: {known}");
     }
     for ros in ["ros1", "ros2"] {
         let states = report["grasps"][ros]["states"].as_array().unwrap();
-        let last: Vec<&str> = states.iter().rev().take(3).filter_map(Value::as_str).collect();
+        let last: Vec<&str> = states
+            .iter()
+            .rev()
+            .take(3)
+            .filter_map(Value::as_str)
+            .collect();
         assert_eq!(last, ["Ready", "Running", "Ready"], "{ros}");
     }
     assert_eq!(report["runs"][0]["plans"], 1, "{report}");

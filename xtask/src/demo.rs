@@ -11,8 +11,14 @@ use crate::{
 pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     step("building the programs (some minutes the first time)");
     let mut build = vec!["build", "--locked"];
-    let is_plug_and_produce = arguments.iter().any(|argument| argument.ends_with("plug-and-produce"));
-    let others: &[&str] = if is_plug_and_produce { &PLUG_AND_PRODUCE } else { &[] };
+    let is_plug_and_produce = arguments
+        .iter()
+        .any(|argument| argument.ends_with("plug-and-produce"));
+    let others: &[&str] = if is_plug_and_produce {
+        &PLUG_AND_PRODUCE
+    } else {
+        &[]
+    };
     for package in LINE.iter().chain(others) {
         build.extend(["-p", package]);
     }

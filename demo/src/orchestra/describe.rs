@@ -8,7 +8,9 @@ use crate::stage::Who;
 /// Whose event it is and what to say of it, unless it is not for people.
 pub(crate) fn describe(event: &Event) -> Option<(Who, String)> {
     match event {
-        Event::Master(_) | Event::Supervisor(SupervisorEvent::Awaits { .. }) | Event::Node(_) => None,
+        Event::Master(_) | Event::Supervisor(SupervisorEvent::Awaits { .. }) | Event::Node(_) => {
+            None
+        }
         Event::Niryo(event) => Some((NIRYO, niryo(*event))),
         Event::Turtlebot(event) => Some((TURTLEBOT, turtlebot(*event))),
         Event::Supervisor(SupervisorEvent::Connected) => Some((

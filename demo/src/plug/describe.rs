@@ -13,7 +13,7 @@ pub(crate) fn describe(story: &Story, fact: &Fact) -> Vec<(Who, String)> {
             vec![(who(*part), reached(*part, *level))]
         }
         Fact::Left(part, level) if story.loses(*part, *level) => {
-            vec![(who(*part), format!("is gone: no longer {}", level.label()))]
+            vec![(who(*part), format!("is gone from {}", level.gone_from()))]
         }
         Fact::Reached(..) | Fact::Left(..) => Vec::new(),
         Fact::Node(event) => node(story, event),
@@ -112,11 +112,13 @@ fn changes(known: Option<&Run>, run: &Run) -> Vec<String> {
     if known.is_none() {
         new.push(format!("runs {}", run.process));
     }
-    let known_plans = known.map(|known| known.plans.as_slice()).unwrap_or_default();
-    if let Some(what) = &run.waits_for
-        && known.and_then(|known| known.waits_for.as_ref()) != Some(what)
+    let known_plans = known
+        .map(|known| known.plans.as_slice())
+        .unwrap_or_default();
+    if let Some(what) = run.waits_for.as_deref().map(need)
+        && known.and_then(|known| known.waits_for.as_deref()).map(need) != Some(what)
     {
-        new.push(format!("waits for {what}"));
+        new.push(format!("waits: {what}"));
     }
     for (number, plan) in run.plans.iter().enumerate() {
         let known = known_plans.get(number);
@@ -133,7 +135,11 @@ fn changes(known: Option<&Run>, run: &Run) -> Vec<String> {
         if plan.retreated != was_retreated
             && let Some(retreated) = plan.retreated
         {
-            let how = if retreated { "is away from the place" } else { "could not retreat" };
+            let how = if retreated {
+                "is away from the place"
+            } else {
+                "could not retreat"
+            };
             new.push(format!("the robot {how}"));
         }
         if plan.outcome == "failed"
@@ -145,9 +151,18 @@ fn changes(known: Option<&Run>, run: &Run) -> Vec<String> {
     }
     if run.outcome != "running" && known.is_none_or(|known| known.outcome == "running") {
         let plans = run.plans.len();
-        new.push(format!("the process is {} after {plans} plan(s)", run.outcome));
+        new.push(format!(
+            "the process is {} after {plans} plan(s)",
+            run.outcome
+        ));
     }
     new
+}
+
+/// The first thing that is waited for, without who was looked at for it.
+fn need(what: &str) -> &str {
+    what.split_once(" by a skill ")
+        .map_or(what, |(need, _)| need)
 }
 
 const fn who(part: Part) -> Who {

@@ -105,6 +105,20 @@ impl Level {
             Self::Ros2 => "a topic in ROS 2",
         }
     }
+
+    /// Where it is gone from when it has left.
+    pub(crate) const fn gone_from(self) -> &'static str {
+        match self {
+            Self::Announced => "what mDNS tells",
+            Self::Registered => "the list of ua-lds",
+            Self::Listed => "the list of ua-mes",
+            Self::InGraph => "the graph",
+            Self::InSpace => "the space",
+            Self::AtServer => "ua-server",
+            Self::Ros1 => "the services of ROS 1",
+            Self::Ros2 => "the services of ROS 2",
+        }
+    }
 }
 
 /// Which of the two nodes.

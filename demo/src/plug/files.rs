@@ -1,8 +1,8 @@
 //! The YAML files of the story: those that the project shows to integrators, at the speed of the story.
 
+use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
-use std::fs;
 
 use super::fact::Part;
 use crate::pace::Speed;
@@ -106,7 +106,11 @@ mod tests {
             }
             let scaled = scaled(text, Speed::new(4.0).unwrap());
             let drivers = text.matches("driver:").count();
-            assert_eq!(scaled.matches("time_scale: 4, ").count(), drivers, "{part:?}");
+            assert_eq!(
+                scaled.matches("time_scale: 4, ").count(),
+                drivers,
+                "{part:?}"
+            );
         }
         assert!(MES.contains(&format!("process: {PROCESS}\n")));
         assert_eq!(MES.lines().filter(|line| *line == "processes:").count(), 1);

@@ -23,8 +23,8 @@ use serde_json::{Map, Value};
 use tokio::sync::mpsc;
 use tokio::time::{Instant, interval, sleep_until, timeout};
 
-pub(crate) use self::fact::NodeEvent;
 use self::describe::describe;
+pub(crate) use self::fact::NodeEvent;
 use self::fact::{Asked, Fact, Part};
 use self::files::{Manifest, PROCESS};
 use self::pages::{Dated, Page};
@@ -55,8 +55,8 @@ pub(crate) async fn play(plan: Plan) -> u8 {
         story: Story::new(),
         began_at: wall_nanos(),
     };
-    let manifest = Manifest::read(plan.manifest.as_deref())
-        .map_err(Failure::io("cannot read the manifest"));
+    let manifest =
+        Manifest::read(plan.manifest.as_deref()).map_err(Failure::io("cannot read the manifest"));
     let (name, outcome) = match manifest {
         Ok(manifest) => {
             let outcome = perform(&plan, &manifest, &mut show).await;
@@ -411,11 +411,7 @@ impl Director<'_> {
         let act = self.show.story.act();
         let by = Instant::now() + limit(act);
         loop {
-            let lacks = self
-                .show
-                .story
-                .missing()
-                .map_err(|why| self.broken(why))?;
+            let lacks = self.show.story.missing().map_err(|why| self.broken(why))?;
             if lacks.is_empty() {
                 return Ok(());
             }
@@ -561,7 +557,12 @@ impl Answer {
             let value = row.get(column).and_then(Value::as_str);
             value.unwrap_or_default().to_owned()
         };
-        let of_kind = |kind: &str| self.rows.iter().filter(|row| text(row, "kind") == kind).count();
+        let of_kind = |kind: &str| {
+            self.rows
+                .iter()
+                .filter(|row| text(row, "kind") == kind)
+                .count()
+        };
         let lacks = |row: &&Map<String, Value>| {
             // What the MES itself can do are processes, which stand elsewhere.
             if text(row, "component") == MES {

@@ -97,7 +97,9 @@ impl Reader {
     pub(crate) fn read(&mut self, now_ns: i64, page: &Value) -> Vec<Dated> {
         let mut facts = Vec::new();
         // A bridge of several spaces has an object for each.
-        let objects = page.as_array().map_or(std::slice::from_ref(page), Vec::as_slice);
+        let objects = page
+            .as_array()
+            .map_or(std::slice::from_ref(page), Vec::as_slice);
         let is_ready = objects.iter().all(|object| {
             let reasons = object.get("not_ready").and_then(Value::as_array);
             reasons.is_none_or(Vec::is_empty)
@@ -135,7 +137,10 @@ impl Reader {
     fn read_mes(&mut self, now_ns: i64, page: MesPage, facts: &mut Vec<Dated>) {
         let of = |component: &Component| Part::of_uri(&component.application_uri);
         let listed = page.components.iter().filter_map(|component| {
-            Some((of(component)?, component.listed_ms.unwrap_or(component.since_ms)))
+            Some((
+                of(component)?,
+                component.listed_ms.unwrap_or(component.since_ms),
+            ))
         });
         self.tell(now_ns, Level::Listed, listed, facts);
         let known = page
@@ -194,7 +199,9 @@ fn part<T: Default + for<'de> Deserialize<'de>>(page: &Value) -> T {
 }
 
 pub(crate) fn nanos(ms: u64) -> i64 {
-    i64::try_from(ms).unwrap_or(i64::MAX).saturating_mul(1_000_000)
+    i64::try_from(ms)
+        .unwrap_or(i64::MAX)
+        .saturating_mul(1_000_000)
 }
 
 #[cfg(test)]
@@ -245,7 +252,10 @@ mod tests {
         let page = |why: &[&str]| json!([{"not_ready": []}, {"not_ready": why}]);
         assert_eq!(bridge.read(1, &page(&["no master"])), []);
         assert!(!bridge.is_done());
-        assert_eq!(bridge.read(2, &page(&[])), [(2, Fact::Ready("bridge-ros2"))]);
+        assert_eq!(
+            bridge.read(2, &page(&[])),
+            [(2, Fact::Ready("bridge-ros2"))]
+        );
         assert!(bridge.is_done());
     }
 
@@ -268,13 +278,17 @@ mod tests {
         });
         assert_eq!(run.unwrap().plans[0].ran[0].step, "Grasp");
         assert_eq!(mes.read(2, &page("running")), []);
-        assert!(matches!(mes.read(3, &page("done")).as_slice(), [(3, Fact::Run(0, _))]));
+        assert!(matches!(
+            mes.read(3, &page("done")).as_slice(),
+            [(3, Fact::Run(0, _))]
+        ));
     }
 
     #[test]
     fn the_server_has_seen_a_component_when_it_has_a_value_of_it() {
         let mut server = Reader::new("ua-server", Page::Server);
-        let page = |delivered: u64| json!({"topics": {"ua_0_8_101": {"delivered": delivered, "sent": 0}}});
+        let page =
+            |delivered: u64| json!({"topics": {"ua_0_8_101": {"delivered": delivered, "sent": 0}}});
         assert_eq!(server.read(1, &page(0)), [(1, Fact::Ready("ua-server"))]);
         assert_eq!(
             server.read(2, &page(1)),

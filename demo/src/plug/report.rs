@@ -64,17 +64,33 @@ impl Report {
             outcome: run.outcome.clone(),
             plans: run.plans.len(),
             lasted_ms: run.ended_ms.and_then(|end| end.checked_sub(run.started_ms)),
-            broke: run.plans.iter().filter_map(|plan| plan.reason.clone()).collect(),
+            broke: run
+                .plans
+                .iter()
+                .filter_map(|plan| plan.reason.clone())
+                .collect(),
         });
         Self {
             finished: story.finished() && failure.is_none(),
             failure,
             speed: speed.factor(),
             manifest: manifest.to_owned(),
-            components: Part::ALL.into_iter().map(|part| (part, levels(part))).collect(),
+            components: Part::ALL
+                .into_iter()
+                .map(|part| (part, levels(part)))
+                .collect(),
             grasps: [Ros::Ros1, Ros::Ros2]
                 .into_iter()
-                .map(|ros| (ros, story.grasps.get(&ros).map(GraspTimes::of).unwrap_or_default()))
+                .map(|ros| {
+                    (
+                        ros,
+                        story
+                            .grasps
+                            .get(&ros)
+                            .map(GraspTimes::of)
+                            .unwrap_or_default(),
+                    )
+                })
                 .collect(),
             runs: runs.collect(),
             loss: Loss {
@@ -105,7 +121,12 @@ impl Report {
         };
         for level in Level::ALL {
             let label = format!("process start to {}", short(level));
-            row(&mut text, &label, known(level).map(shown).each_ref().map(String::as_str), published(level));
+            row(
+                &mut text,
+                &label,
+                known(level).map(shown).each_ref().map(String::as_str),
+                published(level),
+            );
         }
         let listed = Part::ALL.map(|part| {
             let announced = self.known(part, Level::Announced)?;
@@ -119,14 +140,29 @@ impl Report {
             "211, 253, 313 ms",
         );
         for level in LOST_FROM {
-            let label = format!("killed to no longer {}", short(level));
+            let label = format!("killed to gone from {}", level.gone_from());
             let lost = self.loss.lost_ms.get(&level).copied().flatten();
-            row(&mut text, &label, ["", &shown(lost), ""], "2 s (client time-out)");
+            row(
+                &mut text,
+                &label,
+                ["", &shown(lost), ""],
+                "2 s (client time-out)",
+            );
         }
         let halted = shown(self.loss.halted_and_retreated_ms);
-        row(&mut text, "killed to halted and robot away", ["", &halted, ""], "-");
+        row(
+            &mut text,
+            "killed to halted and robot away",
+            ["", &halted, ""],
+            "-",
+        );
         let anew = shown(self.loss.planned_anew_ms);
-        row(&mut text, "process start to planned anew", ["", "", &anew], "-");
+        row(
+            &mut text,
+            "process start to planned anew",
+            ["", "", &anew],
+            "-",
+        );
         text.push('\n');
         row(&mut text, "grasp started from", ["ROS 1", "ROS 2", ""], "");
         let grasp = |of: fn(&GraspTimes) -> Option<f64>| {
@@ -161,7 +197,11 @@ impl GraspTimes {
             running_ms: after(first("Running")),
             ended_ms: after(ended.map(|(at, _)| *at)),
             result_ms: after(grasp.result.as_ref().map(|(at, _)| *at)),
-            states: grasp.states.iter().map(|(_, state)| state.clone()).collect(),
+            states: grasp
+                .states
+                .iter()
+                .map(|(_, state)| state.clone())
+                .collect(),
         }
     }
 }
@@ -202,7 +242,10 @@ fn shown(ms: Option<f64>) -> String {
 
 /// Milliseconds with three places.
 pub(crate) fn millis(nanos: i64) -> f64 {
-    #[expect(clippy::cast_precision_loss, reason = "a story lasts far less than 2^53 ns")]
+    #[expect(
+        clippy::cast_precision_loss,
+        reason = "a story lasts far less than 2^53 ns"
+    )]
     let nanos = nanos as f64;
     (nanos / 1e3).round() / 1e3
 }
@@ -251,7 +294,15 @@ mod tests {
         assert!(json["question"].is_null());
         let keys: Vec<&String> = json.as_object().unwrap().keys().collect();
         let documented = [
-            "components", "failure", "finished", "grasps", "loss", "manifest", "question", "runs", "speed",
+            "components",
+            "failure",
+            "finished",
+            "grasps",
+            "loss",
+            "manifest",
+            "question",
+            "runs",
+            "speed",
         ];
         let mut keys: Vec<&str> = keys.into_iter().map(String::as_str).collect();
         keys.sort_unstable();
@@ -261,7 +312,9 @@ mod tests {
     #[test]
     fn skills_are_listed_after_the_first_word_of_the_component() {
         let table = Report::of(&story(), Speed::new(1.0).unwrap(), "a.aml", None).table();
-        let line = table.lines().find(|line| line.starts_with("announced to skills listed"));
+        let line = table
+            .lines()
+            .find(|line| line.starts_with("announced to skills listed"));
         assert!(line.unwrap().contains("140 ms"), "{table}");
         assert!(line.unwrap().ends_with("211, 253, 313 ms"), "{table}");
     }

@@ -89,7 +89,12 @@ async fn trigger(client: &ServiceClient) -> (bool, String) {
 
 fn subscribe(node: &Node, inbox: &Inbox<Place>) -> anyhow::Result<Vec<Subscription>> {
     let states = Part::ALL.map(|part| (part.namespace(), STATE, "SkillState", SkillState::MD5));
-    let result = (Part::Gripper.namespace(), RESULT, "SkillResult", SkillResult::MD5);
+    let result = (
+        Part::Gripper.namespace(),
+        RESULT,
+        "SkillResult",
+        SkillResult::MD5,
+    );
     states
         .into_iter()
         .chain([result])
@@ -99,7 +104,13 @@ fn subscribe(node: &Node, inbox: &Inbox<Place>) -> anyhow::Result<Vec<Subscripti
                 md5sum: Some(md5.to_owned()),
             };
             let options = SubscriberOptions::default();
-            Ok(node.subscribe(&topic(namespace, id), wanted, options, (namespace, id), inbox)?)
+            Ok(node.subscribe(
+                &topic(namespace, id),
+                wanted,
+                options,
+                (namespace, id),
+                inbox,
+            )?)
         })
         .collect()
 }
@@ -111,10 +122,16 @@ fn heard((namespace, id): Place, event: &InboxEvent) -> Option<NodeEvent> {
     let read = if id == STATE {
         SkillState::from_ros1(&message.bytes).map(|state| NodeEvent::state(ROS, namespace, state))
     } else {
-        SkillResult::from_ros1(&message.bytes).map(|result| NodeEvent::result(ROS, namespace, result))
+        SkillResult::from_ros1(&message.bytes)
+            .map(|result| NodeEvent::result(ROS, namespace, result))
     };
     if read.is_none() {
-        tracing::warn!(namespace, id, bytes = message.bytes.len(), "a message is of another type");
+        tracing::warn!(
+            namespace,
+            id,
+            bytes = message.bytes.len(),
+            "a message is of another type"
+        );
     }
     read
 }

@@ -54,7 +54,10 @@ pub(crate) async fn run() -> anyhow::Result<()> {
         .into_iter()
         .map(|part| {
             let namespace = part.namespace();
-            Ok((namespace, subscription(&mut node, (namespace, STATE), "SkillState")?))
+            Ok((
+                namespace,
+                subscription(&mut node, (namespace, STATE), "SkillState")?,
+            ))
         })
         .collect::<anyhow::Result<_>>()?;
     let gripper = Part::Gripper.namespace();

@@ -128,7 +128,10 @@ mod tests {
     fn bodies_are_read_to_their_end_and_not_beyond() {
         let state = b"\x05\0\0\0Ready\x0c\x0d\0\0\0HaltedToReady\0\0\0\x3f\0\0\0\0\x07\0\0\0";
         let read = SkillState::from_ros1(state).unwrap();
-        assert_eq!((read.state.as_str(), read.number, read.run), ("Ready", 12, 7));
+        assert_eq!(
+            (read.state.as_str(), read.number, read.run),
+            ("Ready", 12, 7)
+        );
         assert_eq!(
             (read.last_transition.as_str(), read.progress),
             ("HaltedToReady", 0.5)
@@ -136,7 +139,10 @@ mod tests {
         let result = b"\x02\0\0\0\x01\0\0\0\0\x01\0\0\0\x07\0\0\0Gripped\x01\0\0\0\x04\0\0\0true";
         let read = SkillResult::from_ros1(result).unwrap();
         assert_eq!((read.run, read.succeeded), (2, true));
-        assert_eq!((read.names, read.values), (vec!["Gripped".to_owned()], vec!["true".to_owned()]));
+        assert_eq!(
+            (read.names, read.values),
+            (vec!["Gripped".to_owned()], vec!["true".to_owned()])
+        );
         for body in [&state[..], result] {
             for end in 0..body.len() {
                 assert_eq!(SkillState::from_ros1(&body[..end]), None);
@@ -146,7 +152,10 @@ mod tests {
             assert_eq!(SkillState::from_ros1(&longer), None);
             assert_eq!(SkillResult::from_ros1(&longer), None);
         }
-        assert_eq!(trigger_response(b"\x01\x02\0\0\0ok"), Some((true, "ok".to_owned())));
+        assert_eq!(
+            trigger_response(b"\x01\x02\0\0\0ok"),
+            Some((true, "ok".to_owned()))
+        );
         assert_eq!(trigger_response(b"\x01\xff\xff\xff\xff"), None);
     }
 }

@@ -214,9 +214,7 @@ impl Story {
 
     /// Whether it is news that a component is not known there any more.
     pub(crate) fn loses(&self, part: Part, level: Level) -> bool {
-        self.act >= Act::Loss
-            && part == Part::Gripper
-            && !self.left.contains_key(&(part, level))
+        self.act >= Act::Loss && part == Part::Gripper && !self.left.contains_key(&(part, level))
     }
 
     /// Whether a state of the gripper, as a node tells it, is another than before, in a grasp of this node.
@@ -333,7 +331,10 @@ impl Story {
         }
         let mut lacks = Vec::new();
         if run.outcome != "done" {
-            lacks.push(format!("ua-mes has not ended the process: {}", standing(run)));
+            lacks.push(format!(
+                "ua-mes has not ended the process: {}",
+                standing(run)
+            ));
         } else if run.plans.len() < plans {
             return Err(format!(
                 "the process ended by {} plans, where {plans} were to be made",
@@ -423,7 +424,10 @@ impl Grasp {
     /// Whether Ready, Running and Ready or Halted were seen, in this order, and the end of them.
     pub(crate) fn has_run(&self) -> bool {
         let states: Vec<&str> = self.states.iter().map(|(_, s)| s.as_str()).collect();
-        matches!(states.as_slice(), [.., "Ready", "Running", "Ready" | "Halted"])
+        matches!(
+            states.as_slice(),
+            [.., "Ready", "Running", "Ready" | "Halted"]
+        )
     }
 }
 
@@ -475,7 +479,11 @@ pub(crate) const LOST_FROM: [Level; 4] = [
 ];
 
 /// Steps of the composite during which the gripper holds the part, and does nothing.
-const CARRYING: [&str; 3] = ["MovePickApproachAfter", "MovePlaceApproachBefore", "MovePlace"];
+const CARRYING: [&str; 3] = [
+    "MovePickApproachAfter",
+    "MovePlaceApproachBefore",
+    "MovePlace",
+];
 
 #[cfg(test)]
 mod tests;

@@ -114,7 +114,9 @@ fn value_of(datagram: &[u8]) -> Option<Part> {
     let mut messages = message.messages();
     messages
         .any(|message| {
-            let fields = message.ok().and_then(|message| message.fields().ok().map(|f| f.len()));
+            let fields = message
+                .ok()
+                .and_then(|message| message.fields().ok().map(|f| f.len()));
             fields.is_some_and(|fields| fields > 0)
         })
         .then_some(part)
@@ -142,7 +144,6 @@ async fn watch_graph(master: String, facts: mpsc::Sender<Dated>) {
 }
 
 /// The group that programs take unless they are told another.
-const GROUP: SocketAddr =
-    SocketAddr::V4(SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 40), 4840));
+const GROUP: SocketAddr = SocketAddr::V4(SocketAddrV4::new(Ipv4Addr::new(239, 192, 0, 40), 4840));
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 const MOST_BYTES: usize = 65_536;

@@ -105,7 +105,11 @@ fn a_grasp_from_ros_needs_the_answer_the_states_in_order_and_the_result() {
         story.observe(at_ns, &fact);
     }
     assert_eq!(story.missing(), Ok(Vec::new()));
-    let states: Vec<_> = story.grasps[&ros].states.iter().map(|(at, _)| *at).collect();
+    let states: Vec<_> = story.grasps[&ros]
+        .states
+        .iter()
+        .map(|(at, _)| *at)
+        .collect();
     assert_eq!(states, [1, 4, 7]);
 }
 
@@ -152,7 +156,10 @@ fn a_refused_start_ends_the_story_with_the_reason() {
 #[test]
 fn the_gripper_is_killed_when_it_holds_the_part_and_not_before() {
     let mut story = at(Act::SecondRun);
-    let early = run("running", vec![ran(&["MovePickApproachBefore", "MovePick", "Grasp"])]);
+    let early = run(
+        "running",
+        vec![ran(&["MovePickApproachBefore", "MovePick", "Grasp"])],
+    );
     sees(&mut story, [(1, Fact::Run(1, early))]);
     assert_eq!(story.missing().unwrap().len(), 1);
     let holding = run("running", vec![ran(&["Grasp", "MovePickApproachAfter"])]);
@@ -164,7 +171,10 @@ fn the_gripper_is_killed_when_it_holds_the_part_and_not_before() {
 #[test]
 fn a_second_run_that_is_over_too_early_is_a_failure() {
     let mut story = at(Act::SecondRun);
-    sees(&mut story, [(1, Fact::Run(1, run("done", vec![ran(&["MovePlace"])])))]);
+    sees(
+        &mut story,
+        [(1, Fact::Run(1, run("done", vec![ran(&["MovePlace"])])))],
+    );
     assert!(story.missing().is_err());
 }
 
@@ -183,7 +193,10 @@ fn who_died_has_to_be_missing_everywhere_and_the_robot_away() {
     plan.reason = Some("parallel-gripper is lost".to_owned());
     assert_eq!(story.missing().unwrap().len(), 1);
     plan.retreated = Some(false);
-    sees(&mut story, [(6, Fact::Run(1, run("running", vec![plan.clone()])))]);
+    sees(
+        &mut story,
+        [(6, Fact::Run(1, run("running", vec![plan.clone()])))],
+    );
     assert!(story.missing().is_err());
     plan.retreated = Some(true);
     sees(&mut story, [(7, Fact::Run(1, run("running", vec![plan])))]);
@@ -195,14 +208,20 @@ fn who_died_has_to_be_missing_everywhere_and_the_robot_away() {
 fn the_second_run_has_to_end_by_another_plan() {
     let ends = |plans| {
         let mut story = at(Act::Vacuum);
-        sees(&mut story, Level::ALL.map(|level| (1, Fact::Reached(Part::Vacuum, level))));
+        sees(
+            &mut story,
+            Level::ALL.map(|level| (1, Fact::Reached(Part::Vacuum, level))),
+        );
         let plans = vec![ran(&["MovePlace"]); plans];
         let ended = Fact::CallEnded {
             run: 1,
             succeeded: true,
             why: String::new(),
         };
-        sees(&mut story, [(2, Fact::Run(1, run("done", plans))), (3, ended)]);
+        sees(
+            &mut story,
+            [(2, Fact::Run(1, run("done", plans))), (3, ended)],
+        );
         story.missing()
     };
     assert!(ends(1).is_err());
