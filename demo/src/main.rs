@@ -182,8 +182,8 @@ async fn play_role(role: Role) -> anyhow::Result<()> {
             speed,
             pki,
         } => supervisor::run(speed.real(conveyor_off_at), pki).await,
-        Role::Ros1Node => plug::ros1_node::run().await,
-        Role::Ros2Node => plug::ros2_node::run().await,
+        Role::Ros1Node => Box::pin(plug::ros1_node::run()).await,
+        Role::Ros2Node => Box::pin(plug::ros2_node::run()).await,
     }
 }
 

@@ -77,6 +77,7 @@ fn state(name: &str) -> (u32, &'static str) {
 }
 
 #[test]
+#[expect(clippy::too_many_lines, reason = "one walk through all states")]
 fn a_client_walks_all_states_and_methods_and_sees_nine_kinds_of_transition() {
     let Some(cell) = Cell::with(&[Peer::Python]) else {
         return;

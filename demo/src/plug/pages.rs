@@ -99,7 +99,7 @@ impl Reader {
         // A bridge of several spaces has an object for each.
         let objects = page
             .as_array()
-            .map_or(std::slice::from_ref(page), Vec::as_slice);
+            .map_or_else(|| std::slice::from_ref(page), Vec::as_slice);
         let is_ready = objects.iter().all(|object| {
             let reasons = object.get("not_ready").and_then(Value::as_array);
             reasons.is_none_or(Vec::is_empty)
@@ -272,9 +272,12 @@ mod tests {
         let facts = mes.read(1, &page("running"));
         assert!(facts.contains(&(7_000_000, Fact::Reached(Part::Robot, Level::Listed))));
         assert!(facts.contains(&(8_000_000, Fact::Reached(Part::Robot, Level::InGraph))));
-        let run = facts.iter().find_map(|(_, fact)| match fact {
-            Fact::Run(0, run) => Some(run),
-            _ => None,
+        let run = facts.iter().find_map(|(_, fact)| {
+            if let Fact::Run(0, run) = fact {
+                Some(run)
+            } else {
+                None
+            }
         });
         assert_eq!(run.unwrap().plans[0].ran[0].step, "Grasp");
         assert_eq!(mes.read(2, &page("running")), []);

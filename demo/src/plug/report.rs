@@ -115,9 +115,12 @@ impl Report {
             "published",
         );
         let known = |level: Level| Part::ALL.map(|part| self.known(part, level));
-        let published = |level| match level {
-            Level::Announced => "under 1 s, and 7 s",
-            _ => "-",
+        let published = |level| {
+            if level == Level::Announced {
+                "under 1 s, and 7 s"
+            } else {
+                "-"
+            }
         };
         for level in Level::ALL {
             let label = format!("process start to {}", short(level));

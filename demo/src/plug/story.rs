@@ -414,10 +414,10 @@ impl Grasp {
     fn saw(&mut self, at_ns: i64, state: &str, run: u32) {
         if self.asked_at.is_none() {
             self.before = Some((at_ns, state.to_owned(), run));
-        } else if self.result.is_none() || !self.has_run() {
-            if self.states.last().is_none_or(|(_, last)| last != state) {
-                self.states.push((at_ns, state.to_owned()));
-            }
+        } else if (self.result.is_none() || !self.has_run())
+            && self.states.last().is_none_or(|(_, last)| last != state)
+        {
+            self.states.push((at_ns, state.to_owned()));
         }
     }
 
