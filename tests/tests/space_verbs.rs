@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use system_tests::{Cell, METRICS_ROS1, Peer, Started, eventually, program};
+use system_tests::{Capture, Cell, METRICS_ROS1, Peer, Started, UadpSocket, eventually, program};
 
 const SOON: Duration = Duration::from_secs(30);
 const TWIST: &str = "geometry_msgs/Twist";
@@ -160,4 +160,39 @@ fn a_skill_of_a_component_is_found_and_run_to_its_result() {
         code == 1 && lines.iter().any(|line| line.contains("BadInvalidState")),
         "{lines:?}"
     );
+}
+
+#[test]
+fn tshark_reads_what_a_component_and_its_caller_say() {
+    let Some(cell) = Cell::with(&[Peer::Tshark]) else {
+        return;
+    };
+    let group = UadpSocket::join();
+    let yaml =
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/plant/parallel-gripper.yaml");
+    let _component = Started::new("ua-component", &program("ua-component"))
+        .args([yaml.to_str().unwrap(), "--interface", "lo", "--lds", "none"])
+        .args(["--pki".into(), cell.folder().join("pki")])
+        .start();
+    eventually("the skill is made ready", SOON, || {
+        (ua_space(&["call", "parallel-gripper.Grasp.Reset"]).0 == 0).then_some(())
+    });
+    assert_eq!(ua_space(&["call", "parallel-gripper.Grasp"]).0, 0);
+    let heard = group.receive_for(Duration::from_millis(200));
+    let shown = cell.dissect(&Capture::of(heard), &[]);
+    for shown in &shown {
+        let wrong = shown.has("uadp.malformed") || shown.has("uadp.dissector_bug");
+        assert!(!wrong, "{:?}: {shown:?}", shown.expert_infos());
+    }
+    let with = |topic: &str, field: &str, value: &str| {
+        let mut shown = shown.iter();
+        shown.any(|shown| {
+            shown.all("uadp.topic").contains(&topic.to_owned())
+                && shown.all(field).contains(&value.to_owned())
+        })
+    };
+    assert!(with("ua_0_7_101", "uadp.field.string", "Running"), "state");
+    assert!(with("ua_0_7_105", "uadp.dataset.kind", "5"), "request");
+    assert!(with("ua_0_7_105", "uadp.dataset.kind", "6"), "response");
+    assert!(with("ua_0_7_105", "uadp.action.state", "2"), "Done");
 }
