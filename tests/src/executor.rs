@@ -49,7 +49,7 @@ struct Work {
 }
 
 impl Executor {
-    /// Announces the call at once and every [`ANNOUNCED_EVERY`], as long as this lives. With `copies` above 1 the network
+    /// Announces the call at once and every `ANNOUNCED_EVERY`, as long as this lives. With `copies` above 1 the network
     /// doubles every datagram to it and of it.
     #[must_use]
     pub fn start(triple: Triple, name: &str, executes: Executes, copies: usize) -> Self {

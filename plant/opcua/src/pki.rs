@@ -122,7 +122,7 @@ impl Pki {
     }
 
     /// Says how to trust each client certificate refused since the last call, and keeps the newest
-    /// [`REJECTED_KEPT`] of them: anyone who reaches the port can have one stored.
+    /// `REJECTED_KEPT` of them: anyone who reaches the port can have one stored.
     pub fn report_rejected(&mut self) {
         // Clients' certificates are refused all the same when the directory is gone: the server says so itself.
         let rejected = self.rejected().unwrap_or_default();

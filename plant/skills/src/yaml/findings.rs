@@ -9,7 +9,7 @@ macro_rules! codes {
         /// What kind of finding. A code keeps its meaning from release to release; new ones may come.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
         #[non_exhaustive]
-        pub enum Code { $(#[doc = concat!($text, ": ", $explanation)] $name,)* }
+        pub enum Code { $(#[doc = concat!($text, ", of which [`explanation`](Self::explanation) tells more.")] $name,)* }
 
         impl Code {
             /// Every code, ascending.
