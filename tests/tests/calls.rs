@@ -75,6 +75,12 @@ fn an_rclpy_client_sees_and_asks_for_a_call_and_is_told_when_its_executor_is_kil
     let executor = Executor::start(START, NAME, Executes::AtOnce, 2);
     let _bridge = cell.bridge_ros2(&[]);
     let mut judge = cell.judge(Distribution::Jazzy, &["judge"]);
+    judge.until(&json!({"nodes": 1}), |nodes| {
+        nodes
+            .as_array()?
+            .contains(&json!("/ua_bridge_ros2"))
+            .then_some(())
+    });
     // `ros2 node info`.
     let info = judge.until(&json!({"info": "/ua_bridge_ros2"}), |info| {
         let services = info["services"].as_array()?;

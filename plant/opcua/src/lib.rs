@@ -16,4 +16,7 @@ pub use opcua::types;
 /// What programs hide of the logs of the OPC UA libraries, in the syntax of `tracing` filters: they say at level info
 /// what they do for each peer, and at level error what a bad peer did, or that there is no certificate where none is
 /// needed. Certificates that are refused are told by the servers here.
-pub const QUIET: &str = "opcua_server=warn,opcua_client=off,opcua_crypto=off,opcua_core=warn,opcua_nodes=warn,opcua_types=off";
+///
+/// A connection that is opened and closed is somebody looking whether the server is there, and no error.
+pub const QUIET: &str = "opcua_server=warn,opcua_server::session::controller=off,opcua_client=off,\
+    opcua_crypto=off,opcua_core=warn,opcua_nodes=warn,opcua_types=off";

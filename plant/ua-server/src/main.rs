@@ -88,9 +88,10 @@ impl Program for UaServer {
 
     const NAME: &'static str = "ua-server";
     const LOCAL: bridge_core::Local = bridge_core::Local::Fields;
-    // The libraries say at level info what they do for each client, and at level error what a bad client did.
-    const QUIET: &'static str =
-        "opcua_server=warn,opcua_crypto=warn,opcua_core=warn,opcua_nodes=warn,opcua_types=off";
+    // The libraries say at level info what they do for each client, and at level error what a bad client did, or that
+    // one looked whether the server is there.
+    const QUIET: &'static str = "opcua_server=warn,opcua_server::session::controller=off,\
+        opcua_crypto=warn,opcua_core=warn,opcua_nodes=warn,opcua_types=off";
 
     fn arguments(&self) -> &Arguments {
         &self.arguments
