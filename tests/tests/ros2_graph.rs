@@ -332,7 +332,7 @@ fn warnings_of_the_bridge_are_on_rosout_under_its_name() {
         log["stamp"]["sec"].as_i64().unwrap() > 1_700_000_000,
         "{log}"
     );
-    assert!(log["file"].as_str().unwrap().ends_with("port.rs"), "{log}");
+    assert!(log["file"].as_str().unwrap().ends_with("told.rs"), "{log}");
 }
 
 #[test]
