@@ -19,4 +19,4 @@ pub use opcua::types;
 ///
 /// A connection that is opened and closed is somebody looking whether the server is there, and no error.
 pub const QUIET: &str = "opcua_server=warn,opcua_server::session::controller=off,opcua_client=off,\
-    opcua_crypto=off,opcua_core=warn,opcua_nodes=warn,opcua_types=off";
+    opcua_crypto=off,opcua_core=warn,opcua_core::comms::secure_channel=off,opcua_nodes=warn,opcua_types=off";
