@@ -3,11 +3,15 @@
 use std::fmt;
 use std::time::Instant;
 
-use mappings::{Overflow, SpaceId, TopicId};
-use messages::{Leaf, MessageType, Rank, ServiceType, TypeName};
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use mappings::{Assigned, FieldMap, Overflow, SpaceId, TopicId};
+use messages::{Leaf, MessageType, Rank, Selected, Selection, ServiceType, TypeName};
 use uadp::action::{ExecutionId, Refusal};
 use uadp::{BuiltinType, StatusCode};
 
+use crate::constant;
 use crate::counters::Counters;
 
 /// What a call takes and gives, as its ActionMetaData say it.
@@ -17,10 +21,61 @@ pub struct CallDescription {
     pub name: String,
     /// What it is, for people; may be empty.
     pub about: String,
+    /// Whether it is a call of its own, or a part of an action.
+    pub role: CallRole,
     /// What a request has in it, in this order.
     pub request: Vec<CallField>,
     /// What an answer has in it, in this order.
     pub response: Vec<CallField>,
+}
+
+/// What a call is to an action, which takes three calls and two values of one namespace.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum CallRole {
+    /// Nothing: it has an answer at once.
+    #[default]
+    Call,
+    /// It sends a goal.
+    Goal(ActionFamily),
+    /// It cancels goals of the action with that DataSetWriterId.
+    Cancel {
+        /// Of the call that sends the goals.
+        of: u16,
+    },
+    /// It waits for the result of a goal of the action with that DataSetWriterId.
+    Result {
+        /// Of the call that sends the goals.
+        of: u16,
+    },
+}
+
+/// The DataSetWriterIds of an action beside that of its goals.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct ActionFamily {
+    /// The call that cancels.
+    pub cancel: u16,
+    /// The call that waits for a result.
+    pub result: u16,
+    /// The value with the feedback of each goal.
+    pub feedback: u16,
+    /// The value with the status of the goals.
+    pub status: u16,
+}
+
+impl ActionFamily {
+    /// Those behind the DataSetWriterId of the goals, in their order; `None` where there are not as many.
+    #[must_use]
+    pub const fn behind(goal: u16) -> Option<Self> {
+        match goal.checked_add(4) {
+            None => None,
+            Some(status) => Some(Self {
+                cancel: goal + 1,
+                result: goal + 2,
+                feedback: goal + 3,
+                status,
+            }),
+        }
+    }
 }
 
 /// One field of a request or response.
@@ -104,6 +159,39 @@ pub struct Offered {
     pub open: bool,
 }
 
+/// A call that the local side executes as a ROS service: requests and responses are its messages in the local encoding.
+#[derive(Debug, Clone)]
+pub struct OfferedType {
+    /// What it takes and gives.
+    pub service_type: Arc<ServiceType>,
+    /// Its name for people, as `Conveyor.Switch`; may be empty.
+    pub name: String,
+    /// What it is, for people, without the name of the type; may be empty.
+    pub about: String,
+    /// What it is to an action.
+    pub role: CallRole,
+    /// Whether requests from other hosts are executed too; else only those from a loopback address.
+    pub open: bool,
+}
+
+/// What the request of a call and the response of the type it is asked for as are made of, where not all goes by name.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct CallMap {
+    /// The fields of the call's request, of those of the type's.
+    pub request: FieldMap,
+    /// The fields of the type's response, of those of the call's.
+    pub response: FieldMap,
+}
+
+/// What a field of a request is made of.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Origin {
+    /// The field at that place of the ROS message.
+    Leaf(usize),
+    /// Always the same: a block of that one field.
+    Constant(Vec<u8>),
+}
+
 /// What a value of our own space is, where no mapping says it and the local side speaks in fields.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ValueDescription {
@@ -137,6 +225,15 @@ pub struct CallCounters {
 }
 
 impl CallField {
+    pub(crate) fn of(leaf: &Leaf) -> Self {
+        Self {
+            name: leaf.path.clone(),
+            builtin: leaf.builtin,
+            rank: leaf.rank,
+            optional: false,
+        }
+    }
+
     /// A single value.
     #[must_use]
     pub fn scalar(name: &str, builtin: BuiltinType) -> Self {
@@ -176,68 +273,102 @@ impl CallDescription {
 
     /// Whether it can be asked for as that ROS type: each field of the type's response is in the response of the call, and
     /// the fields of the requests are the same, in whatever order; or the type's request has none, and the call can be
-    /// asked for so. Further fields of the response are left out.
+    /// asked for so. Further fields of the response are left out. What `map` names is made as it says; where it says anything
+    /// of the request, further fields of the type's request are left out.
     ///
     /// # Errors
     /// Why not, for people.
-    pub fn fits(&self, service: &ServiceType) -> Result<(), String> {
-        self.request_order(service.request())?;
-        self.response_order(service.response())?;
+    pub fn fits(&self, service: &ServiceType, map: &CallMap) -> Result<(), String> {
+        self.request_order(service.request(), &map.request)?;
+        self.response_order(service.response(), &map.response)?;
         Ok(())
     }
 
-    /// For each field of the request its place in the ROS message; `None` where the request goes without fields.
+    /// For each field of the request what it is made of; `None` where the request goes without fields.
     pub(crate) fn request_order(
         &self,
         message: &MessageType,
-    ) -> Result<Option<Vec<usize>>, String> {
+        map: &FieldMap,
+    ) -> Result<Option<Vec<Origin>>, String> {
         let leaves = message.leaves();
-        if leaves.is_empty() && self.may_be_empty() {
+        if leaves.is_empty() && map.is_empty() && self.may_be_empty() {
             return Ok(None);
         }
-        let place = |field: &CallField| {
+        let origin = |field: &CallField| {
+            let path = match map.source(&field.name) {
+                Some(Assigned::Constant(literal)) => {
+                    return constant::block(field, &literal).map(Origin::Constant);
+                }
+                Some(Assigned::Field(path)) => path,
+                None => field.name.clone(),
+            };
             let find = |leaf: &Leaf| {
-                is_same(field, leaf)
+                path.eq_ignore_ascii_case(&leaf.path)
                     && takes(field.rank, leaf.rank)
                     && field.builtin == leaf.builtin
             };
-            let found = leaves.iter().position(find);
-            found.ok_or_else(|| format!("its request has {field}, and {} has not", message.name()))
+            let found = leaves.iter().position(find).map(Origin::Leaf);
+            found.ok_or_else(|| match path == field.name {
+                true => format!("its request has {field}, and {} has not", message.name()),
+                false => format!(
+                    "its request has {field}, which is to be made of `{path}`, and {} has no such field of that type",
+                    message.name()
+                ),
+            })
         };
-        let order: Vec<usize> = self.request.iter().map(place).collect::<Result<_, _>>()?;
+        let order: Vec<Origin> = self.request.iter().map(origin).collect::<Result<_, _>>()?;
         let missing = leaves
             .iter()
             .enumerate()
-            .find(|(at, _)| !order.contains(at));
+            .find(|(at, _)| !order.contains(&Origin::Leaf(*at)));
         match missing {
-            None => Ok(Some(order)),
-            Some((_, leaf)) => Err(format!(
+            Some((_, leaf)) if map.is_empty() => Err(format!(
                 "{} has `{}`, and its request has not",
                 message.name(),
                 leaf.path
             )),
+            Some(_) | None => Ok(Some(order)),
         }
     }
 
-    /// For each field of the ROS message its place in the response.
-    pub(crate) fn response_order(&self, message: &MessageType) -> Result<Vec<usize>, String> {
-        let place = |leaf: &Leaf| {
+    /// What of the ROS message is made of fields of the response, and for each of those its place there.
+    pub(crate) fn response_order(
+        &self,
+        message: &MessageType,
+        map: &FieldMap,
+    ) -> Result<(Selection, Vec<usize>), String> {
+        let (mut fields, mut rest) = (Vec::new(), BTreeMap::new());
+        let mut order = Vec::new();
+        for leaf in message.leaves() {
+            let path = match map.source(&leaf.path) {
+                Some(Assigned::Constant(literal)) => {
+                    rest.insert(leaf.path.clone(), literal);
+                    continue;
+                }
+                Some(Assigned::Field(path)) => path,
+                None => leaf.path.clone(),
+            };
             let find = |field: &CallField| {
-                is_same(field, leaf)
+                field.name.eq_ignore_ascii_case(&path)
                     && takes(leaf.rank, field.rank)
                     && field.builtin == leaf.builtin
             };
             let found = self.response.iter().position(find);
-            found.ok_or_else(|| {
+            order.push(found.ok_or_else(|| {
+                let kind = kind(leaf.builtin, leaf.rank);
                 format!(
-                    "{} has `{}` ({}), and its response has not",
+                    "{} has `{}` ({kind}), and its response has no `{path}` of that type",
                     message.name(),
                     leaf.path,
-                    kind(leaf.builtin, leaf.rank)
                 )
-            })
+            })?);
+            fields.push(Selected::whole(&leaf.path));
+        }
+        let selection = match rest.is_empty() {
+            true => Selection::Whole,
+            false => Selection::Template { fields, rest },
         };
-        message.leaves().iter().map(place).collect()
+        Ok((selection, order))
     }
 }
 
@@ -271,11 +402,6 @@ pub(crate) fn join_name(topic: TopicId, name: &str) -> String {
         "" => topic.to_string(),
         name => format!("{topic} {name}"),
     }
-}
-
-/// ROS 1 and ROS 2 write some names in other cases.
-fn is_same(field: &CallField, leaf: &Leaf) -> bool {
-    field.name.eq_ignore_ascii_case(&leaf.path)
 }
 
 /// Whether values of `given` have a place in what is of `wanted`.

@@ -3,22 +3,40 @@
 //! As with values the name stands behind that of the topic, since an announcement has no WriterGroupId. A field of the request
 //! that has a value of its own has the Property `Optional`.
 
+use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
 
 use mappings::TopicId;
+use messages::MessageType;
 use uadp::discovery::{
     ActionMetaData, ActionTargetDataType, Announced, Announcement, ConfigurationVersion,
     DataSetMetaDataType, FieldMetaData, KeyValuePair, List,
 };
 use uadp::{
-    EncodeError, NodeId, PublisherId, QualifiedName, Scalar, SecurityHeader, Timestamp, Variant,
+    Array, BuiltinType, EncodeError, PublisherId, QualifiedName, Scalar, SecurityHeader, Timestamp,
+    Variant,
 };
 
-use crate::call::{CallDescription, CallField, join_name};
+use crate::call::{ActionFamily, CallDescription, CallField, CallRole, join_name};
 use crate::description::{
-    MAX_ANNOUNCEMENT, MAX_NAME, field_id, list, read_rank, sizes, text, value_rank, version_time,
+    MAX_ANNOUNCEMENT, MAX_NAME, data_type, field_id, list, read_rank, sizes, text, value_rank,
+    version_time, with_structures,
 };
 use crate::learned::Weight;
+
+/// The ROS messages whose fields are those of a call.
+#[derive(Clone, Copy)]
+pub(crate) struct Types<'m> {
+    pub(crate) request: &'m MessageType,
+    pub(crate) response: &'m MessageType,
+}
+
+/// What is said of a call: itself, its types where it has some, and the URIs of namespaces by their index.
+pub(crate) type Said<'s> = (
+    &'s CallDescription,
+    Option<Types<'s>>,
+    &'s BTreeMap<u16, String>,
+);
 
 /// What is announced of a call of ours.
 #[derive(Debug)]
@@ -39,11 +57,11 @@ impl CallAnnouncement {
     /// [`EncodeError`] for more bytes than are sent.
     pub(crate) fn new(
         topic: TopicId,
-        description: &CallDescription,
+        said: Said<'_>,
         before: Option<&Self>,
         utc: Timestamp,
     ) -> Result<Self, EncodeError> {
-        let (body, _) = encode(topic, description, ConfigurationVersion::default())?;
+        let (body, _) = encode(topic, said, ConfigurationVersion::default())?;
         let mut hasher = DefaultHasher::new();
         body.hash(&mut hasher);
         let content = hasher.finish();
@@ -52,7 +70,7 @@ impl CallAnnouncement {
             Some(before) => before.version.changed(version_time(utc)),
             None => ConfigurationVersion::default().changed(version_time(utc)),
         };
-        let (datagram, body_at) = encode(topic, description, version)?;
+        let (datagram, body_at) = encode(topic, said, version)?;
         if datagram.len() > MAX_ANNOUNCEMENT {
             return Err(EncodeError::TooBig {
                 what: "ActionMetaData",
@@ -82,77 +100,176 @@ impl CallAnnouncement {
 /// The announcement, and where its body begins.
 fn encode(
     topic: TopicId,
-    description: &CallDescription,
+    (description, types, namespaces): Said<'_>,
     version: ConfigurationVersion,
 ) -> Result<(Vec<u8>, usize), EncodeError> {
     let (space, _, writer_id) = topic.triple();
     let name = join_name(topic, &description.name);
-    let request_sizes: Vec<Vec<u32>> = description.request.iter().map(|f| sizes(f.rank)).collect();
-    let response_sizes: Vec<Vec<u32>> =
-        description.response.iter().map(|f| sizes(f.rank)).collect();
-    let optional = [KeyValuePair {
-        key: OPTIONAL,
-        value: Variant::Scalar(Scalar::Boolean(true)),
-    }];
-    let request = field_list((topic, 0), &description.request, &request_sizes, &optional);
-    let first = description.request.len();
-    let response = field_list((topic, first), &description.response, &response_sizes, &[]);
-    let data_set = |fields, about| DataSetMetaDataType {
-        name: Some(&name),
-        description: text(about),
-        fields,
-        configuration_version: version,
-        ..DataSetMetaDataType::default()
-    };
     let target = [ActionTargetDataType {
         action_target_id: TARGET,
         name: Some(&description.name),
         description: text(""),
     }];
-    let announcement = Announcement {
-        sequence_number: 0,
-        announced: Announced::ActionMetaData(ActionMetaData {
-            writer_id,
-            action_targets: List::new(&target),
-            request: data_set(list(&request), &description.about),
-            response: data_set(list(&response), ""),
-            action_methods: List::null(),
-        }),
+    let request = Side {
+        fields: FieldList::new(&description.request, description.role),
+        of: types.map(|types| types.request),
+        first: 0,
+        meta_data: (&name, &description.about, version),
     };
-    let mut datagram = Vec::new();
-    announcement.encode(
-        PublisherId::UInt16(space),
-        SecurityHeader::NONE,
-        &mut datagram,
-    )?;
-    let mut body = Vec::new();
-    announcement.encode_body(&mut body)?;
-    let body_at = datagram.len().saturating_sub(body.len());
-    Ok((datagram, body_at))
+    let response = Side {
+        fields: FieldList::new(&description.response, CallRole::Call),
+        of: types.map(|types| types.response),
+        first: description.request.len(),
+        meta_data: (&name, "", version),
+    };
+    request.with(topic, namespaces, |request| {
+        response.with(topic, namespaces, |response| {
+            let announcement = Announcement {
+                sequence_number: 0,
+                announced: Announced::ActionMetaData(ActionMetaData {
+                    writer_id,
+                    action_targets: List::new(&target),
+                    request: *request,
+                    response: *response,
+                    action_methods: List::null(),
+                }),
+            };
+            let mut datagram = Vec::new();
+            announcement.encode(
+                PublisherId::UInt16(space),
+                SecurityHeader::NONE,
+                &mut datagram,
+            )?;
+            let mut body = Vec::new();
+            announcement.encode_body(&mut body)?;
+            let body_at = datagram.len().saturating_sub(body.len());
+            Ok((datagram, body_at))
+        })
+    })
 }
 
-fn field_list<'f>(
-    (topic, first): (TopicId, usize),
-    fields: &'f [CallField],
-    sizes: &'f [Vec<u32>],
-    optional: &'f [KeyValuePair<'f>],
-) -> Vec<FieldMetaData<'f>> {
-    let fields = fields.iter().zip(sizes).enumerate();
-    fields
-        .map(|(index, (field, sizes))| FieldMetaData {
-            name: Some(&field.name),
-            built_in_type: field.builtin.id(),
-            data_type: NodeId::numeric(0, field.builtin.id().into()),
-            value_rank: value_rank(field.rank),
-            array_dimensions: list(sizes),
-            data_set_field_id: field_id(topic, first + index, &field.name),
-            properties: match field.optional {
-                true => list(optional),
-                false => List::null(),
-            },
-            ..FieldMetaData::default()
+/// The request or the response.
+struct Side<'s> {
+    fields: FieldList<'s>,
+    /// The message that its fields are of.
+    of: Option<&'s MessageType>,
+    /// How many fields stand before it.
+    first: usize,
+    /// Name, description and version.
+    meta_data: (&'s str, &'s str, ConfigurationVersion),
+}
+
+/// Fields and what is said of each.
+struct FieldList<'s> {
+    fields: &'s [CallField],
+    sizes: Vec<Vec<u32>>,
+    /// Bytes of an array that says what the call is to an action.
+    family: Vec<u8>,
+    role: CallRole,
+}
+
+impl<'s> FieldList<'s> {
+    fn new(fields: &'s [CallField], role: CallRole) -> Self {
+        let family = match role {
+            CallRole::Goal(ActionFamily {
+                cancel,
+                result,
+                feedback,
+                status,
+            }) => [cancel, result, feedback, status]
+                .map(u16::to_le_bytes)
+                .concat(),
+            CallRole::Call | CallRole::Cancel { .. } | CallRole::Result { .. } => Vec::new(),
+        };
+        Self {
+            fields,
+            sizes: fields.iter().map(|field| sizes(field.rank)).collect(),
+            family,
+            role,
+        }
+    }
+
+    /// The Property that says what the call is to an action.
+    fn role(&self) -> Result<Option<KeyValuePair<'_>>, EncodeError> {
+        let property = |key, value| Some(KeyValuePair { key, value });
+        let of = |of| Variant::Scalar(Scalar::UInt16(of));
+        Ok(match self.role {
+            CallRole::Call => None,
+            CallRole::Goal(_) => {
+                let family = Array::new(BuiltinType::UInt16, FAMILY, &self.family);
+                let family = family.map_err(|_| EncodeError::TooBig {
+                    what: "ActionFamily",
+                    len: self.family.len(),
+                })?;
+                property(ACTION_FAMILY, Variant::Array(family))
+            }
+            CallRole::Cancel { of: goal } => property(CANCEL_OF, of(goal)),
+            CallRole::Result { of: goal } => property(RESULT_OF, of(goal)),
         })
-        .collect()
+    }
+}
+
+impl Side<'_> {
+    /// Hands on what is said of it.
+    fn with<T>(
+        &self,
+        topic: TopicId,
+        namespaces: &BTreeMap<u16, String>,
+        then: impl FnOnce(&DataSetMetaDataType<'_>) -> Result<T, EncodeError>,
+    ) -> Result<T, EncodeError> {
+        let (_, namespace, _) = topic.triple();
+        let optional = KeyValuePair {
+            key: OPTIONAL,
+            value: Variant::Scalar(Scalar::Boolean(true)),
+        };
+        let role = self.fields.role()?;
+        let of_field = |index, field: &CallField| {
+            let role = role.filter(|_| index == 0);
+            let optional = field.optional.then_some(optional);
+            role.into_iter().chain(optional).collect::<Vec<_>>()
+        };
+        let fields = self.fields.fields.iter().enumerate();
+        let properties: Vec<Vec<KeyValuePair<'_>>> = fields
+            .map(|(index, field)| of_field(index, field))
+            .collect();
+        let fields = self.fields.fields.iter().zip(&self.fields.sizes);
+        let fields: Vec<FieldMetaData<'_>> = fields
+            .zip(&properties)
+            .enumerate()
+            .map(|(index, ((field, sizes), properties))| {
+                let structure = field.builtin == BuiltinType::ExtensionObject;
+                let of = self.of.filter(|_| structure);
+                FieldMetaData {
+                    name: Some(&field.name),
+                    built_in_type: field.builtin.id(),
+                    data_type: data_type(
+                        field.builtin,
+                        of.and_then(|of| of.message_at(&field.name)),
+                        namespace,
+                    ),
+                    value_rank: value_rank(field.rank),
+                    array_dimensions: list(sizes),
+                    data_set_field_id: field_id(topic, self.first + index, &field.name),
+                    properties: list(properties),
+                    ..FieldMetaData::default()
+                }
+            })
+            .collect();
+        let (name, about, version) = self.meta_data;
+        let plain = DataSetMetaDataType {
+            name: Some(name),
+            description: text(about),
+            fields: list(&fields),
+            configuration_version: version,
+            ..DataSetMetaDataType::default()
+        };
+        match self.of {
+            None => then(&plain),
+            Some(of) => with_structures(of, of.leaves(), (namespace, namespaces), |schema| {
+                then(&DataSetMetaDataType { schema, ..plain })
+            }),
+        }
+    }
 }
 
 /// Reads what is announced of a call; its name is what stands behind that of the topic.
@@ -170,9 +287,50 @@ pub(crate) fn read(action: &ActionMetaData<'_>, name: &str) -> Result<CallDescri
     Ok(CallDescription {
         name: name.to_owned(),
         about: about.to_owned(),
+        role: read_role(&action.request),
         request: read_fields(&action.request)?,
         response: read_fields(&action.response)?,
     })
+}
+
+/// What the first field says the call is to an action. What makes no sense is a call of its own.
+fn read_role(request: &DataSetMetaDataType<'_>) -> CallRole {
+    let Some(field) = request.fields.get(0) else {
+        return CallRole::Call;
+    };
+    let said = field.properties.iter().find_map(|property| {
+        let number = match property.value {
+            Variant::Scalar(Scalar::UInt16(number)) => number,
+            Variant::Null | Variant::Scalar(_) | Variant::Array(_) | Variant::Matrix(_) => 0,
+        };
+        if property.key == ACTION_FAMILY {
+            read_family(&property.value).map(CallRole::Goal)
+        } else if number == 0 {
+            None
+        } else if property.key == CANCEL_OF {
+            Some(CallRole::Cancel { of: number })
+        } else {
+            (property.key == RESULT_OF).then_some(CallRole::Result { of: number })
+        }
+    });
+    said.unwrap_or_default()
+}
+
+fn read_family(value: &Variant<'_>) -> Option<ActionFamily> {
+    let Variant::Array(array) = value else {
+        return None;
+    };
+    let mut numbers = array.iter().map(|number| match number {
+        Scalar::UInt16(number) if number != 0 => Some(number),
+        _ => None,
+    });
+    let family = ActionFamily {
+        cancel: numbers.next()??,
+        result: numbers.next()??,
+        feedback: numbers.next()??,
+        status: numbers.next()??,
+    };
+    numbers.next().is_none().then_some(family)
 }
 
 fn read_fields(data_set: &DataSetMetaDataType<'_>) -> Result<Vec<CallField>, String> {
@@ -217,6 +375,22 @@ const OPTIONAL: QualifiedName<'static> = QualifiedName {
     namespace: 0,
     name: Some("Optional"),
 };
+/// Of the first field of a request: DataSetWriterIds of an action's cancel, result, feedback and status.
+const ACTION_FAMILY: QualifiedName<'static> = named("ActionFamily");
+/// How many they are.
+const FAMILY: usize = 4;
+/// Of the first field of a request: DataSetWriterId of the action it cancels goals of.
+const CANCEL_OF: QualifiedName<'static> = named("CancelOf");
+/// Of the first field of a request: DataSetWriterId of the action it waits for results of.
+const RESULT_OF: QualifiedName<'static> = named("ResultOf");
+
+const fn named(name: &'static str) -> QualifiedName<'static> {
+    QualifiedName {
+        namespace: 0,
+        name: Some(name),
+    }
+}
+
 /// Bytes of a description that is believed.
 const MAX_ABOUT: usize = 1_024;
 /// Fields of a request or response that are believed.
@@ -233,6 +407,7 @@ mod tests {
         let description = CallDescription {
             name: "gripper.Grasp.Start".to_owned(),
             about: "closes".to_owned(),
+            role: CallRole::Goal(ActionFamily::behind(105).unwrap()),
             request: vec![
                 CallField::scalar("Force", BuiltinType::Double).optional(),
                 CallField::array("Position", BuiltinType::Float),
@@ -241,7 +416,9 @@ mod tests {
         };
         let topic: TopicId = "ua_0_7_105".parse().unwrap();
         let utc = Timestamp::from_unix_nanos(1_700_000_000_000_000_000);
-        let announcement = CallAnnouncement::new(topic, &description, None, utc).unwrap();
+        let announcement =
+            CallAnnouncement::new(topic, (&description, None, &BTreeMap::new()), None, utc)
+                .unwrap();
         let mut bytes = Vec::new();
         announcement.write(3, &mut bytes);
         let message = NetworkMessage::decode(&bytes).unwrap();

@@ -2,13 +2,13 @@
 
 use std::sync::Arc;
 
-use messages::{Plan, PlanError, Selection, ServiceType, Wire};
+use messages::{MessageType, Plan, PlanError, Selection, ServiceType, Wire};
 use uadp::{
     DataSetHeader, EncodeError, FieldEncoder, Fields, NetworkHeader, NetworkMessage,
     NetworkMessageEncoder, Variant,
 };
 
-use crate::call::CallDescription;
+use crate::call::{CallDescription, CallMap, Origin};
 use crate::counters::{Cause, Reason};
 use crate::fields::{self, Payload};
 use crate::plans::Plans;
@@ -18,10 +18,10 @@ use crate::plans::Plans;
 pub(crate) struct CallPlan {
     request: Arc<Plan>,
     response: Arc<Plan>,
-    /// For each field of the request its place in the ROS message; `None` where it goes without fields.
-    request_order: Option<Vec<usize>>,
-    /// For each field of the ROS message its place in the response.
-    response_order: Vec<usize>,
+    /// For each field of the request what it is made of; `None` where it goes without fields.
+    request_order: Option<Vec<Origin>>,
+    /// For each field that the ROS message is made of its place in the response.
+    response_order: Vec<Origin>,
 }
 
 impl CallPlan {
@@ -31,16 +31,19 @@ impl CallPlan {
     /// Why they do not fit, for people.
     pub(crate) fn compile(
         description: &CallDescription,
-        service: &ServiceType,
+        (service, map): (&ServiceType, &CallMap),
         (wire, plans): (Wire, &mut Plans),
     ) -> Result<Self, String> {
         let why = |error: PlanError| error.to_string();
-        let mut plan = |message| plans.plan(message, &Selection::Whole, wire).map_err(why);
+        let mut plan =
+            |message, selection: &Selection| plans.plan(message, selection, wire).map_err(why);
+        let request_order = description.request_order(service.request(), &map.request)?;
+        let (made, order) = description.response_order(service.response(), &map.response)?;
         Ok(Self {
-            request: plan(service.request())?,
-            response: plan(service.response())?,
-            request_order: description.request_order(service.request())?,
-            response_order: description.response_order(service.response())?,
+            request: plan(service.request(), &Selection::Whole)?,
+            response: plan(service.response(), &made)?,
+            request_order,
+            response_order: order.into_iter().map(Origin::Leaf).collect(),
         })
     }
 
@@ -73,26 +76,79 @@ impl CallPlan {
 }
 
 /// The fields at those places, in that order.
-fn arrange(fields: &[u8], order: &[usize]) -> Result<Vec<u8>, (Cause, String)> {
+fn arrange(fields: &[u8], order: &[Origin]) -> Result<Vec<u8>, (Cause, String)> {
     let fields = Fields::parse(fields).map_err(fields::undecodable)?;
     let all: Vec<Variant<'_>> = fields
         .collect::<Result<_, _>>()
         .map_err(fields::undecodable)?;
     block(|frame| {
-        for place in order {
+        for origin in order {
+            let place = match origin {
+                Origin::Leaf(place) => *place,
+                Origin::Constant(block) => {
+                    for field in Fields::parse(block).map_err(fields::undecodable)? {
+                        let field = field.map_err(fields::undecodable)?;
+                        frame.variant(&field).map_err(too_big)?;
+                    }
+                    continue;
+                }
+            };
             let missing = || {
                 let detail = format!("field {place} is missing, there are {}", all.len());
                 ((Reason::Mismatch, "missing").into(), detail)
             };
-            let field = all.get(*place).ok_or_else(missing)?;
+            let field = all.get(place).ok_or_else(missing)?;
             frame.variant(field).map_err(too_big)?;
         }
         Ok(())
     })
 }
 
+/// How the bytes of one service type that is executed here become the fields of its call, and the other way.
+#[derive(Debug)]
+pub(crate) struct ExecutedPlan {
+    request: Arc<Plan>,
+    response: Arc<Plan>,
+}
+
+impl ExecutedPlan {
+    /// For a call with the fields of that type.
+    ///
+    /// # Errors
+    /// Why there can be none, for people.
+    pub(crate) fn compile(
+        service: &ServiceType,
+        (wire, plans): (Wire, &mut Plans),
+    ) -> Result<Self, String> {
+        let mut plan = |message: &Arc<MessageType>| {
+            let plan = plans.plan(message, &Selection::Whole, wire);
+            plan.map_err(|error| error.to_string())
+        };
+        Ok(Self {
+            request: plan(service.request())?,
+            response: plan(service.response())?,
+        })
+    }
+
+    /// Appends the ROS bytes of a request.
+    pub(crate) fn request(&self, fields: &[u8], out: &mut Vec<u8>) -> Result<(), (Cause, String)> {
+        let fields = Fields::parse(fields).map_err(fields::undecodable)?;
+        fields::write(&self.request, fields, out)
+    }
+
+    /// The block of fields of a response in ROS bytes.
+    pub(crate) fn response(
+        &self,
+        message: &[u8],
+        namespace: u16,
+    ) -> Result<Vec<u8>, (Cause, String)> {
+        let payload = Payload::Ros(&self.response, message);
+        block(|frame| fields::read(&payload, namespace, frame))
+    }
+}
+
 /// A block of the fields that are written.
-fn block(
+pub(crate) fn block(
     write: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), (Cause, String)>,
 ) -> Result<Vec<u8>, (Cause, String)> {
     let mut scratch = Vec::new();
@@ -114,11 +170,12 @@ fn block(
     Ok(fields.map_or_else(|| NO_FIELDS.to_vec(), |fields| fields.bytes().to_vec()))
 }
 
-fn is_identity(order: &[usize]) -> bool {
-    order.iter().copied().eq(0..order.len())
+fn is_identity(order: &[Origin]) -> bool {
+    let mut origins = order.iter().enumerate();
+    origins.all(|(at, origin)| *origin == Origin::Leaf(at))
 }
 
-fn too_big(error: EncodeError) -> (Cause, String) {
+pub(crate) fn too_big(error: EncodeError) -> (Cause, String) {
     (Reason::TooBig.into(), error.to_string())
 }
 

@@ -261,35 +261,23 @@ impl Source<'_> {
             .enumerate()
             .map(|(index, (leaf, text))| self.field(index, leaf, (text, &properties)))
             .collect();
-        let structures = self.message.map(|(of, _)| structures(of, self.leaves));
-        let structures = structures.unwrap_or_default();
-        let namespaces = match structures.is_empty() {
-            true => Vec::new(),
-            false => self.namespaces_up_to(namespace),
-        };
-        let inner_sizes: Vec<Vec<Vec<u32>>> = structures.iter().map(member_sizes).collect();
-        let inner: Vec<Vec<StructureField<'_>>> = structures
-            .iter()
-            .zip(&inner_sizes)
-            .map(|(structure, sizes)| structure_fields(structure, sizes, namespace))
-            .collect();
-        let described: Vec<StructureDescription<'_>> = structures
-            .iter()
-            .zip(&inner)
-            .map(|(structure, fields)| structure_description(structure.name, fields, namespace))
-            .collect();
-        self.announcement(&DataSetMetaDataType {
-            schema: DataTypeSchemaHeader {
-                namespaces: list(&namespaces),
-                structure_data_types: list(&described),
-                ..DataTypeSchemaHeader::default()
-            },
-            name: Some(&join_name(self.topic, called)),
+        let name = join_name(self.topic, called);
+        let plain = DataSetMetaDataType {
+            name: Some(&name),
             description: text(&description),
             fields: List::new(&fields),
             configuration_version: version,
             ..DataSetMetaDataType::default()
-        })
+        };
+        match self.message {
+            None => self.announcement(&plain),
+            Some((of, _)) => {
+                let names = (namespace, self.namespaces);
+                with_structures(of, self.leaves, names, |schema| {
+                    self.announcement(&DataSetMetaDataType { schema, ..plain })
+                })
+            }
+        }
     }
 
     fn announcement(
@@ -424,16 +412,46 @@ impl Source<'_> {
             sizes: sizes(leaf.rank),
         }
     }
+}
 
-    /// The list of namespaces that has the index of the topic in it: ExtensionObjects have their TypeIds with that index.
-    fn namespaces_up_to(&self, namespace: u16) -> Vec<Option<&str>> {
-        if namespace > MAX_NAMESPACES {
-            return Vec::new();
-        }
-        (1..=namespace)
-            .map(|index| self.namespaces.get(&index).map(String::as_str))
-            .collect()
+/// Hands on the definitions of the structures among those fields of a message.
+pub(crate) fn with_structures<T>(
+    message_type: &MessageType,
+    leaves: &[Leaf],
+    (namespace, uris): (u16, &BTreeMap<u16, String>),
+    then: impl FnOnce(DataTypeSchemaHeader<'_>) -> Result<T, EncodeError>,
+) -> Result<T, EncodeError> {
+    let structures = structures(message_type, leaves);
+    let namespaces = match structures.is_empty() {
+        true => Vec::new(),
+        false => namespaces_up_to(namespace, uris),
+    };
+    let inner_sizes: Vec<Vec<Vec<u32>>> = structures.iter().map(member_sizes).collect();
+    let inner: Vec<Vec<StructureField<'_>>> = structures
+        .iter()
+        .zip(&inner_sizes)
+        .map(|(structure, sizes)| structure_fields(structure, sizes, namespace))
+        .collect();
+    let described: Vec<StructureDescription<'_>> = structures
+        .iter()
+        .zip(&inner)
+        .map(|(structure, fields)| structure_description(structure.name, fields, namespace))
+        .collect();
+    then(DataTypeSchemaHeader {
+        namespaces: list(&namespaces),
+        structure_data_types: list(&described),
+        ..DataTypeSchemaHeader::default()
+    })
+}
+
+/// The list of namespaces that has that index in it: ExtensionObjects have their TypeIds with it.
+fn namespaces_up_to(namespace: u16, uris: &BTreeMap<u16, String>) -> Vec<Option<&str>> {
+    if namespace > MAX_NAMESPACES {
+        return Vec::new();
     }
+    (1..=namespace)
+        .map(|index| uris.get(&index).map(String::as_str))
+        .collect()
 }
 
 /// The message type that all who read or write the value in ROS take as a whole, and the same.
@@ -586,7 +604,7 @@ fn structure_fields<'s>(
 }
 
 /// The DataType of a message type and its encoding have one NodeId, which is the name of the type.
-fn data_type(builtin: BuiltinType, of: Option<&TypeName>, namespace: u16) -> NodeId<'_> {
+pub(crate) fn data_type(builtin: BuiltinType, of: Option<&TypeName>, namespace: u16) -> NodeId<'_> {
     match of {
         Some(name) => NodeId::string(namespace, name.as_str()),
         None => NodeId::numeric(0, builtin.id().into()),

@@ -13,6 +13,7 @@ mod base;
 mod call;
 mod call_announcement;
 mod call_plan;
+mod constant;
 mod counters;
 mod description;
 mod fields;
@@ -37,8 +38,9 @@ mod transcoder;
 mod writer;
 
 pub use call::{
-    Answered, AskError, AskErrorKind, AskId, CallCounters, CallDescription, CallField, Executed,
-    Execution, Offered, ValueDescription, split_name,
+    ActionFamily, Answered, AskError, AskErrorKind, AskId, CallCounters, CallDescription,
+    CallField, CallMap, CallRole, Executed, Execution, Offered, OfferedType, ValueDescription,
+    split_name,
 };
 pub use counters::{Counters, Reason, Verdict};
 pub use description::Described;

@@ -13,7 +13,7 @@ mod cell;
 use std::collections::BTreeMap;
 
 use bridge_core::{
-    AskErrorKind, AskId, CallDescription, CallField, Executed, Local, Offered, Reason,
+    AskErrorKind, AskId, CallDescription, CallField, CallRole, Executed, Local, Offered, Reason,
 };
 use cell::{Cell, Program, block, is_action, ms, topic};
 use proptest::prelude::*;
@@ -68,6 +68,7 @@ fn description() -> CallDescription {
     CallDescription {
         name: "Echo".to_owned(),
         about: String::new(),
+        role: CallRole::Call,
         request: vec![CallField::scalar("number", BuiltinType::UInt32)],
         response: vec![CallField::scalar("number", BuiltinType::UInt32)],
     }

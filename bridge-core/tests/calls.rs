@@ -12,8 +12,8 @@ mod cell;
 use std::sync::Arc;
 
 use bridge_core::{
-    AskErrorKind, AskId, CallDescription, CallField, Executed, Local, Offered, Output, Owned,
-    Reason, ValueDescription,
+    AskErrorKind, AskId, CallDescription, CallField, CallMap, CallRole, Executed, Local, Offered,
+    Output, Owned, Reason, ValueDescription,
 };
 use cell::{Cell, Program, component, ms, topic};
 use mappings::{Overflow, TopicId};
@@ -37,6 +37,7 @@ fn grasp() -> CallDescription {
     CallDescription {
         name: "gripper.Grasp.Start".to_owned(),
         about: String::new(),
+        role: CallRole::Call,
         request: vec![CallField::scalar("Force", BuiltinType::Double).optional()],
         response: vec![
             CallField::scalar("success", BuiltinType::Boolean),
@@ -99,7 +100,10 @@ fn a_ros_service_call_starts_a_skill_and_is_answered() {
         let trigger = service(dialect, "std_srvs/Trigger");
         let now = cell.now();
         let bridge = &mut cell.programs[BRIDGE].router;
-        assert_eq!(bridge.bind_call(start(), &trigger, now), Ok(()));
+        assert_eq!(
+            bridge.bind_call(start(), (&trigger, &Arc::default()), now),
+            Ok(())
+        );
         cell.ask(BRIDGE, AskId(1), (start(), request), ms(3_000));
         cell.run(ms(50));
         let execution = cell.executions(GRIPPER).pop().unwrap();
@@ -138,20 +142,20 @@ fn a_type_that_lacks_what_the_call_wants_is_refused_with_the_name_of_the_field()
     let mut wants = grasp();
     wants.request = vec![CallField::scalar("Force", BuiltinType::Double)];
     let trigger = service(Dialect::Ros1, "std_srvs/Trigger");
-    let why = wants.fits(&trigger).unwrap_err();
+    let why = wants.fits(&trigger, &CallMap::default()).unwrap_err();
     assert!(why.contains("`Force` (Double)"), "{why}");
     let set_bool = service(Dialect::Ros1, "std_srvs/SetBool");
-    let why = grasp().fits(&set_bool).unwrap_err();
+    let why = grasp().fits(&set_bool, &CallMap::default()).unwrap_err();
     assert!(why.contains("`Force`"), "{why}");
     let mut silent = grasp();
     silent.response.remove(1);
-    let why = silent.fits(&trigger).unwrap_err();
+    let why = silent.fits(&trigger, &CallMap::default()).unwrap_err();
     assert!(why.contains("`message` (String)"), "{why}");
     // Names in other cases and another order fit.
     let mut turned = grasp();
     turned.response.reverse();
     turned.response[1].name = "Message".to_owned();
-    assert_eq!(turned.fits(&trigger), Ok(()));
+    assert_eq!(turned.fits(&trigger, &CallMap::default()), Ok(()));
 
     let mut cell = plugged_in(Local::Ros1);
     cell.offer(GRIPPER, start(), offered(wants));
@@ -160,7 +164,7 @@ fn a_type_that_lacks_what_the_call_wants_is_refused_with_the_name_of_the_field()
     assert!(
         cell.programs[BRIDGE]
             .router
-            .bind_call(start(), &trigger, now)
+            .bind_call(start(), (&trigger, &Arc::default()), now)
             .is_err()
     );
     cell.ask(BRIDGE, AskId(1), (start(), &[]), ms(3_000));
@@ -182,7 +186,9 @@ fn answers_in_another_order_are_sorted_by_name_and_further_fields_left_out() {
     let now = cell.now();
     let trigger = service(Dialect::Ros1, "std_srvs/Trigger");
     let bridge = &mut cell.programs[BRIDGE].router;
-    bridge.bind_call(start(), &trigger, now).unwrap();
+    bridge
+        .bind_call(start(), (&trigger, &Arc::default()), now)
+        .unwrap();
     cell.ask(BRIDGE, AskId(1), (start(), &[]), ms(3_000));
     cell.run(ms(50));
     let execution = cell.executions(GRIPPER).pop().unwrap();

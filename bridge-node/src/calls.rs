@@ -1,4 +1,4 @@
-//! Calls of other spaces, offered as services of a ROS graph under their names: `/ua_0_7_105`.
+//! Calls of other spaces, offered as services of a ROS graph: under their names (`/ua_0_7_105`), or as the mapping says.
 //!
 //! Under which type is [`policy`](crate::policy)'s matter, how a service is offered the graph's; what is asked goes to the
 //! Router as [`PortEvent::Ask`], and its answer comes back by [`answered`](Calls::answered).
@@ -9,10 +9,10 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
-use bridge_core::{Answered, AskId, CallDescription};
+use bridge_core::{Answered, AskId, CallDescription, CallMap, CallRole};
 use bytes::Bytes;
 use mappings::TopicId;
-use messages::{Literal, MessageType, NoFields, Plan, Selection, ServiceType, Wire};
+use messages::{Literal, MessageType, NoFields, Plan, Selection, ServiceType, TypeName, Wire};
 use tokio::sync::{mpsc, oneshot};
 use tracing::{debug, info};
 
@@ -65,9 +65,47 @@ enum State<S> {
     /// There is no service type for it here, or no room.
     Refused,
     Offered {
+        /// As what.
+        target: Target,
         service_type: Arc<ServiceType>,
         server: S,
     },
+}
+
+/// As what a call is offered.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Target {
+    /// Of the service.
+    name: String,
+    /// Where the mapping says it.
+    type_name: Option<TypeName>,
+    map: Arc<CallMap>,
+    timeout: Duration,
+}
+
+impl Target {
+    /// As the mapping says it, else under the name of the topic.
+    fn of(topic: TopicId, policy: &Policy) -> Self {
+        let call = policy.mapping().call(topic);
+        let timeout = call.map_or(ANSWERED_WITHIN, |call| call.timeout);
+        match call.and_then(|call| call.binding(policy.own())) {
+            Some(binding) => Self {
+                name: binding.target.name.clone(),
+                type_name: Some(binding.target.type_name.clone()),
+                map: Arc::new(CallMap {
+                    request: binding.request.clone(),
+                    response: binding.response.clone(),
+                }),
+                timeout,
+            },
+            None => Self {
+                name: format!("/{topic}"),
+                type_name: None,
+                map: Arc::default(),
+                timeout,
+            },
+        }
+    }
 }
 
 #[derive(Debug)]
@@ -227,14 +265,20 @@ impl<S: Send> Calls<S> {
 
     /// Has calls looked at again, as definitions or the mapping may be others: those that are not offered, and those whose
     /// type is another now.
-    pub fn look_again<G: CallGraph<Server = S>>(&mut self, graph: &mut G) {
-        for known in self.known.values_mut() {
+    pub fn look_again<G: CallGraph<Server = S>>(&mut self, graph: &mut G, policy: &Policy) {
+        for (topic, known) in &mut self.known {
             let again = match &known.state {
                 State::Waiting | State::Refused => true,
                 // A file that cannot be read for the moment changes nothing.
-                State::Offered { service_type, .. } => graph
-                    .service_type(service_type.name())
-                    .is_ok_and(|now| !now.is_same(service_type)),
+                State::Offered {
+                    target,
+                    service_type,
+                    ..
+                } => {
+                    let now = graph.service_type(service_type.name());
+                    *target != Target::of(*topic, policy)
+                        || now.is_ok_and(|now| !now.is_same(service_type))
+                }
             };
             if again {
                 known.state = State::Waiting;
@@ -285,6 +329,11 @@ impl<S: Send> Calls<S> {
         let mut events = Vec::new();
         for (topic, known) in waiting.take(most) {
             let topic = *topic;
+            if known.described.role != CallRole::Call {
+                // A part of an action is no service of its own.
+                known.state = State::Refused;
+                continue;
+            }
             if left == 0 {
                 known.state = State::Refused;
                 policy.told.once("", "too many calls", || {
@@ -299,20 +348,25 @@ impl<S: Send> Calls<S> {
                 say: self.say.clone(),
                 next: Arc::clone(&self.next),
             };
-            let service_type = call_type(&known.described, None, |name| graph.service_type(name));
+            let target = Target::of(topic, policy);
+            let said = (target.type_name.as_ref(), &*target.map);
+            let service_type = call_type(&known.described, said, |name| graph.service_type(name));
             let offered = service_type.and_then(|service_type| {
-                let server = graph.offer(&format!("/{topic}"), &service_type, asker)?;
+                let server = graph.offer(&target.name, &service_type, asker)?;
                 Ok((service_type, server))
             });
             known.state = match offered {
                 Ok((service_type, server)) => {
-                    info!(%topic, service_type = %service_type.name(), "offered as a service");
+                    let (service, service_type_name) = (&target.name, service_type.name());
+                    info!(%topic, service, service_type = %service_type_name, "offered as a service");
                     left -= 1;
                     events.push(PortEvent::CallBound {
                         topic,
                         service_type: Arc::clone(&service_type),
+                        map: Arc::clone(&target.map),
                     });
                     State::Offered {
+                        target,
                         service_type,
                         server,
                     }
@@ -350,8 +404,11 @@ impl<S: Send> Calls<S> {
                     answer,
                 } => {
                     // One that was withdrawn meanwhile answers by the end of its sender.
-                    let Some(State::Offered { service_type, .. }) =
-                        self.known.get(&topic).map(|known| &known.state)
+                    let Some(State::Offered {
+                        target,
+                        service_type,
+                        ..
+                    }) = self.known.get(&topic).map(|known| &known.state)
                     else {
                         continue;
                     };
@@ -366,7 +423,7 @@ impl<S: Send> Calls<S> {
                         topic,
                         ask,
                         request,
-                        timeout: ANSWERED_WITHIN,
+                        timeout: target.timeout,
                     });
                 }
                 Said::GivenUp(ask) => {

@@ -24,8 +24,9 @@ mod status;
 
 pub use arguments::{Arguments, Flags, WithoutMapping};
 pub use bridge_core::{
-    Answered, AskError, AskErrorKind, AskId, CallDescription, CallField, Described, Executed,
-    ExecutionId, Kept, Offered, Owned, PublisherKey, Reason, Refusal, Room, ValueDescription,
+    ActionFamily, Answered, AskError, AskErrorKind, AskId, CallDescription, CallField, CallMap,
+    CallRole, Described, Executed, ExecutionId, Kept, Offered, OfferedType, Owned, PublisherKey,
+    Reason, Refusal, Room, ValueDescription,
 };
 pub use busy_poll::BusyPoll;
 pub use calls::{Asker, CallGraph, Calls};

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_core::{
-    Answered, AskId, CallDescription, Described, Executed, ExecutionId, Kept, Offered,
-    PublisherKey, Reason, ValueDescription,
+    Answered, AskId, CallDescription, CallMap, Described, Executed, ExecutionId, Kept, Offered,
+    OfferedType, PublisherKey, Reason, ValueDescription,
 };
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
@@ -214,6 +214,8 @@ pub enum PortEvent {
         topic: TopicId,
         /// Its type in the port's dialect.
         service_type: Arc<ServiceType>,
+        /// What is not made of the field of the same name.
+        map: Arc<CallMap>,
     },
     /// The local side no longer asks for a call, or will under another type.
     CallUnbound {
@@ -247,6 +249,13 @@ pub enum PortEvent {
         topic: TopicId,
         /// What it is.
         offered: Offered,
+    },
+    /// As `Offer`, for a ROS service: requests are handed out, and responses taken, as its messages.
+    OfferTyped {
+        /// Which call: of a namespace that the program owns.
+        topic: TopicId,
+        /// What it is.
+        offered: OfferedType,
     },
     /// The local side no longer executes a call, or no longer has a value, of its own.
     Withdrawn {

@@ -343,6 +343,7 @@ impl<P: Port> Shell<P> {
             | PortEvent::Ask { .. }
             | PortEvent::AskGivenUp { .. }
             | PortEvent::Offer { .. }
+            | PortEvent::OfferTyped { .. }
             | PortEvent::Withdrawn { .. }
             | PortEvent::Executed { .. }) => self.call_event(event),
             PortEvent::Ended(why) => return Err(Failure::new(FailureKind::Unavailable, why)),

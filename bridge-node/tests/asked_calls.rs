@@ -13,8 +13,8 @@ use std::time::Duration;
 
 use bridge_node::policy::Policy;
 use bridge_node::{
-    AskError, AskErrorKind, AskId, Asker, CallDescription, CallFault, CallField, CallGraph, Calls,
-    PortEvent, ServiceCall, ServiceGraph, now,
+    AskError, AskErrorKind, AskId, Asker, CallDescription, CallFault, CallField, CallGraph,
+    CallRole, Calls, PortEvent, ServiceCall, ServiceGraph, now,
 };
 use bytes::Bytes;
 use mappings::{SpaceId, TopicId};
@@ -142,6 +142,7 @@ fn start(response: &[(&str, BuiltinType)]) -> Arc<CallDescription> {
     Arc::new(CallDescription {
         name: "gripper.Grasp.Start".to_owned(),
         about: String::new(),
+        role: CallRole::Call,
         request: Vec::new(),
         response: fields
             .map(|(name, builtin)| CallField::scalar(name, *builtin))
@@ -181,7 +182,7 @@ async fn a_call_is_a_service_from_when_it_is_known_until_it_is_gone() {
     let events = bench.offer();
     assert!(matches!(
         &events[..],
-        [PortEvent::CallBound { topic: of, service_type }]
+        [PortEvent::CallBound { topic: of, service_type, .. }]
             if *of == topic(105) && service_type.name().to_string() == "std_srvs/Trigger"
     ));
     assert_eq!(bench.services(), ["/ua_0_7_105"]);
@@ -290,7 +291,7 @@ fn a_call_without_a_type_waits_for_other_definitions_and_one_of_others_for_them_
         .known(topic(105), start(&[("number", BuiltinType::Double)]));
     assert!(bench.offer().is_empty() && bench.services().is_empty());
     assert!(!bench.calls.is_waiting());
-    bench.calls.look_again(&mut bench.graph);
+    bench.calls.look_again(&mut bench.graph, &bench.policy);
     assert!(bench.calls.is_waiting());
     bench.offer();
     bench.calls.known(topic(106), trigger());

@@ -1,5 +1,6 @@
 //! The names of the space, and the YAML that ties them to ROS topics and OPC UA nodes.
 
+mod call;
 mod check;
 mod code;
 mod diagnostic;
@@ -21,6 +22,10 @@ mod tree;
 mod unit;
 mod variables;
 
+pub use call::{
+    Assigned, Assignment, Call, CallBinding, CallKind, CallTarget, ExecutedBy, ExpandedNodeIdText,
+    FieldMap, MethodTarget, NamespaceText,
+};
 pub use check::{Checked, PathFault, PathFaultKind, Source, TypeFiles, TypeOrigin, TypeUse};
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};

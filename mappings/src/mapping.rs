@@ -9,6 +9,7 @@ use std::time::Duration;
 use messages::{Leaf, Selection, TypeName};
 use uadp::BuiltinType;
 
+use crate::call::{Call, CallBinding};
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 use crate::topic::{SpaceId, TopicId};
@@ -26,6 +27,7 @@ pub struct Mapping {
     server: Server,
     variables: Vec<Variable>,
     by_topic: HashMap<TopicId, usize>,
+    calls: Vec<Call>,
     patterns: Vec<Pattern>,
     type_paths: Vec<PathBuf>,
 }
@@ -50,6 +52,7 @@ impl Mapping {
             server,
             variables,
             by_topic,
+            calls: Vec::new(),
             patterns: Vec::new(),
             type_paths: Vec::new(),
         }
@@ -75,6 +78,37 @@ impl Mapping {
     #[must_use]
     pub fn type_paths(&self) -> &[PathBuf] {
         &self.type_paths
+    }
+
+    /// The same with those calls, of topics that no variable has.
+    #[must_use]
+    pub fn with_calls(mut self, calls: Vec<Call>) -> Self {
+        self.calls = calls;
+        self
+    }
+
+    /// In the order of the document.
+    #[must_use]
+    pub fn calls(&self) -> &[Call] {
+        &self.calls
+    }
+
+    /// The call of a topic; of an action that of its goal.
+    #[must_use]
+    pub fn call(&self, topic: TopicId) -> Option<&Call> {
+        self.calls.iter().find(|call| call.topic == topic)
+    }
+
+    /// Every call that is executed in that space.
+    pub fn executed_in(&self, space: SpaceId) -> impl Iterator<Item = &Call> {
+        let calls = self.calls.iter();
+        calls.filter(move |call| call.topic.space == space)
+    }
+
+    /// Every call that is asked for in that space under a name of the mapping.
+    pub fn asked_in(&self, space: SpaceId) -> impl Iterator<Item = (&Call, &CallBinding)> {
+        let calls = self.calls.iter();
+        calls.filter_map(move |call| Some((call, call.binding(space)?)))
     }
 
     pub(crate) fn with_patterns(mut self, patterns: Vec<Pattern>) -> Self {

@@ -25,7 +25,7 @@ use uadp::{
 use self::execute::{Own, Running};
 use self::learn::{Group, Known};
 use super::{About, Router};
-use crate::call::{AskError, AskErrorKind, AskId, CallCounters, CallDescription};
+use crate::call::{AskError, AskErrorKind, AskId, CallCounters, CallDescription, CallMap};
 use crate::call_announcement::TARGET;
 use crate::call_plan::CallPlan;
 use crate::counters::{Cause, Reason};
@@ -78,6 +78,7 @@ struct Call {
 #[derive(Debug)]
 struct Bound {
     service: Arc<ServiceType>,
+    map: Arc<CallMap>,
     /// `None` while the call is not known.
     plan: Option<Result<Arc<CallPlan>, String>>,
 }
@@ -167,7 +168,7 @@ impl Router {
         (!known.gone).then_some(&known.description)
     }
 
-    /// The local side asks for a call under that type. It may not be known yet: then its executing side is asked what it is,
+    /// The local side asks for a call under that type, whose messages are made as `map` says. It may not be known yet: then its executing side is asked what it is,
     /// and whether it fits turns out later.
     ///
     /// # Errors
@@ -176,7 +177,7 @@ impl Router {
     pub fn bind_call(
         &mut self,
         topic: TopicId,
-        service: &Arc<ServiceType>,
+        (service, map): (&Arc<ServiceType>, &Arc<CallMap>),
         now: Now,
     ) -> Result<(), String> {
         if self.wire().is_none() || self.is_home(topic) {
@@ -184,6 +185,7 @@ impl Router {
         }
         self.calls_mut(now).table.entry(topic).or_default().bound = Some(Bound {
             service: Arc::clone(service),
+            map: Arc::clone(map),
             plan: None,
         });
         let bound = self.compile(topic);
@@ -213,7 +215,11 @@ impl Router {
             return Ok(());
         };
         let Some(wire) = wire else { return Ok(()) };
-        let plan = CallPlan::compile(&known.description, &bound.service, (wire, &mut self.plans));
+        let plan = CallPlan::compile(
+            &known.description,
+            (&bound.service, &bound.map),
+            (wire, &mut self.plans),
+        );
         let outcome = plan.as_ref().map(|_| ()).map_err(Clone::clone);
         bound.plan = Some(plan.map(Arc::new));
         outcome

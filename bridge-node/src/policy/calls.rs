@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use bridge_core::CallDescription;
+use bridge_core::{CallDescription, CallMap};
 use messages::{ServiceType, TypeName};
 
 /// The type of the service that a call is offered as: what the mapping says; else what the one who executes it says
@@ -13,17 +13,17 @@ use messages::{ServiceType, TypeName};
 /// Why there is none, for people.
 pub fn call_type(
     call: &CallDescription,
-    mapped: Option<&TypeName>,
+    (mapped, map): (Option<&TypeName>, &CallMap),
     mut find: impl FnMut(&TypeName) -> Result<Arc<ServiceType>, String>,
 ) -> Result<Arc<ServiceType>, String> {
     if let Some(name) = mapped {
         let service_type = find(name)?;
-        call.fits(&service_type)?;
+        call.fits(&service_type, map)?;
         return Ok(service_type);
     }
     if let Some(name) = named(call) {
         let service_type = find(&name)?;
-        call.fits(&service_type)?;
+        call.fits(&service_type, map)?;
         return Ok(service_type);
     }
     let standard = match call.response.is_empty() {
@@ -33,7 +33,9 @@ pub fn call_type(
     };
     let found = standard.iter().find_map(|name| {
         let service_type = find(&name.parse().ok()?).ok()?;
-        call.fits(&service_type).is_ok().then_some(service_type)
+        call.fits(&service_type, map)
+            .is_ok()
+            .then_some(service_type)
     });
     found.ok_or_else(|| {
         let of = |fields: &[bridge_core::CallField]| {
@@ -59,7 +61,7 @@ const STANDARD: [&str; 3] = ["std_srvs/Trigger", "std_srvs/SetBool", "std_srvs/E
 
 #[cfg(test)]
 mod tests {
-    use bridge_core::CallField;
+    use bridge_core::{CallField, CallRole};
     use messages::{Dialect, Registry};
     use uadp::BuiltinType;
 
@@ -77,6 +79,7 @@ mod tests {
         CallDescription {
             name: "gripper.Grasp.Start".to_owned(),
             about: about.to_owned(),
+            role: CallRole::Call,
             request,
             response,
         }
@@ -86,7 +89,8 @@ mod tests {
         let registry = Registry::bundle(Dialect::Ros2);
         let mapped = mapped.map(|name| name.parse().unwrap());
         let find = |name: &TypeName| registry.service(name).map_err(|error| error.to_string());
-        call_type(call, mapped.as_ref(), find).map(|found| found.name().to_string())
+        call_type(call, (mapped.as_ref(), &CallMap::default()), find)
+            .map(|found| found.name().to_string())
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use bridge_core::{CallDescription, Executed, Output, Refusal};
+use bridge_core::{CallDescription, CallMap, Executed, OfferedType, Output, Refusal};
 use bytes::Bytes;
 use mappings::TopicId;
 use messages::ServiceType;
@@ -26,7 +26,8 @@ impl<P: Port> Shell<P> {
             PortEvent::CallBound {
                 topic,
                 service_type,
-            } => self.bind_call(topic, &service_type),
+                map,
+            } => self.bind_call(topic, (&service_type, &map)),
             PortEvent::CallUnbound { topic } => self.router.unbind_call(topic),
             PortEvent::CallWanted { topic } => self.router.want_call(topic, now()),
             PortEvent::Ask {
@@ -37,6 +38,7 @@ impl<P: Port> Shell<P> {
             } => self.router.ask(ask, (topic, &request), timeout, now()),
             PortEvent::AskGivenUp { ask } => self.router.give_up(ask, now()),
             PortEvent::Offer { topic, offered } => self.router.offer(topic, offered, now()),
+            PortEvent::OfferTyped { topic, offered } => self.offer_typed(topic, &offered),
             PortEvent::Withdrawn { topic } => self.router.withdraw(topic, now()),
             PortEvent::Executed { execution, outcome } => {
                 self.router.executed(execution, outcome, now());
@@ -45,12 +47,24 @@ impl<P: Port> Shell<P> {
         }
     }
 
-    fn bind_call(&mut self, topic: TopicId, service_type: &Arc<ServiceType>) {
-        let bound = self.router.bind_call(topic, service_type, now());
+    fn bind_call(
+        &mut self,
+        topic: TopicId,
+        (service_type, map): (&Arc<ServiceType>, &Arc<CallMap>),
+    ) {
+        let bound = self.router.bind_call(topic, (service_type, map), now());
         let service_type = service_type.name();
         match bound {
             Ok(()) => info!(%topic, %service_type, "call bound"),
             Err(why) => warn!(%topic, %service_type, "cannot be asked for: {why}"),
+        }
+    }
+
+    fn offer_typed(&mut self, topic: TopicId, offered: &OfferedType) {
+        let service_type = offered.service_type.name();
+        match self.router.offer_type(topic, offered, now()) {
+            Ok(()) => info!(%topic, %service_type, name = offered.name, "executed for the space"),
+            Err(why) => warn!(%topic, %service_type, "not executed for the space: {why}"),
         }
     }
 

@@ -33,7 +33,7 @@ impl Ros1Port {
         let services = &mut self.services;
         let events = services.reload(&mut graph, self.policy.own(), (&before, mapping));
         self.events.extend(events);
-        self.calls.look_again(&mut graph);
+        self.calls.look_again(&mut graph, &self.policy);
         self.offer_calls();
         for (ros_topic, wanted) in read {
             self.take_up_values(ros_topic, wanted);

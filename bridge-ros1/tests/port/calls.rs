@@ -3,7 +3,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{AskError, AskErrorKind, AskId, CallDescription, CallField, Port, PortEvent};
+use bridge_node::{
+    AskError, AskErrorKind, AskId, CallDescription, CallField, CallRole, Port, PortEvent,
+};
 use bytes::Bytes;
 use messages::{Dialect, Registry};
 use tcpros::{ServiceClient, ServiceClientOptions, ServiceError};
@@ -19,6 +21,7 @@ fn start() -> Arc<CallDescription> {
     Arc::new(CallDescription {
         name: "gripper.Grasp.Start".to_owned(),
         about: String::new(),
+        role: CallRole::Call,
         request: Vec::new(),
         response: vec![
             CallField::scalar("success", BuiltinType::Boolean),
@@ -81,7 +84,7 @@ async fn a_call_is_a_service_whose_answers_and_faults_reach_who_called() {
     let bound = cell.port.recv().await;
     assert!(matches!(
         bound,
-        PortEvent::CallBound { topic, service_type }
+        PortEvent::CallBound { topic, service_type, .. }
             if topic == id(START) && service_type.name().to_string() == "std_srvs/Trigger"
     ));
     let client = client(&cell);

@@ -179,6 +179,7 @@ fn line(event: &PortEvent) -> String {
         | PortEvent::CallWanted { .. }
         | PortEvent::AskGivenUp { .. }
         | PortEvent::Offer { .. }
+        | PortEvent::OfferTyped { .. }
         | PortEvent::Withdrawn { .. }
         | PortEvent::Executed { .. } => format!("{event:?}"),
         PortEvent::Ended(why) => format!("ended: {why}"),

@@ -33,7 +33,7 @@ impl Ros2Port {
         let services = &mut self.services;
         let events = services.reload(&mut graph, self.policy.own(), (&before, mapping));
         self.events.extend(events);
-        self.calls.look_again(&mut graph);
+        self.calls.look_again(&mut graph, &self.policy);
         for (topic, (message_type, values)) in read {
             self.take_up_values(topic, message_type, values);
         }

@@ -5,7 +5,7 @@ use std::num::NonZeroU16;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use bridge_core::{CallDescription, CallField, Offered, ValueDescription};
+use bridge_core::{CallDescription, CallField, CallRole, Offered, ValueDescription};
 use bridge_node::{PortEvent, now};
 use bytes::Bytes;
 use mappings::{Overflow, TopicId};
@@ -189,6 +189,7 @@ impl Place {
                 "{method} of {}",
                 facts.types.first().map_or("a skill", |of| of.name.as_str())
             ),
+            role: CallRole::Call,
             request,
             response: vec![
                 CallField::scalar("success", BuiltinType::Boolean),

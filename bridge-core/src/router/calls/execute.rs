@@ -1,9 +1,11 @@
 //! Calls of our own: announced, and executed by the local side.
 
 use std::net::SocketAddr;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use mappings::{SpaceId, TopicId};
+use messages::MessageType;
 use uadp::action::{
     ActionFields, ActionMessage, ExecutionId, FinishRefusal, Outcome, Refusal, Requested,
 };
@@ -13,9 +15,12 @@ use uadp::{Fields, PublisherId, SecurityHeader, StatusCode};
 use super::super::announce::BAD_NOT_FOUND;
 use super::super::receive::number_of;
 use super::super::{About, Router};
-use crate::call::{Executed, Execution, Offered, join_name};
-use crate::call_announcement::{CallAnnouncement, TARGET};
-use crate::counters::Reason;
+use crate::call::{
+    CallDescription, CallField, Executed, Execution, Offered, OfferedType, join_name,
+};
+use crate::call_announcement::{CallAnnouncement, TARGET, Types};
+use crate::call_plan::ExecutedPlan;
+use crate::counters::{Cause, Reason};
 use crate::loop_rule::{Side, What};
 use crate::output::Output;
 use crate::settings::Now;
@@ -23,7 +28,9 @@ use crate::settings::Now;
 /// A call of ours.
 #[derive(Debug)]
 pub(super) struct Own {
-    offered: Offered,
+    open: bool,
+    /// What its bytes are read and written with, where the local side speaks ROS.
+    plan: Option<Arc<ExecutedPlan>>,
     announcement: Option<CallAnnouncement>,
 }
 
@@ -32,27 +39,84 @@ pub(super) struct Own {
 pub(super) struct Running {
     pub(super) topic: TopicId,
     deadline: Instant,
+    /// As the request was read, so that a call that is another meanwhile changes nothing.
+    plan: Option<Arc<ExecutedPlan>>,
 }
 
 impl Router {
     /// The local side executes a call from now on, or it is another than before: it is announced. One of a namespace that is
     /// not ours is not taken.
     pub fn offer(&mut self, topic: TopicId, offered: Offered, now: Now) {
+        let Offered { description, open } = offered;
+        self.offer_as(topic, (&description, None), (open, None), now);
+    }
+
+    /// As [`offer`](Self::offer), for a ROS service of the local side: its requests are handed out, and its responses taken, as
+    /// its messages in the local encoding.
+    ///
+    /// # Errors
+    /// Why the type cannot be executed, for people. A local side that speaks in fields has none.
+    pub fn offer_type(
+        &mut self,
+        topic: TopicId,
+        offered: &OfferedType,
+        now: Now,
+    ) -> Result<(), String> {
+        let Some(wire) = self.wire() else {
+            return Err("the local side has no ROS types".to_owned());
+        };
+        let service = &offered.service_type;
+        let plan = ExecutedPlan::compile(service, (wire, &mut self.plans))?;
+        let fields = |message: &MessageType| {
+            let leaves = message.leaves().iter();
+            leaves.map(CallField::of).collect()
+        };
+        let about = match &offered.about[..] {
+            "" => service.name().to_string(),
+            about => format!("{}; {about}", service.name()),
+        };
+        let description = CallDescription {
+            name: offered.name.clone(),
+            about,
+            role: offered.role,
+            request: fields(service.request()),
+            response: fields(service.response()),
+        };
+        let types = Types {
+            request: service.request(),
+            response: service.response(),
+        };
+        let how = (offered.open, Some(Arc::new(plan)));
+        self.offer_as(topic, (&description, Some(types)), how, now);
+        Ok(())
+    }
+
+    fn offer_as(
+        &mut self,
+        topic: TopicId,
+        (description, types): (&CallDescription, Option<Types<'_>>),
+        (open, plan): (bool, Option<Arc<ExecutedPlan>>),
+        now: Now,
+    ) {
         if !self.is_home(topic) {
             return self.count(About::topic(topic), Reason::Looped, 1, String::new);
         }
+        let mapping = Arc::clone(&self.mapping);
+        let namespaces = mapping.namespaces();
         let period = self.mapping.pubsub().metadata_period;
         let calls = self.calls_mut(now);
         let call = calls.table.entry(topic).or_default();
         let before = call.own.take().and_then(|own| own.announcement);
         let (_, _, writer_id) = topic.triple();
-        let made = CallAnnouncement::new(topic, &offered.description, before.as_ref(), now.utc);
+        let said = (description, types, namespaces);
+        let made = CallAnnouncement::new(topic, said, before.as_ref(), now.utc);
         let (announcement, fault) = match made {
             Ok(announcement) => (Some(announcement), None),
             Err(error) => (None, Some(error)),
         };
         call.own = Some(Own {
-            offered,
+            open,
+            plan,
             announcement,
         });
         calls.announce_at.get_or_insert(now.monotonic + period);
@@ -170,7 +234,10 @@ impl Router {
             Ok(Requested::Execute(id)) => {
                 let own = calls.table.get(&topic).and_then(|call| call.own.as_ref());
                 match may_be_executed(own, request, from) {
-                    Ok(fields) => self.execute((topic, id), (request, fields), now),
+                    Ok((fields, plan)) => {
+                        let read = self.read_request(plan.as_deref(), fields);
+                        self.execute((topic, id), (request, read, plan), now);
+                    }
                     Err((refusal, case, detail)) => {
                         // Whom it is told is who asks for it again.
                         let _told = calls.responder.refuse(id, refusal, since).is_ok();
@@ -198,20 +265,51 @@ impl Router {
         }
     }
 
+    /// The request as the local side has it.
+    fn read_request(
+        &mut self,
+        plan: Option<&ExecutedPlan>,
+        fields: &[u8],
+    ) -> Result<Vec<u8>, (Cause, String)> {
+        let mut request = self.buffer();
+        match plan {
+            Some(plan) => plan.request(fields, &mut request)?,
+            None => request.extend_from_slice(fields),
+        }
+        Ok(request)
+    }
+
     fn execute(
         &mut self,
         (topic, id): (TopicId, ExecutionId),
-        (request, fields): (&ActionMessage<'_>, &[u8]),
+        (request, read, plan): (
+            &ActionMessage<'_>,
+            Result<Vec<u8>, (Cause, String)>,
+            Option<Arc<ExecutedPlan>>,
+        ),
         now: Now,
     ) {
-        let mut block = self.buffer();
-        block.extend_from_slice(fields);
         let Some(calls) = &mut self.calls else {
             return;
         };
+        let block = match read {
+            Ok(block) => block,
+            Err((cause, detail)) => {
+                let since = calls.since_start(now);
+                // Whom it is told is who asks for it again.
+                let refused = calls.responder.refuse(id, Refusal::InvalidArgument, since);
+                let _told = refused.is_ok();
+                return self.count_call(topic, None, cause, || detail);
+            }
+        };
         let hint = request.action.timeout().unwrap_or(TIMEOUT);
         let deadline = now.monotonic + hint.min(MAX_TIMEOUT);
-        calls.executions.insert(id, Running { topic, deadline });
+        let running = Running {
+            topic,
+            deadline,
+            plan,
+        };
+        calls.executions.insert(id, running);
         if let Some(call) = calls.table.get_mut(&topic) {
             call.counters.executed += 1;
         }
@@ -230,10 +328,18 @@ impl Router {
         let Some(calls) = &mut self.calls else {
             return;
         };
-        let Some(Running { topic, .. }) = calls.executions.remove(&execution) else {
+        let Some(Running { topic, plan, .. }) = calls.executions.remove(&execution) else {
             return;
         };
         let since = calls.since_start(now);
+        let (_, namespace, _) = topic.triple();
+        let (outcome, fault) = match (outcome, plan) {
+            (Executed::Answered(message), Some(plan)) => match plan.response(&message, namespace) {
+                Ok(fields) => (Executed::Answered(fields), None),
+                Err(fault) => (Executed::Failed(BAD_ENCODING_ERROR), Some(fault)),
+            },
+            (outcome, _) => (outcome, None),
+        };
         let told = match &outcome {
             Executed::Answered(fields) => {
                 match Fields::parse(fields).and_then(|of| of.checked_bytes()) {
@@ -256,6 +362,9 @@ impl Router {
         };
         let finished = calls.responder.finish(execution, told, since);
         calls.reckon();
+        if let Some((cause, detail)) = fault {
+            self.count_call(topic, None, cause, || detail);
+        }
         match finished {
             Ok(()) => {}
             // It is what was asked for.
@@ -286,18 +395,19 @@ fn may_be_executed<'a>(
     own: Option<&Own>,
     request: &ActionMessage<'a>,
     from: SocketAddr,
-) -> Result<&'a [u8], (Refusal, &'static str, String)> {
+) -> Result<(&'a [u8], Option<Arc<ExecutedPlan>>), (Refusal, &'static str, String)> {
     let Some(own) = own.filter(|_| request.target_id == TARGET) else {
         let detail = "it is no call of this program".to_owned();
         return Err((Refusal::NoSuchAction, "unknown", detail));
     };
-    if !own.offered.open && !from.ip().is_loopback() {
+    if !own.open && !from.ip().is_loopback() {
         let detail = format!("{from} is another host, and calls are not open to others");
         return Err((Refusal::NotAllowed, "not allowed", detail));
     }
     let fields = request.fields.variants();
     fields
         .and_then(|fields| fields.checked_bytes())
+        .map(|fields| (fields, own.plan.clone()))
         .map_err(|error| (Refusal::InvalidArgument, "fields", error.to_string()))
 }
 

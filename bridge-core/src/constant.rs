@@ -1,0 +1,115 @@
+//! Constants of the mapping as fields of a request.
+
+use messages::{Literal, Rank};
+use uadp::{BuiltinType, DateTime, FieldEncoder, Scalar};
+
+use crate::call::CallField;
+use crate::call_plan;
+use crate::counters::Cause;
+
+/// The block with the one field that has that value: a number, text or Boolean, bytes as a list of numbers, or an array of
+/// those.
+///
+/// # Errors
+/// The value is none of the field's type, for people.
+pub(crate) fn block(field: &CallField, literal: &Literal) -> Result<Vec<u8>, String> {
+    let texts = match (literal, field.rank, field.builtin) {
+        (Literal::One(text), Rank::Scalar, _) => std::slice::from_ref(text),
+        (Literal::List(texts), Rank::Scalar, BuiltinType::ByteString) => {
+            let numbers = texts.iter().map(|text| text.parse::<u8>());
+            let bytes: Vec<u8> = numbers
+                .collect::<Result<_, _>>()
+                .map_err(|_| format!("{field} is bytes, a list of numbers from 0 to 255"))?;
+            return encode(|frame| frame.scalar(Scalar::ByteString(Some(&bytes))));
+        }
+        (Literal::List(texts), Rank::Array { fixed }, _)
+            if fixed.is_none_or(|fixed| usize::try_from(fixed) == Ok(texts.len())) =>
+        {
+            texts
+        }
+        (Literal::List(_), Rank::Array { .. }, _) => {
+            return Err(format!("{field} has another number of elements"));
+        }
+        (Literal::List(_), Rank::Scalar, _) => return Err(format!("{field} is no list")),
+        (Literal::One(_), Rank::Array { .. }, _) => {
+            return Err(format!("{field} is a list, as [1, 2]"));
+        }
+    };
+    let values = texts.iter().map(|text| {
+        scalar(field.builtin, text).ok_or_else(|| format!("`{text}` is no value of {field}"))
+    });
+    let values: Vec<Scalar<'_>> = values.collect::<Result<_, _>>()?;
+    encode(|frame| match field.rank {
+        Rank::Scalar => values.iter().try_for_each(|value| frame.scalar(*value)),
+        Rank::Array { .. } => {
+            frame.array(field.builtin, values.len())?;
+            values.iter().try_for_each(|value| frame.element(*value))
+        }
+    })
+}
+
+fn encode(
+    write: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), uadp::EncodeError>,
+) -> Result<Vec<u8>, String> {
+    let written = call_plan::block(|frame| write(frame).map_err(call_plan::too_big));
+    written.map_err(|(_, why): (Cause, String)| why)
+}
+
+fn scalar(builtin: BuiltinType, text: &str) -> Option<Scalar<'_>> {
+    Some(match builtin {
+        BuiltinType::Boolean => Scalar::Boolean(text.parse().ok()?),
+        BuiltinType::SByte => Scalar::SByte(text.parse().ok()?),
+        BuiltinType::Byte => Scalar::Byte(text.parse().ok()?),
+        BuiltinType::Int16 => Scalar::Int16(text.parse().ok()?),
+        BuiltinType::UInt16 => Scalar::UInt16(text.parse().ok()?),
+        BuiltinType::Int32 => Scalar::Int32(text.parse().ok()?),
+        BuiltinType::UInt32 => Scalar::UInt32(text.parse().ok()?),
+        BuiltinType::Int64 => Scalar::Int64(text.parse().ok()?),
+        BuiltinType::UInt64 => Scalar::UInt64(text.parse().ok()?),
+        BuiltinType::Float => Scalar::Float(text.parse().ok()?),
+        BuiltinType::Double => Scalar::Double(text.parse().ok()?),
+        BuiltinType::String => Scalar::String(Some(text)),
+        // No time is always the same but that of nothing.
+        BuiltinType::DateTime if text == "0" => Scalar::DateTime(DateTime::default()),
+        BuiltinType::DateTime
+        | BuiltinType::Guid
+        | BuiltinType::ByteString
+        | BuiltinType::XmlElement
+        | BuiltinType::NodeId
+        | BuiltinType::ExpandedNodeId
+        | BuiltinType::StatusCode
+        | BuiltinType::QualifiedName
+        | BuiltinType::LocalizedText
+        | BuiltinType::ExtensionObject
+        | BuiltinType::DataValue
+        | BuiltinType::Variant
+        | BuiltinType::DiagnosticInfo => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use uadp::{Fields, Variant};
+
+    use super::*;
+
+    #[test]
+    fn a_constant_is_a_field_of_the_type_of_its_call() {
+        let speed = CallField::scalar("speed", BuiltinType::Int32);
+        let bytes = block(&speed, &Literal::One("100".to_owned())).unwrap();
+        let mut fields = Fields::parse(&bytes).unwrap();
+        let field = fields.next().unwrap().unwrap();
+        assert_eq!(field, Variant::Scalar(Scalar::Int32(100)));
+        assert!(fields.next().is_none());
+        let why = block(&speed, &Literal::One("fast".to_owned())).unwrap_err();
+        assert!(why.contains("`fast`") && why.contains("`speed`"), "{why}");
+        block(&speed, &Literal::List(vec!["1".to_owned()])).unwrap_err();
+        let list = CallField::array("joints", BuiltinType::Double);
+        let literal = Literal::List(vec!["0.5".to_owned(), "1".to_owned()]);
+        let bytes = block(&list, &literal).unwrap();
+        let Variant::Array(array) = Fields::parse(&bytes).unwrap().next().unwrap().unwrap() else {
+            unreachable!("an array was written");
+        };
+        assert!(array.iter().eq([Scalar::Double(0.5), Scalar::Double(1.0)]));
+    }
+}
