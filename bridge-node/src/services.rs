@@ -20,7 +20,7 @@ use tokio::task::{AbortHandle, JoinSet};
 use tracing::warn;
 use uadp::{BuiltinType, Timestamp};
 
-pub use self::caller::{CallFault, Outcome, ServiceCall};
+pub use self::caller::{CallFault, Outcome, Ran, ServiceCall};
 
 use self::caller::{Caller, Source};
 use self::pending::Pending;

@@ -15,8 +15,8 @@ use std::time::SystemTime;
 
 use bridge_node::policy::{Policy, Step, TYPE_CHANGES, Word, is_bad, type_changes};
 use bridge_node::{
-    Answered, AskId, CallDescription, Calls, Delivery, Described, Kept, Port, PortEvent, Services,
-    TypePaths, timestamp,
+    Answered, AskId, CallDescription, Calls, Delivery, Described, Executed, Executing, Execution,
+    Kept, Port, PortEvent, Services, TypePaths, timestamp,
 };
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId, Variable};
@@ -28,9 +28,10 @@ use tcpros::{
 use tracing::info;
 use uadp::{BuiltinType, Timestamp};
 
+use self::calls::Kinds;
 use self::found::Refused;
 use crate::definitions::Definitions;
-use crate::services::Ros1Graph;
+use crate::services::{Executor, Ros1Graph};
 use crate::sink::{Open, Sink};
 use crate::source::{MAX_LATCHED, Met, Source};
 use crate::watcher::{Seen, Watcher};
@@ -70,6 +71,10 @@ pub struct Ros1Port {
     services: Services,
     /// Calls of other spaces, offered as services.
     calls: Calls<ServiceServer>,
+    /// Services of the graph, executed for other spaces.
+    executing: Executing<Executor>,
+    /// The types of services with a name of the space.
+    kinds: Kinds,
     /// What `recv` hands out next; filled by one message or by one pass over the topics.
     events: VecDeque<PortEvent>,
     /// The topic of the graph that was taken in last: the next look goes on behind it, so that each has its turn.
@@ -114,6 +119,8 @@ impl Ros1Port {
             definitions,
             services,
             calls: Calls::default(),
+            executing: Executing::default(),
+            kinds: Kinds::default(),
             graph: Graph::default(),
             sources: Vec::new(),
             vacant: Vec::new(),
@@ -380,6 +387,7 @@ impl Ros1Port {
                 source.looked_at();
             }
             self.find_sources();
+            self.find_services();
             self.tell_refused();
         }
         for source in &mut self.sources {
@@ -530,6 +538,8 @@ impl Port for Ros1Port {
                     self.events.extend(events);
                 }
                 event = self.calls.recv::<Ros1Graph<'_>>() => return event,
+                events = self.executing.recv() => self.events.extend(events),
+                () = self.kinds.recv() => self.find_services(),
                 (index, event) = self.inbox.recv() => self.taken(index, event),
             }
         }
@@ -656,6 +666,17 @@ impl Port for Ros1Port {
         self.calls.answered(ask, answer);
     }
 
+    fn execute(&mut self, execution: Execution) -> bool {
+        let id = execution.id;
+        if let Err(refusal) = self.executing.execute(execution) {
+            let outcome = Executed::Refused(refusal);
+            let execution = id;
+            let event = PortEvent::Executed { execution, outcome };
+            self.events.push_back(event);
+        }
+        true
+    }
+
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
         self.go_over_to(mapping, types);
         Vec::new()
@@ -678,9 +699,11 @@ impl Port for Ros1Port {
             watcher,
             services,
             calls,
+            executing,
+            kinds,
             ..
         } = self;
-        drop((watcher, services, calls));
+        drop((watcher, services, calls, executing, kinds));
         node.shutdown().await;
         drop((sinks, sources));
     }

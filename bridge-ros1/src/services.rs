@@ -3,12 +3,13 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Asker, CallFault, CallGraph, ServiceCall, ServiceGraph};
+use bridge_node::{Asker, CallFault, CallGraph, ExecutorGraph, Ran, ServiceCall, ServiceGraph};
 use bytes::Bytes;
 use messages::{MessageType, ServiceType, TextKind, TypeName, Wire};
 use tcpros::{
     Node, ServiceClient, ServiceClientOptions, ServiceError, ServiceOptions, ServiceServer,
 };
+use tokio::sync::Mutex;
 use uadp::BuiltinType;
 
 use crate::definitions::Definitions;
@@ -91,7 +92,58 @@ impl CallGraph for Ros1Graph<'_> {
     }
 }
 
+impl ExecutorGraph for Ros1Graph<'_> {
+    type Executor = Executor;
+
+    fn executor(
+        &mut self,
+        service: &str,
+        service_type: &ServiceType,
+        timeout: Duration,
+    ) -> Result<Executor, String> {
+        let client = |persistent| {
+            let options = ServiceClientOptions {
+                md5sum: Some(service_type.md5().to_owned()),
+                type_name: Some(service_type.name().to_string()),
+                persistent,
+                timeout,
+                ..ServiceClientOptions::default()
+            };
+            let client = self.node.service_client(service, options);
+            client.map(Client).map_err(|error| error.to_string())
+        };
+        Ok(Executor {
+            kept: client(true)?,
+            more: client(false)?,
+            turn: Mutex::new(()),
+        })
+    }
+}
+
+/// Calls one service, over a connection that it keeps, and over others while that is in use: a connection carries one call at
+/// a time.
+#[derive(Debug)]
+pub(crate) struct Executor {
+    kept: Client,
+    more: Client,
+    turn: Mutex<()>,
+}
+
+impl ServiceCall for Executor {
+    fn service(&self) -> &str {
+        self.kept.service()
+    }
+
+    async fn call(&self, request: Bytes) -> Result<Bytes, CallFault> {
+        match self.turn.try_lock() {
+            Ok(_turn) => self.kept.call(request).await,
+            Err(_) => self.more.call(request).await,
+        }
+    }
+}
+
 /// Calls one service.
+#[derive(Debug)]
 pub(crate) struct Client(ServiceClient);
 
 impl ServiceCall for Client {
@@ -103,6 +155,11 @@ impl ServiceCall for Client {
         self.0.call(request).await.map_err(|error| CallFault {
             text: error.to_string(),
             may_pass: may_pass(&error),
+            ran: match &error {
+                ServiceError::Failed { .. } => Ran::Yes,
+                error if error.may_have_run() => Ran::Perhaps,
+                _ => Ran::No,
+            },
         })
     }
 }

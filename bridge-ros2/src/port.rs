@@ -27,8 +27,8 @@ use std::task::{Context, Poll};
 
 use bridge_node::policy::{Policy, Read, Step, TYPE_CHANGES, Word, is_bad, type_changes};
 use bridge_node::{
-    Answered, AskId, CallDescription, Calls, Delivery, Described, Kept, Port, PortEvent, Services,
-    TypePaths, now,
+    Answered, AskId, CallDescription, Calls, Delivery, Described, Executed, Executing, Execution,
+    Kept, Port, PortEvent, Services, TypePaths, now,
 };
 use bytes::Bytes;
 use futures_util::StreamExt;
@@ -57,7 +57,7 @@ use descriptions::Descriptions;
 use drops::Drops;
 use reconcile::MAX_BATCH;
 use schedule::Schedule;
-use services::Ros2Graph;
+use services::{Client, Ros2Graph};
 use strangers::{KEPT_OUT, Stranger, Strangers};
 
 /// What a [`Ros2Port`] is started with.
@@ -103,6 +103,8 @@ pub struct Ros2Port {
     services: Services,
     /// Calls of other spaces, offered as services.
     calls: Calls<ServiceServer>,
+    /// Services of the domain, executed for other spaces.
+    executing: Executing<Client>,
     /// Whose services they are, and who is there.
     peers: ServicePeers,
     parameters: ParameterServer,
@@ -176,6 +178,7 @@ impl Ros2Port {
             told_types,
             services,
             calls: Calls::default(),
+            executing: Executing::default(),
             peers,
             parameters,
             graph: Graph::default(),
@@ -264,6 +267,10 @@ impl Ros2Port {
             }
             if let Poll::Ready(outcome) = self.services.poll_recv(cx) {
                 let events = self.services.ended(outcome, now().utc);
+                self.events.extend(events);
+                continue;
+            }
+            if let Poll::Ready(events) = self.executing.poll_recv(cx) {
                 self.events.extend(events);
                 continue;
             }
@@ -555,6 +562,17 @@ impl Port for Ros2Port {
         self.calls.answered(ask, answer);
     }
 
+    fn execute(&mut self, execution: Execution) -> bool {
+        let id = execution.id;
+        if let Err(refusal) = self.executing.execute(execution) {
+            let outcome = Executed::Refused(refusal);
+            let execution = id;
+            let event = PortEvent::Executed { execution, outcome };
+            self.events.push_back(event);
+        }
+        true
+    }
+
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
         let restart = self.fixed(mapping);
         self.go_over_to(mapping, types);
@@ -577,6 +595,7 @@ impl Port for Ros2Port {
             former,
             services,
             calls,
+            executing,
             peers,
             parameters,
             descriptions,
@@ -588,6 +607,7 @@ impl Port for Ros2Port {
             discovery,
             services,
             calls,
+            executing,
             peers,
             parameters,
             descriptions,

@@ -30,6 +30,19 @@ pub struct CallFault {
     pub text: String,
     /// Whether the same call may succeed later, with nobody changing anything but the service coming back.
     pub may_pass: bool,
+    /// Whether the service ran.
+    pub ran: Ran,
+}
+
+/// Whether a service ran although there is no answer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ran {
+    /// It never had the request.
+    No,
+    /// It had the request, and no more is known.
+    Perhaps,
+    /// It did, and says that it failed.
+    Yes,
 }
 
 /// What became of a call.
@@ -101,7 +114,7 @@ impl<C: ServiceCall> Caller<C> {
     async fn call(&mut self, request: Bytes, insist: bool) -> Next {
         let answer = self.client.call(request).await;
         let mut next = Next::Done;
-        let result = answer.map_err(|CallFault { text, may_pass }| {
+        let result = answer.map_err(|CallFault { text, may_pass, .. }| {
             self.failing = true;
             if insist && may_pass {
                 next = Next::Again;

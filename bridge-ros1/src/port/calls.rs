@@ -1,7 +1,15 @@
-//! Calls of other spaces, as services of the graph.
+//! Calls of other spaces, as services of the graph; and services of the graph, executed for other spaces.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+
+use bridge_node::{Executing, Present};
+use messages::TypeName;
+use tcpros::{Node, ServiceClientOptions};
+use tokio::task::JoinSet;
 
 use super::Ros1Port;
-use crate::services::Ros1Graph;
+use crate::services::{Executor, Ros1Graph};
 
 impl Ros1Port {
     /// Offers the calls that are known as services.
@@ -15,4 +23,141 @@ impl Ros1Port {
         let events = calls.offer_waiting(&mut graph, &mut self.policy, all, most);
         self.events.extend(events);
     }
+
+    /// Offers the services of other nodes that are calls of our space, and withdraws those that are gone.
+    pub(super) fn find_services(&mut self) {
+        let own = self.node.name();
+        let services = self.graph.services.iter();
+        let others = services.filter(|(_, nodes)| nodes.iter().any(|node| node != own));
+        let others: BTreeMap<&str, &[String]> = others
+            .map(|(service, nodes)| (service.as_str(), nodes.as_slice()))
+            .collect();
+        let policy = &self.policy;
+        let wanted = others.iter().filter(|(service, _)| {
+            service.len() <= MAX_NAME && Executing::<Executor>::is_wanted(policy, service)
+        });
+        for (service, error) in self.kinds.look(&self.node, wanted) {
+            self.policy.told.once(&service, "type of the service", || {
+                format!("it is not known of which type the service {service} is: {error}")
+            });
+        }
+        let present: Present = others
+            .keys()
+            .map(|service| ((*service).to_owned(), self.kinds.of(service).cloned()))
+            .collect();
+        let mut graph = Ros1Graph {
+            node: &self.node,
+            definitions: &mut self.definitions,
+        };
+        let executing = &mut self.executing;
+        let events = executing.reconcile(&mut graph, &mut self.policy, (&present, usize::MAX));
+        self.events.extend(events);
+    }
 }
+
+/// The types of services, which only their servers know.
+#[derive(Debug, Default)]
+pub(super) struct Kinds {
+    known: BTreeMap<String, Kind>,
+    asking: JoinSet<(String, Result<TypeName, String>)>,
+    faults: Vec<(String, String)>,
+}
+
+#[derive(Debug)]
+struct Kind {
+    /// Who offered it when it was asked.
+    nodes: Vec<String>,
+    type_name: Option<TypeName>,
+    /// Looks at the graph until it is asked again.
+    wait: u32,
+    asked: bool,
+}
+
+impl Kinds {
+    fn of(&self, service: &str) -> Option<&TypeName> {
+        self.known.get(service)?.type_name.as_ref()
+    }
+
+    /// Asks those that are new, or of other nodes than before, a few at a time. Reports whom it could not be learned from.
+    fn look<'s>(
+        &mut self,
+        node: &Node,
+        wanted: impl Iterator<Item = (&'s &'s str, &'s &'s [String])>,
+    ) -> Vec<(String, String)> {
+        let mut there = BTreeSet::new();
+        for (service, nodes) in wanted.take(MOST_KINDS) {
+            there.insert((*service).to_owned());
+            let kind = self.known.entry((*service).to_owned()).or_insert(Kind {
+                nodes: Vec::new(),
+                type_name: None,
+                wait: 0,
+                asked: false,
+            });
+            if kind.nodes != *nodes {
+                (kind.nodes, kind.type_name, kind.wait) = (nodes.to_vec(), None, 0);
+            }
+            kind.wait = kind.wait.saturating_sub(1);
+            let is_due = kind.type_name.is_none() && kind.wait == 0 && !kind.asked;
+            if !is_due || self.asking.len() >= MOST_ASKED {
+                continue;
+            }
+            let options = ServiceClientOptions {
+                timeout: ASKED_WITHIN,
+                ..ServiceClientOptions::default()
+            };
+            let client = match node.service_client(service, options) {
+                Ok(client) => client,
+                Err(error) => {
+                    self.faults.push(((*service).to_owned(), error.to_string()));
+                    kind.wait = ASKED_AGAIN;
+                    continue;
+                }
+            };
+            kind.asked = true;
+            let service = (*service).to_owned();
+            self.asking.spawn(async move {
+                let header = client.probe().await.map_err(|error| error.to_string());
+                let named = header.and_then(|header| {
+                    let named = header.get("type").unwrap_or_default();
+                    let parsed = named.parse();
+                    parsed.map_err(|_| format!("its server says `{}`", named.escape_debug()))
+                });
+                (service, named)
+            });
+        }
+        self.known.retain(|service, _| there.contains(service));
+        std::mem::take(&mut self.faults)
+    }
+
+    /// A type was learned, or could not be. Cancel-safe; pends while nobody is asked.
+    pub(super) async fn recv(&mut self) {
+        let answered = match self.asking.join_next().await {
+            Some(answered) => answered,
+            None => std::future::pending().await,
+        };
+        let Ok((service, named)) = answered else {
+            return;
+        };
+        let Some(kind) = self.known.get_mut(&service) else {
+            return;
+        };
+        kind.asked = false;
+        match named {
+            Ok(type_name) => kind.type_name = Some(type_name),
+            Err(error) => {
+                kind.wait = ASKED_AGAIN;
+                self.faults.push((service, error));
+            }
+        }
+    }
+}
+
+/// Bytes of a name that is looked at.
+const MAX_NAME: usize = 255;
+/// Services whose type is kept.
+const MOST_KINDS: usize = 1024;
+/// Servers that are asked at a time.
+const MOST_ASKED: usize = 16;
+const ASKED_WITHIN: Duration = Duration::from_secs(3);
+/// Looks at the graph until one that did not answer is asked again.
+const ASKED_AGAIN: u32 = 10;

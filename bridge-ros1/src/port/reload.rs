@@ -35,6 +35,13 @@ impl Ros1Port {
         self.events.extend(events);
         self.calls.look_again(&mut graph, &self.policy);
         self.offer_calls();
+        let mut graph = Ros1Graph {
+            node: &self.node,
+            definitions: &mut self.definitions,
+        };
+        let events = self.executing.look_again(&mut graph);
+        self.events.extend(events);
+        self.find_services();
         for (ros_topic, wanted) in read {
             self.take_up_values(ros_topic, wanted);
         }

@@ -48,6 +48,7 @@ impl Ros2Port {
         self.announce_anew(now);
         self.take_descriptions(now);
         self.find_topics(now);
+        self.find_services();
         for index in 0..self.sources.len() {
             self.reconcile_source(index, now);
         }

@@ -34,6 +34,8 @@ impl Ros2Port {
         let events = services.reload(&mut graph, self.policy.own(), (&before, mapping));
         self.events.extend(events);
         self.calls.look_again(&mut graph, &self.policy);
+        let events = self.executing.look_again(&mut graph);
+        self.events.extend(events);
         for (topic, (message_type, values)) in read {
             self.take_up_values(topic, message_type, values);
         }

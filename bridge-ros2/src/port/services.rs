@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Asker, CallFault, CallGraph, ServiceCall, ServiceGraph};
+use bridge_node::{Asker, CallFault, CallGraph, ExecutorGraph, Ran, ServiceCall, ServiceGraph};
 use bytes::Bytes;
 use mappings::SpaceId;
 use messages::{MessageType, ServiceType, TextKind, TypeName, Wire};
@@ -73,6 +73,19 @@ impl ServiceGraph for Ros2Graph<'_> {
     }
 }
 
+impl ExecutorGraph for Ros2Graph<'_> {
+    type Executor = Client;
+
+    fn executor(
+        &mut self,
+        service: &str,
+        service_type: &ServiceType,
+        timeout: Duration,
+    ) -> Result<Client, String> {
+        self.client(service, service_type, timeout)
+    }
+}
+
 impl CallGraph for Ros2Graph<'_> {
     type Server = ServiceServer;
 
@@ -128,6 +141,7 @@ pub(super) fn parameters(own: SpaceId, domain: u16, sim_time: bool) -> Vec<Param
 }
 
 /// Calls one service.
+#[derive(Debug)]
 pub(super) struct Client(ServiceClient);
 
 impl ServiceCall for Client {
@@ -145,6 +159,10 @@ impl ServiceCall for Client {
                     | ServiceError::Lost { .. }
                     | ServiceError::OtherType { .. }
             ),
+            ran: match error.may_have_run() {
+                true => Ran::Perhaps,
+                false => Ran::No,
+            },
         })
     }
 }

@@ -1,0 +1,328 @@
+//! Services of the graph as calls of the space: others ask, a service here executes.
+//!
+//! A service is a call where the mapping says so, or where it has the name of one of our own space (`/ua_1_2_61`). It is
+//! offered while it is there. Each execution is a task of its own, so that a slow service holds nothing up.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use bridge_core::{CallRole, Executed, ExecutionId, OfferedType, Refusal};
+use bytes::Bytes;
+use mappings::{CallKind, ExecutedBy, TopicId};
+use messages::{ServiceType, TypeName};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
+use tokio::task::JoinSet;
+use uadp::StatusCode;
+
+use crate::policy::Policy;
+use crate::port::Execution;
+use crate::services::{CallFault, Ran, ServiceCall};
+use crate::{PortEvent, ServiceGraph};
+
+/// A ROS graph whose services can be executed for others.
+pub trait ExecutorGraph: ServiceGraph {
+    /// Calls one service, several times at once.
+    type Executor: ServiceCall + Sync;
+
+    /// What calls a service, with the time that a call may take.
+    ///
+    /// # Errors
+    /// Why there can be none, for people.
+    fn executor(
+        &mut self,
+        service: &str,
+        service_type: &ServiceType,
+        timeout: Duration,
+    ) -> Result<Self::Executor, String>;
+}
+
+/// The services there are, each with its type as far as that is known.
+pub type Present = BTreeMap<String, Option<TypeName>>;
+
+/// What of a graph is executed for the space.
+#[derive(Debug)]
+pub struct Executing<C> {
+    served: BTreeMap<TopicId, Served<C>>,
+    /// Those that cannot be served as they are.
+    refused: HashMap<TopicId, Wanted>,
+    /// What is executed now, and of which call.
+    running: HashMap<ExecutionId, TopicId>,
+    done: mpsc::Receiver<Done>,
+    report: mpsc::Sender<Done>,
+    tasks: JoinSet<()>,
+}
+
+#[derive(Debug)]
+struct Served<C> {
+    wanted: Wanted,
+    service_type: Arc<ServiceType>,
+    client: Arc<C>,
+    /// One for each execution there may be at a time.
+    places: Arc<Semaphore>,
+}
+
+/// A service, and what is said of it as a call.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Wanted {
+    service: String,
+    type_name: TypeName,
+    name: String,
+    about: String,
+    open: bool,
+    timeout: Duration,
+}
+
+/// What came of one execution.
+#[derive(Debug)]
+struct Done {
+    execution: ExecutionId,
+    result: Result<Bytes, CallFault>,
+}
+
+impl<C> Default for Executing<C> {
+    fn default() -> Self {
+        let (report, done) = mpsc::channel(MOST_RUNNING);
+        Self {
+            served: BTreeMap::new(),
+            refused: HashMap::new(),
+            running: HashMap::new(),
+            done,
+            report,
+            tasks: JoinSet::new(),
+        }
+    }
+}
+
+impl<C: ServiceCall + Sync> Executing<C> {
+    /// Whether a service of that name is a call, so that its type is worth finding out.
+    #[must_use]
+    pub fn is_wanted(policy: &Policy, service: &str) -> bool {
+        named(policy, service).is_some()
+    }
+
+    /// Compares the services there are with those that are offered as calls, and begins to offer `most` at most.
+    pub fn reconcile<G: ExecutorGraph<Executor = C>>(
+        &mut self,
+        graph: &mut G,
+        policy: &mut Policy,
+        (present, mut most): (&Present, usize),
+    ) -> Vec<PortEvent> {
+        while self.tasks.try_join_next().is_some() {}
+        let wanted = wanted(policy, present);
+        let mut events = Vec::new();
+        let gone = self.served.extract_if(.., |topic, served| {
+            wanted.get(topic).is_none_or(|now| served.wanted != *now)
+        });
+        events.extend(gone.map(|(topic, _)| PortEvent::Withdrawn { topic }));
+        self.refused
+            .retain(|topic, refused| wanted.get(topic) == Some(refused));
+        for (topic, wanted) in wanted {
+            if self.served.contains_key(&topic) || self.refused.contains_key(&topic) {
+                continue;
+            }
+            if most == 0 {
+                break;
+            }
+            most -= 1;
+            match self.serve(graph, topic, &wanted) {
+                Ok(event) => events.push(event),
+                Err(why) => {
+                    policy.told.once(&topic.to_string(), "not executed", || {
+                        format!(
+                            "the service {} cannot be asked for from other spaces: {why}",
+                            wanted.service
+                        )
+                    });
+                    self.refused.insert(topic, wanted);
+                }
+            }
+        }
+        events
+    }
+
+    /// Has everything looked at again: definitions may be others.
+    pub fn look_again<G: ExecutorGraph<Executor = C>>(&mut self, graph: &mut G) -> Vec<PortEvent> {
+        self.refused.clear();
+        let other = self.served.extract_if(.., |_, served| {
+            let now = graph.service_type(&served.wanted.type_name);
+            now.is_ok_and(|now| !now.is_same(&served.service_type))
+        });
+        other
+            .map(|(topic, _)| PortEvent::Withdrawn { topic })
+            .collect()
+    }
+
+    fn serve<G: ExecutorGraph<Executor = C>>(
+        &mut self,
+        graph: &mut G,
+        topic: TopicId,
+        wanted: &Wanted,
+    ) -> Result<PortEvent, String> {
+        if self.served.len() >= MOST_SERVED {
+            return Err(format!("{MOST_SERVED} services are offered already"));
+        }
+        let service_type = graph.service_type(&wanted.type_name)?;
+        let client = graph.executor(&wanted.service, &service_type, wanted.timeout)?;
+        self.served.insert(
+            topic,
+            Served {
+                wanted: wanted.clone(),
+                service_type: Arc::clone(&service_type),
+                client: Arc::new(client),
+                places: Arc::new(Semaphore::new(MOST_AT_A_TIME)),
+            },
+        );
+        let offered = OfferedType {
+            service_type,
+            name: wanted.name.clone(),
+            about: wanted.about.clone(),
+            role: CallRole::Call,
+            open: wanted.open,
+        };
+        Ok(PortEvent::OfferTyped { topic, offered })
+    }
+
+    /// The types of the services that are called.
+    pub fn types(&self) -> impl Iterator<Item = &Arc<ServiceType>> {
+        self.served.values().map(|served| &served.service_type)
+    }
+
+    /// Whether it executes that call.
+    #[must_use]
+    pub fn serves(&self, topic: TopicId) -> bool {
+        self.served.contains_key(&topic)
+    }
+
+    /// Calls the service of a call that is executed here. What becomes of it comes from [`recv`](Self::recv).
+    ///
+    /// # Errors
+    /// Why it is not called.
+    pub fn execute(&mut self, execution: Execution) -> Result<(), Refusal> {
+        let served = self.served.get(&execution.topic);
+        let served = served.ok_or(Refusal::NotExecutable)?;
+        let place = Arc::clone(&served.places).try_acquire_owned();
+        let place = place.map_err(|_| Refusal::Busy)?;
+        let report = self.report.clone().try_reserve_owned();
+        let report = report.map_err(|_| Refusal::Busy)?;
+        let client = Arc::clone(&served.client);
+        let Execution {
+            id, topic, request, ..
+        } = execution;
+        self.running.insert(id, topic);
+        self.tasks
+            .spawn(run(client, (id, request), (report, place)));
+        Ok(())
+    }
+
+    /// What an execution came to. Cancel-safe.
+    pub async fn recv(&mut self) -> Vec<PortEvent> {
+        std::future::poll_fn(|cx| self.poll_recv(cx)).await
+    }
+
+    /// As [`recv`](Self::recv), for ports that poll.
+    pub fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<Vec<PortEvent>> {
+        match self.done.poll_recv(cx) {
+            Poll::Ready(Some(done)) => Poll::Ready(self.done(done)),
+            // Never `None` while we hold a sender ourselves.
+            Poll::Ready(None) | Poll::Pending => Poll::Pending,
+        }
+    }
+
+    fn done(&mut self, done: Done) -> Vec<PortEvent> {
+        let Done { execution, result } = done;
+        let Some(topic) = self.running.remove(&execution) else {
+            return Vec::new();
+        };
+        let (outcome, failed) = match result {
+            Ok(response) => (Executed::Answered(response.into()), None),
+            Err(CallFault { text, ran, .. }) => {
+                let outcome = match ran {
+                    Ran::No => Executed::Refused(Refusal::NotExecutable),
+                    Ran::Perhaps => Executed::Lost,
+                    Ran::Yes => Executed::Failed(BAD_UNEXPECTED_ERROR),
+                };
+                let detail = text;
+                (outcome, Some(PortEvent::CallFailed { topic, detail }))
+            }
+        };
+        let executed = PortEvent::Executed { execution, outcome };
+        std::iter::once(executed).chain(failed).collect()
+    }
+}
+
+/// One execution. It goes on when its call is withdrawn, and ends in the time that its client gives a call.
+async fn run<C: ServiceCall + Sync>(
+    client: Arc<C>,
+    (execution, request): (ExecutionId, Bytes),
+    (report, place): (mpsc::OwnedPermit<Done>, OwnedSemaphorePermit),
+) {
+    let result = client.call(request).await;
+    drop(place);
+    drop(report.send(Done { execution, result }));
+}
+
+/// The call that a service is by its name.
+fn named(policy: &Policy, service: &str) -> Option<TopicId> {
+    let topic: TopicId = service.strip_prefix('/')?.parse().ok()?;
+    (topic.space == policy.own()).then_some(topic)
+}
+
+/// What is to be offered of the services there are.
+fn wanted(policy: &Policy, present: &Present) -> BTreeMap<TopicId, Wanted> {
+    let mapping = policy.mapping();
+    let mut wanted = BTreeMap::new();
+    let taken: std::collections::BTreeSet<TopicId> = mapping
+        .executed_in(policy.own())
+        .flat_map(mappings::Call::topics)
+        .collect();
+    for (service, type_name) in present {
+        let (Some(topic), Some(type_name)) = (named(policy, service), type_name) else {
+            continue;
+        };
+        if taken.contains(&topic) {
+            continue;
+        }
+        let name = Wanted {
+            service: service.clone(),
+            type_name: type_name.clone(),
+            name: String::new(),
+            about: String::new(),
+            open: false,
+            timeout: TIMEOUT,
+        };
+        wanted.insert(topic, name);
+    }
+    for call in mapping.executed_in(policy.own()) {
+        let (CallKind::Service, ExecutedBy::Ros(target)) = (call.kind, &call.executed) else {
+            continue;
+        };
+        if !present.contains_key(&target.name) {
+            continue;
+        }
+        wanted.insert(
+            call.topic,
+            Wanted {
+                service: target.name.clone(),
+                type_name: target.type_name.clone(),
+                name: call.name.clone(),
+                about: call.about.clone(),
+                open: call.open,
+                timeout: call.timeout,
+            },
+        );
+    }
+    wanted
+}
+
+/// Services that are offered to other spaces: anybody in a graph can invent names.
+const MOST_SERVED: usize = 1024;
+/// Executions of one service at a time; one more is refused as busy.
+const MOST_AT_A_TIME: usize = 256;
+/// Executions of all services at a time.
+const MOST_RUNNING: usize = 1024;
+/// How long a service may take of which the mapping says nothing.
+const TIMEOUT: Duration = Duration::from_secs(30);
+/// Bad_UnexpectedError (OPC 10000-6, A.2): the service ran, and says that it failed.
+const BAD_UNEXPECTED_ERROR: StatusCode = StatusCode(0x8001_0000);
