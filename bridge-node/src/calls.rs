@@ -3,7 +3,7 @@
 //! Under which type is [`policy`](crate::policy)'s matter, how a service is offered the graph's; what is asked goes to the
 //! Router as [`PortEvent::Ask`], and its answer comes back by [`answered`](Calls::answered).
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::task::{Context, Poll};
@@ -45,6 +45,8 @@ pub struct Calls<S> {
     known: BTreeMap<TopicId, Known<S>>,
     /// Services of calls that are gone, since when: who waits for an answer is still told.
     leaving: Vec<(Instant, TopicId, S)>,
+    /// What clients look for.
+    wanted: BTreeSet<TopicId>,
     /// What was asked and is not answered.
     asked: HashMap<AskId, Asked>,
     said: mpsc::Receiver<Said>,
@@ -198,6 +200,7 @@ impl<S: Send> Default for Calls<S> {
         Self {
             known: BTreeMap::new(),
             leaving: Vec::new(),
+            wanted: BTreeSet::new(),
             asked: HashMap::new(),
             said,
             say,
@@ -295,6 +298,12 @@ impl<S: Send> Calls<S> {
         offered.chain(self.leaving.iter().map(|(_, _, server)| server))
     }
 
+    /// The calls that are known, each with the name of its service here.
+    pub fn names(&self, policy: &Policy) -> Vec<(TopicId, String)> {
+        let named = |topic: &TopicId| (*topic, Target::of(*topic, policy).name);
+        self.known.keys().map(named).collect()
+    }
+
     /// Whether any call waits to be offered.
     #[must_use]
     pub fn is_waiting(&self) -> bool {
@@ -302,33 +311,61 @@ impl<S: Send> Calls<S> {
         known.any(|known| matches!(known.state, State::Waiting))
     }
 
-    /// Withdraws the services of the calls that are left to others, and has them wait.
-    pub fn leave(&mut self, to_others: impl Fn(TopicId) -> bool) {
+    /// Withdraws the services of the calls that are left to others, by their names here, and has them wait.
+    pub fn leave(&mut self, to_others: impl Fn(TopicId, &str) -> bool) {
         for (topic, known) in &mut self.known {
-            if let State::Offered { .. } = known.state
-                && to_others(*topic)
+            if let State::Offered { target, .. } = &known.state
+                && to_others(*topic, &target.name)
             {
                 known.state = State::Waiting;
             }
         }
     }
 
-    /// Offers calls that wait and `may` be offered, at most so many. Reports the types of their services.
+    /// Asks for what the mapping says of other spaces, and nobody here knows.
+    pub fn ask_for_mapped(&self, policy: &Policy) -> Vec<PortEvent> {
+        let mapped = policy.mapping().asked_in(policy.own());
+        let unknown = mapped.filter(|(call, _)| !self.known.contains_key(&call.topic));
+        let topics = unknown.flat_map(|(call, _)| call.topics());
+        topics
+            .map(|topic| PortEvent::CallWanted { topic })
+            .collect()
+    }
+
+    /// Asks for what clients here look for, once while they are there.
+    pub fn looked_for(&mut self, mut topics: BTreeSet<TopicId>) -> Vec<PortEvent> {
+        while topics.len() > MOST_CALLS {
+            topics.pop_last();
+        }
+        let known = &self.known;
+        let new = topics.difference(&self.wanted);
+        let unknown = new.filter(|topic| !known.contains_key(topic));
+        let events = unknown.map(|topic| PortEvent::CallWanted { topic: *topic });
+        let events = events.collect();
+        self.wanted = topics;
+        events
+    }
+
+    /// Offers calls that wait and `may` be offered under their names here, at most so many. Reports the types of their
+    /// services.
     pub fn offer_waiting<G: CallGraph<Server = S>>(
         &mut self,
         graph: &mut G,
         policy: &mut Policy,
-        may: impl Fn(TopicId) -> bool,
+        may: impl Fn(TopicId, &str) -> bool,
         most: usize,
     ) -> Vec<PortEvent> {
         let mut left = MOST_CALLS.saturating_sub(self.servers().count());
-        let waiting = self
-            .known
-            .iter_mut()
-            .filter(|(topic, known)| matches!(known.state, State::Waiting) && may(**topic));
+        let waiting = self.known.iter();
+        let waiting = waiting.filter(|(_, known)| matches!(known.state, State::Waiting));
+        let waiting = waiting.map(|(topic, _)| (*topic, Target::of(*topic, policy)));
+        let waiting = waiting.filter(|(topic, target)| may(*topic, &target.name));
+        let waiting: Vec<(TopicId, Target)> = waiting.take(most).collect();
         let mut events = Vec::new();
-        for (topic, known) in waiting.take(most) {
-            let topic = *topic;
+        for (topic, target) in waiting {
+            let Some(known) = self.known.get_mut(&topic) else {
+                continue;
+            };
             if known.described.role != CallRole::Call {
                 // A part of an action is no service of its own.
                 known.state = State::Refused;
@@ -348,7 +385,6 @@ impl<S: Send> Calls<S> {
                 say: self.say.clone(),
                 next: Arc::clone(&self.next),
             };
-            let target = Target::of(topic, policy);
             let said = (target.type_name.as_ref(), &*target.map);
             let service_type = call_type(&known.described, said, |name| graph.service_type(name));
             let offered = service_type.and_then(|service_type| {

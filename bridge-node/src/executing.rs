@@ -3,7 +3,7 @@
 //! A service is a call where the mapping says so, or where it has the name of one of our own space (`/ua_1_2_61`). It is
 //! offered while it is there. Each execution is a task of its own, so that a slow service holds nothing up.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Duration;
@@ -96,10 +96,19 @@ impl<C> Default for Executing<C> {
 }
 
 impl<C: ServiceCall + Sync> Executing<C> {
-    /// Whether a service of that name is a call, so that its type is worth finding out.
+    /// Whether a service of that name is a call of our own space by its name, so that its type has to be found out.
+    #[must_use]
+    pub fn is_named(policy: &Policy, service: &str) -> bool {
+        named(policy, service).is_some()
+    }
+
+    /// Whether a service of that name is a call of our own space, by its name or because the mapping says so.
     #[must_use]
     pub fn is_wanted(policy: &Policy, service: &str) -> bool {
-        named(policy, service).is_some()
+        Self::is_named(policy, service)
+            || policy.mapping().executed_in(policy.own()).any(
+                |call| matches!(&call.executed, ExecutedBy::Ros(target) if target.name == service),
+            )
     }
 
     /// Compares the services there are with those that are offered as calls, and begins to offer `most` at most.
@@ -110,6 +119,7 @@ impl<C: ServiceCall + Sync> Executing<C> {
         (present, mut most): (&Present, usize),
     ) -> Vec<PortEvent> {
         while self.tasks.try_join_next().is_some() {}
+        tell_other_types(policy, present);
         let wanted = wanted(policy, present);
         let mut events = Vec::new();
         let gone = self.served.extract_if(.., |topic, served| {
@@ -273,7 +283,7 @@ fn named(policy: &Policy, service: &str) -> Option<TopicId> {
 fn wanted(policy: &Policy, present: &Present) -> BTreeMap<TopicId, Wanted> {
     let mapping = policy.mapping();
     let mut wanted = BTreeMap::new();
-    let taken: std::collections::BTreeSet<TopicId> = mapping
+    let taken: BTreeSet<TopicId> = mapping
         .executed_in(policy.own())
         .flat_map(mappings::Call::topics)
         .collect();
@@ -298,8 +308,10 @@ fn wanted(policy: &Policy, present: &Present) -> BTreeMap<TopicId, Wanted> {
         let (CallKind::Service, ExecutedBy::Ros(target)) = (call.kind, &call.executed) else {
             continue;
         };
-        if !present.contains_key(&target.name) {
-            continue;
+        match present.get(&target.name) {
+            Some(None) => {}
+            Some(Some(type_name)) if *type_name == target.type_name => {}
+            Some(Some(_)) | None => continue,
         }
         wanted.insert(
             call.topic,
@@ -314,6 +326,26 @@ fn wanted(policy: &Policy, present: &Present) -> BTreeMap<TopicId, Wanted> {
         );
     }
     wanted
+}
+
+/// Tells of services of other types than the mapping says.
+fn tell_other_types(policy: &mut Policy, present: &Present) {
+    let mapping = Arc::clone(policy.mapping());
+    for call in mapping.executed_in(policy.own()) {
+        let (CallKind::Service, ExecutedBy::Ros(target)) = (call.kind, &call.executed) else {
+            continue;
+        };
+        if let Some(Some(type_name)) = present.get(&target.name)
+            && *type_name != target.type_name
+        {
+            policy.told.once(&target.name, "other type", || {
+                format!(
+                    "the service {} is not executed as {}: it is of type {type_name}, and the mapping says {}",
+                    target.name, call.topic, target.type_name
+                )
+            });
+        }
+    }
 }
 
 /// Services that are offered to other spaces: anybody in a graph can invent names.

@@ -110,7 +110,7 @@ impl Bench {
     }
 
     fn offer(&mut self) -> Vec<PortEvent> {
-        let all = |_| true;
+        let all = |_: TopicId, _: &str| true;
         self.calls
             .offer_waiting(&mut self.graph, &mut self.policy, all, usize::MAX)
     }
@@ -297,7 +297,7 @@ fn a_call_without_a_type_waits_for_other_definitions_and_one_of_others_for_them_
     bench.calls.known(topic(106), trigger());
     bench.offer();
     assert_eq!(bench.services(), ["/ua_0_7_106"]);
-    bench.calls.leave(|_| true);
+    bench.calls.leave(|_, _| true);
     assert!(bench.services().is_empty() && bench.calls.is_waiting());
 }
 

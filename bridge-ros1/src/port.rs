@@ -135,6 +135,8 @@ impl Ros1Port {
             refused: Refused::default(),
         };
         port.take_bindings()?;
+        let wanted = port.calls.ask_for_mapped(&port.policy);
+        port.events.extend(wanted);
         Ok(port)
     }
 
@@ -388,6 +390,7 @@ impl Ros1Port {
             }
             self.find_sources();
             self.find_services();
+            self.offer_calls();
             self.tell_refused();
         }
         for source in &mut self.sources {

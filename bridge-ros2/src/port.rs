@@ -197,6 +197,8 @@ impl Ros2Port {
             schedule: Schedule::new(),
         };
         port.take_bindings();
+        let wanted = port.calls.ask_for_mapped(&port.policy);
+        port.events.extend(wanted);
         Ok(port)
     }
 

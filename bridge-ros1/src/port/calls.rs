@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use bridge_node::{Executing, Present};
+use mappings::TopicId;
 use messages::TypeName;
 use tcpros::{Node, ServiceClientOptions};
 use tokio::task::JoinSet;
@@ -12,15 +13,43 @@ use super::Ros1Port;
 use crate::services::{Executor, Ros1Graph};
 
 impl Ros1Port {
-    /// Offers the calls that are known as services.
+    /// Offers the calls that are known as services. One under a name that the mapping chose gives way to a service of
+    /// another node: the master knows one server of a name, the last that came.
     pub(super) fn offer_calls(&mut self) {
+        let (services, own) = (&self.graph.services, self.node.name());
+        let other = |service: &str| {
+            let nodes = services.get(service)?;
+            nodes.iter().find(|node| *node != own)
+        };
+        let is_chosen = |topic: TopicId, service: &str| service != format!("/{topic}");
+        for (topic, service) in self.calls.names(&self.policy) {
+            if is_chosen(topic, &service)
+                && let Some(node) = other(&service)
+            {
+                self.policy.told.once(&service, "taken", || {
+                    format!(
+                        "{topic} is not offered as {service}: the node {node} has such a service"
+                    )
+                });
+            }
+        }
+        let left =
+            |topic: TopicId, service: &str| is_chosen(topic, service) && other(service).is_some();
+        self.calls.leave(left);
+        if !self.calls.is_waiting() {
+            return;
+        }
         let mut graph = Ros1Graph {
             node: &self.node,
             definitions: &mut self.definitions,
         };
-        let (all, most) = (|_| true, usize::MAX);
+        // Who has which name is known from when the master has answered.
+        let has_master = self.has_master;
+        let may = |topic: TopicId, service: &str| {
+            !left(topic, service) && (has_master || !is_chosen(topic, service))
+        };
         let calls = &mut self.calls;
-        let events = calls.offer_waiting(&mut graph, &mut self.policy, all, most);
+        let events = calls.offer_waiting(&mut graph, &mut self.policy, may, usize::MAX);
         self.events.extend(events);
     }
 
@@ -29,14 +58,14 @@ impl Ros1Port {
         let own = self.node.name();
         let services = self.graph.services.iter();
         let others = services.filter(|(_, nodes)| nodes.iter().any(|node| node != own));
-        let others: BTreeMap<&str, &[String]> = others
-            .map(|(service, nodes)| (service.as_str(), nodes.as_slice()))
-            .collect();
         let policy = &self.policy;
-        let wanted = others.iter().filter(|(service, _)| {
+        let wanted = others.filter(|(service, _)| {
             service.len() <= MAX_NAME && Executing::<Executor>::is_wanted(policy, service)
         });
-        for (service, error) in self.kinds.look(&self.node, wanted) {
+        let others: BTreeMap<&str, &[String]> = wanted
+            .map(|(service, nodes)| (service.as_str(), nodes.as_slice()))
+            .collect();
+        for (service, error) in self.kinds.look(&self.node, others.iter()) {
             self.policy.told.once(&service, "type of the service", || {
                 format!("it is not known of which type the service {service} is: {error}")
             });

@@ -42,6 +42,7 @@ impl Ros1Port {
         let events = self.executing.look_again(&mut graph);
         self.events.extend(events);
         self.find_services();
+        self.events.extend(self.calls.ask_for_mapped(&self.policy));
         for (ros_topic, wanted) in read {
             self.take_up_values(ros_topic, wanted);
         }

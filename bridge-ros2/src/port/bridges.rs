@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
-use mappings::{Mapping, SpaceId};
+use mappings::{Mapping, SpaceId, TopicId};
+use rustdds::GUID;
 
 use super::Ros2Port;
 use crate::graph::{Graph, bridge_topic};
@@ -52,6 +53,42 @@ impl Ros2Port {
 /// Whether another bridge serves that space in the domain of the graph.
 pub(super) fn is_at_home(graph: &Graph, mapping: &Mapping, space: SpaceId, domain: u16) -> bool {
     graph.is_at_home(space.into()) && is_possible(mapping, space, domain)
+}
+
+/// This bridge, beside others of its domain.
+#[derive(Clone, Copy)]
+pub(super) struct Bridge {
+    /// Which it serves.
+    pub(super) space: SpaceId,
+    /// Of its participant.
+    pub(super) participant: GUID,
+}
+
+impl Bridge {
+    /// Whether another bridge that comes before this one offers a call of a third space under the same name: a client would
+    /// ask both, and it would be executed twice.
+    pub(super) fn is_second(
+        &self,
+        graph: &Graph,
+        mapping: &Mapping,
+        (topic, service): (TopicId, &str),
+        domain: u16,
+    ) -> bool {
+        let own = (u16::from(self.space), self.participant.prefix.as_ref());
+        let call = mapping.call(topic);
+        graph.bridges().any(|(bridge, number)| {
+            let Some(space) = SpaceId::new(number) else {
+                return false;
+            };
+            let before = (number, bridge.as_slice()) < own;
+            before && is_possible(mapping, space, domain) && {
+                match call.and_then(|call| call.binding(space)) {
+                    Some(binding) => binding.target.name == service,
+                    None => service.strip_prefix('/') == Some(topic.to_string().as_str()),
+                }
+            }
+        })
+    }
 }
 
 /// Whether a bridge may serve that space in that domain, for all the mapping says.

@@ -1,23 +1,48 @@
 //! Calls of other spaces, as services of the domain; and services of the domain, executed for other spaces.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
+use std::time::Duration;
 
 use bridge_node::{Executing, PortEvent, Present};
 use mappings::TopicId;
 use messages::TypeName;
+use rustdds::RTPSEntity;
+use tokio::time::Instant;
 
 use super::Ros2Port;
-use super::bridges::is_at_home;
+use super::bridges::{Bridge, is_at_home};
 use super::services::{Client, Ros2Graph};
+use crate::graph::Graph;
+use crate::service::{Snapshot, service_type};
 
 impl Ros2Port {
     /// Offers the calls that are known as services, as far as there is room for endpoints; those of a space that another
-    /// bridge of the domain serves are left to it.
+    /// bridge of the domain serves are left to it, as are those that such a bridge offers too and that under a chosen name
+    /// somebody else offers: a client asks all servers of a name.
     pub(super) fn offer_calls(&mut self) {
         let mapping = Arc::clone(self.policy.mapping());
         let (graph, domain) = (&self.graph, self.domain_id);
-        let at_home = |topic: TopicId| is_at_home(graph, &mapping, topic.space, domain);
-        self.calls.leave(at_home);
+        let bridge = Bridge {
+            space: self.policy.own(),
+            participant: self.domain.participant().guid(),
+        };
+        let snapshot = self.peers.look(Instant::now(), SEEN);
+        let mut taken = Vec::new();
+        for (topic, service) in self.calls.names(&self.policy) {
+            if service != format!("/{topic}") && is_offered(graph, &snapshot, &service) {
+                self.policy.told.once(&service, "taken", || {
+                    format!("{topic} is not offered as {service}: another node has such a service")
+                });
+                taken.push(service);
+            }
+        }
+        let left = |topic: TopicId, service: &str| {
+            is_at_home(graph, &mapping, topic.space, domain)
+                || bridge.is_second(graph, &mapping, (topic, service), domain)
+                || taken.iter().any(|name| name == service)
+        };
+        self.calls.leave(left);
         if !self.calls.is_waiting() {
             return;
         }
@@ -27,7 +52,7 @@ impl Ros2Port {
             definitions: &mut self.definitions,
         };
         let (calls, policy) = (&mut self.calls, &mut self.policy);
-        let may = |topic| !at_home(topic);
+        let may = |topic: TopicId, service: &str| !left(topic, service);
         // Each has a reader and a writer.
         let events = calls.offer_waiting(&mut services, policy, may, self.budget / 2);
         self.budget = self.budget.saturating_sub(2 * events.len());
@@ -42,13 +67,22 @@ impl Ros2Port {
     /// Offers the services of other nodes that are calls of our space, and withdraws those that are gone. Of two types under
     /// one name neither can be called.
     pub(super) fn find_services(&mut self) {
+        let snapshot = self.peers.look(Instant::now(), SEEN);
         let mut present = Present::new();
-        for (service, types) in self.domain.services() {
+        for (service, servers) in snapshot.offered() {
+            let service = format!("/{service}");
+            if !Executing::<Client>::is_wanted(&self.policy, &service) {
+                continue;
+            }
+            // What another bridge offers is executed elsewhere.
+            let servers = servers.iter().filter(|one| !self.graph.is_bridge(one.guid));
+            let types: BTreeSet<String> = servers.map(|one| service_type(&one.type_name)).collect();
             let type_name = match types.first() {
+                None => continue,
                 Some(name) if types.len() == 1 => name.parse().ok(),
-                Some(_) | None => None,
+                Some(_) => None,
             };
-            if type_name.is_none() && Executing::<Client>::is_wanted(&self.policy, &service) {
+            if type_name.is_none() && Executing::<Client>::is_named(&self.policy, &service) {
                 let types: Vec<String> = types.into_iter().collect();
                 self.policy.told.once(&service, "type of the service", || {
                     format!(
@@ -59,6 +93,15 @@ impl Ros2Port {
             }
             present.insert(service, type_name);
         }
+        let looked_for = snapshot.called().filter_map(|(service, clients)| {
+            let topic: TopicId = service.parse().ok()?;
+            let ours = self.policy.own() == topic.space;
+            let mut clients = clients.iter();
+            let somebody = clients.any(|one| !self.graph.is_bridge(one.guid));
+            (!ours && somebody).then_some(topic)
+        });
+        let events = self.calls.looked_for(looked_for.collect());
+        self.events.extend(events);
         let mut services = Ros2Graph {
             peers: &self.peers,
             domain: &self.domain,
@@ -85,3 +128,13 @@ impl Ros2Port {
         }
     }
 }
+
+/// Whether another node than a bridge offers that service.
+fn is_offered(graph: &Graph, snapshot: &Snapshot, service: &str) -> bool {
+    let topic = format!("rq/{}Request", service.trim_start_matches('/'));
+    let mut servers = snapshot.readers(&topic).iter();
+    servers.any(|one| !graph.is_bridge(one.guid))
+}
+
+/// How old what is known of others may be.
+const SEEN: Duration = Duration::from_millis(100);

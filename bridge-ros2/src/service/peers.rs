@@ -119,18 +119,30 @@ impl Snapshot {
     pub(crate) fn writers(&self, topic: &str) -> &[Endpoint] {
         self.writers.get(topic).map_or(&[], Vec::as_slice)
     }
+
+    /// The services that somebody offers, each with the readers of its requests.
+    pub(crate) fn offered(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
+        named(&self.readers)
+    }
+
+    /// The services that somebody asks for, each with the writers of its requests.
+    pub(crate) fn called(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
+        named(&self.writers)
+    }
+}
+
+/// The names of the services, without the slash in front, among the topics with requests.
+fn named(topics: &BTreeMap<String, Vec<Endpoint>>) -> impl Iterator<Item = (&str, &[Endpoint])> {
+    topics.iter().filter_map(|(topic, endpoints)| {
+        let name = topic.strip_prefix("rq/")?.strip_suffix("Request")?;
+        (!name.contains("/_action/")).then_some((name, endpoints.as_slice()))
+    })
 }
 
 /// The services that others than `participant` offer, with their types.
 pub(crate) fn offered(participant: &DomainParticipant) -> BTreeMap<String, BTreeSet<String>> {
     let mut services: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
-    for (topic, endpoints) in Snapshot::of(participant).readers {
-        let name = topic
-            .strip_prefix("rq/")
-            .and_then(|name| name.strip_suffix("Request"));
-        let Some(name) = name.filter(|name| !name.contains("/_action/")) else {
-            continue;
-        };
+    for (name, endpoints) in Snapshot::of(participant).offered() {
         let types = services.entry(format!("/{name}")).or_default();
         types.extend(endpoints.iter().map(|one| service_type(&one.type_name)));
     }
@@ -138,7 +150,7 @@ pub(crate) fn offered(participant: &DomainParticipant) -> BTreeMap<String, BTree
 }
 
 /// `std_srvs/SetBool` of `std_srvs::srv::dds_::SetBool_Request_`.
-fn service_type(request: &str) -> String {
+pub(crate) fn service_type(request: &str) -> String {
     let parts = request.split_once("::srv::dds_::");
     let named = parts.and_then(|(package, rest)| Some((package, rest.strip_suffix("_Request_")?)));
     named.map_or_else(

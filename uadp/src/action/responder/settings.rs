@@ -39,6 +39,14 @@ pub struct ResponderSettings {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct ExecutionId(pub(super) u64);
 
+impl ExecutionId {
+    /// That of a Responder that is made up.
+    #[must_use]
+    pub const fn new(number: u64) -> Self {
+        Self(number)
+    }
+}
+
 /// What is to be done about a request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Requested {
