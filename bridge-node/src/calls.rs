@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
 
-use bridge_core::{Answered, AskId, CallDescription, CallMap, CallRole};
+use bridge_core::{Answered, AskErrorKind, AskId, CallDescription, CallMap, CallRole};
 use bytes::Bytes;
 use mappings::TopicId;
 use messages::{Literal, MessageType, NoFields, Plan, Selection, ServiceType, TypeName, Wire};
@@ -298,10 +298,14 @@ impl<S: Send> Calls<S> {
         offered.chain(self.leaving.iter().map(|(_, _, server)| server))
     }
 
-    /// The calls that are known, each with the name of its service here.
-    pub fn names(&self, policy: &Policy) -> Vec<(TopicId, String)> {
-        let named = |topic: &TopicId| (*topic, Target::of(*topic, policy).name);
-        self.known.keys().map(named).collect()
+    /// The calls that are known and have a name of the mapping here, with that.
+    #[must_use]
+    pub fn chosen(&self, policy: &Policy) -> Vec<(TopicId, String)> {
+        let mapped = policy.mapping().asked_in(policy.own());
+        let known = mapped.filter(|(call, _)| self.known.contains_key(&call.topic));
+        known
+            .map(|(call, binding)| (call.topic, binding.target.name.clone()))
+            .collect()
     }
 
     /// Whether any call waits to be offered.
@@ -478,7 +482,10 @@ impl<S: Send> Calls<S> {
         };
         match answer {
             Ok(bytes) => drop(asked.answer.send(Ok(bytes))),
-            Err(fault) => asked.fail(&fault.to_string()),
+            Err(fault) => asked.fail(&match fault.kind {
+                AskErrorKind::Refused => format!("not executed: {fault}"),
+                AskErrorKind::Failed | AskErrorKind::Unknown => fault.to_string(),
+            }),
         }
     }
 }

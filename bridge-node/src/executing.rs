@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use bridge_core::{CallRole, Executed, ExecutionId, OfferedType, Refusal};
 use bytes::Bytes;
-use mappings::{CallKind, ExecutedBy, TopicId};
+use mappings::{CallKind, ExecutedBy, Mapping, TopicId};
 use messages::{ServiceType, TypeName};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
@@ -44,7 +44,7 @@ pub type Present = BTreeMap<String, Option<TypeName>>;
 /// What of a graph is executed for the space.
 #[derive(Debug)]
 pub struct Executing<C> {
-    served: BTreeMap<TopicId, Served<C>>,
+    served: HashMap<TopicId, Served<C>>,
     /// Those that cannot be served as they are.
     refused: HashMap<TopicId, Wanted>,
     /// What is executed now, and of which call.
@@ -85,7 +85,7 @@ impl<C> Default for Executing<C> {
     fn default() -> Self {
         let (report, done) = mpsc::channel(MOST_RUNNING);
         Self {
-            served: BTreeMap::new(),
+            served: HashMap::new(),
             refused: HashMap::new(),
             running: HashMap::new(),
             done,
@@ -102,13 +102,14 @@ impl<C: ServiceCall + Sync> Executing<C> {
         named(policy, service).is_some()
     }
 
-    /// Whether a service of that name is a call of our own space, by its name or because the mapping says so.
-    #[must_use]
-    pub fn is_wanted(policy: &Policy, service: &str) -> bool {
-        Self::is_named(policy, service)
-            || policy.mapping().executed_in(policy.own()).any(
-                |call| matches!(&call.executed, ExecutedBy::Ros(target) if target.name == service),
-            )
+    /// The names of the services that the mapping has executed in our own space.
+    pub fn mapped<'m>(mapping: &'m Mapping, policy: &Policy) -> BTreeSet<&'m str> {
+        let calls = mapping.executed_in(policy.own());
+        let names = calls.filter_map(|call| match &call.executed {
+            ExecutedBy::Ros(target) => Some(target.name.as_str()),
+            ExecutedBy::OpcUa(_) | ExecutedBy::Elsewhere => None,
+        });
+        names.collect()
     }
 
     /// Compares the services there are with those that are offered as calls, and begins to offer `most` at most.
@@ -122,9 +123,9 @@ impl<C: ServiceCall + Sync> Executing<C> {
         tell_other_types(policy, present);
         let wanted = wanted(policy, present);
         let mut events = Vec::new();
-        let gone = self.served.extract_if(.., |topic, served| {
-            wanted.get(topic).is_none_or(|now| served.wanted != *now)
-        });
+        let gone = self
+            .served
+            .extract_if(|topic, served| wanted.get(topic).is_none_or(|now| served.wanted != *now));
         events.extend(gone.map(|(topic, _)| PortEvent::Withdrawn { topic }));
         self.refused
             .retain(|topic, refused| wanted.get(topic) == Some(refused));
@@ -155,7 +156,7 @@ impl<C: ServiceCall + Sync> Executing<C> {
     /// Has everything looked at again: definitions may be others.
     pub fn look_again<G: ExecutorGraph<Executor = C>>(&mut self, graph: &mut G) -> Vec<PortEvent> {
         self.refused.clear();
-        let other = self.served.extract_if(.., |_, served| {
+        let other = self.served.extract_if(|_, served| {
             let now = graph.service_type(&served.wanted.type_name);
             now.is_ok_and(|now| !now.is_same(&served.service_type))
         });
@@ -192,11 +193,6 @@ impl<C: ServiceCall + Sync> Executing<C> {
             open: wanted.open,
         };
         Ok(PortEvent::OfferTyped { topic, offered })
-    }
-
-    /// The types of the services that are called.
-    pub fn types(&self) -> impl Iterator<Item = &Arc<ServiceType>> {
-        self.served.values().map(|served| &served.service_type)
     }
 
     /// Whether it executes that call.

@@ -122,14 +122,14 @@ impl Bench {
 }
 
 fn said(event: &PortEvent) -> String {
-    match event {
-        PortEvent::OfferTyped { topic, offered } => {
-            let open = if offered.open { " open" } else { "" };
-            format!("+{topic} {}{open}", offered.service_type.name())
-        }
-        PortEvent::Withdrawn { topic } => format!("-{topic}"),
-        other => panic!("{other:?}"),
+    if let PortEvent::Withdrawn { topic } = event {
+        return format!("-{topic}");
     }
+    let PortEvent::OfferTyped { topic, offered } = event else {
+        panic!("{event:?}");
+    };
+    let open = if offered.open { " open" } else { "" };
+    format!("+{topic} {}{open}", offered.service_type.name())
 }
 
 /// The call that the mapping executes as the service `/grip` of type `std_srvs/Trigger`.

@@ -155,10 +155,12 @@ impl ServiceCall for Client {
         self.0.call(request).await.map_err(|error| CallFault {
             text: error.to_string(),
             may_pass: may_pass(&error),
-            ran: match &error {
-                ServiceError::Failed { .. } => Ran::Yes,
-                error if error.may_have_run() => Ran::Perhaps,
-                _ => Ran::No,
+            ran: if matches!(error, ServiceError::Failed { .. }) {
+                Ran::Yes
+            } else if error.may_have_run() {
+                Ran::Perhaps
+            } else {
+                Ran::No
             },
         })
     }

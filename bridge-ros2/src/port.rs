@@ -78,6 +78,7 @@ pub struct PortOptions {
 /// The ROS 2 side of a bridge.
 pub struct Ros2Port {
     domain: Domain,
+    joined: Instant,
     /// By it other bridges know this one.
     presence: RawWriter,
     discovery: DomainParticipantStatusListener,
@@ -167,6 +168,7 @@ impl Ros2Port {
         let clock = domain.clock();
         let mut port = Self {
             discovery: domain.status_listener(),
+            joined: Instant::now(),
             strangers: Strangers::default(),
             domain,
             presence,

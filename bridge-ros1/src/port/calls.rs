@@ -1,6 +1,7 @@
 //! Calls of other spaces, as services of the graph; and services of the graph, executed for other spaces.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::{Executing, Present};
@@ -22,10 +23,8 @@ impl Ros1Port {
             nodes.iter().find(|node| *node != own)
         };
         let is_chosen = |topic: TopicId, service: &str| service != format!("/{topic}");
-        for (topic, service) in self.calls.names(&self.policy) {
-            if is_chosen(topic, &service)
-                && let Some(node) = other(&service)
-            {
+        for (topic, service) in self.calls.chosen(&self.policy) {
+            if let Some(node) = other(&service) {
                 self.policy.told.once(&service, "taken", || {
                     format!(
                         "{topic} is not offered as {service}: the node {node} has such a service"
@@ -59,8 +58,11 @@ impl Ros1Port {
         let services = self.graph.services.iter();
         let others = services.filter(|(_, nodes)| nodes.iter().any(|node| node != own));
         let policy = &self.policy;
+        let mapping = Arc::clone(policy.mapping());
+        let mapped = Executing::<Executor>::mapped(&mapping, policy);
         let wanted = others.filter(|(service, _)| {
-            service.len() <= MAX_NAME && Executing::<Executor>::is_wanted(policy, service)
+            let named = || Executing::<Executor>::is_named(policy, service);
+            service.len() <= MAX_NAME && (mapped.contains(service.as_str()) || named())
         });
         let others: BTreeMap<&str, &[String]> = wanted
             .map(|(service, nodes)| (service.as_str(), nodes.as_slice()))

@@ -75,14 +75,13 @@ impl Bridge {
         domain: u16,
     ) -> bool {
         let own = (u16::from(self.space), self.participant.prefix.as_ref());
-        let call = mapping.call(topic);
         graph.bridges().any(|(bridge, number)| {
             let Some(space) = SpaceId::new(number) else {
                 return false;
             };
             let before = (number, bridge.as_slice()) < own;
             before && is_possible(mapping, space, domain) && {
-                match call.and_then(|call| call.binding(space)) {
+                match mapping.call(topic).and_then(|call| call.binding(space)) {
                     Some(binding) => binding.target.name == service,
                     None => service.strip_prefix('/') == Some(topic.to_string().as_str()),
                 }
@@ -109,6 +108,46 @@ fn hex(participant: &ParticipantPrefix) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::graph::{BRIDGE_TYPE, Endpoint};
+
+    fn guid(first: u8) -> GUID {
+        GUID::from_bytes([first; 16])
+    }
+
+    /// A domain with bridges of these spaces, whose participants begin with these bytes.
+    fn domain_with(bridges: &[(u16, u8)]) -> Graph {
+        let markers = bridges.iter().map(|(space, first)| {
+            let endpoint = Endpoint {
+                guid: guid(*first),
+                type_name: BRIDGE_TYPE.into(),
+                reliable: true,
+                transient_local: false,
+                type_hash: None,
+                qos: std::sync::Arc::default(),
+            };
+            (bridge_topic(*space), endpoint)
+        });
+        Graph::from_endpoints(markers, [])
+    }
+
+    #[test]
+    fn of_two_bridges_one_comes_first_unless_the_other_has_the_call_under_another_name() {
+        let bridge = |space, first| Bridge {
+            space: SpaceId::new(space).unwrap(),
+            participant: guid(first),
+        };
+        let mapping = Mapping::default();
+        let second = |one: Bridge, others: &[(u16, u8)], service: &str| {
+            let topic = "ua_1_2_61".parse().unwrap();
+            one.is_second(&domain_with(others), &mapping, (topic, service), 2)
+        };
+        let named = "/ua_1_2_61";
+        assert!(!second(bridge(2, 9), &[], named));
+        assert!(!second(bridge(2, 9), &[(3, 1)], named));
+        assert!(second(bridge(3, 1), &[(2, 9)], named));
+        assert!(second(bridge(2, 9), &[(2, 1)], named) && !second(bridge(2, 1), &[(2, 9)], named));
+        assert!(!second(bridge(3, 1), &[(2, 9)], "/switch"));
+    }
 
     #[test]
     fn a_bridge_of_a_space_that_the_mapping_has_elsewhere_is_not_believed() {

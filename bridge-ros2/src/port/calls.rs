@@ -29,8 +29,8 @@ impl Ros2Port {
         };
         let snapshot = self.peers.look(Instant::now(), SEEN);
         let mut taken = Vec::new();
-        for (topic, service) in self.calls.names(&self.policy) {
-            if service != format!("/{topic}") && is_offered(graph, &snapshot, &service) {
+        for (topic, service) in self.calls.chosen(&self.policy) {
+            if is_offered(graph, &snapshot, &service) {
                 self.policy.told.once(&service, "taken", || {
                     format!("{topic} is not offered as {service}: another node has such a service")
                 });
@@ -52,7 +52,9 @@ impl Ros2Port {
             definitions: &mut self.definitions,
         };
         let (calls, policy) = (&mut self.calls, &mut self.policy);
-        let may = |topic: TopicId, service: &str| !left(topic, service);
+        // Other bridges that are there are known by then.
+        let settled = self.joined.elapsed() >= SETTLED;
+        let may = |topic: TopicId, service: &str| settled && !left(topic, service);
         // Each has a reader and a writer.
         let events = calls.offer_waiting(&mut services, policy, may, self.budget / 2);
         self.budget = self.budget.saturating_sub(2 * events.len());
@@ -68,10 +70,13 @@ impl Ros2Port {
     /// one name neither can be called.
     pub(super) fn find_services(&mut self) {
         let snapshot = self.peers.look(Instant::now(), SEEN);
+        let mapping = Arc::clone(self.policy.mapping());
+        let mapped = Executing::<Client>::mapped(&mapping, &self.policy);
         let mut present = Present::new();
         for (service, servers) in snapshot.offered() {
             let service = format!("/{service}");
-            if !Executing::<Client>::is_wanted(&self.policy, &service) {
+            let is_named = Executing::<Client>::is_named(&self.policy, &service);
+            if !is_named && !mapped.contains(service.as_str()) {
                 continue;
             }
             // What another bridge offers is executed elsewhere.
@@ -82,7 +87,7 @@ impl Ros2Port {
                 Some(name) if types.len() == 1 => name.parse().ok(),
                 Some(_) => None,
             };
-            if type_name.is_none() && Executing::<Client>::is_named(&self.policy, &service) {
+            if type_name.is_none() && is_named {
                 let types: Vec<String> = types.into_iter().collect();
                 self.policy.told.once(&service, "type of the service", || {
                     format!(
@@ -136,5 +141,7 @@ fn is_offered(graph: &Graph, snapshot: &Snapshot, service: &str) -> bool {
     servers.any(|one| !graph.is_bridge(one.guid))
 }
 
+/// From when on after joining a domain services are offered in it.
+const SETTLED: Duration = Duration::from_secs(1);
 /// How old what is known of others may be.
 const SEEN: Duration = Duration::from_millis(100);

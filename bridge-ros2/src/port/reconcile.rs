@@ -35,12 +35,14 @@ impl Ros2Port {
         self.former.retain(|former| !former.is_done(now));
         self.report_drops();
         self.calls.tidy(bridge_node::now().monotonic);
+        if is_due {
+            self.graph = self.domain.graph();
+        }
         self.offer_calls();
         if !is_due {
             return;
         }
         self.schedule.looks(domain, now);
-        self.graph = self.domain.graph();
         let graph = &self.graph;
         self.incompatible.retain(|guid| graph.holds(*guid));
         self.misreading.retain(|guid| graph.holds(*guid));
