@@ -320,9 +320,11 @@ fn read_family(value: &Variant<'_>) -> Option<ActionFamily> {
     let Variant::Array(array) = value else {
         return None;
     };
-    let mut numbers = array.iter().map(|number| match number {
-        Scalar::UInt16(number) if number != 0 => Some(number),
-        _ => None,
+    let mut numbers = array.iter().map(|number| {
+        let Scalar::UInt16(number) = number else {
+            return None;
+        };
+        (number != 0).then_some(number)
     });
     let family = ActionFamily {
         cancel: numbers.next()??,

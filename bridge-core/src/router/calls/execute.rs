@@ -282,11 +282,7 @@ impl Router {
     fn execute(
         &mut self,
         (topic, id): (TopicId, ExecutionId),
-        (request, read, plan): (
-            &ActionMessage<'_>,
-            Result<Vec<u8>, (Cause, String)>,
-            Option<Arc<ExecutedPlan>>,
-        ),
+        (request, read, plan): (&ActionMessage<'_>, ReadRequest, Option<Arc<ExecutedPlan>>),
         now: Now,
     ) {
         let Some(calls) = &mut self.calls else {
@@ -390,12 +386,17 @@ impl super::Calls {
     }
 }
 
+/// A request as the local side has it, or why it has it not.
+type ReadRequest = Result<Vec<u8>, (Cause, String)>;
+/// The fields of a request, and what they are read with where the local side speaks ROS.
+type Executable<'a> = (&'a [u8], Option<Arc<ExecutedPlan>>);
+
 /// The fields of a request that may be executed.
 fn may_be_executed<'a>(
     own: Option<&Own>,
     request: &ActionMessage<'a>,
     from: SocketAddr,
-) -> Result<(&'a [u8], Option<Arc<ExecutedPlan>>), (Refusal, &'static str, String)> {
+) -> Result<Executable<'a>, (Refusal, &'static str, String)> {
     let Some(own) = own.filter(|_| request.target_id == TARGET) else {
         let detail = "it is no call of this program".to_owned();
         return Err((Refusal::NoSuchAction, "unknown", detail));
