@@ -1,6 +1,7 @@
 //! Document -> mapping: what only shows when the parts of a document are seen together.
 
 mod bindings;
+mod calls;
 mod cell;
 mod environment;
 mod meaning;
@@ -305,9 +306,20 @@ fn compile(
         }
         None => Vec::new(),
     };
+    let calls = match &document.calls {
+        Some(entries) => {
+            let entries = entries.value.as_deref().unwrap_or_default();
+            let known = (&spaces, &namespaces, &variables[..]);
+            calls::check(entries, known, &mut types, findings)
+        }
+        None => Vec::new(),
+    };
     let mapping = Mapping::new(pubsub, spaces.known, namespaces.known, server, variables);
     *used = types.used();
-    let mapping = mapping.with_patterns(patterns).with_type_paths(paths);
+    let mapping = mapping
+        .with_calls(calls)
+        .with_patterns(patterns)
+        .with_type_paths(paths);
     let minded_by_all = findings.errors().iter().any(Vec::is_empty);
     if let Some(environment) = around.environment()
         && !minded_by_all
@@ -327,6 +339,7 @@ impl Document {
         }
         count(&self.variables) == mapping.variables().len()
             && count(&self.patterns) == mapping.patterns().len()
+            && count(&self.calls) == mapping.calls().len()
     }
 }
 

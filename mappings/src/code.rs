@@ -119,6 +119,10 @@ codes! {
     ServiceAway = "M124", "Nobody offers the service in the graph as it is now. Only `ua-space check --environment` asks for that.";
     NodeAway = "M125", "The server that runs has no such variable. Only `ua-space check --environment` asks for that.";
     LiveNodeDiffers = "M126", "The variable is there in the server with another data type. Only `ua-space check --environment` asks for that.";
+    CallExecutor = "M130", "A call is executed in the space of its `origin`, by the one service under `ros` that is of that space. Without one somebody else executes it, which is so with the components of space 0, and it can be asked for elsewhere.";
+    CallTopic = "M131", "A call has a topic of its own; that of a variable, or of another call, is taken.";
+    CallMap = "M132", "In `request` stands what the fields of the call's request are made of, in `response` what those of the service here are made of: constants, or fields of the other side, of the same type. What is not named goes by name, and what then is made of nothing needs a constant. The service that executes the call has neither.";
+    CallTwice = "M133", "Two calls have one service in a space.";
 }
 
 impl Code {
@@ -139,6 +143,7 @@ impl Code {
                 | Self::LossyConversion
                 | Self::FieldOrder
                 | Self::StructureOf
+                | Self::CallMap
         )
     }
 }
@@ -163,7 +168,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M126")]
+#[error("no finding has that code; codes are M001 to M133")]
 pub struct UnknownCode;
 
 #[cfg(test)]

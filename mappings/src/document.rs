@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use messages::Literal;
 use schemars::JsonSchema;
 
+use crate::call::Assigned;
 use crate::code::Code;
 use crate::mapping::UaField;
 use crate::read::{At, Read, Reader, choice, document, short};
@@ -34,6 +35,9 @@ document! {
         /// Topics that become values as they appear, at most 1000; the first that fits counts, and an entry of `variables`
         /// with the same topic before all.
         patterns: Vec<At<PatternEntry>>,
+        /// What is executed in one space and asked for from the others, at most 5000. Services of ROS that have a name of the
+        /// space (/ua_1_2_61) need none.
+        calls: Vec<At<CallEntry>>,
     }
 
     /// One ROS side.
@@ -244,6 +248,53 @@ document! {
         r#as: AsEntry,
     }
 
+    /// Something that is executed in one space: a service of ROS, or what a component executes.
+    struct CallEntry {
+        /// The OPC UA Method, as ns=2;i=61.
+        #[schemars(required, regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
+        node: String,
+        /// Name of the Method; dots part the folders it stands in, as Conveyor.Switch.
+        #[schemars(required, length(min = 1, max = 512))]
+        name: String,
+        /// What it does, for people.
+        about: String,
+        /// The space where it is executed: 0 the OPC UA side, else one of `spaces`.
+        #[schemars(required, range(max = 232))]
+        origin: u16,
+        /// As with a variable.
+        #[schemars(range(min = 1, max = 65535))]
+        alias: u16,
+        /// Services of ROS, one or a list, at most one per space. That of the origin executes the call; those of other spaces
+        /// are offered there and ask for it. A space without one has it under its name, as /ua_1_2_61.
+        ros: CallBindings,
+        /// Whether requests from other hosts are executed; left out, only those from a loopback address are, since nobody
+        /// knows who sends them.
+        open: bool,
+        /// How long the service may take, and how long who asks waits; default 30s.
+        #[schemars(regex(pattern = DURATION))]
+        timeout: String,
+    }
+
+    /// A service of ROS that executes a call, or asks for it.
+    struct CallBindingEntry {
+        /// Whose service it is. Left out: the origin of the call.
+        #[schemars(range(min = 1, max = 232))]
+        space: u16,
+        /// Absolute name of the service, as /conveyor/switch.
+        #[schemars(required, regex(pattern = "^/"))]
+        service: String,
+        /// Service type, as std_srvs/SetBool.
+        #[schemars(required)]
+        r#type: String,
+        /// Of a service that asks: what the fields of the call's request are made of, as {id: 6, on: {field: data}}: a constant,
+        /// or a field of the request here. A message stands for all fields in it. What is not named is made of the field of the
+        /// same name.
+        request: FieldMapEntry,
+        /// Of a service that asks: what the fields of the response here are made of, as {success: true, message: {field: text}}: a
+        /// constant, or a field of the call's response.
+        response: FieldMapEntry,
+    }
+
     /// One of several fields, with what converts it.
     struct FieldEntry {
         /// The field, as in a binding with one.
@@ -410,6 +461,114 @@ impl JsonSchema for Request {
 
     fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
         schemars::json_schema!({ "type": "object" })
+    }
+}
+
+/// What fields are made of: path of the field, where it is said, and what.
+#[derive(Clone, Debug)]
+pub(crate) struct FieldMapEntry(pub(crate) Vec<(String, Place, Assigned)>);
+
+impl Read for FieldMapEntry {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+        let mut found = Vec::new();
+        assignments(node, "", reader, &mut found)?;
+        Some(Self(found))
+    }
+}
+
+/// `None` after noting what is faulty. Maps nest no deeper than documents do.
+fn assignments(
+    node: &Node<'_>,
+    prefix: &str,
+    reader: &mut Reader<'_>,
+    found: &mut Vec<(String, Place, Assigned)>,
+) -> Option<()> {
+    let mut sound = Some(());
+    for pair in reader.pairs(
+        node,
+        "a map of field and value, or of field and {field: ..}",
+    )? {
+        let path = format!("{prefix}{}", pair.key);
+        let assigned = match &pair.value.kind {
+            Kind::Map(pairs) => {
+                if let [(key, value)] = &pairs[..]
+                    && matches!(&key.kind, Kind::Scalar(key) if key == "field")
+                    && let Kind::Scalar(text) = &value.kind
+                {
+                    Some(Assigned::Field(text.clone().into_owned()))
+                } else {
+                    let inner = assignments(pair.value, &format!("{path}."), reader, found);
+                    sound = sound.and(inner);
+                    continue;
+                }
+            }
+            Kind::Scalar(text) => Some(Assigned::Constant(Literal::One(text.clone().into_owned()))),
+            Kind::List(items) => {
+                let texts = items
+                    .iter()
+                    .map(|item| reader.text(item, "a single value").map(str::to_owned));
+                let texts: Option<Vec<String>> = texts.collect();
+                texts.map(|texts| Assigned::Constant(Literal::List(texts)))
+            }
+            Kind::Null => {
+                reader.wrong(pair.value, "a value, a list, or {field: name}");
+                None
+            }
+        };
+        match assigned {
+            Some(assigned) => found.push((path, pair.place, assigned)),
+            None => sound = None,
+        }
+    }
+    sound
+}
+
+impl JsonSchema for FieldMapEntry {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "FieldMap".into()
+    }
+
+    fn json_schema(_: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        schemars::json_schema!({ "type": "object" })
+    }
+}
+
+/// One service of a call or a list of them.
+#[derive(Clone, Debug)]
+pub(crate) struct CallBindings(pub(crate) Vec<At<CallBindingEntry>>);
+
+impl Read for CallBindings {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+        match &node.kind {
+            Kind::List(_) => Vec::read(node, reader).map(Self),
+            Kind::Map(_) => Some(Self(vec![reader.at(node)])),
+            Kind::Null | Kind::Scalar(_) => {
+                reader.wrong(
+                    node,
+                    "a service such as `{service: /a/b, type: std_srvs/SetBool}`, or a list of them",
+                );
+                None
+            }
+        }
+    }
+}
+
+impl JsonSchema for CallBindings {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "CallBindings".into()
+    }
+
+    fn json_schema(generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        let one = generator.subschema_for::<CallBindingEntry>();
+        schemars::json_schema!({ "anyOf": [one, { "type": "array", "items": one }] })
     }
 }
 
@@ -635,6 +794,7 @@ impl Default for Document {
             namespaces: None,
             variables: None,
             patterns: None,
+            calls: None,
         }
     }
 }

@@ -255,11 +255,13 @@ impl<'a> Loader<'a> {
             namespaces,
             variables,
             patterns,
+            calls,
         } = other;
         append(&mut self.whole.spaces, spaces);
         append(&mut self.whole.type_paths, type_paths);
         append(&mut self.whole.variables, variables);
         append(&mut self.whole.patterns, patterns);
+        append(&mut self.whole.calls, calls);
         append(&mut self.whole.namespaces, namespaces);
         once("pubsub", &mut self.whole.pubsub, pubsub, self.findings);
         once("server", &mut self.whole.server, server, self.findings);

@@ -175,7 +175,7 @@ pub(super) struct Known<'k> {
 }
 
 /// `package/srv/Name` is the same name.
-fn type_name(text: &str) -> Option<TypeName> {
+pub(super) fn type_name(text: &str) -> Option<TypeName> {
     text.replacen("/srv/", "/", 1).parse().ok()
 }
 
@@ -408,7 +408,7 @@ fn service_type(
 }
 
 /// `None` when it is not built in, which is noted.
-fn built_in(
+pub(super) fn built_in(
     name: &TypeName,
     (dialect, place): (Dialect, Place),
     types: &mut Types,

@@ -24,10 +24,10 @@ use crate::tree::Place;
 const MAX_VARIABLES: usize = 20_000;
 
 /// The WriterGroupId of nodes of namespace 0, whose own index is the null value: the highest, which no server reaches.
-const NAMESPACE_ZERO: NonZeroU16 = NonZeroU16::MAX;
+pub(super) const NAMESPACE_ZERO: NonZeroU16 = NonZeroU16::MAX;
 
-type Namespaces = Declared<BTreeMap<u16, String>>;
-type Spaces = Declared<Vec<Space>>;
+pub(super) type Namespaces = Declared<BTreeMap<u16, String>>;
+pub(super) type Spaces = Declared<Vec<Space>>;
 
 /// What could be read of an entry that is a map.
 struct Draft<'d> {
@@ -134,7 +134,7 @@ fn title(entry: &VariableEntry) -> String {
     }
 }
 
-fn node_id(
+pub(super) fn node_id(
     text: &str,
     place: Place,
     namespaces: &Namespaces,
@@ -479,7 +479,7 @@ fn only_field((builtin, array): ValueType) -> Leaf {
     }
 }
 
-fn checked_name(name: &str, place: Place, findings: &mut Findings) -> Option<String> {
+pub(super) fn checked_name(name: &str, place: Place, findings: &mut Findings) -> Option<String> {
     let fault = if name.trim().is_empty() {
         "is empty"
     } else if name.chars().count() > 512 {
