@@ -1,5 +1,7 @@
 //! Services of one ROS, asked for from the other: under their names of the space, and as a mapping says.
 
+use std::fs;
+use std::path::Path;
 use std::time::Duration;
 
 use nix::sys::signal::Signal;
@@ -174,4 +176,98 @@ fn of_two_bridges_in_one_domain_one_asks_and_a_call_is_executed_once() {
     let asked = |line: &Value| (line.get("value")? == false).then_some(());
     server.wait_for_json("the server is asked", SOON, asked);
     assert_eq!(server.values().len(), 6);
+}
+
+/// A belt of ROS 1 that is switched from ROS 2, under names and fields of its own.
+fn belt(asked: &str) -> String {
+    format!(
+        "
+spaces: [{{id: 1}}, {{id: 2, domain: 2}}]
+namespaces: {{2: 'urn:test:belt'}}
+calls:
+  - node: ns=2;i=61
+    name: Belt.Switch
+    origin: 1
+    timeout: 5s
+    ros:
+      - {{service: /belt/switch, type: std_srvs/SetBool}}
+      - {asked}
+"
+    )
+}
+
+/// Saves a file as editors do: under another name first.
+fn save(file: &Path, text: &str) {
+    let beside = file.with_extension("new");
+    fs::write(&beside, text).unwrap();
+    fs::rename(beside, file).unwrap();
+}
+
+#[test]
+fn a_mapping_names_what_is_executed_and_what_is_asked_for_and_is_read_again_meanwhile() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let as_bool = "{space: 2, service: /switch, type: std_srvs/SetBool}";
+    let file = cell.file("cell.yaml", &belt(as_bool));
+    let path = file.to_str().unwrap();
+    let mut server = cell.rospy("ros1_serve.py", &["/belt/switch"]);
+    let _bridges = (cell.bridge_ros1(&[path]), cell.bridge_ros2(&[path]));
+    let mut judge = cell.judge(Distribution::Jazzy, &["judge"]);
+    assert_eq!(set_bool(&mut judge, "/switch", true), done());
+    has_service(&mut judge, "/ua_bridge_ros2", OF_ROS1, false);
+    // With nothing to say, the belt starts; what it answers goes by the mapping as well.
+    let as_trigger = "{space: 2, service: /start, type: std_srvs/Trigger, request: {data: true}, \
+                      response: {success: true, message: {field: message}}}";
+    save(&file, &belt(as_trigger));
+    let trigger = json!({"call": "/start", "type": "std_srvs/srv/Trigger", "value": {}});
+    has_service(&mut judge, "/ua_bridge_ros2", "/start", true);
+    has_service(&mut judge, "/ua_bridge_ros2", "/switch", false);
+    assert_eq!(judge.ask(trigger), done());
+    // The mapping that is gone leaves nothing behind.
+    save(&file, "spaces: [{id: 1}, {id: 2, domain: 2}]\n");
+    has_service(&mut judge, "/ua_bridge_ros2", "/start", false);
+    assert_eq!(server.values().len(), 2);
+    let asked = |line: &Value| (line.get("value")? == true).then_some(());
+    server.wait_for_json("the server is asked", SOON, asked);
+}
+
+#[test]
+fn a_service_that_somebody_has_keeps_its_name_in_both_ros() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let mapping = "
+spaces: [{id: 1}, {id: 2, domain: 2}]
+namespaces: {2: 'urn:test:belt'}
+calls:
+  - {node: ns=2;i=61, name: Belt, origin: 1, ros: [{service: /belt, type: std_srvs/SetBool}, \
+     {space: 2, service: /taken, type: std_srvs/SetBool}]}
+  - {node: ns=2;i=62, name: Lamp, origin: 2, ros: [{service: /lamp, type: std_srvs/SetBool}, \
+     {space: 1, service: /mine, type: std_srvs/SetBool}]}
+";
+    let file = cell.file("cell.yaml", mapping);
+    let path = file.to_str().unwrap();
+    let mut judge = cell.judge(Distribution::Jazzy, &["judge"]);
+    let theirs = json!({"success": true, "message": "theirs"});
+    for service in ["/taken", "/lamp"] {
+        judge.ask(json!({"serve": service, "type": "std_srvs/srv/SetBool", "value": theirs}));
+    }
+    let _belt = cell.rospy("ros1_serve.py", &["/belt", "--node", "belt"]);
+    let mut mine = cell.rospy("ros1_serve.py", &["/mine", "--node", "mine"]);
+    let before = server_of("/mine").unwrap();
+    let mut ros1 = cell.bridge_ros1(&[path]);
+    let mut ros2 = cell.bridge_ros2(&[path]);
+    ros2.wait_for_line("is not offered as /taken", SOON);
+    ros1.wait_for_line("is not offered as /mine", SOON);
+    assert_eq!(set_bool(&mut judge, "/taken", true), theirs);
+    assert_eq!(server_of("/mine").as_ref(), Some(&before));
+    // Once the name is free, it is taken.
+    mine.end();
+    let ours = eventually("the bridge has the name", SOON, || server_of("/mine"));
+    assert_ne!(ours, before);
+    let told = rospy_call(&cell, "/mine", SET_BOOL, &["{\"data\": true}"]);
+    assert_eq!(told, [theirs]);
 }
