@@ -147,6 +147,16 @@ pub(crate) fn components_folder() -> NodeId {
     NodeId::new(APPLICATION, "UaSpace.Components")
 }
 
+/// Of the calls of other spaces.
+pub(crate) fn calls_folder() -> NodeId {
+    NodeId::new(APPLICATION, "UaSpace.Calls")
+}
+
+/// An object with calls in it, or in others in it.
+pub(crate) fn call_object(parent: &NodeId, name: &str) -> NodeId {
+    NodeId::new(APPLICATION, format!("{}/{name}", parent.identifier))
+}
+
 /// The node of a topic that the mapping does not name.
 pub(crate) fn unmapped_node(topic: TopicId) -> NodeId {
     NodeId::new(APPLICATION, topic.to_string())

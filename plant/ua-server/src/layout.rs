@@ -320,7 +320,7 @@ impl TopicNode {
     }
 }
 
-fn node_id(text: &NodeIdText) -> NodeId {
+pub(crate) fn node_id(text: &NodeIdText) -> NodeId {
     let identifier = match &text.identifier {
         mappings::Identifier::Numeric(number) => Identifier::Numeric(*number),
         mappings::Identifier::String(text) => Identifier::String(text.as_str().into()),

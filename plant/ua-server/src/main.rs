@@ -15,6 +15,7 @@ mod budget;
 mod components;
 mod endpoint;
 mod layout;
+mod methods;
 mod nodes;
 mod port;
 mod properties;

@@ -16,8 +16,8 @@ use opcua::server::address_space::AddressSpace;
 use opcua::server::diagnostics::NamespaceMetadata;
 use opcua::server::node_manager::memory::{InMemoryNodeManager, InMemoryNodeManagerImpl};
 use opcua::server::node_manager::{
-    MonitoredItemRef, MonitoredItemUpdateRef, ParsedReadValueId, ParsedWriteValue, RequestContext,
-    ServerContext, WriteNode,
+    MethodCall, MonitoredItemRef, MonitoredItemUpdateRef, ParsedReadValueId, ParsedWriteValue,
+    RequestContext, ServerContext, WriteNode,
 };
 use opcua::server::{CreateMonitoredItem, MonitoredItemHandle, SubscriptionCache};
 use opcua::sync::{Mutex, RwLock};
@@ -31,6 +31,7 @@ use uadp::Timestamp;
 use crate::address;
 use crate::budget::{Answers, LARGEST, SMALL, Watched};
 use crate::layout::{FieldNode, Layout, TopicNode};
+use crate::methods::{Question, Refused, Table};
 use crate::properties;
 use crate::value;
 use crate::values::{self, Shown, Stamp, Values, View};
@@ -48,6 +49,8 @@ pub(crate) struct SpaceNodes {
     watched: Mutex<Watched>,
     answers: Mutex<Answers>,
     exits: Exits,
+    /// What clients can call.
+    methods: Table,
     /// One client writes at a time.
     writing: Mutex<()>,
     /// Bytes of the largest value that may be written.
@@ -68,6 +71,8 @@ pub(crate) struct Exits {
     pub(crate) room: Arc<Semaphore>,
     /// Monitored items as they are made, to be looked at once more. Without room a look is missed.
     pub(crate) created: mpsc::Sender<(NodeId, MonitoredItemHandle)>,
+    /// What clients ask of calls. A client is told when there is no room.
+    pub(crate) questions: mpsc::Sender<Question>,
 }
 
 /// A value a client wrote to a topic of the OPC UA side.
@@ -123,10 +128,16 @@ impl SpaceNodes {
             watched: Mutex::new(Watched::default()),
             answers: Mutex::new(Answers::default()),
             exits,
+            methods: Table::default(),
             writing: Mutex::new(()),
             largest_write: AtomicUsize::new(usize::MAX),
             refused: AtomicU64::new(0),
         }
+    }
+
+    /// What clients can call.
+    pub(crate) const fn methods(&self) -> &Table {
+        &self.methods
     }
 
     /// Takes the nodes of some topics out and puts those of others in. Who watches a node that is gone is told.
@@ -653,6 +664,38 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
             let result = self.write_one(&address_space, &context.subscriptions, write.value());
             write.set_status(result.err().unwrap_or(StatusCode::Good));
         }
+        Ok(())
+    }
+
+    async fn call(
+        &self,
+        _context: &RequestContext,
+        _address_space: &RwLock<AddressSpace>,
+        methods_to_call: &mut [&mut &mut MethodCall],
+    ) -> Result<(), StatusCode> {
+        let calls = methods_to_call.iter_mut().map(|method| async {
+            // It may have gone since the server looked.
+            let callable = self.methods.lock().get(method.method_id()).cloned();
+            let called = match callable {
+                Some(callable) => {
+                    let arguments = method.arguments().to_vec();
+                    callable.call(&arguments, &self.exits.questions).await
+                }
+                None => Err(Refused::Status(StatusCode::BadNodeIdUnknown)),
+            };
+            match called {
+                Ok(outputs) => {
+                    method.set_outputs(outputs);
+                    method.set_status(StatusCode::Good);
+                }
+                Err(Refused::Arguments(statuses)) => {
+                    method.set_argument_error(statuses);
+                    method.set_status(StatusCode::BadInvalidArgument);
+                }
+                Err(Refused::Status(status)) => method.set_status(status),
+            }
+        });
+        futures_util::future::join_all(calls).await;
         Ok(())
     }
 }

@@ -4,7 +4,11 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Delivery, Described, Failure, FailureKind, Kept, Port, PortEvent, TypePaths};
+use bridge_node::{
+    Answered, AskId, CallDescription, Delivery, Described, Failure, FailureKind, Kept, Port,
+    PortEvent, TypePaths,
+};
+use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
 use mappings::{Mapping, Server, SpaceId, TopicId};
 use opcua::server::address_space::AddressSpace;
@@ -26,6 +30,7 @@ use crate::browse::Ordered;
 use crate::components::Components;
 use crate::endpoint;
 use crate::layout::Layout;
+use crate::methods::{Ask, MOST_QUESTIONS, Methods};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
 use crate::space::Space;
 use crate::structures::Types;
@@ -64,6 +69,8 @@ pub(crate) struct ServerPort {
     /// Tells of the server until the end. Taken then.
     told: Option<Announced>,
     components: Option<Components>,
+    /// Calls of other spaces.
+    methods: Methods,
 }
 
 impl ServerPort {
@@ -72,7 +79,7 @@ impl ServerPort {
     /// # Errors
     /// A mapping that cannot be served, an address that cannot be listened on, a certificate store that cannot be
     /// used.
-    pub(crate) fn start(mapping: &Mapping, setup: Setup) -> Result<Self, Failure> {
+    pub(crate) fn start(mapping: &Arc<Mapping>, setup: Setup) -> Result<Self, Failure> {
         let unavailable = |error: String| Failure::new(FailureKind::Unavailable, error);
         let configuration = |error: String| Failure::new(FailureKind::Configuration, error);
         let io = |error: String| Failure::new(FailureKind::Io, error);
@@ -96,11 +103,13 @@ impl ServerPort {
 
         let (writes_in, writes) = mpsc::channel(MOST_WRITES);
         let (created, created_items) = mpsc::channel(MOST_CREATED);
+        let (questions, asked) = mpsc::channel(MOST_QUESTIONS);
         let room = Arc::new(Semaphore::new(ROOM_FOR_WRITES));
         let exits = Exits {
             writes: writes_in,
             room,
             created,
+            questions,
         };
         if setup.trust_any_client {
             warn!("every client certificate is trusted, and kept as trusted: for tests only");
@@ -134,6 +143,7 @@ impl ServerPort {
             "serving at {} (port {port})",
             setup.url
         );
+        let methods = Methods::new(Arc::clone(&manager), mapping, asked);
         let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
         let server = told_of(described, setup.url.advertised(port));
         let (told, components) = tell(server, setup.announce, nodes)?;
@@ -155,6 +165,7 @@ impl ServerPort {
             look,
             told,
             components,
+            methods,
         })
     }
 }
@@ -176,6 +187,10 @@ impl Port for ServerPort {
                     return PortEvent::Sample { topic, payload: block, received: source, latched_by: None };
                 }
                 ended = ended(&mut self.serving) => return PortEvent::Ended(ended),
+                asked = self.methods.next() => {
+                    let Ask { ask, topic, request, timeout } = asked;
+                    return PortEvent::Ask { ask, topic, request, timeout };
+                }
                 () = next(&mut self.components) => {}
                 _ = self.look.tick() => self.pki.report_rejected(),
             }
@@ -211,6 +226,18 @@ impl Port for ServerPort {
         self.space.set_silent(topic, silent);
     }
 
+    fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
+        self.methods.known(topic, description);
+    }
+
+    fn call_gone(&mut self, topic: TopicId) {
+        self.methods.gone(topic);
+    }
+
+    fn answered(&mut self, ask: AskId, _topic: TopicId, answer: Answered<Bytes>) {
+        self.methods.answered(ask, answer);
+    }
+
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
         let (was, is) = (&self.described, mapping.server());
         let endpoint = self.mapped_url && was.endpoint != is.endpoint;
@@ -238,6 +265,7 @@ impl Port for ServerPort {
             }
             Err(error) => restart.push(format!("variables ({error})")),
         }
+        self.methods.reload(mapping);
         restart
     }
 
