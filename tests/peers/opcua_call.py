@@ -1,0 +1,82 @@
+"""An asyncua client that finds a Method of the server by its path below Objects, waits for it, says what it takes and gives,
+and calls it once for each --value, a JSON list of arguments. A JSON line for each answer, or its status."""
+
+import argparse
+import asyncio
+import json
+import time
+
+from asyncua import ua
+
+import lifetime
+import opcua_session
+
+
+async def found(client, path, seconds):
+    """The object with the Method, and the Method; None when it is not there within the time."""
+    end = time.monotonic() + seconds
+    while True:
+        try:
+            node = client.nodes.objects
+            object_ = node
+            for name in path.split("/"):
+                names = [(await child.read_browse_name()).Name for child in await node.get_children()]
+                if name not in names:
+                    raise ua.UaStatusCodeError(ua.StatusCodes.BadNotFound)
+                object_, node = node, (await node.get_children())[names.index(name)]
+            return object_, node
+        except ua.UaError:
+            if time.monotonic() > end:
+                return None
+            await asyncio.sleep(0.05)
+
+
+async def arguments(method, which):
+    for child in await method.get_properties():
+        if (await child.read_browse_name()).Name == which:
+            described = []
+            for one in await child.read_value():
+                described.append([one.Name, one.DataType.Identifier, one.ValueRank])
+            return described
+    return []
+
+
+async def main():
+    parser = argparse.ArgumentParser()
+    opcua_session.add_arguments(parser)
+    parser.add_argument("path")
+    parser.add_argument("--value", action="append", default=[])
+    parser.add_argument("--wait", type=float, default=30.0)
+    parser.add_argument("--gone", action="store_true", help="waits until the Method is gone again")
+    args = parser.parse_args()
+    lifetime.bound(args.limit)
+    async with await opcua_session.client_of(args) as client:
+        places = await found(client, args.path, args.wait)
+        if places is None:
+            lifetime.say(missing=args.path)
+            return
+        object_, method = places
+        takes = await arguments(method, "InputArguments")
+        gives = await arguments(method, "OutputArguments")
+        lifetime.say(node=method.nodeid.to_string(), takes=takes, gives=gives)
+        for text in args.value:
+            given = []
+            for value, (_, kind, _) in zip(json.loads(text), takes + [[None, None, None]] * 9):
+                given.append(ua.Variant(value, ua.VariantType(kind)) if kind else ua.Variant(value))
+            # As it is on the wire: asyncua's own call_method raises where an argument is wrong.
+            request = ua.CallMethodRequest()
+            request.ObjectId, request.MethodId = object_.nodeid, method.nodeid
+            request.InputArguments = given
+            (result,) = await client.uaclient.call([request])
+            lifetime.say(
+                status=result.StatusCode.name,
+                arguments=[one.name for one in result.InputArgumentResults or []],
+                value=[opcua_session.plain(one.Value) for one in result.OutputArguments or []],
+            )
+        while args.gone and await found(client, args.path, 0) is not None:
+            await asyncio.sleep(0.05)
+        if args.gone:
+            lifetime.say(gone=args.path)
+
+
+asyncio.run(main())
