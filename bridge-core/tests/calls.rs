@@ -13,11 +13,11 @@ use std::sync::Arc;
 
 use bridge_core::{
     AskErrorKind, AskId, CallDescription, CallField, CallMap, CallRole, Executed, Local, Offered,
-    Output, Owned, Reason, ValueDescription,
+    OfferedType, Output, Owned, Reason, ValueDescription,
 };
 use cell::{Cell, Program, component, ms, topic};
-use mappings::{Overflow, TopicId};
-use messages::{Dialect, Leaf, Rank, Registry, ServiceType};
+use mappings::{Assigned, Assignment, FieldMap, Overflow, TopicId};
+use messages::{Dialect, Leaf, Literal, Rank, Registry, ServiceType};
 use uadp::{BuiltinType, Fields, Scalar, StatusCode, Variant};
 
 const BRIDGE: usize = 0;
@@ -587,4 +587,77 @@ fn a_server_shows_the_values_of_components_beside_its_own() {
     cell.programs[0].router.set_owned(only, now);
     cell.run(ms(1_000));
     assert_eq!(cell.texts(0, theirs), ["again"], "by its repetition");
+}
+
+#[test]
+fn a_request_and_a_response_of_a_megabyte_cross_in_chunks() {
+    let mut cell = plugged_in(Local::Fields);
+    let large = |byte: u8| {
+        let bytes = vec![byte; 1 << 20];
+        cell::block(&[Variant::Scalar(Scalar::ByteString(Some(&bytes)))])
+    };
+    let (request, response) = (large(1), large(2));
+    cell.ask(BRIDGE, AskId(1), (start(), &request), ms(3_000));
+    cell.run(ms(50));
+    let execution = cell.executions(GRIPPER).pop().unwrap();
+    assert!(execution.request == request);
+    cell.executed(GRIPPER, execution.id, Executed::Answered(response.clone()));
+    cell.run(ms(50));
+    let answers = cell.answers(BRIDGE);
+    assert!(answers.len() == 1 && answers[0].1 == Ok(response));
+    // They are repeated, and executed once.
+    cell.run(ms(500));
+    assert!(cell.executions(GRIPPER).is_empty());
+}
+
+#[test]
+fn a_service_of_ros_2_is_asked_for_from_ros_1_under_another_type_as_a_map_says() {
+    let mut cell = Cell::new(vec![
+        Program::new(1, Local::Ros1),
+        Program::new(2, Local::Cdr),
+    ]);
+    let call = topic(2, 5, 61);
+    let set_bool = OfferedType {
+        service_type: service(Dialect::Ros2, "std_srvs/SetBool"),
+        name: "Belt.Switch".to_owned(),
+        about: "switches the belt".to_owned(),
+        role: CallRole::Call,
+        open: false,
+    };
+    let now = cell.now();
+    let (asking, executing) = (0, 1);
+    let router = &mut cell.programs[executing].router;
+    router.offer_type(call, &set_bool, now).unwrap();
+    cell.run(ms(200));
+    let described = cell.programs[asking].router.described_call(call).unwrap();
+    assert_eq!(described.about, "std_srvs/SetBool; switches the belt");
+    // Always on; of the answer the text is left out by the map, and something else said.
+    let assign = |target: &str, value| Assignment {
+        target: target.to_owned(),
+        value,
+    };
+    let constant = |text: &str| Assigned::Constant(Literal::One(text.to_owned()));
+    let map = CallMap {
+        request: FieldMap(vec![assign("data", constant("true"))]),
+        response: FieldMap(vec![assign("message", constant("asked"))]),
+    };
+    let trigger = service(Dialect::Ros1, "std_srvs/Trigger");
+    let router = &mut cell.programs[asking].router;
+    let by_name = router.bind_call(call, (&trigger, &Arc::default()), now);
+    assert!(by_name.unwrap_err().contains("`data`"));
+    let router = &mut cell.programs[asking].router;
+    router
+        .bind_call(call, (&trigger, &Arc::new(map)), now)
+        .unwrap();
+    cell.ask(asking, AskId(1), (call, &[]), ms(3_000));
+    cell.run(ms(50));
+    let execution = cell.executions(executing).pop().unwrap();
+    // A CDR with one Boolean, padded.
+    assert_eq!(execution.request, [0, 1, 0, 0, 1, 0, 0, 0]);
+    let response = [&[0, 1, 0, 0, 1, 0, 0, 0][..], &1_u32.to_le_bytes(), &[0; 4]].concat();
+    cell.executed(executing, execution.id, Executed::Answered(response));
+    cell.run(ms(50));
+    let answers = cell.answers(asking);
+    let told = [&[1][..], &5_u32.to_le_bytes(), b"asked"].concat();
+    assert_eq!(answers[0].1, Ok(told));
 }

@@ -19,7 +19,8 @@ use uadp::action::{
     Responder, ResponderSettings, ResponseDrop, Unknown,
 };
 use uadp::{
-    EncodeError, Extras, NetworkHeader, NetworkMessage, OwnedPublisherId, PublisherId, StatusCode,
+    ChunkBudget, Chunks, EncodeError, Extras, GroupHeader, NetworkHeader, NetworkMessage,
+    NetworkMessageType, OwnedPublisherId, PublisherId, StatusCode, Whole,
 };
 
 use self::execute::{Own, Running};
@@ -50,8 +51,12 @@ pub(super) struct Calls {
     asked: BTreeMap<CallId, Asked>,
     asks: HashMap<AskId, CallId>,
     executions: BTreeMap<ExecutionId, Running>,
-    /// What the port is to be told, in this order: never more than calls and requests there are.
+    /// What the port is to be told, in this order: never more than calls and requests there are. The chunks of a large request or
+    /// response go before.
     news: VecDeque<Output>,
+    chunks: VecDeque<Output>,
+    /// Tells what is sent in chunks from what was before.
+    chunked: u16,
     /// When our own are announced again.
     announce_at: Option<Instant>,
     /// When it is looked who fell silent.
@@ -96,12 +101,18 @@ impl Calls {
     fn new(own: SpaceId, instance: [u8; 16], receive_timeout: Duration, start: Instant) -> Self {
         let settings = RequestorSettings {
             receive_timeout,
+            max_bytes: 4 * MAX_BLOCK,
             ..RequestorSettings::default()
         };
         Self {
             start,
             requestor: Requestor::new(OwnedPublisherId::UInt16(own.into()), instance, settings),
-            responder: Responder::new(ResponderSettings::default()),
+            responder: Responder::new(ResponderSettings {
+                max_answer: MAX_BLOCK,
+                max_bytes: 4 * MAX_BLOCK,
+                max_bytes_per_requestor: 2 * MAX_BLOCK,
+                ..ResponderSettings::default()
+            }),
             table: HashMap::new(),
             groups: HashMap::new(),
             weight: 0,
@@ -109,6 +120,8 @@ impl Calls {
             asks: HashMap::new(),
             executions: BTreeMap::new(),
             news: VecDeque::new(),
+            chunks: VecDeque::new(),
+            chunked: 0,
             announce_at: None,
             look_at: None,
             due: None,
@@ -328,9 +341,9 @@ impl Router {
             .transpose()
             .map_err(|(cause, text)| (cause, AskError::refused(Refusal::InvalidArgument, text)))?;
         let fields = block.as_deref().unwrap_or(request);
-        if fields.len() > MAX_REQUEST {
+        if fields.len() > MAX_BLOCK {
             let text = format!(
-                "{} bytes, and {MAX_REQUEST} are all there may be",
+                "{} bytes, and {MAX_BLOCK} are all there may be",
                 fields.len()
             );
             return Err((
@@ -528,6 +541,13 @@ impl Router {
 
     /// What the port is to be told of calls, or the next request or response that is to be sent.
     pub(super) fn next_action(&mut self, now: Now) -> Option<Output> {
+        let chunk = self
+            .calls
+            .as_mut()
+            .and_then(|calls| calls.chunks.pop_front());
+        if chunk.is_some() {
+            return chunk;
+        }
         let mut bytes = self.spare.pop().unwrap_or_default();
         let told = self.write_action(&mut bytes, now);
         match told {
@@ -535,12 +555,57 @@ impl Router {
                 self.recycle(bytes);
                 Some(output)
             }
-            Some(Told::Datagram(topic)) => Some(Output::Action { topic, bytes }),
+            Some(Told::Datagram(topic)) => Some(self.whole_or_chunks(topic, bytes)),
             None => {
                 self.recycle(bytes);
                 None
             }
         }
+    }
+
+    /// A request or response as one datagram, or the first of its chunks, where it does not fit one. What is cut up is the whole
+    /// NetworkMessage, since the ActionHeader stands in it (OPC 10000-14, 7.2.4.4.4).
+    fn whole_or_chunks(&mut self, topic: TopicId, bytes: Vec<u8>) -> Output {
+        let most = usize::from(self.mapping.pubsub().max_datagram);
+        if bytes.len() <= most {
+            return Output::Action { topic, bytes };
+        }
+        let (space, namespace, _) = topic.triple();
+        let Some(calls) = &mut self.calls else {
+            return Output::Action { topic, bytes };
+        };
+        calls.chunked = calls.chunked.wrapping_add(1);
+        let header = NetworkHeader {
+            publisher_id: Some(PublisherId::UInt16(space)),
+            group: Some(GroupHeader {
+                writer_group_id: Some(namespace),
+                ..GroupHeader::default()
+            }),
+            ..NetworkHeader::default()
+        };
+        let whole = Whole {
+            message_type: NetworkMessageType::DataSet,
+            writer_id: None,
+            message_sequence_number: calls.chunked,
+            bytes: &bytes,
+        };
+        let budget = ChunkBudget {
+            network_message: most,
+            trailer: 0,
+        };
+        let extras = Extras::default();
+        let Ok(mut chunks) = Chunks::new(&header, &extras, whole, budget) else {
+            return Output::Action { topic, bytes };
+        };
+        while chunks.remaining() > 0 {
+            let mut bytes = Vec::new();
+            match chunks.append(&mut bytes, &extras) {
+                Some(Ok(_)) => calls.chunks.push_back(Output::Action { topic, bytes }),
+                Some(Err(_)) | None => break,
+            }
+        }
+        let first = calls.chunks.pop_front();
+        first.unwrap_or(Output::Action { topic, bytes })
     }
 
     fn write_action(&mut self, bytes: &mut Vec<u8>, now: Now) -> Option<Told> {
@@ -676,5 +741,5 @@ const BAD: u32 = 0x8000_0000;
 const BAD_DECODING_ERROR: StatusCode = StatusCode(0x8007_0000);
 /// Requests for one call that wait for their answer.
 const MAX_OPEN: usize = 256;
-/// Bytes of the fields of a request, which has to fit a datagram.
-const MAX_REQUEST: usize = 60_000;
+/// Bytes of the fields of a request or response; those that do not fit a datagram go in chunks.
+const MAX_BLOCK: usize = 16 << 20;

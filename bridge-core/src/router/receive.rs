@@ -50,7 +50,14 @@ impl Router {
         }
         let namespace = header.group.and_then(|group| group.writer_group_id);
         if self.is_ours(space, namespace) {
-            self.drop_own(namespace, from, now);
+            // A large request for a call of ours bears our PublisherId, as a small one does.
+            let request = message.is_chunk() && !message.is_sealed() && self.calls.is_some();
+            match (request && message.writer_ids().is_none(), namespace) {
+                (true, Some(namespace)) => {
+                    self.handle_chunk(message, (space, namespace), from, now);
+                }
+                _ => self.drop_own(namespace, from, now),
+            }
             return;
         }
         let Some(namespace) = namespace else {
