@@ -535,4 +535,4 @@ const LEFT_AFTER: Duration = Duration::from_secs(2);
 /// How long a call may take: services of ROS have no deadline of their own.
 const ANSWERED_WITHIN: Duration = Duration::from_secs(30);
 /// Questions of all services that are under way.
-const MOST_ASKED: usize = 128;
+const MOST_ASKED: usize = 512;

@@ -83,7 +83,10 @@ impl CallGraph for Ros1Graph<'_> {
             request_type: service_type.request().name().to_string(),
             response_type: service_type.response().name().to_string(),
         };
-        let options = ServiceOptions::default();
+        let options = ServiceOptions {
+            handler_timeout: ANSWERED,
+            ..ServiceOptions::default()
+        };
         let handler = move |request: tcpros::ServiceRequest| asker.ask(request.bytes);
         let server = self
             .node
@@ -165,6 +168,9 @@ impl ServiceCall for Client {
         })
     }
 }
+
+/// No request takes as long: it ends with the time that its call may take.
+const ANSWERED: Duration = Duration::from_secs(24 * 3600);
 
 /// Whether the same call may succeed later, with nobody changing anything but the service coming back.
 fn may_pass(error: &ServiceError) -> bool {

@@ -1,9 +1,12 @@
 //! What another version of a mapping says differently.
 
+use std::collections::BTreeMap;
+
+use crate::call::Call;
 use crate::mapping::Mapping;
 use crate::topic::TopicId;
 
-/// The variables that two mappings do not have alike, in the order of their documents.
+/// The variables, and behind them the calls, that two mappings do not have alike, in the order of their documents.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Difference {
     /// Only in the newer one.
@@ -17,7 +20,7 @@ pub struct Difference {
 }
 
 impl Mapping {
-    /// How this mapping differs from an older one, variable by variable.
+    /// How this mapping differs from an older one, variable by variable and call by call.
     #[must_use]
     pub fn difference(&self, older: &Self) -> Difference {
         let mut difference = Difference::default();
@@ -32,6 +35,21 @@ impl Mapping {
         difference.removed = gone
             .filter(|topic| self.variable(*topic).is_none())
             .collect();
+        let by_topic = |mapping: &'_ Self| -> BTreeMap<TopicId, Call> {
+            let calls = mapping.calls().iter();
+            calls.map(|call| (call.topic, call.clone())).collect()
+        };
+        let (before, after) = (by_topic(older), by_topic(self));
+        for call in self.calls() {
+            match before.get(&call.topic) {
+                None => difference.added.push(call.topic),
+                Some(before) if before == call => difference.same += 1,
+                Some(_) => difference.changed.push(call.topic),
+            }
+        }
+        let gone = older.calls().iter().map(|call| call.topic);
+        let gone = gone.filter(|topic| !after.contains_key(topic));
+        difference.removed.extend(gone);
         difference
     }
 }
@@ -52,6 +70,31 @@ mod tests {
     fn variables_are_told_apart_by_their_topics() {
         let difference =
             of(&[(1, "A"), (3, "X"), (4, "D")]).difference(&of(&[(1, "A"), (2, "B"), (3, "C")]));
+        let topic = |id: u16| TopicId::new(1, 2, id).unwrap();
+        assert_eq!(
+            difference,
+            Difference {
+                added: vec![topic(4)],
+                changed: vec![topic(3)],
+                removed: vec![topic(2)],
+                same: 1,
+            }
+        );
+    }
+
+    #[test]
+    fn calls_are_told_apart_as_variables_are() {
+        let of = |calls: &[(u16, &str)]| {
+            let mut text = "spaces: [{id: 1}]\nnamespaces: {2: 'urn:test'}\ncalls:\n".to_owned();
+            for (id, service) in calls {
+                text += &format!(
+                    "  - {{node: ns=2;i={id}, name: C{id}, origin: 1, ros: {{service: {service}, type: std_srvs/Empty}}}}\n"
+                );
+            }
+            Mapping::from_yaml(&text, "test.yaml").mapping.unwrap()
+        };
+        let newer = of(&[(1, "/a"), (3, "/x"), (4, "/d")]);
+        let difference = newer.difference(&of(&[(1, "/a"), (2, "/b"), (3, "/c")]));
         let topic = |id: u16| TopicId::new(1, 2, id).unwrap();
         assert_eq!(
             difference,

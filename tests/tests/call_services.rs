@@ -271,3 +271,21 @@ calls:
     let told = rospy_call(&cell, "/mine", SET_BOOL, &["{\"data\": true}"]);
     assert_eq!(told, [theirs]);
 }
+
+#[test]
+fn the_shipped_mapping_of_a_line_switches_its_belt_and_its_lamp() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2]) else {
+        return;
+    };
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../mappings/calls.yaml");
+    let _core = cell.roscore();
+    let mut judge = cell.judge(Distribution::Kilted, &["judge"]);
+    let lit = json!({"success": true, "message": "lit"});
+    judge.ask(json!({"serve": "/lamp", "type": "std_srvs/srv/SetBool", "value": lit}));
+    let _belt = cell.rospy("ros1_serve.py", &["/belt/switch"]);
+    let _bridges = (cell.bridge_ros1(&[path]), cell.bridge_ros2(&[path]));
+    let start = json!({"call": "/belt/start", "type": "std_srvs/srv/Trigger", "value": {}});
+    assert_eq!(judge.ask(start), done());
+    let told = rospy_call(&cell, "/line/lamp", SET_BOOL, &["{\"data\": true}"]);
+    assert_eq!(told, [lit]);
+}

@@ -102,7 +102,12 @@ impl CallGraph for Ros2Graph<'_> {
         if let Some(hashes) = self.definitions.service_type_hashes(service_type.name()) {
             service.announce(self.domain, &hashes);
         }
-        let options = ServiceOptions::default();
+        let options = ServiceOptions {
+            max_handled: HANDLED,
+            // Each request ends with the time that its call may take.
+            handler_timeout: None,
+            ..ServiceOptions::default()
+        };
         let handler = move |request: ServiceRequest| asker.ask(request.bytes);
         ServiceServer::open(self.domain, self.peers, &service, options, handler)
             .map_err(|error| error.to_string())
@@ -166,3 +171,6 @@ impl ServiceCall for Client {
         })
     }
 }
+
+/// Requests of one service at a time, as many as there may be for one call.
+const HANDLED: usize = 256;
