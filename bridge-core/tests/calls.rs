@@ -465,6 +465,13 @@ fn who_comes_late_learns_the_calls_that_are_there_by_asking() {
     cell.programs[1].router.want_call(start(), now);
     cell.run(ms(1_000));
     assert_eq!(cell.known(1), [start()]);
+
+    // Or because a program that begins asks all.
+    cell.programs.push(Program::new(3, Local::Cdr));
+    let now = cell.now();
+    cell.programs[2].router.call_the_roll(now);
+    cell.run(ms(3_000));
+    assert_eq!(cell.known(2), [start()]);
 }
 
 fn state() -> ValueDescription {

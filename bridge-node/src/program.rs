@@ -211,6 +211,7 @@ async fn prepare<P: Program>(
     let mut router = Router::new(settings, Arc::clone(&mapping));
     router.set_owned(P::owned(&mapping), now());
     router.set_instance(instance()?);
+    router.call_the_roll(now());
     let context = Context {
         mapping: Arc::clone(&mapping),
         types,

@@ -128,6 +128,10 @@ impl Calls {
         }
     }
 
+    pub(super) const fn set_receive_timeout(&mut self, receive_timeout: Duration) {
+        self.requestor.set_receive_timeout(receive_timeout);
+    }
+
     fn since_start(&self, now: Now) -> Duration {
         now.monotonic.saturating_duration_since(self.start)
     }

@@ -28,6 +28,10 @@ impl Router {
     pub fn replace_mapping(&mut self, mapping: Arc<Mapping>, now: Now) {
         let before = std::mem::replace(&mut self.mapping, mapping);
         self.renew_chunks(before.pubsub());
+        let receive_timeout = self.mapping.pubsub().receive_timeout;
+        if let Some(calls) = &mut self.calls {
+            calls.set_receive_timeout(receive_timeout);
+        }
         let renamed = before.namespaces() != self.mapping.namespaces();
         let topics: Vec<TopicId> = self.topics.keys().copied().collect();
         for topic in topics {

@@ -1,5 +1,6 @@
 //! Which calls other programs have, and what is said of values and calls that come and go.
 
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::time::Duration;
 
@@ -89,18 +90,35 @@ impl Router {
         }
     }
 
-    /// A program of space 0 is heard for the first time, which may have calls: it is asked for them. In no other space programs
-    /// come and go by themselves, and nothing is executed there.
+    /// A program begins: the spaces that the mapping has, and those there are without one, are asked for their calls. Else
+    /// it would know them once they are announced again.
+    pub fn call_the_roll(&mut self, now: Now) {
+        let declared = self.mapping.spaces().iter().map(|space| space.id);
+        let usual = [0, 1, 2].into_iter().filter_map(SpaceId::new);
+        let spaces: BTreeSet<SpaceId> = declared.chain(usual).collect();
+        for space in spaces {
+            if space != self.settings.own || self.settings.own == SpaceId::UA {
+                self.ask_for_calls(space, now);
+            }
+        }
+    }
+
+    /// A program of space 0 is heard for the first time, which may have calls: it is asked for them. The programs of other
+    /// spaces tell of each call when it comes.
     pub(super) fn meet(&mut self, topic: TopicId, now: Now) {
         if topic.space != SpaceId::UA {
             return;
         }
         let (_, namespace, _) = topic.triple();
+        let discovery = self.discovery(now);
+        if discovery.met.len() < MAX_MET && discovery.met.insert((topic.space, namespace)) {
+            self.ask_for_calls(topic.space, now);
+        }
+    }
+
+    fn ask_for_calls(&mut self, space: SpaceId, now: Now) {
         let random = u32::try_from(now.utc.unix_nanos() & 0xFFFF_FFFF).unwrap_or_default();
         let discovery = self.discovery(now);
-        if discovery.met.len() >= MAX_MET || !discovery.met.insert((topic.space, namespace)) {
-            return;
-        }
         let since = discovery.since_start(now);
         let limits = ProbeLimits {
             max_period: Duration::from_secs(1),
@@ -108,7 +126,7 @@ impl Router {
         };
         discovery
             .rolls
-            .entry(topic.space)
+            .entry(space)
             .or_insert_with(|| ProbeTimer::new(since, random, limits));
         discovery.reckon();
     }

@@ -231,6 +231,12 @@ impl Default for RequestorSettings {
 }
 
 impl Requestor {
+    /// Takes another [`RequestorSettings::receive_timeout`]: for new calls, and for those there are from the next word of their
+    /// Responder on.
+    pub const fn set_receive_timeout(&mut self, receive_timeout: Duration) {
+        self.settings.receive_timeout = receive_timeout;
+    }
+
     /// A Requestor without calls. `instance` are random bytes, others each time a program starts: they tell its requests
     /// from those of its earlier lives, which a Responder may still remember.
     #[must_use]
