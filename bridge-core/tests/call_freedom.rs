@@ -1,5 +1,6 @@
 //! Any set of programs around one group, which loses, doubles and reorders datagrams: a request is executed at most once,
-//! where its name says and never at home, who asked is told what is so, and then there is silence.
+//! where its name says and never at home, who asked is told what is so, and then there is silence. Bridges of ROS 1 and
+//! ROS 2, which offer and ask with the type of a service, and programs that speak in fields are mixed.
 #![expect(
     clippy::unwrap_used,
     clippy::panic,
@@ -11,11 +12,15 @@
 mod cell;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use bridge_core::{
-    AskErrorKind, AskId, CallDescription, CallField, CallRole, Executed, Local, Offered, Reason,
+    AskErrorKind, AskId, CallDescription, CallField, CallRole, Executed, Local, Offered,
+    OfferedType, Reason,
 };
 use cell::{Cell, Program, block, is_action, ms, topic};
+use mappings::TopicId;
+use messages::{Dialect, Registry, ServiceType};
 use proptest::prelude::*;
 use uadp::{BuiltinType, Scalar, Variant};
 
@@ -74,8 +79,56 @@ fn description() -> CallDescription {
     }
 }
 
-fn number(number: u32) -> Vec<u8> {
-    block(&[Variant::Scalar(Scalar::UInt32(number))])
+/// A request or response as that side has it: all end in the four bytes of the number.
+fn number(local: Local, number: u32) -> Vec<u8> {
+    match local {
+        Local::Fields => block(&[Variant::Scalar(Scalar::UInt32(number))]),
+        Local::Ros1 => number.to_le_bytes().to_vec(),
+        Local::Cdr => [[0, 1, 0, 0], number.to_le_bytes()].concat(),
+    }
+}
+
+fn service(dialect: Dialect) -> Arc<ServiceType> {
+    let name = "t/Echo".parse().unwrap();
+    let mut registry = Registry::empty(dialect);
+    registry
+        .add_service(&name, "uint32 number\n---\nuint32 number\n")
+        .unwrap();
+    registry.service(&name).unwrap()
+}
+
+/// Offers the call of a program, and has it ask for those of the others under the type of its side.
+fn join(cell: &mut Cell, (at, local): (usize, Local), own: TopicId, others: &[TopicId]) {
+    let dialect = match local {
+        Local::Fields => {
+            let description = description();
+            return cell.offer(
+                at,
+                own,
+                Offered {
+                    description,
+                    open: false,
+                },
+            );
+        }
+        Local::Ros1 => Dialect::Ros1,
+        Local::Cdr => Dialect::Ros2,
+    };
+    let now = cell.now();
+    let offered = OfferedType {
+        service_type: service(dialect),
+        name: "Echo".to_owned(),
+        about: String::new(),
+        role: CallRole::Call,
+        open: false,
+    };
+    let router = &mut cell.programs[at].router;
+    router.offer_type(own, &offered, now).unwrap();
+    for other in others.iter().filter(|other| **other != own) {
+        let bound = router.bind_call(*other, (&offered.service_type, &Arc::default()), now);
+        bound.unwrap();
+    }
+    cell.drain(at);
 }
 
 fn actions(cell: &mut Cell) -> usize {
@@ -94,15 +147,16 @@ proptest! {
     fn a_request_is_executed_at_most_once_and_where_its_name_says(
         spaces in proptest::collection::btree_set(0_u16..=232, 1..=5),
         asked in proptest::collection::vec((any::<proptest::sample::Index>(), any::<proptest::sample::Index>()), 1..12),
+        sides in proptest::array::uniform5(prop_oneof![Just(Local::Fields), Just(Local::Ros1), Just(Local::Cdr)]),
         weather in weather(),
     ) {
         let spaces: Vec<u16> = spaces.into_iter().collect();
-        let programs = spaces.iter().map(|space| Program::new(*space, Local::Fields));
+        let programs = spaces.iter().zip(sides).map(|(space, local)| Program::new(*space, local));
         let mut cell = Cell::new(programs.collect());
         let call = |at: usize| topic(spaces[at], 5, 61);
-        for at in 0..spaces.len() {
-            let description = description();
-            cell.offer(at, call(at), Offered { description, open: false });
+        let all: Vec<TopicId> = (0..spaces.len()).map(call).collect();
+        for (at, (own, local)) in all.iter().zip(sides).enumerate() {
+            join(&mut cell, (at, local), *own, &all);
         }
         cell.run(ms(300));
         for at in 0..spaces.len() {
@@ -115,7 +169,7 @@ proptest! {
         let mut wanted = BTreeMap::new();
         for (id, (asker, executor)) in (0_u32..).zip(&asked) {
             let (asker, executor) = (asker.index(spaces.len()), executor.index(spaces.len()));
-            cell.ask(asker, AskId(id.into()), (call(executor), &number(id)), ms(3_000));
+            cell.ask(asker, AskId(id.into()), (call(executor), &number(sides[asker], id)), ms(3_000));
             wanted.insert(id, (asker, executor));
         }
         for _ in 0..100 {
@@ -140,7 +194,7 @@ proptest! {
             prop_assert_eq!(told.len(), 1);
             match &told[0] {
                 Ok(response) => {
-                    prop_assert_eq!(response, &number(id));
+                    prop_assert_eq!(response, &number(sides[asker], id));
                     prop_assert_eq!(done, [executor]);
                 }
                 Err(error) if asker == executor => {
