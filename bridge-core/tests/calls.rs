@@ -668,3 +668,45 @@ fn a_service_of_ros_2_is_asked_for_from_ros_1_under_another_type_as_a_map_says()
     let told = [&[1][..], &5_u32.to_le_bytes(), b"asked"].concat();
     assert_eq!(answers[0].1, Ok(told));
 }
+
+#[test]
+fn who_asks_with_the_ids_of_another_gets_the_own_answer_and_what_comes_too_late_nobody() {
+    let mut cell = Cell::new(vec![
+        Program::new(1, Local::Fields),
+        component(7),
+        Program::new(3, Local::Fields),
+    ]);
+    let asking = [0, 2];
+    for at in asking {
+        cell.programs[at].router.set_instance([9; 16]);
+    }
+    cell.offer(GRIPPER, start(), offered(grasp()));
+    cell.run(ms(200));
+    for at in asking {
+        cell.ask(at, AskId(1), (start(), &[0, 0]), ms(3_000));
+    }
+    cell.run(ms(50));
+    for execution in cell.executions(GRIPPER) {
+        let space = execution.requestor.unwrap();
+        let run = 40 + u32::from(u16::from(space));
+        cell.executed(GRIPPER, execution.id, succeeded(run));
+    }
+    cell.run(ms(50));
+    for (at, run) in asking.into_iter().zip(["41", "43"]) {
+        let answers = cell.answers(at);
+        let [(AskId(1), Ok(answer))] = &answers[..] else {
+            panic!("{answers:?}");
+        };
+        assert!(told(answer)[2].contains(run), "{:?}", told(answer));
+    }
+
+    cell.ask(BRIDGE, AskId(2), (start(), &[0, 0]), ms(300));
+    cell.run(ms(1_000));
+    let (ask, answer) = cell.answers(BRIDGE).pop().unwrap();
+    let kind = answer.unwrap_err().kind;
+    assert_eq!((ask, kind), (AskId(2), AskErrorKind::Unknown));
+    let execution = cell.executions(GRIPPER).pop().unwrap();
+    cell.executed(GRIPPER, execution.id, succeeded(5));
+    cell.run(ms(1_000));
+    assert_eq!(cell.answers(BRIDGE).len(), 0);
+}
