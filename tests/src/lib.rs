@@ -10,10 +10,12 @@
 
 mod announcer;
 mod arrows;
+mod asker;
 mod bare_node;
 mod capture;
 mod cell;
 mod child;
+mod codec_asker;
 mod enclave;
 mod executor;
 mod host;
@@ -22,6 +24,7 @@ mod net;
 mod numbered;
 mod peers;
 mod programs;
+mod relay;
 mod rtps;
 mod stamp;
 mod times;
@@ -31,10 +34,12 @@ mod wait;
 
 pub use announcer::Announcer;
 pub use arrows::{forbidden, tree};
+pub use asker::{Asker, Counting};
 pub use bare_node::{BareNode, BareSubscription, PATIENCE, string_frame};
 pub use capture::{Capture, Dissected, hex, is_true};
 pub use cell::{Cell, Distribution, Peer, without_data};
 pub use child::{Child, Started};
+pub use codec_asker::{CodecAsker, Ended, send_from};
 pub use enclave::{Governance, Keystore, Wiretap, has_security};
 pub use executor::{Executes, Executor};
 pub use host::{Cable, HERE, Host, THERE, WIRE, Wire};
@@ -48,6 +53,7 @@ pub use peers::MASTER;
 pub use programs::{
     METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, SERVER_ENDPOINT, drops, number, program,
 };
+pub use relay::{OTHER_GROUP, Relay, Weather};
 pub use rtps::{Mutator, announced, claims_too_much, queued};
 pub use stamp::{Stamp, now};
 pub use times::{Times, micros, per_message, processor_time};

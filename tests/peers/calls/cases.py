@@ -1,0 +1,124 @@
+"""What is asked and answered in the tests of calls, the same for peers of ROS 1 and of ROS 2.
+
+A case says how the request with a number is filled in, what it is answered with, and whether an answer is the one of
+that number.
+"""
+
+BIG = 1_000_000
+
+
+class Bundled:
+    """Built in: std_srvs/SetBool."""
+
+    type = "std_srvs/SetBool"
+
+    @staticmethod
+    def ask(request, number):
+        request.data = number % 2 == 1
+
+    @staticmethod
+    def key(request):
+        return request.data
+
+    @staticmethod
+    def answer(request, response):
+        response.success = request.data
+        response.message = "odd" if request.data else "even"
+
+    @staticmethod
+    def right(response, number):
+        odd = number % 2 == 1
+        return response.success == odd and response.message == ("odd" if odd else "even")
+
+
+class Files:
+    """Known from files only: test_msgs/BasicTypes."""
+
+    type = "test_msgs/BasicTypes"
+
+    @staticmethod
+    def ask(request, number):
+        request.bool_value = True
+        request.float64_value = number / 8
+        request.int16_value = -number
+        request.uint64_value = 2**63 + number
+        request.string_value = f"é {number}"
+
+    @staticmethod
+    def key(request):
+        return request.uint64_value - 2**63
+
+    @staticmethod
+    def answer(request, response):
+        response.bool_value = not request.bool_value
+        response.float64_value = request.float64_value * 2
+        response.int16_value = request.int16_value
+        response.uint64_value = request.uint64_value
+        response.string_value = request.string_value * 2
+
+    @staticmethod
+    def right(response, number):
+        return (
+            not response.bool_value
+            and response.float64_value == number / 4
+            and response.int16_value == -number
+            and response.uint64_value == 2**63 + number
+            and response.string_value == f"é {number}" * 2
+        )
+
+
+class Empty:
+    """A request without fields: std_srvs/Trigger."""
+
+    type = "std_srvs/Trigger"
+
+    @staticmethod
+    def ask(request, number):
+        pass
+
+    @staticmethod
+    def key(request):
+        return 0
+
+    @staticmethod
+    def answer(request, response):
+        response.success = True
+        response.message = "done"
+
+    @staticmethod
+    def right(response, number):
+        return response.success and response.message == "done"
+
+
+class Big(Empty):
+    """A response of 1 MB: the message of std_srvs/Trigger."""
+
+    @staticmethod
+    def answer(request, response):
+        response.success = True
+        response.message = "0123456789" * (BIG // 10)
+
+    @staticmethod
+    def right(response, number):
+        return response.success and response.message == "0123456789" * (BIG // 10)
+
+
+class Messages(Empty):
+    """An array of messages: lifecycle_msgs/GetAvailableStates."""
+
+    type = "lifecycle_msgs/GetAvailableStates"
+    state = None
+
+    @classmethod
+    def answer(cls, request, response):
+        for number, label in enumerate(("one", "", "drei")):
+            state = cls.state()
+            state.id, state.label = number, label
+            response.available_states.append(state)
+
+    @staticmethod
+    def right(response, number):
+        return [(one.id, one.label) for one in response.available_states] == [(0, "one"), (1, ""), (2, "drei")]
+
+
+CASES = {"bundled": Bundled, "files": Files, "empty": Empty, "megabyte": Big, "messages": Messages}

@@ -1,0 +1,87 @@
+"""What peers that execute have in common: how often each request was executed, and for how long each takes."""
+
+import collections
+import json
+import sys
+import threading
+import time
+
+
+class Counted:
+    """Requests by case and number, told on a line of standard input."""
+
+    def __init__(self, say, delay):
+        self.say = say
+        self.delay = delay
+        self.lock = threading.Lock()
+        self.times = collections.Counter()
+        self.running = 0
+        self.most = 0
+
+    def execute(self, case, kind, request, response):
+        with self.lock:
+            self.times[case, kind.key(request)] += 1
+            self.running += 1
+            self.most = max(self.most, self.running)
+        if self.delay:
+            time.sleep(self.delay)
+        kind.answer(request, response)
+        with self.lock:
+            self.running -= 1
+        return response
+
+    def tell(self):
+        """`executed` requests, of which `twice` were executed more often than once, and `most` at a time."""
+        with self.lock:
+            self.say(
+                executed=sum(self.times.values()),
+                different=len(self.times),
+                twice=sorted(str(key) for key, times in self.times.items() if times > 1),
+                most=self.most,
+                running=self.running,
+            )
+
+    def listen(self):
+        for _ in sys.stdin:
+            self.tell()
+
+
+class Asked:
+    """Answers as they come: right, wrong, or none with the reason."""
+
+    def __init__(self):
+        self.lock = threading.Lock()
+        self.right = 0
+        self.wrong = []
+        self.failed = []
+        self.took = []
+
+    def answered(self, right, text, took):
+        with self.lock:
+            self.took.append(took)
+            if right:
+                self.right += 1
+            else:
+                self.wrong.append(text[:300])
+
+    def refused(self, why):
+        with self.lock:
+            self.failed.append(why[:300])
+
+    def told(self):
+        took = sorted(self.took) or [0.0]
+        return {
+            "right": self.right,
+            "wrong": self.wrong[:5],
+            "wrongs": len(self.wrong),
+            "failed": self.failed[:5],
+            "failures": len(self.failed),
+            "p50": took[len(took) // 2],
+            "p99": took[len(took) * 99 // 100],
+            "longest": took[-1],
+        }
+
+
+def lines():
+    for line in sys.stdin:
+        yield json.loads(line)

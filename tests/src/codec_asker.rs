@@ -1,0 +1,137 @@
+//! Somebody in the space who asks for a call, by the codec alone.
+
+use std::net::{Ipv4Addr, SocketAddr, UdpSocket};
+use std::time::{Duration, Instant};
+
+use socket2::SockRef;
+use uadp::action::{
+    ActionAddress, ActionDialect, ActionFields, ActionRequest, CallId, Heard, Outcome, Requestor,
+    RequestorSettings,
+};
+use uadp::{Extras, NetworkHeader, NetworkMessage, OwnedPublisherId};
+
+use crate::{GROUP, Triple, UadpSocket};
+
+/// Asks in the name of a space.
+pub struct CodecAsker {
+    socket: UadpSocket,
+    requestor: Requestor,
+    start: Instant,
+}
+
+/// How a call ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Ended {
+    /// Executed; the bytes of its fields.
+    Answered(Vec<u8>),
+    /// Not executed.
+    Refused,
+    /// Nobody knows.
+    Unknown,
+}
+
+impl CodecAsker {
+    /// In the name of `space`. Those with the same `instance` send the same CorrelationData.
+    #[must_use]
+    pub fn new(space: u16, instance: u8) -> Self {
+        let id = OwnedPublisherId::UInt16(space);
+        Self {
+            socket: UadpSocket::join(),
+            requestor: Requestor::new(id, [instance; 16], RequestorSettings::default()),
+            start: Instant::now(),
+        }
+    }
+
+    /// Begins a call with fields as Variants, their count in front.
+    ///
+    /// # Panics
+    /// When it is not taken.
+    pub fn call(
+        &mut self,
+        (space, namespace, id): Triple,
+        fields: &[u8],
+        timeout: Duration,
+    ) -> CallId {
+        let request = ActionRequest {
+            address: ActionAddress {
+                publisher_id: OwnedPublisherId::UInt16(space),
+                writer_group_id: Some(namespace),
+                writer_id: id,
+                target_id: 1,
+            },
+            dialect: ActionDialect::Standard,
+            fields: ActionFields::Variants(fields),
+            timeout,
+        };
+        self.requestor.call(request, self.start.elapsed()).unwrap()
+    }
+
+    /// Sends and hears for one turn of 5 ms at most, and gives what has ended.
+    ///
+    /// # Panics
+    /// When the group cannot be used.
+    pub fn turn(&mut self) -> Vec<(CallId, Ended)> {
+        let now = self.start.elapsed();
+        self.requestor.handle_timeout(now);
+        while let Some(request) = self.requestor.poll_transmit(now) {
+            let mut datagram = Vec::new();
+            let (header, extras) = (NetworkHeader::default(), Extras::default());
+            let encoder = request.encode(&mut datagram, &header, &extras).unwrap();
+            encoder.finish().unwrap();
+            self.socket.send(&datagram);
+        }
+        let mut ended = Vec::new();
+        if let Some(datagram) = self.socket.receive(TURN) {
+            self.hear(&datagram, &mut ended);
+        }
+        while let Some((call, _)) = self.requestor.poll_given_up() {
+            ended.push((call, Ended::Unknown));
+        }
+        ended
+    }
+
+    /// Responses that were nobody's, or came too late.
+    #[must_use]
+    pub const fn dropped(&self) -> u64 {
+        self.requestor.counters().dropped
+    }
+
+    fn hear(&mut self, datagram: &[u8], ended: &mut Vec<(CallId, Ended)>) {
+        let Ok(message) = NetworkMessage::decode(datagram) else {
+            return;
+        };
+        let Ok(messages) = message.actions(ActionDialect::Standard) else {
+            return;
+        };
+        for message in messages.flatten() {
+            let now = self.start.elapsed();
+            if let Ok(Heard::Done(call, outcome)) = self.requestor.handle_response(&message, now) {
+                ended.push((
+                    call,
+                    match outcome {
+                        Outcome::Answered { fields, .. } => {
+                            Ended::Answered(fields.bytes().to_vec())
+                        }
+                        Outcome::Refused(_) => Ended::Refused,
+                        Outcome::Unknown(_) => Ended::Unknown,
+                    },
+                ));
+            }
+        }
+    }
+}
+
+/// Sends a datagram to the group from another loopback address than everybody else.
+///
+/// # Panics
+/// When it does not leave.
+pub fn send_from(address: Ipv4Addr, datagram: &[u8]) {
+    let socket = UdpSocket::bind(SocketAddr::from((address, 0))).unwrap();
+    let options = SockRef::from(&socket);
+    options.set_multicast_if_v4(&Ipv4Addr::LOCALHOST).unwrap();
+    options.set_multicast_loop_v4(true).unwrap();
+    socket.send_to(datagram, GROUP).unwrap();
+}
+
+/// How long it listens before it looks what is due.
+const TURN: Duration = Duration::from_millis(5);
