@@ -51,6 +51,7 @@
 //! the byte after the 4 byte encapsulation header, a string's length counts its NUL, and an empty message is one byte.
 //! A `wstring` is a count of UTF-16 units, each written as 4 bytes, as `rmw_cyclonedds` and `rmw_fastrtps` do.
 
+mod action_calls;
 mod bundle;
 mod convert;
 mod definition;
@@ -68,6 +69,7 @@ mod service;
 mod structure;
 mod type_hash;
 
+pub use action_calls::ActionCalls;
 pub use convert::{date_time_to_time, duration_to_millis, millis_to_duration, time_to_date_time};
 pub use definition::Constant;
 pub use description::{DescribedField, DescribedType};

@@ -9,8 +9,8 @@ use crate::idl;
 use crate::resolve::{self, Resolver};
 use crate::service::{self, ServiceDefinition};
 use crate::{
-    ActionMessages, ActionType, DefinitionError, Dialect, MessageType, ServiceType, TextKind,
-    TypeName,
+    ActionCalls, ActionMessages, ActionType, DefinitionError, Dialect, MessageType, ServiceType,
+    TextKind, TypeName,
 };
 
 /// Message definitions of one dialect by name.
@@ -267,6 +267,14 @@ impl Registry {
     /// As [`Registry::get`], of one of the messages.
     pub fn action_messages(&self, name: &TypeName) -> Result<ActionMessages, DefinitionError> {
         ActionMessages::of(name, |name| self.get(name))
+    }
+
+    /// The action of that name, of either ROS, as calls and values of the space.
+    ///
+    /// # Errors
+    /// As [`Registry::get`], of one of its messages.
+    pub fn action_calls(&self, name: &TypeName) -> Result<ActionCalls, DefinitionError> {
+        ActionCalls::of((self.dialect, name), &self.definitions)
     }
 
     /// As [`Registry::suggest`], among the services.

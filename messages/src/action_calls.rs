@@ -1,0 +1,196 @@
+//! An action as calls and values of the space: the same fields for the actions of both ROS.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use crate::definition::Definition;
+use crate::resolve::Resolver;
+use crate::service::{ServiceDefinition, derived};
+use crate::{DefinitionError, Dialect, MessageType, ServiceType, TypeName};
+
+/// The three calls and two values that an action of the space is, made of its goal, result and feedback.
+///
+/// A goal is told by 16 bytes in front of all else, so that a goal or feedback of either ROS is a message here when its id is
+/// put in front of it. Statuses and return codes are those of `action_msgs/GoalStatus` and `action_msgs/CancelGoal`.
+#[derive(Debug)]
+pub struct ActionCalls {
+    goal: Arc<ServiceType>,
+    cancel: Arc<ServiceType>,
+    result: Arc<ServiceType>,
+    feedback: Arc<MessageType>,
+    status: Arc<MessageType>,
+}
+
+impl ActionCalls {
+    pub(crate) fn of(
+        (dialect, name): (Dialect, &TypeName),
+        definitions: &BTreeMap<TypeName, Arc<Definition>>,
+    ) -> Result<Self, DefinitionError> {
+        let x = name.name();
+        let time = match dialect {
+            Dialect::Ros1 => "time",
+            Dialect::Ros2 => "builtin_interfaces/Time",
+        };
+        let service = |name: &TypeName, text: &str| {
+            let service = ServiceDefinition::parse(dialect, name, text)?;
+            let own = service.messages();
+            let sets = [&own, definitions];
+            let mut resolver = Resolver::new(dialect, &sets);
+            service.resolve(name, &mut resolver).map(Arc::new)
+        };
+        let message = |suffix, text: &str| {
+            let name = derived(name, suffix)?;
+            let definition = Arc::new(Definition::parse(dialect, &name, text)?);
+            let own = BTreeMap::from([(name.clone(), definition)]);
+            let sets = [&own, definitions];
+            let mut resolver = Resolver::new(dialect, &sets);
+            resolver.message_type(&name, None).map(Arc::new)
+        };
+        let goal =
+            format!("{ID}{x}Goal goal\n---\nbool accepted\n{ID}{time} stamp\nstring message\n");
+        let cancel = format!("{ID}{time} stamp\n---\nint8 return_code\nuint8[] goal_ids\n");
+        let result = format!("{ID}---\nint8 status\nstring message\n{x}Result result\n");
+        Ok(Self {
+            goal: service(name, &goal)?,
+            cancel: service(&derived(name, "_CancelCall")?, &cancel)?,
+            result: service(&derived(name, "_ResultCall")?, &result)?,
+            feedback: message("_FeedbackValue", &format!("{ID}{x}Feedback feedback\n"))?,
+            status: message("_StatusValue", "uint8[] goal_ids\nuint8[] statuses\n")?,
+        })
+    }
+
+    /// Sends a goal, under the name of the action. Request: `goal_id` (16 bytes; all zero where who executes chooses) and `goal`;
+    /// response: `accepted`, `goal_id`, `stamp` (when it was accepted, by the clock of who executes) and `message`.
+    #[must_use]
+    pub const fn goal(&self) -> &Arc<ServiceType> {
+        &self.goal
+    }
+
+    /// Cancels goals. Request: `goal_id` (all zero: any) and `stamp` (zero: any; else those accepted then or before); response:
+    /// `return_code` and `goal_ids`, 16 bytes of each goal that is being cancelled.
+    #[must_use]
+    pub const fn cancel(&self) -> &Arc<ServiceType> {
+        &self.cancel
+    }
+
+    /// Waits for a result. Request: `goal_id`; response: `status`, `message` (for people) and `result`.
+    #[must_use]
+    pub const fn result(&self) -> &Arc<ServiceType> {
+        &self.result
+    }
+
+    /// The value with the progress of a goal: `goal_id` and `feedback`.
+    #[must_use]
+    pub const fn feedback(&self) -> &Arc<MessageType> {
+        &self.feedback
+    }
+
+    /// The value with the goals there are: `goal_ids`, 16 bytes of each, and `statuses`, one byte of each.
+    #[must_use]
+    pub const fn status(&self) -> &Arc<MessageType> {
+        &self.status
+    }
+}
+
+/// Tells a goal.
+const ID: &str = "uint8[16] goal_id\n";
+
+#[cfg(test)]
+mod tests {
+    use uadp::BuiltinType;
+
+    use crate::{Dialect, MessageType, Registry};
+
+    const COUNT: &str = "int32 order\n---\nint32[] sequence\n---\nint32[] partial\nfloat64 share\n";
+
+    fn leaves(message: &MessageType) -> Vec<(String, BuiltinType)> {
+        let leaves = message.leaves().iter();
+        leaves
+            .map(|leaf| (leaf.path.clone(), leaf.builtin))
+            .collect()
+    }
+
+    #[test]
+    fn an_action_of_either_ros_is_the_same_calls_and_values() {
+        let name = "demo_msgs/Count".parse().unwrap();
+        let [one, two] = [Dialect::Ros1, Dialect::Ros2].map(|dialect| {
+            let mut registry = Registry::bundle(dialect);
+            registry.add_action(&name, COUNT).unwrap();
+            let calls = registry.action_calls(&name).unwrap();
+            assert_eq!(*calls.goal().name(), name);
+            [
+                leaves(calls.goal().request()),
+                leaves(calls.goal().response()),
+                leaves(calls.cancel().request()),
+                leaves(calls.cancel().response()),
+                leaves(calls.result().request()),
+                leaves(calls.result().response()),
+                leaves(calls.feedback()),
+                leaves(calls.status()),
+            ]
+        });
+        assert_eq!(one, two);
+        let id = || ("goal_id".to_owned(), BuiltinType::ByteString);
+        let leaf = |path: &str, builtin| (path.to_owned(), builtin);
+        let [
+            goal,
+            accepted,
+            cancel,
+            cancelled,
+            ask,
+            result,
+            feedback,
+            status,
+        ] = one;
+        assert_eq!(goal, [id(), leaf("goal.order", BuiltinType::Int32)]);
+        assert_eq!(
+            accepted,
+            [
+                leaf("accepted", BuiltinType::Boolean),
+                id(),
+                leaf("stamp", BuiltinType::DateTime),
+                leaf("message", BuiltinType::String),
+            ]
+        );
+        assert_eq!(cancel, [id(), leaf("stamp", BuiltinType::DateTime)]);
+        assert_eq!(
+            cancelled,
+            [
+                leaf("return_code", BuiltinType::SByte),
+                leaf("goal_ids", BuiltinType::ByteString),
+            ]
+        );
+        assert_eq!(ask, [id()]);
+        assert_eq!(
+            result,
+            [
+                leaf("status", BuiltinType::SByte),
+                leaf("message", BuiltinType::String),
+                leaf("result.sequence", BuiltinType::Int32),
+            ]
+        );
+        assert_eq!(
+            feedback,
+            [
+                id(),
+                leaf("feedback.partial", BuiltinType::Int32),
+                leaf("feedback.share", BuiltinType::Double),
+            ]
+        );
+        assert_eq!(
+            status,
+            [
+                leaf("goal_ids", BuiltinType::ByteString),
+                leaf("statuses", BuiltinType::ByteString),
+            ]
+        );
+    }
+
+    #[test]
+    fn an_action_that_is_not_known_is_named() {
+        let registry = Registry::bundle(Dialect::Ros2);
+        let name = "demo_msgs/Count".parse().unwrap();
+        let why = registry.action_calls(&name).unwrap_err().to_string();
+        assert!(why.contains("demo_msgs/CountGoal"), "{why}");
+    }
+}
