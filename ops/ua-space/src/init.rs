@@ -252,6 +252,7 @@ fn added(file: &str, (text, before): (&str, &Mapping), plan: &mut Plan) -> Resul
                     .variables()
                     .iter()
                     .all(|one| after.variables().contains(one))
+                && after.calls() == before.calls()
         });
     if kept { Ok(merged) } else { Err(unmergeable()) }
 }
@@ -615,5 +616,29 @@ mod tests {
         // In the namespace of the others, behind the highest number, and before the next key.
         assert_eq!(origins(&more)[1].1, "ua_1_2_6");
         assert!(more.find("name: Next").unwrap() < more.find("patterns:").unwrap());
+    }
+
+    #[test]
+    fn what_calls_have_is_not_given_away_and_their_services_are_not_told_of() {
+        let text = "spaces:\n  - {id: 1}\n  - {id: 2}\nnamespaces:\n  2: urn:cell\ncalls:\n  - {node: ns=2;i=61, name: A, origin: \
+                    1, ros: [{service: /a, type: std_srvs/SetBool}, {space: 2, service: /b, type: std_srvs/SetBool}]}\n";
+        let mut seen = graph(2, &[("/a", "std_msgs/Bool", true)]);
+        let service = |name: &str| {
+            let kind = BTreeSet::from(["std_srvs/SetBool".to_owned()]);
+            (name.to_owned(), kind)
+        };
+        seen.live.services = Some(
+            ["/b", "/c", "/n/get_parameters", "/ua_1_2_61"]
+                .map(service)
+                .into(),
+        );
+        let more = merged(text, std::slice::from_ref(&seen));
+        // Behind the number of the call, under another name than its own.
+        assert_eq!(
+            origins(&more),
+            [("A2".to_owned(), "ua_2_2_62".to_owned(), 1)]
+        );
+        assert!(more.contains("\n  #   /c (std_srvs/SetBool)\n"), "{more}");
+        assert_eq!(merged(&more, &[seen]), more);
     }
 }

@@ -40,6 +40,13 @@ impl Known {
             } = variable.topic;
             known.use_number(namespace.get(), identifier.get());
         }
+        for call in mapping.calls() {
+            known.nodes.insert(call.node.clone());
+            known.names.insert((call.node.namespace, call.name.clone()));
+            for topic in call.topics() {
+                known.use_number(topic.namespace.get(), topic.identifier.get());
+            }
+        }
         for line in text.lines() {
             if let Some((_, comment)) = line.split_once('#') {
                 known.hear(comment);

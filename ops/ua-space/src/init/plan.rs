@@ -20,7 +20,8 @@ pub(super) struct Plan {
     pub(super) left_out: BTreeMap<(SpaceId, LeftOut), BTreeSet<String>>,
     /// Topics that a variable of the file could be bound to beside its own.
     pub(super) proposals: Vec<String>,
-    pub(super) services: BTreeMap<SpaceId, BTreeSet<String>>,
+    /// By their names, with their type where one is told.
+    pub(super) services: BTreeMap<SpaceId, BTreeMap<String, Option<String>>>,
 }
 
 /// A variable.
@@ -390,23 +391,44 @@ impl Planner<'_> {
             let Some(services) = &graph.live.services else {
                 continue;
             };
-            let of_mapping: BTreeSet<&str> = self
-                .known
-                .mapping
+            let mapping = &self.known.mapping;
+            let executed =
+                mapping
+                    .executed_in(graph.space)
+                    .filter_map(|call| match &call.executed {
+                        mappings::ExecutedBy::Ros(target) => Some(target.name.as_str()),
+                        mappings::ExecutedBy::OpcUa(_) | mappings::ExecutedBy::Elsewhere => None,
+                    });
+            let asked = mapping.asked_in(graph.space);
+            let asked = asked.map(|(_, binding)| binding.target.name.as_str());
+            let of_mapping: BTreeSet<&str> = mapping
                 .services(graph.space)
                 .filter_map(|(_, bound)| match &bound.role {
                     mappings::ServiceRole::Call { service, .. }
                     | mappings::ServiceRole::Poll { service, .. } => Some(service.as_str()),
                     mappings::ServiceRole::Answer { .. } => None,
                 })
+                .chain(executed)
+                .chain(asked)
                 .collect();
-            let wanted = services.keys().filter(|name| {
+            let wanted = services.iter().filter(|(name, _)| {
                 let last = name.rsplit('/').next().unwrap_or_default();
+                // One of the space needs no mapping.
+                let of_space = name
+                    .trim_start_matches('/')
+                    .parse::<mappings::TopicId>()
+                    .is_ok();
                 !EACH_NODE.contains(&last)
+                    && !of_space
                     && !of_mapping.contains(name.as_str())
                     && !self.known.mentions(name)
             });
-            let wanted: BTreeSet<String> = wanted.cloned().collect();
+            let wanted: BTreeMap<String, Option<String>> = wanted
+                .map(|(name, types)| {
+                    let only = types.first().filter(|_| types.len() == 1);
+                    (name.clone(), only.cloned())
+                })
+                .collect();
             if !wanted.is_empty() {
                 self.plan.services.insert(graph.space, wanted);
             }

@@ -116,9 +116,15 @@ pub(super) fn variables(plan: &Plan, indent: &str) -> Variables {
     for (space, services) in &plan.services {
         lines.extend([
             String::new(),
-            format!("{indent}# Services of space {space}: `call` and `poll` in a binding make values of them"),
+            format!(
+                "{indent}# Services of space {space}: `calls` has them executed for other spaces, `call` and `poll` in a binding \
+                 make values of them"
+            ),
         ]);
-        let services = services.iter().map(|name| comment(name));
+        let services = services.iter().map(|(name, kind)| match kind {
+            Some(kind) => comment(&format!("{name} ({kind})")),
+            None => comment(name),
+        });
         lines.extend(wrapped(&lead, services));
     }
     Variables { lines, entries }
