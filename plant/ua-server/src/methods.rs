@@ -101,32 +101,43 @@ impl Methods {
     pub(crate) fn known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         self.gone(topic);
         if self.shown.len() >= MOST_METHODS {
-            if !std::mem::replace(&mut self.told_full, true) {
-                warn!(
-                    "more than {MOST_METHODS} calls of the space: the rest is shown as no Methods"
-                );
-            }
+            self.tell_full();
             return;
         }
         let node = self.node(topic);
-        let mut address_space = self.manager.address_space().write();
-        if address_space.node_exists(&node) {
+        if !self.insert(&node, (topic, description)) {
             warn!(%topic, %node, "the call is shown as no Method: there is a node of that id already");
             return;
         }
-        add(&mut address_space, &node, (topic, description));
+        info!(%topic, name = description.name, %node, "shown as a Method");
+        self.shown.insert(topic, node);
+    }
+
+    fn tell_full(&mut self) {
+        if !std::mem::replace(&mut self.told_full, true) {
+            warn!("more than {MOST_METHODS} calls of the space: the rest is shown as no Methods");
+        }
+    }
+
+    /// Puts a Method in, unless there is something under its node.
+    fn insert(
+        &self,
+        node: &NodeId,
+        (topic, description): (TopicId, &Arc<CallDescription>),
+    ) -> bool {
+        let mut address_space = self.manager.address_space().write();
+        if address_space.node_exists(node) {
+            return false;
+        }
+        add(&mut address_space, node, (topic, description));
         drop(address_space);
         let callable = Callable {
             topic,
             description: Arc::clone(description),
         };
-        self.manager
-            .inner()
-            .methods()
-            .lock()
-            .insert(node.clone(), callable);
-        info!(%topic, name = description.name, %node, "shown as a Method");
-        self.shown.insert(topic, node);
+        let mut methods = self.manager.inner().methods().lock();
+        methods.insert(node.clone(), callable);
+        true
     }
 
     /// A mapped call has the node that the mapping says, if the server has its namespace.

@@ -16,7 +16,8 @@ use opcua::server::node_manager::ServerContext;
 use opcua::server::node_manager::memory::{
     CoreNodeManagerBuilder, InMemoryNodeManagerBuilder, InMemoryNodeManagerImplBuilder,
 };
-use opcua::server::{ServerHandle, SubscriptionCache};
+use opcua::server::{MonitoredItemHandle, ServerHandle, SubscriptionCache};
+use opcua::types::NodeId;
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::pki::Pki;
 use tokio::runtime::Runtime;
@@ -30,7 +31,7 @@ use crate::browse::Ordered;
 use crate::components::Components;
 use crate::endpoint;
 use crate::layout::Layout;
-use crate::methods::{Ask, MOST_QUESTIONS, Methods};
+use crate::methods::{Ask, MOST_QUESTIONS, Methods, Question};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
 use crate::space::Space;
 use crate::structures::Types;
@@ -101,16 +102,7 @@ impl ServerPort {
             .map_err(|error| io(error.to_string()))?
             .port();
 
-        let (writes_in, writes) = mpsc::channel(MOST_WRITES);
-        let (created, created_items) = mpsc::channel(MOST_CREATED);
-        let (questions, asked) = mpsc::channel(MOST_QUESTIONS);
-        let room = Arc::new(Semaphore::new(ROOM_FOR_WRITES));
-        let exits = Exits {
-            writes: writes_in,
-            room,
-            created,
-            questions,
-        };
+        let (exits, (writes, created_items, asked)) = exits();
         if setup.trust_any_client {
             warn!("every client certificate is trusted, and kept as trusted: for tests only");
         }
@@ -294,6 +286,27 @@ impl Drop for ServerPort {
         }
     }
 }
+
+/// What leaves the node manager, and the other ends of that.
+fn exits() -> (Exits, Entries) {
+    let (writes, written) = mpsc::channel(MOST_WRITES);
+    let (created, created_items) = mpsc::channel(MOST_CREATED);
+    let (questions, asked) = mpsc::channel(MOST_QUESTIONS);
+    let exits = Exits {
+        writes,
+        room: Arc::new(Semaphore::new(ROOM_FOR_WRITES)),
+        created,
+        questions,
+    };
+    (exits, (written, created_items, asked))
+}
+
+/// What clients wrote, the monitored items they made, and what they ask.
+type Entries = (
+    mpsc::Receiver<ClientWrite>,
+    mpsc::Receiver<(NodeId, MonitoredItemHandle)>,
+    mpsc::Receiver<Question>,
+);
 
 /// What happens next to the servers that are there.
 async fn next(components: &mut Option<Components>) {
