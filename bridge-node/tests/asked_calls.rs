@@ -269,7 +269,7 @@ async fn no_more_is_asked_at_a_time_than_there_is_room_for() {
     bench.offer();
     let asker = bench.asker("/ua_0_7_105");
     let mut asks = Vec::new();
-    for _ in 0..127 {
+    for _ in 0..511 {
         asks.push(tokio::spawn(asker.ask(Bytes::new())));
         bench.asked().await;
     }
