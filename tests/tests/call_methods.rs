@@ -63,6 +63,11 @@ fn asyncua_calls_a_service_of_rospy_and_is_told_how_it_went() {
     assert_eq!(server.values(), [true, false]);
     bridge.end();
     line(&mut client, "gone");
+    // And so is the object that had nothing else in it.
+    let object = ["UaSpace/Calls/Belt", "--wait", "0"];
+    let args = [&[SERVER_ENDPOINT][..], &object].concat();
+    let told = cell.asyncua_once("opcua_call.py", &args);
+    assert_eq!(told, [json!({"missing": "UaSpace/Calls/Belt"})]);
 }
 
 #[test]

@@ -152,9 +152,9 @@ pub(crate) fn calls_folder() -> NodeId {
     NodeId::new(APPLICATION, "UaSpace.Calls")
 }
 
-/// An object with calls in it, or in others in it.
-pub(crate) fn call_object(parent: &NodeId, name: &str) -> NodeId {
-    NodeId::new(APPLICATION, format!("{}/{name}", parent.identifier))
+/// An object with calls in it, or in others in it, by the names of those around it and its own.
+pub(crate) fn call_object(names: &[&str]) -> NodeId {
+    NodeId::new(APPLICATION, format!("UaSpace.Calls/{}", names.join("/")))
 }
 
 /// The node of a topic that the mapping does not name.

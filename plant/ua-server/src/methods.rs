@@ -50,6 +50,10 @@ pub(crate) struct Methods {
     mapping: Arc<Mapping>,
     questions: mpsc::Receiver<Question>,
     shown: HashMap<TopicId, NodeId>,
+    /// How many Methods are in each object, or in one in it.
+    objects: HashMap<NodeId, usize>,
+    /// The objects around each Method, the outermost first.
+    around: HashMap<TopicId, Vec<NodeId>>,
     asked: HashMap<AskId, oneshot::Sender<Answered<Bytes>>>,
     /// Those that waited the longest, to be looked at whether their client is still there.
     order: VecDeque<AskId>,
@@ -90,6 +94,8 @@ impl Methods {
             mapping: Arc::clone(mapping),
             questions,
             shown: HashMap::new(),
+            objects: HashMap::new(),
+            around: HashMap::new(),
             asked: HashMap::new(),
             order: VecDeque::new(),
             next: 0,
@@ -105,10 +111,14 @@ impl Methods {
             return;
         }
         let node = self.node(topic);
-        if !self.insert(&node, (topic, description)) {
+        let Some(around) = self.insert(&node, (topic, description)) else {
             warn!(%topic, %node, "the call is shown as no Method: there is a node of that id already");
             return;
+        };
+        for object in &around {
+            *self.objects.entry(object.clone()).or_default() += 1;
         }
+        self.around.insert(topic, around);
         info!(%topic, name = description.name, %node, "shown as a Method");
         self.shown.insert(topic, node);
     }
@@ -119,17 +129,17 @@ impl Methods {
         }
     }
 
-    /// Puts a Method in, unless there is something under its node.
+    /// Puts a Method in, unless there is something under its node. Gives the objects around it.
     fn insert(
         &self,
         node: &NodeId,
         (topic, description): (TopicId, &Arc<CallDescription>),
-    ) -> bool {
+    ) -> Option<Vec<NodeId>> {
         let mut address_space = self.manager.address_space().write();
         if address_space.node_exists(node) {
-            return false;
+            return None;
         }
-        add(&mut address_space, node, (topic, description));
+        let around = add(&mut address_space, node, (topic, description));
         drop(address_space);
         let callable = Callable {
             topic,
@@ -137,7 +147,7 @@ impl Methods {
         };
         let mut methods = self.manager.inner().methods().lock();
         methods.insert(node.clone(), callable);
-        true
+        Some(around)
     }
 
     /// A mapped call has the node that the mapping says, if the server has its namespace.
@@ -167,6 +177,17 @@ impl Methods {
             drop(address_space.delete(&arguments_node(&node, arguments), true));
         }
         drop(address_space.delete(&node, true));
+        // An object without a Method in it would stay for ever.
+        for object in self.around.remove(&topic).unwrap_or_default().iter().rev() {
+            let left = self.objects.get_mut(object).map_or(0, |methods| {
+                *methods = methods.saturating_sub(1);
+                *methods
+            });
+            if left == 0 {
+                self.objects.remove(object);
+                drop(address_space.delete(object, true));
+            }
+        }
     }
 
     /// Another mapping may say another node.
@@ -291,12 +312,12 @@ fn shape(field: &CallField) -> Shape {
     )))
 }
 
-/// Puts the Method in, and the objects around it that are not there.
+/// Puts the Method in, and the objects around it that are not there. Gives the objects, the outermost first.
 fn add(
     address_space: &mut AddressSpace,
     node: &NodeId,
     (topic, description): (TopicId, &CallDescription),
-) {
+) -> Vec<NodeId> {
     let name = match &description.name[..] {
         "" => topic.to_string(),
         name => name.to_owned(),
@@ -307,8 +328,10 @@ fn add(
         .filter(|part| !part.is_empty());
     let last = parts.next_back().unwrap_or(&name);
     let mut object = address::calls_folder();
+    let (mut around, mut path) = (Vec::new(), Vec::new());
     for part in parts.take(MOST_PARTS) {
-        let inner = address::call_object(&object, part);
+        path.push(part);
+        let inner = address::call_object(&path);
         if !address_space.node_exists(&inner) {
             let names = QualifiedName::new(inner.namespace, part);
             ObjectBuilder::new(&inner, names, LocalizedText::from(part))
@@ -316,6 +339,7 @@ fn add(
                 .organized_by(object.clone())
                 .insert(address_space);
         }
+        around.push(inner.clone());
         object = inner;
     }
     let about = match (&description.about[..], description.role) {
@@ -339,6 +363,7 @@ fn add(
         method = method.output_args(address_space, &id, &arguments);
     }
     method.insert(address_space);
+    around
 }
 
 fn arguments(fields: &[CallField]) -> Vec<Argument> {
