@@ -9,7 +9,7 @@ use serde_json::{Value, json};
 use system_tests::{Cell, Child, Peer, SERVER_ENDPOINT, UadpSocket, eventually};
 use uadp::{
     DataSetHeader, GroupHeader, MessageKind, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
-    PublisherId, Scalar, Timestamp, Variant,
+    NetworkMessageType, PublisherId, Scalar, Timestamp, Variant,
 };
 
 const SOON: Duration = Duration::from_secs(20);
@@ -215,6 +215,9 @@ fn a_clients_write_leaves_as_a_key_frame_of_the_nodes_topic() {
 /// The triple and the Doubles of a key frame; `None` for another message.
 fn written(datagram: &[u8]) -> Option<((u16, u16, u16), Vec<f64>)> {
     let message = NetworkMessage::decode(datagram).unwrap();
+    if message.message_type() != NetworkMessageType::DataSet {
+        return None;
+    }
     let header = message.header();
     let Some(PublisherId::UInt16(publisher)) = header.publisher_id else {
         panic!("{header:?}");
