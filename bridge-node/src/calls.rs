@@ -122,6 +122,8 @@ struct Asked {
 #[derive(Debug, Clone)]
 pub struct Asker {
     topic: TopicId,
+    /// Of one that asks for a part of an action: how long it waits.
+    timeout: Option<Duration>,
     say: mpsc::Sender<Said>,
     next: Arc<AtomicU64>,
 }
@@ -133,6 +135,7 @@ enum Said {
         ask: AskId,
         topic: TopicId,
         request: Bytes,
+        timeout: Option<Duration>,
         answer: oneshot::Sender<Result<Bytes, String>>,
     },
     GivenUp(AskId),
@@ -153,6 +156,13 @@ impl Drop for GiveUp {
 }
 
 impl Asker {
+    /// The same, of which an answer is waited for that long.
+    #[must_use]
+    pub fn within(self, timeout: Duration) -> Self {
+        let timeout = Some(timeout);
+        Self { timeout, ..self }
+    }
+
     /// Asks with a request as the messages of that ROS are on the wire; the answer is likewise. Dropping the future gives
     /// the question up. Ends in bounded time, as every call of the space does.
     ///
@@ -182,11 +192,12 @@ impl Asker {
         };
         let (question, later) = (place()?, place()?);
         let (answer, answered) = oneshot::channel();
-        let topic = self.topic;
+        let (topic, timeout) = (self.topic, self.timeout);
         drop(question.send(Said::Ask {
             ask,
             topic,
             request,
+            timeout,
             answer,
         }));
         let place = Some(later);
@@ -386,6 +397,7 @@ impl<S: Send> Calls<S> {
             self.leaving.retain(|(_, left, _)| *left != topic);
             let asker = Asker {
                 topic,
+                timeout: None,
                 say: self.say.clone(),
                 next: Arc::clone(&self.next),
             };
@@ -441,18 +453,13 @@ impl<S: Send> Calls<S> {
                     ask,
                     topic,
                     request,
+                    timeout,
                     answer,
                 } => {
                     // One that was withdrawn meanwhile answers by the end of its sender.
-                    let Some(State::Offered {
-                        target,
-                        service_type,
-                        ..
-                    }) = self.known.get(&topic).map(|known| &known.state)
-                    else {
+                    let Some((timeout, says_no)) = self.how_asked::<G>(topic, timeout) else {
                         continue;
                     };
-                    let says_no = (!G::TELLS_FAULTS).then(|| Arc::clone(service_type.response()));
                     let asked = Asked {
                         topic,
                         answer,
@@ -463,7 +470,7 @@ impl<S: Send> Calls<S> {
                         topic,
                         ask,
                         request,
-                        timeout: target.timeout,
+                        timeout,
                     });
                 }
                 Said::GivenUp(ask) => {
@@ -472,6 +479,39 @@ impl<S: Send> Calls<S> {
                     }
                 }
             }
+        }
+    }
+
+    /// How long the answer to a request is waited for, and the type of an answer that says no, where there is one.
+    fn how_asked<G: CallGraph<Server = S>>(
+        &self,
+        topic: TopicId,
+        timeout: Option<Duration>,
+    ) -> Option<(Duration, Option<Arc<MessageType>>)> {
+        if let Some(timeout) = timeout {
+            return Some((timeout, None));
+        }
+        match &self.known.get(&topic)?.state {
+            State::Offered {
+                target,
+                service_type,
+                ..
+            } => {
+                let says_no = (!G::TELLS_FAULTS).then(|| Arc::clone(service_type.response()));
+                Some((target.timeout, says_no))
+            }
+            State::Waiting | State::Refused => None,
+        }
+    }
+
+    /// Asks a part of an action, which is no service of its own; its [`timeout`](Asker::within) is to be given.
+    #[must_use]
+    pub fn asker(&self, topic: TopicId) -> Asker {
+        Asker {
+            topic,
+            timeout: Some(ANSWERED_WITHIN),
+            say: self.say.clone(),
+            next: Arc::clone(&self.next),
         }
     }
 

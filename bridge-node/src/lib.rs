@@ -3,6 +3,7 @@
 //! A program implements [`Program`] and [`Port`], and its `main` is [`run`]. This crate does not know which ROS it
 //! serves (that is the port) nor how UADP bytes look (that is `bridge-core`).
 
+pub mod actions;
 mod arguments;
 mod busy_poll;
 mod calls;
@@ -23,6 +24,7 @@ mod services;
 mod stamp;
 mod status;
 
+pub use actions::{ActionGraph, Actions};
 pub use arguments::{Arguments, Flags, WithoutMapping};
 pub use bridge_core::{
     ActionFamily, Answered, AskError, AskErrorKind, AskId, CallDescription, CallField, CallMap,
