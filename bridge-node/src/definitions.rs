@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use messages::{
-    DefinitionError, Dialect, Library, MessageType, Noted, Registry, ServiceType, TextKind,
-    TypeName,
+    ActionCalls, ActionMessages, ActionType, DefinitionError, Dialect, Library, MessageType, Noted,
+    Registry, ServiceType, TextKind, TypeName,
 };
 use tracing::{info, warn};
 use type_files::{Environment, TypeFiles, TypePaths};
@@ -72,6 +72,42 @@ impl Definitions {
         let found = self.library.service(name, &mut self.files);
         self.tell();
         found
+    }
+
+    /// The action of ROS 1 of that name, found likewise.
+    ///
+    /// # Errors
+    /// As [`find`](Self::find), of one of its messages.
+    pub fn find_action(&mut self, name: &TypeName) -> Result<Arc<ActionType>, DefinitionError> {
+        let found = self.library.action(name, &mut self.files);
+        self.tell();
+        found
+    }
+
+    /// The action of ROS 2 of that name, found likewise.
+    ///
+    /// # Errors
+    /// As [`find`](Self::find), of one of its messages.
+    pub fn find_action_messages(
+        &mut self,
+        name: &TypeName,
+    ) -> Result<ActionMessages, DefinitionError> {
+        let found = self.library.action_messages(name, &mut self.files);
+        self.tell();
+        found
+    }
+
+    /// The action of either ROS of that name as calls and values of the space, found likewise.
+    ///
+    /// # Errors
+    /// As [`find`](Self::find), of one of its messages.
+    pub fn find_action_calls(
+        &mut self,
+        name: &TypeName,
+    ) -> Result<Arc<ActionCalls>, DefinitionError> {
+        let found = self.library.action_calls(name, &mut self.files);
+        self.tell();
+        found.map(Arc::new)
     }
 
     /// What people are to be told of an error of [`find`](Self::find), or of [`find_service`](Self::find_service) for the

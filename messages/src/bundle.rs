@@ -1,15 +1,25 @@
 //! The common interfaces, one file per package.
 //!
 //! A line `message Name` begins a definition of both dialects, `message Name 1` and `message Name 2` one of ROS 1 and of
-//! ROS 2, where they differ; a line `service Name`, with `1` or `2` likewise, begins a service. Field names, types and constants only.
+//! ROS 2, where they differ; a line `service Name` or `action Name`, with `1` or `2` likewise, begins a service or an action.
+//! Field names, types and constants only.
 
 use crate::{Dialect, TypeName};
 
-const PACKAGES: [(&str, &str); 20] = [
+const PACKAGES: [(&str, &str); 26] = [
     ("action_msgs", include_str!("../bundle/action_msgs.txt")),
+    (
+        "action_tutorials_interfaces",
+        include_str!("../bundle/action_tutorials_interfaces.txt"),
+    ),
+    ("actionlib", include_str!("../bundle/actionlib.txt")),
     (
         "actionlib_msgs",
         include_str!("../bundle/actionlib_msgs.txt"),
+    ),
+    (
+        "actionlib_tutorials",
+        include_str!("../bundle/actionlib_tutorials.txt"),
     ),
     (
         "builtin_interfaces",
@@ -19,10 +29,18 @@ const PACKAGES: [(&str, &str); 20] = [
         "diagnostic_msgs",
         include_str!("../bundle/diagnostic_msgs.txt"),
     ),
+    (
+        "example_interfaces",
+        include_str!("../bundle/example_interfaces.txt"),
+    ),
     ("geometry_msgs", include_str!("../bundle/geometry_msgs.txt")),
     (
         "lifecycle_msgs",
         include_str!("../bundle/lifecycle_msgs.txt"),
+    ),
+    (
+        "move_base_msgs",
+        include_str!("../bundle/move_base_msgs.txt"),
     ),
     ("nav_msgs", include_str!("../bundle/nav_msgs.txt")),
     (
@@ -36,6 +54,7 @@ const PACKAGES: [(&str, &str); 20] = [
     ("std_msgs", include_str!("../bundle/std_msgs.txt")),
     ("std_srvs", include_str!("../bundle/std_srvs.txt")),
     ("stereo_msgs", include_str!("../bundle/stereo_msgs.txt")),
+    ("test_msgs", include_str!("../bundle/test_msgs.txt")),
     ("tf2_msgs", include_str!("../bundle/tf2_msgs.txt")),
     (
         "trajectory_msgs",
@@ -57,6 +76,7 @@ const PACKAGES: [(&str, &str); 20] = [
 pub(crate) enum Kind {
     Message,
     Service,
+    Action,
 }
 
 /// Kind, name and text of each definition of the dialect.
@@ -87,8 +107,11 @@ pub(crate) fn texts(dialect: Dialect) -> Vec<(Kind, TypeName, String)> {
 }
 
 fn heading(line: &str) -> Option<(Kind, &str)> {
-    let message = line
-        .strip_prefix("message ")
-        .map(|rest| (Kind::Message, rest));
-    message.or_else(|| Some((Kind::Service, line.strip_prefix("service ")?)))
+    [
+        ("message ", Kind::Message),
+        ("service ", Kind::Service),
+        ("action ", Kind::Action),
+    ]
+    .into_iter()
+    .find_map(|(word, kind)| Some((kind, line.strip_prefix(word)?)))
 }

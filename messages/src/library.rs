@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use crate::definition::Definition;
 use crate::{
-    ActionMessages, ActionType, DefinitionError, Dialect, MessageType, Registry, ServiceType,
-    TypeName,
+    ActionCalls, ActionMessages, ActionType, DefinitionError, Dialect, MessageType, Registry,
+    ServiceType, TypeName,
 };
 
 /// What a text defines.
@@ -118,7 +118,7 @@ pub enum Noted {
         name: TypeName,
         /// The file.
         file: Arc<str>,
-        /// Fields, and in ROS 1 constants, that only the file has; in their order, a part of a service before its name.
+        /// Fields, and in ROS 1 constants, that only the file has; in their order, a part of a service or action before its name.
         only_file: Vec<String>,
         /// Those that only the built-in definition has.
         only_built_in: Vec<String>,
@@ -231,6 +231,19 @@ impl Library {
     ) -> Result<ActionMessages, DefinitionError> {
         self.gather(vec![(TextKind::Action, name.clone())], texts);
         self.registry.action_messages(name)
+    }
+
+    /// The action of that name, of either ROS, as calls and values of the space.
+    ///
+    /// # Errors
+    /// As [`message`](Self::message), of one of the messages.
+    pub fn action_calls(
+        &mut self,
+        name: &TypeName,
+        texts: &mut dyn DefinitionTexts,
+    ) -> Result<ActionCalls, DefinitionError> {
+        self.gather(vec![(TextKind::Action, name.clone())], texts);
+        self.registry.action_calls(name)
     }
 
     /// The file a definition is from; `None` of one that is built in, came from a peer, or is not known.
@@ -360,8 +373,19 @@ impl Library {
                 lines.extend(response.lines(self.dialect(), "response "));
                 Some(lines)
             }
-            // None is built in.
-            TextKind::Action => None,
+            TextKind::Action => {
+                let mut lines = Vec::new();
+                for (part, prefix) in [
+                    ("Goal", "goal "),
+                    ("Result", "result "),
+                    ("Feedback", "feedback "),
+                ] {
+                    let name = crate::service::derived(name, part).ok()?;
+                    let definition = self.registry.definition(&name)?;
+                    lines.extend(definition.lines(self.dialect(), prefix));
+                }
+                Some(lines)
+            }
         }
     }
 

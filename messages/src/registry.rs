@@ -35,7 +35,8 @@ impl Registry {
 
     /// With the common interfaces built in: std_msgs, geometry_msgs, sensor_msgs, nav_msgs, trajectory_msgs,
     /// diagnostic_msgs, actionlib_msgs, tf2_msgs, rosgraph_msgs, shape_msgs, visualization_msgs, stereo_msgs, the
-    /// services of std_srvs and ua_msgs (the skills of OPC UA, `ros/ua_msgs`), for ROS 1 also roscpp and their services,
+    /// services of std_srvs and ua_msgs (the skills of OPC UA, `ros/ua_msgs`), the actions of actionlib, the MoveBase of
+    /// move_base_msgs and the Fibonacci of the tutorials of both ROS, for ROS 1 also roscpp and their services,
     /// and for ROS 2 builtin_interfaces, action_msgs, unique_identifier_msgs, lifecycle_msgs and rcl_interfaces with the
     /// services of action_msgs and rcl_interfaces.
     pub fn bundle(dialect: Dialect) -> Self {
@@ -44,6 +45,7 @@ impl Registry {
             let added = match kind {
                 bundle::Kind::Message => registry.add(&name, &text),
                 bundle::Kind::Service => registry.add_service(&name, &text),
+                bundle::Kind::Action => registry.add_action(&name, &text),
             };
             // A test asks for each of them.
             debug_assert!(added.is_ok(), "every text of the bundle parses");

@@ -17,6 +17,7 @@ use support::{Player, Recorder};
 
 const MD5S: &str = include_str!("data/ros1_md5.txt");
 const SERVICES: &str = include_str!("data/ros1_services.txt");
+const ACTIONS: &str = include_str!("data/ros1_actions.txt");
 const FIELDS: &str = include_str!("data/ros2_fields.txt");
 const ROSBAGS: &str = include_str!("data/rosbags.json");
 const CYCLONE: &str = include_str!("data/cyclone.json");
@@ -58,10 +59,10 @@ fn the_md5_of_every_ros_1_type_of_the_bundle_is_the_one_others_compute() {
         .map(|line| line.split_once(' ').unwrap())
         .map(|(name, md5)| (name.to_owned(), md5.to_owned()))
         .collect();
-    for line in SERVICES
+    let logger = SERVICES
         .lines()
-        .filter(|line| line.starts_with("roscpp/Logger "))
-    {
+        .filter(|line| line.starts_with("roscpp/Logger "));
+    for line in logger.chain(ACTIONS.lines()) {
         let (name, md5) = line.split_once(' ').unwrap();
         table.insert(name.to_owned(), md5.to_owned());
     }
@@ -288,9 +289,10 @@ fn the_fields_of_every_ros_2_type_of_the_bundle_are_those_of_rosbags() {
         others.add(&type_name, &fields.join("\n")).unwrap();
     }
     let bundle = Registry::bundle(Dialect::Ros2);
-    let names = |registry: &Registry| registry.names().cloned().collect::<Vec<_>>();
-    assert_eq!(names(&bundle), names(&others));
-    for each in bundle.names() {
+    let of_actions = |name: &&TypeName| ACTION_PACKAGES.contains(&name.package());
+    let messages = || bundle.names().filter(|name| !of_actions(name));
+    assert!(messages().eq(others.names()));
+    for each in messages() {
         let (ours, theirs) = (bundle.get(each).unwrap(), others.get(each).unwrap());
         assert_eq!(ours.leaves(), theirs.leaves(), "{each}");
         let without_constants: Vec<&str> = ours
@@ -321,6 +323,43 @@ fn the_fields_of_every_ros_2_type_of_the_bundle_are_those_of_rosbags() {
             "{each}"
         );
     }
+}
+
+/// rosbags has no actions.
+const ACTION_PACKAGES: [&str; 6] = [
+    "action_tutorials_interfaces",
+    "actionlib",
+    "actionlib_tutorials",
+    "example_interfaces",
+    "move_base_msgs",
+    "test_msgs",
+];
+
+#[test]
+fn every_action_of_the_bundle_is_the_same_calls_and_values_in_both_ros() {
+    let registries = [Dialect::Ros1, Dialect::Ros2].map(Registry::bundle);
+    let leaves = |message: &MessageType| {
+        let leaves = message.leaves().iter();
+        leaves
+            .map(|leaf| (leaf.path.clone(), leaf.builtin))
+            .collect::<Vec<_>>()
+    };
+    let goals = registries[0].names().filter_map(|goal| {
+        let action = goal.name().strip_suffix("ActionGoal")?;
+        Some(name(&format!("{}/{action}", goal.package())))
+    });
+    let mut judged = 0;
+    // nav_msgs/GetMap is one of ROS 1 alone.
+    for action in goals.filter(|action| ACTION_PACKAGES.contains(&action.package())) {
+        let [one, two] = registries.each_ref().map(|registry| {
+            let calls = registry.action_calls(&action).unwrap();
+            let (goal, result) = (calls.goal().request(), calls.result().response());
+            [goal, result, calls.feedback()].map(|message| leaves(message))
+        });
+        assert_eq!(one, two, "{action}");
+        judged += 1;
+    }
+    assert_eq!(judged, 8);
 }
 
 #[test]

@@ -6,6 +6,7 @@
                               -rosgraph-msgs, -actionlib-msgs -> genpy.json
     python3 make.py services  needs Debian's python3-std-srvs, -nav-msgs, -sensor-msgs, -tf2-msgs, -diagnostic-msgs,
                               -roscpp-msg, -move-base-msgs -> ros1_services.txt
+    python3 make.py actions   needs Debian's python3-actionlib, -move-base-msgs -> ros1_actions.txt
     python3 make.py hashes    needs rosbags -> ros2_type_hashes.txt
     python3 make.py idl       needs rosbags -> rosbags_idl.json
 
@@ -14,6 +15,8 @@ ua_msgs of this project (../../../ros/ua_msgs) is read from its files into each 
 ros1_md5.txt    name and md5 of each ROS 1 type: rosbags' store ROS1_NOETIC
 ros1_services.txt name and md5 of each service of those packages, of roscpp/Logger, and of the messages genaction made
                 of two actions: the classes genpy made
+ros1_actions.txt name and md5 of each message genaction made of the actions of actionlib and move_base_msgs: the classes
+                genpy made; and those genpy makes of the Fibonacci of other packages here
 ros2_fields.txt name and fields of each ROS 2 type: rosbags' store ROS2_JAZZY
 ros2_type_hashes.txt for each of rosbags' stores from Humble to Lyrical a line `# store`, then type hash, name and fields of
                 each type that the store before has not or has otherwise
@@ -129,6 +132,37 @@ def services():
         out.write("\n".join(sorted(table)) + "\n")
 
 
+FIBONACCI = {
+    "actionlib_tutorials": "sequence", "example_interfaces": "sequence", "test_msgs": "sequence",
+    "action_tutorials_interfaces": "partial_sequence",
+}  # fmt: skip
+
+
+def actions():
+    import importlib
+    import pathlib
+    import subprocess
+    import tempfile
+
+    table = []
+    known = [("actionlib", name) for name in ("Test", "TestRequest", "TwoInts")] + [("move_base_msgs", "MoveBase")]
+    for package, action in known:
+        for suffix in "Action ActionGoal ActionResult ActionFeedback Goal Result Feedback".split():
+            cls = getattr(importlib.import_module(package + ".msg"), action + suffix)
+            table.append(f"{cls._type} {cls._md5sum}")
+    with tempfile.TemporaryDirectory() as root:
+        for package, feedback in FIBONACCI.items():
+            folder = pathlib.Path(root) / package / "action"
+            folder.mkdir(parents=True)
+            text = f"int32 order\n---\nint32[] sequence\n---\nint32[] {feedback}\n"
+            (folder / "Fibonacci.action").write_text(text)
+        script = pathlib.Path(__file__).resolve().parent / "genmsg_md5.py"
+        made = subprocess.run([sys.executable, script, root], capture_output=True, text=True, check=True)
+        table += made.stdout.splitlines()
+    with open("ros1_actions.txt", "w") as out:
+        out.write("\n".join(sorted(table)) + "\n")
+
+
 def hashes():
     from rosbags.interfaces import Nodetype
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -235,4 +269,4 @@ IDL_SAMPLES = """geometry_msgs/PoseWithCovariance geometry_msgs/Polygon std_msgs
     lifecycle_msgs/Transition nav_msgs/OccupancyGrid builtin_interfaces/Duration""".split()
 
 
-{"hashes": hashes, "rosbags": rosbags, "cyclone": cyclone, "genpy": genpy, "services": services, "idl": idl}[sys.argv[1]]()
+{"hashes": hashes, "actions": actions, "rosbags": rosbags, "cyclone": cyclone, "genpy": genpy, "services": services, "idl": idl}[sys.argv[1]]()
