@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use bridge_node::{Environment, TypePaths};
 use messages::{
-    DefinitionError, Dialect, MessageType, NameError, PeerDefinitions, ServiceType, TextKind,
-    TypeName,
+    ActionCalls, ActionType, DefinitionError, Dialect, MessageType, NameError, PeerDefinitions,
+    ServiceType, TextKind, TypeName,
 };
 use tcpros::ConnectionHeader;
 use uadp::BuiltinType;
@@ -132,6 +132,19 @@ impl Definitions {
     /// The service of that name, looked for likewise.
     pub(crate) fn service(&mut self, name: &TypeName) -> Result<Arc<ServiceType>, DefinitionError> {
         self.known.find_service(name)
+    }
+
+    /// The action of that name, looked for likewise.
+    pub(crate) fn action(&mut self, name: &TypeName) -> Result<Arc<ActionType>, DefinitionError> {
+        self.known.find_action(name)
+    }
+
+    /// As [`action`](Self::action), as calls and values of the space.
+    pub(crate) fn action_calls(
+        &mut self,
+        name: &TypeName,
+    ) -> Result<Arc<ActionCalls>, DefinitionError> {
+        self.known.find_action_calls(name)
     }
 
     /// Where the definition is from that [`get`](Self::get) has, for people.

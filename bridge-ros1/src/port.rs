@@ -2,6 +2,7 @@
 //!
 //! One task owns everything; [`Ros1Port::recv`](Port::recv) is its only wait.
 
+mod actions;
 mod calls;
 mod found;
 mod reload;
@@ -15,8 +16,8 @@ use std::time::SystemTime;
 
 use bridge_node::policy::{Policy, Step, TYPE_CHANGES, Word, is_bad, type_changes};
 use bridge_node::{
-    Answered, AskId, CallDescription, Calls, Delivery, Described, Executed, Executing, Execution,
-    Kept, Port, PortEvent, Services, TypePaths, timestamp,
+    Actions, Answered, AskId, CallDescription, Calls, Delivery, Described, Executed, Executing,
+    Execution, ExecutionId, Kept, Port, PortEvent, Services, TypePaths, timestamp,
 };
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId, Variable};
@@ -30,6 +31,7 @@ use uadp::{BuiltinType, Timestamp};
 
 use self::calls::Kinds;
 use self::found::Refused;
+use crate::actions::Senders;
 use crate::definitions::Definitions;
 use crate::services::{Executor, Ros1Graph};
 use crate::sink::{Open, Sink};
@@ -73,6 +75,10 @@ pub struct Ros1Port {
     calls: Calls<ServiceServer>,
     /// Services of the graph, executed for other spaces.
     executing: Executing<Executor>,
+    /// Actions of other spaces, and action servers of the graph that are executed for other spaces.
+    actions: Actions,
+    /// The clients of those.
+    senders: Senders,
     /// The types of services with a name of the space.
     kinds: Kinds,
     /// What `recv` hands out next; filled by one message or by one pass over the topics.
@@ -107,9 +113,11 @@ impl Ros1Port {
         let node = Node::start(node)?;
         info!(node = node.name(), uri = node.uri(), master, space = %own, "started the ROS 1 node");
         let mut definitions = Definitions::new(types, packages);
+        let mut senders = Senders::default();
         let mut graph = Ros1Graph {
             node: &node,
             definitions: &mut definitions,
+            senders: &mut senders,
         };
         let (services, bound) = Services::start(&mut graph, own, &mapping);
         let mut port = Self {
@@ -120,6 +128,8 @@ impl Ros1Port {
             services,
             calls: Calls::default(),
             executing: Executing::default(),
+            actions: Actions::default(),
+            senders,
             kinds: Kinds::default(),
             graph: Graph::default(),
             sources: Vec::new(),
@@ -390,7 +400,9 @@ impl Ros1Port {
             }
             self.find_sources();
             self.find_services();
+            self.find_actions();
             self.offer_calls();
+            self.offer_actions();
             self.tell_refused();
         }
         for source in &mut self.sources {
@@ -403,7 +415,9 @@ impl Ros1Port {
                 }));
             }
         }
-        self.calls.tidy(bridge_node::now().monotonic);
+        let now = bridge_node::now().monotonic;
+        self.calls.tidy(now);
+        self.actions.tidy(&self.policy, now);
         let topics: Vec<TopicId> = self.sinks.keys().copied().collect();
         for topic in topics {
             self.reconcile_sink(topic);
@@ -542,6 +556,7 @@ impl Port for Ros1Port {
                 }
                 event = self.calls.recv::<Ros1Graph<'_>>() => return event,
                 events = self.executing.recv() => self.events.extend(events),
+                events = self.actions.recv() => self.events.extend(events),
                 () = self.kinds.recv() => self.find_services(),
                 (index, event) = self.inbox.recv() => self.taken(index, event),
             }
@@ -554,6 +569,9 @@ impl Port for Ros1Port {
         }
         if is_bad(sample.status) {
             return Err("bad status");
+        }
+        if self.actions.takes(sample.topic) {
+            return self.actions.publish(&sample);
         }
         // What was handed out before is for late joiners, and a service is none.
         let again = sample.kept == Kept::Again;
@@ -607,6 +625,11 @@ impl Port for Ros1Port {
         {
             return;
         }
+        if self.actions.takes(topic) {
+            let bound = self.actions.wanted(topic, described, &mut self.policy);
+            self.events.extend(bound);
+            return;
+        }
         if !self.take_in(topic) {
             return;
         }
@@ -658,11 +681,15 @@ impl Port for Ros1Port {
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         self.calls.known(topic, Arc::clone(description));
+        self.actions.known(topic, description);
         self.offer_calls();
+        self.offer_actions();
     }
 
     fn call_gone(&mut self, topic: TopicId) {
-        self.calls.gone(topic, bridge_node::now().monotonic);
+        let now = bridge_node::now().monotonic;
+        self.calls.gone(topic, now);
+        self.actions.gone(topic, now);
     }
 
     fn answered(&mut self, ask: AskId, _: TopicId, answer: Answered<Bytes>) {
@@ -671,13 +698,24 @@ impl Port for Ros1Port {
 
     fn execute(&mut self, execution: Execution) -> bool {
         let id = execution.id;
-        if let Err(refusal) = self.executing.execute(execution) {
+        let executed = if self.actions.serves(execution.topic) {
+            self.actions.execute(execution)
+        } else {
+            self.executing.execute(execution)
+        };
+        if let Err(refusal) = executed {
             let outcome = Executed::Refused(refusal);
             let execution = id;
             let event = PortEvent::Executed { execution, outcome };
             self.events.push_back(event);
         }
         true
+    }
+
+    fn abandoned(&mut self, execution: ExecutionId, topic: TopicId) {
+        if self.actions.serves(topic) {
+            self.actions.abandoned(execution);
+        }
     }
 
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
@@ -703,10 +741,11 @@ impl Port for Ros1Port {
             services,
             calls,
             executing,
+            actions,
             kinds,
             ..
         } = self;
-        drop((watcher, services, calls, executing, kinds));
+        drop((watcher, services, calls, executing, actions, kinds));
         node.shutdown().await;
         drop((sinks, sources));
     }

@@ -41,6 +41,7 @@ impl Ros1Port {
         let mut graph = Ros1Graph {
             node: &self.node,
             definitions: &mut self.definitions,
+            senders: &mut self.senders,
         };
         // Who has which name is known from when the master has answered.
         let has_master = self.has_master;
@@ -79,6 +80,7 @@ impl Ros1Port {
         let mut graph = Ros1Graph {
             node: &self.node,
             definitions: &mut self.definitions,
+            senders: &mut self.senders,
         };
         let executing = &mut self.executing;
         let events = executing.reconcile(&mut graph, &mut self.policy, (&present, usize::MAX));

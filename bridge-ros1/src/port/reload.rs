@@ -29,6 +29,7 @@ impl Ros1Port {
         let mut graph = Ros1Graph {
             node: &self.node,
             definitions: &mut self.definitions,
+            senders: &mut self.senders,
         };
         let services = &mut self.services;
         let events = services.reload(&mut graph, self.policy.own(), (&before, mapping));
@@ -38,10 +39,15 @@ impl Ros1Port {
         let mut graph = Ros1Graph {
             node: &self.node,
             definitions: &mut self.definitions,
+            senders: &mut self.senders,
         };
         let events = self.executing.look_again(&mut graph);
         self.events.extend(events);
+        let events = self.actions.look_again(&mut graph, &mut self.policy);
+        self.events.extend(events);
         self.find_services();
+        self.find_actions();
+        self.offer_actions();
         self.events.extend(self.calls.ask_for_mapped(&self.policy));
         for (ros_topic, wanted) in read {
             self.take_up_values(ros_topic, wanted);

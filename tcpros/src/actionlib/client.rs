@@ -1,7 +1,7 @@
 //! The client: sends goals, and hands each what its server says of it.
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 use thiserror::Error;
@@ -128,8 +128,24 @@ impl ActionClient {
     /// once, see [`LostReason::NoServer`]. To send it to a server that is starting, wait for that first.
     pub fn send_goal(&self, body: &[u8]) -> GoalHandle {
         let goal_id = self.shared.new_id();
+        self.send(lock(&self.shared.state), goal_id, body)
+    }
+
+    /// As [`Self::send_goal`], under an id of the caller's, which no other goal of the action has or had.
+    ///
+    /// # Errors
+    /// [`IdInUse`] while there is a handle of a goal with that id; then nothing is sent.
+    pub fn send_goal_as(&self, id: String, body: &[u8]) -> Result<GoalHandle, IdInUse> {
+        let stamp = self.shared.clock.now();
+        let state = lock(&self.shared.state);
+        if state.goals.goal(&id).is_some() {
+            return Err(IdInUse { id });
+        }
+        Ok(self.send(state, GoalId { stamp, id }, body))
+    }
+
+    fn send(&self, mut state: MutexGuard<'_, State>, goal_id: GoalId, body: &[u8]) -> GoalHandle {
         let wake = Arc::new(Notify::new());
-        let mut state = lock(&self.shared.state);
         let id = goal_id.id.clone();
         state
             .goals
@@ -150,6 +166,38 @@ impl ActionClient {
             goal_id,
             wake,
         }
+    }
+
+    /// Asks the server to cancel one goal, as [`GoalHandle::cancel`] does.
+    pub fn cancel_goal(&self, id: &str) -> CancelSent {
+        let mut state = lock(&self.shared.state);
+        let Some(goal) = state.goals.goal(id) else {
+            return CancelSent::NotFollowed;
+        };
+        match goal.state {
+            CommState::WaitingForResult | CommState::Done | CommState::Lost => CancelSent::Ended,
+            CommState::Recalling | CommState::Preempting => CancelSent::Asked,
+            CommState::WaitingForGoalAck
+            | CommState::Pending
+            | CommState::Active
+            | CommState::WaitingForCancelAck => {
+                let _wanted = state.goals.cancel(id);
+                drop(state);
+                let request = GoalId {
+                    stamp: RosTime::default(),
+                    id: id.to_owned(),
+                };
+                match self.shared.send_cancel(&request) {
+                    0 => CancelSent::NoServer,
+                    _ => CancelSent::Asked,
+                }
+            }
+        }
+    }
+
+    /// The ids of the goals that there are handles of and that have not ended.
+    pub fn open_goals(&self) -> Vec<String> {
+        lock(&self.shared.state).goals.open()
     }
 
     /// Asks the server to cancel all goals of the action, those of other clients too. Returns how many nodes were
@@ -233,6 +281,26 @@ impl Drop for ActionClient {
         drop(state);
         drop(outputs);
     }
+}
+
+/// What became of a request to cancel one goal.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum CancelSent {
+    /// The server is asked, or knows already. The goal says what comes of it.
+    Asked,
+    /// The goal has ended.
+    Ended,
+    /// Nobody takes requests to cancel.
+    NoServer,
+    /// There is no handle of a goal with that id.
+    NotFollowed,
+}
+
+/// A goal with that id is followed already.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+#[error("there is a goal `{id}` already")]
+pub struct IdInUse {
+    id: String,
 }
 
 /// No server is ready to take goals.

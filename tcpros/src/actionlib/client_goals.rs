@@ -221,6 +221,12 @@ impl ClientGoals {
         self.goals.get(id)
     }
 
+    /// The ids of those that have not ended.
+    pub(super) fn open(&self) -> Vec<String> {
+        let open = self.goals.iter().filter(|(_, goal)| !goal.state.is_end());
+        open.map(|(id, _)| id.clone()).collect()
+    }
+
     pub(super) fn next_event(&mut self, id: &str) -> Option<GoalEvent> {
         self.goals.get_mut(id)?.next_event()
     }

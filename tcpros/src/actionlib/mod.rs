@@ -27,7 +27,7 @@ mod simple;
 mod types;
 mod wire;
 
-pub use client::{ActionClient, ActionClientOptions, GoalHandle, NoServer};
+pub use client::{ActionClient, ActionClientOptions, CancelSent, GoalHandle, IdInUse, NoServer};
 pub use client_goals::{ClientCounters, CommState, Feedback, GoalEvent, GoalResult, LostReason};
 pub use server::{ActionServer, ActionServerOptions, ServerEvent, ServerGoal};
 pub use server_goals::{GoalError, ServerCounters};

@@ -1,0 +1,563 @@
+//! Actions of the ROS 1 graph (actionlib): goals of other spaces sent to their servers, and servers for actions of other
+//! spaces.
+//!
+//! actionlib tells goals by a text, the space by 16 bytes: a goal of the space has the hex digits of its bytes as its text, and
+//! a goal of the graph with any other text the MD5 of that. actionlib has no answer to a goal: a goal counts as accepted once
+//! its server lists it as at work.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Weak};
+use std::time::Duration;
+
+use bridge_node::actions::{
+    ActionClient, ActionGraph, ActionServer, CancelAnswer, CancelRequest, CancelWhat, GoalEvent,
+    GoalId, NewGoal, SentGoal, ServedGoal, ServerEvent, Waits,
+};
+use bridge_node::{CallFault, Ran};
+use bytes::Bytes;
+use md5::{Digest, Md5};
+use messages::{
+    ActionCalls, ActionType, DefinitionError, MessageType, NoFields, Plan, Selection, TextKind,
+    TypeName, Wire,
+};
+use tcpros::TopicType;
+use tcpros::actionlib::{
+    ActionClientOptions, ActionServerOptions, CancelSent, CommState, GoalHandle, GoalResult,
+    LostReason, ServerGoal, Status,
+};
+use tokio::time::{Instant, timeout_at};
+use tracing::warn;
+
+use crate::definitions::Definitions;
+use crate::services::Ros1Graph;
+
+/// The clients of actions that are in use, by the names of the actions: a node has one of each.
+#[derive(Debug, Default)]
+pub(crate) struct Senders {
+    clients: BTreeMap<String, Known>,
+}
+
+#[derive(Debug)]
+struct Known {
+    md5: String,
+    client: Weak<tcpros::actionlib::ActionClient>,
+}
+
+impl ActionGraph for Ros1Graph<'_> {
+    type Sender = Sender;
+    type Taker = Taker;
+
+    fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, String> {
+        let calls = self.definitions.action_calls(name);
+        calls.map_err(|error| unknown(self.definitions, name, &error))
+    }
+
+    fn action_client(
+        &mut self,
+        action: &str,
+        type_name: &TypeName,
+        waits: Waits,
+    ) -> Result<Sender, String> {
+        let found = self.definitions.action(type_name);
+        let action_type = found.map_err(|error| unknown(self.definitions, type_name, &error))?;
+        let clients = &mut self.senders.clients;
+        clients.retain(|_, known| known.client.strong_count() > 0);
+        let md5 = action_type.action().md5();
+        if let Some(known) = clients.get(action)
+            && known.md5 == md5
+            && let Some(client) = known.client.upgrade()
+        {
+            return Ok(Sender { client, waits });
+        }
+        let options = ActionClientOptions {
+            acknowledge_timeout: waits.answer,
+            silence_timeout: waits.silence,
+            reconnect_timeout: waits.silence.min(RECONNECT),
+            ..ActionClientOptions::default()
+        };
+        let types = types(&action_type);
+        let client = tcpros::actionlib::ActionClient::new(self.node, action, types, options);
+        let client = Arc::new(client.map_err(|error| error.to_string())?);
+        let known = Known {
+            md5: md5.to_owned(),
+            client: Arc::downgrade(&client),
+        };
+        clients.insert(action.to_owned(), known);
+        Ok(Sender { client, waits })
+    }
+
+    fn serve_action(&mut self, action: &str, type_name: &TypeName) -> Result<Taker, String> {
+        let found = self.definitions.action(type_name);
+        let action_type = found.map_err(|error| unknown(self.definitions, type_name, &error))?;
+        let empty_result = empty(action_type.result())?;
+        let options = ActionServerOptions::new(empty_result.clone());
+        let types = types(&action_type);
+        let server = tcpros::actionlib::ActionServer::new(self.node, action, types, options);
+        let server = server.map_err(|error| error.to_string())?;
+        Ok(Taker {
+            server,
+            empty_result,
+        })
+    }
+}
+
+fn unknown(definitions: &mut Definitions, name: &TypeName, error: &DefinitionError) -> String {
+    let error = definitions.explain(TextKind::Action, error);
+    format!(
+        "{error}; the connections of an action do not bring the definition of its goal, so a folder below \
+         ROS_PACKAGE_PATH must have {}/action/{}.action",
+        name.package(),
+        name.name()
+    )
+}
+
+/// The types of the topics of an action.
+fn types(action: &ActionType) -> tcpros::actionlib::ActionType {
+    let of = |message_type: &MessageType| TopicType {
+        name: message_type.name().to_string(),
+        md5sum: message_type.md5().to_owned(),
+        definition: message_type.definition().to_owned(),
+    };
+    tcpros::actionlib::ActionType {
+        goal: of(action.action_goal()),
+        result: of(action.action_result()),
+        feedback: of(action.action_feedback()),
+    }
+}
+
+/// A message of that type with nothing in it.
+fn empty(message_type: &Arc<MessageType>) -> Result<Bytes, String> {
+    let nothing = Selection::Template {
+        fields: Vec::new(),
+        rest: BTreeMap::new(),
+    };
+    let plan = Plan::compile(message_type, &nothing, Wire::Ros1);
+    let plan = plan.map_err(|error| error.to_string())?;
+    let mut bytes = Vec::new();
+    let written = plan.write(&mut NoFields, &mut bytes);
+    written.map_err(|error| error.to_string())?;
+    Ok(bytes.into())
+}
+
+/// How actionlib spells the id of a goal of the space.
+fn spelled(id: GoalId) -> String {
+    use std::fmt::Write as _;
+    id.iter().fold(String::with_capacity(32), |mut text, byte| {
+        // To a String it does not fail.
+        let _written = write!(text, "{byte:02x}");
+        text
+    })
+}
+
+/// The 16 bytes for the id of a goal of the graph.
+fn read(id: &str) -> GoalId {
+    let is_ours = id.len() == 32
+        && id
+            .bytes()
+            .all(|b| b.is_ascii_digit() || (b'a'..=b'f').contains(&b));
+    match u128::from_str_radix(id, 16) {
+        Ok(number) if is_ours => number.to_be_bytes(),
+        Ok(_) | Err(_) => Md5::digest(id).into(),
+    }
+}
+
+/// Sends goals to one action server.
+#[derive(Debug)]
+pub(crate) struct Sender {
+    client: Arc<tcpros::actionlib::ActionClient>,
+    waits: Waits,
+}
+
+impl ActionClient for Sender {
+    type Goal = Sent;
+
+    fn send_goal(&self, id: GoalId, body: &[u8]) -> Sent {
+        let mut goal = Sent {
+            client: Arc::clone(&self.client),
+            patience: PENDING.min(self.waits.answer / 2),
+            stage: Stage::Waiting {
+                id: spelled(id),
+                body: Bytes::copy_from_slice(body),
+                until: after(self.waits.answer),
+            },
+            accepted: false,
+            undecided: None,
+            events: VecDeque::new(),
+        };
+        if self.client.server().is_ok() {
+            goal.send();
+        }
+        goal
+    }
+
+    async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, CallFault> {
+        let unheard = || CallFault {
+            text: format!(
+                "nobody takes requests to cancel goals of {}",
+                self.client.name()
+            ),
+            may_pass: true,
+            ran: Ran::No,
+        };
+        let (code, goals) = match what {
+            CancelWhat::All => {
+                let open = self.client.open_goals();
+                if self.client.cancel_all() == 0 {
+                    return Err(unheard());
+                }
+                (0, open.iter().map(|id| read(id)).collect())
+            }
+            CancelWhat::Goal(id) => match self.client.cancel_goal(&spelled(id)) {
+                CancelSent::Asked => (0, vec![id]),
+                CancelSent::NotFollowed => (2, Vec::new()),
+                CancelSent::Ended => (3, Vec::new()),
+                CancelSent::NoServer => return Err(unheard()),
+            },
+        };
+        Ok(CancelAnswer { code, goals })
+    }
+}
+
+/// A goal on its way to a server, or there.
+#[derive(Debug)]
+pub(crate) struct Sent {
+    client: Arc<tcpros::actionlib::ActionClient>,
+    /// How long its server may leave it undecided.
+    patience: Duration,
+    stage: Stage,
+    accepted: bool,
+    /// Until when it may be undecided, where its server has it.
+    undecided: Option<Instant>,
+    events: VecDeque<GoalEvent>,
+}
+
+#[derive(Debug)]
+enum Stage {
+    /// For its server, which connects to new clients within moments.
+    Waiting {
+        id: String,
+        body: Bytes,
+        until: Instant,
+    },
+    Sent(GoalHandle),
+    Ended,
+}
+
+impl SentGoal for Sent {
+    async fn recv(&mut self) -> Option<GoalEvent> {
+        loop {
+            if let Some(event) = self.events.pop_front() {
+                return Some(event);
+            }
+            match &mut self.stage {
+                Stage::Waiting { until, .. } => {
+                    let left = until.saturating_duration_since(after(Duration::ZERO));
+                    match self.client.wait_for_server(left).await {
+                        Ok(_) => self.send(),
+                        Err(error) => self.lose(error.to_string(), Ran::No),
+                    }
+                }
+                Stage::Sent(handle) => {
+                    let undecided = self.undecided.filter(|_| !self.accepted);
+                    let heard = match undecided {
+                        Some(until) => timeout_at(until, handle.recv()).await,
+                        None => Ok(handle.recv().await),
+                    };
+                    match heard {
+                        Ok(Some(event)) => self.heard(event),
+                        Ok(None) => self.stage = Stage::Ended,
+                        Err(_) => self.accept(),
+                    }
+                }
+                Stage::Ended => return None,
+            }
+        }
+    }
+}
+
+impl Sent {
+    fn send(&mut self) {
+        let Stage::Waiting { id, body, .. } = std::mem::replace(&mut self.stage, Stage::Ended)
+        else {
+            return;
+        };
+        match self.client.send_goal_as(id, &body) {
+            Ok(handle) => self.stage = Stage::Sent(handle),
+            Err(error) => self
+                .events
+                .push_back(GoalEvent::Rejected(error.to_string())),
+        }
+    }
+
+    fn lose(&mut self, text: String, ran: Ran) {
+        self.stage = Stage::Ended;
+        self.events.push_back(GoalEvent::Lost { text, ran });
+    }
+
+    fn accept(&mut self) {
+        if !self.accepted {
+            self.accepted = true;
+            let now = bridge_node::now().utc;
+            self.events.push_back(GoalEvent::Accepted(now));
+        }
+    }
+
+    fn heard(&mut self, event: tcpros::actionlib::GoalEvent) {
+        use tcpros::actionlib::GoalEvent as Heard;
+        match event {
+            Heard::State(state) => self.went(state),
+            Heard::Feedback(feedback) => {
+                // Another connection than that of the status, which may be later.
+                self.accept();
+                self.events.push_back(GoalEvent::Feedback(feedback.body));
+            }
+            Heard::FeedbackDropped(count) => {
+                warn!(
+                    action = self.client.name(),
+                    count, "feedback came faster than it was taken: the oldest is dropped"
+                );
+            }
+            Heard::Done(result) => self.done(result),
+            Heard::Lost(reason) => {
+                let ran = match reason {
+                    LostReason::NoServer { .. } => Ran::No,
+                    _ => Ran::Perhaps,
+                };
+                self.lose(reason.to_string(), ran);
+            }
+        }
+    }
+
+    fn went(&mut self, state: CommState) {
+        match state {
+            // A SimpleActionServer at work has the next goal wait until it has stopped.
+            CommState::Pending => self.undecided = Some(after(self.patience)),
+            CommState::Active => {
+                self.accept();
+                self.events.push_back(GoalEvent::Status(EXECUTING));
+            }
+            CommState::Preempting => {
+                self.accept();
+                self.events.push_back(GoalEvent::Status(CANCELING));
+            }
+            CommState::Recalling if self.accepted => {
+                self.events.push_back(GoalEvent::Status(CANCELING));
+            }
+            CommState::WaitingForGoalAck
+            | CommState::WaitingForCancelAck
+            | CommState::Recalling
+            | CommState::WaitingForResult
+            | CommState::Done
+            | CommState::Lost => {}
+        }
+    }
+
+    fn done(&mut self, ended: GoalResult) {
+        let said = |otherwise: &str| match ended.text.as_str() {
+            "" => otherwise.to_owned(),
+            text => text.to_owned(),
+        };
+        let status = match ended.status {
+            Status::Succeeded => SUCCEEDED,
+            Status::Preempted => CANCELED,
+            Status::Recalled if self.accepted => CANCELED,
+            Status::Aborted => ABORTED,
+            Status::Rejected if self.accepted => ABORTED,
+            Status::Recalled | Status::Rejected => {
+                let why = match ended.status {
+                    Status::Recalled => "the goal was cancelled before its server worked on it",
+                    _ => "the action server rejected the goal",
+                };
+                self.events.push_back(GoalEvent::Rejected(said(why)));
+                return;
+            }
+            Status::Pending
+            | Status::Active
+            | Status::Preempting
+            | Status::Recalling
+            | Status::Lost => {
+                let text = format!(
+                    "the server of {} sent a result of a goal that has not ended",
+                    self.client.name()
+                );
+                self.lose(text, Ran::Perhaps);
+                return;
+            }
+        };
+        self.accept();
+        self.events.push_back(GoalEvent::Ended {
+            status,
+            message: ended.text,
+            result: ended.body,
+        });
+    }
+}
+
+fn after(wait: Duration) -> Instant {
+    let now = Instant::from_std(bridge_node::now().monotonic);
+    now.checked_add(wait).unwrap_or(now)
+}
+
+/// Serves one action for another space.
+#[derive(Debug)]
+pub(crate) struct Taker {
+    server: tcpros::actionlib::ActionServer,
+    empty_result: Bytes,
+}
+
+impl ActionServer for Taker {
+    type New = New;
+    type Cancel = Cancel;
+
+    async fn recv(&mut self) -> ServerEvent<New, Cancel> {
+        match self.server.recv().await {
+            tcpros::actionlib::ServerEvent::Goal(goal) => ServerEvent::Goal(New {
+                goal: Some(goal),
+                empty_result: self.empty_result.clone(),
+            }),
+            tcpros::actionlib::ServerEvent::Cancel(id) => ServerEvent::Cancel(Cancel(read(&id.id))),
+        }
+    }
+}
+
+/// A goal of the graph that was not decided about.
+#[derive(Debug)]
+pub(crate) struct New {
+    /// `None` once it is.
+    goal: Option<ServerGoal>,
+    empty_result: Bytes,
+}
+
+impl NewGoal for New {
+    type Goal = Served;
+
+    fn id(&self) -> GoalId {
+        let goal = self.goal.as_ref();
+        goal.map(|goal| read(&goal.goal_id().id))
+            .unwrap_or_default()
+    }
+
+    fn body(&self) -> &Bytes {
+        static NOTHING: Bytes = Bytes::new();
+        self.goal.as_ref().map_or(&NOTHING, ServerGoal::body)
+    }
+
+    async fn accept(mut self) -> Result<Served, String> {
+        let goal = self.goal.take().ok_or("it was decided about already")?;
+        goal.accept("").map_err(|error| error.to_string())?;
+        Ok(Served {
+            goal,
+            empty_result: std::mem::take(&mut self.empty_result),
+        })
+    }
+
+    fn reject(mut self, why: &str) {
+        if let Some(goal) = self.goal.take() {
+            reject(&goal, why);
+        }
+    }
+}
+
+impl Drop for New {
+    fn drop(&mut self) {
+        if let Some(goal) = self.goal.take() {
+            reject(&goal, "nobody decided about the goal");
+        }
+    }
+}
+
+fn reject(goal: &ServerGoal, why: &str) {
+    // One that was recalled meanwhile has ended.
+    if let Err(error) = goal.reject(why) {
+        tracing::debug!("a goal is not rejected: {error}");
+    }
+}
+
+/// A goal whose client wants it cancelled. In actionlib there is no answer to that: the goal ends as it does.
+#[derive(Debug)]
+pub(crate) struct Cancel(GoalId);
+
+impl CancelRequest for Cancel {
+    fn id(&self) -> GoalId {
+        self.0
+    }
+
+    fn accept(self) -> Result<(), String> {
+        Ok(())
+    }
+
+    fn reject(self) {}
+}
+
+/// A goal of the graph that another space works on.
+#[derive(Debug)]
+pub(crate) struct Served {
+    goal: ServerGoal,
+    empty_result: Bytes,
+}
+
+impl ServedGoal for Served {
+    // It is at work since it was accepted.
+    fn execute(&self) {}
+
+    fn feedback(&self, body: &[u8]) -> Result<(), String> {
+        let told = self.goal.feedback(body);
+        told.map_err(|error| error.to_string())
+    }
+
+    fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), String> {
+        let ended = match status {
+            SUCCEEDED => self
+                .goal
+                .succeed(result.unwrap_or(&self.empty_result), message),
+            CANCELED => self.goal.cancelled(result, message),
+            _ => self.goal.abort(result, message),
+        };
+        ended.map_err(|error| error.to_string())
+    }
+}
+
+// The statuses of `action_msgs/GoalStatus`.
+const EXECUTING: i8 = 2;
+const CANCELING: i8 = 3;
+const SUCCEEDED: i8 = 4;
+const CANCELED: i8 = 5;
+const ABORTED: i8 = 6;
+
+/// How long a server may list a goal without deciding about it, until it counts as accepted.
+const PENDING: Duration = Duration::from_secs(1);
+/// From the end of the connection to a server until its goals are lost.
+const RECONNECT: Duration = Duration::from_secs(1);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_id_of_the_space_comes_back_from_its_text_and_others_have_one_of_their_own() {
+        let id: GoalId = *b"\x00\x01goal of a plant"[..16].first_chunk().unwrap();
+        assert_eq!(spelled(id).len(), 32);
+        assert_eq!(read(&spelled(id)), id);
+        let texts = [
+            "",
+            "/client-1-12.3",
+            "/client-2-12.3",
+            "0123456789ABCDEF0123456789abcdef",
+            "+123456789abcdef0123456789abcdef",
+        ];
+        let read: std::collections::BTreeSet<GoalId> = texts.iter().map(|id| read(id)).collect();
+        assert_eq!(read.len(), texts.len());
+    }
+
+    #[test]
+    fn a_result_with_nothing_in_it_has_the_length_of_its_type() {
+        let registry = messages::Registry::bundle(messages::Dialect::Ros1);
+        let of = |name: &str| {
+            let action = registry.action(&name.parse().unwrap()).unwrap();
+            empty(action.result()).unwrap().to_vec()
+        };
+        assert_eq!(of("actionlib/TwoInts"), [0; 8]);
+        assert_eq!(of("actionlib_tutorials/Fibonacci"), [0; 4]);
+        assert!(of("move_base_msgs/MoveBase").is_empty());
+    }
+}
