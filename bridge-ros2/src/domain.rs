@@ -31,7 +31,7 @@ use crate::qos::{Offered, Requested};
 use crate::raw::{Opaque, Payload, RawReader, RawWriter, Reader, Writer};
 use crate::rosout;
 use crate::security::{Enclave, SecurityError};
-use crate::service::offered;
+use crate::service::{changes_of, offered};
 
 /// Which domain to join and how.
 #[derive(Debug, Clone)]
@@ -288,11 +288,7 @@ impl Domain {
     /// Another number than before means that [`graph`](Self::graph) may be another. RustDDS as published does not say it.
     #[must_use]
     pub fn changes(&self) -> Option<u64> {
-        #[cfg(feature = "patched-dds")]
-        let changes = Some(self.participant.discovered_changes());
-        #[cfg(not(feature = "patched-dds"))]
-        let changes = None;
-        changes
+        changes_of(&self.participant)
     }
 
     /// The services others offer, by their names, with the types they have, as `std_srvs/SetBool`; a name that is none of

@@ -21,7 +21,14 @@ pub struct ServicePeers(Arc<Shared>);
 
 struct Shared {
     participant: DomainParticipant,
-    seen: Mutex<Option<(Instant, Arc<Snapshot>)>>,
+    seen: Mutex<Option<Seen>>,
+}
+
+struct Seen {
+    at: Instant,
+    /// What discovery had counted by then; see [`changes_of`].
+    changes: Option<u64>,
+    snapshot: Arc<Snapshot>,
 }
 
 /// The endpoints at one moment, by DDS topic.
@@ -41,16 +48,31 @@ impl ServicePeers {
         }))
     }
 
-    /// What is known, no older than `age`.
+    /// What is known, no older than `age`. Discovery is not copied again while it says that nothing changed: with
+    /// thousands of endpoints a copy costs more than all else a bridge does when nothing happens.
     pub(crate) fn look(&self, now: Instant, age: Duration) -> Arc<Snapshot> {
         let mut seen = self.0.seen.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((at, snapshot)) = seen.as_ref()
-            && now.saturating_duration_since(*at) < age
+        let fresh = seen
+            .as_ref()
+            .filter(|seen| now.saturating_duration_since(seen.at) < age);
+        if let Some(fresh) = fresh {
+            return Arc::clone(&fresh.snapshot);
+        }
+        // Counted before the copy: a change in between is copied again.
+        let changes = changes_of(&self.0.participant);
+        if let Some(seen) = seen.as_mut()
+            && changes.is_some()
+            && seen.changes == changes
         {
-            return Arc::clone(snapshot);
+            seen.at = now;
+            return Arc::clone(&seen.snapshot);
         }
         let snapshot = Arc::new(Snapshot::of(&self.0.participant));
-        *seen = Some((now, Arc::clone(&snapshot)));
+        *seen = Some(Seen {
+            at: now,
+            changes,
+            snapshot: Arc::clone(&snapshot),
+        });
         snapshot
     }
 
@@ -69,6 +91,17 @@ impl std::fmt::Debug for ServicePeers {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("ServicePeers").finish_non_exhaustive()
     }
+}
+
+/// Another number than before means that what is discovered may be another. RustDDS as published does not say it.
+#[cfg(feature = "patched-dds")]
+pub(crate) fn changes_of(participant: &DomainParticipant) -> Option<u64> {
+    Some(participant.discovered_changes())
+}
+
+#[cfg(not(feature = "patched-dds"))]
+pub(crate) fn changes_of(_participant: &DomainParticipant) -> Option<u64> {
+    None
 }
 
 /// The vendor of a participant with that endpoint, as it says itself. GUIDs start with the same number (RTPS 2.5, 8.2.4.1)
