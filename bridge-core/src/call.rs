@@ -207,6 +207,19 @@ pub struct ValueDescription {
     pub overflow: Overflow,
 }
 
+/// What is said of a value that is [bound by name](crate::Router::bind_as), where no mapping says it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ValueNote {
+    /// Its name for people, as `Nav.Drive.Feedback`; may be empty.
+    pub name: String,
+    /// What it is, for people; may be empty.
+    pub about: String,
+    /// What its queue does when full: a state has one place and is repeated, events have several and are not.
+    pub overflow: Overflow,
+    /// Of a value of another space: what is not made of the field of the same name.
+    pub map: FieldMap,
+}
+
 /// What became of the requests of one call.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct CallCounters {

@@ -76,7 +76,7 @@ impl CallPlan {
 }
 
 /// The fields at those places, in that order.
-fn arrange(fields: &[u8], order: &[Origin]) -> Result<Vec<u8>, (Cause, String)> {
+pub(crate) fn arrange(fields: &[u8], order: &[Origin]) -> Result<Vec<u8>, (Cause, String)> {
     let fields = Fields::parse(fields).map_err(fields::undecodable)?;
     let all: Vec<Variant<'_>> = fields
         .collect::<Result<_, _>>()

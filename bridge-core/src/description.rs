@@ -324,10 +324,10 @@ impl Source<'_> {
 
     /// The message that the values make, if they make one.
     fn made(&self) -> Option<&TypeName> {
-        if let Some(said) = self.said {
-            return said.message_type.as_ref();
-        }
         let Some((message_type, selection)) = self.message else {
+            if let Some(said) = self.said {
+                return said.message_type.as_ref();
+            }
             return self.variable.and_then(whole_message);
         };
         match selection {

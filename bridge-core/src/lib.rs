@@ -40,7 +40,7 @@ mod writer;
 pub use call::{
     ActionFamily, Answered, AskError, AskErrorKind, AskId, CallCounters, CallDescription,
     CallField, CallMap, CallRole, Executed, Execution, Offered, OfferedType, ValueDescription,
-    split_name,
+    ValueNote, split_name,
 };
 pub use counters::{Counters, Reason, Verdict};
 pub use description::Described;

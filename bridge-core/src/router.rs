@@ -2,6 +2,7 @@
 
 mod announce;
 mod batch;
+mod by_name;
 mod calls;
 mod chunks;
 mod content;
@@ -38,6 +39,7 @@ use crate::settings::{Local, Now, Settings};
 use crate::topic::{Item, Role, Topic};
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Idle, MAX_KEPT, Message};
+pub(crate) use by_name::ByName;
 use calls::Calls;
 use chunks::Chunks;
 use discovery::Discovery;

@@ -13,6 +13,7 @@ use crate::gate::Gate;
 use crate::output::Delivery;
 use crate::queue::Queue;
 use crate::reader::Reader;
+use crate::router::ByName;
 use crate::takes::Takes;
 use crate::transcoder::Transcoder;
 use crate::writer::{Encoded, Message, Writer};
@@ -28,6 +29,8 @@ pub(crate) struct Topic {
     pub(crate) bound: Option<(Arc<MessageType>, Selection)>,
     /// For bytes of the other ROS, what makes them ours, or why nothing does.
     pub(crate) transcoder: Option<Box<Result<Transcoder, String>>>,
+    /// What makes the message of the fields by their names, where no mapping names the value.
+    pub(crate) by_name: Option<Box<ByName>>,
     pub(crate) queue: Queue<Item>,
     /// A large message of which chunks are still to be sent, before anything of the queue.
     pub(crate) sending: Option<Sending>,
@@ -91,6 +94,7 @@ impl Topic {
             plan: None,
             bound: None,
             transcoder: None,
+            by_name: None,
             queue: Queue::new(overflow),
             sending: None,
             overflow,

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::Instant;
 
-use bridge_core::{CallDescription, Described, ExecutionId, Refusal};
+use bridge_core::{CallDescription, ExecutionId, Refusal};
 use mappings::{Mapping, TopicId};
 
 pub use self::graph::{
@@ -108,7 +108,7 @@ impl Actions {
 
     /// Withdraws the servers of the actions that are left to others, by their names here, and has them wait.
     pub fn leave(&mut self, to_others: impl Fn(TopicId, &str) -> bool) {
-        let _ = to_others;
+        let _unused = to_others;
     }
 
     /// Offers actions that wait and `may` be offered under their names here, at most so many. `asker` makes what asks a call
@@ -134,17 +134,6 @@ impl Actions {
     pub fn takes(&self, topic: TopicId) -> bool {
         let _unused = topic;
         false
-    }
-
-    /// What the value of a topic that it [takes](Self::takes) is bound to, where its writer says what it is.
-    pub fn wanted(
-        &mut self,
-        topic: TopicId,
-        described: Option<&Described>,
-        policy: &mut Policy,
-    ) -> Option<PortEvent> {
-        let _unused = (topic, described, policy);
-        None
     }
 
     /// Takes a value of a topic that it [takes](Self::takes).

@@ -29,7 +29,7 @@ pub use arguments::{Arguments, Flags, WithoutMapping};
 pub use bridge_core::{
     ActionFamily, Answered, AskError, AskErrorKind, AskId, CallDescription, CallField, CallMap,
     CallRole, Described, Executed, ExecutionId, Kept, Offered, OfferedType, Owned, PublisherKey,
-    Reason, Refusal, Room, ValueDescription,
+    Reason, Refusal, Room, ValueDescription, ValueNote,
 };
 pub use busy_poll::BusyPoll;
 pub use calls::{Asker, CallGraph, Calls};

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use bridge_core::{
     Answered, AskId, CallDescription, CallMap, Described, Executed, ExecutionId, Kept, Offered,
-    OfferedType, PublisherKey, Reason, ValueDescription,
+    OfferedType, PublisherKey, Reason, ValueDescription, ValueNote,
 };
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
@@ -138,6 +138,15 @@ pub enum PortEvent {
         message_type: Arc<MessageType>,
         /// The part of the message that is the value.
         selection: Selection,
+    },
+    /// As `Bound`, for a value that no mapping names and that is bound by the names of its fields.
+    BoundAs {
+        /// Which value.
+        topic: TopicId,
+        /// Its message type in the port's dialect.
+        message_type: Arc<MessageType>,
+        /// What is said of it, and how it queues.
+        note: ValueNote,
     },
     /// The local side no longer has a topic, or will bind it to something else: the mapping has changed.
     Unbound {

@@ -337,6 +337,7 @@ impl<P: Port> Shell<P> {
             PortEvent::Unmatched { topic } => self.router.unmatched(topic),
             PortEvent::CallFailed { topic, detail } => self.router.call_failed(topic, &detail),
             event @ (PortEvent::Described { .. }
+            | PortEvent::BoundAs { .. }
             | PortEvent::CallBound { .. }
             | PortEvent::CallUnbound { .. }
             | PortEvent::CallWanted { .. }

@@ -17,6 +17,7 @@ pub struct ActionCalls {
     goal: Arc<ServiceType>,
     cancel: Arc<ServiceType>,
     result: Arc<ServiceType>,
+    outcome: Arc<ServiceType>,
     feedback: Arc<MessageType>,
     status: Arc<MessageType>,
 }
@@ -50,7 +51,9 @@ impl ActionCalls {
             format!("{ID}{x}Goal goal\n---\nbool accepted\n{ID}{time} stamp\nstring message\n");
         let cancel = format!("{ID}{time} stamp\n---\nint8 return_code\nuint8[] goal_ids\n");
         let result = format!("{ID}---\nint8 status\nstring message\n{x}Result result\n");
+        let outcome = format!("{ID}---\nint8 status\n{x}Result result\n");
         Ok(Self {
+            outcome: service(&derived(name, "_OutcomeCall")?, &outcome)?,
             goal: service(name, &goal)?,
             cancel: service(&derived(name, "_CancelCall")?, &cancel)?,
             result: service(&derived(name, "_ResultCall")?, &result)?,
@@ -77,6 +80,12 @@ impl ActionCalls {
     #[must_use]
     pub const fn result(&self) -> &Arc<ServiceType> {
         &self.result
+    }
+
+    /// As [`result`](Self::result) without the `message`: in ROS 2 the response is on the wire as `X_GetResult_Response` is.
+    #[must_use]
+    pub const fn outcome(&self) -> &Arc<ServiceType> {
+        &self.outcome
     }
 
     /// The value with the progress of a goal: `goal_id` and `feedback`.

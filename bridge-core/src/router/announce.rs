@@ -33,7 +33,7 @@ impl Router {
         else {
             return;
         };
-        let said = said.as_deref().filter(|_| message.is_none());
+        let said = said.as_deref();
         let variable = self.mapping.variable(topic).filter(|_| said.is_none());
         let mapped = match (message, variable) {
             (None, Some(variable)) => mapped_leaves(variable),

@@ -41,7 +41,7 @@ pub(super) struct Discovery {
     pub(super) met: HashSet<(SpaceId, u16)>,
     /// Publishers that are asked.
     probing: BTreeMap<SpaceId, Probing>,
-    learned: Learned<Described>,
+    pub(super) learned: Learned<Described>,
     /// What the fields are, as announced, for messages that do not say it.
     layouts: Learned<Layout>,
     /// When there is something to do: looked up at every turn, and computed when something changes.
@@ -370,7 +370,7 @@ impl Router {
                 let counters = self.topics.get_mut(&topic);
                 let counters = counters.map_or(&mut self.others, |entry| &mut entry.counters);
                 counters.described += 1;
-                if shape.is_some() {
+                if !self.arrange(topic, now) && shape.is_some() {
                     self.tell_unbound(topic);
                 }
             }
@@ -517,6 +517,9 @@ impl Router {
         shape: Vec<(uadp::BuiltinType, bool)>,
         now: Now,
     ) -> Option<Output> {
+        if self.arrange(topic, now) {
+            return None;
+        }
         let learned = self.discovery.as_ref().map(|discovery| &discovery.learned);
         let described = learned.and_then(|learned| learned.get(topic, now.monotonic));
         let described = described.cloned();

@@ -370,7 +370,10 @@ impl Router {
         }
         let mut payload = self.buffer();
         let Some(Topic {
-            plan, transcoder, ..
+            plan,
+            transcoder,
+            by_name,
+            ..
         }) = self.topics.get_mut(&topic)
         else {
             return;
@@ -382,7 +385,10 @@ impl Router {
                 transcoder.run(sample.fields.clone(), scratch, &mut payload)
             }
             (Some(_), Some(Err(why))) => Err((Reason::Mismatch.into(), why.clone())),
-            (Some(plan), None) => fields::write(plan, sample.fields.clone(), &mut payload),
+            (Some(plan), None) => match by_name {
+                Some(by_name) => by_name.write(plan, sample.fields.bytes(), &mut payload),
+                None => fields::write(plan, sample.fields.clone(), &mut payload),
+            },
             (None, _) => fields::copy(&sample.fields, &mut payload),
         };
         if let Some(scratch) = scratch {

@@ -81,6 +81,7 @@ impl Router {
         entry.plan = None;
         entry.bound = None;
         entry.transcoder = None;
+        entry.by_name = None;
         match &mut entry.role {
             Role::Ours(writer) => {
                 writer.keep_nothing();

@@ -23,6 +23,16 @@ impl<P: Port> Shell<P> {
             PortEvent::Described { topic, description } => {
                 self.router.describe_value(topic, description, now());
             }
+            PortEvent::BoundAs {
+                topic,
+                message_type,
+                note,
+            } => {
+                let bound = self.router.bind_as(topic, (&message_type, note), now());
+                if let Err(error) = bound {
+                    warn!(%topic, %error, "the value of the action cannot cross");
+                }
+            }
             PortEvent::CallBound {
                 topic,
                 service_type,

@@ -1,0 +1,148 @@
+//! Values that no mapping names, bound by the names of their fields.
+
+use std::sync::Arc;
+
+use mappings::{FieldMap, TopicId};
+use messages::{MessageType, Plan, PlanError, Selection};
+use uadp::Fields;
+
+use super::{About, Router};
+use crate::call::{CallDescription, CallField, CallRole, Origin, ValueDescription, ValueNote};
+use crate::call_plan;
+use crate::counters::{Cause, Reason};
+use crate::description::Described;
+use crate::fields;
+use crate::settings::Now;
+use crate::topic::{Role, Topic};
+
+/// How the fields of a value of another space become a message, whatever their order is.
+#[derive(Debug)]
+pub(crate) struct ByName {
+    message_type: Arc<MessageType>,
+    /// What is not made of the field of the same name.
+    map: FieldMap,
+    /// What its writer says it is, and the places of the fields that are taken, in the order of the message.
+    arranged: Option<(Arc<Described>, Vec<Origin>)>,
+}
+
+impl ByName {
+    /// Appends the message that the fields make.
+    pub(crate) fn write(
+        &self,
+        plan: &Plan,
+        fields: &[u8],
+        out: &mut Vec<u8>,
+    ) -> Result<(), (Cause, String)> {
+        let order = self.arranged.as_ref();
+        let order = order.map_or(&[][..], |(_, order)| order);
+        let fields = call_plan::arrange(fields, order)?;
+        fields::write(
+            plan,
+            Fields::parse(&fields).map_err(fields::undecodable)?,
+            out,
+        )
+    }
+}
+
+impl Router {
+    /// As [`bind`](Self::bind), for a value that no mapping names. One of ours is the whole message, and `note` says what is
+    /// announced of it. Of another space it is made of the fields of the same names, or as `note` says, once its writer has said
+    /// what they are, which it is asked.
+    ///
+    /// # Errors
+    /// [`PlanError`] when the type cannot be read.
+    pub fn bind_as(
+        &mut self,
+        topic: TopicId,
+        (message_type, note): (&Arc<MessageType>, ValueNote),
+        now: Now,
+    ) -> Result<(), PlanError> {
+        let ValueNote {
+            name,
+            about,
+            overflow,
+            map,
+        } = note;
+        let Some(entry) = self.follow(topic, None, now) else {
+            return Ok(());
+        };
+        let ours = matches!(entry.role, Role::Ours(_));
+        if ours {
+            entry.said = Some(Box::new(ValueDescription {
+                name,
+                message_type: None,
+                about,
+                fields: Vec::new(),
+                overflow,
+            }));
+        } else {
+            entry.plan = None;
+            entry.by_name = Some(Box::new(ByName {
+                message_type: Arc::clone(message_type),
+                map,
+                arranged: None,
+            }));
+        }
+        if entry.overflow != overflow {
+            self.requeue(topic, overflow);
+        }
+        if ours {
+            return self.bind(topic, message_type, &Selection::Whole, now);
+        }
+        self.arrange(topic, now);
+        Ok(())
+    }
+
+    /// Looks how the fields of a value make its message, if it is one that goes by their names. False for all others.
+    pub(super) fn arrange(&mut self, topic: TopicId, now: Now) -> bool {
+        let learned = self.discovery.as_ref().map(|discovery| &discovery.learned);
+        let described = learned.and_then(|learned| learned.get(topic, now.monotonic));
+        let Some(Topic {
+            by_name: Some(by_name),
+            ..
+        }) = self.topics.get_mut(&topic)
+        else {
+            return false;
+        };
+        let Some(described) = described.cloned() else {
+            self.ask_what(topic, now);
+            return true;
+        };
+        if let Some((known, _)) = &by_name.arranged
+            && *known == described
+        {
+            return true;
+        }
+        let message_type = Arc::clone(&by_name.message_type);
+        let bound = match order(&described, (&message_type, &by_name.map)) {
+            Ok((selection, order)) => {
+                by_name.arranged = Some((described, order));
+                let bound = self.bind(topic, &message_type, &selection, now);
+                bound.map_err(|error| error.to_string())
+            }
+            Err(why) => Err(why),
+        };
+        if let Err(why) = bound {
+            let cause = (Reason::Mismatch, "type");
+            self.count(About::topic(topic), cause, 1, || why);
+        }
+        true
+    }
+}
+
+/// What of the message is made of the fields, and for each of those its place among them.
+fn order(
+    described: &Described,
+    (message_type, map): (&MessageType, &FieldMap),
+) -> Result<(Selection, Vec<Origin>), String> {
+    let fields = described.fields.iter().map(CallField::of).collect();
+    let call = CallDescription {
+        name: String::new(),
+        about: String::new(),
+        role: CallRole::Call,
+        request: Vec::new(),
+        response: fields,
+    };
+    let (selection, order) = call.response_order(message_type, map)?;
+    Ok((selection, order.into_iter().map(Origin::Leaf).collect()))
+}
