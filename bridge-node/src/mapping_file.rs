@@ -534,7 +534,7 @@ fn is_left_to_the_run(finding: &Diagnostic) -> bool {
         && !doubtful
         && matches!(
             finding.code,
-            Code::UnknownMessageType | Code::UnknownServiceType
+            Code::UnknownMessageType | Code::UnknownServiceType | Code::UnknownActionType
         )
 }
 

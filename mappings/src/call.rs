@@ -1,12 +1,11 @@
 //! The calls of the mapping: what is executed where, and as what it is asked for elsewhere.
 
-use std::fmt;
 use std::time::Duration;
 
 use messages::{Literal, TypeName};
 
 use crate::mapping::Endpoint;
-use crate::node_id::{Identifier, NodeIdText};
+use crate::node_id::{ExpandedNodeIdText, NodeIdText};
 use crate::topic::{SpaceId, TopicId};
 
 /// One call of the space: an OPC UA Method, the service or action that executes it, and those that ask for it.
@@ -74,36 +73,21 @@ pub struct MethodTarget {
     pub method: ExpandedNodeIdText,
 }
 
-/// A NodeId of another server, whose namespace is named by its URI or by its index there: `nsu=urn:plc;s=Line` or `ns=3;i=7`.
-#[derive(Clone, Debug, PartialEq, Eq, Hash)]
-pub struct ExpandedNodeIdText {
-    /// The namespace.
-    pub namespace: NamespaceText,
-    /// The identifier in it.
-    pub identifier: Identifier,
-}
-
-/// The namespace of a node of another server.
-#[derive(Clone, Debug, PartialEq, Eq, Hash)]
-pub enum NamespaceText {
-    /// By its index.
-    Index(u16),
-    /// By its URI.
-    Uri(String),
-}
-
 /// As what a space asks for a call.
+///
+/// The fields of an action are those of [`messages::ActionCalls`]: `goal.order` of its goal, `result.sequence` of its result,
+/// `feedback.share` of its feedback. What stands beside those messages, as `goal_id`, is in no map and goes by name.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct CallBinding {
     /// Whose ROS graph the service or action is offered in.
     pub space: SpaceId,
     /// What is offered there.
     pub target: CallTarget,
-    /// What the request of the call, or its goal, is made of.
+    /// What the request of the call, or of its goal, is made of.
     pub request: FieldMap,
-    /// What the response here, or the result, is made of.
+    /// What the response here, or that with the result, is made of.
     pub response: FieldMap,
-    /// What the feedback here is made of.
+    /// What the value with the feedback here is made of; of a service it is empty.
     pub feedback: FieldMap,
 }
 
@@ -159,39 +143,33 @@ impl FieldMap {
     }
 }
 
+impl CallKind {
+    /// What the topics of such a call are of, in their order; nothing of the call itself.
+    pub(crate) const fn parts(self) -> &'static [&'static str] {
+        match self {
+            Self::Service => &[""],
+            Self::Action => &["", "cancel", "result", "feedback", "status"],
+        }
+    }
+
+    /// The topics of such a call; fewer where the numbers end.
+    pub(crate) fn topics(self, first: TopicId) -> impl Iterator<Item = TopicId> + use<> {
+        let (space, namespace, id) = first.triple();
+        let parts = self.parts().iter().zip(0..);
+        parts.filter_map(move |(_, n): (_, u16)| TopicId::new(space, namespace, id.checked_add(n)?))
+    }
+}
+
 impl Call {
     /// Every topic the call takes: of an action five.
     pub fn topics(&self) -> impl Iterator<Item = TopicId> + use<> {
-        let (space, namespace, id) = self.topic.triple();
-        let last = match self.kind {
-            CallKind::Service => 0,
-            CallKind::Action => 4,
-        };
-        (0..=last).filter_map(move |n| TopicId::new(space, namespace, id.checked_add(n)?))
+        self.kind.topics(self.topic)
     }
 
     /// As what that space asks for it.
     #[must_use]
     pub fn binding(&self, space: SpaceId) -> Option<&CallBinding> {
         self.asked.iter().find(|binding| binding.space == space)
-    }
-}
-
-impl fmt::Display for ExpandedNodeIdText {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let namespace = match &self.namespace {
-            NamespaceText::Index(index) => *index,
-            NamespaceText::Uri(uri) => {
-                write!(f, "nsu={uri};")?;
-                0
-            }
-        };
-        let identifier = self.identifier.clone();
-        NodeIdText {
-            namespace,
-            identifier,
-        }
-        .fmt(f)
     }
 }
 

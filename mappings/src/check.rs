@@ -51,12 +51,12 @@ pub struct Checked {
     in_parts: Option<Mapping>,
 }
 
-/// A message or service type that a mapping names.
+/// A message, service or action type that a mapping names.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct TypeUse {
     /// Of which ROS.
     pub dialect: Dialect,
-    /// Whether it is a message or a service.
+    /// Whether it is a message, a service or an action.
     pub kind: TextKind,
     /// Its name.
     pub name: TypeName,
@@ -309,7 +309,12 @@ fn compile(
     let calls = match &document.calls {
         Some(entries) => {
             let entries = entries.value.as_deref().unwrap_or_default();
-            let known = (&spaces, &namespaces, &variables[..]);
+            let known = calls::Known {
+                spaces: &spaces,
+                namespaces: &namespaces,
+                variables: &variables,
+                server: &server.endpoint,
+            };
             calls::check(entries, known, &mut types, findings)
         }
         None => Vec::new(),

@@ -120,9 +120,12 @@ codes! {
     NodeAway = "M125", "The server that runs has no such variable. Only `ua-space check --environment` asks for that.";
     LiveNodeDiffers = "M126", "The variable is there in the server with another data type. Only `ua-space check --environment` asks for that.";
     CallExecutor = "M130", "A call is executed in the space of its `origin`, by the one service under `ros` that is of that space. Without one somebody else executes it, which is so with the components of space 0, and it can be asked for elsewhere.";
-    CallTopic = "M131", "A call has a topic of its own; that of a variable, or of another call, is taken.";
-    CallMap = "M132", "In `request` stands what the fields of the call's request are made of, in `response` what those of the service here are made of: constants, or fields of the other side, of the same type. What is not named goes by name, and what then is made of nothing needs a constant. The service that executes the call has neither.";
-    CallTwice = "M133", "Two calls have one service in a space.";
+    CallTopic = "M131", "A call has a topic and a node of its own; those of a variable, or of another call, are taken. An action has five topics: the next four numbers are those of its cancel, its result, its feedback and its status.";
+    CallMap = "M132", "In `request` stands what the fields of the call's request are made of, in `response` what those of the service here are made of: constants, or fields of the other side, of the same type. `goal`, and `feedback` and `result`, are the same of actions. What is not named goes by name, and what then is made of nothing needs a constant. The service or action that executes the call has none of them.";
+    CallTwice = "M133", "Two calls have one service or action in a space.";
+    CallBinding = "M134", "Under `ros` of a call stands a `service` with its `request` and `response`, or an `action` with its `goal`, `feedback` and `result`. All of a call are of one kind, as a service has an answer at once, and an action takes its time. A Method of an OPC UA server is asked for by services.";
+    UnknownActionType = "M135", "No definition of the action type is built in, so a package with the .action file must be in `type_paths`, or below one of the folders of ROS_PACKAGE_PATH or AMENT_PREFIX_PATH, when the bridge runs.";
+    MethodTarget = "M136", "`opcua` says which Method of which other OPC UA server executes a call: `endpoint`, `object` and `method`, the nodes as nsu=urn:plc;s=Line.Reset. The cell's own server calls it, so the call has `origin: 0`, a node of a namespace of `namespaces`, and the endpoint is not that of the cell's server itself.";
 }
 
 impl Code {
@@ -144,6 +147,7 @@ impl Code {
                 | Self::FieldOrder
                 | Self::StructureOf
                 | Self::CallMap
+                | Self::UnknownActionType
         )
     }
 }
@@ -168,7 +172,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M133")]
+#[error("no finding has that code; codes are M001 to M136")]
 pub struct UnknownCode;
 
 #[cfg(test)]

@@ -35,8 +35,8 @@ document! {
         /// Topics that become values as they appear, at most 1000; the first that fits counts, and an entry of `variables`
         /// with the same topic before all.
         patterns: Vec<At<PatternEntry>>,
-        /// What is executed in one space and asked for from the others, at most 5000. Services of ROS that have a name of the
-        /// space (/ua_1_2_61) need none.
+        /// What is executed in one space and asked for from the others, at most 5000. Services and actions of ROS that have a name
+        /// of the space (/ua_1_2_61) need none.
         calls: Vec<At<CallEntry>>,
     }
 
@@ -248,9 +248,11 @@ document! {
         r#as: AsEntry,
     }
 
-    /// Something that is executed in one space: a service of ROS, or what a component executes.
+    /// Something that is executed in one space: a service or action of ROS, a Method of an OPC UA server, or what a component
+    /// executes.
     struct CallEntry {
-        /// The OPC UA Method, as ns=2;i=61.
+        /// The OPC UA Method, as ns=2;i=61. An action takes five numbers: its goal this one, its cancel, its result, its feedback
+        /// and its status the next four.
         #[schemars(required, regex(pattern = r"^(ns=[0-9]+;)?[isgb]="))]
         node: String,
         /// Name of the Method; dots part the folders it stands in, as Conveyor.Switch.
@@ -264,26 +266,33 @@ document! {
         /// As with a variable.
         #[schemars(range(min = 1, max = 65535))]
         alias: u16,
-        /// Services of ROS, one or a list, at most one per space. That of the origin executes the call; those of other spaces
-        /// are offered there and ask for it. A space without one has it under its name, as /ua_1_2_61.
+        /// Services of ROS, or actions, one or a list, at most one per space. That of the origin executes the call; those of other
+        /// spaces are offered there and ask for it. A space without one has it under its name, as /ua_1_2_61.
         ros: CallBindings,
+        /// With `origin: 0`: the Method of another OPC UA server that executes the call.
+        opcua: MethodEntry,
         /// Whether requests from other hosts are executed; left out, only those from a loopback address are, since nobody
         /// knows who sends them.
         open: bool,
-        /// How long the service may take, and how long who asks waits; default 30s.
+        /// How long the service or Method may take, and how long who asks waits; default 30s. Of an action it is the time until a
+        /// goal is accepted or refused.
         #[schemars(regex(pattern = DURATION))]
         timeout: String,
     }
 
-    /// A service of ROS that executes a call, or asks for it.
+    /// A service or action of ROS that executes a call, or asks for it: exactly one of `service` and `action`.
+    #[schemars(extend("oneOf" = [{ "required": ["service"] }, { "required": ["action"] }]))]
     struct CallBindingEntry {
-        /// Whose service it is. Left out: the origin of the call.
+        /// Whose service or action it is. Left out: the origin of the call.
         #[schemars(range(min = 1, max = 232))]
         space: u16,
         /// Absolute name of the service, as /conveyor/switch.
-        #[schemars(required, regex(pattern = "^/"))]
+        #[schemars(regex(pattern = "^/"))]
         service: String,
-        /// Service type, as std_srvs/SetBool.
+        /// Absolute name of the action, as /navigate_to_pose: in ROS 1 the name before /goal, /cancel and /result.
+        #[schemars(regex(pattern = "^/"))]
+        action: String,
+        /// Type of the service or action, as std_srvs/SetBool.
         #[schemars(required)]
         r#type: String,
         /// Of a service that asks: what the fields of the call's request are made of, as {id: 6, on: {field: data}}: a constant,
@@ -293,6 +302,29 @@ document! {
         /// Of a service that asks: what the fields of the response here are made of, as {success: true, message: {field: text}}: a
         /// constant, or a field of the call's response.
         response: FieldMapEntry,
+        /// Of an action that asks: what the fields of the goal that is executed are made of, as `request`: constants, or fields of
+        /// the goal here.
+        goal: FieldMapEntry,
+        /// Of an action that asks: what the fields of the feedback here are made of, as `response`: constants, or fields of the
+        /// feedback of the action that is executed.
+        feedback: FieldMapEntry,
+        /// Of an action that asks: what the fields of the result here are made of, as `response`: constants, or fields of the
+        /// result of the action that is executed.
+        result: FieldMapEntry,
+    }
+
+    /// A Method of an OPC UA server.
+    struct MethodEntry {
+        /// The server, as opc.tcp://127.0.0.1:4841.
+        #[schemars(required, regex(pattern = r"^opc\.tcp://"))]
+        endpoint: String,
+        /// The Object that the Method is called on, as nsu=urn:plc;s=Line: its namespace by the URI, which holds when the server
+        /// numbers its namespaces anew, or by the index there, as ns=3;i=7.
+        #[schemars(required, regex(pattern = EXPANDED_NODE_ID))]
+        object: String,
+        /// The Method, likewise.
+        #[schemars(required, regex(pattern = EXPANDED_NODE_ID))]
+        method: String,
     }
 
     /// One of several fields, with what converts it.
@@ -349,6 +381,8 @@ choice! {
         Basic256Sha256 = "Basic256Sha256",
     }
 }
+
+const EXPANDED_NODE_ID: &str = r"^(ns=[0-9]+;|nsu=[^;]+;)?[isgb]=";
 
 const DURATION: &str = r"^[0-9]+(\.[0-9]+)?(ms|s|min|h)$";
 
@@ -537,7 +571,7 @@ impl JsonSchema for FieldMapEntry {
     }
 }
 
-/// One service of a call or a list of them.
+/// One service or action of a call, or a list of them.
 #[derive(Clone, Debug)]
 pub(crate) struct CallBindings(pub(crate) Vec<At<CallBindingEntry>>);
 

@@ -23,8 +23,8 @@ mod unit;
 mod variables;
 
 pub use call::{
-    Assigned, Assignment, Call, CallBinding, CallKind, CallTarget, ExecutedBy, ExpandedNodeIdText,
-    FieldMap, MethodTarget, NamespaceText,
+    Assigned, Assignment, Call, CallBinding, CallKind, CallTarget, ExecutedBy, FieldMap,
+    MethodTarget,
 };
 pub use check::{Checked, PathFault, PathFaultKind, Source, TypeFiles, TypeOrigin, TypeUse};
 pub use code::{Code, UnknownCode};
@@ -35,7 +35,7 @@ pub use mapping::{
     Binding, Endpoint, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule,
     SecurityPolicy, Server, ServiceBinding, ServiceRole, Space, Trigger, UaField, Variable,
 };
-pub use node_id::{Identifier, NodeIdError, NodeIdText};
+pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use schema::schema;
 pub use surroundings::{Readers, Surroundings};

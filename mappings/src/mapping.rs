@@ -93,7 +93,7 @@ impl Mapping {
         &self.calls
     }
 
-    /// The call of a topic; of an action that of its goal.
+    /// The call of a topic, which is of an action that of its goal.
     #[must_use]
     pub fn call(&self, topic: TopicId) -> Option<&Call> {
         self.calls.iter().find(|call| call.topic == topic)
@@ -126,7 +126,7 @@ impl Mapping {
     /// that a variable is bound to, and the names of the space (`/ua_1_2_10`).
     ///
     /// # Errors
-    /// The pattern makes no node of it, or one that a variable of the mapping has. Two topics that become one node are
+    /// The pattern makes no node of it, or one that a variable or call of the mapping has. Two topics that become one node are
     /// the caller's to tell.
     #[must_use]
     pub fn matching(
@@ -149,16 +149,25 @@ impl Mapping {
         let (pattern, made) = patterns
             .filter_map(|pattern| Some((pattern, pattern.matches(ros_topic)?)))
             .next()?;
-        Some(made.and_then(|made| {
-            let taken = |v: &&Variable| v.topic == made.topic || v.node == made.node;
-            match self.variables.iter().find(taken) {
-                Some(other) => {
-                    let why = PatternReason::Taken(made.topic, other.name.clone());
-                    Err(pattern.fault(ros_topic, why))
-                }
-                None => Ok(made),
+        Some(made.and_then(|made| match self.holder(&made) {
+            Some(name) => {
+                let why = PatternReason::Taken(made.topic, name.to_owned());
+                Err(pattern.fault(ros_topic, why))
             }
+            None => Ok(made),
         }))
+    }
+
+    /// The name of the variable or call that has the topic or the node already.
+    fn holder(&self, made: &PatternVariable) -> Option<&str> {
+        let mut variables = self.variables.iter();
+        let variable = variables.find(|v| v.topic == made.topic || v.node == made.node);
+        if let Some(variable) = variable {
+            return Some(&variable.name);
+        }
+        let mut calls = self.calls.iter();
+        let call = calls.find(|c| c.node == made.node || c.topics().any(|t| t == made.topic));
+        call.map(|call| call.name.as_str())
     }
 
     /// How NetworkMessages travel.

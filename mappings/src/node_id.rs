@@ -86,6 +86,73 @@ impl FromStr for NodeIdText {
     }
 }
 
+/// A NodeId of another server, whose namespace is named by its URI or by its index there: `nsu=urn:plc;s=Line` or `ns=3;i=7`
+/// (OPC 10000-6, 5.1.12).
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub struct ExpandedNodeIdText {
+    /// The namespace.
+    pub namespace: NamespaceText,
+    /// The identifier in it.
+    pub identifier: Identifier,
+}
+
+/// The namespace of a node of another server.
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
+pub enum NamespaceText {
+    /// By its index.
+    Index(u16),
+    /// By its URI.
+    Uri(String),
+}
+
+impl fmt::Display for ExpandedNodeIdText {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let namespace = match &self.namespace {
+            NamespaceText::Index(index) => *index,
+            NamespaceText::Uri(uri) => {
+                write!(f, "nsu={};", uri.replace('%', "%25").replace(';', "%3B"))?;
+                0
+            }
+        };
+        let identifier = self.identifier.clone();
+        NodeIdText {
+            namespace,
+            identifier,
+        }
+        .fmt(f)
+    }
+}
+
+impl FromStr for ExpandedNodeIdText {
+    type Err = NodeIdError;
+
+    fn from_str(text: &str) -> Result<Self, NodeIdError> {
+        let Some(rest) = text.strip_prefix("nsu=") else {
+            let node: NodeIdText = text.parse()?;
+            return Ok(Self {
+                namespace: NamespaceText::Index(node.namespace),
+                identifier: node.identifier,
+            });
+        };
+        let (uri, rest) = rest.split_once(';').ok_or(NodeIdError::Form)?;
+        let uri = uri
+            .replace("%3B", ";")
+            .replace("%3b", ";")
+            .replace("%25", "%");
+        if uri.is_empty() || uri.len() > MAX_STRING || uri.contains(char::is_control) {
+            return Err(NodeIdError::Uri);
+        }
+        if rest.starts_with("ns=") {
+            return Err(NodeIdError::Form);
+        }
+        let node: NodeIdText = rest.parse()?;
+        Ok(Self {
+            namespace: NamespaceText::Uri(uri),
+            identifier: node.identifier,
+        })
+    }
+}
+
 /// Why a text is not a NodeId.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
@@ -98,6 +165,9 @@ pub enum NodeIdError {
     /// The index after `ns=`.
     #[error("the namespace index after `ns=` is not a number 0..65535")]
     Namespace,
+    /// The URI after `nsu=`.
+    #[error("the namespace URI after `nsu=` is empty, longer than 4096 bytes or no text")]
+    Uri,
     /// The identifier after `i=`.
     #[error("the identifier after `i=` is not a number 0..4294967295")]
     Numeric,
@@ -147,6 +217,31 @@ mod tests {
 
     fn parse(text: &str) -> Result<NodeIdText, NodeIdError> {
         text.parse()
+    }
+
+    #[test]
+    fn a_node_of_another_server_is_read_by_uri_or_index_and_prints_as_it_was_read() {
+        for text in [
+            "i=2253",
+            "ns=3;i=7",
+            "nsu=urn:plc;s=Line.Reset",
+            "nsu=urn:a%3Bb%25;s=x;y",
+            "nsu=http://opcfoundation.org/UA/;i=85",
+        ] {
+            let node: ExpandedNodeIdText = text.parse().unwrap();
+            assert_eq!(node.to_string(), text);
+        }
+        let node: ExpandedNodeIdText = "nsu=urn:a%3Bb%25;i=1".parse().unwrap();
+        assert_eq!(node.namespace, NamespaceText::Uri("urn:a;b%".to_owned()));
+        for text in [
+            "nsu=;i=1",
+            "nsu=urn:plc",
+            "nsu=urn:plc;ns=2;i=1",
+            "nsu=urn:plc;i=x",
+            "svr=1;i=1",
+        ] {
+            assert!(text.parse::<ExpandedNodeIdText>().is_err(), "{text}");
+        }
     }
 
     #[test]

@@ -61,8 +61,8 @@ pub enum PatternReason {
     /// The name is empty or longer than 512 characters.
     #[error("its name would not have 1 to 512 characters")]
     Name,
-    /// A variable of the mapping has that topic of the space or that node.
-    #[error("`{0}` is the variable `{1}` already")]
+    /// A variable or call of the mapping has that topic of the space or that node.
+    #[error("`{0}` is `{1}` of the mapping already")]
     Taken(TopicId, String),
 }
 

@@ -606,7 +606,7 @@ fn a_pattern_does_not_take_the_node_of_a_variable() {
     assert!(
         fault
             .to_string()
-            .ends_with("`ua_1_2_101` is the variable `First` already"),
+            .ends_with("`ua_1_2_101` is `First` of the mapping already"),
         "{fault}"
     );
     assert!(

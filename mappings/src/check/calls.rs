@@ -1,26 +1,24 @@
 //! Calls: node, topic, what executes each and as what it is asked for.
 
+mod bindings;
+mod fields;
+mod method;
+
 use std::collections::{BTreeMap, HashMap};
-use std::sync::Arc;
 use std::time::Duration;
 
-use messages::{Leaf, ServiceType, TypeName};
-
-use super::bindings::ros_name;
+use self::bindings::Found;
 use super::network::duration;
 use super::required;
-use super::services::{built_in, type_name};
-use super::types::{self, Types, dialect};
+use super::types::Types;
 use super::variables::{NAMESPACE_ZERO, Namespaces, Spaces, checked_name, node_id, space};
-use crate::call::{
-    Assigned, Assignment, Call, CallBinding, CallKind, CallTarget, ExecutedBy, FieldMap,
-};
+use crate::call::{Call, CallBinding, CallKind, ExecutedBy, MethodTarget};
 use crate::code::Code;
-use crate::document::{CallBindingEntry, CallEntry, FieldMapEntry};
+use crate::document::CallEntry;
 use crate::findings::Findings;
-use crate::mapping::Variable;
+use crate::mapping::{Endpoint, Variable};
 use crate::node_id::NodeIdText;
-use crate::read::{At, Field, given, short};
+use crate::read::{At, given, short};
 use crate::topic::{SpaceId, TopicId};
 use crate::tree::Place;
 
@@ -29,19 +27,18 @@ const MAX_CALLS: usize = 5_000;
 /// How long a call may take where nothing is said.
 const TIMEOUT: Duration = Duration::from_secs(30);
 
-/// A service under `ros`, as far as it goes.
-struct Found {
-    space: SpaceId,
-    place: Place,
-    target: CallTarget,
-    service_type: Option<Arc<ServiceType>>,
-    request: Option<(FieldMap, Place)>,
-    response: Option<(FieldMap, Place)>,
+/// What calls are checked against.
+pub(super) struct Known<'k> {
+    pub(super) spaces: &'k Spaces,
+    pub(super) namespaces: &'k Namespaces,
+    pub(super) variables: &'k [Variable],
+    /// Where the cell's own server is.
+    pub(super) server: &'k Endpoint,
 }
 
 pub(super) fn check(
     entries: &[At<CallEntry>],
-    (spaces, namespaces, variables): (&Spaces, &Namespaces, &[Variable]),
+    known: Known<'_>,
     types: &mut Types,
     findings: &mut Findings,
 ) -> Vec<Call> {
@@ -50,13 +47,15 @@ pub(super) fn check(
         findings.error(Code::TooLarge, first.place, message);
         return Vec::new();
     }
+    let variables = known.variables.iter();
     let mut checker = Checker {
-        spaces,
-        namespaces,
+        values: variables.clone().map(|v| (v.topic, &v.name[..])).collect(),
+        nodes: variables.map(|v| (&v.node, &v.name[..])).collect(),
+        known: &known,
         types,
         topics: HashMap::new(),
-        values: variables.iter().map(|v| (v.topic, &v.name[..])).collect(),
-        services: HashMap::new(),
+        call_nodes: HashMap::new(),
+        targets: HashMap::new(),
     };
     let calls = entries.iter().filter_map(|at| {
         let entry = at.value.as_ref()?;
@@ -66,13 +65,15 @@ pub(super) fn check(
 }
 
 struct Checker<'c> {
-    spaces: &'c Spaces,
-    namespaces: &'c Namespaces,
+    known: &'c Known<'c>,
     types: &'c mut Types,
-    /// Topics of the calls before, and where they are said.
-    topics: HashMap<TopicId, Place>,
     values: BTreeMap<TopicId, &'c str>,
-    services: HashMap<(SpaceId, String), Place>,
+    nodes: HashMap<&'c NodeIdText, &'c str>,
+    /// Topics and nodes of the calls before, and where they are said.
+    topics: HashMap<TopicId, Place>,
+    call_nodes: HashMap<NodeIdText, Place>,
+    /// Names of services and actions, and where they are said.
+    targets: HashMap<(SpaceId, CallKind, String), Place>,
 }
 
 impl Checker<'_> {
@@ -82,28 +83,38 @@ impl Checker<'_> {
             None => "the call".to_owned(),
         };
         let node = required(&entry.node, "node", &title, place, findings)
-            .and_then(|(text, place)| node_id(text, place, self.namespaces, findings));
-        let origin = required(&entry.origin, "origin", &title, place, findings)
-            .and_then(|(number, place)| space(*number, place, "origin", self.spaces, findings));
+            .and_then(|(text, place)| node_id(text, place, self.known.namespaces, findings));
+        let origin =
+            required(&entry.origin, "origin", &title, place, findings).and_then(|(number, at)| {
+                Some((
+                    space(*number, at, "origin", self.known.spaces, findings)?,
+                    at,
+                ))
+            });
         let name = required(&entry.name, "name", &title, place, findings)
             .and_then(|(name, place)| checked_name(name, place, findings));
         let timeout = match &entry.timeout {
             Some(_) => duration(&entry.timeout, findings)?,
             None => TIMEOUT,
         };
+        let found = self.bindings(entry, origin.map(|(origin, _)| origin), findings);
+        let method = self.method(entry, node.as_ref(), origin, findings);
+        let kind = bindings::kind_of(found.as_deref(), entry, findings);
         let topic = match (&node, origin) {
-            (Some((node, at)), Some(origin)) => self.topic(entry, (node, *at), origin, findings),
+            (Some((node, at)), Some((origin, _))) => {
+                let kind = kind.unwrap_or(CallKind::Service);
+                self.topic(entry, (node, *at), (origin, kind), findings)
+            }
             _ => None,
         };
-        let found = self.bindings(entry, origin, findings);
-        let (node, topic, origin) = (node?.0, topic?, origin?);
-        let (executed, asked) = settle(origin, found?, findings)?;
+        let (node, topic, (origin, _)) = (node?.0, topic?, origin?);
+        let (executed, asked) = settle(origin, found?, method.ok()?, findings)?;
         Some(Call {
             topic,
             node,
             name: name?,
             about: given(&entry.about).map_or_else(String::new, |(text, _)| text.clone()),
-            kind: CallKind::Service,
+            kind: kind?,
             executed,
             asked,
             open: given(&entry.open).is_some_and(|(open, _)| *open),
@@ -115,7 +126,7 @@ impl Checker<'_> {
         &mut self,
         entry: &CallEntry,
         (node, place): (&NodeIdText, Place),
-        space: SpaceId,
+        (space, kind): (SpaceId, CallKind),
         findings: &mut Findings,
     ) -> Option<TopicId> {
         let alias = given(&entry.alias).and_then(|(alias, _)| std::num::NonZeroU16::new(*alias));
@@ -132,271 +143,104 @@ impl Checker<'_> {
             namespace,
             identifier,
         };
-        let taken = match self.values.get(&topic) {
-            Some(name) => Some(format!("the variable `{}` has it", short(name))),
-            None => self
-                .topics
-                .insert(topic, place)
-                .map(|first| format!("first at {}", findings.line(first, place))),
-        };
-        if let Some(label) = taken {
+        let topics: Vec<TopicId> = kind.topics(topic).collect();
+        if topics.len() < kind.parts().len() {
+            let message = format!("`{topic}` is an action, and there are not four numbers behind");
             findings
-                .error(Code::CallTopic, place, format!("`{topic}` is taken"))
+                .error(Code::CallTopic, place, message)
+                .help("an action takes five numbers, so the first is at most 65531");
+            return None;
+        }
+        for (topic, part) in topics.into_iter().zip(kind.parts()) {
+            let taken = match self.values.get(&topic) {
+                Some(name) => Some(format!("the variable `{}` has it", short(name))),
+                None => self
+                    .topics
+                    .insert(topic, place)
+                    .map(|first| format!("first at {}", findings.line(first, place))),
+            };
+            let Some(label) = taken else { continue };
+            let what = match *part {
+                "" => String::new(),
+                part => format!(", the {part} of the action,"),
+            };
+            findings
+                .error(Code::CallTopic, place, format!("`{topic}`{what} is taken"))
                 .label(label)
                 .help("give one of them another node, or an `alias`");
             return None;
         }
-        Some(topic)
+        self.free_node(node, place, findings).map(|()| topic)
     }
 
-    /// `None` where one of them is faulty.
-    fn bindings(
+    /// `None` where something else has the node.
+    fn free_node(
         &mut self,
-        entry: &CallEntry,
-        origin: Option<SpaceId>,
-        findings: &mut Findings,
-    ) -> Option<Vec<Found>> {
-        let entries = entry.ros.as_ref().and_then(|at| at.value.as_ref());
-        let entries = entries.map_or(&[][..], |bindings| &bindings.0);
-        let mut all: Option<Vec<Found>> = Some(Vec::new());
-        for at in entries {
-            let found = at.value.as_ref().and_then(|binding| {
-                let found = self.binding(binding, at.place, origin, findings)?;
-                let others = all.as_deref().unwrap_or_default();
-                if others.iter().any(|other| other.space == found.space) {
-                    let message = format!("the call has two services in space {}", found.space);
-                    findings
-                        .error(Code::CallExecutor, at.place, message)
-                        .help("leave one of them out");
-                    return None;
-                }
-                Some(found)
-            });
-            match (found, &mut all) {
-                (Some(found), Some(all)) => all.push(found),
-                _ => all = None,
-            }
-        }
-        all
-    }
-
-    fn binding(
-        &mut self,
-        entry: &CallBindingEntry,
+        node: &NodeIdText,
         place: Place,
-        origin: Option<SpaceId>,
         findings: &mut Findings,
-    ) -> Option<Found> {
-        let of = match &entry.space {
-            Some(at) => {
-                let number = at.value?;
-                (
-                    space(number, at.place, "space", self.spaces, findings)?,
-                    at.place,
-                )
-            }
-            None => (origin?, place),
+    ) -> Option<()> {
+        let label = match (
+            self.nodes.get(node),
+            self.call_nodes.insert(node.clone(), place),
+        ) {
+            (Some(name), _) => format!("the variable `{}` has it", short(name)),
+            (None, Some(first)) => format!("first at {}", findings.line(first, place)),
+            (None, None) => return Some(()),
         };
-        if of.0 == SpaceId::UA {
-            findings
-                .error(
-                    Code::OpcUaBinding,
-                    of.1,
-                    "space 0 is the OPC UA side and has no services of ROS",
-                )
-                .help("say whose service it is with `space`");
-            return None;
-        }
-        let dialect = dialect(of.0);
-        let service = required(&entry.service, "service", "the binding", place, findings);
-        let service = service.and_then(|(text, place)| {
-            ros_name(text, place, (dialect, "service"), findings)?;
-            Some((text.clone(), place))
-        });
-        let named = required(&entry.r#type, "type", "the binding", place, findings);
-        let named = named.and_then(|(text, place)| {
-            let name = type_name(text);
-            if name.is_none() {
-                findings
-                    .error(
-                        Code::MessageTypeName,
-                        place,
-                        format!("`{}` is no service type name", short(text)),
-                    )
-                    .help("package and name, as std_srvs/SetBool");
-            }
-            Some((name?, place))
-        });
-        let ((name, at), (type_name, type_place)) = (service?, named?);
-        findings.of_part([of.0]);
-        let service_type = built_in(&type_name, (dialect, type_place), self.types, findings);
-        findings.of_part(None);
-        if let Some(first) = self.services.insert((of.0, name.clone()), at) {
-            let line = findings.line(first, at);
-            findings
-                .error(
-                    Code::CallTwice,
-                    at,
-                    format!("`{name}` is the service of two calls"),
-                )
-                .label(format!("first at {line}"));
-            return None;
-        }
-        Some(Found {
-            space: of.0,
-            place,
-            target: CallTarget { name, type_name },
-            service_type,
-            request: field_map(&entry.request),
-            response: field_map(&entry.response),
-        })
+        let message = format!("the node `{}` is taken", short(&node.to_string()));
+        findings
+            .error(Code::CallTopic, place, message)
+            .label(label)
+            .help("give one of them another node");
+        None
     }
-}
-
-fn field_map(entry: &Field<FieldMapEntry>) -> Option<(FieldMap, Place)> {
-    let (entry, place) = given(entry)?;
-    let assigned = entry.0.iter();
-    let assigned = assigned.map(|(target, _, value)| Assignment {
-        target: target.clone(),
-        value: value.clone(),
-    });
-    Some((FieldMap(assigned.collect()), place))
 }
 
 /// Parts who executes a call from those who ask for it, and holds their types against each other.
 fn settle(
     origin: SpaceId,
     found: Vec<Found>,
+    method: Option<MethodTarget>,
     findings: &mut Findings,
 ) -> Option<(ExecutedBy, Vec<CallBinding>)> {
     let (executes, asks): (Vec<Found>, Vec<Found>) =
         found.into_iter().partition(|one| one.space == origin);
     let executor = executes.into_iter().next();
-    if let Some(executor) = &executor {
-        let maps = [&executor.request, &executor.response];
-        if let Some((_, place)) = maps.into_iter().flatten().next() {
-            findings
-                .error(
-                    Code::CallMap,
-                    *place,
-                    "the service that executes the call has its fields as they are",
-                )
-                .help("write it beside the services of other spaces, which ask for it");
-            return None;
-        }
-    } else if origin != SpaceId::UA && asks.is_empty() {
-        return Some((ExecutedBy::Elsewhere, Vec::new()));
+    if let Some(executor) = &executor
+        && let Some(place) = executor.maps.place()
+    {
+        let message = format!(
+            "the {} that executes the call has its fields as they are",
+            executor.kind.word()
+        );
+        findings
+            .error(Code::CallMap, place, message)
+            .help("write it beside those of other spaces, which ask for it");
+        return None;
     }
-    let service_type = executor.as_ref().and_then(|one| one.service_type.clone());
     let mut asked = Vec::new();
     for one in asks {
-        if let (Some(there), Some(here)) = (&service_type, &one.service_type) {
+        if let Some(executor) = &executor {
             findings.of_part([origin, one.space]);
-            compare((there, here), &one, findings);
+            fields::compare(executor, &one, findings);
             findings.of_part(None);
         }
+        let of = |map: Option<(crate::call::FieldMap, Place)>| {
+            map.map_or_else(Default::default, |(map, _)| map)
+        };
         asked.push(CallBinding {
             space: one.space,
             target: one.target,
-            request: one.request.map(|(map, _)| map).unwrap_or_default(),
-            response: one.response.map(|(map, _)| map).unwrap_or_default(),
-            feedback: FieldMap::default(),
+            request: of(one.maps.request),
+            response: of(one.maps.response),
+            feedback: of(one.maps.feedback),
         });
     }
-    let executed = executor.map_or(ExecutedBy::Elsewhere, |one| ExecutedBy::Ros(one.target));
-    Some((executed, asked))
-}
-
-/// Notes where a field of the call's request, or of the response here, is made of nothing.
-fn compare((there, here): (&ServiceType, &ServiceType), one: &Found, findings: &mut Findings) {
-    let none = FieldMap::default();
-    let map = |map: &Option<(FieldMap, Place)>| {
-        map.as_ref()
-            .map_or((None, one.place), |(_, at)| (Some(()), *at))
-            .1
+    let executed = match (executor, method) {
+        (Some(one), _) => ExecutedBy::Ros(one.target),
+        (None, Some(method)) => ExecutedBy::OpcUa(method),
+        (None, None) => ExecutedBy::Elsewhere,
     };
-    let said = |field: &'_ Option<(FieldMap, Place)>| field.as_ref().map(|(map, _)| map.clone());
-    let request = said(&one.request).unwrap_or_else(|| none.clone());
-    let response = said(&one.response).unwrap_or(none);
-    let (leaves, given) = (there.request().leaves(), here.request().leaves());
-    let fault = made(&request, (leaves, given)).or_else(|| {
-        let spare =
-            request.is_empty() && !leaves.is_empty() || leaves.is_empty() && !given.is_empty();
-        spare.then(|| unused((leaves, given))).flatten()
-    });
-    let names = (there.name(), here.name());
-    note(
-        "request",
-        (names.0, names.1),
-        fault,
-        map(&one.request),
-        findings,
-    );
-    let fault = made(
-        &response,
-        (here.response().leaves(), there.response().leaves()),
-    );
-    note(
-        "response",
-        (names.1, names.0),
-        fault,
-        map(&one.response),
-        findings,
-    );
-}
-
-fn note(
-    key: &str,
-    (target, source): (&TypeName, &TypeName),
-    fault: Option<String>,
-    place: Place,
-    findings: &mut Findings,
-) {
-    let Some(fault) = fault else { return };
-    let message = format!("the {key} of `{target}` cannot be made of that of `{source}`: {fault}");
-    findings.error(Code::CallMap, place, message).help(format!(
-        "say what it is made of: `{key}: {{a: {{field: b}}, c: 1}}`"
-    ));
-}
-
-/// Which field is made of nothing, or of one of another type.
-fn made(map: &FieldMap, (targets, sources): (&[Leaf], &[Leaf])) -> Option<String> {
-    for Assignment { target, .. } in &map.0 {
-        let within = |leaf: &Leaf| {
-            let head = leaf.path.get(..target.len());
-            head.is_some_and(|head| head.eq_ignore_ascii_case(target))
-        };
-        if !targets.iter().any(within) {
-            return Some(format!("there is no field `{}`", short(target)));
-        }
-    }
-    targets.iter().find_map(|leaf| {
-        let path = match map.source(&leaf.path) {
-            Some(Assigned::Constant(_)) => return None,
-            Some(Assigned::Field(path)) => path,
-            None => leaf.path.clone(),
-        };
-        let wanted = types::print(types::value_type(leaf));
-        let source = sources
-            .iter()
-            .find(|source| source.path.eq_ignore_ascii_case(&path));
-        match source {
-            None => Some(format!("`{}` ({wanted}) is made of nothing", leaf.path)),
-            Some(source) if types::value_type(source) != types::value_type(leaf) => Some(format!(
-                "`{}` is {wanted}, and `{path}` {}",
-                leaf.path,
-                types::print(types::value_type(source))
-            )),
-            Some(_) => None,
-        }
-    })
-}
-
-/// Which field of who asks nothing is made of, where nothing says that it is left out.
-fn unused((targets, sources): (&[Leaf], &[Leaf])) -> Option<String> {
-    let lost = sources.iter().find(|source| {
-        let mut targets = targets.iter();
-        !targets.any(|target| target.path.eq_ignore_ascii_case(&source.path))
-    })?;
-    Some(format!("nothing is made of `{}`", lost.path))
+    Some((executed, asked))
 }

@@ -4,8 +4,8 @@ use std::collections::HashMap;
 use std::sync::{Arc, LazyLock};
 
 use messages::{
-    DefinitionError, Dialect, Leaf, Library, MessageType, Noted, Rank, Registry, ServiceType,
-    TextKind, TypeName,
+    ActionCalls, DefinitionError, Dialect, Leaf, Library, MessageType, Noted, Rank, Registry,
+    ServiceType, TextKind, TypeName,
 };
 use uadp::BuiltinType;
 
@@ -89,6 +89,7 @@ pub(super) struct Types {
     libraries: [Option<Library>; 2],
     asked: HashMap<(Dialect, TypeName), Answer>,
     services: HashMap<(Dialect, TypeName), Option<Arc<ServiceType>>>,
+    actions: HashMap<(Dialect, TypeName), Option<Arc<ActionCalls>>>,
     used: Vec<TypeUse>,
 }
 
@@ -102,6 +103,7 @@ impl Types {
             libraries: [None, None],
             asked: HashMap::new(),
             services: HashMap::new(),
+            actions: HashMap::new(),
             used: Vec::new(),
         }
     }
@@ -147,6 +149,30 @@ impl Types {
         });
         note(library.take_noted(), place, findings);
         self.services.insert((dialect, name.clone()), found.clone());
+        found
+    }
+
+    /// An action that is known, as calls and values; notes what is wrong with its files.
+    pub(super) fn action(
+        &mut self,
+        (dialect, place): (Dialect, Place),
+        name: &TypeName,
+        findings: &mut Findings,
+    ) -> Option<Arc<ActionCalls>> {
+        if let Some(known) = self.actions.get(&(dialect, name.clone())) {
+            return known.clone();
+        }
+        let (library, files, used) = self.library(dialect);
+        let found = library.action_calls(name, files.as_mut());
+        let found = found.ok().map(Arc::new);
+        used.push(TypeUse {
+            dialect,
+            kind: TextKind::Action,
+            name: name.clone(),
+            source: origin(library, TextKind::Action, name, found.is_some()),
+        });
+        note(library.take_noted(), place, findings);
+        self.actions.insert((dialect, name.clone()), found.clone());
         found
     }
 
