@@ -626,8 +626,6 @@ impl Port for Ros1Port {
             return;
         }
         if self.actions.takes(topic) {
-            let bound = self.actions.wanted(topic, described, &mut self.policy);
-            self.events.extend(bound);
             return;
         }
         if !self.take_in(topic) {

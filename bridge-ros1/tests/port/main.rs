@@ -181,6 +181,7 @@ fn line(event: &PortEvent) -> String {
         | PortEvent::Offer { .. }
         | PortEvent::OfferTyped { .. }
         | PortEvent::Withdrawn { .. }
+        | PortEvent::BoundAs { .. }
         | PortEvent::Executed { .. } => format!("{event:?}"),
         PortEvent::Ended(why) => format!("ended: {why}"),
     }
