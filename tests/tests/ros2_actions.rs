@@ -19,7 +19,7 @@ use std::time::Duration;
 
 use bridge_ros2::action::{
     Action, ActionClient, ActionClientOptions, CancelCode, CancelWhat, GoalEvent, GoalHandle,
-    LostReason, Outcome, Status,
+    GoalId, IdInUse, LostReason, Outcome, Status,
 };
 use nix::sys::signal::Signal;
 use system_tests::{Cell, Child, Peer};
@@ -162,6 +162,29 @@ async fn a_server_of_cyclone_is_asked_to_cancel_one_some_and_all() {
     let unknown = client.cancel(CancelWhat::Goal(nobody)).await.unwrap();
     assert_eq!(unknown.code, CancelCode::UnknownGoal);
     assert_eq!(goals[1].status(), Status::Executing);
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 1)]
+async fn a_goal_has_the_id_that_was_chosen_for_it_and_there_is_one_of_each() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let ours = Ours::join();
+    let client = client(&ours);
+    let _server = cyclone(&cell, &[]);
+    let id = GoalId::from_bytes(*b"chosen elsewhere");
+    let mut first = client.send_goal_as(id, &goal(100)).unwrap();
+    assert_eq!(client.send_goal_as(id, &goal(2)).unwrap_err(), IdInUse(id));
+    feedback(&mut first, 3).await;
+    assert_eq!(first.id(), id);
+    // By its id, as the server knows it.
+    let cancelled = client.cancel(CancelWhat::Goal(id)).await.unwrap();
+    assert_eq!(cancelled.goals[0].id, id);
+    assert_eq!(done(&mut first).await, (Status::Canceled, vec![1, 1, 2]));
+    drop(first);
+    let mut again = client.send_goal_as(id, &goal(2)).unwrap();
+    // The server has not forgotten it.
+    assert_eq!(outcome(&mut again).await, Outcome::Rejected);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 1)]

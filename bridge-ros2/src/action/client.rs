@@ -13,7 +13,7 @@ use tokio::time::{Instant, sleep, timeout};
 use tracing::debug;
 
 use super::client_goals::{ClientCounters, ClientGoals, Limits, Outcome};
-use super::error::{ActionError, LostReason, NoServer};
+use super::error::{ActionError, IdInUse, LostReason, NoServer};
 use super::goal::GoalHandle;
 use super::types::{CancelAnswer, CancelWhat, GoalId, Status};
 use super::{Action, STATUS_TYPE, status_policies, wire};
@@ -121,8 +121,23 @@ impl ActionClient {
     #[must_use]
     pub fn send_goal(&self, body: &[u8]) -> GoalHandle {
         let id = self.shared.new_id();
+        self.send_new(self.shared.lock(), id, body)
+    }
+
+    /// As [`send_goal`](Self::send_goal), under an id that was chosen elsewhere. A server rejects one that it knows already.
+    ///
+    /// # Errors
+    /// [`IdInUse`] while somebody holds a goal of that id: nothing is sent.
+    pub fn send_goal_as(&self, id: GoalId, body: &[u8]) -> Result<GoalHandle, IdInUse> {
+        let state = self.shared.lock();
+        if state.goals.is_held(id) {
+            return Err(IdInUse(id));
+        }
+        Ok(self.send_new(state, id, body))
+    }
+
+    fn send_new(&self, mut state: MutexGuard<'_, State>, id: GoalId, body: &[u8]) -> GoalHandle {
         let wake: Arc<Notify> = Arc::default();
-        let mut state = self.shared.lock();
         state.goals.sent(id, Arc::clone(&wake));
         match wire::join(id, body) {
             None => state.goals.end(id, Outcome::Lost(LostReason::Message)),

@@ -120,6 +120,11 @@ impl ClientGoals {
         }
     }
 
+    /// Whether somebody holds a goal of that id, be it ended.
+    pub(super) fn is_held(&self, id: GoalId) -> bool {
+        self.goals.contains_key(&id)
+    }
+
     /// A server has accepted the goal.
     pub(super) fn accepted(&mut self, id: GoalId, stamp: RosTime) {
         if let Some(goal) = self.open(id)

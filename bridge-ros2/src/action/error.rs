@@ -2,6 +2,7 @@
 
 use thiserror::Error;
 
+use super::types::GoalId;
 use crate::domain::DomainError;
 use crate::service::ServiceError;
 
@@ -16,6 +17,11 @@ pub enum ActionError {
     #[error("the empty result of the action {0} is not CDR in little endian with a status in it")]
     EmptyResult(String),
 }
+
+/// A goal was not sent, because its client holds one of the same id.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Error)]
+#[error("the client has a goal {0} already")]
+pub struct IdInUse(pub GoalId);
 
 /// No server is ready to take goals.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]

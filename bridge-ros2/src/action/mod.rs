@@ -27,7 +27,7 @@ use rustdds::{QosPolicies, QosPolicyBuilder};
 
 pub use self::client::{ActionClient, ActionClientOptions};
 pub use self::client_goals::{ClientCounters, GoalEvent, Outcome};
-pub use self::error::{ActionError, LostReason, NoServer};
+pub use self::error::{ActionError, IdInUse, LostReason, NoServer};
 pub use self::goal::GoalHandle;
 pub use self::server::{ActionServer, ActionServerOptions, ServerEvent};
 pub use self::server_goals::{GoalError, ServerCounters};
