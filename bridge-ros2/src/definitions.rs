@@ -6,8 +6,8 @@ use std::sync::Arc;
 
 use bridge_node::{Environment, TypePaths};
 use messages::{
-    DefinitionError, DescribedType, Dialect, MessageType, Registry, ServiceType, ServiceTypeHashes,
-    TextKind, TypeHash, TypeName,
+    ActionCalls, ActionMessages, ActionTypeHashes, DefinitionError, DescribedType, Dialect,
+    MessageType, Registry, ServiceType, ServiceTypeHashes, TextKind, TypeHash, TypeName,
 };
 use uadp::BuiltinType;
 
@@ -212,6 +212,44 @@ impl Definitions {
     /// The type hashes of a service that was found.
     pub(crate) fn service_type_hashes(&self, name: &TypeName) -> Option<ServiceTypeHashes> {
         self.known.registry().service_type_hashes(name).ok()
+    }
+
+    /// The calls and values that the action of that name is, found likewise.
+    ///
+    /// # Errors
+    /// [`DefinitionError`].
+    pub(crate) fn action_calls(
+        &mut self,
+        name: &TypeName,
+    ) -> Result<Arc<ActionCalls>, DefinitionError> {
+        self.known.find_action_calls(name)
+    }
+
+    /// The messages of the action of that name, found likewise.
+    ///
+    /// # Errors
+    /// [`DefinitionError`].
+    pub(crate) fn action_messages(
+        &mut self,
+        name: &TypeName,
+    ) -> Result<ActionMessages, DefinitionError> {
+        self.known.find_action_messages(name)
+    }
+
+    /// The type hashes of an action that was found.
+    pub(crate) fn action_type_hashes(&self, name: &TypeName) -> Option<ActionTypeHashes> {
+        self.known.registry().added_action_type_hashes(name).ok()
+    }
+
+    /// The description of an action that was found, and what it needs.
+    ///
+    /// # Errors
+    /// [`DefinitionError`].
+    pub(crate) fn described_action(
+        &self,
+        name: &TypeName,
+    ) -> Result<Vec<DescribedType>, DefinitionError> {
+        self.known.registry().describe_action(name)
     }
 
     /// The ROS type that carries one value of that type, and nothing else.

@@ -4,6 +4,8 @@
 //! [`reconcile`], which compares what the domain holds with what is open: every 200 ms, and soon
 //! after RustDDS reports a change.
 
+mod action_graph;
+mod actions;
 mod bridges;
 mod calls;
 mod descriptions;
@@ -27,8 +29,8 @@ use std::task::{Context, Poll};
 
 use bridge_node::policy::{Policy, Read, Step, TYPE_CHANGES, Word, is_bad, type_changes};
 use bridge_node::{
-    Answered, AskId, CallDescription, Calls, Delivery, Described, Executed, Executing, Execution,
-    Kept, Port, PortEvent, Services, TypePaths, now,
+    Actions, Answered, AskId, CallDescription, Calls, Delivery, Described, Executed, Executing,
+    Execution, ExecutionId, Kept, Port, PortEvent, Services, TypePaths, now,
 };
 use bytes::Bytes;
 use futures_util::StreamExt;
@@ -106,6 +108,8 @@ pub struct Ros2Port {
     calls: Calls<ServiceServer>,
     /// Services of the domain, executed for other spaces.
     executing: Executing<Client>,
+    /// Actions, either way.
+    actions: Actions,
     /// Whose services they are, and who is there.
     peers: ServicePeers,
     parameters: ParameterServer,
@@ -181,6 +185,7 @@ impl Ros2Port {
             services,
             calls: Calls::default(),
             executing: Executing::default(),
+            actions: Actions::default(),
             peers,
             parameters,
             graph: Graph::default(),
@@ -275,6 +280,10 @@ impl Ros2Port {
                 continue;
             }
             if let Poll::Ready(events) = self.executing.poll_recv(cx) {
+                self.events.extend(events);
+                continue;
+            }
+            if let Poll::Ready(events) = self.actions.poll_recv(cx) {
                 self.events.extend(events);
                 continue;
             }
@@ -442,6 +451,12 @@ impl Port for Ros2Port {
     }
 
     fn publish(&mut self, sample: Delivery) -> Result<(), &'static str> {
+        if type_changes(&self.events, sample.topic) {
+            return Err(TYPE_CHANGES);
+        }
+        if self.actions.takes(sample.topic) {
+            return self.actions.publish(&sample);
+        }
         let Delivery {
             topic,
             payload,
@@ -450,9 +465,6 @@ impl Port for Ros2Port {
             kept,
             ..
         } = sample;
-        if type_changes(&self.events, topic) {
-            return Err(TYPE_CHANGES);
-        }
         if kept == Kept::Again {
             // A writer of depth 1 has no place for more than the last value.
             return Ok(());
@@ -505,6 +517,10 @@ impl Port for Ros2Port {
         shape: &[(BuiltinType, bool)],
         described: Option<&Described>,
     ) {
+        if self.actions.takes(topic) {
+            // It is bound when its action is served.
+            return;
+        }
         let at_home = topic.space == self.policy.own() || self.is_at_home(topic.space);
         if at_home || self.services.takes(topic) {
             return;
@@ -555,11 +571,14 @@ impl Port for Ros2Port {
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         self.calls.known(topic, Arc::clone(description));
+        self.actions.known(topic, description);
         self.schedule.look_next();
     }
 
     fn call_gone(&mut self, topic: TopicId) {
-        self.calls.gone(topic, now().monotonic);
+        let now = now().monotonic;
+        self.calls.gone(topic, now);
+        self.actions.gone(topic, now);
     }
 
     fn answered(&mut self, ask: AskId, _: TopicId, answer: Answered<Bytes>) {
@@ -568,13 +587,21 @@ impl Port for Ros2Port {
 
     fn execute(&mut self, execution: Execution) -> bool {
         let id = execution.id;
-        if let Err(refusal) = self.executing.execute(execution) {
+        let begun = match self.actions.serves(execution.topic) {
+            true => self.actions.execute(execution),
+            false => self.executing.execute(execution),
+        };
+        if let Err(refusal) = begun {
             let outcome = Executed::Refused(refusal);
             let execution = id;
             let event = PortEvent::Executed { execution, outcome };
             self.events.push_back(event);
         }
         true
+    }
+
+    fn abandoned(&mut self, execution: ExecutionId, _: TopicId) {
+        self.actions.abandoned(execution);
     }
 
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
@@ -600,6 +627,7 @@ impl Port for Ros2Port {
             services,
             calls,
             executing,
+            actions,
             peers,
             parameters,
             descriptions,
@@ -612,6 +640,7 @@ impl Port for Ros2Port {
             services,
             calls,
             executing,
+            actions,
             peers,
             parameters,
             descriptions,

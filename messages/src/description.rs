@@ -125,6 +125,14 @@ impl Registry {
     pub fn describe_service(&self, name: &TypeName) -> Result<Vec<DescribedType>, DefinitionError> {
         crate::type_hash::describe_service(self, name)
     }
+
+    /// The description of an action of ROS 2 that was added, and what it needs, itself first.
+    ///
+    /// # Errors
+    /// As [`Registry::get`], of one of its messages.
+    pub fn describe_action(&self, name: &TypeName) -> Result<Vec<DescribedType>, DefinitionError> {
+        crate::type_hash::describe_action(self, name)
+    }
 }
 
 fn definition(of: &TypeName, described: &DescribedType) -> Result<Definition, DefinitionError> {

@@ -74,6 +74,15 @@ pub(crate) fn describe_service(
     Ok(types.with_needed(&full))
 }
 
+/// The description of an action of ROS 2 that was added, and of what it needs.
+pub(crate) fn describe_action(
+    registry: &Registry,
+    name: &TypeName,
+) -> Result<Vec<DescribedType>, DefinitionError> {
+    let (types, full) = Described::of_added_action(registry, name)?;
+    Ok(types.with_needed(&full))
+}
+
 /// The hashes of a service and its parts, each by its ROS 2 name, such as `std_srvs/srv/SetBool_Request`.
 ///
 /// The endpoints of a service announce those of `_Request` and `_Response`.
@@ -147,25 +156,20 @@ impl Registry {
         text: &str,
     ) -> Result<ActionTypeHashes, DefinitionError> {
         let parts = crate::service::action_parts(self.dialect(), name, text)?;
-        let full = format!("{}/action/{}", name.package(), name.name());
-        let mut types = Described::new(self);
-        for (suffix, part) in ["Goal", "Result", "Feedback"].into_iter().zip(&parts) {
-            for needed in part.needs() {
-                self.get(needed)?;
-            }
-            types.definition(&format!("{full}_{suffix}"), part)?;
-        }
-        types.action(&full);
-        let of = |suffix: &str| types.hash(&format!("{full}_{suffix}"));
-        Ok(ActionTypeHashes {
-            action: types.hash(&full),
-            goal: of("Goal"),
-            result: of("Result"),
-            feedback: of("Feedback"),
-            send_goal: types.service_hashes(&format!("{full}_SendGoal")),
-            get_result: types.service_hashes(&format!("{full}_GetResult")),
-            feedback_message: of("FeedbackMessage"),
-        })
+        let (types, full) = Described::of_action(self, name, &parts)?;
+        Ok(types.action_hashes(&full))
+    }
+
+    /// The type hashes of an action of ROS 2 that was added, as [`action_type_hashes`](Self::action_type_hashes).
+    ///
+    /// # Errors
+    /// As [`Registry::get`], of one of its messages.
+    pub fn added_action_type_hashes(
+        &self,
+        name: &TypeName,
+    ) -> Result<ActionTypeHashes, DefinitionError> {
+        let (types, full) = Described::of_added_action(self, name)?;
+        Ok(types.action_hashes(&full))
     }
 }
 
@@ -207,6 +211,40 @@ impl<'r> Described<'r> {
         }
         types.service(&full);
         Ok((types, full))
+    }
+
+    /// An action of these three parts with all it needs, and its ROS 2 name.
+    fn of_action(
+        registry: &'r Registry,
+        name: &TypeName,
+        parts: &[Arc<Definition>; 3],
+    ) -> Result<(Self, String), DefinitionError> {
+        let full = format!("{}/action/{}", name.package(), name.name());
+        let mut types = Self::new(registry);
+        for (suffix, part) in ACTION_PARTS.into_iter().zip(parts) {
+            for needed in part.needs() {
+                registry.get(needed)?;
+            }
+            types.definition(&format!("{full}_{suffix}"), part)?;
+        }
+        types.action(&full);
+        Ok((types, full))
+    }
+
+    fn of_added_action(
+        registry: &'r Registry,
+        name: &TypeName,
+    ) -> Result<(Self, String), DefinitionError> {
+        let part = |suffix| {
+            let part = crate::service::derived(name, suffix)?;
+            let found = registry.definition(&part).cloned();
+            found.ok_or(DefinitionError::Unknown {
+                name: part,
+                needed_by: None,
+            })
+        };
+        let [goal, result, feedback] = ACTION_PARTS.map(part);
+        Self::of_action(registry, name, &[goal?, result?, feedback?])
     }
 
     /// A type first, then what it needs in the order of the names.
@@ -319,6 +357,19 @@ impl<'r> Described<'r> {
             nested("feedback_message", "FeedbackMessage"),
         ];
         self.types.insert(full.to_owned(), action);
+    }
+
+    fn action_hashes(&self, full: &str) -> ActionTypeHashes {
+        let of = |suffix: &str| self.hash(&format!("{full}_{suffix}"));
+        ActionTypeHashes {
+            action: self.hash(full),
+            goal: of("Goal"),
+            result: of("Result"),
+            feedback: of("Feedback"),
+            send_goal: self.service_hashes(&format!("{full}_SendGoal")),
+            get_result: self.service_hashes(&format!("{full}_GetResult")),
+            feedback_message: of("FeedbackMessage"),
+        }
     }
 
     /// The messages that services and actions are made with, whatever the registry has.
@@ -529,6 +580,8 @@ fn base(written: &str) -> &str {
     written.split('[').next().unwrap_or(written)
 }
 
+/// What an action is made of, in the order of its text.
+const ACTION_PARTS: [&str; 3] = ["Goal", "Result", "Feedback"];
 const TIME: &str = "builtin_interfaces/msg/Time";
 const UUID: &str = "unique_identifier_msgs/msg/UUID";
 // `type_description_interfaces/msg/FieldType`, whose arrays of a type are numbered as far behind it as this:

@@ -226,9 +226,16 @@ fn services_have_the_hashes_that_nodes_of_ros_2_were_seen_to_announce() {
 fn the_messages_of_an_action_have_the_hashes_rosidl_generates() {
     // example_interfaces/action/Fibonacci as SwiftROS2 holds them, checked there against rosidl's generated files.
     let text = "int32 order\n---\nint32[] sequence\n---\nint32[] sequence\n";
-    let ours = Registry::bundle(Dialect::Ros2)
-        .action_type_hashes(&name("example_interfaces/Fibonacci"), text)
-        .unwrap();
+    let fibonacci = name("example_interfaces/Fibonacci");
+    let mut registry = Registry::bundle(Dialect::Ros2);
+    let ours = registry.action_type_hashes(&fibonacci, text).unwrap();
+    registry.add_action(&fibonacci, text).unwrap();
+    assert_eq!(
+        registry.added_action_type_hashes(&fibonacci),
+        Ok(ours.clone())
+    );
+    let described = registry.describe_action(&fibonacci).unwrap();
+    assert_eq!(described[0].name, "example_interfaces/action/Fibonacci");
     for (ours, hash) in [
         (
             ours.goal,
@@ -276,6 +283,10 @@ fn what_is_missing_or_contains_itself_is_an_error_as_elsewhere() {
     assert!(registry.service_type_hashes(&name("a/Unknown")).is_err());
     let action = "Ring ring\n---\n---\n";
     assert!(registry.action_type_hashes(&name("a/Act"), action).is_err());
+    let unknown = registry
+        .added_action_type_hashes(&name("a/Act"))
+        .unwrap_err();
+    assert!(unknown.to_string().contains("a/ActGoal"), "{unknown}");
 }
 
 /// The hash is the SHA-256 that Python computes of the description, in which such a field has FIELD_TYPE_CHAR (13).

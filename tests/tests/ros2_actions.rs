@@ -158,7 +158,7 @@ async fn a_server_of_cyclone_is_asked_to_cancel_one_some_and_all() {
     let all = client.cancel(CancelWhat::All).await.unwrap();
     assert_eq!(ids(&all), [goals[2].id()]);
     assert_eq!(done(&mut goals[2]).await.0, Status::Canceled);
-    let nobody = bridge_ros2::action::GoalId::from_bytes([9; 16]);
+    let nobody = GoalId::from_bytes([9; 16]);
     let unknown = client.cancel(CancelWhat::Goal(nobody)).await.unwrap();
     assert_eq!(unknown.code, CancelCode::UnknownGoal);
     assert_eq!(goals[1].status(), Status::Executing);

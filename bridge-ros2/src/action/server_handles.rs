@@ -163,6 +163,22 @@ impl ServerGoal {
             .decide(|goals| goals.execute(self.ticket).map(|()| Vec::new()))
     }
 
+    /// Goes over to cancelling without a client here having asked, as when the goal is worked on elsewhere and is cancelled
+    /// there.
+    ///
+    /// # Errors
+    /// [`GoalError`].
+    pub fn cancel_unasked(&self) -> Result<(), GoalError> {
+        self.shared
+            .decide(|goals| goals.cancel(self.ticket).map(|()| Vec::new()))
+    }
+
+    /// The empty result of the server's options.
+    #[must_use]
+    pub fn empty_result(&self) -> Bytes {
+        self.shared.empty_result()
+    }
+
     /// Reports progress: an `X_Feedback`, CDR in little endian with its encapsulation header. Never waits.
     ///
     /// # Errors

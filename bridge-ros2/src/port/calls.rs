@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::{Executing, PortEvent, Present};
-use mappings::TopicId;
+use mappings::{Mapping, TopicId};
 use messages::TypeName;
 use rustdds::RTPSEntity;
 use tokio::time::Instant;
@@ -21,28 +21,25 @@ impl Ros2Port {
     /// bridge of the domain serves are left to it, as are those that such a bridge offers too and that under a chosen name
     /// somebody else offers: a client asks all servers of a name.
     pub(super) fn offer_calls(&mut self) {
-        let mapping = Arc::clone(self.policy.mapping());
-        let (graph, domain) = (&self.graph, self.domain_id);
-        let bridge = Bridge {
-            space: self.policy.own(),
-            participant: self.domain.participant().guid(),
-        };
         let snapshot = self.peers.look(Instant::now(), SEEN);
         let mut taken = Vec::new();
         for (topic, service) in self.calls.chosen(&self.policy) {
-            if is_offered(graph, &snapshot, &service) {
+            if is_offered(&self.graph, &snapshot, &service) {
                 self.policy.told.once(&service, "taken", || {
                     format!("{topic} is not offered as {service}: another node has such a service")
                 });
                 taken.push(service);
             }
         }
-        let left = |topic: TopicId, service: &str| {
-            is_at_home(graph, &mapping, topic.space, domain)
-                || bridge.is_second(graph, &mapping, (topic, service), domain)
-                || taken.iter().any(|name| name == service)
+        let (bridge, mapping) = (self.bridge(), Arc::clone(self.policy.mapping()));
+        let left = Left {
+            graph: &self.graph,
+            mapping: &mapping,
+            bridge,
+            domain: self.domain_id,
+            taken,
         };
-        self.calls.leave(left);
+        self.calls.leave(|topic, service| left.is(topic, service));
         if !self.calls.is_waiting() {
             return;
         }
@@ -54,7 +51,7 @@ impl Ros2Port {
         let (calls, policy) = (&mut self.calls, &mut self.policy);
         // Other bridges that are there are known by then.
         let settled = self.joined.elapsed() >= SETTLED;
-        let may = |topic: TopicId, service: &str| settled && !left(topic, service);
+        let may = |topic: TopicId, service: &str| settled && !left.is(topic, service);
         // Each has a reader and a writer.
         let events = calls.offer_waiting(&mut services, policy, may, self.budget / 2);
         self.budget = self.budget.saturating_sub(2 * events.len());
@@ -98,8 +95,9 @@ impl Ros2Port {
             }
             present.insert(service, type_name);
         }
-        let looked_for = snapshot.called().filter_map(|(service, clients)| {
-            let topic: TopicId = service.parse().ok()?;
+        let called = snapshot.called().chain(snapshot.called_actions());
+        let looked_for = called.filter_map(|(name, clients)| {
+            let topic: TopicId = name.parse().ok()?;
             let ours = self.policy.own() == topic.space;
             let mut clients = clients.iter();
             let somebody = clients.any(|one| !self.graph.is_bridge(one.guid));
@@ -124,6 +122,14 @@ impl Ros2Port {
         self.events.extend(events);
     }
 
+    /// This bridge, beside others of the domain.
+    pub(super) fn bridge(&self) -> Bridge {
+        Bridge {
+            space: self.policy.own(),
+            participant: self.domain.participant().guid(),
+        }
+    }
+
     /// Has the node tell who asks what the type of a service is.
     fn tell_service(&self, name: &TypeName) {
         if let Some(hashes) = self.definitions.service_type_hashes(name)
@@ -131,6 +137,28 @@ impl Ros2Port {
         {
             self.told_types.learn(described, hashes.service);
         }
+    }
+}
+
+/// Which calls of other spaces are left to others of the domain.
+pub(super) struct Left<'p> {
+    pub(super) graph: &'p Graph,
+    pub(super) mapping: &'p Mapping,
+    pub(super) bridge: Bridge,
+    pub(super) domain: u16,
+    /// The names that another node has.
+    pub(super) taken: Vec<String>,
+}
+
+impl Left<'_> {
+    /// Whether that call is not to be offered under that name here.
+    pub(super) fn is(&self, topic: TopicId, name: &str) -> bool {
+        let (graph, mapping) = (self.graph, self.mapping);
+        is_at_home(graph, mapping, topic.space, self.domain)
+            || self
+                .bridge
+                .is_second(graph, mapping, (topic, name), self.domain)
+            || self.taken.iter().any(|taken| taken == name)
     }
 }
 
@@ -142,6 +170,6 @@ fn is_offered(graph: &Graph, snapshot: &Snapshot, service: &str) -> bool {
 }
 
 /// From when on after joining a domain services are offered in it.
-const SETTLED: Duration = Duration::from_secs(1);
+pub(super) const SETTLED: Duration = Duration::from_secs(1);
 /// How old what is known of others may be.
-const SEEN: Duration = Duration::from_millis(100);
+pub(super) const SEEN: Duration = Duration::from_millis(100);

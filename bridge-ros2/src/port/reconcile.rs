@@ -34,11 +34,14 @@ impl Ros2Port {
         }
         self.former.retain(|former| !former.is_done(now));
         self.report_drops();
-        self.calls.tidy(bridge_node::now().monotonic);
+        let monotonic = bridge_node::now().monotonic;
+        self.calls.tidy(monotonic);
+        self.actions.tidy(&self.policy, monotonic);
         if is_due {
             self.graph = self.domain.graph();
         }
         self.offer_calls();
+        self.offer_actions();
         if !is_due {
             return;
         }
@@ -51,6 +54,7 @@ impl Ros2Port {
         self.take_descriptions(now);
         self.find_topics(now);
         self.find_services();
+        self.find_actions();
         for index in 0..self.sources.len() {
             self.reconcile_source(index, now);
         }

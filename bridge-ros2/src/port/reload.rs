@@ -36,6 +36,8 @@ impl Ros2Port {
         self.calls.look_again(&mut graph, &self.policy);
         let events = self.executing.look_again(&mut graph);
         self.events.extend(events);
+        let events = self.actions.look_again(&mut graph, &mut self.policy);
+        self.events.extend(events);
         self.events.extend(self.calls.ask_for_mapped(&self.policy));
         for (topic, (message_type, values)) in read {
             self.take_up_values(topic, message_type, values);

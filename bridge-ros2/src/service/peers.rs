@@ -155,21 +155,42 @@ impl Snapshot {
 
     /// The services that somebody offers, each with the readers of its requests.
     pub(crate) fn offered(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
-        named(&self.readers)
+        named(&self.readers, service_name)
     }
 
     /// The services that somebody asks for, each with the writers of its requests.
     pub(crate) fn called(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
-        named(&self.writers)
+        named(&self.writers, service_name)
+    }
+
+    /// The actions that somebody serves, each with the readers of its goals.
+    pub(crate) fn served_actions(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
+        named(&self.readers, action_name)
+    }
+
+    /// The actions that somebody sends goals to, each with the writers of its goals.
+    pub(crate) fn called_actions(&self) -> impl Iterator<Item = (&str, &[Endpoint])> {
+        named(&self.writers, action_name)
     }
 }
 
-/// The names of the services, without the slash in front, among the topics with requests.
-fn named(topics: &BTreeMap<String, Vec<Endpoint>>) -> impl Iterator<Item = (&str, &[Endpoint])> {
-    topics.iter().filter_map(|(topic, endpoints)| {
-        let name = topic.strip_prefix("rq/")?.strip_suffix("Request")?;
-        (!name.contains("/_action/")).then_some((name, endpoints.as_slice()))
+/// The names without the slash in front that `name` finds in topics with requests.
+fn named(
+    topics: &BTreeMap<String, Vec<Endpoint>>,
+    name: impl Fn(&str) -> Option<&str>,
+) -> impl Iterator<Item = (&str, &[Endpoint])> {
+    topics.iter().filter_map(move |(topic, endpoints)| {
+        let name = name(topic.strip_prefix("rq/")?.strip_suffix("Request")?)?;
+        Some((name, endpoints.as_slice()))
     })
+}
+
+fn service_name(name: &str) -> Option<&str> {
+    (!name.contains("/_action/")).then_some(name)
+}
+
+fn action_name(name: &str) -> Option<&str> {
+    name.strip_suffix("/_action/send_goal")
 }
 
 /// The services that others than `participant` offer, with their types.
@@ -192,6 +213,17 @@ pub(crate) fn service_type(request: &str) -> String {
     )
 }
 
+/// `nav2_msgs/NavigateToPose` of `nav2_msgs::action::dds_::NavigateToPose_SendGoal_Request_`.
+pub(crate) fn action_type(request: &str) -> String {
+    let parts = request.split_once("::action::dds_::");
+    let named =
+        parts.and_then(|(package, rest)| Some((package, rest.strip_suffix("_SendGoal_Request_")?)));
+    named.map_or_else(
+        || request.to_owned(),
+        |(package, name)| format!("{package}/{name}"),
+    )
+}
+
 fn is_wanted(topic: &str) -> bool {
     topic.starts_with("rq/") || topic.starts_with("rr/") || topic.contains("/_action/")
 }
@@ -204,5 +236,18 @@ mod tests {
     fn a_service_is_named_as_its_file_is() {
         let of = ["std_srvs::srv::dds_::SetBool_Request_", "SomethingElse"];
         assert_eq!(of.map(service_type), ["std_srvs/SetBool", "SomethingElse"]);
+    }
+
+    #[test]
+    fn an_action_is_named_as_its_file_is() {
+        let of = [
+            "nav2_msgs::action::dds_::NavigateToPose_SendGoal_Request_",
+            "nav2_msgs::action::dds_::NavigateToPose_GetResult_Request_",
+        ];
+        assert_eq!(of.map(action_type), ["nav2_msgs/NavigateToPose", of[1]]);
+        assert_eq!(action_name("arm/_action/send_goal"), Some("arm"));
+        assert_eq!(action_name("arm/_action/cancel_goal"), None);
+        assert_eq!(service_name("arm/_action/send_goal"), None);
+        assert_eq!(service_name("arm/stop"), Some("arm/stop"));
     }
 }

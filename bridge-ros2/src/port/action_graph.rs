@@ -1,0 +1,348 @@
+//! Actions of the domain, as the policy of both bridges knows them.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge_node::actions::{
+    ActionClient as Sends, ActionGraph, ActionServer as Takes, CancelAnswer, CancelRequest,
+    CancelWhat, GoalEvent, GoalId, NewGoal, SentGoal, ServedGoal, ServerEvent, Waits,
+};
+use bridge_node::{CallFault, Ran};
+use bytes::Bytes;
+use messages::{ActionCalls, MessageType, NoFields, Plan, Selection, TextKind, TypeName, Wire};
+use tracing::debug;
+use uadp::Timestamp;
+
+use super::services::Ros2Graph;
+use crate::action::{
+    self, Action, ActionClientOptions, ActionServerOptions, GoalError, GoalHandle, LostReason,
+    Outcome, Status,
+};
+use crate::clock::RosTime;
+
+impl ActionGraph for Ros2Graph<'_> {
+    type Sender = Client;
+    type Taker = Server;
+
+    fn action_calls(&mut self, name: &TypeName) -> Result<Arc<ActionCalls>, String> {
+        let found = self.definitions.action_calls(name);
+        found.map_err(|error| {
+            let error = self.definitions.explain(TextKind::Action, &error);
+            format!(
+                "{error}; discovery does not bring the definition of an action, so a prefix in AMENT_PREFIX_PATH or a \
+                 folder of type_paths must have {}/action/{}.action",
+                name.package(),
+                name.name()
+            )
+        })
+    }
+
+    fn action_client(
+        &mut self,
+        action: &str,
+        type_name: &TypeName,
+        waits: Waits,
+    ) -> Result<Client, String> {
+        let action = self.action(action, type_name);
+        let options = ActionClientOptions {
+            server_timeout: waits.silence,
+            answer_timeout: Some(waits.answer),
+            cancel_timeout: waits.answer,
+            ..ActionClientOptions::default()
+        };
+        action::ActionClient::open(self.domain, self.peers, &action, options)
+            .map(Client)
+            .map_err(|error| error.to_string())
+    }
+
+    fn serve_action(&mut self, action: &str, type_name: &TypeName) -> Result<Server, String> {
+        let messages = self.definitions.action_messages(type_name);
+        let messages = messages.map_err(|error| error.to_string())?;
+        let empty_result = empty(messages.result_response())?;
+        let action = self.action(action, type_name);
+        let options = ActionServerOptions {
+            result_timeout: Some(KEPT),
+            cancel_timeout: CANCEL_TIMEOUT,
+            ..ActionServerOptions::new(empty_result)
+        };
+        action::ActionServer::open(self.domain, self.peers, &action, options)
+            .map(Server)
+            .map_err(|error| error.to_string())
+    }
+}
+
+impl Ros2Graph<'_> {
+    /// The action, whose hashes the domain announces.
+    fn action(&self, name: &str, type_name: &TypeName) -> Action {
+        let action = Action::new(name, type_name);
+        if let Some(hashes) = self.definitions.action_type_hashes(type_name) {
+            action.announce(self.domain, &hashes);
+        }
+        action
+    }
+}
+
+/// A message with nothing in it, CDR in little endian.
+fn empty(message: &Arc<MessageType>) -> Result<Bytes, String> {
+    let nothing = Selection::Template {
+        fields: Vec::new(),
+        rest: BTreeMap::new(),
+    };
+    let plan = Plan::compile(message, &nothing, Wire::Cdr).map_err(|error| error.to_string())?;
+    let mut bytes = Vec::new();
+    plan.write(&mut NoFields, &mut bytes)
+        .map_err(|error| error.to_string())?;
+    Ok(bytes.into())
+}
+
+/// Sends goals to an action of the domain.
+#[derive(Debug)]
+pub(super) struct Client(action::ActionClient);
+
+impl Sends for Client {
+    type Goal = Goal;
+
+    fn send_goal(&self, id: GoalId, body: &[u8]) -> Goal {
+        match self.0.send_goal_as(action::GoalId::from_bytes(id), body) {
+            Ok(handle) => Goal::Sent(handle),
+            Err(in_use) => Goal::NotSent(Some(in_use.to_string())),
+        }
+    }
+
+    async fn cancel(&self, what: CancelWhat) -> Result<CancelAnswer, CallFault> {
+        let what = match what {
+            CancelWhat::All => action::CancelWhat::All,
+            CancelWhat::Goal(id) => action::CancelWhat::Goal(action::GoalId::from_bytes(id)),
+        };
+        let answer = self.0.cancel(what).await.map_err(|error| CallFault {
+            text: error.to_string(),
+            may_pass: false,
+            ran: match error.may_have_run() {
+                true => Ran::Perhaps,
+                false => Ran::No,
+            },
+        })?;
+        Ok(CancelAnswer {
+            code: answer.code.code(),
+            goals: answer.goals.iter().map(|goal| goal.id.to_bytes()).collect(),
+        })
+    }
+}
+
+/// A goal of ours at a server of the domain.
+#[derive(Debug)]
+pub(super) enum Goal {
+    Sent(GoalHandle),
+    /// With the reason, until it is told.
+    NotSent(Option<String>),
+}
+
+impl SentGoal for Goal {
+    async fn recv(&mut self) -> Option<GoalEvent> {
+        let handle = match self {
+            Self::Sent(handle) => handle,
+            Self::NotSent(why) => return why.take().map(GoalEvent::Rejected),
+        };
+        loop {
+            let event = match handle.recv().await? {
+                action::GoalEvent::Accepted(stamp) => GoalEvent::Accepted(timestamp(stamp)),
+                action::GoalEvent::Status(status) => GoalEvent::Status(status.code()),
+                action::GoalEvent::Feedback(body) => GoalEvent::Feedback(body),
+                action::GoalEvent::FeedbackDropped(count) => {
+                    let goal = handle.id();
+                    debug!(%goal, count, "feedback gave way to newer one");
+                    continue;
+                }
+                action::GoalEvent::Ended(outcome) => ended(outcome),
+            };
+            return Some(event);
+        }
+    }
+}
+
+fn ended(outcome: Outcome) -> GoalEvent {
+    match outcome {
+        Outcome::Rejected => GoalEvent::Rejected("the action server rejected the goal".to_owned()),
+        Outcome::Done { status, result } => GoalEvent::Ended {
+            status: status.code(),
+            message: String::new(),
+            result,
+        },
+        Outcome::Lost(reason) => lost(&reason),
+    }
+}
+
+fn lost(reason: &LostReason) -> GoalEvent {
+    GoalEvent::Lost {
+        text: reason.to_string(),
+        ran: match reason.may_run() {
+            true => Ran::Perhaps,
+            false => Ran::No,
+        },
+    }
+}
+
+/// Times beyond those of OPC UA are cut to its ends.
+fn timestamp(time: RosTime) -> Timestamp {
+    let nanos = i128::from(time.sec) * NANOS + i128::from(time.nanosec);
+    Timestamp::from_unix_nanos(nanos)
+}
+
+/// Takes goals of the domain.
+#[derive(Debug)]
+pub(super) struct Server(action::ActionServer);
+
+impl Takes for Server {
+    type New = New;
+    type Cancel = Cancel;
+
+    async fn recv(&mut self) -> ServerEvent<New, Cancel> {
+        match self.0.recv().await {
+            action::ServerEvent::Goal(goal) => ServerEvent::Goal(New(goal)),
+            action::ServerEvent::Cancel(request) => ServerEvent::Cancel(Cancel(request)),
+        }
+    }
+}
+
+/// A goal of a client of the domain.
+#[derive(Debug)]
+pub(super) struct New(action::NewGoal);
+
+impl NewGoal for New {
+    type Goal = Served;
+
+    fn id(&self) -> GoalId {
+        self.0.id().to_bytes()
+    }
+
+    fn body(&self) -> &Bytes {
+        self.0.body()
+    }
+
+    async fn accept(self) -> Result<Served, String> {
+        let goal = self.0.accept().await.map_err(|error| error.to_string())?;
+        Ok(Served(goal))
+    }
+
+    fn reject(self, why: &str) {
+        // Clients are told that, and not why.
+        debug!(goal = %self.0.id(), why, "a goal is rejected");
+        self.0.reject();
+    }
+}
+
+/// A request of a client of the domain.
+#[derive(Debug)]
+pub(super) struct Cancel(action::CancelRequest);
+
+impl CancelRequest for Cancel {
+    fn id(&self) -> GoalId {
+        self.0.id().to_bytes()
+    }
+
+    fn accept(self) -> Result<(), String> {
+        self.0.accept().map_err(|error| error.to_string())
+    }
+
+    fn reject(self) {
+        self.0.reject();
+    }
+}
+
+/// A goal of a client of the domain, worked on elsewhere.
+#[derive(Debug)]
+pub(super) struct Served(action::ServerGoal);
+
+impl Served {
+    /// Ends are no steps from accepted, and the one as cancelled only from canceling.
+    fn step(&self, status: i8) -> Result<(), GoalError> {
+        if self.0.status() == Status::Accepted {
+            self.0.execute()?;
+        }
+        match status {
+            CANCELED => self.0.cancel_unasked(),
+            _ => Ok(()),
+        }
+    }
+}
+
+impl ServedGoal for Served {
+    fn execute(&self) {
+        if self.0.status() == Status::Accepted
+            && let Err(error) = self.0.execute()
+        {
+            debug!(%error, "work on a goal that has ended");
+        }
+    }
+
+    fn feedback(&self, body: &[u8]) -> Result<(), String> {
+        self.0.feedback(body).map_err(|error| error.to_string())
+    }
+
+    fn end(&self, status: i8, message: &str, result: Option<&[u8]>) -> Result<(), String> {
+        if !message.is_empty() {
+            // Results of ROS 2 have no words of their own.
+            debug!(goal = %self.0.id(), status, message, "a goal ends");
+        }
+        let end = || {
+            self.step(status)?;
+            match (status, result) {
+                (SUCCEEDED, Some(result)) => self.0.succeed(result),
+                (SUCCEEDED, None) => self.0.succeed(&self.0.empty_result()),
+                (CANCELED, Some(result)) => self.0.canceled(result),
+                (CANCELED, None) => self.0.canceled(&self.0.empty_result()),
+                (_, Some(result)) => self.0.abort(result),
+                (_, None) => self.0.abort(&self.0.empty_result()),
+            }
+        };
+        end().map_err(|error| error.to_string())
+    }
+}
+
+const SUCCEEDED: i8 = Status::Succeeded.code();
+const CANCELED: i8 = Status::Canceled.code();
+/// How long results stay, as those of the space do.
+const KEPT: Duration = Duration::from_secs(15 * 60);
+/// How long a server elsewhere may take to say whether it cancels a goal.
+const CANCEL_TIMEOUT: Duration = Duration::from_secs(10);
+const NANOS: i128 = 1_000_000_000;
+
+#[cfg(test)]
+mod tests {
+    use messages::{Dialect, Registry};
+
+    use super::*;
+
+    #[test]
+    fn an_empty_result_has_all_its_fields() {
+        let name = "demo_msgs/Count".parse().unwrap();
+        let mut registry = Registry::bundle(Dialect::Ros2);
+        let text = "int32 order\n---\nint32[] sequence\nfloat64 share\n---\nint32 done\n";
+        registry.add_action(&name, text).unwrap();
+        let messages = registry.action_messages(&name).unwrap();
+        let bytes = empty(messages.result_response()).unwrap();
+        // Status, the count of the sequence behind three bytes of padding, and the share.
+        assert_eq!(bytes.as_ref(), [&[0, 1, 0, 0][..], &[0; 16]].concat());
+    }
+
+    #[test]
+    fn what_nobody_had_did_not_run() {
+        for (reason, ran) in [
+            (LostReason::Busy(1), Ran::No),
+            (LostReason::Unknown, Ran::Perhaps),
+        ] {
+            let text = reason.to_string();
+            assert_eq!(lost(&reason), GoalEvent::Lost { text, ran });
+        }
+    }
+
+    #[test]
+    fn a_time_before_1970_is_one() {
+        let time = RosTime {
+            sec: -1,
+            nanosec: 500,
+        };
+        assert_eq!(timestamp(time).unix_nanos(), -999_999_500);
+    }
+}

@@ -1,0 +1,139 @@
+//! Actions of other spaces, as action servers of the domain; and action servers of the domain, executed for other spaces.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+
+use bridge_node::{Actions, CallRole, PortEvent, Present};
+use messages::TypeName;
+use tokio::time::Instant;
+
+use super::Ros2Port;
+use super::calls::{Left, SEEN, SETTLED};
+use super::services::Ros2Graph;
+use crate::graph::Graph;
+use crate::service::{Snapshot, action_type};
+
+impl Ros2Port {
+    /// Serves the actions that are known, as [`offer_calls`](Self::offer_calls) does with services.
+    pub(super) fn offer_actions(&mut self) {
+        let snapshot = self.peers.look(Instant::now(), SEEN);
+        let mut taken = Vec::new();
+        for (topic, action) in self.actions.chosen(&self.policy) {
+            if is_served(&self.graph, &snapshot, &action) {
+                self.policy.told.once(&action, "taken", || {
+                    format!("{topic} is not served as {action}: another node has such an action")
+                });
+                taken.push(action);
+            }
+        }
+        let (bridge, mapping) = (self.bridge(), Arc::clone(self.policy.mapping()));
+        let left = Left {
+            graph: &self.graph,
+            mapping: &mapping,
+            bridge,
+            domain: self.domain_id,
+            taken,
+        };
+        self.actions.leave(|topic, action| left.is(topic, action));
+        if !self.actions.is_waiting() {
+            return;
+        }
+        let mut graph = Ros2Graph {
+            peers: &self.peers,
+            domain: &self.domain,
+            definitions: &mut self.definitions,
+        };
+        let (calls, actions) = (&self.calls, &mut self.actions);
+        let settled = self.joined.elapsed() >= SETTLED;
+        let before = actions.offered().len();
+        let events = actions.offer_waiting(
+            (&mut graph, &mut self.policy),
+            |topic| calls.asker(topic),
+            |topic, action| settled && !left.is(topic, action),
+            self.budget / ENDPOINTS,
+        );
+        let made = actions.offered().len().saturating_sub(before);
+        self.budget = self.budget.saturating_sub(ENDPOINTS * made);
+        for event in &events {
+            if let PortEvent::CallBound { service_type, .. } = event {
+                self.tell_action(service_type.name());
+            }
+        }
+        self.events.extend(events);
+    }
+
+    /// Offers the action servers of other nodes that are actions of our space, and withdraws those that are gone. Of two types
+    /// under one name neither can be asked.
+    pub(super) fn find_actions(&mut self) {
+        let snapshot = self.peers.look(Instant::now(), SEEN);
+        let mapping = Arc::clone(self.policy.mapping());
+        let mapped = Actions::mapped(&mapping, &self.policy);
+        let mut present = Present::new();
+        for (action, servers) in snapshot.served_actions() {
+            let action = format!("/{action}");
+            let is_named = Actions::is_named(&self.policy, &action);
+            if !is_named && !mapped.contains(action.as_str()) {
+                continue;
+            }
+            // What another bridge serves is executed elsewhere.
+            let servers = servers.iter().filter(|one| !self.graph.is_bridge(one.guid));
+            let types: BTreeSet<String> = servers.map(|one| action_type(&one.type_name)).collect();
+            let type_name = match types.first() {
+                None => continue,
+                Some(name) if types.len() == 1 => name.parse().ok(),
+                Some(_) => None,
+            };
+            if type_name.is_none() && is_named {
+                let types: Vec<String> = types.into_iter().collect();
+                self.policy.told.once(&action, "type of the action", || {
+                    format!(
+                        "the action {action} cannot be asked for from other spaces: its type is {}",
+                        types.join(" and ")
+                    )
+                });
+            }
+            present.insert(action, type_name);
+        }
+        let mut graph = Ros2Graph {
+            peers: &self.peers,
+            domain: &self.domain,
+            definitions: &mut self.definitions,
+        };
+        let most = self.budget / ENDPOINTS;
+        let actions = &mut self.actions;
+        let events = actions.reconcile(&mut graph, &mut self.policy, (&present, most));
+        let made = events.iter().filter(|event| is_goal(event)).count();
+        self.budget = self.budget.saturating_sub(ENDPOINTS * made);
+        self.schedule.unfinished |= most > 0 && made == most;
+        self.events.extend(events);
+    }
+
+    /// Has the node tell who asks what the type of an action is. The name of a call that sends goals is that of the type.
+    fn tell_action(&mut self, name: &TypeName) {
+        if let Some(hashes) = self.definitions.action_type_hashes(name)
+            && let Ok(described) = self.definitions.described_action(name)
+        {
+            self.told_types.learn(described, hashes.action);
+        }
+    }
+}
+
+/// Whether an action is executed from now on, by what is said of its call that takes goals.
+fn is_goal(event: &PortEvent) -> bool {
+    matches!(
+        event,
+        PortEvent::OfferTyped { offered, .. } if matches!(offered.role, CallRole::Goal(_))
+    )
+}
+
+/// Whether another node than a bridge serves that action.
+fn is_served(graph: &Graph, snapshot: &Snapshot, action: &str) -> bool {
+    let action = action.trim_start_matches('/');
+    let mut served = snapshot.served_actions();
+    let servers = served.find_map(|(name, servers)| (name == action).then_some(servers));
+    let mut servers = servers.unwrap_or_default().iter();
+    servers.any(|one| !graph.is_bridge(one.guid))
+}
+
+/// Of an action, on either side: a reader and a writer of each of three services, and two of topics.
+const ENDPOINTS: usize = 8;
