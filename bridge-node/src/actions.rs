@@ -4,7 +4,13 @@
 //! others: a goal is a request, and so are cancelling and waiting for a result; feedback and the statuses of goals are values.
 //! The action of another space is offered as an action server of the graph.
 
+mod executors;
+mod facade;
+mod facades;
 mod graph;
+mod serving;
+mod table;
+mod wire;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
@@ -13,34 +19,52 @@ use std::time::Instant;
 
 use bridge_core::{CallDescription, ExecutionId, Refusal};
 use mappings::{Mapping, TopicId};
+use tokio::sync::mpsc;
 
 pub use self::graph::{
     ActionClient, ActionGraph, ActionServer, CancelAnswer, CancelRequest, CancelWhat, GoalEvent,
-    GoalId, NewGoal, SentGoal, ServedGoal, ServerEvent, Waits,
+    GoalId, NO_GOAL, NewGoal, SentGoal, ServedGoal, ServerEvent, Waits,
 };
 
+use self::executors::Executors;
+use self::facades::Facades;
 use crate::policy::Policy;
 use crate::port::{Delivery, Execution};
 use crate::{Asker, PortEvent, Present};
 
 /// The actions of one bridge: those of its graph that it executes for others, and those of other spaces that it offers.
-#[derive(Debug, Default)]
-pub struct Actions {}
+#[derive(Debug)]
+pub struct Actions {
+    executors: Executors,
+    facades: Facades,
+    reports: mpsc::Receiver<PortEvent>,
+    report: mpsc::Sender<PortEvent>,
+}
 
+impl Default for Actions {
+    fn default() -> Self {
+        let (report, reports) = mpsc::channel(MOST_REPORTS);
+        Self {
+            executors: Executors::default(),
+            facades: Facades::default(),
+            reports,
+            report,
+        }
+    }
+}
+
+/// What the graph has, executed for others.
 impl Actions {
-    // What the graph has, executed for others.
-
     /// Whether an action of that name is one of our own space by its name, so that its type has to be found out.
     #[must_use]
     pub fn is_named(policy: &Policy, action: &str) -> bool {
-        let _unused = (policy, action);
-        false
+        executors::named(policy, action).is_some()
     }
 
     /// The names of the actions that the mapping has executed in our own space.
+    #[must_use]
     pub fn mapped<'m>(mapping: &'m Mapping, policy: &Policy) -> BTreeSet<&'m str> {
-        let _unused = (mapping, policy);
-        BTreeSet::new()
+        executors::mapped(mapping, policy)
     }
 
     /// Compares the action servers there are, each with its type as far as that is known, with those that are offered to
@@ -51,15 +75,14 @@ impl Actions {
         policy: &mut Policy,
         (present, most): (&Present, usize),
     ) -> Vec<PortEvent> {
-        let _unused = (graph, policy, present, most);
-        Vec::new()
+        let (executors, report) = (&mut self.executors, &self.report);
+        executors.reconcile((graph, policy), (present, most), report)
     }
 
     /// Whether it executes that call: a part of an action.
     #[must_use]
     pub fn serves(&self, topic: TopicId) -> bool {
-        let _unused = topic;
-        false
+        self.executors.serves(topic)
     }
 
     /// Executes a request for a part of an action. What becomes of it comes from [`recv`](Self::recv).
@@ -67,73 +90,75 @@ impl Actions {
     /// # Errors
     /// Why it is not executed.
     pub fn execute(&mut self, execution: Execution) -> Result<(), Refusal> {
-        let _unused = execution;
-        Err(Refusal::NotExecutable)
+        self.executors.execute(execution)
     }
 
     /// Who asked for an execution does not want it any longer. Goals go on.
     pub fn abandoned(&mut self, execution: ExecutionId) {
-        let _unused = execution;
+        self.executors.abandoned(execution);
     }
+}
 
-    // What other spaces have, offered here.
-
+/// What other spaces have, offered here.
+impl Actions {
     /// A call of another space is known, or is another than before.
     pub fn known(&mut self, topic: TopicId, described: &Arc<CallDescription>) {
-        let _unused = (topic, described);
+        self.facades.known(topic, described);
     }
 
     /// A call is gone. Its action server stays for `receive_timeout`, after which its goals are aborted.
     pub fn gone(&mut self, topic: TopicId, now: Instant) {
-        let _unused = (topic, now);
+        self.facades.gone(topic, now);
     }
 
     /// Withdraws the action servers of actions that are gone. To be called now and then.
     pub fn tidy(&mut self, policy: &Policy, now: Instant) {
-        let _unused = (policy, now);
+        for event in self.facades.tidy(policy, now) {
+            // What stays bound has no consequence but its place.
+            drop(self.report.try_send(event));
+        }
     }
 
     /// The actions that are known and have a name of the mapping here, with that.
     #[must_use]
     pub fn chosen(&self, policy: &Policy) -> Vec<(TopicId, String)> {
-        let _unused = policy;
-        Vec::new()
+        self.facades.chosen(policy)
     }
 
     /// Whether any action waits to be offered.
     #[must_use]
     pub fn is_waiting(&self) -> bool {
-        false
+        self.facades.is_waiting()
     }
 
     /// Withdraws the servers of the actions that are left to others, by their names here, and has them wait.
     pub fn leave(&mut self, to_others: impl Fn(TopicId, &str) -> bool) {
-        let _unused = to_others;
+        self.facades.leave(to_others);
     }
 
     /// Offers actions that wait and `may` be offered under their names here, at most so many. `asker` makes what asks a call
     /// ([`Calls::asker`](crate::Calls::asker)). Reports the types of their calls and values.
     pub fn offer_waiting<G: ActionGraph>(
         &mut self,
-        (graph, policy): (&mut G, &mut Policy),
+        with: (&mut G, &mut Policy),
         asker: impl Fn(TopicId) -> Asker,
         may: impl Fn(TopicId, &str) -> bool,
         most: usize,
     ) -> Vec<PortEvent> {
-        let _unused = (graph, policy, asker, may, most);
-        Vec::new()
+        let (facades, report) = (&mut self.facades, &self.report);
+        facades.offer_waiting(with, (asker, report), may, most)
     }
 
     /// The names of the action servers that are there.
+    #[must_use]
     pub fn offered(&self) -> BTreeMap<TopicId, &str> {
-        BTreeMap::new()
+        self.facades.offered()
     }
 
     /// Whether the values of a topic are for an action server here: they are no topic of the graph by themselves.
     #[must_use]
     pub fn takes(&self, topic: TopicId) -> bool {
-        let _unused = topic;
-        false
+        self.facades.takes(topic)
     }
 
     /// Takes a value of a topic that it [takes](Self::takes).
@@ -141,20 +166,20 @@ impl Actions {
     /// # Errors
     /// A short reason under which it is counted as dropped.
     pub fn publish(&mut self, value: &Delivery) -> Result<(), &'static str> {
-        let _unused = value;
-        Ok(())
+        self.facades.publish(value)
     }
+}
 
-    // Both.
-
+/// Both.
+impl Actions {
     /// Has everything looked at again: definitions or the mapping may be others.
     pub fn look_again<G: ActionGraph>(
         &mut self,
         graph: &mut G,
         policy: &mut Policy,
     ) -> Vec<PortEvent> {
-        let _unused = (graph, policy);
-        Vec::new()
+        self.facades.look_again(graph, policy);
+        self.executors.look_again(graph)
     }
 
     /// What came of executions, and what goals report. Cancel-safe.
@@ -164,7 +189,24 @@ impl Actions {
 
     /// As [`recv`](Self::recv), for ports that poll.
     pub fn poll_recv(&mut self, cx: &mut Context<'_>) -> Poll<Vec<PortEvent>> {
-        let _unused = cx;
-        Poll::Pending
+        let mut events = Vec::new();
+        // Pending without a taken one only where the next is waited for.
+        while events.len() < MOST_AT_A_TIME
+            && let Poll::Ready(Some(event)) = self.reports.poll_recv(cx)
+        {
+            if let PortEvent::Executed { execution, .. } = &event {
+                self.executors.ended(*execution);
+            }
+            events.push(event);
+        }
+        match events.is_empty() {
+            true => Poll::Pending,
+            false => Poll::Ready(events),
+        }
     }
 }
+
+/// What came of executions and waits to be taken.
+const MOST_REPORTS: usize = 256;
+/// What is taken of it at a time.
+const MOST_AT_A_TIME: usize = 64;

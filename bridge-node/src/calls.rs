@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use bridge_core::{Answered, AskErrorKind, AskId, CallDescription, CallMap, CallRole};
 use bytes::Bytes;
-use mappings::TopicId;
+use mappings::{CallKind, TopicId};
 use messages::{Literal, MessageType, NoFields, Plan, Selection, ServiceType, TypeName, Wire};
 use tokio::sync::{mpsc, oneshot};
 use tracing::{debug, info};
@@ -113,7 +113,7 @@ impl Target {
 #[derive(Debug)]
 struct Asked {
     topic: TopicId,
-    answer: oneshot::Sender<Result<Bytes, String>>,
+    answer: oneshot::Sender<Result<Bytes, AskFault>>,
     /// An answer that says no, where the caller can be told in no other way.
     says_no: Option<Arc<MessageType>>,
 }
@@ -136,7 +136,7 @@ enum Said {
         topic: TopicId,
         request: Bytes,
         timeout: Option<Duration>,
-        answer: oneshot::Sender<Result<Bytes, String>>,
+        answer: oneshot::Sender<Result<Bytes, AskFault>>,
     },
     GivenUp(AskId),
 }
@@ -153,6 +153,15 @@ impl Drop for GiveUp {
             drop(place.send(Said::GivenUp(self.ask)));
         }
     }
+}
+
+/// Why a question has no answer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct AskFault {
+    /// Whether it was executed, as far as that is known.
+    pub(crate) kind: AskErrorKind,
+    /// For people.
+    pub(crate) text: String,
 }
 
 impl Asker {
@@ -172,19 +181,37 @@ impl Asker {
         &self,
         request: Bytes,
     ) -> impl Future<Output = Result<Bytes, String>> + Send + use<> {
+        let answer = self.ask_for(request);
+        async move { answer.await.map_err(|fault| fault.text) }
+    }
+
+    /// As [`ask`](Self::ask), with what is known of whether it was executed.
+    pub(crate) fn ask_for(
+        &self,
+        request: Bytes,
+    ) -> impl Future<Output = Result<Bytes, AskFault>> + Send + use<> {
         let asked = self.send(request);
         async move {
-            let (mut give_up, answer) = asked?;
+            let not_asked = |text| AskFault {
+                kind: AskErrorKind::Refused,
+                text,
+            };
+            let (mut give_up, answer) = asked.map_err(not_asked)?;
             let answer = answer.await;
             give_up.place = None;
-            answer.unwrap_or_else(|_| Err("the call is not there any more".to_owned()))
+            answer.unwrap_or_else(|_| {
+                Err(AskFault {
+                    kind: AskErrorKind::Unknown,
+                    text: "the call is not there any more".to_owned(),
+                })
+            })
         }
     }
 
     fn send(
         &self,
         request: Bytes,
-    ) -> Result<(GiveUp, oneshot::Receiver<Result<Bytes, String>>), String> {
+    ) -> Result<(GiveUp, oneshot::Receiver<Result<Bytes, AskFault>>), String> {
         let ask = AskId(self.next.fetch_add(1, Ordering::Relaxed));
         let place = || {
             let place = self.say.clone().try_reserve_owned();
@@ -261,7 +288,7 @@ impl<S: Send> Calls<S> {
             let age = now.duration_since(*since);
             if age >= ANSWERED_AFTER {
                 for (_, asked) in asked.extract_if(|_, asked| asked.topic == *topic) {
-                    asked.fail(GONE);
+                    asked.fail(AskErrorKind::Unknown, GONE);
                 }
             }
             age < LEFT_AFTER
@@ -313,7 +340,9 @@ impl<S: Send> Calls<S> {
     #[must_use]
     pub fn chosen(&self, policy: &Policy) -> Vec<(TopicId, String)> {
         let mapped = policy.mapping().asked_in(policy.own());
-        let known = mapped.filter(|(call, _)| self.known.contains_key(&call.topic));
+        let known = mapped.filter(|(call, _)| {
+            call.kind == CallKind::Service && self.known.contains_key(&call.topic)
+        });
         known
             .map(|(call, binding)| (call.topic, binding.target.name.clone()))
             .collect()
@@ -341,7 +370,8 @@ impl<S: Send> Calls<S> {
     pub fn ask_for_mapped(&self, policy: &Policy) -> Vec<PortEvent> {
         let mapped = policy.mapping().asked_in(policy.own());
         let unknown = mapped.filter(|(call, _)| !self.known.contains_key(&call.topic));
-        let topics = unknown.flat_map(|(call, _)| call.topics());
+        // Behind them an action has values.
+        let topics = unknown.flat_map(|(call, _)| call.topics().take(CALLS_OF_ACTION));
         topics
             .map(|topic| PortEvent::CallWanted { topic })
             .collect()
@@ -522,20 +552,24 @@ impl<S: Send> Calls<S> {
         };
         match answer {
             Ok(bytes) => drop(asked.answer.send(Ok(bytes))),
-            Err(fault) => asked.fail(&match fault.kind {
-                AskErrorKind::Refused => format!("not executed: {fault}"),
-                AskErrorKind::Failed | AskErrorKind::Unknown => fault.to_string(),
-            }),
+            Err(fault) => {
+                let text = match fault.kind {
+                    AskErrorKind::Refused => format!("not executed: {fault}"),
+                    AskErrorKind::Failed | AskErrorKind::Unknown => fault.to_string(),
+                };
+                asked.fail(fault.kind, &text);
+            }
         }
     }
 }
 
 impl Asked {
-    fn fail(self, why: &str) {
+    fn fail(self, kind: AskErrorKind, why: &str) {
         debug!(topic = %self.topic, why, "a call came to nothing");
         let no = self.says_no.and_then(|response| no(&response, why));
         // Who asked may have gone.
-        drop(self.answer.send(no.ok_or_else(|| why.to_owned())));
+        let text = why.to_owned();
+        drop(self.answer.send(no.ok_or(AskFault { kind, text })));
     }
 }
 
@@ -564,6 +598,8 @@ fn no(response: &Arc<MessageType>, why: &str) -> Option<Bytes> {
     Some(bytes.into())
 }
 
+/// Goal, cancel and result.
+const CALLS_OF_ACTION: usize = 3;
 /// Calls that are offered as services: anybody in the space can announce some.
 const MOST_CALLS: usize = 1024;
 /// What who waits is told when the one who executes a call is gone.

@@ -17,6 +17,9 @@ use crate::services::{CallFault, Ran};
 /// other text its MD5.
 pub type GoalId = [u8; 16];
 
+/// The id of no goal.
+pub const NO_GOAL: GoalId = [0; 16];
+
 /// A ROS graph with actions, as a port has it. How its messages are on the wire is [`ServiceGraph::WIRE`].
 pub trait ActionGraph: ServiceGraph {
     /// Sends goals to one action.

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use bridge_core::{CallDescription, CallMap};
-use messages::{ServiceType, TypeName};
+use messages::{ActionCalls, ServiceType, TypeName};
 
 /// The type of the service that a call is offered as: what the mapping says; else what the one who executes it says
 /// (at the beginning of what is said about it, as in `my_msgs/Weigh; Weighs the part`); else one of `std_srvs` that has its
@@ -48,6 +48,23 @@ pub fn call_type(
             of(&call.response)
         )
     })
+}
+
+/// The type of the action that a family of calls is offered as: what the mapping says, else what the one who executes it says
+/// of its goals. `find` finds the type of a name.
+///
+/// # Errors
+/// Why there is none, for people.
+pub fn action_type(
+    call: &CallDescription,
+    (mapped, map): (Option<&TypeName>, &CallMap),
+    find: impl FnOnce(&TypeName) -> Result<Arc<ActionCalls>, String>,
+) -> Result<Arc<ActionCalls>, String> {
+    let name = mapped.cloned().or_else(|| named(call));
+    let name = name.ok_or("its executor names no action type")?;
+    let calls = find(&name)?;
+    call.fits(calls.goal(), map)?;
+    Ok(calls)
 }
 
 /// The service type that is named in what is said about a call.

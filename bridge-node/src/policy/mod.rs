@@ -17,7 +17,7 @@ use bridge_core::{Described, Room};
 use mappings::{Mapping, SpaceId, TopicId};
 use messages::{MessageType, Selection, TypeName};
 
-pub use self::calls::call_type;
+pub use self::calls::{action_type, call_type};
 pub use self::choice::{Choice, Step, Word};
 pub use self::found::Found;
 pub use self::reload::{Destination, Read, still_made, taken_up};

@@ -1,0 +1,422 @@
+//! The action servers of the graph that are executed for the space: which they are, and the task of each.
+
+use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::num::NonZeroU16;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use bridge_core::{ActionFamily, CallRole, ExecutionId, OfferedType, Refusal, ValueNote};
+use mappings::{CallKind, ExecutedBy, FieldMap, Mapping, Overflow, SpaceId, TopicId};
+use messages::{ActionCalls, TypeName};
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+
+use super::graph::{ActionGraph, Waits};
+use super::serving::{Action, Command, Part, Serving};
+use super::wire;
+use crate::clock::now;
+use crate::policy::Policy;
+use crate::port::Execution;
+use crate::{PortEvent, Present};
+
+/// What of a graph's actions is executed for the space.
+#[derive(Debug, Default)]
+pub(super) struct Executors {
+    served: HashMap<TopicId, Served>,
+    /// Those that cannot be served as they are.
+    refused: HashMap<TopicId, Wanted>,
+    /// The parts of those that are served: of which, and what.
+    parts: HashMap<TopicId, (TopicId, Part)>,
+    /// Where what is executed was begun.
+    running: HashMap<ExecutionId, TopicId>,
+    tasks: JoinSet<()>,
+}
+
+#[derive(Debug)]
+struct Served {
+    wanted: Wanted,
+    family: ActionFamily,
+    calls: Arc<ActionCalls>,
+    commands: mpsc::Sender<Command>,
+    /// Whether its server is there.
+    offered: Arc<AtomicBool>,
+    /// Since when it is not.
+    gone: Option<Instant>,
+}
+
+/// An action server, and what is said of it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Wanted {
+    action: String,
+    type_name: TypeName,
+    name: String,
+    about: String,
+    open: bool,
+    waits: Waits,
+}
+
+impl Executors {
+    /// See [`Actions::reconcile`](super::Actions::reconcile).
+    pub(super) fn reconcile<G: ActionGraph>(
+        &mut self,
+        (graph, policy): (&mut G, &mut Policy),
+        (present, mut most): (&Present, usize),
+        report: &mpsc::Sender<PortEvent>,
+    ) -> Vec<PortEvent> {
+        while self.tasks.try_join_next().is_some() {}
+        tell_other_types(policy, present);
+        let wanted = wanted(policy, present);
+        let mut events = self.withdraw_missing(&wanted);
+        self.refused
+            .retain(|topic, refused| wanted.get(topic) == Some(refused));
+        for (topic, wanted) in wanted {
+            if let Some(served) = self.served.get_mut(&topic) {
+                if served.gone.take().is_some() {
+                    events.extend(served.offer(topic));
+                    // Where it has much to do, it tells them at the next change.
+                    drop(served.commands.try_send(Command::TellStatuses));
+                }
+                continue;
+            }
+            if self.refused.contains_key(&topic) {
+                continue;
+            }
+            if most == 0 {
+                break;
+            }
+            most -= 1;
+            match self.serve(graph, (topic, &wanted), report) {
+                Ok(offered) => events.extend(offered),
+                Err(why) => {
+                    policy.told.once(&topic.to_string(), "not executed", || {
+                        format!(
+                            "the action {} cannot be asked for from other spaces: {why}",
+                            wanted.action
+                        )
+                    });
+                    self.refused.insert(topic, wanted);
+                }
+            }
+        }
+        events
+    }
+
+    /// Withdraws those that are wanted otherwise, and those whose servers are not there. What became of the goals of the latter
+    /// can still be asked for once they are there again.
+    fn withdraw_missing(&mut self, wanted: &BTreeMap<TopicId, Wanted>) -> Vec<PortEvent> {
+        let now = now().monotonic;
+        let mut events = Vec::new();
+        self.served.retain(|topic, served| {
+            let other = wanted.get(topic).is_some_and(|now| served.wanted != *now);
+            if wanted.contains_key(topic) && !other {
+                return true;
+            }
+            if served.offered.swap(false, Ordering::AcqRel) {
+                events.extend(served.withdraw(*topic));
+            }
+            let since = *served.gone.get_or_insert(now);
+            !other && now.duration_since(since) < KEPT
+        });
+        let served = &self.served;
+        self.parts.retain(|_, (of, _)| served.contains_key(of));
+        events
+    }
+
+    fn serve<G: ActionGraph>(
+        &mut self,
+        graph: &mut G,
+        (topic, wanted): (TopicId, &Wanted),
+        report: &mpsc::Sender<PortEvent>,
+    ) -> Result<Vec<PortEvent>, String> {
+        if self.served.len() >= MOST_SERVED {
+            return Err(format!("{MOST_SERVED} actions are offered already"));
+        }
+        let (_, _, id) = topic.triple();
+        let family = ActionFamily::behind(id);
+        let family =
+            family.ok_or("it takes five identifiers, and there are none behind its own")?;
+        let of = |id| beside(topic, id).ok_or("0 is no identifier");
+        let (cancel, result) = (of(family.cancel)?, of(family.result)?);
+        let (feedback, status) = (of(family.feedback)?, of(family.status)?);
+        let calls = graph.action_calls(&wanted.type_name)?;
+        let client = graph.action_client(&wanted.action, &wanted.type_name, wanted.waits)?;
+        let (commands, told) = mpsc::channel(MOST_COMMANDS);
+        let offered = Arc::new(AtomicBool::new(false));
+        let action = Action {
+            wire: G::WIRE,
+            calls: Arc::clone(&calls),
+            topic,
+            feedback,
+            status,
+            offered: Arc::clone(&offered),
+            report: report.clone(),
+        };
+        self.tasks.spawn(Serving::new(action, client).run(told));
+        let served = Served {
+            wanted: wanted.clone(),
+            family,
+            calls,
+            commands,
+            offered,
+            gone: None,
+        };
+        let mut events = served.offer(topic);
+        events.push(PortEvent::Sample {
+            topic: status,
+            payload: wire::statuses(G::WIRE, &[]),
+            received: now().utc,
+            latched_by: None,
+        });
+        for (of, part) in [
+            (topic, Part::Goal),
+            (cancel, Part::Cancel),
+            (result, Part::Result),
+        ] {
+            self.parts.insert(of, (topic, part));
+        }
+        self.served.insert(topic, served);
+        Ok(events)
+    }
+
+    /// Has everything looked at again: definitions may be others.
+    pub(super) fn look_again<G: ActionGraph>(&mut self, graph: &mut G) -> Vec<PortEvent> {
+        self.refused.clear();
+        let other = self.served.extract_if(|_, served| {
+            let now = graph.action_calls(&served.wanted.type_name);
+            now.is_ok_and(|now| !is_same(&now, &served.calls))
+        });
+        let events = other.flat_map(|(topic, served)| served.withdraw(topic));
+        let events = events.collect();
+        let served = &self.served;
+        self.parts.retain(|_, (of, _)| served.contains_key(of));
+        events
+    }
+
+    /// Whether that call is a part of an action that is executed.
+    pub(super) fn serves(&self, topic: TopicId) -> bool {
+        self.parts.contains_key(&topic)
+    }
+
+    /// Hands a request to the task of its action.
+    pub(super) fn execute(&mut self, execution: Execution) -> Result<(), Refusal> {
+        let part = self.parts.get(&execution.topic);
+        let (action, part) = *part.ok_or(Refusal::NotExecutable)?;
+        let served = self.served.get(&action).ok_or(Refusal::NotExecutable)?;
+        let id = execution.id;
+        let command = Command::Execute(part, execution);
+        let told = served.commands.try_send(command);
+        told.map_err(|_| Refusal::Busy)?;
+        self.running.insert(id, action);
+        Ok(())
+    }
+
+    /// An execution has come to its end.
+    pub(super) fn ended(&mut self, execution: ExecutionId) {
+        self.running.remove(&execution);
+    }
+
+    /// Who asked for an execution does not want it any longer.
+    pub(super) fn abandoned(&mut self, execution: ExecutionId) {
+        let action = self.running.get(&execution);
+        if let Some(served) = action.and_then(|action| self.served.get(action)) {
+            // Where it has much to do, the request ends at its deadline.
+            drop(served.commands.try_send(Command::Abandoned(execution)));
+        }
+    }
+}
+
+impl Served {
+    /// The three calls and two values.
+    fn offer(&self, topic: TopicId) -> Vec<PortEvent> {
+        self.offered.store(true, Ordering::Release);
+        let (_, _, goal) = topic.triple();
+        let ActionFamily {
+            cancel,
+            result,
+            feedback,
+            status,
+        } = self.family;
+        let Wanted {
+            name, about, open, ..
+        } = &self.wanted;
+        let named = |part: &str| match &name[..] {
+            "" => String::new(),
+            name => format!("{name}{part}"),
+        };
+        let call = |id, service_type: &Arc<messages::ServiceType>, (part, role)| {
+            let offered = OfferedType {
+                service_type: Arc::clone(service_type),
+                name: named(part),
+                about: about.clone(),
+                role,
+                open: *open,
+            };
+            let topic = beside(topic, id)?;
+            Some(PortEvent::OfferTyped { topic, offered })
+        };
+        let value = |id, message_type: &Arc<messages::MessageType>, (part, overflow)| {
+            Some(PortEvent::BoundAs {
+                topic: beside(topic, id)?,
+                message_type: Arc::clone(message_type),
+                note: ValueNote {
+                    name: named(part),
+                    about: about.clone(),
+                    overflow,
+                    map: FieldMap::default(),
+                },
+            })
+        };
+        let calls = &self.calls;
+        let events = [
+            value(feedback, calls.feedback(), (".Feedback", EVENTS)),
+            value(status, calls.status(), (".Status", Overflow::KeepLatest)),
+            call(
+                cancel,
+                calls.cancel(),
+                (".Cancel", CallRole::Cancel { of: goal }),
+            ),
+            call(
+                result,
+                calls.result(),
+                (".Result", CallRole::Result { of: goal }),
+            ),
+            call(goal, calls.goal(), ("", CallRole::Goal(self.family))),
+        ];
+        events.into_iter().flatten().collect()
+    }
+
+    fn withdraw(&self, topic: TopicId) -> Vec<PortEvent> {
+        let (_, _, goal) = topic.triple();
+        let ActionFamily {
+            cancel,
+            result,
+            feedback,
+            status,
+        } = self.family;
+        let all = [goal, cancel, result, feedback, status];
+        let topics = all.into_iter().filter_map(|id| beside(topic, id));
+        topics.map(|topic| PortEvent::Withdrawn { topic }).collect()
+    }
+}
+
+/// The topic of another DataSetWriterId in the same namespace.
+pub(super) fn beside(topic: TopicId, id: u16) -> Option<TopicId> {
+    let (space, namespace, _) = topic.triple();
+    TopicId::new(space, namespace, id)
+}
+
+/// Whether both are the same on the wire.
+pub(super) fn is_same(one: &ActionCalls, other: &ActionCalls) -> bool {
+    one.goal().is_same(other.goal())
+        && one.result().is_same(other.result())
+        && one.feedback().is_same(other.feedback())
+}
+
+/// The action that a server is by its name.
+pub(super) fn named(policy: &Policy, action: &str) -> Option<TopicId> {
+    let topic: TopicId = action.strip_prefix('/')?.parse().ok()?;
+    (topic.space == policy.own()).then_some(topic)
+}
+
+/// The names of the actions that the mapping has executed in our own space.
+pub(super) fn mapped<'m>(mapping: &'m Mapping, policy: &Policy) -> BTreeSet<&'m str> {
+    let targets = targets(mapping, policy.own());
+    targets.map(|(_, target)| target.name.as_str()).collect()
+}
+
+fn targets<'m>(
+    mapping: &'m Mapping,
+    own: SpaceId,
+) -> impl Iterator<Item = (&'m mappings::Call, &'m mappings::CallTarget)> {
+    let calls = mapping.executed_in(own);
+    calls.filter_map(|call| match (call.kind, &call.executed) {
+        (CallKind::Action, ExecutedBy::Ros(target)) => Some((call, target)),
+        (CallKind::Action | CallKind::Service, _) => None,
+    })
+}
+
+/// What is to be offered of the action servers there are.
+fn wanted(policy: &Policy, present: &Present) -> BTreeMap<TopicId, Wanted> {
+    let mapping = policy.mapping();
+    let silence = mapping.pubsub().receive_timeout;
+    let mut wanted = BTreeMap::new();
+    let taken: BTreeSet<TopicId> = mapping
+        .executed_in(policy.own())
+        .flat_map(mappings::Call::topics)
+        .collect();
+    for (action, type_name) in present {
+        let (Some(topic), Some(type_name)) = (named(policy, action), type_name) else {
+            continue;
+        };
+        if taken.contains(&topic) {
+            continue;
+        }
+        let found = Wanted {
+            action: action.clone(),
+            type_name: type_name.clone(),
+            name: String::new(),
+            about: String::new(),
+            open: false,
+            waits: Waits {
+                answer: ANSWER,
+                silence,
+            },
+        };
+        wanted.insert(topic, found);
+    }
+    for (call, target) in targets(mapping, policy.own()) {
+        match present.get(&target.name) {
+            Some(None) => {}
+            Some(Some(type_name)) if *type_name == target.type_name => {}
+            Some(Some(_)) | None => continue,
+        }
+        wanted.insert(
+            call.topic,
+            Wanted {
+                action: target.name.clone(),
+                type_name: target.type_name.clone(),
+                name: call.name.clone(),
+                about: call.about.clone(),
+                open: call.open,
+                waits: Waits {
+                    answer: call.timeout,
+                    silence,
+                },
+            },
+        );
+    }
+    wanted
+}
+
+/// Tells of action servers of other types than the mapping says.
+fn tell_other_types(policy: &mut Policy, present: &Present) {
+    let mapping = Arc::clone(policy.mapping());
+    for (call, target) in targets(&mapping, policy.own()) {
+        if let Some(Some(type_name)) = present.get(&target.name)
+            && *type_name != target.type_name
+        {
+            let told = &mut policy.told;
+            told.once(&target.name, "other type", || {
+                format!(
+                    "the action {} is not executed as {}: it is of type {type_name}, and the mapping says {}",
+                    target.name, call.topic, target.type_name
+                )
+            });
+        }
+    }
+}
+
+/// Feedback is events: as many wait.
+pub(super) const EVENTS: Overflow = Overflow::DropOldest(match NonZeroU16::new(100) {
+    Some(waiting) => waiting,
+    None => NonZeroU16::MIN,
+});
+/// How long the server of an action may take for its word on a goal, where the mapping does not say it.
+const ANSWER: Duration = Duration::from_secs(30);
+/// Actions that are offered to other spaces: anybody in a graph can invent names.
+const MOST_SERVED: usize = 256;
+/// Requests of one action that wait to be looked at; one more is refused as busy.
+const MOST_COMMANDS: usize = 256;
+/// How long the goals of a server that is gone are kept, so that their ends can be asked for once it is there again.
+const KEPT: Duration = Duration::from_secs(15 * 60);

@@ -1,0 +1,296 @@
+//! One action of another space, served in the graph: a task that takes goals from its clients, asks for them in the space, and
+//! hands on what becomes of them.
+
+use std::collections::HashMap;
+use std::time::{Duration, Instant};
+
+use bridge_core::AskErrorKind;
+use bytes::Bytes;
+use mappings::TopicId;
+use messages::Wire;
+use tokio::sync::{mpsc, watch};
+use tokio::task::JoinSet;
+use tokio::time::{sleep, timeout};
+use tracing::debug;
+
+use super::graph::{ActionServer, CancelRequest, GoalId, NewGoal, ServedGoal, ServerEvent};
+use super::wire;
+use crate::calls::AskFault;
+use crate::clock::now;
+use crate::{Asker, PortEvent};
+
+/// What asks in the space, and how long for.
+#[derive(Debug, Clone)]
+pub(super) struct Asks {
+    pub(super) wire: Wire,
+    pub(super) goal: Asker,
+    pub(super) cancel: Asker,
+    pub(super) result: Asker,
+    /// How long who executes the action may be gone until its goals are given up.
+    pub(super) silence: Duration,
+    /// Since when it is.
+    pub(super) gone: watch::Receiver<Option<Instant>>,
+}
+
+/// The task.
+#[derive(Debug)]
+pub(super) struct Facade<A> {
+    pub(super) asks: Asks,
+    pub(super) server: A,
+    /// Feedback of all goals of the action.
+    pub(super) values: mpsc::Receiver<Bytes>,
+    /// The topic of that.
+    pub(super) feedback: TopicId,
+    pub(super) report: mpsc::Sender<PortEvent>,
+}
+
+impl<A: ActionServer> Facade<A> {
+    /// Serves until it is aborted. The goals that are open then are aborted here, and go on in the space.
+    pub(super) async fn run(mut self) {
+        let mut goals: HashMap<GoalId, mpsc::Sender<Bytes>> = HashMap::new();
+        let mut tasks = JoinSet::new();
+        let mut cancels = JoinSet::new();
+        loop {
+            // All are cancel-safe.
+            tokio::select! {
+                event = self.server.recv() => match event {
+                    ServerEvent::Goal(new) => {
+                        goals.retain(|_, feedback| !feedback.is_closed());
+                        if let Some(refusal) = refusal(&goals, new.id()) {
+                            new.reject(refusal);
+                            continue;
+                        }
+                        let (feedback, told) = mpsc::channel(MOST_FEEDBACK);
+                        goals.insert(new.id(), feedback);
+                        tasks.spawn(drive(self.asks.clone(), new, told));
+                    }
+                    ServerEvent::Cancel(request) if cancels.len() < MOST_CANCELS => {
+                        cancels.spawn(cancel(self.asks.clone(), request));
+                    }
+                    ServerEvent::Cancel(request) => request.reject(),
+                },
+                value = self.values.recv() => match value {
+                    Some(value) => self.hand_on(&goals, &value),
+                    None => return,
+                },
+            }
+            while tasks.try_join_next().is_some() || cancels.try_join_next().is_some() {}
+        }
+    }
+
+    /// Goals of others have feedback too.
+    fn hand_on(&self, goals: &HashMap<GoalId, mpsc::Sender<Bytes>>, value: &[u8]) {
+        let Some((id, body)) = wire::split(self.asks.wire, value) else {
+            return;
+        };
+        let Some(goal) = goals.get(&id) else {
+            return;
+        };
+        if let Err(mpsc::error::TrySendError::Full(_)) = goal.try_send(body) {
+            // Where nothing more can be reported either, that is counted with the next.
+            drop(self.report.try_send(PortEvent::Lost {
+                topic: Some(self.feedback),
+                why: "goal is slow",
+                count: 1,
+            }));
+        }
+    }
+}
+
+/// Why a goal is not taken.
+fn refusal(goals: &HashMap<GoalId, mpsc::Sender<Bytes>>, id: GoalId) -> Option<&'static str> {
+    if goals.contains_key(&id) {
+        return Some("there is a goal of that id");
+    }
+    (goals.len() >= MOST_GOALS).then_some("as many goals as may be are open")
+}
+
+/// Sees one goal through to its end.
+async fn drive<N: NewGoal>(asks: Asks, new: N, mut feedback: mpsc::Receiver<Bytes>) {
+    let id = new.id();
+    let Some(request) = wire::join(asks.wire, id, new.body()) else {
+        new.reject("the goal does not read");
+        return;
+    };
+    if let Err(why) = send(&asks, id, request).await {
+        debug!(why, "a goal of another space was not accepted");
+        new.reject(&why);
+        return;
+    }
+    let goal = match new.accept().await {
+        Ok(goal) => goal,
+        Err(why) => {
+            debug!(why, "a goal that was accepted goes on without its client");
+            return;
+        }
+    };
+    goal.execute();
+    let mut end = Box::pin(wait(&asks, id));
+    let End {
+        status,
+        message,
+        result,
+    } = loop {
+        // What was reported before the end comes before it.
+        tokio::select! {
+            biased;
+            Some(body) = feedback.recv() => hand_to(&goal, &body),
+            end = &mut end => break end,
+        }
+    };
+    while let Ok(body) = feedback.try_recv() {
+        hand_to(&goal, &body);
+    }
+    if let Err(why) = goal.end(status, &message, result.as_deref()) {
+        debug!(why, "the end of a goal cannot be told");
+    }
+}
+
+fn hand_to(goal: &impl ServedGoal, feedback: &[u8]) {
+    if let Err(why) = goal.feedback(feedback) {
+        debug!(why, "feedback cannot be told");
+    }
+}
+
+/// Asks for a goal, once more where it is not known whether it was heard: one of the same id is the same goal.
+async fn send(asks: &Asks, id: GoalId, request: Bytes) -> Result<(), String> {
+    let ask = || asks.goal.ask_for(request.clone());
+    let answer = match ask().await {
+        Err(AskFault {
+            kind: AskErrorKind::Unknown,
+            ..
+        }) => ask().await,
+        answer => answer,
+    };
+    let text = match answer {
+        Ok(answer) => match wire::read_goal_answer(asks.wire, &answer) {
+            Some(answer) if answer.accepted => return Ok(()),
+            Some(answer) => return Err(answer.message),
+            None => "the answer to the goal does not read".to_owned(),
+        },
+        Err(AskFault {
+            kind: AskErrorKind::Refused,
+            text,
+        }) => return Err(text),
+        Err(AskFault { text, .. }) => text,
+    };
+    // It may be at work, and nobody would know.
+    let request = wire::CancelRequest { id, until: None };
+    let request = wire::cancel_request(asks.wire, request);
+    let cancel = asks.cancel.clone().within(CANCEL_WITHIN);
+    drop(cancel.ask_for(request).await);
+    Err(text)
+}
+
+/// The end of a goal.
+struct End {
+    status: i8,
+    message: String,
+    result: Option<Bytes>,
+}
+
+impl End {
+    const fn aborted(message: String) -> Self {
+        Self {
+            status: ABORTED,
+            message,
+            result: None,
+        }
+    }
+}
+
+/// Waits for the end of a goal, or until who executes it is gone for too long.
+async fn wait(asks: &Asks, id: GoalId) -> End {
+    let request = wire::result_request(asks.wire, id);
+    let result = asks.result.clone().within(RESULT_WITHIN);
+    let mut pause = FIRST_PAUSE;
+    loop {
+        let fault = match result.ask_for(request.clone()).await {
+            Ok(answer) => {
+                return match wire::read_outcome(asks.wire, &answer) {
+                    Some(outcome) if outcome.status == UNKNOWN => End::aborted(or(
+                        outcome.message,
+                        "who executes the action has lost the goal",
+                    )),
+                    Some(outcome) => End {
+                        status: outcome.status,
+                        message: outcome.message,
+                        result: Some(outcome.result),
+                    },
+                    None => End::aborted("the result does not read".to_owned()),
+                };
+            }
+            Err(fault) => fault,
+        };
+        let gone = *asks.gone.borrow();
+        let is_gone =
+            gone.is_some_and(|since| now().monotonic.duration_since(since) >= asks.silence);
+        if is_gone {
+            return End::aborted(format!(
+                "who executes the action is gone; the goal may go on: {}",
+                fault.text
+            ));
+        }
+        match fault.kind {
+            AskErrorKind::Failed => return End::aborted(fault.text),
+            // It asked for as long as it may, or nobody is heard for the moment.
+            AskErrorKind::Refused | AskErrorKind::Unknown => sleep(pause).await,
+        }
+        pause = (pause * 2).min(LAST_PAUSE);
+    }
+}
+
+fn or(text: String, otherwise: &str) -> String {
+    match &text[..] {
+        "" => otherwise.to_owned(),
+        _ => text,
+    }
+}
+
+/// Asks to cancel a goal. One that is not known there may be on its way.
+async fn cancel<C: CancelRequest>(asks: Asks, request: C) {
+    let id = request.id();
+    let agreed = timeout(CANCEL_WITHIN, async {
+        while let Some(code) = ask_to_cancel(&asks, id).await {
+            if code != NO_SUCH_GOAL {
+                return code == AGREED;
+            }
+            sleep(FIRST_PAUSE).await;
+        }
+        false
+    });
+    if !agreed.await.unwrap_or(false) {
+        request.reject();
+    } else if let Err(why) = request.accept() {
+        debug!(why, "a goal that is being cancelled has ended here");
+    }
+}
+
+/// The code of the answer; `None` where there is none.
+async fn ask_to_cancel(asks: &Asks, id: GoalId) -> Option<i8> {
+    let request = wire::CancelRequest { id, until: None };
+    let request = wire::cancel_request(asks.wire, request);
+    let cancel = asks.cancel.clone().within(CANCEL_WITHIN);
+    let answer = cancel.ask_for(request).await.ok()?;
+    Some(wire::read_cancel_answer(asks.wire, &answer)?.code)
+}
+
+/// Goals of one action that are open here.
+const MOST_GOALS: usize = 1000;
+/// Requests to cancel that are under way.
+const MOST_CANCELS: usize = 64;
+/// Feedback of a goal that waits to be told.
+const MOST_FEEDBACK: usize = 100;
+/// How long a request for a result is held at a time.
+const RESULT_WITHIN: Duration = Duration::from_secs(30);
+/// How long it is tried to cancel a goal: a server of ROS 2 answers its client within 5 s.
+const CANCEL_WITHIN: Duration = Duration::from_secs(4);
+/// Before it is asked anew, doubling from the first to the last.
+const FIRST_PAUSE: Duration = Duration::from_millis(100);
+const LAST_PAUSE: Duration = Duration::from_secs(1);
+/// `action_msgs/GoalStatus`, STATUS_UNKNOWN and STATUS_ABORTED.
+const UNKNOWN: i8 = 0;
+const ABORTED: i8 = 6;
+/// `action_msgs/CancelGoal`, ERROR_NONE and ERROR_UNKNOWN_GOAL_ID.
+const AGREED: i8 = 0;
+const NO_SUCH_GOAL: i8 = 2;

@@ -1,0 +1,476 @@
+//! One action server of the graph, executed for the space: a task that sends goals, and answers who asks about them.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use bridge_core::{Executed, ExecutionId, Refusal};
+use bytes::Bytes;
+use mappings::TopicId;
+use messages::{ActionCalls, Wire};
+use tokio::sync::mpsc;
+use tokio::task::JoinSet;
+use tokio::time::timeout_at;
+use uadp::StatusCode;
+
+use super::graph::{ActionClient, CancelAnswer, CancelWhat, GoalEvent, GoalId, NO_GOAL, SentGoal};
+use super::table::{Asked, Goals, Progress, Wanted};
+use super::wire::{self, CancelRequest};
+use crate::PortEvent;
+use crate::clock::now;
+use crate::port::Execution;
+use crate::services::{CallFault, Ran};
+
+/// What a request is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Part {
+    Goal,
+    Cancel,
+    Result,
+}
+
+/// What the task of an action is told.
+#[derive(Debug)]
+pub(super) enum Command {
+    Execute(Part, Execution),
+    Abandoned(ExecutionId),
+    /// The statuses of goals are taken from now on.
+    TellStatuses,
+}
+
+/// What an action is, and where its values go.
+#[derive(Debug)]
+pub(super) struct Action {
+    pub(super) wire: Wire,
+    pub(super) calls: Arc<ActionCalls>,
+    /// Of its goals.
+    pub(super) topic: TopicId,
+    pub(super) feedback: TopicId,
+    pub(super) status: TopicId,
+    /// Whether its values are taken: its server is there.
+    pub(super) offered: Arc<AtomicBool>,
+    pub(super) report: mpsc::Sender<PortEvent>,
+}
+
+/// The task.
+pub(super) struct Serving<C> {
+    action: Action,
+    client: Arc<C>,
+    goals: Goals,
+    /// What goals and requests to cancel come to.
+    news: mpsc::Receiver<News>,
+    tell: mpsc::Sender<News>,
+    tasks: JoinSet<()>,
+}
+
+enum News {
+    Goal(GoalId, GoalEvent),
+    Cancelled(ExecutionId, Result<CancelAnswer, CallFault>),
+}
+
+impl<C: ActionClient> Serving<C> {
+    pub(super) fn new(action: Action, client: C) -> Self {
+        let (tell, news) = mpsc::channel(MOST_NEWS);
+        Self {
+            action,
+            client: Arc::new(client),
+            goals: Goals::default(),
+            news,
+            tell,
+            tasks: JoinSet::new(),
+        }
+    }
+
+    /// Works until nobody is left to tell it what to do. Who waits for anything then is told that it is lost; goals go on.
+    pub(super) async fn run(mut self, mut commands: mpsc::Receiver<Command>) {
+        let mut ticks = tokio::time::interval(TICK);
+        loop {
+            // All are cancel-safe.
+            let is_over = tokio::select! {
+                command = commands.recv() => match command {
+                    Some(Command::Execute(part, execution)) => self.execute(part, execution).await,
+                    Some(Command::Abandoned(execution)) => self.abandoned(execution).await,
+                    Some(Command::TellStatuses) => self.tell_statuses().await,
+                    None => Err(Over),
+                },
+                // Never `None` while we hold a sender ourselves.
+                Some(news) = self.news.recv() => match news {
+                    News::Goal(id, event) => self.goal_event(id, event).await,
+                    News::Cancelled(execution, answer) => self.cancelled(execution, answer).await,
+                },
+                _ = ticks.tick() => self.tidy().await,
+            };
+            while self.tasks.try_join_next().is_some() {}
+            if is_over.is_err() {
+                break;
+            }
+        }
+        for execution in self.goals.all_waiting() {
+            if self.finish(execution, Executed::Lost).await.is_err() {
+                return;
+            }
+        }
+    }
+
+    async fn execute(&mut self, part: Part, execution: Execution) -> Result<(), Over> {
+        match part {
+            Part::Goal => self.ask_goal(execution).await,
+            Part::Cancel => self.cancel(execution).await,
+            Part::Result => self.want_result(execution).await,
+        }
+    }
+
+    async fn ask_goal(&mut self, execution: Execution) -> Result<(), Over> {
+        let Execution {
+            id: run, request, ..
+        } = execution;
+        let Some((id, body)) = wire::split(self.action.wire, &request) else {
+            return self.refuse(run, Refusal::InvalidArgument).await;
+        };
+        let id = match id {
+            NO_GOAL => new_id(),
+            id => id,
+        };
+        match self.goals.ask(id, run) {
+            Asked::Send => {
+                let goal = self.client.send_goal(id, &body);
+                self.tasks.spawn(follow(id, goal, self.tell.clone()));
+                Ok(())
+            }
+            Asked::Waits => Ok(()),
+            Asked::Answer(answer) => {
+                let answer = wire::goal_answer(self.action.wire, &answer);
+                self.finish(run, answered(&answer)).await
+            }
+            Asked::Full => self.refuse(run, Refusal::Busy).await,
+        }
+    }
+
+    async fn want_result(&mut self, execution: Execution) -> Result<(), Over> {
+        let Execution {
+            id: run,
+            request,
+            deadline,
+            ..
+        } = execution;
+        let Some(id) = wire::read_result_request(self.action.wire, &request) else {
+            return self.refuse(run, Refusal::InvalidArgument).await;
+        };
+        // In time for the answer to get there.
+        let until = deadline.checked_sub(BEFORE_DEADLINE).unwrap_or(deadline);
+        match self.goals.want(id, run, until) {
+            Wanted::Waits => Ok(()),
+            Wanted::Answer(answer) => self.finish(run, answered(&answer)).await,
+            Wanted::NoGoal => {
+                let outcome = self.no_result("there is no such goal");
+                self.finish(run, outcome).await
+            }
+            Wanted::Full => self.refuse(run, Refusal::Busy).await,
+        }
+    }
+
+    /// The answer of a goal of which nothing is known.
+    fn no_result(&self, why: &str) -> Executed {
+        match self.empty(UNKNOWN, why) {
+            Some(answer) => answered(&answer),
+            None => Executed::Failed(BAD_UNEXPECTED_ERROR),
+        }
+    }
+
+    fn empty(&self, status: i8, why: &str) -> Option<Bytes> {
+        let Action { wire, calls, .. } = &self.action;
+        wire::empty_result_answer(*wire, calls, (status, why)).ok()
+    }
+
+    async fn cancel(&mut self, execution: Execution) -> Result<(), Over> {
+        let Execution {
+            id: run,
+            request,
+            deadline,
+            ..
+        } = execution;
+        let Some(request) = wire::read_cancel_request(self.action.wire, &request) else {
+            return self.refuse(run, Refusal::InvalidArgument).await;
+        };
+        let what = match request {
+            CancelRequest {
+                id: NO_GOAL,
+                until: None,
+            } => vec![CancelWhat::All],
+            CancelRequest { id, until: None } => match self.goals.progress(id) {
+                Progress::Ended => {
+                    let answer = CancelAnswer {
+                        code: TERMINATED,
+                        goals: Vec::new(),
+                    };
+                    return self.cancelled(run, Ok(answer)).await;
+                }
+                // One of the graph's own clients may have sent it.
+                Progress::Unknown | Progress::Open => vec![CancelWhat::Goal(id)],
+            },
+            CancelRequest {
+                id,
+                until: Some(until),
+            } => {
+                let mut goals = self.goals.open_until(until);
+                if id != NO_GOAL && !goals.contains(&id) {
+                    goals.push(id);
+                }
+                goals.into_iter().map(CancelWhat::Goal).collect()
+            }
+        };
+        let (client, tell) = (Arc::clone(&self.client), self.tell.clone());
+        self.tasks.spawn(async move {
+            let answer = timeout_at(deadline.into(), cancel_each(&*client, what)).await;
+            let late = |_| {
+                Err(CallFault {
+                    text: "the server has not said in time whether it cancels".to_owned(),
+                    may_pass: true,
+                    ran: Ran::Perhaps,
+                })
+            };
+            let answer = answer.unwrap_or_else(late);
+            drop(tell.send(News::Cancelled(run, answer)).await);
+        });
+        Ok(())
+    }
+
+    async fn cancelled(
+        &mut self,
+        run: ExecutionId,
+        answer: Result<CancelAnswer, CallFault>,
+    ) -> Result<(), Over> {
+        match answer {
+            Ok(answer) => {
+                let answer = wire::cancel_answer(self.action.wire, &answer);
+                self.finish(run, answered(&answer)).await
+            }
+            Err(CallFault { text, ran, .. }) => {
+                self.finish(run, failed(ran)).await?;
+                self.tell_failure(text).await
+            }
+        }
+    }
+
+    async fn goal_event(&mut self, id: GoalId, event: GoalEvent) -> Result<(), Over> {
+        let wire = self.action.wire;
+        match event {
+            GoalEvent::Accepted(stamp) => {
+                if let Some((asked, answer)) = self.goals.accepted(id, stamp) {
+                    let answer = wire::goal_answer(wire, &answer);
+                    self.finish_all(asked, &answered(&answer)).await?;
+                    self.tell_statuses().await?;
+                }
+                Ok(())
+            }
+            GoalEvent::Rejected(why) => match self.goals.rejected(id, why, now().monotonic) {
+                Some((asked, answer, waiting)) => {
+                    let none = self.no_result(&answer.message);
+                    let answer = wire::goal_answer(wire, &answer);
+                    self.finish_all(asked, &answered(&answer)).await?;
+                    self.finish_all(waiting, &none).await
+                }
+                None => Ok(()),
+            },
+            GoalEvent::Status(status) => match self.goals.status(id, status) {
+                true => self.tell_statuses().await,
+                false => Ok(()),
+            },
+            GoalEvent::Feedback(body) => match wire::join(wire, id, &body) {
+                Some(value) => self.sample(self.action.feedback, value).await,
+                None => Ok(()),
+            },
+            GoalEvent::Ended {
+                status,
+                message,
+                result,
+            } => {
+                let answer = wire::result_answer(wire, (status, &message), &result);
+                let answer = answer.or_else(|| self.empty(status, &message));
+                self.ended(id, (status, answer)).await
+            }
+            GoalEvent::Lost { text, ran } => self.lost(id, text, ran).await,
+        }
+    }
+
+    async fn ended(
+        &mut self,
+        id: GoalId,
+        (status, answer): (i8, Option<Bytes>),
+    ) -> Result<(), Over> {
+        let outcome = match &answer {
+            Some(answer) => answered(answer),
+            None => Executed::Failed(BAD_UNEXPECTED_ERROR),
+        };
+        let ended = (status, answer.unwrap_or_default());
+        let (waiting, asked) = self.goals.ended(id, ended, now().monotonic);
+        self.finish_all(asked, &Executed::Lost).await?;
+        self.finish_all(waiting, &outcome).await?;
+        self.tell_statuses().await
+    }
+
+    async fn lost(&mut self, id: GoalId, text: String, ran: Ran) -> Result<(), Over> {
+        if ran == Ran::No {
+            let (asked, waiting) = self.goals.failed(id);
+            let none = self.no_result(&text);
+            self.finish_all(asked, &failed(ran)).await?;
+            self.finish_all(waiting, &none).await?;
+        } else {
+            let answer = self.empty(UNKNOWN, &text);
+            self.ended(id, (UNKNOWN, answer)).await?;
+        }
+        self.tell_failure(text).await
+    }
+
+    /// Who asked does not wait any longer.
+    async fn abandoned(&mut self, execution: ExecutionId) -> Result<(), Over> {
+        match self.goals.give_up(execution) {
+            true => self.refuse(execution, Refusal::NotExecutable).await,
+            // A goal is decided all the same.
+            false => Ok(()),
+        }
+    }
+
+    async fn tidy(&mut self) -> Result<(), Over> {
+        let (late, forgotten) = self.goals.tidy(now().monotonic);
+        // They ask anew.
+        let not_yet = Executed::Refused(Refusal::NotExecutable);
+        self.finish_all(late, &not_yet).await?;
+        match forgotten {
+            true => self.tell_statuses().await,
+            false => Ok(()),
+        }
+    }
+
+    async fn tell_statuses(&self) -> Result<(), Over> {
+        let value = wire::statuses(self.action.wire, &self.goals.statuses());
+        self.sample(self.action.status, value).await
+    }
+
+    async fn sample(&self, topic: TopicId, payload: Bytes) -> Result<(), Over> {
+        if !self.action.offered.load(Ordering::Acquire) {
+            return Ok(());
+        }
+        self.report(PortEvent::Sample {
+            topic,
+            payload,
+            received: now().utc,
+            latched_by: None,
+        })
+        .await
+    }
+
+    async fn refuse(&self, execution: ExecutionId, refusal: Refusal) -> Result<(), Over> {
+        self.finish(execution, Executed::Refused(refusal)).await
+    }
+
+    async fn finish_all(&self, all: Vec<ExecutionId>, outcome: &Executed) -> Result<(), Over> {
+        for execution in all {
+            self.finish(execution, outcome.clone()).await?;
+        }
+        Ok(())
+    }
+
+    async fn finish(&self, execution: ExecutionId, outcome: Executed) -> Result<(), Over> {
+        self.report(PortEvent::Executed { execution, outcome })
+            .await
+    }
+
+    async fn tell_failure(&self, detail: String) -> Result<(), Over> {
+        let topic = self.action.topic;
+        self.report(PortEvent::CallFailed { topic, detail }).await
+    }
+
+    /// Waits while the port has much to take: what comes meanwhile waits, and feedback gives way, in the client.
+    async fn report(&self, event: PortEvent) -> Result<(), Over> {
+        let report = &self.action.report;
+        report.send(event).await.map_err(|_| Over)
+    }
+}
+
+/// The port is gone.
+struct Over;
+
+/// Hands on what happens to one goal.
+async fn follow<G: SentGoal>(id: GoalId, mut goal: G, tell: mpsc::Sender<News>) {
+    let mut is_open = true;
+    while is_open {
+        let event = goal.recv().await.unwrap_or_else(|| GoalEvent::Lost {
+            text: "nothing more is heard of the goal".to_owned(),
+            ran: Ran::Perhaps,
+        });
+        is_open = match &event {
+            GoalEvent::Accepted(_) | GoalEvent::Status(_) | GoalEvent::Feedback(_) => true,
+            GoalEvent::Ended { .. } | GoalEvent::Rejected(_) | GoalEvent::Lost { .. } => false,
+        };
+        if tell.send(News::Goal(id, event)).await.is_err() {
+            return;
+        }
+    }
+}
+
+/// Cancels one after the other. Where one is being cancelled, that is what is said.
+async fn cancel_each<C: ActionClient>(
+    client: &C,
+    what: Vec<CancelWhat>,
+) -> Result<CancelAnswer, CallFault> {
+    let mut all = CancelAnswer {
+        code: NONE,
+        goals: Vec::new(),
+    };
+    let mut worst = NONE;
+    let mut fault = None;
+    for what in what {
+        match client.cancel(what).await {
+            Ok(CancelAnswer { code: NONE, goals }) => all.goals.extend(goals),
+            Ok(CancelAnswer { code, .. }) => worst = code,
+            Err(why) => fault = Some(why),
+        }
+    }
+    match fault {
+        Some(fault) if all.goals.is_empty() => Err(fault),
+        Some(_) | None => {
+            if all.goals.is_empty() {
+                all.code = worst;
+            }
+            Ok(all)
+        }
+    }
+}
+
+fn answered(answer: &Bytes) -> Executed {
+    Executed::Answered(answer.to_vec())
+}
+
+const fn failed(ran: Ran) -> Executed {
+    match ran {
+        Ran::No => Executed::Refused(Refusal::NotExecutable),
+        Ran::Perhaps => Executed::Lost,
+        Ran::Yes => Executed::Failed(BAD_UNEXPECTED_ERROR),
+    }
+}
+
+/// One that nobody has chosen before.
+fn new_id() -> GoalId {
+    use std::hash::{BuildHasher, RandomState};
+    let random = || RandomState::new().hash_one(now().utc.unix_nanos());
+    let mut id = NO_GOAL;
+    let (first, second) = id.split_at_mut(8);
+    first.copy_from_slice(&random().to_le_bytes());
+    second.copy_from_slice(&random().to_le_bytes());
+    id
+}
+
+/// How long before its deadline one who waits for a result is told to ask anew.
+const BEFORE_DEADLINE: Duration = Duration::from_secs(1);
+/// How often it is looked who waits too long.
+const TICK: Duration = Duration::from_millis(250);
+/// What of goals waits to be taken in.
+const MOST_NEWS: usize = 64;
+/// `action_msgs/GoalStatus`, STATUS_UNKNOWN.
+const UNKNOWN: i8 = 0;
+/// `action_msgs/CancelGoal`, ERROR_NONE and ERROR_GOAL_TERMINATED.
+const NONE: i8 = 0;
+const TERMINATED: i8 = 3;
+/// Bad_UnexpectedError (OPC 10000-6, A.2): the server says that it failed.
+const BAD_UNEXPECTED_ERROR: StatusCode = StatusCode(0x8001_0000);
