@@ -325,10 +325,10 @@ pub(super) fn mapped<'m>(mapping: &'m Mapping, policy: &Policy) -> BTreeSet<&'m 
     targets.map(|(_, target)| target.name.as_str()).collect()
 }
 
-fn targets<'m>(
-    mapping: &'m Mapping,
+fn targets(
+    mapping: &Mapping,
     own: SpaceId,
-) -> impl Iterator<Item = (&'m mappings::Call, &'m mappings::CallTarget)> {
+) -> impl Iterator<Item = (&mappings::Call, &mappings::CallTarget)> {
     let calls = mapping.executed_in(own);
     calls.filter_map(|call| match (call.kind, &call.executed) {
         (CallKind::Action, ExecutedBy::Ros(target)) => Some((call, target)),
