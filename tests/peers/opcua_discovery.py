@@ -20,7 +20,13 @@ async def find(client, args):
             {"uri": one.ApplicationUri, "name": one.ApplicationName.Text, "urls": one.DiscoveryUrls} for one in servers
         ]
     )
-    network = await client.find_servers_on_network()
+    if args.what == "find-servers":
+        return
+    asked = ua.FindServersOnNetworkParameters()
+    asked.StartingRecordId = args.start
+    asked.MaxRecordsToReturn = args.most
+    asked.ServerCapabilityFilter = args.capability
+    network = await client.uaclient.find_servers_on_network(asked)
     lifetime.say(
         network=[
             {
@@ -40,7 +46,8 @@ async def register(client, args):
     server = ua.RegisteredServer()
     server.ServerUri = args.uri
     server.DiscoveryUrls = args.url
-    server.ServerType = ua.ApplicationType.Server
+    server.ServerType = ua.ApplicationType[args.type]
+    server.SemaphoreFilePath = args.semaphore
     server.ServerNames = [ua.LocalizedText(args.name)] if args.name else []
     server.IsOnline = not args.offline
     try:
@@ -50,7 +57,7 @@ async def register(client, args):
             return
         configuration = ua.MdnsDiscoveryConfiguration()
         configuration.MdnsServerName = args.mdns
-        configuration.ServerCapabilities = ["DA", "AC"]
+        configuration.ServerCapabilities = args.capability or ["DA", "AC"]
         parameters = ua.RegisterServer2Parameters()
         parameters.Server = server
         parameters.DiscoveryConfiguration = [configuration] if args.mdns else []
@@ -76,18 +83,23 @@ async def run(args):
         lifetime.say(**described(error))
         return
     try:
-        await {"find": find, "register": register, "session": session}[args.what](client, args)
+        await {"find": find, "find-servers": find, "register": register, "session": session}[args.what](client, args)
     finally:
         await client.disconnect_sessionless()
 
 
 def main():
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=["find", "register", "session"])
+    parser.add_argument("what", choices=["find", "find-servers", "register", "session"])
     opcua_session.add_arguments(parser)
     parser.add_argument("--uri", default="urn:asyncua:arm")
     parser.add_argument("--url", action="append", default=[])
     parser.add_argument("--name", default="arm")
+    parser.add_argument("--type", default="Server", choices=["Server", "Client", "DiscoveryServer"])
+    parser.add_argument("--semaphore", help="a file that is there while the server is installed")
+    parser.add_argument("--capability", action="append", default=[], help="of the server, or that one found has")
+    parser.add_argument("--start", type=int, default=0, help="the first record")
+    parser.add_argument("--most", type=int, default=0, help="how many records")
     parser.add_argument("--mdns", help="the name to be announced under")
     parser.add_argument("--offline", action="store_true")
     parser.add_argument("--old", action="store_true", help="RegisterServer instead of RegisterServer2")

@@ -1,5 +1,8 @@
 //! Who is there: `ua-lds`, servers that tell of themselves, and clients and packets of other makers as judges.
 
+#[path = "discovery/rules.rs"]
+mod rules;
+
 use std::io::{Read as _, Write as _};
 use std::net::{Ipv4Addr, SocketAddrV4, TcpListener, TcpStream};
 use std::time::{Duration, Instant};

@@ -316,6 +316,7 @@ fn announce(component: &Component, url: &str, options: &Options) -> Option<Annou
     let settings = AnnounceSettings {
         lds,
         mdns: options.mdns.clone(),
+        pki: options.pki.clone(),
         ..AnnounceSettings::default()
     };
     match discovery::announce(server, settings) {

@@ -3,7 +3,7 @@
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::process::ExitCode;
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bridge_node::{Failure, FailureKind, LogFormat, Service, run_service};
 use discovery::{AnnounceSettings, Found, Interface, Server, WatchSettings, announce, watch};
@@ -37,6 +37,18 @@ enum What {
         /// Leave mDNS to the discovery server
         #[arg(long)]
         no_mdns: bool,
+        /// How often to register, in seconds
+        #[arg(long, default_value = "60")]
+        register_period: u64,
+        /// The certificate store, with a pair, to register over a secured channel
+        #[arg(long)]
+        pki: Option<std::path::PathBuf>,
+        /// The ApplicationUri
+        #[arg(long)]
+        uri: Option<String>,
+        /// Codes of what it can do
+        #[arg(long, default_value = "DA", value_delimiter = ',')]
+        capabilities: Vec<String>,
     },
     /// Print who comes and goes
     Watch,
@@ -63,19 +75,25 @@ impl Service for Who {
                 path,
                 lds,
                 no_mdns,
+                register_period,
+                pki,
+                uri,
+                capabilities,
             } => {
                 let listener = TcpListener::bind(SocketAddr::from((address, port))).await;
                 let listener = listener.map_err(|error| unavailable(&error))?;
                 let at = listener.local_addr().map_err(|error| unavailable(&error))?;
                 let server = Server {
-                    application_uri: format!("urn:who:{name}"),
+                    application_uri: uri.unwrap_or_else(|| format!("urn:who:{name}")),
                     product_uri: String::new(),
                     name,
                     url: format!("opc.tcp://{at}{path}"),
-                    capabilities: vec!["DA".to_owned()],
+                    capabilities,
                 };
                 let settings = AnnounceSettings {
                     lds,
+                    register_every: Duration::from_secs(register_period),
+                    pki,
                     mdns: (!no_mdns).then(|| Interface::parse(&address.to_string())),
                     ..AnnounceSettings::default()
                 };

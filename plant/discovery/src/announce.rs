@@ -1,5 +1,6 @@
 //! Telling of a server: [`announce`].
 
+use std::path::PathBuf;
 use std::pin::Pin;
 use std::time::{Duration, SystemTime};
 
@@ -40,6 +41,10 @@ pub struct AnnounceSettings {
     pub mdns: Option<Interface>,
     /// How often the registration is repeated; every ten seconds at least where nothing is heard by mDNS.
     pub register_every: Duration,
+    /// The certificate store of the server, with its pair made: it registers over a secured channel where the discovery
+    /// server offers one and is trusted. `None` registers over channels that are not secured, which most discovery servers
+    /// take from their own host at best.
+    pub pki: Option<PathBuf>,
 }
 
 impl Default for AnnounceSettings {
@@ -48,6 +53,7 @@ impl Default for AnnounceSettings {
             lds: Some(crate::DEFAULT_LDS.to_owned()),
             mdns: Some(Interface::LOOPBACK),
             register_every: Duration::from_secs(60),
+            pki: None,
         }
     }
 }
@@ -274,8 +280,10 @@ impl Telling {
         let server = self.server.borrow().clone();
         // Whoever announces itself is not announced by another.
         let mdns_name = self.mdns.is_none().then(|| name(&server));
+        let pki = self.settings.pki.clone();
         Some(Box::pin(async move {
-            client::register(&lds, &server, mdns_name.as_deref(), is_online).await
+            let how = (mdns_name.as_deref(), pki.as_deref());
+            client::register(&lds, &server, how, is_online).await
         }))
     }
 
@@ -303,7 +311,7 @@ impl Telling {
                     state.registered = None;
                     // Once for each reason: it is tried again and again.
                     if state.fault.as_ref() != Some(&fault) {
-                        if matches!(error, AskFault::Refused(_)) {
+                        if matches!(error, AskFault::Refused(_) | AskFault::Certificate(_)) {
                             warn!(lds, "not registered: {fault}");
                         } else {
                             info!(lds, "not registered yet: {fault}");

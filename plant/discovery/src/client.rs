@@ -5,22 +5,26 @@
     reason = "of the messages of all services some are those of discovery"
 )]
 
+use std::path::Path;
 use std::time::Duration;
 
 use opcua::core::comms::secure_channel::Role;
+use opcua::core::comms::security_header::AsymmetricSecurityHeader;
 use opcua::core::comms::tcp_types::{AcknowledgeMessage, HelloMessage};
 use opcua::core::{RequestMessage, ResponseMessage};
+use opcua::crypto::SecurityPolicy;
 use opcua::types::{
-    ApplicationType, CloseSecureChannelRequest, DateTime, ExtensionObject,
-    FindServersOnNetworkRequest, FindServersRequest, LocalizedText, MdnsDiscoveryConfiguration,
-    MessageSecurityMode, NodeId, OpenSecureChannelRequest, RegisterServer2Request,
-    RegisterServerRequest, RegisteredServer, RequestHeader, SecurityTokenRequestType, StatusCode,
-    UAString,
+    ApplicationType, ByteString, CloseSecureChannelRequest, DateTime, EndpointDescription,
+    ExtensionObject, FindServersOnNetworkRequest, FindServersRequest, GetEndpointsRequest,
+    LocalizedText, MdnsDiscoveryConfiguration, MessageSecurityMode, NodeId,
+    OpenSecureChannelRequest, RegisterServer2Request, RegisterServerRequest, RegisteredServer,
+    RequestHeader, SecurityTokenRequestType, StatusCode, UAString,
 };
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
 use crate::announce::Server;
+use crate::security::Security;
 use crate::url::Url;
 use crate::wire::{Conversation, Kind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, WireFault};
 
@@ -40,6 +44,9 @@ pub enum AskFault {
     /// It refuses, with this StatusCode.
     #[error("refused: {0}")]
     Refused(StatusCode),
+    /// Its certificate is not trusted, or ours cannot be read.
+    #[error("{0}")]
+    Certificate(String),
     /// It does not speak OPC UA as it should.
     #[error("{0}")]
     Protocol(String),
@@ -91,7 +98,7 @@ pub async fn find_servers(url: &str, limit: Duration) -> Result<Vec<Application>
         endpoint_url: url.into(),
         ..FindServersRequest::default()
     };
-    match ask(url, request.into(), limit).await? {
+    match ask(url, None, request.into(), limit).await? {
         ResponseMessage::FindServers(response) => Ok(response
             .servers
             .into_iter()
@@ -119,7 +126,7 @@ pub async fn find_servers_on_network(
         request_header: header(),
         ..FindServersOnNetworkRequest::default()
     };
-    match ask(url, request.into(), limit).await? {
+    match ask(url, None, request.into(), limit).await? {
         ResponseMessage::FindServersOnNetwork(response) => Ok(response
             .servers
             .into_iter()
@@ -135,13 +142,73 @@ pub async fn find_servers_on_network(
     }
 }
 
-/// Registers a server, or takes its registration back: RegisterServer2, and RegisterServer where that is not known.
+/// A secured channel to a server, and whose it is.
+#[derive(Debug)]
+struct Way {
+    security: Security,
+    server: ByteString,
+    mode: MessageSecurityMode,
+}
+
+/// The best secured channel that a server offers to the application of that certificate store; `None` where it offers
+/// none, and where it runs on this host and is not trusted: what could be forged there could also be done.
+async fn way(url: &str, pki: &Path) -> Result<Option<Way>, AskFault> {
+    let security = Security::existing(pki).map_err(AskFault::Certificate)?;
+    let request = GetEndpointsRequest {
+        request_header: header(),
+        endpoint_url: url.into(),
+        ..GetEndpointsRequest::default()
+    };
+    let endpoints = match ask(url, None, request.into(), REGISTER_LIMIT).await? {
+        ResponseMessage::GetEndpoints(response) => response.endpoints.unwrap_or_default(),
+        other => return Err(unexpected(&other)),
+    };
+    let basic = |endpoint: &&EndpointDescription| {
+        let policy = SecurityPolicy::from_uri(endpoint.security_policy_uri.as_ref());
+        policy == SecurityPolicy::Basic256Sha256
+            && endpoint.endpoint_url.as_ref().starts_with(SCHEME)
+    };
+    let rank = |endpoint: &&EndpointDescription| match endpoint.security_mode {
+        MessageSecurityMode::SignAndEncrypt => 2,
+        MessageSecurityMode::Sign => 1,
+        MessageSecurityMode::None | MessageSecurityMode::Invalid => 0,
+    };
+    let best = endpoints.iter().filter(basic).max_by_key(rank);
+    let Some(best) = best.filter(|best| rank(best) > 0) else {
+        return Ok(None);
+    };
+    let server = best.server_certificate.clone();
+    if security.trusts(server.as_ref()) {
+        let mode = best.security_mode;
+        return Ok(Some(Way {
+            security,
+            server,
+            mode,
+        }));
+    }
+    let ip = Url::parse(url).and_then(|url| url.ip());
+    if ip.is_some_and(|ip| ip.to_canonical().is_loopback()) {
+        return Ok(None);
+    }
+    Err(AskFault::Certificate(format!(
+        "its certificate is not trusted; to trust it, move it from rejected into {}",
+        security.trusted().display()
+    )))
+}
+
+/// Registers a server, or takes its registration back: RegisterServer2, and RegisterServer where that is not known. Over
+/// a secured channel where the server has a certificate store and the discovery server such a channel.
 pub(crate) async fn register(
     lds: &str,
     server: &Server,
-    mdns_name: Option<&str>,
+    (mdns_name, pki): (Option<&str>, Option<&Path>),
     is_online: bool,
 ) -> Result<(), AskFault> {
+    let way = match pki {
+        Some(pki) => way(lds, pki).await?,
+        None => None,
+    };
+    let way = way.as_ref();
     let registered = RegisteredServer {
         server_uri: server.application_uri.as_str().into(),
         product_uri: server.product_uri.as_str().into(),
@@ -170,13 +237,13 @@ pub(crate) async fn register(
         StatusCode::BadServiceUnsupported,
         StatusCode::BadNotImplemented,
     ];
-    let answer = match ask(lds, request.into(), REGISTER_LIMIT).await {
+    let answer = match ask(lds, way, request.into(), REGISTER_LIMIT).await {
         Err(AskFault::Refused(status)) if unknown.contains(&status) => {
             let request = RegisterServerRequest {
                 request_header: header(),
                 server: registered,
             };
-            ask(lds, request.into(), REGISTER_LIMIT).await?
+            ask(lds, way, request.into(), REGISTER_LIMIT).await?
         }
         answer => answer?,
     };
@@ -189,16 +256,21 @@ pub(crate) async fn register(
 /// One question on a channel of its own.
 async fn ask(
     url: &str,
+    way: Option<&Way>,
     request: RequestMessage,
     limit: Duration,
 ) -> Result<ResponseMessage, AskFault> {
-    match timeout(limit, converse(url, request)).await {
+    match timeout(limit, Box::pin(converse(url, way, request))).await {
         Ok(answer) => answer,
         Err(_) => Err(AskFault::Late(limit)),
     }
 }
 
-async fn converse(url: &str, request: RequestMessage) -> Result<ResponseMessage, AskFault> {
+async fn converse(
+    url: &str,
+    way: Option<&Way>,
+    request: RequestMessage,
+) -> Result<ResponseMessage, AskFault> {
     let place = Url::parse(url).ok_or_else(|| AskFault::Url(url.to_owned()))?;
     let stream = TcpStream::connect((place.host.as_str(), place.port)).await?;
     stream.set_nodelay(true)?;
@@ -212,22 +284,7 @@ async fn converse(url: &str, request: RequestMessage) -> Result<ResponseMessage,
         acknowledge.receive_buffer_size,
         acknowledge.max_message_size,
     );
-    let open = OpenSecureChannelRequest {
-        request_header: header(),
-        client_protocol_version: 0,
-        request_type: SecurityTokenRequestType::Issue,
-        security_mode: MessageSecurityMode::None,
-        client_nonce: opcua::types::ByteString::null(),
-        requested_lifetime: CHANNEL_LIFETIME,
-    };
-    let open = RequestMessage::from(open);
-    let opened = match answer(&mut conversation, 1, &open).await? {
-        ResponseMessage::OpenSecureChannel(opened) => opened,
-        other => return Err(unexpected(&other)),
-    };
-    conversation
-        .channel
-        .set_security_token(opened.security_token);
+    open(&mut conversation, way).await?;
     let answered = answer(&mut conversation, 2, &request).await?;
     // The answer is there; whether the peer hears of the end changes nothing.
     let close = CloseSecureChannelRequest {
@@ -237,13 +294,68 @@ async fn converse(url: &str, request: RequestMessage) -> Result<ResponseMessage,
     Ok(answered)
 }
 
+/// Opens the channel.
+async fn open(
+    conversation: &mut Conversation<TcpStream>,
+    way: Option<&Way>,
+) -> Result<(), AskFault> {
+    let bad = |error: opcua::types::Error| AskFault::Protocol(error.to_string());
+    let channel = &mut conversation.channel;
+    if let Some(way) = way {
+        channel.set_security_policy(SecurityPolicy::Basic256Sha256);
+        channel.set_security_mode(way.mode);
+        channel.set_cert(Some(way.security.certificate.clone()));
+        channel.set_private_key(Some(way.security.key.clone()));
+        let set = channel.set_remote_cert_from_byte_string(&way.server);
+        set.map_err(bad)?;
+        channel.create_random_nonce();
+    }
+    let request = OpenSecureChannelRequest {
+        request_header: header(),
+        client_protocol_version: 0,
+        request_type: SecurityTokenRequestType::Issue,
+        security_mode: way.map_or(MessageSecurityMode::None, |way| way.mode),
+        client_nonce: way.map_or_else(ByteString::null, |_| channel.local_nonce_as_byte_string()),
+        requested_lifetime: CHANNEL_LIFETIME,
+    };
+    let request = RequestMessage::from(request);
+    let opened = match answer_from(conversation, way, 1, &request).await? {
+        ResponseMessage::OpenSecureChannel(opened) => opened,
+        other => return Err(unexpected(&other)),
+    };
+    let channel = &mut conversation.channel;
+    channel.set_security_token(opened.security_token);
+    if way.is_some() {
+        let set = channel.set_remote_nonce_from_byte_string(&opened.server_nonce);
+        set.map_err(bad)?;
+        channel.derive_keys();
+    }
+    Ok(())
+}
+
 async fn answer(
     conversation: &mut Conversation<TcpStream>,
     request_id: u32,
     request: &RequestMessage,
 ) -> Result<ResponseMessage, AskFault> {
+    answer_from(conversation, None, request_id, request).await
+}
+
+/// The answer; of one that opens the channel, from whom it has to come.
+async fn answer_from(
+    conversation: &mut Conversation<TcpStream>,
+    way: Option<&Way>,
+    request_id: u32,
+    request: &RequestMessage,
+) -> Result<ResponseMessage, AskFault> {
     conversation.send(request_id, request).await?;
-    let received = conversation.receive::<ResponseMessage>(|_| Ok(())).await?;
+    let whose = |header: &AsymmetricSecurityHeader| match way {
+        Some(way) if header.sender_certificate != way.server => {
+            Err(StatusCode::BadSecurityChecksFailed)
+        }
+        Some(_) | None => Ok(()),
+    };
+    let received = conversation.receive::<ResponseMessage>(whose).await?;
     let status = received.message.response_header().service_result;
     match received.message {
         ResponseMessage::ServiceFault(_) => Err(AskFault::Refused(status)),
@@ -278,6 +390,7 @@ fn texts(all: Option<&[UAString]>) -> Vec<String> {
     all.unwrap_or_default().iter().take(64).map(text).collect()
 }
 
+const SCHEME: &str = "opc.tcp:";
 const REGISTER_LIMIT: Duration = Duration::from_secs(5);
 /// In milliseconds: for one question.
 const CHANNEL_LIFETIME: u32 = 60_000;

@@ -24,7 +24,7 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::time::timeout;
 use tracing::debug;
 
-use crate::security::Security;
+use crate::security::{Security, application_uri};
 use crate::services::{self, Answer, Own, Question};
 use crate::wire::{
     Conversation, Kind, MOST_CHUNK, MOST_CHUNKS, MOST_HEARD, Received, WireFault, policy,
@@ -41,6 +41,8 @@ pub(crate) struct Shared {
     pub(crate) security: Option<Security>,
     pub(crate) ask: mpsc::Sender<Asking>,
     pub(crate) counters: Counters,
+    /// Whether who is on this host may register without a secured channel.
+    host_may: bool,
     last_channel: AtomicU32,
 }
 
@@ -66,7 +68,16 @@ impl Shared {
             security,
             ask,
             counters: Counters::default(),
+            host_may: true,
             last_channel: AtomicU32::new(0),
+        }
+    }
+
+    /// Takes registrations over secured channels alone.
+    pub(crate) fn secured_only(self, secured_only: bool) -> Self {
+        Self {
+            host_may: !secured_only,
+            ..self
         }
     }
 
@@ -247,21 +258,17 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         let is_secured = channel.security_mode() != MessageSecurityMode::None;
         let certificate = channel.remote_cert().filter(|_| is_secured);
         let certificate_uri = match (certificate, question) {
-            (Some(certificate), Question::Register { asked, .. }) => {
-                let uri = &asked.server_uri;
-                let is_its = certificate.is_application_uri_valid(uri).is_ok();
-                // The crate tells whether a URI is the certificate's, and not which one that is.
-                Some(if is_its {
-                    uri.clone()
-                } else {
-                    "another application".to_owned()
-                })
+            (Some(certificate), Question::Register { .. }) => {
+                let uri = application_uri(certificate.as_byte_string().as_ref());
+                // One without is nobody's.
+                Some(uri.unwrap_or_default())
             }
             _ => None,
         };
+        // What who is on this host could forge it could also do.
+        let of_host = self.shared.host_may && self.peer.ip().to_canonical().is_loopback();
         Channel {
-            // Who is on this host may register: what it could forge it could also do.
-            is_secured: is_secured || self.peer.ip().to_canonical().is_loopback(),
+            is_secured: is_secured || of_host,
             certificate_uri,
         }
     }

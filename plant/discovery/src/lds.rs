@@ -34,6 +34,10 @@ pub struct LdsSettings {
     pub interface: Interface,
     /// Whether servers of other hosts may register over a channel that is not secured.
     pub allow_unsecured: bool,
+    /// Whether servers of this host, too, have to register over a secured channel.
+    pub secured_only: bool,
+    /// How often servers are to register; without semaphore file a registration counts twice as long.
+    pub register_every: Duration,
     /// The certificate store for secured channels; without it there are none.
     pub pki: Option<PathBuf>,
     /// Whether any client certificate will do. For tests only.
@@ -125,7 +129,7 @@ pub async fn run(
     stop: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
     let (mut lds, mut questions) = Lds::start(&settings).await?;
-    let mut semaphores = interval(SEMAPHORES_EVERY);
+    let mut semaphores = interval(SEMAPHORES_EVERY.min(settings.register_every));
     semaphores.set_missed_tick_behavior(MissedTickBehavior::Delay);
     tokio::pin!(stop);
     loop {
@@ -216,11 +220,12 @@ impl Lds {
             start_time: Some(clock::ticks(started)),
         });
         let (ask, questions) = mpsc::channel(64);
-        let shared = Arc::new(Shared::new(own, security, ask));
+        let shared = Arc::new(Shared::new(own, security, ask).secured_only(settings.secured_only));
         tokio::spawn(endpoint::accept(listener, Arc::clone(&shared)));
         info!(url, interface = %settings.interface, "ua-lds listens");
         let registry = Settings {
             allow_unsecured: settings.allow_unsecured,
+            forget_after: settings.register_every * 2,
             ..Settings::default()
         };
         let lds = Self {

@@ -7,6 +7,10 @@ use bridge_node::{Failure, FailureKind};
 use opcua::crypto::{CertificateStore, PrivateKey, SecurityPolicy, X509, X509Data};
 use opcua::types::StatusCode;
 use tracing::{debug, info, warn};
+use x509_cert::Certificate;
+use x509_cert::der::Decode as _;
+use x509_cert::ext::pkix::SubjectAltName;
+use x509_cert::ext::pkix::name::GeneralName;
 
 /// The certificate store of a discovery server: `own`, `private` and `trusted` under one directory.
 #[derive(Debug)]
@@ -36,7 +40,7 @@ impl Security {
             fs::create_dir_all(root.join(folder)).map_err(|error| failed(&error))?;
         }
         owner_only(&root.join("private")).map_err(|error| failed(&error))?;
-        let (certificate, key) = (root.join("own/cert.der"), root.join("private/private.pem"));
+        let (certificate, key) = pair(root);
         if !certificate.exists() && !key.exists() {
             let made = CertificateStore::create_certificate_and_key(
                 &data(application_uri, host),
@@ -57,6 +61,46 @@ impl Security {
             trusted: root.join("trusted"),
             trust_any,
         })
+    }
+
+    /// The store of an application that has made its pair already; nothing is made here.
+    pub(crate) fn existing(root: &Path) -> Result<Self, String> {
+        let failed = |error| format!("the certificate store {}: {error}", root.display());
+        let (certificate, key) = pair(root);
+        Ok(Self {
+            certificate: CertificateStore::read_cert(&certificate).map_err(failed)?,
+            key: CertificateStore::read_pkey(&key).map_err(failed)?,
+            trusted: root.join("trusted"),
+            trust_any: false,
+        })
+    }
+
+    /// Whether a server is whom this application trusts. The certificate of another is kept in `rejected`, for whoever
+    /// decides on it to move.
+    pub(crate) fn trusts(&self, der: &[u8]) -> bool {
+        if self.is_trusted(der) {
+            return true;
+        }
+        let thumbprint = X509::from_der(der).map(|certificate| certificate.thumbprint());
+        if let Ok(thumbprint) = thumbprint
+            && let Some(root) = self.trusted.parent()
+        {
+            let path = root
+                .join("rejected")
+                .join(format!("{}.der", thumbprint.as_hex_string()));
+            // There is nobody to tell but whoever looks there; what it is about is told by the caller.
+            if !path.exists()
+                && let Err(error) = fs::write(&path, der)
+            {
+                debug!(%error, path = %path.display(), "a certificate is not kept");
+            }
+        }
+        false
+    }
+
+    /// Where certificates of others are put to be trusted.
+    pub(crate) fn trusted(&self) -> &Path {
+        &self.trusted
     }
 
     /// Whether a channel may be opened with this certificate.
@@ -99,6 +143,28 @@ impl Security {
         };
         files.any(same)
     }
+}
+
+/// The ApplicationUri of a certificate (OPC 10000-6, 6.2.2): the first URI among its alternative names, wherever it stands
+/// there. Some stacks put the names of the host in front of it.
+pub(crate) fn application_uri(der: &[u8]) -> Option<String> {
+    let certificate = Certificate::from_der(der).ok()?;
+    let (_, names) = certificate.tbs_certificate.get::<SubjectAltName>().ok()??;
+    names.0.iter().find_map(|name| match name {
+        GeneralName::UniformResourceIdentifier(uri) => Some(uri.as_str().to_owned()),
+        GeneralName::OtherName(_)
+        | GeneralName::Rfc822Name(_)
+        | GeneralName::DnsName(_)
+        | GeneralName::DirectoryName(_)
+        | GeneralName::EdiPartyName(_)
+        | GeneralName::IpAddress(_)
+        | GeneralName::RegisteredId(_) => None,
+    })
+}
+
+/// The own certificate and its key.
+fn pair(root: &Path) -> (PathBuf, PathBuf) {
+    (root.join("own/cert.der"), root.join("private/private.pem"))
 }
 
 fn data(application_uri: &str, host: &str) -> X509Data {

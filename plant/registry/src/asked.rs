@@ -95,6 +95,12 @@ pub enum RegisterFault {
         /// How many there may be.
         most: usize,
     },
+    /// BadSecurityModeInsufficient: whoever registered by a certificate is not replaced by one without.
+    #[error("{asked} is registered by its certificate, and is changed by it alone")]
+    Certified {
+        /// What it asked for.
+        asked: String,
+    },
 }
 
 impl RegisterFault {
@@ -102,7 +108,7 @@ impl RegisterFault {
     #[must_use]
     pub fn status(&self) -> u32 {
         match self {
-            Self::Unsecured => 0x80E6_0000,
+            Self::Unsecured | Self::Certified { .. } => 0x80E6_0000,
             Self::NoUri | Self::OtherUri { .. } => 0x804F_0000,
             Self::NoName => 0x8050_0000,
             Self::NoUrl => 0x8051_0000,
@@ -133,6 +139,10 @@ impl Asked {
                 asked: self.server_uri.clone(),
                 certificate: certificate.clone(),
             });
+        }
+        if !self.is_online {
+            // What is taken back needs no more than to be found; some leave the rest out.
+            return Ok(());
         }
         if self.application_type == ApplicationType::Client {
             let what = "a client does not register";
@@ -179,9 +189,15 @@ impl Asked {
         .chain(self.names.iter().flat_map(|(locale, text)| [locale, text]))
         .chain(&self.discovery_urls)
         .chain(mdns.flat_map(|mdns| mdns.capabilities.iter().chain([&mdns.name])));
-        match texts.into_iter().any(|text| text.len() > MAX_TEXT) {
+        let mut texts = texts.into_iter();
+        if texts.any(|text| text.len() > MAX_TEXT) {
+            let what = "a text that is longer than 1024 bytes";
+            return Err(RegisterFault::Invalid { what });
+        }
+        let strange = |url: &String| url.contains(|c: char| c.is_control() || c.is_whitespace());
+        match self.discovery_urls.iter().any(strange) {
             true => Err(RegisterFault::Invalid {
-                what: "a text that is longer than 1024 bytes",
+                what: "a discovery URL with a space or a control character",
             }),
             false => Ok(()),
         }

@@ -123,17 +123,21 @@ pub enum Event {
 pub struct Registry {
     settings: Settings,
     servers: BTreeMap<String, Server>,
+    /// Registered, and not to be reached: listed again when they answer before their registration has run out.
+    away: BTreeMap<String, Server>,
     network: Network,
     watch: Watch,
     events: VecDeque<Event>,
     refused: u64,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Server {
     asked: Asked,
     /// What we announce for it: what it asked for, under another name where that one was taken.
     announced: Option<Announcement>,
+    /// Whether a certificate said who registers it.
+    certified: bool,
     since: Instant,
     forget_at: Instant,
 }
@@ -145,6 +149,7 @@ impl Registry {
         Self {
             settings,
             servers: BTreeMap::new(),
+            away: BTreeMap::new(),
             network: Network::default(),
             watch: Watch::default(),
             events: VecDeque::new(),
@@ -165,7 +170,10 @@ impl Registry {
         now: Instant,
     ) -> Result<Registered, RegisterFault> {
         asked.check(channel, self.settings.allow_unsecured)?;
+        let certified = channel.certificate_uri.is_some();
+        self.check_certified(&asked, certified)?;
         if !asked.is_online {
+            self.forget_away(&asked.server_uri);
             self.end(&asked.server_uri.clone(), Loss::Unregistered);
             return Ok(Registered::Withdrawn);
         }
@@ -183,6 +191,7 @@ impl Registry {
         let (registered, since) = match known {
             Some(server) if server.asked == asked => {
                 server.forget_at = forget_at;
+                server.certified |= certified;
                 return Ok(Registered::Again);
             }
             Some(server) => (Registered::Changed, server.since),
@@ -192,11 +201,25 @@ impl Registry {
         let server = Server {
             asked,
             announced,
+            certified,
             since,
             forget_at,
         };
+        self.forget_away(&server.asked.server_uri);
         self.take(server, now);
         Ok(registered)
+    }
+
+    /// Who came with a certificate is changed by it alone, for as long as the registration counts.
+    fn check_certified(&self, asked: &Asked, certified: bool) -> Result<(), RegisterFault> {
+        let known = self.servers.get(&asked.server_uri);
+        let known = known.or_else(|| self.away.get(&asked.server_uri));
+        match known {
+            Some(known) if known.certified && !certified => Err(RegisterFault::Certified {
+                asked: asked.server_uri.clone(),
+            }),
+            Some(_) | None => Ok(()),
+        }
     }
 
     /// Takes a server in, in the place of what it registered before.
@@ -265,6 +288,7 @@ impl Registry {
 
     /// The semaphore file of a registered server is gone.
     pub fn semaphore_gone(&mut self, server_uri: &str) {
+        self.forget_away(server_uri);
         self.end(server_uri, Loss::SemaphoreGone);
     }
 
@@ -275,18 +299,33 @@ impl Registry {
 
     /// What came of a try.
     pub fn probed(&mut self, url: &str, outcome: Outcome, now: Instant) {
+        match outcome {
+            Outcome::Alive { .. } => self.welcome_back(url, now),
+            // The host is there and the program is not: another run of it registers anew, and whoever else
+            // gets its port is not it.
+            Outcome::Refused => self.forget_away_at(url),
+            Outcome::Silent | Outcome::Untried => {}
+        }
         let patience = (self.settings.probe_every, self.settings.lost_after);
         match self.watch.probed(url, outcome, patience, now) {
             Sign::Nothing => {}
             Sign::Restarted => self.events.push_back(Event::Restarted {
                 url: url.to_owned(),
             }),
-            Sign::Lost => self.lose(url),
+            Sign::Lost => self.lose(url, outcome == Outcome::Refused, now),
         }
     }
 
     /// Forgets who has not registered again.
     pub fn handle_timeout(&mut self, now: Instant) {
+        let away = self
+            .away
+            .iter()
+            .filter(|(_, server)| server.forget_at <= now);
+        let away: Vec<String> = away.map(|(uri, _)| uri.clone()).collect();
+        for uri in away {
+            self.forget_away(&uri);
+        }
         let expired: Vec<String> = self
             .servers
             .iter()
@@ -337,7 +376,7 @@ impl Registry {
     }
 
     /// Nobody answers at a URL: all that was said of it goes.
-    fn lose(&mut self, url: &str) {
+    fn lose(&mut self, url: &str, ended: bool, now: Instant) {
         self.watch.remove(url);
         let has = |asked: &Asked| asked.discovery_urls.iter().any(|known| known == url);
         let servers: Vec<String> = self
@@ -357,9 +396,12 @@ impl Registry {
             let Some(server) = self.servers.get_mut(&uri) else {
                 continue;
             };
+            if server.asked.discovery_urls.iter().all(|known| known == url) {
+                self.leave(&uri, ended);
+                continue;
+            }
             server.asked.discovery_urls.retain(|known| known != url);
             let Some(other) = server.asked.discovery_urls.first() else {
-                self.end(&uri, Loss::Unreachable);
                 continue;
             };
             if let Some(announced) = server.announced.as_mut().filter(|old| old.url == url) {
@@ -372,6 +414,60 @@ impl Registry {
             if !self.is_ours(&instance) {
                 self.vanish(&instance, Loss::Unreachable);
             }
+        }
+        if self.away.values().any(|server| has(&server.asked)) {
+            self.watch.add(url, self.settings.probe_every, now);
+        }
+    }
+
+    /// A registered server is not to be reached. Unless it has ended its program may run on behind a cable that is cut,
+    /// and registers again in some minutes only.
+    fn leave(&mut self, server_uri: &str, ended: bool) {
+        let server = self.servers.get(server_uri).cloned();
+        self.end(server_uri, Loss::Unreachable);
+        let room = !ended && self.away.len() < self.settings.most;
+        if let Some(server) = server.filter(|_| room) {
+            self.away.insert(server_uri.to_owned(), server);
+        }
+    }
+
+    fn forget_away(&mut self, server_uri: &str) {
+        if let Some(server) = self.away.remove(server_uri) {
+            for url in &server.asked.discovery_urls {
+                self.unwatch(url);
+            }
+        }
+    }
+
+    fn forget_away_at(&mut self, url: &str) {
+        for uri in self.away_at(url) {
+            self.forget_away(&uri);
+        }
+    }
+
+    fn away_at(&self, url: &str) -> Vec<String> {
+        let has = |server: &Server| server.asked.discovery_urls.iter().any(|known| known == url);
+        let away = self.away.iter().filter(|(_, server)| has(server));
+        away.map(|(uri, _)| uri.clone()).collect()
+    }
+
+    /// Who was not to be reached at a URL answers there again.
+    fn welcome_back(&mut self, url: &str, now: Instant) {
+        for uri in self.away_at(url) {
+            let Some(server) = self.away.remove(&uri) else {
+                continue;
+            };
+            if self.servers.len() >= self.settings.most {
+                self.refused += 1;
+                continue;
+            }
+            let announced = self.free(&server.asked);
+            let server = Server {
+                announced,
+                since: now,
+                ..server
+            };
+            self.take(server, now);
         }
     }
 
@@ -405,7 +501,7 @@ impl Registry {
 
     /// Looks no longer after a URL that nobody is known by any more.
     fn unwatch(&mut self, url: &str) {
-        let registered = self.servers.values();
+        let registered = self.servers.values().chain(self.away.values());
         let mut urls = registered
             .flat_map(|server| &server.asked.discovery_urls)
             .chain(self.network.iter().map(|record| &record.announcement.url));

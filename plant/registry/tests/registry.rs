@@ -466,3 +466,82 @@ fn made_up_servers_take_no_more_room_than_there_is() {
         "who is there stays"
     );
 }
+
+#[test]
+fn who_was_behind_a_cut_cable_is_listed_again_and_who_ended_is_not() {
+    let url = &gripper().discovery_urls[0];
+    let alive = Outcome::Alive { start_time: None };
+    for (what, then, back) in [
+        ("it answers again", alive, 1),
+        ("its program has ended by then", Outcome::Refused, 0),
+    ] {
+        let (mut registry, now) = start();
+        register(&mut registry, &gripper(), now).unwrap();
+        registry.probed(url, Outcome::Silent, now + SECOND * 3);
+        assert_eq!(registry.find_servers(&[]).count(), 0, "{what}");
+        events(&mut registry);
+        let again = registry
+            .poll_probe(now + SECOND * 4)
+            .expect("it is tried on");
+        registry.probed(&again.url, then, now + SECOND * 4);
+        // Who has the port of one that ended is not it.
+        registry.probed(&again.url, alive, now + SECOND * 5);
+        assert_eq!(registry.find_servers(&[]).count(), back, "{what}");
+        let announced = |event: &Event| matches!(event, Event::Announce(_));
+        let happened = events(&mut registry);
+        assert_eq!(happened.iter().filter(|one| announced(one)).count(), back);
+        registry.handle_timeout(now + Settings::default().forget_after);
+        assert_eq!(
+            registry.find_servers(&[]).count(),
+            0,
+            "as long as it counts"
+        );
+    }
+}
+
+#[test]
+fn who_is_away_for_longer_than_the_registration_counts_is_forgotten() {
+    let (mut registry, now) = start();
+    register(&mut registry, &gripper(), now).unwrap();
+    let url = &gripper().discovery_urls[0];
+    registry.probed(url, Outcome::Silent, now + SECOND * 3);
+    let later = now + Settings::default().forget_after;
+    registry.handle_timeout(later);
+    assert_eq!(registry.poll_probe(later), None);
+    registry.probed(url, Outcome::Alive { start_time: None }, later);
+    assert_eq!(registry.find_servers(&[]).count(), 0);
+}
+
+#[test]
+fn what_a_certificate_registered_nobody_changes_without_one() {
+    let (mut registry, now) = start();
+    register(&mut registry, &gripper(), now).unwrap();
+    let on_this_host = Channel {
+        is_secured: true,
+        certificate_uri: None,
+    };
+    let offline = Asked {
+        is_online: false,
+        ..gripper()
+    };
+    for asked in [gripper(), offline.clone()] {
+        let fault = registry.register(asked, &on_this_host, None, now);
+        let fault = fault.unwrap_err();
+        assert_eq!(fault.status(), 0x80E6_0000, "{fault}");
+    }
+    assert_eq!(registry.find_servers(&[]).count(), 1);
+    // Who takes its registration back says who it is, and some say no more.
+    let bare = Asked {
+        names: Vec::new(),
+        discovery_urls: Vec::new(),
+        ..offline
+    };
+    assert_eq!(
+        register(&mut registry, &bare, now),
+        Ok(Registered::Withdrawn)
+    );
+    assert_eq!(
+        registry.register(gripper(), &on_this_host, None, now),
+        Ok(Registered::New)
+    );
+}

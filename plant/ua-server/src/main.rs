@@ -65,6 +65,11 @@ fn main() -> ExitCode {
 }
 
 impl UaServer {
+    fn pki_root(&self) -> PathBuf {
+        let usual = || pki::default_root(|name| std::env::var(name).ok());
+        self.pki.clone().unwrap_or_else(usual)
+    }
+
     /// To whom the server is told of, if to anybody.
     fn announcement(&self) -> Option<AnnounceSettings> {
         let interface = self
@@ -78,6 +83,8 @@ impl UaServer {
             mdns: self
                 .announce
                 .then(|| interface.unwrap_or(Interface::LOOPBACK)),
+            // That of --pki is made by then.
+            pki: Some(self.pki_root()),
             ..AnnounceSettings::default()
         };
         (self.announce || self.lds.is_some()).then_some(settings)
@@ -120,11 +127,7 @@ impl Program for UaServer {
                 })?
             }
         };
-        let root = self
-            .pki
-            .clone()
-            .unwrap_or_else(|| pki::default_root(|name| std::env::var(name).ok()));
-        let pki = Pki::open(root)
+        let pki = Pki::open(self.pki_root())
             .map_err(|error| Failure::new(FailureKind::Io, format!("{error} (--pki)")))?;
         let setup = Setup {
             url,

@@ -1,8 +1,8 @@
 "use strict";
 // lds.js PORT: node-opcua's discovery server. Says `ready`, and then a JSON line whenever what it sees on the network
-// is another.
+// is another, and one whenever who is registered is.
 const { OPCUADiscoveryServer } = require("node-opcua-server-discovery");
-const { findServersOnNetwork } = require("node-opcua-client");
+const { findServers, findServersOnNetwork } = require("node-opcua-client");
 const path = require("path");
 const { OPCUACertificateManager } = require("node-opcua-certificate-manager");
 
@@ -16,6 +16,7 @@ async function main([port]) {
   await server.start();
   console.log("ready");
   let last = "";
+  let lastRegistered = "";
   for (;;) {
     const found = await findServersOnNetwork(`opc.tcp://127.0.0.1:${port}`);
     const seen = JSON.stringify(found.map((server) => ({
@@ -26,6 +27,12 @@ async function main([port]) {
     if (seen !== last) {
       last = seen;
       console.log(`{"network":${seen}}`);
+    }
+    const { servers } = await findServers(`opc.tcp://127.0.0.1:${port}`);
+    const registered = JSON.stringify(servers.map((server) => server.applicationUri));
+    if (registered !== lastRegistered) {
+      lastRegistered = registered;
+      console.log(`{"registered":${registered}}`);
     }
     await new Promise((resolve) => setTimeout(resolve, 100));
   }

@@ -3,6 +3,7 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::time::Duration;
 
 use bridge_node::{Failure, LogFormat, Service, run_service, serve_pages};
 use discovery::lds::{self, LdsSettings};
@@ -26,6 +27,12 @@ struct UaLds {
     /// a loopback address
     #[arg(long)]
     allow_unsecured: bool,
+    /// Take registrations over secured channels alone, from this host too
+    #[arg(long, requires = "pki", conflicts_with = "allow_unsecured")]
+    secured_only: bool,
+    /// How often servers are expected to register, in seconds. A registration without semaphore file counts twice as long
+    #[arg(long, value_name = "SECONDS", default_value = "600", value_parser = clap::value_parser!(u32).range(1..=86_400))]
+    register_period: u32,
     /// The certificate store, for secured channels (Basic256Sha256): own, private and trusted under one directory. Without
     /// it no channel is secured
     #[arg(long, value_name = "DIR", env = "UA_LDS_PKI")]
@@ -66,6 +73,8 @@ impl Service for UaLds {
             endpoint: self.endpoint,
             interface: interface.unwrap_or(Interface::LOOPBACK),
             allow_unsecured: self.allow_unsecured,
+            secured_only: self.secured_only,
+            register_every: Duration::from_secs(self.register_period.into()),
             pki: self.pki,
             trust_any: self.trust_any_client_certificate,
         };
