@@ -292,10 +292,10 @@ impl Domain {
     }
 
     /// The services others offer, by their names, with the types they have, as `std_srvs/SetBool`; a name that is none of
-    /// ROS as it is. Those that actions are made of are left out.
+    /// ROS as it is. Those that actions are made of are left out, and those of the other bridges in `graph`.
     #[must_use]
-    pub fn services(&self) -> BTreeMap<String, BTreeSet<String>> {
-        offered(&self.participant)
+    pub fn services(&self, graph: &Graph) -> BTreeMap<String, BTreeSet<String>> {
+        offered(&self.participant, graph)
     }
 
     /// The readers and writers made here that were not announced to the domain: RustDDS' discovery drops what does not

@@ -144,6 +144,15 @@ impl FieldMap {
 }
 
 impl CallKind {
+    /// What people call it in ROS: `service` or `action`.
+    #[must_use]
+    pub const fn word(self) -> &'static str {
+        match self {
+            Self::Service => "service",
+            Self::Action => "action",
+        }
+    }
+
     /// What the topics of such a call are of, in their order; nothing of the call itself.
     pub(crate) const fn parts(self) -> &'static [&'static str] {
         match self {

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use uadp::BuiltinType;
 
+use crate::call::MethodTarget;
 use crate::node_id::NodeIdText;
 use crate::topic::SpaceId;
 
@@ -14,6 +15,9 @@ pub struct Environment {
     pub spaces: BTreeMap<SpaceId, LiveSpace>,
     /// The OPC UA server of the cell.
     pub server: Option<LiveServer>,
+    /// What other OPC UA servers said of Methods of theirs that execute calls: nothing where all is well, else why one cannot
+    /// be called, for people.
+    pub methods: Vec<(MethodTarget, Option<String>)>,
 }
 
 /// A ROS graph as it was.
@@ -24,6 +28,30 @@ pub struct LiveSpace {
     /// Services by their names, with the types they have, as `std_srvs/SetBool`: several where servers disagree, none where
     /// nobody told. `None` where they were not asked for.
     pub services: Option<BTreeMap<String, BTreeSet<String>>>,
+}
+
+impl LiveSpace {
+    /// The actions that somebody serves, by their names, with the types they have, as `nav2_msgs/NavigateToPose`: told by the
+    /// topics of their feedback.
+    #[must_use]
+    pub fn actions(&self) -> BTreeMap<&str, BTreeSet<String>> {
+        let mut actions: BTreeMap<&str, BTreeSet<String>> = BTreeMap::new();
+        for (topic, live) in self.topics.iter().filter(|(_, live)| live.published) {
+            let (name, end) = match topic.strip_suffix("/_action/feedback") {
+                Some(name) => (name, "_FeedbackMessage"),
+                None => match topic.strip_suffix("/feedback") {
+                    Some(name) => (name, "ActionFeedback"),
+                    None => continue,
+                },
+            };
+            let types = live.types.iter().filter_map(|kind| kind.strip_suffix(end));
+            let types: BTreeSet<String> = types.map(str::to_owned).collect();
+            if !name.is_empty() && !types.is_empty() {
+                actions.insert(name, types);
+            }
+        }
+        actions
+    }
 }
 
 /// A topic as it was.
@@ -61,5 +89,45 @@ impl LiveServer {
     pub fn agrees(&self, node: &NodeIdText, uri: Option<&str>) -> bool {
         let index = usize::from(node.namespace);
         node.namespace == 0 || self.namespaces.get(index).map(String::as_str) == uri
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn actions_of_either_ros_are_told_by_their_feedback() {
+        let topic = |name: &str, kind: &str, published| {
+            let live = LiveTopic {
+                types: BTreeSet::from([kind.to_owned()]),
+                published,
+                subscribed: !published,
+            };
+            (name.to_owned(), live)
+        };
+        let live = LiveSpace {
+            topics: [
+                topic(
+                    "/nav/_action/feedback",
+                    "nav2_msgs/Nav_FeedbackMessage",
+                    true,
+                ),
+                topic("/move/feedback", "a_msgs/MoveActionFeedback", true),
+                topic("/asked/feedback", "a_msgs/MoveActionFeedback", false),
+                topic("/user/feedback", "std_msgs/String", true),
+            ]
+            .into(),
+            services: None,
+        };
+        let actions = live.actions();
+        let actions: Vec<(&str, &str)> = actions
+            .iter()
+            .map(|(name, types)| (*name, types.first().map_or("", String::as_str)))
+            .collect();
+        assert_eq!(
+            actions,
+            [("/move", "a_msgs/Move"), ("/nav", "nav2_msgs/Nav")]
+        );
     }
 }

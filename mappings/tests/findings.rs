@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use mappings::{
-    Checked, Code, Environment, LiveNode, LiveServer, LiveSpace, LiveTopic, Mapping, PathFault,
-    PathFaultKind, Severity, SpaceId, Surroundings, TypeFiles, TypeOrigin,
+    Checked, Code, Endpoint, Environment, LiveNode, LiveServer, LiveSpace, LiveTopic, Mapping,
+    MethodTarget, PathFault, PathFaultKind, Severity, SpaceId, Surroundings, TypeFiles, TypeOrigin,
 };
 use messages::{DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName};
 use uadp::BuiltinType;
@@ -123,11 +123,24 @@ fn environment() -> Environment {
             ("/conveyor/running".to_owned(), topic("std_msgs/Bool", true)),
             ("/conveyor/switch".to_owned(), topic("std_msgs/Bool", false)),
             ("/robot1/pose".to_owned(), topic("std_msgs/String", true)),
+            (
+                "/drive/feedback".to_owned(),
+                topic("move_base_msgs/MoveBaseActionFeedback", true),
+            ),
         ]),
         services: Some(BTreeMap::from([(
             "/conveyor/start".to_owned(),
             BTreeSet::from(["std_srvs/Trigger".to_owned()]),
         )])),
+    };
+    let method = |method: &str| MethodTarget {
+        endpoint: Endpoint {
+            host: "192.168.0.10".to_owned(),
+            port: 4840,
+            path: String::new(),
+        },
+        object: "nsu=urn:plc;s=Line".parse().unwrap(),
+        method: method.parse().unwrap(),
     };
     Environment {
         spaces: BTreeMap::from([(SpaceId::ROS1, ros1)]),
@@ -143,6 +156,13 @@ fn environment() -> Environment {
                 ),
             ]),
         }),
+        methods: vec![
+            (
+                method("nsu=urn:plc;s=Line.Rest"),
+                Some("the server has no Method `nsu=urn:plc;s=Line.Rest`".to_owned()),
+            ),
+            (method("nsu=urn:plc;s=Line.Stop"), None),
+        ],
     }
 }
 

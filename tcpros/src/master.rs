@@ -30,14 +30,7 @@ impl Graph {
     /// # Errors
     /// The URI is none, the master cannot be reached, or answers what no master does.
     pub async fn of_master(uri: &str, caller_id: &str) -> Result<Self, MasterError> {
-        let endpoint = Endpoint::parse(uri).ok_or(RpcError::Uri)?;
-        let master = Master::new(
-            endpoint,
-            uri.to_owned(),
-            caller_id.to_owned(),
-            String::new(),
-        );
-        master.graph().await
+        Master::at(uri, caller_id)?.graph().await
     }
 }
 
@@ -56,6 +49,17 @@ pub(crate) struct Master {
 pub(crate) type Request = (&'static str, Vec<Value>);
 
 impl Master {
+    /// That of the URI, for one that is no node of its graph.
+    pub(crate) fn at(uri: &str, caller_id: &str) -> Result<Self, MasterError> {
+        let endpoint = Endpoint::parse(uri).ok_or(RpcError::Uri)?;
+        Ok(Self::new(
+            endpoint,
+            uri.to_owned(),
+            caller_id.to_owned(),
+            String::new(),
+        ))
+    }
+
     pub(crate) fn new(
         endpoint: Endpoint,
         uri: String,

@@ -8,7 +8,7 @@ use rustdds::{DomainParticipant, GUID, RTPSEntity};
 use tokio::time::Instant;
 
 use crate::domain::Domain;
-use crate::graph::Endpoint;
+use crate::graph::{Endpoint, Graph};
 
 use super::ServiceMapping;
 
@@ -193,12 +193,18 @@ fn action_name(name: &str) -> Option<&str> {
     name.strip_suffix("/_action/send_goal")
 }
 
-/// The services that others than `participant` offer, with their types.
-pub(crate) fn offered(participant: &DomainParticipant) -> BTreeMap<String, BTreeSet<String>> {
+/// The services that others than `participant` and the bridges in `graph` offer, with their types.
+pub(crate) fn offered(
+    participant: &DomainParticipant,
+    graph: &Graph,
+) -> BTreeMap<String, BTreeSet<String>> {
     let mut services: BTreeMap<String, BTreeSet<String>> = BTreeMap::new();
     for (name, endpoints) in Snapshot::of(participant).offered() {
-        let types = services.entry(format!("/{name}")).or_default();
-        types.extend(endpoints.iter().map(|one| service_type(&one.type_name)));
+        let others = endpoints.iter().filter(|one| !graph.is_bridge(one.guid));
+        for one in others {
+            let types = services.entry(format!("/{name}")).or_default();
+            types.insert(service_type(&one.type_name));
+        }
     }
     services
 }

@@ -1,5 +1,7 @@
 //! Whether what a sound document names is there.
 
+mod calls;
+
 use super::types;
 use crate::code::Code;
 use crate::document::{BindingEntry, Document, VariableEntry};
@@ -11,7 +13,7 @@ use crate::read::{given, short};
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
-/// `mapping` is what `document` came to, which has no errors: a variable for each entry, in their order.
+/// `mapping` is what `document` came to, which has no errors: a variable or call for each entry, in their order.
 pub(super) fn check(
     document: &Document,
     mapping: &Mapping,
@@ -31,6 +33,13 @@ pub(super) fn check(
         service(entry, variable, environment, at.place, findings);
         if let Some(server) = &environment.server {
             node(entry, variable, mapping, server, findings);
+        }
+    }
+    let entries = document.calls.as_ref().and_then(|at| at.value.as_ref());
+    let entries = entries.into_iter().flatten();
+    for (at, call) in entries.zip(mapping.calls()) {
+        if let Some(entry) = &at.value {
+            calls::check(entry, call, environment, at.place, findings);
         }
     }
     let entries = document.patterns.as_ref().and_then(|at| at.value.as_ref());

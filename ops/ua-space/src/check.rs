@@ -128,6 +128,7 @@ fn sum(name: &str, checked: &Checked, spaces: &[SpaceId]) -> String {
     let parts = [
         several(mapping.variables().len(), "variable"),
         several(mapping.patterns().len(), "pattern"),
+        several(mapping.calls().len(), "call"),
         several(mapping.spaces().len(), "ROS space"),
     ];
     // Most likely a slip of the pen; a bridge would run there without a line of configuration.
@@ -152,7 +153,7 @@ struct Told<'a> {
     #[serde(rename = "for", skip_serializing_if = "Vec::is_empty")]
     spaces: Vec<u8>,
     findings: Vec<Finding<'a>>,
-    /// The message and service types it names.
+    /// The message, service and action types it names.
     types: Vec<Type<'a>>,
     #[serde(skip_serializing_if = "Option::is_none")]
     environment: Option<&'a [Asked]>,

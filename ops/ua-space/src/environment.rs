@@ -1,8 +1,9 @@
 //! What is there of what a mapping names.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
-use mappings::{Environment, Mapping, SpaceId};
+use mappings::{Environment, ExecutedBy, Mapping, MethodTarget, SpaceId};
 use serde::Serialize;
 
 use crate::arguments::{Check, Part};
@@ -28,7 +29,7 @@ pub(crate) struct Asked {
 }
 
 impl Seen {
-    /// Asks the graphs of the mapping's spaces and its server, as far as that is wished.
+    /// Asks the graphs of the mapping's spaces and its servers, as far as that is wished.
     ///
     /// # Errors
     /// What was typed, or the environment's own configuration, is wrong; who is not there is no error.
@@ -55,8 +56,27 @@ impl Seen {
             let url = mapping.server().endpoint.to_string();
             let server = look(survey::opcua::check(&url, mapping));
             seen.environment.server = seen.asked(format!("OPC UA server {url}"), server)?;
+            seen.methods(mapping)?;
         }
         Ok(seen)
+    }
+
+    /// Asks each server that has Methods of the mapping.
+    fn methods(&mut self, mapping: &Mapping) -> Result<(), Failure> {
+        let mut by_server: BTreeMap<String, Vec<&MethodTarget>> = BTreeMap::new();
+        for call in mapping.executed_in(SpaceId::UA) {
+            if let ExecutedBy::OpcUa(target) = &call.executed {
+                let url = target.endpoint.to_string();
+                by_server.entry(url).or_default().push(target);
+            }
+        }
+        for (url, targets) in by_server {
+            let told = look(survey::opcua::methods(&url, &targets));
+            let told = self.asked(format!("OPC UA server {url}"), told)?;
+            let methods = targets.into_iter().cloned().zip(told.unwrap_or_default());
+            self.environment.methods.extend(methods);
+        }
+        Ok(())
     }
 
     fn asked<T>(&mut self, whom: String, answer: Result<T, Failure>) -> Result<Option<T>, Failure> {

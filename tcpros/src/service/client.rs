@@ -85,6 +85,21 @@ impl ServiceClient {
         }
     }
 
+    /// A client of one that is no node of the graph: the master at `uri` (`http://host:port`) tells it where the service is.
+    /// `service` is the full name.
+    ///
+    /// # Errors
+    /// The URI is none.
+    pub fn of_master(
+        uri: &str,
+        caller_id: &str,
+        service: &str,
+        options: ServiceClientOptions,
+    ) -> Result<Self, MasterError> {
+        let master = Master::at(uri, caller_id)?;
+        Ok(Self::new(service.to_owned(), options, caller_id, master))
+    }
+
     /// The service's resolved name.
     pub fn service(&self) -> &str {
         &self.shared.service

@@ -54,16 +54,6 @@ impl Maps {
     }
 }
 
-impl CallKind {
-    /// What people call it.
-    pub(super) const fn word(self) -> &'static str {
-        match self {
-            Self::Service => "service",
-            Self::Action => "action",
-        }
-    }
-}
-
 /// What a call is by its bindings. `None` where they are of both kinds, which is noted, or faulty.
 pub(super) fn kind_of(
     found: Option<&[Found]>,

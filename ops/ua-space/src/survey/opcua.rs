@@ -5,7 +5,9 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
-use mappings::{LiveNode, LiveServer, Mapping, NodeIdText};
+use mappings::{
+    ExpandedNodeIdText, LiveNode, LiveServer, Mapping, MethodTarget, NamespaceText, NodeIdText,
+};
 use opcua::client::{ClientBuilder, IdentityToken, Session};
 use opcua::types::{
     AttributeId, BrowseDescription, BrowseDirection, BrowseResultMask, DataValue,
@@ -74,6 +76,36 @@ pub(crate) async fn check(url: &str, mapping: &Mapping) -> Result<LiveServer, Fa
     let live = server.within(asking).await?;
     server.leave().await;
     Ok(live)
+}
+
+/// Asks the server at `url` for Methods: nothing where one can be called, else why not, for people.
+pub(crate) async fn methods(
+    url: &str,
+    wanted: &[&MethodTarget],
+) -> Result<Vec<Option<String>>, Failure> {
+    let server = Connected::to(url).await?;
+    let asking = async {
+        let namespaces = server.namespaces().await?;
+        let mut told = Vec::with_capacity(wanted.len());
+        for target in wanted {
+            let parts = [
+                (&target.object, OBJECT, "Object"),
+                (&target.method, METHOD, "Method"),
+            ];
+            let mut why = None;
+            for (node, class, word) in parts {
+                why = server.is_away(node, &namespaces, (class, word)).await?;
+                if why.is_some() {
+                    break;
+                }
+            }
+            told.push(why);
+        }
+        Ok(told)
+    };
+    let told = server.within(asking).await?;
+    server.leave().await;
+    Ok(told)
 }
 
 /// A session without security, as an anonymous user.
@@ -184,6 +216,38 @@ impl Connected {
             }
         });
         Ok(uris.collect())
+    }
+
+    /// Why there is no such node of that NodeClass; `None` where there is.
+    async fn is_away(
+        &self,
+        node: &ExpandedNodeIdText,
+        namespaces: &[String],
+        (class, word): (i32, &str),
+    ) -> Result<Option<String>, Failure> {
+        let index = match &node.namespace {
+            NamespaceText::Index(index) => Some(*index),
+            NamespaceText::Uri(uri) => {
+                let at = namespaces.iter().position(|other| other == uri);
+                at.and_then(|at| u16::try_from(at).ok())
+            }
+        };
+        let Some(namespace) = index else {
+            return Ok(Some(format!("{} has no namespace for `{node}`", self.url)));
+        };
+        let local = NodeIdText {
+            namespace,
+            identifier: node.identifier.clone(),
+        };
+        let Ok(local) = local.to_string().parse::<NodeId>() else {
+            return Ok(Some(format!(
+                "`{node}` is no node id that can be asked for"
+            )));
+        };
+        let read = self.read(&[local], &[AttributeId::NodeClass]).await?;
+        let told = read.into_iter().next().and_then(|told| told.value);
+        let told = told.and_then(|value| value.try_cast_to::<i32>().ok());
+        Ok((told != Some(class)).then(|| format!("{} has no {word} `{node}`", self.url)))
     }
 
     /// The variables below the Objects folder. Of variables nothing below is looked at, and no property.
@@ -405,8 +469,10 @@ fn absent(url: &str, why: &str) -> Failure {
     )
 }
 
-/// NodeClass Variable (OPC 10000-3, 8.29).
+/// NodeClasses (OPC 10000-3, 8.29).
+const OBJECT: i32 = 1;
 const VARIABLE: i32 = 2;
+const METHOD: i32 = 4;
 const ANY_RANK: i64 = -2;
 const BATCH: usize = 100;
 const REFERENCES: u32 = 1000;

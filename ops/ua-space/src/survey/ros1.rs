@@ -1,10 +1,12 @@
 //! The graph of a ROS 1 master.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use mappings::{LiveSpace, LiveTopic};
-use tcpros::{MasterError, RpcError};
+use messages::TypeName;
+use tcpros::{MasterError, RpcError, ServiceClient, ServiceClientOptions};
+use tokio::task::JoinSet;
 use tokio::time::timeout;
 
 use super::{MOST, away};
@@ -40,15 +42,7 @@ pub(crate) async fn survey(uri: &str) -> Result<LiveSpace, Failure> {
         }
     };
     let mut live = LiveSpace {
-        // The master knows no types of them.
-        services: Some(
-            graph
-                .services
-                .into_keys()
-                .take(MOST)
-                .map(|name| (name, BTreeSet::new()))
-                .collect(),
-        ),
+        services: Some(services(uri, graph.services).await),
         ..LiveSpace::default()
     };
     for (ends, published) in [(graph.publishers, true), (graph.subscribers, false)] {
@@ -70,6 +64,56 @@ pub(crate) async fn survey(uri: &str) -> Result<LiveSpace, Failure> {
     Ok(live)
 }
 
+/// The services there are but for those of bridges, each with the type its server tells. The master knows none.
+async fn services(
+    uri: &str,
+    offered: BTreeMap<String, Vec<String>>,
+) -> BTreeMap<String, BTreeSet<String>> {
+    let others = offered
+        .into_iter()
+        .filter(|(_, nodes)| !nodes.iter().all(|node| node.starts_with(BRIDGE)));
+    let names: Vec<String> = others.map(|(name, _)| name).take(MOST).collect();
+    let mut services: BTreeMap<String, BTreeSet<String>> = names
+        .iter()
+        .map(|name| (name.clone(), BTreeSet::new()))
+        .collect();
+    let mut left = names.into_iter();
+    let mut asking = JoinSet::new();
+    let asked = async {
+        loop {
+            while asking.len() < AT_ONCE
+                && let Some(name) = left.next()
+            {
+                asking.spawn(service_type(uri.to_owned(), name));
+            }
+            match asking.join_next().await {
+                Some(Ok((name, Some(told)))) => {
+                    services.entry(name).or_default().insert(told);
+                }
+                Some(_) => {}
+                None => return,
+            }
+        }
+    };
+    // Those that did not tell it by then have none.
+    let _over = timeout(PROBING, asked).await;
+    services
+}
+
+/// The name of a service, and its type as its server has it.
+async fn service_type(uri: String, name: String) -> (String, Option<String>) {
+    let options = ServiceClientOptions {
+        timeout: PROBE,
+        ..ServiceClientOptions::default()
+    };
+    let Ok(client) = ServiceClient::of_master(&uri, CALLER, &name, options) else {
+        return (name, None);
+    };
+    let told = client.probe().await.ok();
+    let told = told.and_then(|header| header.get("type").map(str::to_owned));
+    (name, told.filter(|told| told.parse::<TypeName>().is_ok()))
+}
+
 /// A subscriber of any type says `*`.
 fn learn(topic: &mut LiveTopic, told: &str) {
     if told != "*" {
@@ -84,3 +128,7 @@ const HELP: &str =
     "is roscore running there? ROS_MASTER_URI or the argument of --ros1 names the master";
 /// Two calls of 3 s, and the time to find the host.
 const LIMIT: Duration = Duration::from_secs(8);
+/// Servers of services that are asked for their types side by side, how long one of them has, and how long all have.
+const AT_ONCE: usize = 32;
+const PROBE: Duration = Duration::from_secs(2);
+const PROBING: Duration = Duration::from_secs(10);

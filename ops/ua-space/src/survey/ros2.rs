@@ -18,13 +18,14 @@ pub(crate) async fn survey(domain: u16, wait: Duration) -> Result<LiveSpace, Fai
     let joined = join(domain)?;
     let end = Instant::now() + wait;
     let (mut graph, mut since) = (joined.graph(), Instant::now());
-    let mut services = joined.services();
+    let mut services = joined.services(&graph);
     while Instant::now() < end {
         if !graph.participants().is_empty() && since.elapsed() >= SETTLED {
             break;
         }
         sleep(STEP).await;
-        let (newer, offered) = (joined.graph(), joined.services());
+        let newer = joined.graph();
+        let offered = joined.services(&newer);
         if newer != graph || offered != services {
             (graph, services, since) = (newer, offered, Instant::now());
         }
