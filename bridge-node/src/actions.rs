@@ -210,3 +210,6 @@ impl Actions {
 const MOST_REPORTS: usize = 256;
 /// What is taken of it at a time.
 const MOST_AT_A_TIME: usize = 64;
+
+#[cfg(test)]
+mod tests;
