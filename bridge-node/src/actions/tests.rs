@@ -245,7 +245,7 @@ impl CancelRequest for Request {
     }
 
     fn reject(self) {
-        drop(self.agreed.send(false));
+        let _gone = self.agreed.send(false).is_err();
     }
 }
 
@@ -320,10 +320,8 @@ impl Space {
     }
 
     fn announce(&mut self, events: &[PortEvent]) {
-        for event in events {
-            if let PortEvent::OfferTyped { topic, offered } = event {
-                self.offering.known(*topic, &describe(offered));
-            }
+        for (topic, offered) in offers(events) {
+            self.offering.known(topic, &describe(offered));
         }
     }
 
@@ -351,6 +349,10 @@ impl Space {
         }
     }
 
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "all others are none of an action that is there"
+    )]
     fn executed(&mut self, event: PortEvent) {
         match event {
             PortEvent::Executed { execution, outcome } => {
@@ -384,8 +386,7 @@ impl Space {
                 self.offering.publish(&delivery).unwrap();
             }
             PortEvent::Sample { payload, .. } => self.statuses.push(payload),
-            PortEvent::CallFailed { .. } => {}
-            other => panic!("{other:?}"),
+            other => assert!(matches!(other, PortEvent::CallFailed { .. }), "{other:?}"),
         }
     }
 
@@ -475,6 +476,16 @@ impl Space {
         self.cancels = cancels;
         cancel
     }
+}
+
+fn offers(events: &[PortEvent]) -> impl Iterator<Item = (TopicId, &OfferedType)> {
+    events.iter().filter_map(|event| {
+        if let PortEvent::OfferTyped { topic, offered } = event {
+            Some((*topic, offered))
+        } else {
+            None
+        }
+    })
 }
 
 /// As it is announced.
@@ -684,10 +695,8 @@ async fn a_server_that_goes_is_withdrawn_and_the_ends_of_its_goals_can_still_be_
     space.present = present;
     let events = space.reconcile();
     assert_eq!(events.len(), 5, "{events:?}");
-    let role = events.iter().find_map(|event| match event {
-        PortEvent::OfferTyped { topic, offered } if *topic == of_goals() => Some(offered.role),
-        _ => None,
-    });
+    let role =
+        offers(&events).find_map(|(topic, offered)| (topic == of_goals()).then_some(offered.role));
     let Some(CallRole::Goal(family)) = role else {
         panic!("{events:?}");
     };
@@ -775,11 +784,9 @@ calls:
     );
     space.present = [("/count".to_owned(), NAME.parse().ok())].into();
     let events = space.reconcile();
-    let offered = events.iter().find_map(|event| match event {
-        PortEvent::OfferTyped { topic, offered } if topic.triple().2 == 72 => Some(offered),
-        _ => None,
-    });
-    let offered = offered.unwrap();
+    let (_, offered) = offers(&events)
+        .find(|(topic, _)| topic.triple().2 == 72)
+        .unwrap();
     assert_eq!(offered.name, "Count.Result");
     assert!(offered.open && offered.role == CallRole::Result { of: 70 });
     space.announce(&events);
