@@ -108,6 +108,7 @@ impl Calls {
             start,
             requestor: Requestor::new(OwnedPublisherId::UInt16(own.into()), instance, settings),
             responder: Responder::new(ResponderSettings {
+                max_executing: MAX_EXECUTING,
                 max_answer: MAX_BLOCK,
                 max_bytes: 4 * MAX_BLOCK,
                 max_bytes_per_requestor: 2 * MAX_BLOCK,
@@ -745,5 +746,7 @@ const BAD: u32 = 0x8000_0000;
 const BAD_DECODING_ERROR: StatusCode = StatusCode(0x8007_0000);
 /// Requests for one call that wait for their answer.
 const MAX_OPEN: usize = 256;
+/// Requests that are executed at a time: those that wait for the results of actions among them.
+const MAX_EXECUTING: usize = 1_024;
 /// Bytes of the fields of a request or response; those that do not fit a datagram go in chunks.
 const MAX_BLOCK: usize = 16 << 20;

@@ -28,8 +28,10 @@ pub(super) struct Executors {
     refused: HashMap<TopicId, Wanted>,
     /// The parts of those that are served: of which, and what.
     parts: HashMap<TopicId, (TopicId, Part)>,
-    /// Where what is executed was begun.
-    running: HashMap<ExecutionId, TopicId>,
+    /// Where what is executed was begun, and as what.
+    running: HashMap<ExecutionId, (TopicId, Part)>,
+    /// How many of them wait for a result.
+    held: usize,
     tasks: JoinSet<()>,
 }
 
@@ -203,23 +205,29 @@ impl Executors {
         let part = self.parts.get(&execution.topic);
         let (action, part) = *part.ok_or(Refusal::NotExecutable)?;
         let served = self.served.get(&action).ok_or(Refusal::NotExecutable)?;
+        if part == Part::Result && self.held >= MOST_HELD {
+            return Err(Refusal::Busy);
+        }
         let id = execution.id;
         let command = Command::Execute(part, execution);
         let told = served.commands.try_send(command);
         told.map_err(|_| Refusal::Busy)?;
-        self.running.insert(id, action);
+        self.held += usize::from(part == Part::Result);
+        self.running.insert(id, (action, part));
         Ok(())
     }
 
     /// An execution has come to its end.
     pub(super) fn ended(&mut self, execution: ExecutionId) {
-        self.running.remove(&execution);
+        if let Some((_, Part::Result)) = self.running.remove(&execution) {
+            self.held -= 1;
+        }
     }
 
     /// Who asked for an execution does not want it any longer.
     pub(super) fn abandoned(&mut self, execution: ExecutionId) {
-        let action = self.running.get(&execution);
-        if let Some(served) = action.and_then(|action| self.served.get(action)) {
+        let running = self.running.get(&execution);
+        if let Some(served) = running.and_then(|(action, _)| self.served.get(action)) {
             // Where it has much to do, the request ends at its deadline.
             drop(served.commands.try_send(Command::Abandoned(execution)));
         }
@@ -418,5 +426,7 @@ const ANSWER: Duration = Duration::from_secs(30);
 const MOST_SERVED: usize = 256;
 /// Requests of one action that wait to be looked at; one more is refused as busy.
 const MOST_COMMANDS: usize = 256;
+/// Requests that wait for results of all actions: others have places left.
+const MOST_HELD: usize = 512;
 /// How long the goals of a server that is gone are kept, so that their ends can be asked for once it is there again.
 const KEPT: Duration = Duration::from_secs(15 * 60);
