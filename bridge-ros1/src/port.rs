@@ -21,7 +21,7 @@ use bridge_node::{
 };
 use bytes::Bytes;
 use mappings::{Mapping, SpaceId, TopicId, Variable};
-use messages::{DefinitionError, MessageType, Selection, TextKind, TypeName};
+use messages::{ActionCalls, DefinitionError, MessageType, Selection, TextKind, TypeName};
 use tcpros::{
     Graph, Inbox, InboxEvent, Latched, Message, Node, NodeError, NodeOptions, Peer, ServiceServer,
     SubscriberOptions, TopicType, Wanted,
@@ -515,6 +515,10 @@ impl Ros1Port {
 
     /// The local type a writer says its value is of, if it is known and has the fields that are said.
     fn learned(&mut self, topic: TopicId, described: &Described) -> Option<(TypeName, Selection)> {
+        if ActionCalls::is_value(&described.message_type) {
+            // Whoever serves the action here takes it.
+            return None;
+        }
         match self.definitions.get(&described.message_type) {
             Ok(message_type) => self.policy.learned(topic, described, &message_type),
             Err(error) => {

@@ -35,7 +35,7 @@ use bridge_node::{
 use bytes::Bytes;
 use futures_util::StreamExt;
 use mappings::{Mapping, SpaceId, TopicId};
-use messages::{DefinitionError, Selection, TextKind, TypeName};
+use messages::{ActionCalls, DefinitionError, Selection, TextKind, TypeName};
 use rustdds::{DomainParticipantStatusEvent, DomainParticipantStatusListener, GUID, StatusEvented};
 use tokio::time::Instant;
 use tracing::{debug, info, warn};
@@ -417,6 +417,10 @@ impl Ros2Port {
     /// The local type a writer says its value is of, if it is known and has the fields that are said.
     fn learned(&mut self, topic: TopicId, described: &Described) -> Option<(TypeName, Selection)> {
         let name = &described.message_type;
+        if ActionCalls::is_value(name) {
+            // Whoever serves the action here takes it.
+            return None;
+        }
         match self.definitions.get(name) {
             Ok(found) => self.policy.learned(topic, described, &found.message_type),
             Err(error) => {

@@ -57,9 +57,17 @@ impl ActionCalls {
             goal: service(name, &goal)?,
             cancel: service(&derived(name, "_CancelCall")?, &cancel)?,
             result: service(&derived(name, "_ResultCall")?, &result)?,
-            feedback: message("_FeedbackValue", &format!("{ID}{x}Feedback feedback\n"))?,
-            status: message("_StatusValue", "uint8[] goal_ids\nuint8[] statuses\n")?,
+            feedback: message(FEEDBACK, &format!("{ID}{x}Feedback feedback\n"))?,
+            status: message(STATUS, "uint8[] goal_ids\nuint8[] statuses\n")?,
         })
+    }
+
+    /// Whether a type is that of a value of an action, by its name: no graph has such messages by themselves.
+    #[must_use]
+    pub fn is_value(name: &TypeName) -> bool {
+        [FEEDBACK, STATUS]
+            .iter()
+            .any(|suffix| name.name().ends_with(suffix))
     }
 
     /// Sends a goal, under the name of the action. Request: `goal_id` (16 bytes; all zero where who executes chooses) and `goal`;
@@ -101,6 +109,9 @@ impl ActionCalls {
     }
 }
 
+/// What the types of an action's values have behind its name.
+const FEEDBACK: &str = "_FeedbackValue";
+const STATUS: &str = "_StatusValue";
 /// Tells a goal.
 const ID: &str = "uint8[16] goal_id\n";
 
@@ -108,7 +119,7 @@ const ID: &str = "uint8[16] goal_id\n";
 mod tests {
     use uadp::BuiltinType;
 
-    use crate::{Dialect, MessageType, Registry};
+    use crate::{ActionCalls, Dialect, MessageType, Registry};
 
     const COUNT: &str = "int32 order\n---\nint32[] sequence\n---\nint32[] partial\nfloat64 share\n";
 
@@ -127,6 +138,8 @@ mod tests {
             registry.add_action(&name, COUNT).unwrap();
             let calls = registry.action_calls(&name).unwrap();
             assert_eq!(*calls.goal().name(), name);
+            let values = [calls.feedback().name(), calls.status().name(), &name];
+            assert_eq!(values.map(ActionCalls::is_value), [true, true, false]);
             [
                 leaves(calls.goal().request()),
                 leaves(calls.goal().response()),

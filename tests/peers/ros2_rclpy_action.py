@@ -143,7 +143,9 @@ class Client:
 
     def cancelled(self, answer):
         ids = [list(one.uuid) for one in self.ids]
-        goals = [ids.index(list(info.goal_id.uuid)) for info in answer.goals_canceling]
+        cancelled = [list(info.goal_id.uuid) for info in answer.goals_canceling]
+        # Those of other clients have no number here.
+        goals = [ids.index(one) if one in ids else None for one in cancelled]
         lifetime.say(cancel=CODES[answer.return_code], goals=goals)
 
     def ask_cancel(self, goal_id=None, stamp=None):

@@ -209,7 +209,8 @@ fn a_goal_outlives_its_client_and_others_can_cancel_it() {
             .any(|line| line.get("cancel") == Some(&json!(order)))
     };
     assert!(!cancelled(&server, 100), "it goes on");
-    second.tell("cancel_all");
+    let all = cancels(&mut second, "cancel_all");
+    assert_eq!(all, json!({"cancel": "NONE", "goals": [null, 0]}));
     for order in [100, 102] {
         says(&mut server, "cancel", &json!(order));
     }
