@@ -36,9 +36,9 @@ CODES = ["NONE", "REJECTED", "UNKNOWN_GOAL_ID", "GOAL_TERMINATED"]
 STATUS_QOS = types.qos(Policy.Durability.TransientLocal, 1)
 
 
-def topics(participant, action):
+def topics(participant, action, feedback=types.FibonacciFeedback):
     base = f"rt/{action.lstrip('/')}/_action"
-    feedback = Topic(participant, f"{base}/feedback", types.FibonacciFeedback, qos=types.qos())
+    feedback = Topic(participant, f"{base}/feedback", feedback, qos=types.qos())
     return feedback, Topic(participant, f"{base}/status", types.GoalStatusArray, qos=STATUS_QOS)
 
 
@@ -67,13 +67,16 @@ class Goal:
 
 
 class ActionServer:
+    KINDS = (SEND, RESULT, types.FibonacciFeedback)
+
     def __init__(self, participant, args):
         base = f"{args.action}/_action"
         self.args = args
-        self.send = Server(participant, f"{base}/send_goal", SEND)
+        send, result, feedback = self.KINDS
+        self.send = Server(participant, f"{base}/send_goal", send)
         self.cancel = Server(participant, f"{base}/cancel_goal", CANCEL)
-        self.result = Server(participant, f"{base}/get_result", RESULT)
-        feedback, status = topics(participant, args.action)
+        self.result = Server(participant, f"{base}/get_result", result)
+        feedback, status = topics(participant, args.action, feedback)
         self.feedback = DataWriter(participant, feedback, qos=types.qos())
         self.status = DataWriter(participant, status, qos=STATUS_QOS)
         self.goals = {}

@@ -7,9 +7,9 @@ use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, MASTER, Peer, eventually};
 use tcpros::actionlib::{
-    ActionClient, ActionClientOptions, ActionServer, ActionServerOptions, ActionType, ClientType,
-    CommState, GoalEvent, GoalHandle, LostReason, ServerEvent, ServerGoal, SimpleActionServer,
-    Status,
+    ActionClient, ActionClientOptions, ActionServer, ActionServerOptions, ActionType, CancelSent,
+    ClientType, CommState, GoalEvent, GoalHandle, LostReason, ServerEvent, ServerGoal,
+    SimpleActionServer, Status,
 };
 use tcpros::{Node, NodeOptions, TopicType};
 use tokio::runtime::{Builder, Runtime};
@@ -262,6 +262,42 @@ fn an_actionlib_server_serves_our_client_with_every_kind_of_end_whatever_its_clo
         assert_eq!(server, "/rospy_action_server");
         every_kind_of_end(&client).await;
     });
+}
+
+#[test]
+fn a_goal_under_an_id_of_our_choice_is_known_to_its_server_and_cancelled_by_it() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let (_master, runtime) = (cell.roscore(), runtime());
+    let _inside = runtime.enter();
+    let mut server = cell.rospy("ros1_action_server.py", &["count"]);
+    let here = node("here");
+    let client = client(&here);
+    runtime.block_on(async {
+        client.wait_for_server(START).await.unwrap();
+        let send = |id: &str, goal: i32| client.send_goal_as(id.to_owned(), &goal.to_le_bytes());
+        let (mut first, mut second) = (send("a1", 100).unwrap(), send("b2", 101).unwrap());
+        assert!(send("a1", 5).is_err(), "one goal has one id");
+        assert_eq!(progress(&mut first).await, 101);
+        assert_eq!(progress(&mut second).await, 102);
+        let mut open = client.open_goals();
+        open.sort();
+        assert_eq!(open, ["a1", "b2"]);
+        assert_eq!(client.cancel_goal("c3"), CancelSent::NotFollowed);
+        assert_eq!(client.cancel_goal("b2"), CancelSent::Asked);
+        let stopped = (Status::Preempted, "stopped".to_owned(), 7);
+        assert_eq!(outcome(&mut second).await, stopped);
+        assert_eq!(client.cancel_goal("b2"), CancelSent::Ended);
+        assert_eq!(client.open_goals(), ["a1"]);
+        assert_eq!(first.state(), CommState::Active);
+        drop(first);
+        assert_eq!(client.cancel_goal("a1"), CancelSent::NotFollowed);
+    });
+    for (number, id) in [(100, "a1"), (101, "b2")] {
+        let told = |line: &Value| (line.get("goal")? == number).then(|| line["id"].clone());
+        assert_eq!(server.wait_for_json("the goal", SOON, told), id);
+    }
 }
 
 #[test]

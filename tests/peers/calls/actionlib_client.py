@@ -1,0 +1,110 @@
+"""An actionlib client. Lines of standard input tell it what to do: {"send": GOAL}, {"cancel": N} with N counting goals from 0,
+{"cancel_all": true}. It prints what it hears of its goals. With --plain several goals go on side by side, else a newer goal
+ends the interest in an older one."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import actionlib
+import genpy
+import rospy
+from actionlib_msgs.msg import GoalStatus
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
+import lifetime
+from calls.actionlib_types import action_class, told
+
+
+def status_name(code):
+    return next((name for name, value in vars(GoalStatus).items() if name.isupper() and value == code), str(code))
+
+
+class Plain:
+    """ActionClient: goals side by side."""
+
+    def __init__(self, name, kind):
+        self.client = actionlib.ActionClient(name, kind)
+        self.sent = []
+
+    def send(self, goal):
+        count = len(self.sent)
+
+        def transition(handle):
+            state = actionlib.CommState.to_string(handle.get_comm_state())
+            lifetime.say(goal=count, state=state)
+            if state in ("DONE", "LOST"):
+                ended(count, handle.get_terminal_state(), handle.get_goal_status_text(), handle.get_result())
+
+        def feedback(_handle, message):
+            lifetime.say(goal=count, feedback=told(message))
+
+        self.sent.append(self.client.send_goal(goal, transition, feedback))
+
+    def cancel(self, count):
+        self.sent[count].cancel()
+
+
+class Simple:
+    """SimpleActionClient: follows the last goal only."""
+
+    def __init__(self, name, kind):
+        self.client = actionlib.SimpleActionClient(name, kind)
+        self.count = 0
+
+    def send(self, goal):
+        count = self.count
+        self.count += 1
+
+        def done(status, result):
+            ended(count, status, self.client.get_goal_status_text(), result)
+
+        # The client knows the goal as its own only once it is sent, and loses what is answered before.
+        with self.client.action_client.manager.list_mutex:
+            self.client.send_goal(
+                goal,
+                done,
+                lambda: lifetime.say(goal=count, state="ACTIVE"),
+                lambda message: lifetime.say(goal=count, feedback=told(message)),
+            )
+
+    def cancel(self, _count):
+        self.client.cancel_goal()
+
+
+def ended(count, status, text, result):
+    lifetime.say(goal=count, end=status_name(status), text=text, result=told(result))
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("name")
+    parser.add_argument("type")
+    parser.add_argument("--node", default="actionlib_client")
+    parser.add_argument("--plain", action="store_true")
+    parser.add_argument("--limit", type=float, default=200.0)
+    args = parser.parse_args()
+    lifetime.limit(args.limit)
+    rospy.init_node(args.node, disable_rosout=True)
+    kind = action_class(args.type)
+    driving = (Plain if args.plain else Simple)(args.name, kind)
+    if not driving.client.wait_for_server(rospy.Duration(60.0)):
+        sys.exit("no server was found")
+    lifetime.say(ready=args.name)
+    for line in sys.stdin:
+        order = json.loads(line)
+        if "send" in order:
+            goal = type(kind().action_goal.goal)()
+            genpy.message.fill_message_args(goal, [order["send"]])
+            driving.send(goal)
+        elif "cancel" in order:
+            driving.cancel(order["cancel"])
+        else:
+            driving.client.cancel_all_goals()
+        lifetime.say(told=order)
+    rospy.spin()
+
+
+main()

@@ -1,0 +1,303 @@
+//! Actions of ROS 1 and of ROS 2 by each other: actionlib itself at one end, rclpy or Cyclone DDS at the other.
+
+use std::time::Duration;
+
+use nix::sys::signal::Signal;
+use serde_json::{Value, json};
+use system_tests::{Cell, Child, Distribution, Peer};
+
+/// rospy and rclpy need seconds to start on a busy machine.
+const SOON: Duration = Duration::from_secs(60);
+const OF_ROS1: &str = "/ua_1_2_70";
+const OF_ROS2: &str = "/ua_2_2_70";
+const FIBONACCI: &str = "test_msgs/Fibonacci";
+const SERVER: &str = "calls/actionlib_server.py";
+const CLIENT: &str = "calls/actionlib_client.py";
+const RCLPY: &str = "ros2_rclpy_action.py";
+
+/// An actionlib client, which takes orders once it has found its server.
+fn actionlib_client(cell: &Cell, args: &[&str]) -> Child {
+    let started = cell.rospy_started(CLIENT, args).told();
+    started.start().ready(SOON)
+}
+
+fn send(client: &mut Child, goal: &Value) {
+    client.tell(&json!({"send": goal}).to_string());
+}
+
+/// How a goal of an actionlib client ended.
+fn end(client: &mut Child, goal: u64) -> Value {
+    client.wait_for_json(&format!("the end of goal {goal}"), SOON, |line| {
+        (line.get("goal")? == goal && line.get("end").is_some())
+            .then(|| json!([line["end"], line["text"], line["result"]]))
+    })
+}
+
+/// The feedback that an actionlib client has of a goal.
+fn feedback(client: &Child, goal: u64) -> Vec<Value> {
+    let lines = client.json_lines();
+    let told = lines.iter().filter(|line| line["goal"] == goal);
+    told.filter_map(|line| line.get("feedback").cloned())
+        .collect()
+}
+
+fn rclpy_client(cell: &Cell, action: &str) -> Child {
+    let args = ["call", action, "--results", "--wait", "60"];
+    let started = cell.rclpy_started(Distribution::Jazzy, RCLPY, &args).told();
+    started.start().ready(SOON)
+}
+
+fn rclpy_server(cell: &Cell, action: &str) -> Child {
+    let args = ["serve", action];
+    let started = cell
+        .rclpy_started(Distribution::Kilted, RCLPY, &args)
+        .told();
+    started.start().ready(SOON)
+}
+
+/// Waits for a line in which `key` is `value`, and gives what it has under another key.
+fn line(child: &mut Child, key: &str, value: &Value, wanted: &str) -> Value {
+    child.wait_for_json(&format!("{key} {value} with {wanted}"), SOON, |line| {
+        (line.get(key)? == value).then(|| line.get(wanted).cloned())?
+    })
+}
+
+fn sequence(of: &[i32]) -> Value {
+    json!({ "sequence": of })
+}
+
+#[test]
+fn a_simple_action_client_drives_an_action_server_of_rclpy() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let mut server = rclpy_server(&cell, OF_ROS2);
+    let _bridges = (cell.bridge_ros1(&[]), cell.bridge_ros2(&[]));
+    let mut client = actionlib_client(&cell, &[OF_ROS2, FIBONACCI]);
+    send(&mut client, &json!({"order": 5}));
+    let reached = json!(["SUCCEEDED", "", sequence(&[1, 1, 2, 3, 5])]);
+    assert_eq!(end(&mut client, 0), reached);
+    // In ROS 1 a result may overtake the last feedback.
+    let told = feedback(&client, 0);
+    assert_eq!(told.first(), Some(&sequence(&[1])), "{told:?}");
+    assert_eq!(line(&mut server, "goal", &json!(5), "accepted"), true);
+
+    send(&mut client, &json!({"order": -1}));
+    let rejected = end(&mut client, 1);
+    assert_eq!(
+        (&rejected[0], &rejected[2]),
+        (&json!("REJECTED"), &sequence(&[]))
+    );
+    send(&mut client, &json!({"order": -2}));
+    assert_eq!(end(&mut client, 2)[0], "ABORTED");
+
+    send(&mut client, &json!({"order": 100}));
+    client.wait_for_json("the third feedback", SOON, |line| {
+        (line["goal"] == 3 && line.get("feedback")? == &sequence(&[1, 1, 2])).then_some(())
+    });
+    client.tell("{\"cancel\": 3}");
+    let cancelled = json!(["PREEMPTED", "", sequence(&[1, 1, 2])]);
+    assert_eq!(end(&mut client, 3), cancelled);
+    line(&mut server, "cancel", &json!(100), "cancel");
+    assert_eq!(
+        server
+            .json_lines()
+            .iter()
+            .filter(|line| line.get("goal").is_some())
+            .count(),
+        4,
+        "each goal is taken once"
+    );
+}
+
+#[test]
+fn rclpy_drives_a_simple_action_server() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let mut server = cell.rospy(SERVER, &[OF_ROS1, FIBONACCI, "--simple"]);
+    let _bridges = (cell.bridge_ros1(&[]), cell.bridge_ros2(&[]));
+    let mut client = rclpy_client(&cell, OF_ROS1);
+    client.tell("send 5");
+    assert_eq!(line(&mut client, "goal", &json!(0), "accepted"), true);
+    assert_eq!(
+        line(&mut client, "result", &json!(0), "status"),
+        "SUCCEEDED"
+    );
+    let reached = line(&mut client, "result", &json!(0), "sequence");
+    assert_eq!(reached, json!([1, 1, 2, 3, 5]));
+    line(&mut client, "feedback", &json!(0), "sequence");
+    client.tell("send -2");
+    assert_eq!(line(&mut client, "result", &json!(1), "status"), "ABORTED");
+    client.tell("send 100");
+    assert_eq!(line(&mut client, "goal", &json!(2), "accepted"), true);
+    client.tell("cancel 2");
+    client.wait_for_json("the server agrees", SOON, |line| {
+        (line.get("cancel")? == "NONE" && line["goals"] == json!([2])).then_some(())
+    });
+    assert_eq!(line(&mut client, "result", &json!(2), "status"), "CANCELED");
+    line(&mut server, "cancel", &json!(100), "cancel");
+    let taken = server.json_lines();
+    let taken = taken.iter().filter(|line| line.get("goal").is_some());
+    assert_eq!(taken.count(), 3, "each goal is taken once");
+}
+
+#[test]
+fn goals_side_by_side_are_told_apart_rejected_and_cancelled_together() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let mut server = cell.rospy(SERVER, &[OF_ROS1, FIBONACCI]);
+    let _bridges = (cell.bridge_ros1(&[]), cell.bridge_ros2(&[]));
+    let mut client = rclpy_client(&cell, OF_ROS1);
+    client.tell("send -1");
+    assert_eq!(line(&mut client, "goal", &json!(0), "accepted"), false);
+    for (goal, order) in [(1, 100), (2, 102)] {
+        client.tell(&format!("send {order}"));
+        let accepted = line(&mut client, "goal", &json!(goal), "accepted");
+        assert_eq!(accepted, true);
+    }
+    client.tell("send 3");
+    assert_eq!(
+        line(&mut client, "result", &json!(3), "status"),
+        "SUCCEEDED"
+    );
+    client.tell("cancel_all");
+    for goal in [1, 2] {
+        let status = line(&mut client, "result", &json!(goal), "status");
+        assert_eq!(status, "CANCELED");
+    }
+    for order in [100, 102] {
+        line(&mut server, "cancel", &json!(order), "cancel");
+    }
+}
+
+#[test]
+fn a_goal_goes_on_without_its_client_and_ends_without_its_server() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let mut server = cell.rospy(SERVER, &[OF_ROS1, FIBONACCI]);
+    let _bridges = (cell.bridge_ros1(&[]), cell.bridge_ros2(&[]));
+    let mut client = rclpy_client(&cell, OF_ROS1);
+    client.tell("send 100");
+    assert_eq!(line(&mut client, "goal", &json!(0), "accepted"), true);
+    client.signal(Signal::SIGKILL);
+    let mut other = rclpy_client(&cell, OF_ROS1);
+    other.tell("send 102");
+    assert_eq!(line(&mut other, "goal", &json!(0), "accepted"), true);
+    let ended = |line: &Value| line.get("cancel").or_else(|| line.get("done")).is_some();
+    assert!(!server.json_lines().iter().any(ended), "the first goes on");
+    // Another client can end it.
+    other.tell("cancel_all");
+    for order in [100, 102] {
+        line(&mut server, "cancel", &json!(order), "cancel");
+    }
+    assert_eq!(line(&mut other, "result", &json!(0), "status"), "CANCELED");
+    other.tell("send 104");
+    assert_eq!(line(&mut other, "goal", &json!(1), "accepted"), true);
+    server.signal(Signal::SIGKILL);
+    assert_eq!(line(&mut other, "result", &json!(1), "status"), "ABORTED");
+}
+
+/// A base of ROS 2 that clients of ROS 1 drive as they drive theirs.
+fn navigation(types: &str) -> String {
+    format!(
+        "
+spaces: [{{id: 1}}, {{id: 2, domain: 2}}]
+namespaces: {{2: 'urn:test:base'}}
+type_paths: ['{types}']
+calls:
+  - node: ns=2;i=70
+    name: Base.Drive
+    origin: 2
+    ros:
+      - {{action: /navigate_to_pose, type: nav2_msgs/NavigateToPose}}
+      - space: 1
+        action: /move_base
+        type: move_base_msgs/MoveBase
+        goal: {{pose: {{field: target_pose}}, behavior_tree: \"\"}}
+        feedback: {{base_position: {{field: current_pose}}}}
+        result: {{}}
+"
+    )
+}
+
+const NAVIGATE: &str = "\
+geometry_msgs/PoseStamped pose
+string behavior_tree
+---
+uint16 error_code
+string error_msg
+---
+geometry_msgs/PoseStamped current_pose
+builtin_interfaces/Duration navigation_time
+builtin_interfaces/Duration estimated_time_remaining
+int16 number_of_recoveries
+float32 distance_remaining
+";
+
+fn types(cell: &Cell, package: &str, action: &str, text: &str) -> String {
+    let folder = cell.folder().join("types").join(package).join("action");
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join(format!("{action}.action")), text).unwrap();
+    cell.folder().join("types").display().to_string()
+}
+
+#[test]
+fn a_client_of_move_base_drives_a_base_of_ros_2() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
+        return;
+    };
+    let types = types(&cell, "nav2_msgs", "NavigateToPose", NAVIGATE);
+    let mapping = cell.file("base.yaml", &navigation(&types));
+    let mapping = mapping.display().to_string();
+    let _core = cell.roscore();
+    let mut base = cell.cyclone("calls/ros2_navigate.py", &["/navigate_to_pose"]);
+    let _bridges = (
+        cell.bridge_ros1(&[&mapping]),
+        cell.bridge_ros2_alone(&[&mapping]).start(),
+    );
+    let mut client = actionlib_client(&cell, &["/move_base", "move_base_msgs/MoveBase"]);
+    let pose = |x: f64| {
+        json!({"target_pose": {
+            "header": {"frame_id": "map", "stamp": {"secs": 7, "nsecs": 5}},
+            "pose": {
+                "position": {"x": x, "y": 2.5, "z": -1.0},
+                "orientation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8},
+            },
+        }})
+    };
+    send(&mut client, &pose(1.0));
+    assert_eq!(end(&mut client, 0)[0], "SUCCEEDED");
+    let met = base.wait_for_json("the goal", SOON, |line| {
+        line.get("position").map(|_| line.clone())
+    });
+    assert_eq!(met["position"], json!([1.0, 2.5, -1.0]));
+    assert_eq!(met["orientation"], json!([0.0, 0.0, 0.6, 0.8]));
+    assert_eq!(
+        (&met["frame"], &met["stamp"], &met["tree"]),
+        (&json!("map"), &json!([7, 5]), &json!(""))
+    );
+    send(&mut client, &pose(-2.0));
+    let failed = end(&mut client, 1);
+    assert_eq!(failed[0], "ABORTED");
+    send(&mut client, &pose(100.0));
+    let told = client.wait_for_json("feedback", SOON, |line| {
+        (line["goal"] == 2).then(|| line.get("feedback").cloned())?
+    });
+    let at = &told["base_position"];
+    assert_eq!(at["pose"]["position"]["x"], 100.0, "{told}");
+    assert_eq!(
+        (&at["header"]["frame_id"], &at["header"]["stamp"]),
+        (&json!("map"), &json!([7, 5]))
+    );
+    client.tell("{\"cancel\": 2}");
+    assert_eq!(end(&mut client, 2)[0], "PREEMPTED");
+    send(&mut client, &pose(-1.0));
+    assert_eq!(end(&mut client, 3)[0], "REJECTED");
+}
