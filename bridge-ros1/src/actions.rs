@@ -319,10 +319,8 @@ impl Sent {
             }
             Heard::Done(result) => self.done(result),
             Heard::Lost(reason) => {
-                let ran = match reason {
-                    LostReason::NoServer { .. } => Ran::No,
-                    _ => Ran::Perhaps,
-                };
+                let unsent = matches!(reason, LostReason::NoServer { .. });
+                let ran = if unsent { Ran::No } else { Ran::Perhaps };
                 self.lose(reason.to_string(), ran);
             }
         }
@@ -363,12 +361,14 @@ impl Sent {
             Status::Recalled if self.accepted => CANCELED,
             Status::Aborted => ABORTED,
             Status::Rejected if self.accepted => ABORTED,
-            Status::Recalled | Status::Rejected => {
-                let why = match ended.status {
-                    Status::Recalled => "the goal was cancelled before its server worked on it",
-                    _ => "the action server rejected the goal",
-                };
-                self.events.push_back(GoalEvent::Rejected(said(why)));
+            Status::Recalled => {
+                let why = said("the goal was cancelled before its server worked on it");
+                self.events.push_back(GoalEvent::Rejected(why));
+                return;
+            }
+            Status::Rejected => {
+                let why = said("the action server rejected the goal");
+                self.events.push_back(GoalEvent::Rejected(why));
                 return;
             }
             Status::Pending
@@ -530,34 +530,4 @@ const PENDING: Duration = Duration::from_secs(1);
 const RECONNECT: Duration = Duration::from_secs(1);
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn an_id_of_the_space_comes_back_from_its_text_and_others_have_one_of_their_own() {
-        let id: GoalId = *b"\x00\x01goal of a plant"[..16].first_chunk().unwrap();
-        assert_eq!(spelled(id).len(), 32);
-        assert_eq!(read(&spelled(id)), id);
-        let texts = [
-            "",
-            "/client-1-12.3",
-            "/client-2-12.3",
-            "0123456789ABCDEF0123456789abcdef",
-            "+123456789abcdef0123456789abcdef",
-        ];
-        let read: std::collections::BTreeSet<GoalId> = texts.iter().map(|id| read(id)).collect();
-        assert_eq!(read.len(), texts.len());
-    }
-
-    #[test]
-    fn a_result_with_nothing_in_it_has_the_length_of_its_type() {
-        let registry = messages::Registry::bundle(messages::Dialect::Ros1);
-        let of = |name: &str| {
-            let action = registry.action(&name.parse().unwrap()).unwrap();
-            empty(action.result()).unwrap().to_vec()
-        };
-        assert_eq!(of("actionlib/TwoInts"), [0; 8]);
-        assert_eq!(of("actionlib_tutorials/Fibonacci"), [0; 4]);
-        assert!(of("move_base_msgs/MoveBase").is_empty());
-    }
-}
+mod tests;

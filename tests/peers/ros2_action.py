@@ -199,13 +199,16 @@ def lines():
 
 
 class ActionClient:
+    KINDS = (SEND, RESULT, types.FibonacciFeedback)
+
     def __init__(self, participant, args):
         base = f"{args.action}/_action"
         self.args = args
-        self.send = Client(participant, f"{base}/send_goal", SEND)
+        send, result, feedback = self.KINDS
+        self.send = Client(participant, f"{base}/send_goal", send)
         self.cancel = Client(participant, f"{base}/cancel_goal", CANCEL)
-        self.result = Client(participant, f"{base}/get_result", RESULT)
-        feedback, status = topics(participant, args.action)
+        self.result = Client(participant, f"{base}/get_result", result)
+        feedback, status = topics(participant, args.action, feedback)
         self.feedback = DataReader(participant, feedback, qos=types.qos())
         self.status = DataReader(participant, status, qos=STATUS_QOS)
         self.goals, self.stamps, self.said = [], {}, {}
@@ -274,6 +277,9 @@ class ActionClient:
             goals = [self.number(info.goal_id) for info in reply.goals_canceling]
             lifetime.say(cancel=CODES[reply.return_code], goals=goals)
 
+    def reported(self, number, sample):
+        lifetime.say(feedback=number, sequence=list(sample.sequence))
+
     def turn(self):
         for part in (self.send, self.cancel, self.result):
             for count, reply in part.replies():
@@ -283,7 +289,7 @@ class ActionClient:
         for sample in valid(self.feedback):
             number = self.number(sample.goal_id)
             if number is not None:
-                lifetime.say(feedback=number, sequence=list(sample.sequence))
+                self.reported(number, sample)
         for sample in valid(self.status):
             for status in sample.status_list:
                 number = self.number(status.goal_info.goal_id)

@@ -301,3 +301,143 @@ fn a_client_of_move_base_drives_a_base_of_ros_2() {
     send(&mut client, &pose(-1.0));
     assert_eq!(end(&mut client, 3)[0], "REJECTED");
 }
+
+/// The types of a trajectory in ROS 1, and the richer ones in ROS 2.
+fn trajectory_types(cell: &Cell) -> [String; 2] {
+    const POINTS: &str = "trajectory_msgs/JointTrajectoryPoint desired\n\
+        trajectory_msgs/JointTrajectoryPoint actual\n\
+        trajectory_msgs/JointTrajectoryPoint error\n";
+    const MANY: &str = "trajectory_msgs/MultiDOFJointTrajectoryPoint";
+    const LIMITS: &str = "float64 position\nfloat64 velocity\nfloat64 acceleration\n";
+    let one = format!(
+        "trajectory_msgs/JointTrajectory trajectory\nJointTolerance[] path_tolerance\n\
+         JointTolerance[] goal_tolerance\nduration goal_time_tolerance\n---\n\
+         int32 error_code\nstring error_string\n---\n\
+         std_msgs/Header header\nstring[] joint_names\n{POINTS}"
+    );
+    let two = format!(
+        "trajectory_msgs/JointTrajectory trajectory\n\
+         trajectory_msgs/MultiDOFJointTrajectory multi_dof_trajectory\n\
+         JointTolerance[] path_tolerance\nJointComponentTolerance[] component_path_tolerance\n\
+         JointTolerance[] goal_tolerance\nJointComponentTolerance[] component_goal_tolerance\n\
+         builtin_interfaces/Duration goal_time_tolerance\n---\n\
+         int32 error_code\nstring error_string\n---\n\
+         std_msgs/Header header\nstring[] joint_names\n{POINTS}string[] multi_dof_joint_names\n\
+         {MANY} multi_dof_desired\n{MANY} multi_dof_actual\n{MANY} multi_dof_error\n"
+    );
+    let tolerance = format!("string name\n{LIMITS}");
+    let component = format!("string joint_name\nint32 component\n{LIMITS}");
+    [("catkin", one), ("ament_cmake", two)].map(|(tool, text)| {
+        let package = cell.folder().join(tool).join("control_msgs");
+        let (action, msg) = (package.join("action"), package.join("msg"));
+        let about = format!(
+            "<package format=\"2\"><name>control_msgs</name>\
+             <buildtool_depend>{tool}</buildtool_depend></package>"
+        );
+        for (folder, name, text) in [
+            (&package, "package.xml", &about),
+            (&action, "FollowJointTrajectory.action", &text),
+            (&msg, "JointTolerance.msg", &tolerance),
+            (&msg, "JointComponentTolerance.msg", &component),
+        ] {
+            std::fs::create_dir_all(folder).unwrap();
+            std::fs::write(folder.join(name), text).unwrap();
+        }
+        cell.folder().join(tool).display().to_string()
+    })
+}
+
+/// An arm of ROS 1 that clients of ROS 2 move with goals of a type that has more.
+fn arm([one, two]: &[String; 2]) -> String {
+    format!(
+        "
+spaces: [{{id: 1}}, {{id: 2, domain: 2}}]
+namespaces: {{2: 'urn:test:arm'}}
+type_paths: ['{one}', '{two}']
+calls:
+  - node: ns=2;i=70
+    name: Arm.Follow
+    origin: 1
+    ros:
+      - {{action: /arm_controller/follow, type: control_msgs/FollowJointTrajectory}}
+      - space: 2
+        action: /follow
+        type: control_msgs/FollowJointTrajectory
+        goal: {{trajectory: {{field: trajectory}}}}
+        feedback:
+          multi_dof_joint_names: []
+          multi_dof_desired.transforms: []
+          multi_dof_desired.velocities: []
+          multi_dof_desired.accelerations: []
+          multi_dof_desired.time_from_start: 0
+          multi_dof_actual.transforms: []
+          multi_dof_actual.velocities: []
+          multi_dof_actual.accelerations: []
+          multi_dof_actual.time_from_start: 0
+          multi_dof_error.transforms: []
+          multi_dof_error.velocities: []
+          multi_dof_error.accelerations: []
+          multi_dof_error.time_from_start: 0
+"
+    )
+}
+
+#[test]
+fn a_client_of_ros_2_moves_an_arm_of_ros_1_along_a_trajectory() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
+        return;
+    };
+    let mapping = cell.file("arm.yaml", &arm(&trajectory_types(&cell)));
+    let mapping = mapping.display().to_string();
+    let _core = cell.roscore();
+    let kind = "control_msgs/FollowJointTrajectory";
+    let mut arm = cell.rospy(SERVER, &["/arm_controller/follow", kind]);
+    let _bridges = (
+        cell.bridge_ros1(&[&mapping]),
+        cell.bridge_ros2_alone(&[&mapping]).start(),
+    );
+    let client = cell.cyclone_started("calls/ros2_trajectory.py", &["/follow"]);
+    let mut client = client.told().start().ready(SOON);
+    client.tell("3");
+    assert_eq!(line(&mut client, "goal", &json!(0), "accepted"), true);
+    let goal = line(&mut arm, "goal", &json!(3), "body");
+    let path = &goal["trajectory"];
+    assert_eq!(path["joint_names"], json!(["shoulder", "elbow"]));
+    assert_eq!(
+        path["header"],
+        json!({"seq": 0, "stamp": [0, 0], "frame_id": "arm"})
+    );
+    let points = json!([
+        {"positions": [3.0, 0.25], "velocities": [], "accelerations": [], "effort": [], "time_from_start": [1, 500_000_000]},
+        {"positions": [0.5, -0.25], "velocities": [1.0, 2.0], "accelerations": [], "effort": [], "time_from_start": [3, 0]},
+    ]);
+    assert_eq!(path["points"], points);
+    let tolerance =
+        json!([{"name": "elbow", "position": 0.125, "velocity": 0.0, "acceleration": 0.0}]);
+    assert_eq!(goal["path_tolerance"], tolerance);
+    assert_eq!(goal["goal_time_tolerance"], json!([2, 0]));
+    let told = client.wait_for_json("feedback", SOON, |line| {
+        (line.get("feedback")? == 0).then(|| line.clone())
+    });
+    assert_eq!(
+        (
+            &told["joints"],
+            &told["desired"],
+            &told["at"],
+            &told["many"]
+        ),
+        (
+            &json!(["shoulder", "elbow"]),
+            &json!([0.5, -0.25]),
+            &json!([3, 0]),
+            &json!([])
+        )
+    );
+    let ended = client.wait_for_json("the result", SOON, |line| {
+        (line.get("result")? == 0).then(|| line.clone())
+    });
+    assert_eq!(
+        (&ended["status"], &ended["code"], &ended["text"]),
+        (&json!("SUCCEEDED"), &json!(-2), &json!("elbow"))
+    );
+}
