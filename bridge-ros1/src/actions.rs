@@ -22,25 +22,52 @@ use messages::{
 };
 use tcpros::TopicType;
 use tcpros::actionlib::{
-    ActionClientOptions, ActionServerOptions, CancelSent, CommState, GoalHandle, GoalResult,
-    LostReason, ServerGoal, Status,
+    ActionClientOptions, ActionError, ActionServerOptions, CancelSent, CommState, GoalHandle,
+    GoalResult, LostReason, ServerGoal, Status,
 };
+use tokio::sync::Mutex;
 use tokio::time::{Instant, timeout_at};
 use tracing::warn;
 
 use crate::definitions::Definitions;
 use crate::services::Ros1Graph;
 
-/// The clients of actions that are in use, by the names of the actions: a node has one of each.
+/// The clients and servers of actions that are in use, by the names of the actions: a node has one of each. Who takes one up
+/// again while its predecessor is about to go has the same.
 #[derive(Debug, Default)]
-pub(crate) struct Senders {
-    clients: BTreeMap<String, Known>,
+pub(crate) struct Ends {
+    clients: BTreeMap<String, Known<tcpros::actionlib::ActionClient>>,
+    servers: BTreeMap<String, Known<Server>>,
 }
 
+/// A server that one after another waits for.
+type Server = Mutex<tcpros::actionlib::ActionServer>;
+
+/// An end of an action whose messages have that checksum.
 #[derive(Debug)]
-struct Known {
+struct Known<E> {
     md5: String,
-    client: Weak<tcpros::actionlib::ActionClient>,
+    end: Weak<E>,
+}
+
+/// The end of an action that is in use, else one that is made.
+fn shared<E>(
+    known: &mut BTreeMap<String, Known<E>>,
+    (action, md5): (&str, &str),
+    make: impl FnOnce() -> Result<E, ActionError>,
+) -> Result<Arc<E>, String> {
+    known.retain(|_, known| known.end.strong_count() > 0);
+    let in_use = known.get(action).filter(|known| known.md5 == md5);
+    if let Some(end) = in_use.and_then(|known| known.end.upgrade()) {
+        return Ok(end);
+    }
+    let end = Arc::new(make().map_err(|error| error.to_string())?);
+    let made = Known {
+        md5: md5.to_owned(),
+        end: Arc::downgrade(&end),
+    };
+    known.insert(action.to_owned(), made);
+    Ok(end)
 }
 
 impl ActionGraph for Ros1Graph<'_> {
@@ -60,29 +87,17 @@ impl ActionGraph for Ros1Graph<'_> {
     ) -> Result<Sender, String> {
         let found = self.definitions.action(type_name);
         let action_type = found.map_err(|error| unknown(self.definitions, type_name, &error))?;
-        let clients = &mut self.senders.clients;
-        clients.retain(|_, known| known.client.strong_count() > 0);
-        let md5 = action_type.action().md5();
-        if let Some(known) = clients.get(action)
-            && known.md5 == md5
-            && let Some(client) = known.client.upgrade()
-        {
-            return Ok(Sender { client, waits });
-        }
         let options = ActionClientOptions {
             acknowledge_timeout: waits.answer,
             silence_timeout: waits.silence,
             reconnect_timeout: waits.silence.min(RECONNECT),
             ..ActionClientOptions::default()
         };
-        let types = types(&action_type);
-        let client = tcpros::actionlib::ActionClient::new(self.node, action, types, options);
-        let client = Arc::new(client.map_err(|error| error.to_string())?);
-        let known = Known {
-            md5: md5.to_owned(),
-            client: Arc::downgrade(&client),
-        };
-        clients.insert(action.to_owned(), known);
+        let md5 = action_type.action().md5();
+        let client = shared(&mut self.ends.clients, (action, md5), || {
+            let types = types(&action_type);
+            tcpros::actionlib::ActionClient::new(self.node, action, types, options)
+        })?;
         Ok(Sender { client, waits })
     }
 
@@ -90,10 +105,12 @@ impl ActionGraph for Ros1Graph<'_> {
         let found = self.definitions.action(type_name);
         let action_type = found.map_err(|error| unknown(self.definitions, type_name, &error))?;
         let empty_result = empty(action_type.result())?;
-        let options = ActionServerOptions::new(empty_result.clone());
-        let types = types(&action_type);
-        let server = tcpros::actionlib::ActionServer::new(self.node, action, types, options);
-        let server = server.map_err(|error| error.to_string())?;
+        let md5 = action_type.action().md5();
+        let server = shared(&mut self.ends.servers, (action, md5), || {
+            let options = ActionServerOptions::new(empty_result.clone());
+            let types = types(&action_type);
+            tcpros::actionlib::ActionServer::new(self.node, action, types, options).map(Mutex::new)
+        })?;
         Ok(Taker {
             server,
             empty_result,
@@ -401,7 +418,7 @@ fn after(wait: Duration) -> Instant {
 /// Serves one action for another space.
 #[derive(Debug)]
 pub(crate) struct Taker {
-    server: tcpros::actionlib::ActionServer,
+    server: Arc<Server>,
     empty_result: Bytes,
 }
 
@@ -410,7 +427,8 @@ impl ActionServer for Taker {
     type Cancel = Cancel;
 
     async fn recv(&mut self) -> ServerEvent<New, Cancel> {
-        match self.server.recv().await {
+        let event = self.server.lock().await.recv().await;
+        match event {
             tcpros::actionlib::ServerEvent::Goal(goal) => ServerEvent::Goal(New {
                 goal: Some(goal),
                 empty_result: self.empty_result.clone(),

@@ -31,7 +31,7 @@ use uadp::{BuiltinType, Timestamp};
 
 use self::calls::Kinds;
 use self::found::Refused;
-use crate::actions::Senders;
+use crate::actions::Ends;
 use crate::definitions::Definitions;
 use crate::services::{Executor, Ros1Graph};
 use crate::sink::{Open, Sink};
@@ -77,8 +77,8 @@ pub struct Ros1Port {
     executing: Executing<Executor>,
     /// Actions of other spaces, and action servers of the graph that are executed for other spaces.
     actions: Actions,
-    /// The clients of those.
-    senders: Senders,
+    /// What those are taken by.
+    ends: Ends,
     /// The types of services with a name of the space.
     kinds: Kinds,
     /// What `recv` hands out next; filled by one message or by one pass over the topics.
@@ -113,11 +113,11 @@ impl Ros1Port {
         let node = Node::start(node)?;
         info!(node = node.name(), uri = node.uri(), master, space = %own, "started the ROS 1 node");
         let mut definitions = Definitions::new(types, packages);
-        let mut senders = Senders::default();
+        let mut ends = Ends::default();
         let mut graph = Ros1Graph {
             node: &node,
             definitions: &mut definitions,
-            senders: &mut senders,
+            ends: &mut ends,
         };
         let (services, bound) = Services::start(&mut graph, own, &mapping);
         let mut port = Self {
@@ -129,7 +129,7 @@ impl Ros1Port {
             calls: Calls::default(),
             executing: Executing::default(),
             actions: Actions::default(),
-            senders,
+            ends,
             kinds: Kinds::default(),
             graph: Graph::default(),
             sources: Vec::new(),

@@ -12,14 +12,14 @@ use tcpros::{
 use tokio::sync::Mutex;
 use uadp::BuiltinType;
 
-use crate::actions::Senders;
+use crate::actions::Ends;
 use crate::definitions::Definitions;
 
 /// A node and what it knows of types.
 pub(crate) struct Ros1Graph<'p> {
     pub(crate) node: &'p Node,
     pub(crate) definitions: &'p mut Definitions,
-    pub(crate) senders: &'p mut Senders,
+    pub(crate) ends: &'p mut Ends,
 }
 
 impl ServiceGraph for Ros1Graph<'_> {

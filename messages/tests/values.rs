@@ -468,6 +468,11 @@ fn a_constant_that_does_not_fit_its_field_is_told_with_what_would() {
         )],
     );
     let message = ros1.get(&name("t/T")).unwrap();
+    let [with, without] = [&[("many", list(&[]))][..], &[]].map(|rest| {
+        let plan = Plan::compile(&message, &template(None, rest), Wire::Ros1);
+        write(&plan.unwrap(), &[]).unwrap()
+    });
+    assert_eq!(with, without, "no messages are none");
     for (path, literal, told) in [
         (
             "id",
@@ -502,7 +507,11 @@ fn a_constant_that_does_not_fit_its_field_is_told_with_what_would() {
         ),
         ("wait", one("5"), "`5` is not a duration with its unit"),
         ("when", one("5"), "a time cannot be a constant"),
-        ("many", list(&[]), "arrays of messages have no constants"),
+        (
+            "many",
+            list(&["1"]),
+            "arrays of messages have no constant but []",
+        ),
         (
             "colour",
             one("1"),

@@ -143,9 +143,9 @@ class Client:
 
     def cancelled(self, answer):
         ids = [list(one.uuid) for one in self.ids]
-        cancelled = [list(info.goal_id.uuid) for info in answer.goals_canceling]
-        # Those of other clients have no number here.
-        goals = [ids.index(one) if one in ids else None for one in cancelled]
+        told = [list(info.goal_id.uuid) for info in answer.goals_canceling]
+        # Those of other clients are not counted here.
+        goals = [ids.index(one) if one in ids else None for one in told]
         lifetime.say(cancel=CODES[answer.return_code], goals=goals)
 
     def ask_cancel(self, goal_id=None, stamp=None):

@@ -265,7 +265,7 @@ fn a_client_of_move_base_drives_a_base_of_ros_2() {
     let mut client = actionlib_client(&cell, &["/move_base", "move_base_msgs/MoveBase"]);
     let pose = |x: f64| {
         json!({"target_pose": {
-            "header": {"frame_id": "map", "stamp": {"secs": 7, "nsecs": 5}},
+            "header": {"frame_id": "map", "stamp": {"secs": 7, "nsecs": 500}},
             "pose": {
                 "position": {"x": x, "y": 2.5, "z": -1.0},
                 "orientation": {"x": 0.0, "y": 0.0, "z": 0.6, "w": 0.8},
@@ -281,7 +281,7 @@ fn a_client_of_move_base_drives_a_base_of_ros_2() {
     assert_eq!(met["orientation"], json!([0.0, 0.0, 0.6, 0.8]));
     assert_eq!(
         (&met["frame"], &met["stamp"], &met["tree"]),
-        (&json!("map"), &json!([7, 5]), &json!(""))
+        (&json!("map"), &json!([7, 500]), &json!(""))
     );
     send(&mut client, &pose(-2.0));
     let failed = end(&mut client, 1);
@@ -294,7 +294,7 @@ fn a_client_of_move_base_drives_a_base_of_ros_2() {
     assert_eq!(at["pose"]["position"]["x"], 100.0, "{told}");
     assert_eq!(
         (&at["header"]["frame_id"], &at["header"]["stamp"]),
-        (&json!("map"), &json!([7, 5]))
+        (&json!("map"), &json!([7, 500]))
     );
     client.tell("{\"cancel\": 2}");
     assert_eq!(end(&mut client, 2)[0], "PREEMPTED");
@@ -369,15 +369,15 @@ calls:
           multi_dof_desired.transforms: []
           multi_dof_desired.velocities: []
           multi_dof_desired.accelerations: []
-          multi_dof_desired.time_from_start: 0
+          multi_dof_desired.time_from_start: 0s
           multi_dof_actual.transforms: []
           multi_dof_actual.velocities: []
           multi_dof_actual.accelerations: []
-          multi_dof_actual.time_from_start: 0
+          multi_dof_actual.time_from_start: 0s
           multi_dof_error.transforms: []
           multi_dof_error.velocities: []
           multi_dof_error.accelerations: []
-          multi_dof_error.time_from_start: 0
+          multi_dof_error.time_from_start: 0s
 "
     )
 }

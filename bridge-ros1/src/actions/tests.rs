@@ -49,7 +49,7 @@ struct Cell {
     bridge: Node,
     robot: Node,
     definitions: Definitions,
-    senders: Senders,
+    ends: Ends,
 }
 
 impl Cell {
@@ -67,7 +67,7 @@ impl Cell {
             robot: node("robot"),
             _core: core,
             definitions: Definitions::new(Arc::default(), Vec::new()),
-            senders: Senders::default(),
+            ends: Ends::default(),
         }
     }
 
@@ -75,7 +75,7 @@ impl Cell {
         Ros1Graph {
             node: &self.bridge,
             definitions: &mut self.definitions,
-            senders: &mut self.senders,
+            ends: &mut self.ends,
         }
     }
 
@@ -252,6 +252,9 @@ async fn a_goal_without_a_server_was_not_executed_and_a_client_is_shared() {
 async fn goals_of_the_graph_are_decided_about_and_ended_here() {
     let mut cell = Cell::start();
     let mut taker = cell.graph().serve_action("/count", &test()).unwrap();
+    // One that is about to go, as when an action is given up and taken up in one go.
+    let again = cell.graph().serve_action("/count", &test());
+    drop(std::mem::replace(&mut taker, again.unwrap()));
     let options = ActionClientOptions::default();
     let client =
         tcpros::actionlib::ActionClient::new(&cell.robot, "/count", test_types(), options).unwrap();

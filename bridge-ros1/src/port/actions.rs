@@ -35,7 +35,7 @@ impl Ros1Port {
         let mut ros = Ros1Graph {
             node: &self.node,
             definitions: &mut self.definitions,
-            senders: &mut self.senders,
+            ends: &mut self.ends,
         };
         // Who has which name is known from when the master has answered.
         let has_master = self.has_master;
@@ -70,7 +70,7 @@ impl Ros1Port {
         let mut ros = Ros1Graph {
             node: &self.node,
             definitions: &mut self.definitions,
-            senders: &mut self.senders,
+            ends: &mut self.ends,
         };
         let policy = &mut self.policy;
         let events = self

@@ -41,7 +41,7 @@ impl Ros1Port {
         let mut graph = Ros1Graph {
             node: &self.node,
             definitions: &mut self.definitions,
-            senders: &mut self.senders,
+            ends: &mut self.ends,
         };
         // Who has which name is known from when the master has answered.
         let has_master = self.has_master;
@@ -80,7 +80,7 @@ impl Ros1Port {
         let mut graph = Ros1Graph {
             node: &self.node,
             definitions: &mut self.definitions,
-            senders: &mut self.senders,
+            ends: &mut self.ends,
         };
         let executing = &mut self.executing;
         let events = executing.reconcile(&mut graph, &mut self.policy, (&present, usize::MAX));

@@ -29,7 +29,7 @@ impl Ros1Port {
         let mut graph = Ros1Graph {
             node: &self.node,
             definitions: &mut self.definitions,
-            senders: &mut self.senders,
+            ends: &mut self.ends,
         };
         let services = &mut self.services;
         let events = services.reload(&mut graph, self.policy.own(), (&before, mapping));
@@ -39,7 +39,7 @@ impl Ros1Port {
         let mut graph = Ros1Graph {
             node: &self.node,
             definitions: &mut self.definitions,
-            senders: &mut self.senders,
+            ends: &mut self.ends,
         };
         let events = self.executing.look_again(&mut graph);
         self.events.extend(events);

@@ -76,7 +76,10 @@ impl<'m> Given<'m> {
                     Literal::One(text) => text,
                     Literal::List(_) => "a list",
                 };
-                Err(self.fault(text, "possible here: arrays of messages have no constants"))
+                Err(self.fault(
+                    text,
+                    "possible here: arrays of messages have no constant but []",
+                ))
             }
         }
     }

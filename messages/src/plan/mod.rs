@@ -362,9 +362,14 @@ fn given<'m>(
                 path: path.clone(),
             });
         }
-        Ok((at, Given::new(message, path, literal)))
+        // No messages stand there without a constant as well.
+        let is_open = leaf.is_some_and(|leaf| {
+            leaf.builtin == BuiltinType::ExtensionObject && leaf.rank == Rank::Array { fixed: None }
+        });
+        let is_empty = matches!(literal, Literal::List(texts) if texts.is_empty());
+        Ok((!is_open || !is_empty).then(|| (at, Given::new(message, path, literal))))
     });
-    each.collect()
+    each.filter_map(Result::transpose).collect()
 }
 
 /// The steps with a [`What::Run`] before those that may be moved at once.

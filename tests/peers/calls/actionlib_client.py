@@ -5,6 +5,7 @@ ends the interest in an older one."""
 import argparse
 import json
 import sys
+import time
 from pathlib import Path
 
 import actionlib
@@ -53,12 +54,18 @@ class Simple:
     def __init__(self, name, kind):
         self.client = actionlib.SimpleActionClient(name, kind)
         self.count = 0
+        self.over = False
 
     def send(self, goal):
+        # The client takes note of an end only after it has told of it, and would take it for that of the next goal.
+        while self.over and self.client.simple_state != actionlib.SimpleGoalState.DONE:
+            time.sleep(0.001)
         count = self.count
         self.count += 1
+        self.over = False
 
         def done(status, result):
+            self.over = True
             ended(count, status, self.client.get_goal_status_text(), result)
 
         # The client knows the goal as its own only once it is sent, and loses what is answered before.
