@@ -391,7 +391,7 @@ impl Router {
     #[must_use]
     pub fn poll_timeout(&self) -> Option<Instant> {
         let timer = self.timers.peek().map(|Reverse((at, _))| *at);
-        let pace = match self.paced.is_empty() {
+        let pace = match self.paced.is_empty() && !self.is_chunking() {
             true => None,
             false => self.pace.opens(),
         };

@@ -1,5 +1,6 @@
-//! Any set of programs around one group, which loses, doubles and reorders datagrams: a request is executed at most once,
-//! where its name says and never at home, who asked is told what is so, and then there is silence. Bridges of ROS 1 and
+//! Any set of programs around one group, which loses, doubles, delays and reorders datagrams, one of which may die midway and be
+//! started anew: a request is executed at most once in the life of a program, where its name says and never at home, who asked
+//! is told what is so, and then there is silence. Bridges of ROS 1 and
 //! ROS 2, which offer and ask with the type of a service, and programs that speak in fields are mixed.
 #![expect(
     clippy::unwrap_used,
@@ -11,7 +12,7 @@
 
 mod cell;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use bridge_core::{
@@ -24,22 +25,32 @@ use messages::{Dialect, Registry, ServiceType};
 use proptest::prelude::*;
 use uadp::{BuiltinType, Scalar, Variant};
 
-/// How the group is: per mille of datagrams that are lost and doubled, and whether they come in another order.
+/// How the group is: per mille of datagrams that are lost, doubled and late, and whether they come in another order.
 #[derive(Debug, Clone, Copy)]
 struct Weather {
     lost: u32,
     doubled: u32,
+    late: u32,
     reorders: bool,
     seed: u32,
 }
 
+/// Xorshift: enough to be different each time. A number below 1000.
+const fn drawn(seed: &mut u32) -> u32 {
+    *seed ^= *seed << 13;
+    *seed ^= *seed >> 17;
+    *seed ^= *seed << 5;
+    *seed % 1_000
+}
+
 fn weather() -> impl Strategy<Value = Weather> {
-    let fair = Just((0, 0));
-    let rough = (0_u32..400, 0_u32..400);
+    let fair = Just((0, 0, 0));
+    let rough = (0_u32..400, 0_u32..400, 0_u32..400);
     (prop_oneof![fair, rough], any::<bool>(), 1_u32..).prop_map(
-        |((lost, doubled), reorders, seed)| Weather {
+        |((lost, doubled, late), reorders, seed)| Weather {
             lost,
             doubled,
+            late,
             reorders,
             seed,
         },
@@ -51,20 +62,20 @@ impl Weather {
         let Self {
             lost,
             doubled,
+            late,
             reorders,
             mut seed,
         } = self;
+        let mut other = !seed | 1;
         cell.reorders = reorders;
-        cell.copies = Box::new(move |_| {
-            // Xorshift: enough to be different each time.
-            seed ^= seed << 13;
-            seed ^= seed >> 17;
-            seed ^= seed << 5;
-            match seed % 1_000 {
-                drawn if drawn < lost => 0,
-                drawn if drawn < lost + doubled => 2,
-                _ => 1,
-            }
+        cell.copies = Box::new(move |_| match drawn(&mut seed) {
+            drawn if drawn < lost => 0,
+            drawn if drawn < lost + doubled => 2,
+            _ => 1,
+        });
+        cell.delay = Box::new(move || match drawn(&mut other) {
+            drawn if drawn < late => ms(u64::from(drawn) + 1),
+            _ => ms(0),
         });
     }
 }
@@ -149,7 +160,10 @@ proptest! {
         asked in proptest::collection::vec((any::<proptest::sample::Index>(), any::<proptest::sample::Index>()), 1..12),
         sides in proptest::array::uniform5(prop_oneof![Just(Local::Fields), Just(Local::Ros1), Just(Local::Cdr)]),
         weather in weather(),
+        death in proptest::option::of((any::<proptest::sample::Index>(), 0_u32..20, any::<bool>())),
     ) {
+        let death = death.map(|(who, when, again)| (who.index(spaces.len()), when, again));
+        let dies = |at: usize| death.is_some_and(|(who, ..)| who == at);
         let spaces: Vec<u16> = spaces.into_iter().collect();
         let programs = spaces.iter().zip(sides).map(|(space, local)| Program::new(*space, local));
         let mut cell = Cell::new(programs.collect());
@@ -165,21 +179,33 @@ proptest! {
         weather.fill(&mut cell);
 
         let mut answers: BTreeMap<u32, Vec<_>> = BTreeMap::new();
-        let mut executed: BTreeMap<u32, Vec<usize>> = BTreeMap::new();
+        // By request: where, and in which life.
+        let mut executed: BTreeMap<u32, Vec<(usize, u32)>> = BTreeMap::new();
+        let mut lives = vec![0_u32; spaces.len()];
         let mut wanted = BTreeMap::new();
         for (id, (asker, executor)) in (0_u32..).zip(&asked) {
             let (asker, executor) = (asker.index(spaces.len()), executor.index(spaces.len()));
             cell.ask(asker, AskId(id.into()), (call(executor), &number(sides[asker], id)), ms(3_000));
             wanted.insert(id, (asker, executor));
         }
-        for _ in 0..100 {
+        for turn in 0..100 {
             cell.run(ms(50));
+            match death {
+                Some((who, when, _)) if turn == when => cell.kill(who),
+                Some((who, when, true)) if turn == when + 5 => {
+                    let port = 30_000 + u16::try_from(who).unwrap();
+                    cell.start(who, Program::new(spaces[who], sides[who]).at_port(port));
+                    join(&mut cell, (who, sides[who]), all[who], &all);
+                    lives[who] += 1;
+                }
+                _ => {}
+            }
             for at in 0..spaces.len() {
                 for execution in cell.executions(at) {
                     prop_assert_eq!(execution.topic, call(at), "never anywhere else");
                     let id = u32::from_le_bytes(*execution.request.last_chunk().unwrap());
                     prop_assert_eq!(execution.requestor.map(|space| u16::from(space.get())), Some(spaces[wanted[&id].0]));
-                    executed.entry(id).or_default().push(at);
+                    executed.entry(id).or_default().push((at, lives[at]));
                     cell.executed(at, execution.id, Executed::Answered(execution.request));
                 }
                 for (ask, answer) in cell.answers(at) {
@@ -190,20 +216,25 @@ proptest! {
             }
         }
         for (id, (asker, executor)) in wanted {
-            let (told, done) = (&answers[&id], executed.get(&id).cloned().unwrap_or_default());
-            prop_assert_eq!(told.len(), 1);
-            match &told[0] {
+            let told = answers.get(&id).cloned().unwrap_or_default();
+            let done = executed.get(&id).cloned().unwrap_or_default();
+            let lives: BTreeSet<_> = done.iter().collect();
+            prop_assert_eq!(lives.len(), done.len(), "at most once in a life: {:?}", done);
+            prop_assert!(done.len() <= 1 || dies(executor));
+            prop_assert!(told.len() == 1 || told.is_empty() && dies(asker));
+            let Some(told) = told.first() else { continue };
+            match told {
                 Ok(response) => {
                     prop_assert_eq!(response, &number(sides[asker], id));
-                    prop_assert_eq!(done, [executor]);
+                    prop_assert!(done.iter().any(|(at, _)| *at == executor));
                 }
                 Err(error) if asker == executor => {
                     prop_assert_eq!(error.kind, AskErrorKind::Refused);
-                    prop_assert_eq!(done, Vec::<usize>::new(), "never at home");
+                    prop_assert!(done.is_empty(), "never at home");
                 }
                 Err(error) => {
                     prop_assert_eq!(error.kind, AskErrorKind::Unknown);
-                    prop_assert!(done.len() <= 1 && weather.lost > 0, "{}", error);
+                    prop_assert!(weather.lost > 0 || dies(executor), "{}", error);
                 }
             }
         }

@@ -3,6 +3,7 @@
 //! A request is repeated until it is answered, and executed once: [`uadp::action`] sees to both. Here is what that needs of
 //! the space: who executes a call and from where (`learn`), what our own are (`execute`), and the bytes of both sides.
 
+mod chunks;
 mod execute;
 mod learn;
 
@@ -19,10 +20,10 @@ use uadp::action::{
     Responder, ResponderSettings, ResponseDrop, Unknown,
 };
 use uadp::{
-    ChunkBudget, Chunks, EncodeError, Extras, GroupHeader, NetworkHeader, NetworkMessage,
-    NetworkMessageType, OwnedPublisherId, PublisherId, StatusCode, Whole,
+    EncodeError, Extras, NetworkHeader, NetworkMessage, OwnedPublisherId, PublisherId, StatusCode,
 };
 
+use self::chunks::{Chunking, Of};
 use self::execute::{Own, Running};
 use self::learn::{Group, Known};
 use super::{About, Router};
@@ -51,12 +52,10 @@ pub(super) struct Calls {
     asked: BTreeMap<CallId, Asked>,
     asks: HashMap<AskId, CallId>,
     executions: BTreeMap<ExecutionId, Running>,
-    /// What the port is to be told, in this order: never more than calls and requests there are. The chunks of a large request or
-    /// response go before.
+    /// What the port is to be told, in this order: never more than calls and requests there are.
     news: VecDeque<Output>,
-    chunks: VecDeque<Output>,
-    /// Tells what is sent in chunks from what was before.
-    chunked: u16,
+    /// Requests and responses that fit no datagram.
+    chunking: Chunking,
     /// When our own are announced again.
     announce_at: Option<Instant>,
     /// When it is looked who fell silent.
@@ -102,6 +101,7 @@ impl Calls {
         let settings = RequestorSettings {
             receive_timeout,
             max_bytes: 4 * MAX_BLOCK,
+            large: LARGE,
             ..RequestorSettings::default()
         };
         Self {
@@ -121,8 +121,7 @@ impl Calls {
             asks: HashMap::new(),
             executions: BTreeMap::new(),
             news: VecDeque::new(),
-            chunks: VecDeque::new(),
-            chunked: 0,
+            chunking: Chunking::default(),
             announce_at: None,
             look_at: None,
             due: None,
@@ -146,6 +145,10 @@ impl Calls {
 
     pub(super) const fn due(&self) -> Option<Instant> {
         self.due
+    }
+
+    fn topic_of(&self, id: CallId) -> Option<TopicId> {
+        self.asked.get(&id).map(|asked| asked.topic)
     }
 
     /// The request is over: it counts no longer as open.
@@ -425,7 +428,7 @@ impl Router {
                 }
             }
         }
-        self.settle();
+        self.settle(now);
     }
 
     fn handle_response(
@@ -449,6 +452,9 @@ impl Router {
             true => Err(ResponseDrop::Elsewhere),
             false => calls.requestor.handle_response(response, since),
         };
+        if heard.is_ok() {
+            calls.spoke(topic);
+        }
         match heard {
             Ok(uadp::action::Heard::Done(id, outcome)) => self.conclude(id, outcome),
             Ok(uadp::action::Heard::Executing(_) | uadp::action::Heard::Closed(_)) => {}
@@ -507,13 +513,17 @@ impl Router {
     }
 
     /// What is to be told of requests that nobody answered and executions that nobody waits for.
-    pub(super) fn settle(&mut self) {
+    pub(super) fn settle(&mut self, now: Now) {
         while let Some((id, why)) = self
             .calls
             .as_mut()
             .and_then(|calls| calls.requestor.poll_given_up())
         {
+            let topic = self.calls.as_ref().and_then(|calls| calls.topic_of(id));
             self.conclude(id, Outcome::Unknown(why));
+            if let (Some(topic), Unknown::Silent) = (topic, why) {
+                self.doubt(topic, now);
+            }
         }
         if let Some(calls) = &mut self.calls {
             while let Some(execution) = calls.responder.poll_overdue() {
@@ -541,76 +551,33 @@ impl Router {
             self.announce_calls(now);
         }
         self.look_for_silence(now);
-        self.settle();
+        self.settle(now);
     }
 
     /// What the port is to be told of calls, or the next request or response that is to be sent.
     pub(super) fn next_action(&mut self, now: Now) -> Option<Output> {
-        let chunk = self
-            .calls
-            .as_mut()
-            .and_then(|calls| calls.chunks.pop_front());
-        if chunk.is_some() {
-            return chunk;
+        if let Some(chunk) = self.next_chunk(now) {
+            return Some(chunk);
         }
         let mut bytes = self.spare.pop().unwrap_or_default();
         let told = self.write_action(&mut bytes, now);
         match told {
+            Some(Told::Datagram(topic, _)) if bytes.len() <= self.most() => {
+                Some(Output::Action { topic, bytes })
+            }
+            Some(Told::Datagram(topic, of)) => {
+                self.cut_up(topic, of, bytes);
+                self.next_chunk(now).or_else(|| self.next_action(now))
+            }
             Some(Told::News(output)) => {
                 self.recycle(bytes);
                 Some(output)
             }
-            Some(Told::Datagram(topic)) => Some(self.whole_or_chunks(topic, bytes)),
             None => {
                 self.recycle(bytes);
                 None
             }
         }
-    }
-
-    /// A request or response as one datagram, or the first of its chunks, where it does not fit one. What is cut up is the whole
-    /// NetworkMessage, since the ActionHeader stands in it (OPC 10000-14, 7.2.4.4.4).
-    fn whole_or_chunks(&mut self, topic: TopicId, bytes: Vec<u8>) -> Output {
-        let most = usize::from(self.mapping.pubsub().max_datagram);
-        if bytes.len() <= most {
-            return Output::Action { topic, bytes };
-        }
-        let (space, namespace, _) = topic.triple();
-        let Some(calls) = &mut self.calls else {
-            return Output::Action { topic, bytes };
-        };
-        calls.chunked = calls.chunked.wrapping_add(1);
-        let header = NetworkHeader {
-            publisher_id: Some(PublisherId::UInt16(space)),
-            group: Some(GroupHeader {
-                writer_group_id: Some(namespace),
-                ..GroupHeader::default()
-            }),
-            ..NetworkHeader::default()
-        };
-        let whole = Whole {
-            message_type: NetworkMessageType::DataSet,
-            writer_id: None,
-            message_sequence_number: calls.chunked,
-            bytes: &bytes,
-        };
-        let budget = ChunkBudget {
-            network_message: most,
-            trailer: 0,
-        };
-        let extras = Extras::default();
-        let Ok(mut chunks) = Chunks::new(&header, &extras, whole, budget) else {
-            return Output::Action { topic, bytes };
-        };
-        while chunks.remaining() > 0 {
-            let mut bytes = Vec::new();
-            match chunks.append(&mut bytes, &extras) {
-                Some(Ok(_)) => calls.chunks.push_back(Output::Action { topic, bytes }),
-                Some(Err(_)) | None => break,
-            }
-        }
-        let first = calls.chunks.pop_front();
-        first.unwrap_or(Output::Action { topic, bytes })
     }
 
     fn write_action(&mut self, bytes: &mut Vec<u8>, now: Now) -> Option<Told> {
@@ -624,30 +591,30 @@ impl Router {
             }
             let since = calls.since_start(now);
             let answer = calls.responder.poll_transmit(since);
-            let answer = answer.map(|((), answer)| encode(&answer, bytes));
+            let answer = answer.map(|((), answer)| (Of::of(&answer), encode(&answer, bytes)));
             let next = answer.or_else(|| {
                 let request = calls.requestor.poll_transmit(since);
-                request.map(|request| encode(&request, bytes))
+                request.map(|request| (Of::of(&request), encode(&request, bytes)))
             });
             match next {
                 // What timed out meanwhile is told.
                 None => {
-                    self.settle();
+                    self.settle(now);
                     let calls = self.calls.as_mut()?;
                     return calls.news.pop_front().map(Told::News);
                 }
-                Some((Some(topic), Ok(()))) if !self.is_withheld(topic) => {
-                    return Some(Told::Datagram(topic));
+                Some((of, (Some(topic), Ok(())))) if !self.is_withheld(topic) => {
+                    return Some(Told::Datagram(topic, of));
                 }
-                Some((Some(topic), Ok(()))) => {
+                Some((_, (Some(topic), Ok(())))) => {
                     self.count_call(topic, None, (Reason::SpaceTaken, "withheld"), String::new);
                 }
-                Some((topic, Err(error))) => {
+                Some((_, (topic, Err(error)))) => {
                     if let Some(topic) = topic {
                         self.count_call(topic, None, Reason::TooBig, || error.to_string());
                     }
                 }
-                Some((None, Ok(()))) => {}
+                Some((_, (None, Ok(())))) => {}
             }
             bytes.clear();
         }
@@ -682,7 +649,7 @@ type Begun = (CallId, Option<Arc<CallPlan>>);
 /// What comes of a look at the calls.
 enum Told {
     News(Output),
-    Datagram(TopicId),
+    Datagram(TopicId, Of),
 }
 
 /// Writes the NetworkMessage, and says of which call it is.
@@ -748,5 +715,7 @@ const BAD_DECODING_ERROR: StatusCode = StatusCode(0x8007_0000);
 const MAX_OPEN: usize = 256;
 /// Requests that are executed at a time: those that wait for the results of actions among them.
 const MAX_EXECUTING: usize = 1_024;
+/// Bytes of a request's fields from which on it may fit no datagram: the smallest `max_datagram` less headers.
+const LARGE: usize = 128;
 /// Bytes of the fields of a request or response; those that do not fit a datagram go in chunks.
 const MAX_BLOCK: usize = 16 << 20;

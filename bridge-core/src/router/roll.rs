@@ -188,7 +188,7 @@ impl Router {
             self.tell_silence(topic);
         }
         self.unlearn_call(topic, from);
-        self.settle();
+        self.settle(now);
     }
 }
 

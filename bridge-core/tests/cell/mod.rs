@@ -18,13 +18,20 @@ use uadp::{
 
 /// Who hears the datagrams of whom, in which order and how often; all hear each once by default.
 pub(crate) type Network = Box<dyn FnMut(&[u8]) -> usize>;
+/// How long a datagram is under way.
+pub(crate) type Delay = Box<dyn FnMut() -> Duration>;
 
 pub(crate) struct Cell {
     pub(crate) programs: Vec<Program>,
     /// What is under way on the group: from where, and what.
     under_way: VecDeque<(SocketAddr, Vec<u8>)>,
+    /// Those that are late, by when they come and in which order they were sent.
+    late: BTreeMap<(Duration, u64), (SocketAddr, Vec<u8>)>,
+    sent: u64,
     /// How often each datagram comes.
     pub(crate) copies: Network,
+    /// How late each of them is; not at all by default.
+    pub(crate) delay: Delay,
     /// Whether what is under way is taken from the end, by turns.
     pub(crate) reorders: bool,
     turn: usize,
@@ -91,7 +98,10 @@ impl Cell {
         Self {
             programs,
             under_way: VecDeque::new(),
+            late: BTreeMap::new(),
+            sent: 0,
             copies: Box::new(|_| 1),
+            delay: Box::new(|| Duration::ZERO),
             reorders: false,
             turn: 0,
             started: start().monotonic,
@@ -118,6 +128,8 @@ impl Cell {
                 .filter_map(|program| program.router.poll_timeout())
                 .min();
             let next = due.map(|due| due.saturating_duration_since(self.started));
+            let late = self.late.first_key_value().map(|((at, _), _)| *at);
+            let next = next.into_iter().chain(late).min();
             match next.filter(|next| *next <= end) {
                 Some(next) => self.passed = self.passed.max(next),
                 None => {
@@ -140,6 +152,11 @@ impl Cell {
     fn carry(&mut self) {
         for at in 0..self.programs.len() {
             self.drain(at);
+        }
+        while let Some(entry) = self.late.first_entry()
+            && entry.key().0 <= self.passed
+        {
+            self.under_way.push_back(entry.remove());
         }
         for _ in 0..100_000 {
             self.turn += 1;
@@ -178,7 +195,14 @@ impl Cell {
                 | Output::Discovery { bytes }
                 | Output::Action { bytes, .. } => {
                     for _ in 0..(self.copies)(&bytes) {
-                        self.under_way.push_back((program.address, bytes.clone()));
+                        let delay = (self.delay)();
+                        let datagram = (program.address, bytes.clone());
+                        if delay.is_zero() {
+                            self.under_way.push_back(datagram);
+                        } else {
+                            self.sent += 1;
+                            self.late.insert((self.passed + delay, self.sent), datagram);
+                        }
                     }
                     program.sent.push(bytes);
                 }

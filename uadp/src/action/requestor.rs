@@ -87,6 +87,9 @@ pub struct RequestorSettings {
     pub idle_repeats: u8,
     /// ResponseAddress to send; `None` to be answered where the Responder answers by itself. Default `None`.
     pub response_address: Option<Box<str>>,
+    /// A request with more bytes of arguments than that is repeated byte for byte, so that the chunks of one repetition fill in
+    /// those lost of another (OPC 10000-14, 7.2.4.4.4). Default 1000.
+    pub large: usize,
     /// Calls at a time, those that are only to be acknowledged or told still included. Default 1024.
     pub max_calls: usize,
     /// Bytes of the arguments of all calls. Default 4 MiB.
@@ -102,7 +105,8 @@ pub struct ActionRequest<'a> {
     pub dialect: ActionDialect,
     /// The arguments.
     pub fields: ActionFields<'a>,
-    /// How long an answer is waited for. What is left of it goes with every request as its TimeoutHint.
+    /// How long an answer is waited for. What is left of it goes with every request as its TimeoutHint; what was left at
+    /// first, where arguments are [large](RequestorSettings::large).
     pub timeout: Duration,
 }
 
@@ -212,6 +216,8 @@ enum Phase {
         deadline: Duration,
         /// When the Responder is taken for lost.
         silent: Duration,
+        /// TimeoutHint of a large request, once it was sent.
+        hint: Option<f64>,
     },
     /// Idle is wanted, so many more times.
     Closing { left: u8, given_up: bool },
@@ -224,6 +230,7 @@ impl Default for RequestorSettings {
             receive_timeout: Duration::from_secs(2),
             idle_repeats: 5,
             response_address: None,
+            large: 1000,
             max_calls: 1024,
             max_bytes: 4 << 20,
         }
@@ -307,7 +314,11 @@ impl Requestor {
             address,
             dialect,
             fields: fields.into(),
-            phase: Phase::Asking { deadline, silent },
+            phase: Phase::Asking {
+                deadline,
+                silent,
+                hint: None,
+            },
             next_send: Some(now),
             sent: false,
             wake: now,
@@ -358,7 +369,9 @@ impl Requestor {
                 return;
             };
             match call.phase {
-                Phase::Asking { deadline, silent } if now >= deadline.min(silent) => {
+                Phase::Asking {
+                    deadline, silent, ..
+                } if now >= deadline.min(silent) => {
                     let why = match now >= deadline {
                         true => Unknown::Deadline,
                         false => Unknown::Silent,
@@ -384,13 +397,17 @@ impl Requestor {
         let call = self.calls.get_mut(&id)?;
         let again = now.saturating_add(interval);
         let (state, timeout_hint) = match &mut call.phase {
-            Phase::Asking { deadline, .. } => {
+            Phase::Asking { deadline, hint, .. } => {
                 call.next_send = match call.dialect {
                     ActionDialect::Standard => Some(again),
                     ActionDialect::UaNetStandard(_) => None,
                 };
-                let left = deadline.saturating_sub(now);
-                (ActionState::Executing, Some(left.as_secs_f64() * 1000.0))
+                let left = deadline.saturating_sub(now).as_secs_f64() * 1000.0;
+                let left = match call.fields.as_fields().bytes().len() > self.settings.large {
+                    true => *hint.get_or_insert(left),
+                    false => left,
+                };
+                (ActionState::Executing, Some(left))
             }
             Phase::Closing { left, .. } => {
                 *left = left.saturating_sub(1);
@@ -415,6 +432,7 @@ impl Requestor {
                 timeout_hint,
             },
             request_id,
+            call: id,
             state,
             status: None,
             fields: call.fields.as_fields(),
@@ -533,7 +551,9 @@ impl Requestor {
 impl Call {
     fn next_wake(&self) -> Duration {
         let end = match self.phase {
-            Phase::Asking { deadline, silent } => deadline.min(silent),
+            Phase::Asking {
+                deadline, silent, ..
+            } => deadline.min(silent),
             Phase::Closing { .. } => Duration::MAX,
         };
         self.next_send.map_or(end, |at| at.min(end))

@@ -249,6 +249,7 @@ impl<P> Responder<P> {
                 ..ActionHeader::new(ActionKind::Response)
             },
             request_id: entry.key.request_id,
+            call: id,
             state,
             status: match entry.dialect {
                 ActionDialect::Standard => status,

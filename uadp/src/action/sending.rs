@@ -28,6 +28,9 @@ pub struct ActionToSend<'a> {
     pub action: ActionHeader<'a>,
     /// Which of the Requestor's requests it is.
     pub request_id: u16,
+    /// Which call of its Requestor or Responder it is of. Nothing of the wire: it tells a repetition, for which chunks are to
+    /// have the MessageSequenceNumber that they had before.
+    pub call: u64,
     /// The state wanted, or the one there is.
     pub state: ActionState,
     /// Status of the DataSetMessage header, in responses.

@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use mappings::{SpaceId, TopicId};
+use mappings::{PubSub, SpaceId, TopicId};
 use messages::MessageType;
 use uadp::action::{
     ActionFields, ActionMessage, ExecutionId, FinishRefusal, Outcome, Refusal, Requested,
@@ -230,10 +230,11 @@ impl Router {
             return self.count(About::sender(from), Reason::NotAsked, 1, String::new);
         };
         let since = calls.since_start(now);
+        let group = self.mapping.pubsub().address;
         match calls.responder.handle_request(request, (), since) {
             Ok(Requested::Execute(id)) => {
                 let own = calls.table.get(&topic).and_then(|call| call.own.as_ref());
-                match may_be_executed(own, request, from) {
+                match may_be_executed(own, request, (from, group)) {
                     Ok((fields, plan)) => {
                         let read = self.read_request(plan.as_deref(), fields);
                         self.execute((topic, id), (request, read, plan), now);
@@ -395,7 +396,7 @@ type Executable<'a> = (&'a [u8], Option<Arc<ExecutedPlan>>);
 fn may_be_executed<'a>(
     own: Option<&Own>,
     request: &ActionMessage<'a>,
-    from: SocketAddr,
+    (from, group): (SocketAddr, SocketAddr),
 ) -> Result<Executable<'a>, (Refusal, &'static str, String)> {
     let Some(own) = own.filter(|_| request.target_id == TARGET) else {
         let detail = "it is no call of this program".to_owned();
@@ -405,11 +406,24 @@ fn may_be_executed<'a>(
         let detail = format!("{from} is another host, and calls are not open to others");
         return Err((Refusal::NotAllowed, "not allowed", detail));
     }
+    let wanted = request.action.response_address.unwrap_or_default();
+    if !is_answered_at(wanted, (from, group)) {
+        let detail = format!("{from} wants the answer at {wanted:?}, and answers go to {group}");
+        return Err((Refusal::NotAllowed, "response address", detail));
+    }
     let fields = request.fields.variants();
     fields
         .and_then(|fields| fields.checked_bytes())
         .map(|fields| (fields, own.plan.clone()))
         .map_err(|error| (Refusal::InvalidArgument, "fields", error.to_string()))
+}
+
+/// Whether who wants its answer at that ResponseAddress (OPC 10000-14, 7.2.4.4.2) gets it by what is sent to the group: the
+/// group's own address is meant, none, or one of the host that asks. To answer where anybody says would attack whom it names.
+fn is_answered_at(wanted: &str, (from, group): (SocketAddr, SocketAddr)) -> bool {
+    let wanted = wanted.trim();
+    let at = PubSub::parse_address(wanted);
+    wanted.is_empty() || at.is_some_and(|at| at == group || at.ip() == from.ip())
 }
 
 /// Bad_EncodingError (OPC 10000-6, A.2).

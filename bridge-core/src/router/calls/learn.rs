@@ -40,14 +40,18 @@ pub(super) struct Group {
     heard: Option<Instant>,
     /// It is silent.
     gone: bool,
-    /// Somebody else says it has these calls.
-    contended: bool,
+    /// Since when it was asked what its calls are, and nothing is heard of it: somebody else says that it has them, or it
+    /// executes nothing.
+    doubted: Option<Instant>,
 }
 
 impl Group {
     /// Whether nothing is heard of it any more.
     fn is_silent(&self, now: Instant, (silence, forgotten): (Duration, Duration)) -> bool {
         let since = |at: Instant| now.saturating_duration_since(at);
+        if self.doubted.is_some_and(|at| since(at) >= silence) {
+            return true;
+        }
         match self.heard {
             Some(heard) => since(heard) >= silence,
             None => since(self.said) >= forgotten,
@@ -72,8 +76,17 @@ impl Calls {
             return;
         }
         group.heard = Some(now.monotonic);
+        group.doubted = None;
         if std::mem::take(&mut group.gone) {
             self.revive((space, namespace), now.monotonic);
+        }
+    }
+
+    /// The program that executes a call spoke of it.
+    pub(super) fn spoke(&mut self, topic: TopicId) {
+        let (_, namespace, _) = topic.triple();
+        if let Some(group) = self.groups.get_mut(&(topic.space, namespace)) {
+            group.doubted = None;
         }
     }
 
@@ -135,6 +148,8 @@ impl Router {
             return self.drop_own(Some(namespace), from, now);
         }
         if !self.may_execute((space, namespace), from, now) {
+            // Who does execute them answers; who does not within the time is gone.
+            self.plan_probe(topic, now);
             let cause = (Reason::MetaData, "sender");
             return self.count_call(topic, Some(from), cause, || {
                 "another program than the one that executes the calls of its namespace says what it is"
@@ -161,7 +176,9 @@ impl Router {
             return true;
         };
         let may = group.from == from || group.is_silent(now.monotonic, silences);
-        group.contended |= !may;
+        if !may {
+            group.doubted.get_or_insert(now.monotonic);
+        }
         may
     }
 
@@ -199,13 +216,13 @@ impl Router {
             said: now.monotonic,
             heard: None,
             gone: false,
-            contended: false,
+            doubted: None,
         });
         if group.from != from {
             // A program that was started anew.
-            (group.from, group.heard, group.contended) = (from, None, false);
+            (group.from, group.heard) = (from, None);
         }
-        (group.said, group.gone) = (now.monotonic, false);
+        (group.said, group.gone, group.doubted) = (now.monotonic, false, None);
         calls.look_at.get_or_insert(now.monotonic + LOOK);
         let call = calls.table.entry(topic).or_default();
         match &mut call.known {
@@ -255,7 +272,20 @@ impl Router {
         }
     }
 
-    /// Who sends values is gone when they are missing; who sends none, when its announcements are.
+    /// Who executes a call has let requests for it go unanswered until it was taken for lost: unless it says soon what its calls
+    /// are, they are gone.
+    pub(super) fn doubt(&mut self, topic: TopicId, now: Now) {
+        let (_, namespace, _) = topic.triple();
+        let calls = self.calls.as_mut();
+        let group = calls.and_then(|calls| calls.groups.get_mut(&(topic.space, namespace)));
+        if let Some(group) = group.filter(|group| !group.gone) {
+            group.doubted.get_or_insert(now.monotonic);
+            self.plan_probe(topic, now);
+        }
+    }
+
+    /// Who sends values is gone when they are missing; who sends none, when its announcements are; and either when it is asked
+    /// in vain.
     fn silences(&self) -> (Duration, Duration) {
         let pubsub = self.mapping.pubsub();
         let forgotten = pubsub.metadata_period.saturating_mul(MISSED);
@@ -286,7 +316,7 @@ impl Router {
             let silent = group.is_none_or(|group| group.gone);
             if (old || silent) && !std::mem::replace(&mut known.gone, true) {
                 calls.news.push_back(Output::CallGone { topic: *topic });
-                if group.is_some_and(|group| group.contended) {
+                if group.is_some_and(|group| group.doubted.is_some()) {
                     asked.push(*topic);
                 }
             }
@@ -296,7 +326,7 @@ impl Router {
             .retain(|_, group| now.monotonic.saturating_duration_since(group.said) < forgotten);
         let some = !calls.groups.is_empty() || !calls.executions.is_empty();
         calls.look_at = some.then(|| now.monotonic + LOOK);
-        // Somebody else said it has them.
+        // Somebody else may have them, or they are back.
         for topic in asked {
             self.plan_probe(topic, now);
         }

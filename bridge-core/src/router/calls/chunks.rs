@@ -1,0 +1,189 @@
+//! Requests and responses that fit no datagram: cut up, and sent at the pace of all chunks.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use mappings::TopicId;
+use uadp::action::{ActionKind, ActionToSend};
+use uadp::{
+    ChunkBudget, ChunkError, Chunks, Extras, GroupHeader, NetworkHeader, NetworkMessageType,
+    PublisherId, Whole,
+};
+
+use super::Router;
+use crate::counters::Reason;
+use crate::output::Output;
+use crate::settings::Now;
+
+/// What is sent in chunks. Of each call's message there is one at a time, so that there is no more of it than the Requestor and
+/// the Responder hold.
+#[derive(Debug, Default)]
+pub(super) struct Chunking {
+    /// Messages in the order in which they were due. One goes after another: of each sender a receiver keeps few that are
+    /// incomplete.
+    waiting: VecDeque<Large>,
+    /// The MessageSequenceNumber of the next one.
+    next: u16,
+    /// Those given, for repetitions, and the same in the order in which they were given.
+    numbers: BTreeMap<Of, u16>,
+    given: VecDeque<Of>,
+    /// A value's chunk was let go in between.
+    gave_way: bool,
+}
+
+/// Of which call a message is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Of {
+    Request(u64),
+    Response(u64),
+}
+
+/// A message on its way.
+#[derive(Debug)]
+struct Large {
+    topic: TopicId,
+    of: Of,
+    number: u16,
+    bytes: Vec<u8>,
+    offset: usize,
+}
+
+impl Of {
+    pub(super) const fn of(action: &ActionToSend<'_>) -> Self {
+        match action.action.kind {
+            ActionKind::Request => Self::Request(action.call),
+            ActionKind::Response => Self::Response(action.call),
+        }
+    }
+}
+
+impl Chunking {
+    pub(super) fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
+    }
+
+    /// Takes a message in, unless one of that call has not gone out yet. A repetition has the number that it had before, so that
+    /// its chunks fill in those that were lost (OPC 10000-14, 7.2.4.4.4).
+    fn push(&mut self, topic: TopicId, of: Of, bytes: Vec<u8>) {
+        if self.waiting.iter().any(|large| large.of == of) {
+            return;
+        }
+        let number = match self.numbers.get(&of) {
+            Some(number) => *number,
+            None => self.give(of),
+        };
+        self.waiting.push_back(Large {
+            topic,
+            of,
+            number,
+            bytes,
+            offset: 0,
+        });
+    }
+
+    fn give(&mut self, of: Of) -> u16 {
+        if self.given.len() >= MOST_NUMBERS
+            && let Some(oldest) = self.given.pop_front()
+        {
+            self.numbers.remove(&oldest);
+        }
+        self.next = self.next.wrapping_add(1);
+        self.numbers.insert(of, self.next);
+        self.given.push_back(of);
+        self.next
+    }
+
+    /// Appends the next chunk.
+    fn write(
+        &mut self,
+        most: usize,
+        out: &mut Vec<u8>,
+    ) -> Option<(TopicId, Result<(), ChunkError>)> {
+        let large = self.waiting.front_mut()?;
+        let topic = large.topic;
+        let written = large.write(most, out);
+        if written.is_err() || large.offset >= large.bytes.len() {
+            self.waiting.pop_front();
+        }
+        Some((topic, written))
+    }
+}
+
+impl Large {
+    /// What is cut up is the whole NetworkMessage, since the ActionHeader stands in it (OPC 10000-14, 7.2.4.4.4).
+    fn write(&mut self, most: usize, out: &mut Vec<u8>) -> Result<(), ChunkError> {
+        let (space, namespace, _) = self.topic.triple();
+        let header = NetworkHeader {
+            publisher_id: Some(PublisherId::UInt16(space)),
+            group: Some(GroupHeader {
+                writer_group_id: Some(namespace),
+                ..GroupHeader::default()
+            }),
+            ..NetworkHeader::default()
+        };
+        let whole = Whole {
+            message_type: NetworkMessageType::DataSet,
+            writer_id: None,
+            message_sequence_number: self.number,
+            bytes: &self.bytes,
+        };
+        let budget = ChunkBudget {
+            network_message: most,
+            trailer: 0,
+        };
+        let extras = Extras::default();
+        let mut chunks = Chunks::new(&header, &extras, whole, budget)?.resumed_at(self.offset);
+        chunks.append(out, &extras).transpose()?;
+        self.offset = chunks.offset();
+        Ok(())
+    }
+}
+
+impl Router {
+    /// Bytes of a datagram.
+    pub(super) fn most(&self) -> usize {
+        self.mapping.pubsub().max_datagram.into()
+    }
+
+    /// Takes in a request or response that fits no datagram.
+    pub(super) fn cut_up(&mut self, topic: TopicId, of: Of, bytes: Vec<u8>) {
+        if let Some(calls) = &mut self.calls {
+            calls.chunking.push(topic, of, bytes);
+        }
+    }
+
+    /// Whether a chunk of a request or response waits for the pace.
+    pub(in super::super) fn is_chunking(&self) -> bool {
+        let calls = self.calls.as_ref();
+        calls.is_some_and(|calls| !calls.chunking.is_empty())
+    }
+
+    /// The next chunk, if the pace lets it go; in turn with those of values.
+    pub(super) fn next_chunk(&mut self, now: Now) -> Option<Output> {
+        let values_wait = !self.paced.is_empty();
+        let most = self.most();
+        let calls = self.calls.as_mut()?;
+        let chunking = &mut calls.chunking;
+        if chunking.is_empty() || !self.pace.is_open(now.monotonic) {
+            return None;
+        }
+        if values_wait && !std::mem::replace(&mut chunking.gave_way, true) {
+            return None;
+        }
+        chunking.gave_way = false;
+        let mut bytes = Vec::new();
+        let (topic, written) = chunking.write(most, &mut bytes)?;
+        match written {
+            Ok(()) => {
+                self.pace.spend(bytes.len(), now.monotonic);
+                Some(Output::Action { topic, bytes })
+            }
+            Err(error) => {
+                self.count_call(topic, None, Reason::TooBig, || error.to_string());
+                None
+            }
+        }
+    }
+}
+
+/// Numbers that are remembered: of more calls than wait for an answer at a time.
+const MOST_NUMBERS: usize = 2_048;

@@ -1,0 +1,233 @@
+//! What calls do on a network that loses, and to peers that lie or die.
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
+
+mod cell;
+
+use std::cell::Cell as Shared;
+use std::net::SocketAddr;
+use std::rc::Rc;
+
+use bridge_core::{
+    AskErrorKind, AskId, CallDescription, CallField, CallRole, Executed, Local, Offered, Output,
+    Reason,
+};
+use cell::{Cell, Program, component, ms, topic};
+use mappings::TopicId;
+use uadp::action::{
+    ActionAddress, ActionDialect, ActionFields, ActionHeader, ActionKind, ActionState, ActionToSend,
+};
+use uadp::{
+    BuiltinType, Extras, NetworkHeader, NetworkMessage, OwnedPublisherId, PublisherId, Scalar,
+    Variant,
+};
+
+const BRIDGE: usize = 0;
+const GRIPPER: usize = 1;
+
+fn start() -> TopicId {
+    topic(0, 7, 105)
+}
+
+fn offered(open: bool) -> Offered {
+    Offered {
+        description: CallDescription {
+            name: "gripper.Load".to_owned(),
+            about: String::new(),
+            role: CallRole::Call,
+            request: vec![CallField::scalar("bytes", BuiltinType::ByteString).optional()],
+            response: vec![CallField::scalar("bytes", BuiltinType::ByteString)],
+        },
+        open,
+    }
+}
+
+/// A bridge of space 1 and a component with the namespace 7, whose call is known in the bridge.
+fn plugged_in() -> Cell {
+    let mut cell = Cell::new(vec![Program::new(1, Local::Fields), component(7)]);
+    cell.offer(GRIPPER, start(), offered(true));
+    cell.run(ms(200));
+    assert_eq!(cell.known(BRIDGE), [start()]);
+    cell
+}
+
+/// So many bytes, which differ from place to place.
+fn large(bytes: u32) -> Vec<u8> {
+    let bytes: Vec<u8> = (0..bytes).flat_map(|at| at.to_le_bytes()).collect();
+    cell::block(&[Variant::Scalar(Scalar::ByteString(Some(&bytes)))])
+}
+
+/// A datagram that asks for the call, as a program of another maker sends it.
+fn request(response_address: Option<&str>, request_id: u16) -> Vec<u8> {
+    let (space, namespace, writer_id) = start().triple();
+    let address = ActionAddress {
+        publisher_id: OwnedPublisherId::UInt16(space),
+        writer_group_id: Some(namespace),
+        writer_id,
+        target_id: 1,
+    };
+    let request = ActionToSend {
+        address: &address,
+        action: ActionHeader {
+            response_address,
+            correlation_data: Some(b"test"),
+            requestor_id: Some(PublisherId::UInt16(9)),
+            timeout_hint: Some(3_000.0),
+            ..ActionHeader::new(ActionKind::Request)
+        },
+        request_id,
+        call: 0,
+        state: ActionState::Executing,
+        status: None,
+        fields: ActionFields::NONE,
+        dialect: ActionDialect::Standard,
+    };
+    let mut datagram = Vec::new();
+    let (header, extras) = (NetworkHeader::default(), Extras::default());
+    let encoder = request.encode(&mut datagram, &header, &extras).unwrap();
+    encoder.finish().unwrap();
+    datagram
+}
+
+#[test]
+fn a_request_that_wants_its_answer_elsewhere_is_refused_and_counted() {
+    let from = SocketAddr::from(([192, 0, 2, 9], 5_000));
+    // The group by its number, with and without its port, nothing, and the host that asks.
+    let allowed = [
+        None,
+        Some(""),
+        Some("opc.udp://239.192.0.40:4840"),
+        Some("opc.udp://239.192.0.40/"),
+        Some("opc.udp://192.0.2.9:6000"),
+    ];
+    let elsewhere = [
+        "opc.udp://192.0.2.10:5000",
+        "opc.udp://239.192.0.41:4840",
+        "opc.udp://printer.example:9100",
+        "opc.tcp://192.0.2.9:4840",
+        "nonsense",
+    ];
+    let mut cell = plugged_in();
+    for (id, address) in (0..).zip(allowed) {
+        cell.hear(GRIPPER, &request(address, id), from);
+        assert_eq!(cell.executions(GRIPPER).len(), 1, "{address:?}");
+    }
+    for (id, address) in (100..).zip(elsewhere) {
+        let before = cell.dropped(GRIPPER, Reason::CallRefused);
+        cell.hear(GRIPPER, &request(Some(address), id), from);
+        assert_eq!(cell.executions(GRIPPER).len(), 0, "{address:?}");
+        assert_eq!(cell.dropped(GRIPPER, Reason::CallRefused), before + 1);
+        let told = cell
+            .outputs(GRIPPER)
+            .into_iter()
+            .any(|output| match output {
+                Output::Notice(notice) => notice.detail.contains(address),
+                _ => false,
+            });
+        assert!(told || id > 100, "the first of them is told with where");
+    }
+}
+
+#[test]
+fn the_chunks_of_a_repetition_fill_in_those_that_were_lost() {
+    let mut cell = plugged_in();
+    // Every seventh is lost, which are others in each repetition: none comes whole.
+    let count = Rc::new(Shared::new(0_u32));
+    let counting = Rc::clone(&count);
+    cell.copies = Box::new(move |bytes| {
+        let chunk = NetworkMessage::decode(bytes).and_then(|message| message.chunk());
+        // The first has the ActionHeader: what differs in it would begin another message.
+        if chunk.is_ok_and(|chunk| chunk.offset > 0) {
+            counting.set(counting.get() + 1);
+            usize::from(!counting.get().is_multiple_of(7))
+        } else {
+            1
+        }
+    });
+    // 31 chunks and 32.
+    let (asked, answer) = (large(500_000), large(510_000));
+    cell.ask(BRIDGE, AskId(1), (start(), &asked), ms(10_000));
+    cell.run(ms(900));
+    let execution = cell.executions(GRIPPER).pop().expect("filled in");
+    assert!(execution.request == asked);
+    let id = execution.id;
+    cell.executed(GRIPPER, id, Executed::Answered(answer.clone()));
+    cell.run(ms(900));
+    let (_, told) = cell.answers(BRIDGE).pop().expect("filled in");
+    assert!(told == Ok(answer));
+    cell.run(ms(5_000));
+    assert!(cell.executions(GRIPPER).is_empty(), "executed once");
+}
+
+#[test]
+fn chunks_of_calls_go_out_at_the_pace_of_chunks() {
+    let mut cell = plugged_in();
+    let sent = |cell: &mut Cell| -> usize { cell.datagrams_of(BRIDGE).iter().map(Vec::len).sum() };
+    let before = sent(&mut cell);
+    cell.ask(BRIDGE, AskId(1), (start(), &large(2_500_000)), ms(10_000));
+    let burst = sent(&mut cell) - before;
+    assert!(burst < 400_000, "{burst} bytes at once");
+    // 10 MB at 100 MB/s.
+    cell.run(ms(50));
+    assert!(cell.executions(GRIPPER).is_empty(), "half of it is there");
+    cell.run(ms(60));
+    assert_eq!(cell.executions(GRIPPER).len(), 1);
+    // Nothing is sent twice while it is under way, though it takes as long as a repetition waits.
+    let all = sent(&mut cell) - before;
+    assert!(all < 11_000_000, "{all} bytes for 10 MB");
+}
+
+#[test]
+fn who_is_started_anew_at_once_without_values_is_believed_soon() {
+    let mut cell = plugged_in();
+    cell.run(ms(10_000));
+    cell.start(GRIPPER, component(7).at_port(7_777));
+    cell.offer(GRIPPER, start(), offered(true));
+    cell.run(ms(6_000));
+    assert_eq!(
+        (cell.gone(BRIDGE), cell.known(BRIDGE)),
+        (vec![start()], vec![start()])
+    );
+    cell.ask(BRIDGE, AskId(1), (start(), &[0, 0]), ms(3_000));
+    cell.run(ms(50));
+    assert_eq!(cell.executions(GRIPPER).len(), 1);
+}
+
+#[test]
+fn who_lives_keeps_its_calls_whatever_others_say() {
+    let mut cell = plugged_in();
+    cell.programs.push(component(7).at_port(7_777));
+    for _ in 0..20 {
+        cell.offer(2, start(), offered(true));
+        cell.run(ms(1_500));
+    }
+    assert_eq!((cell.gone(BRIDGE), cell.known(BRIDGE)), (vec![], vec![]));
+    cell.ask(BRIDGE, AskId(1), (start(), &[0, 0]), ms(3_000));
+    cell.run(ms(50));
+    assert_eq!(cell.executions(GRIPPER).len(), 1);
+    assert!(cell.dropped(BRIDGE, Reason::MetaData) > 0, "it is counted");
+}
+
+#[test]
+fn who_lets_a_request_go_unheard_is_gone_until_it_speaks_again() {
+    let mut cell = plugged_in();
+    cell.kill(GRIPPER);
+    cell.ask(BRIDGE, AskId(1), (start(), &[0, 0]), ms(10_000));
+    cell.run(ms(3_500));
+    let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
+    assert_eq!(answer.unwrap_err().kind, AskErrorKind::Unknown);
+    cell.run(ms(4_000));
+    assert_eq!(cell.gone(BRIDGE), [start()]);
+    // The next one is refused at once, and not after as long again.
+    cell.ask(BRIDGE, AskId(2), (start(), &[0, 0]), ms(10_000));
+    let (_, answer) = cell.answers(BRIDGE).pop().unwrap();
+    assert_eq!(answer.unwrap_err().kind, AskErrorKind::Refused);
+    cell.start(GRIPPER, component(7).at_port(7_777));
+    cell.offer(GRIPPER, start(), offered(true));
+    cell.run(ms(600));
+    assert_eq!(cell.known(BRIDGE), [start()]);
+}
