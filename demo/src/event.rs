@@ -46,9 +46,13 @@ pub(crate) enum SupervisorEvent {
     Awaits {
         names: Vec<Name>,
     },
-    /// It has written the switch of the conveyor.
+    /// All values are there, and the Method that switches the conveyor is not.
+    AwaitsSwitch,
+    /// It has called the switch of the conveyor, and Niryo Ned has answered. The stamp is of the call.
     Switched {
         on: bool,
+        /// From the call to its answer.
+        answered_after_ns: i64,
     },
     /// The server has a new value; the stamp is the server's.
     Saw {

@@ -1,4 +1,4 @@
-//! The names of the line's values: as ROS topics, the same in both ROS spaces, and as nodes of the OPC UA server.
+//! The names of the line's values and of its one call: in both ROS spaces, and as nodes of the OPC UA server.
 
 use serde::{Deserialize, Serialize};
 
@@ -6,8 +6,6 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "PascalCase")]
 pub(crate) enum Name {
-    /// Boolean, written by a supervisor.
-    ConveyorSwitch,
     /// Boolean, from Niryo Ned.
     ConveyorRunning,
     /// UInt32, from Niryo Ned.
@@ -23,8 +21,7 @@ pub(crate) enum Name {
 }
 
 impl Name {
-    pub(crate) const ALL: [Self; 7] = [
-        Self::ConveyorSwitch,
+    pub(crate) const ALL: [Self; 6] = [
         Self::ConveyorRunning,
         Self::CoversInStorage,
         Self::CoversOnConveyor,
@@ -36,7 +33,6 @@ impl Name {
     /// The ROS topic, without the leading slash.
     pub(crate) const fn ros_topic(self) -> &'static str {
         match self {
-            Self::ConveyorSwitch => "conveyor/switch",
             Self::ConveyorRunning => "conveyor/running",
             Self::CoversInStorage => "storage/covers",
             Self::CoversOnConveyor => "conveyor/covers",
@@ -49,7 +45,6 @@ impl Name {
     /// The numeric identifier of the node in namespace [`NAMESPACE`].
     pub(crate) const fn node(self) -> u32 {
         match self {
-            Self::ConveyorSwitch => 1,
             Self::ConveyorRunning => 10,
             Self::CoversInStorage => 11,
             Self::CoversOnConveyor => 12,
@@ -62,7 +57,6 @@ impl Name {
     /// The program that produces the value.
     pub(crate) const fn producer(self) -> &'static str {
         match self {
-            Self::ConveyorSwitch => "the supervisor",
             Self::ConveyorRunning
             | Self::CoversInStorage
             | Self::CoversOnConveyor
@@ -78,6 +72,11 @@ impl std::fmt::Display for Name {
     }
 }
 
+/// The call that switches the conveyor: a service (std_srvs/SetBool) of Niryo Ned, without the leading slash, and a
+/// Method of the OPC UA server.
+pub(crate) const SWITCH: &str = "conveyor/switch";
+/// The numeric identifier of that Method in namespace [`NAMESPACE`].
+pub(crate) const SWITCH_NODE: u32 = 61;
 /// Where the OPC UA server has the values.
 pub(crate) const NAMESPACE: &str = "urn:ua-bridge:assembly-line";
 /// Where the OPC UA server listens.
@@ -89,7 +88,7 @@ pub(crate) const DOMAIN: u16 = 2;
 mod tests {
     use std::collections::BTreeMap;
 
-    use mappings::{Identifier, Mapping, SpaceId};
+    use mappings::{CallTarget, ExecutedBy, Identifier, Mapping, SpaceId};
 
     use super::*;
 
@@ -123,11 +122,20 @@ mod tests {
                 assert_eq!(binding.ros_topic, format!("/{}", name.ros_topic()));
             }
             let producer = match variable.topic.triple().0 {
-                0 => "the supervisor",
                 1 => "Niryo Ned",
                 _ => "TurtleBot3",
             };
             assert_eq!(name.producer(), producer, "{name}");
         }
+        let [call] = mapping.calls() else {
+            panic!("{:?}", mapping.calls());
+        };
+        assert_eq!(call.node.namespace, 2);
+        assert_eq!(call.node.identifier, Identifier::Numeric(SWITCH_NODE));
+        let service = CallTarget {
+            name: format!("/{SWITCH}"),
+            type_name: "std_srvs/SetBool".parse().unwrap(),
+        };
+        assert_eq!(call.executed, ExecutedBy::Ros(service));
     }
 }

@@ -1,4 +1,5 @@
-//! The supervisor: an OPC UA client that works the switch of the conveyor and watches all values.
+//! The supervisor: an OPC UA client that calls the switch of the conveyor, a service of Niryo Ned, and watches all
+//! values.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -7,19 +8,19 @@ use std::time::Duration;
 use anyhow::{Context as _, anyhow, bail};
 use opcua::client::{ClientBuilder, DataChangeCallback, IdentityToken, MonitoredItem, Session};
 use opcua::types::{
-    DataValue, Identifier, MessageSecurityMode, MonitoredItemCreateRequest, MonitoringMode,
-    MonitoringParameters, NodeId, StatusCode, TimestampsToReturn, UserTokenPolicy, Variant,
-    WriteValue,
+    BrowseDescription, BrowseDirection, CallMethodResult, DataValue, Identifier,
+    MessageSecurityMode, MonitoredItemCreateRequest, MonitoringMode, MonitoringParameters, NodeId,
+    ReferenceTypeId, StatusCode, TimestampsToReturn, UserTokenPolicy, Variant,
 };
 use tokio::sync::mpsc;
 use tokio::time::{Instant, sleep, sleep_until, timeout};
 
 use crate::clock::wall_nanos;
 use crate::event::{SupervisorEvent, Value, tell, tell_at};
-use crate::line::{ENDPOINT, NAMESPACE, Name};
+use crate::line::{ENDPOINT, NAMESPACE, Name, SWITCH_NODE};
 use crate::stop::Stop;
 
-/// Starts the line when all its values are at the server, switches the conveyor off after `off_after`, and watches
+/// Starts the line when all its values and its switch are at the server, switches the conveyor off after `off_after`, and watches
 /// until it is told to end.
 pub(crate) async fn run(off_after: Duration, pki: PathBuf) -> anyhow::Result<()> {
     let mut stop = Stop::new()?;
@@ -40,9 +41,10 @@ async fn supervise(off_after: Duration, pki: PathBuf) -> anyhow::Result<()> {
         let (name, value) = values.recv().await.ok_or_else(subscription_ended)?;
         watch.see(name, &value)?;
     }
+    let switch = Switch::find(&session, namespace).await?;
     let off_at = Instant::now() + off_after;
     if !off_after.is_zero() {
-        switch(&session, namespace, true).await?;
+        switch.turn(&session, true).await?;
     }
     let mut switched_off = false;
     loop {
@@ -52,7 +54,7 @@ async fn supervise(off_after: Duration, pki: PathBuf) -> anyhow::Result<()> {
                 watch.see(name, &value)?;
             }
             () = sleep_until(off_at), if !switched_off => {
-                switch(&session, namespace, false).await?;
+                switch.turn(&session, false).await?;
                 switched_off = true;
             }
         }
@@ -163,31 +165,89 @@ fn is(node: &NodeId, name: Name) -> bool {
     matches!(&node.identifier, Identifier::Numeric(number) if *number == name.node())
 }
 
-/// Writes the switch; retries, because a write is what the whole story hangs on.
-async fn switch(session: &Session, namespace: u16, on: bool) -> anyhow::Result<()> {
-    let value = DataValue::value_only(Variant::Boolean(on));
-    let node = NodeId::new(namespace, Name::ConveyorSwitch.node());
-    let mut write = WriteValue::value_attr(node, Variant::Boolean(on));
-    write.value = value;
-    let mut problem = String::new();
-    for _ in 0..WRITE_ATTEMPTS {
-        let stamp = wall_nanos();
-        match session.write(std::slice::from_ref(&write)).await {
-            Ok(results) if results.iter().all(StatusCode::is_good) && !results.is_empty() => {
-                tell_at(stamp, SupervisorEvent::Switched { on })?;
-                return Ok(());
+/// The Method that switches the conveyor, and the object it is of.
+struct Switch {
+    object: NodeId,
+    method: NodeId,
+}
+
+impl Switch {
+    /// Waits until the server has the Method, which it has as long as Niryo Ned's service is there.
+    async fn find(session: &Session, namespace: u16) -> anyhow::Result<Self> {
+        let method = NodeId::new(namespace, SWITCH_NODE);
+        let mut told = false;
+        loop {
+            if let Some(object) = object_of(session, &method).await? {
+                return Ok(Self { object, method });
             }
-            Ok(results) => {
-                problem = results
-                    .first()
-                    .map_or_else(String::new, ToString::to_string)
+            if !told {
+                tell(SupervisorEvent::AwaitsSwitch)?;
+                told = true;
             }
-            Err(error) => problem = error.to_string(),
+            sleep(LOOK_AGAIN).await;
         }
-        tracing::warn!(problem, "the switch was not written");
-        sleep(Duration::from_millis(200)).await;
     }
-    Err(anyhow!("{problem}")).context("the OPC UA server does not take the switch of the conveyor")
+
+    /// Switches the conveyor. A call that came to nothing is made anew, as the whole story hangs on it; also one of which
+    /// nobody knows whether it was executed, since to be told twice changes nothing.
+    async fn turn(&self, session: &Session, on: bool) -> anyhow::Result<()> {
+        let mut problem = String::new();
+        for _ in 0..CALL_ATTEMPTS {
+            let stamp = wall_nanos();
+            let arguments = Some(vec![Variant::Boolean(on)]);
+            let request = (self.object.clone(), self.method.clone(), arguments);
+            match session.call_one(request).await {
+                Ok(result) if result.status_code.is_good() => {
+                    follow(&result, on)?;
+                    let answered_after_ns = wall_nanos() - stamp;
+                    tell_at(
+                        stamp,
+                        SupervisorEvent::Switched {
+                            on,
+                            answered_after_ns,
+                        },
+                    )?;
+                    return Ok(());
+                }
+                Ok(result) => problem = result.status_code.to_string(),
+                Err(error) => problem = error.to_string(),
+            }
+            tracing::warn!(problem, "the conveyor was not switched");
+            sleep(LOOK_AGAIN).await;
+        }
+        Err(anyhow!("{problem}")).context("Conveyor.Switch of the OPC UA server was not executed")
+    }
+}
+
+/// Whether the response of std_srvs/SetBool says that it was done.
+fn follow(result: &CallMethodResult, on: bool) -> anyhow::Result<()> {
+    match result.output_arguments.as_deref() {
+        Some([Variant::Boolean(true), _]) => Ok(()),
+        Some([Variant::Boolean(false), Variant::String(message)]) => {
+            bail!("Niryo Ned does not switch the conveyor to {on}: {message}")
+        }
+        answer => bail!("Conveyor.Switch answers {answer:?}, no Boolean and text"),
+    }
+}
+
+/// The object that has a Method as its component; nothing where there is no such Method.
+async fn object_of(session: &Session, method: &NodeId) -> anyhow::Result<Option<NodeId>> {
+    let description = BrowseDescription {
+        node_id: method.clone(),
+        browse_direction: BrowseDirection::Inverse,
+        reference_type_id: ReferenceTypeId::HasComponent.into(),
+        include_subtypes: true,
+        node_class_mask: 0,
+        result_mask: 0,
+    };
+    let results = session
+        .browse(&[description], 1, None)
+        .await
+        .map_err(|error| anyhow!("the OPC UA server does not say what it has: {error}"))?;
+    let references = results.into_iter().next();
+    let references = references.and_then(|result| result.references);
+    let object = references.and_then(|references| references.into_iter().next());
+    Ok(object.map(|reference| reference.node_id.node_id))
 }
 
 /// The last value seen of each variable.
@@ -208,10 +268,8 @@ impl Watch {
     }
 
     fn missing(&self) -> Vec<Name> {
-        let needed = Name::ALL
+        Name::ALL
             .into_iter()
-            .filter(|name| *name != Name::ConveyorSwitch);
-        needed
             .filter(|name| !self.last.contains_key(name))
             .collect()
     }
@@ -254,8 +312,11 @@ fn server_time(data: &DataValue) -> Option<i64> {
 const UNIX_EPOCH_TICKS: i64 = 116_444_736_000_000_000;
 const PUBLISHING_INTERVAL: Duration = Duration::from_millis(10);
 const CONNECT_LIMIT: Duration = Duration::from_secs(60);
-const REQUEST_LIMIT: Duration = Duration::from_secs(5);
-const WRITE_ATTEMPTS: u32 = 10;
+/// More than the mapping's `timeout` of the call, after which the server answers.
+const REQUEST_LIMIT: Duration = Duration::from_secs(8);
+const CALL_ATTEMPTS: u32 = 10;
+/// Between two looks or calls.
+const LOOK_AGAIN: Duration = Duration::from_millis(200);
 
 #[cfg(test)]
 mod tests {
@@ -273,14 +334,25 @@ mod tests {
     }
 
     #[test]
-    fn the_line_starts_when_all_values_but_the_switch_are_there() {
+    fn the_line_starts_when_all_values_are_there() {
         let mut watch = Watch::new();
         for name in Name::ALL {
-            assert_eq!(watch.complete(), watch.last.len() == 6, "{name}");
-            if name != Name::ConveyorSwitch {
-                watch.last.insert(name, Value::Number(0));
-            }
+            assert!(!watch.complete(), "{name}");
+            watch.last.insert(name, Value::Number(0));
         }
         assert!(watch.complete());
+    }
+
+    #[test]
+    fn an_answer_that_says_no_is_told_with_its_reason() {
+        let answer = |arguments| CallMethodResult {
+            output_arguments: arguments,
+            ..CallMethodResult::default()
+        };
+        let said = |yes: bool| Some(vec![Variant::Boolean(yes), Variant::from("jammed")]);
+        assert!(follow(&answer(said(true)), true).is_ok());
+        let refused = follow(&answer(said(false)), true).unwrap_err();
+        assert!(refused.to_string().contains("jammed"), "{refused}");
+        assert!(follow(&answer(None), true).is_err());
     }
 }

@@ -69,12 +69,6 @@ fn the_assembly_line_names_each_value_on_both_sides() {
     assert_eq!(mapping.space_of_domain(2), Some(two));
     let expected = [
         (
-            "ua_0_2_1",
-            "ConveyorSwitch",
-            BuiltinType::Boolean,
-            "/conveyor/switch",
-        ),
-        (
             "ua_1_2_10",
             "ConveyorRunning",
             BuiltinType::Boolean,
@@ -124,7 +118,7 @@ fn the_assembly_line_names_each_value_on_both_sides() {
             assert_eq!(binding.selection, Selection::Field("data".to_owned()));
         }
     }
-    assert_eq!(mapping.bindings(SpaceId::ROS1).count(), 7);
+    assert_eq!(mapping.bindings(SpaceId::ROS1).count(), 6);
 }
 
 #[test]

@@ -40,9 +40,15 @@ def take(topic, kind):
     return rospy.Subscriber(topic, ros1_messages.message_class(kind), heard, queue_size=None)
 
 
+def switch(request):
+    lifetime.say(heard="/conveyor/switch", value=request.data)
+    return SetBoolResponse(True, "runs" if request.data else "stands still")
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--more", action="store_true")
+    parser.add_argument("--switch", action="store_true", help="the conveyor is switched by a service")
     parser.add_argument("--limit", type=float, default=120.0)
     args = parser.parse_args()
     lifetime.limit(args.limit)
@@ -58,6 +64,8 @@ def main():
         topic, name, text = OWN
         kept.append(rospy.Publisher(topic, genpy.dynamic.generate_dynamic(name, text)[name], queue_size=1))
         kept.append(rospy.Service("/conveyor/start", SetBool, lambda _: SetBoolResponse(True, "")))
+    if args.switch:
+        kept.append(rospy.Service("/conveyor/switch", SetBool, switch))
     lifetime.say(ready="assembly line")
     rate = rospy.Rate(10)
     while not rospy.is_shutdown():

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Peer, UaSide, eventually};
+use system_tests::{Cell, Child, Peer, SERVER_ENDPOINT, UaSide};
 use uadp::{Scalar, Variant};
 
 const SOON: Duration = Duration::from_secs(30);
@@ -27,7 +27,7 @@ fn every_value_of_the_assembly_line_reaches_all_sides() {
     };
     let _master = cell.roscore();
     let mut side = UaSide::join();
-    let mut niryo = cell.rospy("assembly_line_ros1.py", &[]);
+    let mut niryo = cell.rospy("assembly_line_ros1.py", &["--switch"]);
     let mut turtlebot = cell.cyclone("assembly_line_ros2.py", &[]);
     let mapping = shipped("assembly-line.yaml");
     let _bridges = (
@@ -50,15 +50,33 @@ fn every_value_of_the_assembly_line_reaches_all_sides() {
     }
     hears(&mut niryo, "/park/busy", json!(true));
     hears(&mut niryo, "/bucket/busy", json!(false));
-    // What an OPC UA client writes reaches both robots.
-    for robot in [&niryo, &turtlebot] {
-        eventually("the switch is heard", SOON, || {
-            side.write((0, 2, 1), Scalar::Boolean(true));
-            let told = robot.json_lines();
-            let switch = told.iter().find(|line| line["heard"] == "/conveyor/switch");
-            switch.map(|line| assert_eq!(line["value"], true))
-        });
-    }
+    // What an OPC UA client calls, and a node of ROS 2, the robot executes.
+    let _server = cell.ua_server(&[&mapping]);
+    let args = [SERVER_ENDPOINT, "UaSpace/Calls/Conveyor/Switch"];
+    let args = [&args[..], &["--value", "[true]"]].concat();
+    let told = cell.asyncua_once("opcua_call.py", &args);
+    assert_eq!(told[0]["node"], "ns=2;i=61");
+    let answer = (&told[1]["status"], &told[1]["value"]);
+    assert_eq!(answer, (&json!("Good"), &json!([true, "runs"])));
+    hears(&mut niryo, "/conveyor/switch", json!(true));
+    let args = ["call", "/conveyor/switch", "std_srvs/SetBool"];
+    let args = [
+        &args[..],
+        &[
+            "--domain",
+            "2",
+            "--wait",
+            "30",
+            "--value",
+            r#"{"data": false}"#,
+        ],
+    ]
+    .concat();
+    let mut worker = cell.cyclone("ros2_service.py", &args);
+    worker.wait_for_json("the conveyor stands still", SOON, |line| {
+        (line["value"]["message"] == "stands still").then_some(())
+    });
+    hears(&mut niryo, "/conveyor/switch", json!(false));
 }
 
 #[test]

@@ -8,18 +8,18 @@ use crate::stage::Who;
 /// Whose event it is and what to say of it, unless it is not for people.
 pub(crate) fn describe(event: &Event) -> Option<(Who, String)> {
     match event {
-        Event::Master(_) | Event::Supervisor(SupervisorEvent::Awaits { .. }) | Event::Node(_) => {
-            None
-        }
+        Event::Master(_)
+        | Event::Supervisor(SupervisorEvent::Awaits { .. } | SupervisorEvent::AwaitsSwitch)
+        | Event::Node(_) => None,
         Event::Niryo(event) => Some((NIRYO, niryo(*event))),
         Event::Turtlebot(event) => Some((TURTLEBOT, turtlebot(*event))),
         Event::Supervisor(SupervisorEvent::Connected) => Some((
             SUPERVISOR,
             "has a session with the OPC UA server".to_owned(),
         )),
-        Event::Supervisor(SupervisorEvent::Switched { on }) => {
+        Event::Supervisor(SupervisorEvent::Switched { on, .. }) => {
             let state = if *on { "on" } else { "off" };
-            Some((SUPERVISOR, format!("switches the conveyor {state}")))
+            Some((SUPERVISOR, format!("calls Conveyor.Switch: {state}")))
         }
         Event::Supervisor(SupervisorEvent::Saw { name, value }) => {
             Some((SERVER, format!("{name} = {value}")))

@@ -47,6 +47,8 @@ pub(crate) struct Report {
     conveyor_off_at_s: Option<f64>,
     finished: bool,
     hops: Hops,
+    /// Of each call of the switch, from the client's call to its answer.
+    switch_answered_us: Vec<f64>,
     /// `null` when the conveyor was not running when it was switched off, or was not switched off.
     server_saw_conveyor_off_after_us: Option<f64>,
 }
@@ -61,6 +63,12 @@ impl Report {
             conveyor_off_at_s: story.conveyor_off_at().map(|s| (s * 1e3).round() / 1e3),
             finished: story.finished(),
             hops,
+            switch_answered_us: story
+                .switch_answered_after()
+                .iter()
+                .copied()
+                .map(micros)
+                .collect(),
             server_saw_conveyor_off_after_us: story.server_saw_off_after().map(micros),
         }
     }
@@ -76,6 +84,11 @@ impl Report {
             ("tPB1, in the ROS 1 bridge", self.hops.pb1, "2 s"),
             ("tTR0, PubSub network", self.hops.tr0, "-"),
             ("tPB2, in the ROS 2 bridge", self.hops.pb2, "-"),
+            (
+                "Conveyor.Switch called to answered",
+                Hop::of(story.switch_answered_after()),
+                "-",
+            ),
             (
                 "conveyor off at Niryo Ned to server",
                 Hop::of(&saw_off),
@@ -183,7 +196,7 @@ mod tests {
         };
         assert_eq!(
             serde_json::to_string(&Report::of(&story, hops)).unwrap(),
-            r#"{"covers":4,"delivered":0,"by_conveyor":0,"by_turtlebot":0,"conveyor_off_at_s":null,"finished":false,"hops":{"tPB1":{"p50_us":41.0,"p99_us":99.5,"max_us":120.0,"count":7},"tTR0":null,"tPB2":null},"server_saw_conveyor_off_after_us":null}"#
+            r#"{"covers":4,"delivered":0,"by_conveyor":0,"by_turtlebot":0,"conveyor_off_at_s":null,"finished":false,"hops":{"tPB1":{"p50_us":41.0,"p99_us":99.5,"max_us":120.0,"count":7},"tTR0":null,"tPB2":null},"switch_answered_us":[],"server_saw_conveyor_off_after_us":null}"#
         );
     }
 

@@ -23,6 +23,9 @@ pub(crate) struct Story {
     unloaded: u32,
     server: BTreeMap<Name, Vec<(i64, Value)>>,
     awaited: Vec<Name>,
+    awaits_switch: bool,
+    /// Nanoseconds from each call of the switch to its answer.
+    switch_answered: Vec<i64>,
     connected: bool,
     arm: &'static str,
     turtlebot: &'static str,
@@ -42,8 +45,10 @@ impl Story {
             unloaded: 0,
             server: BTreeMap::new(),
             awaited: Vec::new(),
+            awaits_switch: false,
+            switch_answered: Vec::new(),
             connected: false,
-            arm: "has not heard the switch of its conveyor",
+            arm: "has not been told whether its conveyor is to run",
             turtlebot: "stands at the park",
         }
     }
@@ -56,8 +61,13 @@ impl Story {
             Event::Turtlebot(event) => self.observe_turtlebot(*event, at),
             Event::Supervisor(SupervisorEvent::Connected) => self.connected = true,
             Event::Supervisor(SupervisorEvent::Awaits { names }) => self.awaited.clone_from(names),
-            Event::Supervisor(SupervisorEvent::Switched { on }) => {
+            Event::Supervisor(SupervisorEvent::AwaitsSwitch) => self.awaits_switch = true,
+            Event::Supervisor(SupervisorEvent::Switched {
+                on,
+                answered_after_ns,
+            }) => {
                 self.began_at.get_or_insert(at);
+                self.switch_answered.push(*answered_after_ns);
                 if !on {
                     self.switched_off_at.get_or_insert(at);
                 }
@@ -158,6 +168,11 @@ impl Story {
         values.iter().find(off).map(|(at, _)| at - stopped)
     }
 
+    /// Nanoseconds from each call of the switch to its answer.
+    pub(crate) fn switch_answered_after(&self) -> &[i64] {
+        &self.switch_answered
+    }
+
     /// Nanoseconds from each cover placed to the count at the server.
     pub(crate) fn place_to_counter(&self) -> Vec<i64> {
         [
@@ -191,6 +206,9 @@ impl Story {
     pub(crate) fn standing(&self) -> String {
         if !self.connected {
             return "no OPC UA session with the server".to_owned();
+        }
+        if !self.began() && self.awaits_switch {
+            return "the server has no Method Conveyor.Switch (a service of Niryo Ned)".to_owned();
         }
         if !self.began() {
             let missing: Vec<String> = self
@@ -241,6 +259,15 @@ mod tests {
         SupervisorEvent::Saw { name, value }.into()
     }
 
+    fn switched(on: bool) -> Event {
+        let answered_after_ns = 7;
+        SupervisorEvent::Switched {
+            on,
+            answered_after_ns,
+        }
+        .into()
+    }
+
     #[test]
     fn a_cover_on_turtlebot3_has_not_arrived_before_it_is_unloaded() {
         let mut events = vec![
@@ -277,12 +304,9 @@ mod tests {
     fn the_conveyor_standing_still_at_first_is_not_the_stop() {
         let story = told(&[
             (10, saw(Name::ConveyorRunning, Value::Boolean(false))),
-            (20, SupervisorEvent::Switched { on: true }.into()),
+            (20, switched(true)),
             (30, saw(Name::ConveyorRunning, Value::Boolean(true))),
-            (
-                25_000_000_020,
-                SupervisorEvent::Switched { on: false }.into(),
-            ),
+            (25_000_000_020, switched(false)),
             (
                 25_000_000_100,
                 NiryoEvent::ConveyorStopped {
@@ -297,6 +321,7 @@ mod tests {
         ]);
         assert_eq!(story.server_saw_off_after(), Some(300));
         assert_eq!(story.conveyor_off_at(), Some(25.0));
+        assert_eq!(story.switch_answered_after(), [7, 7]);
     }
 
     #[test]
@@ -312,6 +337,14 @@ mod tests {
         assert_eq!(
             story.standing(),
             "the server has no value of ParkBusy (from TurtleBot3)"
+        );
+        let story = told(&[
+            (1, SupervisorEvent::Connected.into()),
+            (2, SupervisorEvent::AwaitsSwitch.into()),
+        ]);
+        assert_eq!(
+            story.standing(),
+            "the server has no Method Conveyor.Switch (a service of Niryo Ned)"
         );
     }
 }

@@ -5,16 +5,17 @@ use std::io;
 use anyhow::Context as _;
 use bytes::Bytes;
 use tcpros::{
-    Inbox, InboxEvent, Node, NodeOptions, Publisher, PublisherOptions, SubscriberOptions,
-    Subscription, TopicType, Wanted,
+    Inbox, InboxEvent, Node, NodeOptions, Publisher, PublisherOptions, ServiceOptions,
+    ServiceServer, ServiceType, SubscriberOptions, Subscription, TopicType, Wanted,
 };
+use tokio::sync::{mpsc, oneshot};
 use tokio::time::{Instant, interval, sleep_until};
 
 use super::niryo::{Counts, Heard, Niryo, NiryoEvent};
 use super::{REPEAT, far_away};
 use crate::clock::wall_nanos;
 use crate::event::tell_at;
-use crate::line::Name;
+use crate::line::{Name, SWITCH};
 use crate::pace::{Pace, Speed};
 use crate::stop::Stop;
 
@@ -25,6 +26,8 @@ pub(crate) async fn run(covers: u32, speed: Speed) -> anyhow::Result<()> {
     let outputs = Outputs::advertise(&node)?;
     let mut inbox = Inbox::new();
     let _subscriptions = subscribe(&node, &inbox)?;
+    let (sender, mut orders) = mpsc::channel(MOST_ORDERS);
+    let _switch = serve_switch(&node, sender)?;
     let started = Instant::now();
     let mut niryo = Niryo::new(covers, Pace::at(speed));
     let mut repeat = interval(REPEAT);
@@ -32,7 +35,12 @@ pub(crate) async fn run(covers: u32, speed: Speed) -> anyhow::Result<()> {
         let wake = niryo
             .timeout()
             .map_or_else(|| far_away(started), |at| started + at);
+        let mut done = None;
         let heard = tokio::select! {
+            Some(order) = orders.recv() => {
+                done = Some(order.done);
+                Some(Heard::Switch(order.on))
+            }
             (name, event) = inbox.recv() => heard(name, &event),
             () = sleep_until(wake) => Some(Heard::Nothing),
             _ = repeat.tick() => { outputs.publish(niryo.counts()); None }
@@ -45,6 +53,10 @@ pub(crate) async fn run(covers: u32, speed: Speed) -> anyhow::Result<()> {
         let stamp = wall_nanos();
         if niryo.counts() != before {
             outputs.publish(niryo.counts());
+        }
+        if let Some(done) = done {
+            // Who asked may have given up.
+            done.send(()).ok();
         }
         tell(stamp, &events).context("the demo does not listen any more")?;
     }
@@ -65,7 +77,6 @@ fn heard(name: Name, event: &InboxEvent) -> Option<Heard> {
         return None;
     };
     match name {
-        Name::ConveyorSwitch => Some(Heard::Switch(value)),
         Name::ParkBusy => Some(Heard::Park(value)),
         Name::BucketBusy => Some(Heard::Bucket(value)),
         Name::ConveyorRunning
@@ -87,7 +98,7 @@ fn subscribe(node: &Node, inbox: &Inbox<Name>) -> anyhow::Result<Vec<Subscriptio
         type_name: Some(BOOL.0.to_owned()),
         md5sum: Some(BOOL.1.to_owned()),
     };
-    [Name::ConveyorSwitch, Name::ParkBusy, Name::BucketBusy]
+    [Name::ParkBusy, Name::BucketBusy]
         .into_iter()
         .map(|name| {
             let topic = format!("/{}", name.ros_topic());
@@ -95,6 +106,49 @@ fn subscribe(node: &Node, inbox: &Inbox<Name>) -> anyhow::Result<Vec<Subscriptio
             Ok(node.subscribe(&topic, wanted.clone(), options, name, inbox)?)
         })
         .collect()
+}
+
+/// What the switch of the conveyor is told.
+struct Order {
+    on: bool,
+    /// Told when the conveyor has followed.
+    done: oneshot::Sender<()>,
+}
+
+/// Offers the switch of the conveyor: a service that answers when the conveyor has followed.
+fn serve_switch(node: &Node, orders: mpsc::Sender<Order>) -> anyhow::Result<ServiceServer> {
+    let service_type = ServiceType {
+        name: SET_BOOL.0.to_owned(),
+        md5sum: SET_BOOL.1.to_owned(),
+        request_type: format!("{}Request", SET_BOOL.0),
+        response_type: format!("{}Response", SET_BOOL.0),
+    };
+    let serve = move |request: tcpros::ServiceRequest| {
+        let orders = orders.clone();
+        async move {
+            let on = read_bool(&request.bytes).ok_or("the request is no std_srvs/SetBool")?;
+            let (done, followed) = oneshot::channel();
+            orders
+                .try_send(Order { on, done })
+                .map_err(|_| "too many want to switch the conveyor")?;
+            followed.await.map_err(|_| "the arm is being ended")?;
+            let message = if on {
+                "the conveyor runs"
+            } else {
+                "the conveyor stands still"
+            };
+            Ok(set_bool_response(message))
+        }
+    };
+    let options = ServiceOptions::default();
+    Ok(node.advertise_service(&format!("/{SWITCH}"), service_type, options, serve)?)
+}
+
+/// A response of std_srvs/SetBool that says yes: the Boolean, then the text with its length before it.
+fn set_bool_response(message: &str) -> Bytes {
+    let length = u32::try_from(message.len()).unwrap_or_default();
+    let parts: [&[u8]; 3] = [&[1], &length.to_le_bytes(), message.as_bytes()];
+    Bytes::from(parts.concat())
 }
 
 /// The latched topics of the arm.
@@ -156,6 +210,11 @@ const UINT32: (&str, &str, &str) = (
     "uint32 data\n",
 );
 
+/// Type name and checksum of the service that switches the conveyor.
+const SET_BOOL: (&str, &str) = ("std_srvs/SetBool", "09fb03525b03e7ea1fd3992bafd87e16");
+/// Calls of the switch that wait for the arm to come to them.
+const MOST_ORDERS: usize = 16;
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -166,5 +225,10 @@ mod tests {
         assert_eq!(read_bool(&[0]), Some(false));
         assert_eq!(read_bool(&[]), None);
         assert_eq!(read_bool(&[1, 0, 0, 0]), None);
+    }
+
+    #[test]
+    fn the_response_is_that_of_the_type() {
+        assert_eq!(&set_bool_response("on")[..], b"\x01\x02\0\0\0on");
     }
 }
