@@ -121,4 +121,44 @@ class Messages(Empty):
         return [(one.id, one.label) for one in response.available_states] == [(0, "one"), (1, ""), (2, "drei")]
 
 
-CASES = {"bundled": Bundled, "files": Files, "empty": Empty, "megabyte": Big, "messages": Messages}
+class Switch(Bundled):
+    """std_srvs/SetBool of whoever answers with what was asked."""
+
+    @staticmethod
+    def right(response, number):
+        return response.success == (number % 2 == 1)
+
+
+class Skill(Empty):
+    """A Method of a component's skill, which says whether it was done."""
+
+    @staticmethod
+    def right(response, number):
+        return response.success is True
+
+
+class Loggers(Empty):
+    """What every node of roscpp has: `~get_loggers`."""
+
+    type = "roscpp/GetLoggers"
+
+    @staticmethod
+    def right(response, number):
+        return any(one.name == "ros" for one in response.loggers)
+
+
+class Level(Empty):
+    """What every node of roscpp has: `~set_logger_level`."""
+
+    type = "roscpp/SetLoggerLevel"
+
+    @staticmethod
+    def ask(request, number):
+        request.logger, request.level = "ros", "warn"
+
+    @staticmethod
+    def right(response, number):
+        return True
+
+
+CASES = {"bundled": Bundled, "files": Files, "empty": Empty, "megabyte": Big, "messages": Messages, "switch": Switch, "skill": Skill, "loggers": Loggers, "level": Level}

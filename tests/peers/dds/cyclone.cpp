@@ -4,6 +4,9 @@
 #include <atomic>
 #include <cstdio>
 #include <map>
+#include <sstream>
+#include <string>
+#include <thread>
 #include <vector>
 
 #include <dds/dds.h>
@@ -232,6 +235,22 @@ void must_write(dds_entity_t writer, const void* sample) {
     }
 }
 
+// Wakes when a sample comes to a reader.
+class Waiting {
+public:
+    Waiting(CycloneParticipant& participant, dds_entity_t reader)
+        : set_(made(dds_create_waitset(participant.entity()), "waitset")) {
+        const dds_entity_t condition = made(dds_create_readcondition(reader, DDS_ANY_STATE), "condition");
+        made(dds_waitset_attach(set_, condition, 0), "attachment");
+    }
+
+    // Until a sample is there, or for so long.
+    void wait(std::chrono::milliseconds time) const { dds_waitset_wait(set_, nullptr, 0, DDS_MSECS(time.count())); }
+
+private:
+    dds_entity_t set_;
+};
+
 Ends set_bool(CycloneParticipant& participant, const std::string& name, bool serves) {
     return ends(participant, name, std_srvs_srv_dds__SetBool_Request__desc, std_srvs_srv_dds__SetBool_Response__desc,
         serves);
@@ -243,15 +262,71 @@ void serve(const Arguments& arguments) {
     std::string text = arguments.text("text", "served");
     CycloneParticipant participant(arguments);
     const Ends own = set_bool(participant, name, true);
+    const bool quiet = arguments.has("quiet");
+    const Waiting waiting(participant, own.reader);
     Line().field("ready", name);
-    poll([&] {
+    while (!Lifetime::told()) {
+        waiting.wait(std::chrono::milliseconds(50));
         take_all<Request>(own.reader, [&](const Request& request) {
             const Reply reply{request.client, request.count, request.data, text.data()};
             const bool taken = dds_write(own.writer, &reply) == DDS_RETCODE_OK;
-            Line().field("request", request.data).field("replied", taken);
+            if (!quiet) {
+                Line().field("request", request.data).field("replied", taken);
+            }
         });
-        return false;
-    });
+    }
+}
+
+// A client of std_srvs/SetBool that is measured: each line, COUNT WINDOW, asks so often, with so many not answered at a time.
+void calls(const Arguments& arguments) {
+    using Clock = std::chrono::steady_clock;
+    const std::string name = arguments.position(1, "a service");
+    const auto patience = std::chrono::milliseconds(static_cast<int64_t>(1000 * arguments.number("patience", 5)));
+    CycloneParticipant participant(arguments);
+    const Ends own = set_bool(participant, name, false);
+    const Waiting waiting(participant, own.reader);
+    dds_instance_handle_t client = 0;
+    dds_get_instance_handle(own.writer, &client);
+    Line().field("ready", name);
+    while (!own.matched()) {
+        std::this_thread::sleep_for(std::chrono::milliseconds(2));
+    }
+    Line().field("matched", name);
+    int64_t seq = 0;
+    while (const auto order = Lifetime::line()) {
+        std::istringstream words(*order);
+        int64_t count = 0;
+        size_t window = 1;
+        words >> count >> window;
+        std::map<int64_t, Clock::time_point> open;
+        std::string took;
+        int64_t asked = 0;
+        int64_t answered = 0;
+        const auto start = Clock::now();
+        auto last = start;
+        while (answered < count && Clock::now() - last < patience) {
+            while (asked < count && open.size() < window) {
+                const Request request{client, ++seq, true};
+                open[seq] = Clock::now();
+                must_write(own.writer, &request);
+                ++asked;
+            }
+            waiting.wait(std::chrono::milliseconds(50));
+            take_all<Reply>(own.reader, [&](const Reply& reply) {
+                const auto found = open.find(reply.count);
+                if (reply.client != client || found == open.end()) {
+                    return;
+                }
+                last = Clock::now();
+                const auto ns = std::chrono::duration_cast<std::chrono::nanoseconds>(last - found->second).count();
+                took += (took.empty() ? "" : ",") + std::to_string(ns);
+                open.erase(found);
+                ++answered;
+            });
+        }
+        const auto whole = std::chrono::duration<double>(last - start).count();
+        Line().field("lost", count - answered).field("seconds", whole).put("ns", "[" + took + "]");
+    }
 }
 
 // A client of std_srvs/SetBool that asks true --count times, one after the other.
@@ -402,6 +477,8 @@ int main(int count, char** words) {
         serve(arguments);
     } else if (command == "call") {
         call(arguments);
+    } else if (command == "calls") {
+        calls(arguments);
     } else if (command == "action-serve") {
         action_serve(arguments);
     } else if (command == "action-call") {

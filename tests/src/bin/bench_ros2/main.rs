@@ -4,6 +4,7 @@
 //! is compared takes turns, so that all of it sees the same machine.
 
 mod bursts;
+mod calls;
 mod ends;
 mod floods;
 mod idle;
@@ -44,7 +45,7 @@ fn main() -> ExitCode {
     if plan.has("many") {
         many::measure(&cell, plan.seconds);
     }
-    if ["through", "bursts", "floods"]
+    if ["through", "bursts", "floods", "calls"]
         .iter()
         .any(|part| plan.has(part))
     {
@@ -54,6 +55,9 @@ fn main() -> ExitCode {
         }
         if plan.has("bursts") {
             bursts::measure(&cell, plan.turns);
+        }
+        if plan.has("calls") {
+            calls::measure(&cell, plan.calls);
         }
         if plan.has("floods") {
             floods::measure(&cell, plan.turns.min(FLOODS));
@@ -75,6 +79,8 @@ struct Plan {
     seconds: u64,
     /// Of what happens a few times only.
     turns: u64,
+    /// Of a service, one at a time and many at a time.
+    calls: u64,
 }
 
 impl Plan {
@@ -87,6 +93,7 @@ impl Plan {
             turn: 50,
             seconds: 20,
             turns: 20,
+            calls: 2000,
         };
         let mut args = args.iter();
         while let Some(arg) = args.next() {
@@ -97,6 +104,7 @@ impl Plan {
                         messages: 500,
                         seconds: 2,
                         turns: 3,
+                        calls: 200,
                         ..plan
                     }
                 }
@@ -116,7 +124,7 @@ impl Plan {
 
 /// Each takes seconds.
 const FLOODS: u64 = 3;
-const PARTS: [&str; 8] = [
+const PARTS: [&str; 9] = [
     "round-trip",
     "throughput",
     "joining",
@@ -125,6 +133,7 @@ const PARTS: [&str; 8] = [
     "through",
     "bursts",
     "floods",
+    "calls",
 ];
 
 const HELP: &str = "\
@@ -133,5 +142,5 @@ bench-ros2 [--quick] [--seconds N] [--turn N] [PART..]
   --quick      a trial of a minute; its figures are no measurement
   --seconds N  how long each path gets messages at 1 kHz, 20 unless told
   --turn N     samples through one relay before the next has its turn, 50 unless told
-  PART         round-trip, throughput, joining, idle, many, through, bursts, floods; all unless told
+  PART         round-trip, throughput, joining, idle, many, through, bursts, floods, calls; all unless told
 ";
