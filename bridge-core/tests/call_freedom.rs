@@ -200,12 +200,12 @@ proptest! {
                 }
                 _ => {}
             }
-            for at in 0..spaces.len() {
+            for (at, life) in lives.iter().enumerate() {
                 for execution in cell.executions(at) {
                     prop_assert_eq!(execution.topic, call(at), "never anywhere else");
                     let id = u32::from_le_bytes(*execution.request.last_chunk().unwrap());
                     prop_assert_eq!(execution.requestor.map(|space| u16::from(space.get())), Some(spaces[wanted[&id].0]));
-                    executed.entry(id).or_default().push((at, lives[at]));
+                    executed.entry(id).or_default().push((at, *life));
                     cell.executed(at, execution.id, Executed::Answered(execution.request));
                 }
                 for (ask, answer) in cell.answers(at) {

@@ -262,6 +262,7 @@ fn forged(datagram: &[u8], id: (u16, u16, u16)) -> Option<Vec<u8>> {
             ..ActionHeader::new(ActionKind::Response)
         },
         request_id: request.request_id,
+        call: 0,
         state: ActionState::Done,
         status: Some(0),
         fields: ActionFields::Variants(&fields),

@@ -26,7 +26,7 @@ fn every_value_of_the_assembly_line_reaches_all_sides() {
         return;
     };
     let _master = cell.roscore();
-    let mut side = UaSide::join();
+    let side = UaSide::join();
     let mut niryo = cell.rospy("assembly_line_ros1.py", &["--switch"]);
     let mut turtlebot = cell.cyclone("assembly_line_ros2.py", &[]);
     let mapping = shipped("assembly-line.yaml");

@@ -591,10 +591,10 @@ impl Router {
             }
             let since = calls.since_start(now);
             let answer = calls.responder.poll_transmit(since);
-            let answer = answer.map(|((), answer)| (Of::of(&answer), encode(&answer, bytes)));
+            let answer = answer.map(|((), answer)| (Of::message(&answer), encode(&answer, bytes)));
             let next = answer.or_else(|| {
                 let request = calls.requestor.poll_transmit(since);
-                request.map(|request| (Of::of(&request), encode(&request, bytes)))
+                request.map(|request| (Of::message(&request), encode(&request, bytes)))
             });
             match next {
                 // What timed out meanwhile is told.

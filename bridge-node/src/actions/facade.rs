@@ -106,44 +106,58 @@ fn refusal(goals: &HashMap<GoalId, mpsc::Sender<Bytes>>, id: GoalId) -> Option<&
 }
 
 /// Sees one goal through to its end.
-async fn drive<N: NewGoal>(asks: Asks, new: N, mut feedback: mpsc::Receiver<Bytes>) {
+async fn drive<N: NewGoal>(asks: Asks, new: N, feedback: mpsc::Receiver<Bytes>) {
     let id = new.id();
-    let Some(request) = wire::join(asks.wire, id, new.body()) else {
-        new.reject("the goal does not read");
+    let Some(goal) = begin(&asks, id, new).await else {
         return;
-    };
-    if let Err(why) = send(&asks, id, request).await {
-        debug!(why, "a goal of another space was not accepted");
-        new.reject(&why);
-        return;
-    }
-    let goal = match new.accept().await {
-        Ok(goal) => goal,
-        Err(why) => {
-            debug!(why, "a goal that was accepted goes on without its client");
-            return;
-        }
     };
     goal.execute();
-    let mut end = Box::pin(wait(&asks, id));
     let End {
         status,
         message,
         result,
-    } = loop {
-        // What was reported before the end comes before it.
+    } = follow(&asks, id, &goal, feedback).await;
+    if let Err(why) = goal.end(status, &message, result.as_deref()) {
+        debug!(why, "the end of a goal cannot be told");
+    }
+}
+
+/// Has a goal accepted where it is executed, and then by the server here.
+async fn begin<N: NewGoal>(asks: &Asks, id: GoalId, new: N) -> Option<N::Goal> {
+    let Some(request) = wire::join(asks.wire, id, new.body()) else {
+        new.reject("the goal does not read");
+        return None;
+    };
+    if let Err(why) = send(asks, id, request).await {
+        debug!(why, "a goal of another space was not accepted");
+        new.reject(&why);
+        return None;
+    }
+    let accepted = new.accept().await;
+    accepted
+        .inspect_err(|why| debug!(why, "a goal that was accepted goes on without its client"))
+        .ok()
+}
+
+/// Hands feedback on until the goal has ended. What was reported before the end comes before it.
+async fn follow(
+    asks: &Asks,
+    id: GoalId,
+    goal: &impl ServedGoal,
+    mut feedback: mpsc::Receiver<Bytes>,
+) -> End {
+    let mut end = Box::pin(wait(asks, id));
+    let end = loop {
         tokio::select! {
             biased;
-            Some(body) = feedback.recv() => hand_to(&goal, &body),
+            Some(body) = feedback.recv() => hand_to(goal, &body),
             end = &mut end => break end,
         }
     };
     while let Ok(body) = feedback.try_recv() {
-        hand_to(&goal, &body);
+        hand_to(goal, &body);
     }
-    if let Err(why) = goal.end(status, &message, result.as_deref()) {
-        debug!(why, "the end of a goal cannot be told");
-    }
+    end
 }
 
 fn hand_to(goal: &impl ServedGoal, feedback: &[u8]) {

@@ -95,7 +95,6 @@ impl Service for Who {
                     register_every: Duration::from_secs(register_period),
                     pki,
                     mdns: (!no_mdns).then(|| Interface::parse(&address.to_string())),
-                    ..AnnounceSettings::default()
                 };
                 let told = announce(server, settings).map_err(|error| unavailable(&error))?;
                 say(&json!({"ready": true, "port": at.port()}));

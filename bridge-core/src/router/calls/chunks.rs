@@ -48,7 +48,7 @@ struct Large {
 }
 
 impl Of {
-    pub(super) const fn of(action: &ActionToSend<'_>) -> Self {
+    pub(super) const fn message(action: &ActionToSend<'_>) -> Self {
         match action.action.kind {
             ActionKind::Request => Self::Request(action.call),
             ActionKind::Response => Self::Response(action.call),
