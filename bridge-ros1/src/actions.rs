@@ -195,7 +195,7 @@ impl ActionClient for Sender {
             stage: Stage::Waiting {
                 id: spelled(id),
                 body: Bytes::copy_from_slice(body),
-                until: after(self.waits.answer),
+                until: after(self.waits.answer.min(CONNECTS)),
             },
             accepted: false,
             undecided: None,
@@ -544,6 +544,8 @@ const ABORTED: i8 = 6;
 
 /// How long a server may list a goal without deciding about it, until it counts as accepted.
 const PENDING: Duration = Duration::from_secs(1);
+/// How long a server that the master names may take to connect. One that was killed is named on, and never does.
+const CONNECTS: Duration = Duration::from_secs(5);
 /// From the end of the connection to a server until its goals are lost.
 const RECONNECT: Duration = Duration::from_secs(1);
 

@@ -52,11 +52,12 @@ impl ActionCalls {
         let cancel = format!("{ID}{time} stamp\n---\nint8 return_code\nuint8[] goal_ids\n");
         let result = format!("{ID}---\nint8 status\nstring message\n{x}Result result\n");
         let outcome = format!("{ID}---\nint8 status\n{x}Result result\n");
+        // The goal first: of an action that is not known it is what is told.
         Ok(Self {
-            outcome: service(&derived(name, "_OutcomeCall")?, &outcome)?,
             goal: service(name, &goal)?,
             cancel: service(&derived(name, "_CancelCall")?, &cancel)?,
             result: service(&derived(name, "_ResultCall")?, &result)?,
+            outcome: service(&derived(name, "_OutcomeCall")?, &outcome)?,
             feedback: message(FEEDBACK, &format!("{ID}{x}Feedback feedback\n"))?,
             status: message(STATUS, "uint8[] goal_ids\nuint8[] statuses\n")?,
         })

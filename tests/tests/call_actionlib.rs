@@ -202,31 +202,17 @@ fn a_goal_goes_on_without_its_client_and_ends_without_its_server() {
     assert_eq!(line(&mut other, "goal", &json!(1), "accepted"), true);
     server.signal(Signal::SIGKILL);
     assert_eq!(line(&mut other, "result", &json!(1), "status"), "ABORTED");
+    // The master goes on to name it.
+    other.tell("send 3");
+    assert_eq!(line(&mut other, "goal", &json!(2), "accepted"), false);
+    let _again = cell.rospy(SERVER, &[OF_ROS1, FIBONACCI]);
+    other.tell("send 4");
+    assert_eq!(line(&mut other, "goal", &json!(3), "accepted"), true);
+    let reached = line(&mut other, "result", &json!(3), "sequence");
+    assert_eq!(reached, json!([1, 1, 2, 3]));
 }
 
-/// A base of ROS 2 that clients of ROS 1 drive as they drive theirs.
-fn navigation(types: &str) -> String {
-    format!(
-        "
-spaces: [{{id: 1}}, {{id: 2, domain: 2}}]
-namespaces: {{2: 'urn:test:base'}}
-type_paths: ['{types}']
-calls:
-  - node: ns=2;i=70
-    name: Base.Drive
-    origin: 2
-    ros:
-      - {{action: /navigate_to_pose, type: nav2_msgs/NavigateToPose}}
-      - space: 1
-        action: /move_base
-        type: move_base_msgs/MoveBase
-        goal: {{pose: {{field: target_pose}}, behavior_tree: \"\"}}
-        feedback: {{base_position: {{field: current_pose}}}}
-        result: {{}}
-"
-    )
-}
-
+const NAVIGATION: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../mappings/navigation.yaml");
 const NAVIGATE: &str = "\
 geometry_msgs/PoseStamped pose
 string behavior_tree
@@ -241,11 +227,13 @@ int16 number_of_recoveries
 float32 distance_remaining
 ";
 
-fn types(cell: &Cell, package: &str, action: &str, text: &str) -> String {
-    let folder = cell.folder().join("types").join(package).join("action");
+/// An installation of ROS 2 that has Nav2's action.
+fn ament_prefix(cell: &Cell) -> String {
+    let prefix = cell.folder().join("ros");
+    let folder = prefix.join("share/nav2_msgs/action");
     std::fs::create_dir_all(&folder).unwrap();
-    std::fs::write(folder.join(format!("{action}.action")), text).unwrap();
-    cell.folder().join("types").display().to_string()
+    std::fs::write(folder.join("NavigateToPose.action"), NAVIGATE).unwrap();
+    prefix.display().to_string()
 }
 
 #[test]
@@ -253,15 +241,11 @@ fn a_client_of_move_base_drives_a_base_of_ros_2() {
     let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
         return;
     };
-    let types = types(&cell, "nav2_msgs", "NavigateToPose", NAVIGATE);
-    let mapping = cell.file("base.yaml", &navigation(&types));
-    let mapping = mapping.display().to_string();
     let _core = cell.roscore();
     let mut base = cell.cyclone("calls/ros2_navigate.py", &["/navigate_to_pose"]);
-    let _bridges = (
-        cell.bridge_ros1(&[&mapping]),
-        cell.bridge_ros2_alone(&[&mapping]).start(),
-    );
+    let bridge = cell.bridge_ros2_alone(&[NAVIGATION]);
+    let bridge = bridge.env("AMENT_PREFIX_PATH", ament_prefix(&cell));
+    let _bridges = (cell.bridge_ros1(&[NAVIGATION]), bridge.start());
     let mut client = actionlib_client(&cell, &["/move_base", "move_base_msgs/MoveBase"]);
     let pose = |x: f64| {
         json!({"target_pose": {
