@@ -89,6 +89,18 @@ pub struct CallField {
     pub rank: Rank,
     /// Of a request: it has a value of its own where the request has no fields at all.
     pub optional: bool,
+    /// What is in it where it is a message, as far as who executes the call says that. Of a call of one's own nothing is said
+    /// here.
+    pub structure: Option<Arc<CallStructure>>,
+}
+
+/// A message in a field of a call, as the schema of its ActionMetaData defines it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CallStructure {
+    /// The name of its type, as `geometry_msgs/Point`, which is also its TypeId on the wire, in the namespace of the call.
+    pub name: String,
+    /// What is in it, in this order.
+    pub fields: Vec<CallField>,
 }
 
 /// One request of the local side, by a number that the port chooses and uses once.
@@ -244,6 +256,7 @@ impl CallField {
             builtin: leaf.builtin,
             rank: leaf.rank,
             optional: false,
+            structure: None,
         }
     }
 
@@ -255,6 +268,7 @@ impl CallField {
             builtin,
             rank: Rank::Scalar,
             optional: false,
+            structure: None,
         }
     }
 

@@ -5,19 +5,21 @@
 
 use std::collections::BTreeMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::sync::Arc;
 
 use mappings::TopicId;
-use messages::MessageType;
+use messages::{MessageType, Rank};
 use uadp::discovery::{
     ActionMetaData, ActionTargetDataType, Announced, Announcement, ConfigurationVersion,
-    DataSetMetaDataType, FieldMetaData, KeyValuePair, List,
+    DataSetMetaDataType, DataTypeSchemaHeader, FieldMetaData, KeyValuePair, List,
+    StructureDescription, StructureType,
 };
 use uadp::{
-    Array, BuiltinType, EncodeError, PublisherId, QualifiedName, Scalar, SecurityHeader, Timestamp,
-    Variant,
+    Array, BuiltinType, EncodeError, Identifier, NodeId, PublisherId, QualifiedName, Scalar,
+    SecurityHeader, Timestamp, Variant,
 };
 
-use crate::call::{ActionFamily, CallDescription, CallField, CallRole, join_name};
+use crate::call::{ActionFamily, CallDescription, CallField, CallRole, CallStructure, join_name};
 use crate::description::{
     MAX_ANNOUNCEMENT, MAX_NAME, data_type, field_id, list, read_rank, sizes, text, value_rank,
     version_time, with_structures,
@@ -339,6 +341,7 @@ fn read_fields(data_set: &DataSetMetaDataType<'_>) -> Result<Vec<CallField>, Str
     if data_set.fields.len() > MAX_CALL_FIELDS {
         return Err(format!("more than {MAX_CALL_FIELDS} fields"));
     }
+    let structures = read_structures(&data_set.schema);
     let fields = data_set.fields.iter().map(|field| {
         let name = field.name.unwrap_or_default();
         if name.len() > MAX_NAME {
@@ -355,19 +358,122 @@ fn read_fields(data_set: &DataSetMetaDataType<'_>) -> Result<Vec<CallField>, Str
             builtin,
             rank: read_rank(&field)?,
             optional,
+            structure: find(&structures, field.data_type).filter(|_| is_structure(builtin)),
         })
     });
     fields.collect()
 }
 
+type Structures<'s> = Vec<(NodeId<'s>, Arc<CallStructure>)>;
+
+/// The structures that a schema defines. Those that cannot be known whole are left out, such as one that is in itself.
+fn read_structures<'s>(schema: &DataTypeSchemaHeader<'s>) -> Structures<'s> {
+    let mut open: Vec<StructureDescription<'s>> = schema
+        .structure_data_types
+        .iter()
+        .take(MAX_STRUCTURES)
+        .collect();
+    let mut known = Vec::new();
+    loop {
+        let before = open.len();
+        open.retain(|one| {
+            let read = read_structure(one, &known);
+            known.extend(read.iter().map(|read| (one.data_type_id, Arc::clone(read))));
+            read.is_none()
+        });
+        if open.len() == before {
+            return known;
+        }
+    }
+}
+
+/// A structure of which all that is in it is known.
+fn read_structure(
+    described: &StructureDescription<'_>,
+    known: &Structures<'_>,
+) -> Option<Arc<CallStructure>> {
+    let name = described.name.name.filter(|name| name.len() <= MAX_NAME)?;
+    let definition = &described.structure_definition;
+    let written = NodeId::string(described.data_type_id.namespace, name);
+    let plain = definition.structure_type == StructureType::default();
+    if !plain
+        || definition.default_encoding_id != written
+        || definition.fields.len() > MAX_CALL_FIELDS
+    {
+        return None;
+    }
+    let fields = definition.fields.iter().map(|field| {
+        let name = field.name.filter(|name| name.len() <= MAX_NAME)?;
+        let rank = match field.value_rank {
+            -1 => Rank::Scalar,
+            1 => Rank::Array {
+                fixed: field.array_dimensions.get(0).filter(|length| *length > 0),
+            },
+            _ => return None,
+        };
+        let structure = find(known, field.data_type);
+        let builtin = match (&structure, field.data_type) {
+            (Some(_), _) => BuiltinType::ExtensionObject,
+            (
+                None,
+                NodeId {
+                    namespace: 0,
+                    identifier: Identifier::Numeric(number),
+                },
+            ) => {
+                let builtin = u8::try_from(number).ok().and_then(BuiltinType::from_id)?;
+                (!is_structure(builtin)).then_some(builtin)?
+            }
+            (None, _) => return None,
+        };
+        Some(CallField {
+            name: name.to_owned(),
+            builtin,
+            rank,
+            optional: false,
+            structure,
+        })
+    });
+    let name = name.to_owned();
+    let fields = fields.collect::<Option<_>>()?;
+    Some(Arc::new(CallStructure { name, fields }))
+}
+
+fn find(structures: &Structures<'_>, data_type: NodeId<'_>) -> Option<Arc<CallStructure>> {
+    let found = structures.iter().find(|(id, _)| *id == data_type);
+    found.map(|(_, structure)| Arc::clone(structure))
+}
+
+fn is_structure(builtin: BuiltinType) -> bool {
+    builtin == BuiltinType::ExtensionObject
+}
+
 impl Weight for CallDescription {
     fn weight(&self) -> usize {
         let fields = self.request.iter().chain(&self.response);
-        let names: usize = fields
-            .map(|field| field.name.len() + size_of::<CallField>())
-            .sum();
+        let mut seen = Vec::new();
+        let names: usize = fields.map(|field| weight(field, &mut seen)).sum();
         names + self.name.len() + self.about.len() + size_of::<Self>()
     }
+}
+
+/// Bytes of a field, with those of the structures in it that are not seen yet.
+fn weight(field: &CallField, seen: &mut Vec<*const CallStructure>) -> usize {
+    let own = field.name.len() + size_of::<CallField>();
+    let Some(structure) = &field.structure else {
+        return own;
+    };
+    let place = Arc::as_ptr(structure);
+    if seen.contains(&place) {
+        return own;
+    }
+    seen.push(place);
+    let inner: usize = structure
+        .fields
+        .iter()
+        .map(|field| weight(field, seen))
+        .sum();
+    own + structure.name.len() + inner
 }
 
 /// The one target of each call.
@@ -397,6 +503,8 @@ const fn named(name: &'static str) -> QualifiedName<'static> {
 const MAX_ABOUT: usize = 1_024;
 /// Fields of a request or response that are believed.
 const MAX_CALL_FIELDS: usize = 256;
+/// Structures of a request or response that are believed.
+const MAX_STRUCTURES: usize = 64;
 
 #[cfg(test)]
 mod tests {
@@ -433,5 +541,54 @@ mod tests {
         let (named, name) = crate::split_name(action.name().unwrap()).unwrap();
         assert_eq!(named, topic);
         assert_eq!(read(&action, name), Ok(description));
+    }
+
+    #[test]
+    fn the_structures_of_a_service_are_read_with_those_in_them() {
+        let registry = messages::Registry::bundle(messages::Dialect::Ros1);
+        let name = "nav_msgs/GetPlan".parse().unwrap();
+        let service = registry.service(&name).unwrap();
+        let (request, response) = (service.request(), service.response());
+        let of = |message: &MessageType| message.leaves().iter().map(CallField::of).collect();
+        let description = CallDescription {
+            name: String::new(),
+            about: String::new(),
+            role: CallRole::Call,
+            request: of(request),
+            response: of(response),
+        };
+        let topic: TopicId = "ua_2_3_7".parse().unwrap();
+        let types = Types { request, response };
+        let said = (&description, Some(types), &BTreeMap::new());
+        let utc = Timestamp::from_unix_nanos(1_700_000_000_000_000_000);
+        let announcement = CallAnnouncement::new(topic, said, None, utc).unwrap();
+        let mut bytes = Vec::new();
+        announcement.write(3, &mut bytes);
+        let message = NetworkMessage::decode(&bytes).unwrap();
+        let Announced::ActionMetaData(action) = Announcement::decode(&message).unwrap().announced
+        else {
+            unreachable!();
+        };
+        let heard = read(&action, "").unwrap();
+        let poses = heard
+            .response
+            .iter()
+            .find(|field| field.name == "plan.poses");
+        let stamped = poses.and_then(|field| field.structure.clone()).unwrap();
+        assert_eq!(stamped.name, "geometry_msgs/PoseStamped");
+        let inner: Vec<(&str, BuiltinType)> = stamped
+            .fields
+            .iter()
+            .map(|field| (&field.name[..], field.builtin))
+            .collect();
+        let structure = BuiltinType::ExtensionObject;
+        assert_eq!(inner, [("header", structure), ("pose", structure)]);
+        let pose = stamped.fields[1].structure.as_ref().unwrap();
+        let position = pose.fields[0].structure.as_ref().unwrap();
+        assert_eq!(
+            (&position.name[..], position.fields.len()),
+            ("geometry_msgs/Point", 3)
+        );
+        assert!(heard.request.iter().all(|field| field.structure.is_none()));
     }
 }

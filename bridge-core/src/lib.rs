@@ -39,8 +39,8 @@ mod writer;
 
 pub use call::{
     ActionFamily, Answered, AskError, AskErrorKind, AskId, CallCounters, CallDescription,
-    CallField, CallMap, CallRole, Executed, Execution, Offered, OfferedType, ValueDescription,
-    ValueNote, split_name,
+    CallField, CallMap, CallRole, CallStructure, Executed, Execution, Offered, OfferedType,
+    ValueDescription, ValueNote, split_name,
 };
 pub use counters::{Counters, Reason, Verdict};
 pub use description::Described;

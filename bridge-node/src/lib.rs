@@ -28,8 +28,8 @@ pub use actions::{ActionGraph, Actions};
 pub use arguments::{Arguments, Flags, WithoutMapping};
 pub use bridge_core::{
     ActionFamily, Answered, AskError, AskErrorKind, AskId, CallDescription, CallField, CallMap,
-    CallRole, Described, Executed, ExecutionId, Kept, Offered, OfferedType, Owned, PublisherKey,
-    Reason, Refusal, Room, ValueDescription, ValueNote,
+    CallRole, CallStructure, Described, Executed, ExecutionId, Kept, Offered, OfferedType, Owned,
+    PublisherKey, Reason, Refusal, Room, ValueDescription, ValueNote,
 };
 pub use busy_poll::BusyPoll;
 pub use calls::{Asker, CallGraph, Calls};
