@@ -15,7 +15,7 @@ use std::time::Duration;
 use opcua::types::StatusCode;
 use tokio::sync::watch;
 
-pub use self::services::{Browse, CallError, MOST_REFERENCES};
+pub use self::services::{Browse, CallError, CallOptions, MOST_REFERENCES};
 pub use self::subscription::{Notice, Select, Subscription, Watch};
 pub use self::types::MOST_TYPES;
 

@@ -1,5 +1,9 @@
 //! What a client asks of a server.
 
+use std::time::Duration;
+
+use opcua::client::UARequest as _;
+use opcua::client::services::Call;
 use opcua::types::{
     AttributeId, BrowseDescription, BrowseDirection, BrowsePath, BrowseResultMask, ByteString,
     CallMethodRequest, DataValue, NodeClassMask, NodeId, QualifiedName, ReadValueId,
@@ -47,6 +51,15 @@ impl Browse {
         self.inverse = true;
         self
     }
+}
+
+/// How a method is called.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct CallOptions {
+    /// How long the answer is waited for.
+    pub within: Duration,
+    /// Only over that connection (`connects` of [`Link::Up`](super::Link::Up)): a NodeId may name another node after the next one.
+    pub connection: Option<u64>,
 }
 
 /// Why a method has no outputs.
@@ -230,13 +243,42 @@ impl Client {
         method: &NodeId,
         arguments: Vec<Variant>,
     ) -> Result<Vec<Variant>, CallError> {
+        let options = CallOptions {
+            within: self.shared.config.timeout,
+            connection: None,
+        };
+        self.call_within((object, method), arguments, options).await
+    }
+
+    /// Calls a method of an object that may take longer than other requests: the server is told how long (the TimeoutHint,
+    /// OPC 10000-4, 7.33).
+    ///
+    /// # Errors
+    /// A refusal, or no answer.
+    pub async fn call_within(
+        &self,
+        (object, method): (&NodeId, &NodeId),
+        arguments: Vec<Variant>,
+        options: CallOptions,
+    ) -> Result<Vec<Variant>, CallError> {
         let request = CallMethodRequest {
             object_id: object.clone(),
             method_id: method.clone(),
             input_arguments: (!arguments.is_empty()).then_some(arguments),
         };
         let session = self.shared.connected()?;
-        let called = session.session.call(vec![request]).await;
+        if options
+            .connection
+            .is_some_and(|one| one != session.connects)
+        {
+            let other = "there is another connection by now".to_owned();
+            return Err(ClientError::NotConnected(other).into());
+        }
+        let call = Call::new(&session.session)
+            .methods_to_call(vec![request])
+            .timeout(options.within);
+        let called = call.send(session.session.channel()).await;
+        let called = called.map(|response| response.results.unwrap_or_default());
         let result = as_many(called, 1)?
             .pop()
             .ok_or(ClientError::Answer("no result"))?;

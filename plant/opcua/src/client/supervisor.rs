@@ -45,6 +45,8 @@ pub(crate) struct Shared {
 pub(crate) struct Connected {
     pub(crate) session: Arc<Session>,
     pub(crate) namespaces: Vec<String>,
+    /// How many connections there have been with this one.
+    pub(crate) connects: u64,
     /// The supertypes that are known.
     pub(crate) supertypes: Mutex<HashMap<NodeId, Option<NodeId>>>,
     /// The loop of the library, without which nothing is sent and nothing heard.
@@ -131,7 +133,7 @@ async fn live(shared: &Shared) {
     let (first, longest) = shared.config.backoff;
     let mut wait = first;
     loop {
-        let reason = match connect(shared, &client).await {
+        let reason = match connect(shared, &client, life.connects + 1).await {
             Ok(connection) => {
                 wait = first;
                 hold(shared, &mut life, connection).await
@@ -241,7 +243,11 @@ enum Activity {
     Published,
 }
 
-async fn connect(shared: &Shared, client: &opcua::client::Client) -> Result<Connection, String> {
+async fn connect(
+    shared: &Shared,
+    client: &opcua::client::Client,
+    connects: u64,
+) -> Result<Connection, String> {
     let within = shared.config.timeout;
     let endpoint = timeout(within * 2, endpoint(shared, client))
         .await
@@ -299,6 +305,7 @@ async fn connect(shared: &Shared, client: &opcua::client::Client) -> Result<Conn
         connected: Arc::new(Connected {
             session,
             namespaces,
+            connects,
             supertypes: Mutex::default(),
             driving: driving.keep(),
         }),
