@@ -1,8 +1,11 @@
 """An asyncua client that finds a Method of the server by its path below Objects, waits for it, says what it takes and gives,
-and calls it once for each --value, a JSON list of arguments. A JSON line for each answer, or its status."""
+and calls it once for each --value, a JSON list of arguments. An argument is a value of the type the Method takes, or an
+object with the name of another type and the value; with --structures that of a structure, by the definitions the server has. A
+JSON line for each answer, or its status."""
 
 import argparse
 import asyncio
+import dataclasses
 import json
 import time
 
@@ -41,12 +44,58 @@ async def arguments(method, which):
     return []
 
 
+def built(kind, fields):
+    made = kind()
+    for name, value in fields.items():
+        inner = getattr(made, name)
+        setattr(made, name, built(type(inner), value) if dataclasses.is_dataclass(inner) else value)
+    return made
+
+
+def opened(value):
+    if isinstance(value, list):
+        return [opened(item) for item in value]
+    if dataclasses.is_dataclass(value):
+        return {field.name: opened(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return opcua_session.plain(value)
+
+
+def argument(value, kind):
+    if isinstance(value, dict):
+        ((name, value),) = value.items()
+        if name in ua.VariantType.__members__:
+            return ua.Variant(value, ua.VariantType[name])
+        return ua.Variant([built(getattr(ua, name), one) for one in value], ua.VariantType.ExtensionObject)
+    return ua.Variant(value, ua.VariantType(kind)) if kind else ua.Variant(value)
+
+
+async def called(client, object_, method, given):
+    # As it is on the wire: asyncua's own call_method raises where an argument is wrong.
+    request = ua.CallMethodRequest()
+    request.ObjectId, request.MethodId = object_.nodeid, method.nodeid
+    request.InputArguments = given
+    try:
+        (result,) = await client.uaclient.call([request])
+    except asyncio.TimeoutError:
+        lifetime.say(given_up=True)
+        return
+    except ua.UaStatusCodeError as error:
+        lifetime.say(fault=type(error).__name__)
+        return
+    lifetime.say(
+        status=result.StatusCode.name,
+        arguments=[one.name for one in result.InputArgumentResults or []],
+        value=[opened(one.Value) for one in result.OutputArguments or []],
+    )
+
+
 async def main():
     parser = argparse.ArgumentParser()
     opcua_session.add_arguments(parser)
     parser.add_argument("path")
     parser.add_argument("--value", action="append", default=[])
     parser.add_argument("--wait", type=float, default=30.0)
+    parser.add_argument("--structures", action="store_true")
     parser.add_argument("--gone", action="store_true", help="waits until the Method is gone again")
     args = parser.parse_args()
     lifetime.bound(args.limit)
@@ -56,23 +105,15 @@ async def main():
             lifetime.say(missing=args.path)
             return
         object_, method = places
+        if args.structures:
+            await client.load_data_type_definitions()
         takes = await arguments(method, "InputArguments")
         gives = await arguments(method, "OutputArguments")
         lifetime.say(node=method.nodeid.to_string(), takes=takes, gives=gives)
         for text in args.value:
-            given = []
-            for value, (_, kind, _) in zip(json.loads(text), takes + [[None, None, None]] * 9):
-                given.append(ua.Variant(value, ua.VariantType(kind)) if kind else ua.Variant(value))
-            # As it is on the wire: asyncua's own call_method raises where an argument is wrong.
-            request = ua.CallMethodRequest()
-            request.ObjectId, request.MethodId = object_.nodeid, method.nodeid
-            request.InputArguments = given
-            (result,) = await client.uaclient.call([request])
-            lifetime.say(
-                status=result.StatusCode.name,
-                arguments=[one.name for one in result.InputArgumentResults or []],
-                value=[opcua_session.plain(one.Value) for one in result.OutputArguments or []],
-            )
+            kinds = [kind for _, kind, _ in takes] + [None] * 9
+            given = [argument(value, kind) for value, kind in zip(json.loads(text), kinds)]
+            await called(client, object_, method, given)
         while args.gone and await found(client, args.path, 0) is not None:
             await asyncio.sleep(0.05)
         if args.gone:

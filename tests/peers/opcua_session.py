@@ -18,11 +18,12 @@ def add_arguments(parser):
     parser.add_argument("--security", choices=["None", "Basic256Sha256"], default="None")
     parser.add_argument("--certificates", help="folder for this client's key and certificate")
     parser.add_argument("--limit", type=float, default=60.0)
+    parser.add_argument("--patience", type=float, default=10.0, help="how long an answer is waited for")
 
 
 async def client_of(args):
     """A client that is not connected yet: `async with await client_of(args) as client`."""
-    client = Client(args.endpoint, timeout=10)
+    client = Client(args.endpoint, timeout=args.patience)
     if args.security == "None":
         return client
     folder = pathlib.Path(args.certificates)

@@ -24,6 +24,7 @@ use crate::{Triple, UadpSocket};
 pub struct Executor {
     stop: Arc<AtomicBool>,
     executed: Arc<AtomicU32>,
+    abandoned: Arc<AtomicU32>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -45,6 +46,7 @@ struct Work {
     /// How often each datagram is heard and sent.
     copies: usize,
     executed: Arc<AtomicU32>,
+    abandoned: Arc<AtomicU32>,
     start: Instant,
 }
 
@@ -53,7 +55,8 @@ impl Executor {
     /// doubles every datagram to it and of it.
     #[must_use]
     pub fn start(triple: Triple, name: &str, executes: Executes, copies: usize) -> Self {
-        let (stop, executed) = (Arc::<AtomicBool>::default(), Arc::<AtomicU32>::default());
+        let stop = Arc::<AtomicBool>::default();
+        let [executed, abandoned] = [(), ()].map(|()| Arc::<AtomicU32>::default());
         let mut work = Work {
             triple,
             name: name.to_owned(),
@@ -62,6 +65,7 @@ impl Executor {
             executes,
             copies,
             executed: Arc::clone(&executed),
+            abandoned: Arc::clone(&abandoned),
             start: Instant::now(),
         };
         let stopped = Arc::clone(&stop);
@@ -69,6 +73,7 @@ impl Executor {
         Self {
             stop,
             executed,
+            abandoned,
             thread: Some(thread),
         }
     }
@@ -77,6 +82,12 @@ impl Executor {
     #[must_use]
     pub fn executed(&self) -> u32 {
         self.executed.load(Ordering::Relaxed)
+    }
+
+    /// How many that were begun nobody wants any longer.
+    #[must_use]
+    pub fn abandoned(&self) -> u32 {
+        self.abandoned.load(Ordering::Relaxed)
     }
 
     /// Ends it in the middle of what it does, as a process that is killed: nothing of it is heard any more.
@@ -132,10 +143,12 @@ impl Work {
                 continue;
             }
             // What it does not take, such as a response of its own, is none of its business.
-            if let Ok(Requested::Execute(execution)) =
-                self.responder.handle_request(&request, (), now)
-            {
-                self.execute(execution, now);
+            match self.responder.handle_request(&request, (), now) {
+                Ok(Requested::Execute(execution)) => self.execute(execution, now),
+                Ok(Requested::Abandoned(_)) => {
+                    self.abandoned.fetch_add(1, Ordering::Relaxed);
+                }
+                Ok(_) | Err(_) => {}
             }
         }
     }

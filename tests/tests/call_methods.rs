@@ -1,9 +1,13 @@
 //! Calls of the space as Methods of the server: an OPC UA client calls services of ROS.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use nix::sys::signal::Signal;
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Distribution, Peer, SERVER_ENDPOINT};
+use system_tests::{
+    Cell, Child, Counting, Distribution, Executes, Executor, METRICS_SERVER, Peer, SERVER_ENDPOINT,
+    Started, eventually, metrics, program,
+};
 
 /// rospy, rclpy and asyncua need seconds to start on a busy machine.
 const SOON: Duration = Duration::from_secs(40);
@@ -18,6 +22,15 @@ fn line(client: &mut Child, key: &str) -> Value {
     client.wait_for_json(key, SOON, |line| line.get(key).map(|_| line.clone()))
 }
 
+/// What a client says of so many calls.
+fn answers(client: &mut Child, count: usize) -> Vec<Value> {
+    let mut all = Vec::new();
+    client.wait_for_json("all answers", SOON, |line| {
+        all.extend(line.get("status").map(|_| line.clone()));
+        (all.len() == count).then(|| all.clone())
+    })
+}
+
 #[test]
 fn asyncua_calls_a_service_of_rospy_and_is_told_how_it_went() {
     let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
@@ -30,7 +43,13 @@ fn asyncua_calls_a_service_of_rospy_and_is_told_how_it_went() {
     let mut bridge = cell.bridge_ros1(&[path]);
     let _ua_server = cell.ua_server(&[path]);
     let method = "UaSpace/Calls/Belt/Switch";
-    let values = ["[true]", "[false]", "[]", "[true, true]"];
+    let values = [
+        "[true]",
+        "[false]",
+        "[]",
+        "[true, true]",
+        r#"[{"String": "on"}]"#,
+    ];
     let mut args = vec![SERVER_ENDPOINT, method, "--gone"];
     for value in values {
         args.extend(["--value", value]);
@@ -44,21 +63,18 @@ fn asyncua_calls_a_service_of_rospy_and_is_told_how_it_went() {
         found["gives"],
         json!([["success", 1, -1], ["message", 12, -1]])
     );
-    let told = client.wait_for_json("four answers", SOON, {
-        let mut all = Vec::new();
-        move |line| {
-            all.extend(
-                line.get("status")
-                    .map(|status| (status.clone(), line["value"].clone())),
-            );
-            (all.len() == values.len()).then(|| all.clone())
-        }
-    });
-    let none = || json!([]);
-    assert_eq!(told[0], (json!("Good"), json!([true, "done"])));
-    assert_eq!(told[1], (json!("BadUnexpectedError"), none()));
-    assert_eq!(told[2], (json!("BadArgumentsMissing"), none()));
-    assert_eq!(told[3], (json!("BadTooManyArguments"), none()));
+    let told = answers(&mut client, values.len());
+    let wanted = [
+        ("Good", json!([true, "done"]), json!([])),
+        ("BadUnexpectedError", json!([]), json!([])),
+        ("BadArgumentsMissing", json!([]), json!([])),
+        ("BadTooManyArguments", json!([]), json!([])),
+        ("BadInvalidArgument", json!([]), json!(["BadTypeMismatch"])),
+    ];
+    for (told, (status, value, arguments)) in told.iter().zip(wanted) {
+        let wanted = json!({"status": status, "value": value, "arguments": arguments});
+        assert_eq!(*told, wanted);
+    }
     // What was not right never reached the service.
     assert_eq!(server.values(), [true, false]);
     bridge.end();
@@ -71,6 +87,151 @@ fn asyncua_calls_a_service_of_rospy_and_is_told_how_it_went() {
 }
 
 #[test]
+fn asyncua_is_told_that_a_call_takes_too_long_and_that_its_service_fell() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let timed = |name: &str, timeout: &str| {
+        format!(
+            "  - {{node: ns=2;s={name}, alias: {}, name: {name}, origin: 1, timeout: {timeout}, \
+             ros: {{service: /{name}, type: std_srvs/Trigger}}}}\n",
+            name.len()
+        )
+    };
+    let calls = [timed("Slow", "1s"), timed("Slower", "30s")].concat();
+    let mapping =
+        format!("spaces: [{{id: 1}}]\nnamespaces: {{2: 'urn:test:belt'}}\ncalls:\n{calls}");
+    let file = cell.file("cell.yaml", &mapping);
+    let path = file.to_str().unwrap();
+    let mut executor = cell.rospy_executor(&["empty=/Slow", "empty=/Slower", "--delay", "1000"]);
+    let _bridge = cell.bridge_ros1(&[path]);
+    let _ua_server = cell.ua_server(&[path]);
+    let asked = |method: &str, patience: &str| {
+        let method = format!("UaSpace/Calls/{method}");
+        let value = ["--value", "[]", "--patience", patience];
+        let args = [&[SERVER_ENDPOINT, &method][..], &value].concat();
+        cell.asyncua_started("opcua_call.py", &args).start()
+    };
+    let mut client = asked("Slow", "20");
+    let start = Instant::now();
+    assert_eq!(line(&mut client, "status")["status"], "BadTimeout");
+    assert!(start.elapsed() < SOON, "{:?}", start.elapsed());
+    let mut client = asked("Slower", "40");
+    running(&mut executor, 2);
+    executor.child().signal(Signal::SIGKILL);
+    assert_eq!(line(&mut client, "status")["status"], "BadNoCommunication");
+}
+
+fn running(executor: &mut Counting, count: u64) {
+    let deadline = Instant::now() + SOON;
+    while executor.counts()["running"] != count {
+        assert!(Instant::now() < deadline, "{}", executor.counts());
+        std::thread::park_timeout(Duration::from_millis(50));
+    }
+}
+
+#[test]
+fn who_executes_is_told_that_a_client_has_given_up_or_gone_and_the_method_moves_when_told() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mapping = |node: &str, more: &str| {
+        format!(
+            "spaces: [{{id: 1}}]\nnamespaces: {{2: 'urn:test:belt'}}\n{more}\
+             calls: [{{node: {node}, alias: 61, name: Grip, origin: 1, timeout: 1h, \
+             ros: {{service: /grip, type: std_srvs/Trigger}}}}]\n"
+        )
+    };
+    let file = cell.file("cell.yaml", &mapping("ns=2;s=Old", ""));
+    let path = file.to_str().unwrap();
+    let executor = Executor::start((1, 2, 61), "Grip", Executes::Forever, 1);
+    let ua_server = cell.ua_server(&[path]);
+    let asked = |patience: &str| {
+        let value = ["--value", "[]", "--patience", patience];
+        let args = [&[SERVER_ENDPOINT, "UaSpace/Calls/Grip"][..], &value].concat();
+        cell.asyncua_started("opcua_call.py", &args).start()
+    };
+    // Its time is the one it gives, and not the one of the mapping.
+    let mut client = asked("2");
+    assert_eq!(line(&mut client, "node")["node"], "ns=2;s=Old");
+    line(&mut client, "given_up");
+    eventually("the first is abandoned", SOON, || {
+        (executor.abandoned() == 1).then_some(())
+    });
+    assert_eq!(executor.executed(), 1);
+    drop(executor);
+    // A variable takes the node that the Method had.
+    let more = "variables: [{node: ns=2;s=Old, alias: 70, name: Load, origin: 1, ros: {topic: /load, type: std_msgs/Float64}}]\n";
+    let _ = cell.file("cell.yaml", &mapping("ns=2;s=Grip", more));
+    ua_server.signal(Signal::SIGHUP);
+    eventually("the mapping is read", SOON, || {
+        (metrics(METRICS_SERVER)?["mapping"]["reloads"] == 1).then_some(())
+    });
+    let executor = Executor::start((1, 2, 61), "Grip", Executes::AtOnce, 1);
+    let mut client = asked("20");
+    assert_eq!(line(&mut client, "node")["node"], "ns=2;s=Grip");
+    assert_eq!(line(&mut client, "status")["status"], "Good");
+    let read = cell.asyncua_once("opcua_read.py", &[SERVER_ENDPOINT, "ns=2;s=Old"]);
+    assert_eq!(read[0]["status"], "BadWaitingForInitialData", "{read:?}");
+    drop(executor);
+}
+
+#[test]
+fn a_skill_of_a_component_is_started_by_clients_that_know_only_the_server() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
+        return;
+    };
+    let _ua_server = cell.ua_server(&[]);
+    let component = |name: &str, metrics: &str| {
+        let plant = concat!(env!("CARGO_MANIFEST_DIR"), "/../examples/plant");
+        let args = ["--lds", "none", "--interface", "lo", "--metrics", metrics];
+        Started::new("ua-component", &program("ua-component"))
+            .args([format!("{plant}/{name}.yaml")])
+            .args(args)
+            .start()
+    };
+    let _components = (
+        component("parallel-gripper", "127.0.0.1:9855"),
+        component("robot", "127.0.0.1:9856"),
+    );
+    let asked = |method: &str| {
+        let method = format!("UaSpace/Calls/parallel-gripper/Grasp/{method}");
+        let args = [SERVER_ENDPOINT, &method, "--value", "[]"];
+        let mut client = cell.asyncua_started("opcua_call.py", &args).start();
+        let takes = line(&mut client, "node")["takes"].clone();
+        (takes, line(&mut client, "status"))
+    };
+    let good = |told: &Value| told["status"] == "Good" && told["value"][0] == true;
+    let (takes, told) = asked("Reset");
+    assert!(takes == json!([]) && good(&told), "{takes} {told}");
+    // All that it takes has a value of its own.
+    let (takes, told) = asked("Start");
+    assert!(takes != json!([]) && good(&told), "{takes} {told}");
+    // And here it has not.
+    let asked = |method: &str, values: &[&str]| {
+        let method = format!("UaSpace/Calls/robot/PtpMove/{method}");
+        let args = [&[SERVER_ENDPOINT, &method], values].concat();
+        cell.node_opcua_once("call.js", &args)
+    };
+    let told = asked("Reset", &["[]"]);
+    assert!(good(&told[1]), "{told:?}");
+    let told = asked(
+        "Start",
+        &["[]", r#"[[0.4, 0, 0.2, 0, 0, 0], 0.5, 0.5, "base"]"#],
+    );
+    let takes = json!([
+        ["TargetPosition", 11, 1],
+        ["MaxVelocity", 11, -1],
+        ["MaxAcceleration", 11, -1],
+        ["ToolFrame", 12, -1]
+    ]);
+    assert_eq!(told[0]["takes"], takes);
+    assert_eq!(told[1]["status"], "BadArgumentsMissing");
+    assert!(good(&told[2]), "{told:?}");
+}
+
+#[test]
 fn asyncua_calls_a_service_of_rclpy_that_nobody_mapped() {
     let Some(cell) = Cell::with(&[Peer::Ros2, Peer::Python]) else {
         return;
@@ -80,12 +241,212 @@ fn asyncua_calls_a_service_of_rclpy_that_nobody_mapped() {
     judge.ask(json!({"serve": "/ua_2_2_62", "type": "std_srvs/srv/Trigger", "value": answer}));
     let _bridge = cell.bridge_ros2(&[]);
     let _ua_server = cell.ua_server(&[]);
+    // A topic of the same name has a node beside it.
+    let value = json!({"data": "on the scales"});
+    let publish = json!({"publish": "/ua_2_2_62", "type": "std_msgs/msg/String", "value": value});
+    let args = [SERVER_ENDPOINT, "ns=1;s=ua_2_2_62"];
+    eventually("the value is there", SOON, || {
+        judge.ask(publish.clone());
+        let read = cell.asyncua_once("opcua_read.py", &args);
+        (read[0]["value"] == "on the scales").then_some(())
+    });
     let args = [SERVER_ENDPOINT, "UaSpace/Calls/ua_2_2_62", "--value", "[]"];
     let mut client = cell.asyncua_started("opcua_call.py", &args).start();
-    assert_eq!(line(&mut client, "node")["takes"], json!([]));
+    let found = line(&mut client, "node");
+    assert_eq!(found["node"], "ns=1;s=ua_2_2_62.call");
+    assert_eq!(found["takes"], json!([]));
     let told = line(&mut client, "status");
     assert_eq!(
         (&told["status"], &told["value"]),
         (&json!("Good"), &json!([true, "weighed"]))
+    );
+}
+
+/// Calls of the space that are Methods of another server.
+const OTHER: &str = "opc.tcp://127.0.0.1:4841";
+
+fn executed(more: &str) -> String {
+    let call = |number: u16, name: &str, method: &str, more: &str| {
+        let node = "nsu=urn:ua-bridge:system-tests:plc;s=Line";
+        format!(
+            "  - {{node: ns=3;i={number}, name: Plc.{name}, origin: 0, \
+             opcua: {{endpoint: '{OTHER}', object: '{node}', method: '{node}.{method}'}}{more}}}\n"
+        )
+    };
+    let trigger = "service: /plc/move, type: std_srvs/Trigger, \
+         request: {TargetPosition: 1.5, speeds: [0.5, 0.25]}, response: {success: true, message: {field: Remark}}";
+    let asked = format!(", ros: [{{space: 1, {trigger}}}, {{space: 2, {trigger}}}]");
+    let calls = [
+        call(80, "Move", "Move", &asked),
+        call(81, "Wait", "Wait", ""),
+        call(83, "Strange", "Strange", ""),
+    ];
+    format!(
+        "spaces: [{{id: 1}}, {{id: 2}}]\nnamespaces: {{3: 'urn:test:plc-calls'}}\ncalls:\n{}{more}",
+        calls.concat()
+    )
+}
+
+fn reset(number: u16) -> String {
+    format!(
+        "  - {{node: ns=3;i={number}, name: Plc.Reset, origin: 0, opcua: {{endpoint: '{OTHER}', \
+         object: 'nsu=urn:ua-bridge:system-tests:plc;s=Line', \
+         method: 'nsu=urn:ua-bridge:system-tests:plc;s=Line.Reset'}}}}\n"
+    )
+}
+
+/// `ua-space call`, which ends by itself.
+fn ua_space_call(words: &[&str]) -> Child {
+    Started::new("ua-space", &program("ua-space"))
+        .args(["call"])
+        .args(words)
+        .args([
+            "--json",
+            "--wait",
+            "30",
+            "--timeout",
+            "30",
+            "--interface",
+            "lo",
+        ])
+        .start()
+}
+
+/// Its exit code and what it printed.
+fn ended(mut child: Child) -> (i32, Vec<Value>) {
+    let code = child.wait_for_end(SOON).code().unwrap();
+    (code, child.json_lines())
+}
+
+#[test]
+fn methods_of_another_server_are_executed_once_for_each_who_asks() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let file = cell.file("cell.yaml", &executed(&reset(82)));
+    let path = file.to_str().unwrap();
+    let mut ua_server = cell.ua_server(&[path]);
+    let mut plc = cell.asyncua("opcua_methods.py", &[OTHER]);
+    let (code, told) = ended(ua_space_call(&[
+        "ua_0_3_80",
+        "TargetPosition=2.5",
+        "speeds=0.5,0.25,1",
+    ]));
+    let fields = json!({"Reached": 5.0, "Remark": "3 axes"});
+    assert_eq!((code, &told[0]["fields"]), (0, &fields), "{told:?}");
+    let begun = line(&mut plc, "begun");
+    assert_eq!(
+        begun,
+        json!({"begun": "Move", "arguments": [2.5, [0.5, 0.25, 1.0]], "calls": 1})
+    );
+    // The Method says no, in its own words.
+    let args = ["Plc.Move", "TargetPosition=-1", "speeds=1"];
+    let (code, told) = ended(ua_space_call(&args));
+    let out_of_range = 0x803C_0000_u32;
+    assert_eq!(
+        (code, &told[0]["status"]),
+        (1, &json!(out_of_range)),
+        "{told:?}"
+    );
+    // Two at once, which asyncua executes one after the other.
+    let both =
+        ["1", "1.5"].map(|seconds| ua_space_call(&["Plc.Wait", &format!("seconds={seconds}")]));
+    for child in both {
+        let (code, told) = ended(child);
+        assert_eq!(code, 0, "{told:?}");
+    }
+    // What no call can carry is told, and not offered.
+    ua_server.wait_for_line("which no call has", SOON);
+    // A Method has another number from now on.
+    let _ = cell.file("cell.yaml", &executed(&reset(84)));
+    ua_server.signal(Signal::SIGHUP);
+    let (code, told) = ended(ua_space_call(&["ua_0_3_84"]));
+    assert_eq!(code, 0, "{told:?}");
+    // While: nobody knows what became of it, and it is not called again.
+    let slow = ua_space_call(&["Plc.Wait", "seconds=100"]);
+    plc.wait_for_json("the last call", SOON, |line| {
+        (line.get("arguments")? == &json!([100.0])).then_some(())
+    });
+    let begun = |plc: &Child| {
+        let lines = plc.json_lines();
+        lines.iter().filter_map(|line| line["calls"].as_u64()).max()
+    };
+    assert_eq!(begun(&plc), Some(6), "{plc}");
+    plc.signal(Signal::SIGKILL);
+    let (code, told) = ended(slow);
+    assert_eq!((code, told), (69, Vec::new()));
+    // After: another index for the same namespace.
+    let plc = cell.asyncua("opcua_methods.py", &[OTHER, "--before", "3"]);
+    let (code, told) = ended(ua_space_call(&["Plc.Reset"]));
+    assert_eq!(code, 0, "{told:?}");
+    assert_eq!(begun(&plc), Some(1), "{plc}");
+}
+
+#[test]
+fn rospy_and_rclpy_ask_for_a_method_of_another_server_as_a_service() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2, Peer::Python]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let file = cell.file("cell.yaml", &executed(&reset(82)));
+    let path = file.to_str().unwrap();
+    let plc = cell.asyncua("opcua_methods.py", &[OTHER]);
+    let _ua_server = cell.ua_server(&[path]);
+    let _bridges = (cell.bridge_ros1(&[path]), cell.bridge_ros2(&[path]));
+    let args = ["/plc/move", "std_srvs/Trigger", "--value", "{}"];
+    let mut client = cell.rospy("ros1_call.py", &args);
+    let answer = json!({"success": true, "message": "2 axes"});
+    assert_eq!(line(&mut client, "value")["value"], answer);
+    let mut judge = cell.judge(Distribution::Jazzy, &["judge"]);
+    let told = judge.ask(json!({"call": "/plc/move", "type": "std_srvs/srv/Trigger", "value": {}}));
+    assert_eq!(told, answer);
+    let begun: Vec<Value> = plc
+        .json_lines()
+        .into_iter()
+        .filter(|line| line["begun"] == "Move")
+        .collect();
+    let begins = |calls| json!({"begun": "Move", "arguments": [1.5, [0.5, 0.25]], "calls": calls});
+    assert_eq!(begun, [begins(1), begins(2)]);
+}
+
+#[test]
+fn asyncua_builds_and_reads_messages_in_arguments_by_the_definitions_of_the_server() {
+    let Some(cell) = Cell::with(&[Peer::Ros2, Peer::Python]) else {
+        return;
+    };
+    let mapping = "
+spaces: [{id: 2}]
+namespaces: {2: 'urn:test:belt'}
+calls:
+  - {node: ns=2;i=61, name: Set, origin: 2, ros: {service: /judge/judge/set_parameters, type: rcl_interfaces/SetParameters}}
+  - {node: ns=2;i=62, name: Get, origin: 2, ros: {service: /judge/judge/get_parameters, type: rcl_interfaces/GetParameters}}
+";
+    let file = cell.file("cell.yaml", mapping);
+    let path = file.to_str().unwrap();
+    let _judge = cell.judge(Distribution::Jazzy, &["judge"]);
+    let _bridge = cell.bridge_ros2(&[path]);
+    let _ua_server = cell.ua_server(&[path]);
+    let parameter = json!([{"rcl_interfaces_Parameter": [
+        {"name": "use_sim_time", "value": {"type": 1, "bool_value": true}}
+    ]}]);
+    let asked = |method: &str, value: &Value| {
+        let (method, value) = (format!("UaSpace/Calls/{method}"), value.to_string());
+        let args = [SERVER_ENDPOINT, &method, "--structures", "--value", &value];
+        let mut client = cell.asyncua_started("opcua_call.py", &args).start();
+        (line(&mut client, "node"), line(&mut client, "status"))
+    };
+    let (found, told) = asked("Set", &parameter);
+    assert_eq!(
+        found["takes"],
+        json!([["parameters", "DataType.rcl_interfaces/Parameter", 1]])
+    );
+    let result = json!({"successful": true, "reason": ""});
+    assert_eq!(told["value"], json!([[result]]), "{told}");
+    let (_, told) = asked("Get", &json!([["use_sim_time"]]));
+    let value = &told["value"][0][0];
+    assert_eq!(
+        (&value["type"], &value["bool_value"]),
+        (&json!(1), &json!(true)),
+        "{told}"
     );
 }

@@ -162,5 +162,10 @@ pub(crate) fn unmapped_node(topic: TopicId) -> NodeId {
     NodeId::new(APPLICATION, topic.to_string())
 }
 
+/// The node of a call that the mapping does not name. A value may have the same name.
+pub(crate) fn unmapped_call(topic: TopicId) -> NodeId {
+    NodeId::new(APPLICATION, format!("{topic}.call"))
+}
+
 /// The namespace index of the application's own URI.
 const APPLICATION: u16 = 1;

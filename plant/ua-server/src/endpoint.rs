@@ -31,6 +31,9 @@ pub(crate) fn server(described: &Server, url: &EndpointUrl, port: u16) -> Server
         .certificate_path(OWN_CERTIFICATE)
         .private_key_path(OWN_KEY)
         .subscription_poll_interval_ms(limits::POLL_MS)
+        // The library lets a request take the longer one of this and of what its client says, and what a client says is to
+        // hold. Each call has an end of its own.
+        .max_timeout_ms(0)
         .limits(limits::server());
     for policy in &described.security {
         let (policy, modes) = match policy {

@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 
+use bridge_node::CallField;
 use mappings::{Mapping, Meaning, NodeIdText, SpaceId, TopicId, Variable};
 use messages::{Leaf, Rank};
 use opcua::types::{ByteString, DataTypeId, Identifier, NodeId, Variant, VariantTypeId};
@@ -355,6 +356,14 @@ impl FieldNode {
 }
 
 impl Shape {
+    /// What values a field of a call has.
+    pub(crate) fn of(field: &CallField) -> Self {
+        Self(Some((
+            field.builtin,
+            matches!(field.rank, Rank::Array { .. }),
+        )))
+    }
+
     /// The DataType attribute: the builtin types have the numbers of their encoding ids (OPC 10000-6, 5.1.2).
     pub(crate) fn data_type(self) -> NodeId {
         match self.0 {

@@ -6,14 +6,16 @@
 //!
 //! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show),
 //! `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in),
-//! `components` (which servers are there), `port` (the shell's side),
+//! `components` (which servers are there), `methods` and `argument_types` (calls of the space as Methods), `executing` (Methods of other servers as calls), `port` (the shell's side),
 //! `endpoint` (how clients get in), `value` (between the two codecs).
 
 mod address;
+mod argument_types;
 mod browse;
 mod budget;
 mod components;
 mod endpoint;
+mod executing;
 mod layout;
 mod methods;
 mod nodes;
@@ -97,8 +99,8 @@ impl Program for UaServer {
     const NAME: &'static str = "ua-server";
     const LOCAL: bridge_core::Local = bridge_core::Local::Fields;
     // The libraries say at level info what they do for each client, and at level error what a bad client did, or that
-    // one looked whether the server is there.
-    const QUIET: &'static str = "opcua_server=warn,opcua_server::session::controller=off,\
+    // one looked whether the server is there. What becomes of other servers is told here.
+    const QUIET: &'static str = "opcua_server=warn,opcua_server::session::controller=off,opcua_client=off,\
         opcua_crypto=warn,opcua_core=warn,opcua_nodes=warn,opcua_types=off";
 
     fn arguments(&self) -> &Arguments {

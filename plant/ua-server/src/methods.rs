@@ -7,7 +7,7 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Answered, AskId, CallDescription, CallField, CallRole};
+use bridge_node::{Answered, AskId, CallDescription, CallField};
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
 use messages::Rank;
@@ -17,13 +17,15 @@ use opcua::sync::Mutex;
 use opcua::types::{
     Argument, LocalizedText, NodeId, ObjectTypeId, QualifiedName, StatusCode, Variant,
 };
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::{Notify, mpsc, oneshot};
 use tracing::{info, warn};
 use uadp::Fields;
 
 use crate::address;
+use crate::argument_types::ArgumentTypes;
 use crate::layout::Shape;
 use crate::nodes::SpaceManager;
+use crate::structures::Structure;
 use crate::value;
 
 /// The Methods there are, by their nodes.
@@ -36,38 +38,80 @@ pub(crate) struct Callable {
     description: Arc<CallDescription>,
 }
 
+/// The way of clients to [`Methods`].
+#[derive(Debug, Clone)]
+pub(crate) struct Questions {
+    sender: mpsc::Sender<Question>,
+    given_up: Arc<Notify>,
+}
+
+/// The other end of [`Questions`].
+#[derive(Debug)]
+pub(crate) struct Heard {
+    questions: mpsc::Receiver<Question>,
+    /// Of one or more that were handed on nobody waits for the answer any longer.
+    given_up: Arc<Notify>,
+}
+
 /// A request of a client.
 #[derive(Debug)]
-pub(crate) struct Question {
+struct Question {
     topic: TopicId,
     block: Bytes,
     answer: oneshot::Sender<Answered<Bytes>>,
+}
+
+/// What a client waits for; [`Methods`] is told when it does no longer.
+struct Waiting {
+    answered: oneshot::Receiver<Answered<Bytes>>,
+    given_up: Arc<Notify>,
+    over: bool,
+}
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        if !self.over {
+            self.answered.close();
+            self.given_up.notify_one();
+        }
+    }
 }
 
 /// Shows the calls of other spaces, and hands on what clients ask them.
 pub(crate) struct Methods {
     manager: Arc<SpaceManager>,
     mapping: Arc<Mapping>,
-    questions: mpsc::Receiver<Question>,
+    heard: Heard,
     shown: HashMap<TopicId, NodeId>,
+    /// Calls without a Method, since something else has their node.
+    refused: HashMap<TopicId, Arc<CallDescription>>,
     /// How many Methods are in each object, or in one in it.
     objects: HashMap<NodeId, usize>,
     /// The objects around each Method, the outermost first.
     around: HashMap<TopicId, Vec<NodeId>>,
+    types: ArgumentTypes,
     asked: HashMap<AskId, oneshot::Sender<Answered<Bytes>>>,
-    /// Those that waited the longest, to be looked at whether their client is still there.
-    order: VecDeque<AskId>,
+    /// Those whose clients wait no longer, to be told.
+    given_up: VecDeque<AskId>,
     next: u64,
     told_full: bool,
 }
 
-/// What is to be asked.
-pub(crate) struct Ask {
-    pub(crate) ask: AskId,
-    pub(crate) topic: TopicId,
-    pub(crate) request: Bytes,
-    pub(crate) timeout: Duration,
+/// What clients want.
+pub(crate) enum Wish {
+    /// An answer.
+    Ask {
+        ask: AskId,
+        topic: TopicId,
+        request: Bytes,
+        timeout: Duration,
+    },
+    /// No answer any longer.
+    GiveUp(AskId),
 }
+
+/// The calls that another mapping has under another node, without a Method in between.
+pub(crate) struct Moved(Vec<(TopicId, Arc<CallDescription>)>);
 
 /// What the arguments of a client come to.
 pub(crate) enum Refused {
@@ -81,8 +125,10 @@ impl Methods {
     pub(crate) fn new(
         manager: Arc<SpaceManager>,
         mapping: &Arc<Mapping>,
-        questions: mpsc::Receiver<Question>,
+        (heard, structures): (Heard, &[Structure]),
     ) -> Self {
+        let mut types = ArgumentTypes::default();
+        types.set_variables(structures);
         address::add_folder(
             &address::calls_folder(),
             "Calls",
@@ -92,12 +138,14 @@ impl Methods {
         Self {
             manager,
             mapping: Arc::clone(mapping),
-            questions,
+            heard,
             shown: HashMap::new(),
+            refused: HashMap::new(),
             objects: HashMap::new(),
             around: HashMap::new(),
+            types,
             asked: HashMap::new(),
-            order: VecDeque::new(),
+            given_up: VecDeque::new(),
             next: 0,
             told_full: false,
         }
@@ -106,13 +154,14 @@ impl Methods {
     /// Shows a call, in the place of what it was. The parts of an action are Methods too.
     pub(crate) fn known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
         self.gone(topic);
-        if self.shown.len() >= MOST_METHODS {
+        if self.shown.len() + self.refused.len() >= MOST_METHODS {
             self.tell_full();
             return;
         }
         let node = self.node(topic);
         let Some(around) = self.insert(&node, (topic, description)) else {
             warn!(%topic, %node, "the call is shown as no Method: there is a node of that id already");
+            self.refused.insert(topic, Arc::clone(description));
             return;
         };
         for object in &around {
@@ -131,7 +180,7 @@ impl Methods {
 
     /// Puts a Method in, unless there is something under its node. Gives the objects around it.
     fn insert(
-        &self,
+        &mut self,
         node: &NodeId,
         (topic, description): (TopicId, &Arc<CallDescription>),
     ) -> Option<Vec<NodeId>> {
@@ -139,7 +188,13 @@ impl Methods {
         if address_space.node_exists(node) {
             return None;
         }
-        let around = add(&mut address_space, node, (topic, description));
+        let namespace = topic.namespace.get();
+        let mut served = self.manager.inner().served_namespaces();
+        // The TypeIds of its values are in that namespace, which means another one to a client else.
+        if served.any(|(index, _)| index == namespace) {
+            self.types.add(&mut address_space, (topic, description));
+        }
+        let around = add(&mut address_space, node, (topic, description), &self.types);
         drop(address_space);
         let callable = Callable {
             topic,
@@ -163,11 +218,12 @@ impl Methods {
         };
         mapped
             .filter(has)
-            .unwrap_or_else(|| address::unmapped_node(topic))
+            .unwrap_or_else(|| address::unmapped_call(topic))
     }
 
     /// Takes a call away. What was asked is still answered.
     pub(crate) fn gone(&mut self, topic: TopicId) {
+        self.refused.remove(&topic);
         let Some(node) = self.shown.remove(&topic) else {
             return;
         };
@@ -177,6 +233,7 @@ impl Methods {
             drop(address_space.delete(&arguments_node(&node, arguments), true));
         }
         drop(address_space.delete(&node, true));
+        self.types.remove(&mut address_space, topic);
         // An object without a Method in it would stay for ever.
         for object in self.around.remove(&topic).unwrap_or_default().iter().rev() {
             let left = self.objects.get_mut(object).map_or(0, |methods| {
@@ -190,30 +247,55 @@ impl Methods {
         }
     }
 
-    /// Another mapping may say another node.
-    pub(crate) fn reload(&mut self, mapping: &Arc<Mapping>) {
+    /// Takes the Methods out that another mapping has under another node: a variable may have theirs.
+    pub(crate) fn take_moved(&mut self, mapping: &Arc<Mapping>) -> Moved {
         self.mapping = Arc::clone(mapping);
         let moved = self
             .shown
             .iter()
             .filter(|(topic, node)| self.node(**topic) != **node);
-        let moved: Vec<TopicId> = moved.map(|(topic, _)| *topic).collect();
-        for topic in moved {
-            let callable = self.shown.get(&topic).and_then(|node| {
-                let methods = self.manager.inner().methods().lock();
-                methods.get(node).cloned()
-            });
-            if let Some(callable) = callable {
-                self.known(topic, &callable.description);
+        let callable = |(topic, node): (&TopicId, &NodeId)| {
+            let methods = self.manager.inner().methods().lock();
+            Some((*topic, Arc::clone(&methods.get(node)?.description)))
+        };
+        let mut moved: Vec<_> = moved.filter_map(callable).collect();
+        for (topic, _) in &moved {
+            self.gone(*topic);
+        }
+        moved.extend(self.refused.drain());
+        Moved(moved)
+    }
+
+    /// Puts them in again, beside variables of these DataTypes.
+    pub(crate) fn put(&mut self, Moved(moved): Moved, structures: &[Structure]) {
+        self.types.set_variables(structures);
+        for (topic, description) in moved {
+            self.known(topic, &description);
+        }
+    }
+
+    /// What a client wants next. Cancel-safe.
+    pub(crate) async fn next(&mut self) -> Wish {
+        loop {
+            if let Some(ask) = self.given_up.pop_front() {
+                return Wish::GiveUp(ask);
+            }
+            tokio::select! {
+                Some(question) = self.heard.questions.recv() => {
+                    // Whoever has given up meanwhile has not asked.
+                    if !question.answer.is_closed() {
+                        return self.ask(question);
+                    }
+                }
+                () = self.heard.given_up.notified() => {
+                    let given_up = self.asked.extract_if(|_, answer| answer.is_closed());
+                    self.given_up.extend(given_up.map(|(ask, _)| ask));
+                }
             }
         }
     }
 
-    /// What a client asks next. Cancel-safe.
-    pub(crate) async fn next(&mut self) -> Ask {
-        let Some(question) = self.questions.recv().await else {
-            return std::future::pending().await;
-        };
+    fn ask(&mut self, question: Question) -> Wish {
         let Question {
             topic,
             block,
@@ -221,23 +303,12 @@ impl Methods {
         } = question;
         let ask = AskId(self.next);
         self.next = self.next.wrapping_add(1);
-        // Answered ones, and those whose client is gone.
-        while let Some(oldest) = self.order.front()
-            && self
-                .asked
-                .get(oldest)
-                .is_none_or(oneshot::Sender::is_closed)
-        {
-            self.asked.remove(oldest);
-            self.order.pop_front();
-        }
         self.asked.insert(ask, answer);
-        self.order.push_back(ask);
         let timeout = self
             .mapping
             .call(topic)
             .map_or(TIMEOUT, |call| call.timeout);
-        Ask {
+        Wish::Ask {
             ask,
             topic,
             request: block,
@@ -253,12 +324,42 @@ impl Methods {
     }
 }
 
+impl Questions {
+    /// Both ends.
+    pub(crate) fn channel() -> (Self, Heard) {
+        let (sender, questions) = mpsc::channel(MOST_QUESTIONS);
+        let given_up = Arc::<Notify>::default();
+        let heard = Heard {
+            questions,
+            given_up: Arc::clone(&given_up),
+        };
+        (Self { sender, given_up }, heard)
+    }
+}
+
+impl Waiting {
+    /// The answer. It is given up when the client is gone, for which is looked from time to time: the library goes on with the
+    /// requests of a connection that is lost.
+    async fn answer(mut self, gone: impl Fn() -> bool) -> Result<Answered<Bytes>, StatusCode> {
+        let answer = loop {
+            match tokio::time::timeout(LOOK_AT_CLIENT, &mut self.answered).await {
+                Ok(answer) => break answer.map_err(|_| StatusCode::BadShutdown),
+                Err(_) if gone() => return Err(StatusCode::BadSessionClosed),
+                Err(_) => {}
+            }
+        };
+        self.over = true;
+        answer
+    }
+}
+
 impl Callable {
-    /// Asks with those arguments, and gives what comes back.
+    /// Asks with those arguments, and gives what comes back. Given up when it is dropped, or when the client is gone.
     pub(crate) async fn call(
         self,
         arguments: &[Variant],
-        questions: &mpsc::Sender<Question>,
+        questions: &Questions,
+        gone: impl Fn() -> bool,
     ) -> Result<Vec<Variant>, Refused> {
         let block = self.block(arguments)?;
         let (answer, answered) = oneshot::channel();
@@ -267,11 +368,16 @@ impl Callable {
             block,
             answer,
         };
+        let waiting = Waiting {
+            answered,
+            given_up: Arc::clone(&questions.given_up),
+            over: false,
+        };
         questions
+            .sender
             .try_send(question)
             .map_err(|_| Refused::Status(StatusCode::BadTooManyOperations))?;
-        let answer = answered.await;
-        let answer = answer.map_err(|_| Refused::Status(StatusCode::BadShutdown))?;
+        let answer = waiting.answer(gone).await.map_err(Refused::Status)?;
         let response = answer.map_err(|error| {
             info!(topic = %self.topic, "a call came to nothing: {error}");
             Refused::Status(StatusCode::from(error.status.0))
@@ -284,16 +390,18 @@ impl Callable {
             .map_err(|_| Refused::Status(StatusCode::BadDecodingError))
     }
 
+    /// The request. Arguments that all have values of their own may be left out all together.
     fn block(&self, arguments: &[Variant]) -> Result<Bytes, Refused> {
         let request = &self.description.request;
-        if arguments.len() < request.len() {
+        let left_out = arguments.is_empty() && self.description.may_be_empty();
+        if arguments.len() < request.len() && !left_out {
             return Err(Refused::Status(StatusCode::BadArgumentsMissing));
         }
         let block = value::fields_block(arguments).map_err(Refused::Status)?;
         let fields = Fields::parse(&block);
         let fields = fields.map_err(|_| Refused::Status(StatusCode::BadInvalidArgument))?;
         let statuses = fields.zip(request).map(|(value, field)| match value {
-            Ok(value) if shape(field).fits(&value) => StatusCode::Good,
+            Ok(value) if Shape::of(field).fits(&value) => StatusCode::Good,
             Ok(_) => StatusCode::BadTypeMismatch,
             Err(_) => StatusCode::BadInvalidArgument,
         });
@@ -305,18 +413,12 @@ impl Callable {
     }
 }
 
-fn shape(field: &CallField) -> Shape {
-    Shape(Some((
-        field.builtin,
-        matches!(field.rank, Rank::Array { .. }),
-    )))
-}
-
 /// Puts the Method in, and the objects around it that are not there. Gives the objects, the outermost first.
 fn add(
     address_space: &mut AddressSpace,
     node: &NodeId,
     (topic, description): (TopicId, &CallDescription),
+    types: &ArgumentTypes,
 ) -> Vec<NodeId> {
     let name = match &description.name[..] {
         "" => topic.to_string(),
@@ -342,9 +444,9 @@ fn add(
         around.push(inner.clone());
         object = inner;
     }
-    let about = match (&description.about[..], description.role) {
-        ("", CallRole::Call) => topic.to_string(),
-        (about, _) => format!("{topic}: {about}"),
+    let about = match &description.about[..] {
+        "" => topic.to_string(),
+        about => format!("{topic}: {about}"),
     };
     let names = QualifiedName::new(node.namespace, last);
     let mut method = MethodBuilder::new(node, names, LocalizedText::from(last))
@@ -353,12 +455,12 @@ fn add(
         .executable(true)
         .user_executable(true);
     if !description.request.is_empty() {
-        let arguments = arguments(&description.request);
+        let arguments = arguments(topic, &description.request, types);
         let id = arguments_node(node, "InputArguments");
         method = method.input_args(address_space, &id, &arguments);
     }
     if !description.response.is_empty() {
-        let arguments = arguments(&description.response);
+        let arguments = arguments(topic, &description.response, types);
         let id = arguments_node(node, "OutputArguments");
         method = method.output_args(address_space, &id, &arguments);
     }
@@ -366,11 +468,11 @@ fn add(
     around
 }
 
-fn arguments(fields: &[CallField]) -> Vec<Argument> {
+fn arguments(topic: TopicId, fields: &[CallField], types: &ArgumentTypes) -> Vec<Argument> {
     let argument = |field: &CallField| Argument {
         name: field.name.as_str().into(),
-        data_type: shape(field).data_type(),
-        value_rank: shape(field).value_rank(),
+        data_type: types.data_type(topic, field),
+        value_rank: Shape::of(field).value_rank(),
         array_dimensions: match field.rank {
             Rank::Scalar => None,
             Rank::Array { fixed } => Some(vec![fixed.unwrap_or(0)]),
@@ -392,6 +494,8 @@ const MOST_METHODS: usize = 4_096;
 /// Objects around one Method.
 const MOST_PARTS: usize = 8;
 /// Requests of clients that wait for the run loop; one more is refused.
-pub(crate) const MOST_QUESTIONS: usize = 256;
+const MOST_QUESTIONS: usize = 256;
+/// How often it is looked whether a client that waits is still there.
+const LOOK_AT_CLIENT: Duration = Duration::from_secs(1);
 /// How long an answer is waited for where the mapping says nothing.
 const TIMEOUT: Duration = Duration::from_secs(30);

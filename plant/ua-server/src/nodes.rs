@@ -31,7 +31,7 @@ use uadp::Timestamp;
 use crate::address;
 use crate::budget::{Answers, LARGEST, SMALL, Watched};
 use crate::layout::{FieldNode, Layout, TopicNode};
-use crate::methods::{Question, Refused, Table};
+use crate::methods::{Questions, Refused, Table};
 use crate::properties;
 use crate::value;
 use crate::values::{self, Shown, Stamp, Values, View};
@@ -72,7 +72,7 @@ pub(crate) struct Exits {
     /// Monitored items as they are made, to be looked at once more. Without room a look is missed.
     pub(crate) created: mpsc::Sender<(NodeId, MonitoredItemHandle)>,
     /// What clients ask of calls. A client is told when there is no room.
-    pub(crate) questions: mpsc::Sender<Question>,
+    pub(crate) questions: Questions,
 }
 
 /// A value a client wrote to a topic of the OPC UA side.
@@ -669,17 +669,23 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
 
     async fn call(
         &self,
-        _context: &RequestContext,
+        context: &RequestContext,
         _address_space: &RwLock<AddressSpace>,
         methods_to_call: &mut [&mut &mut MethodCall],
     ) -> Result<(), StatusCode> {
+        // An answer goes by the channel that the request came by, or not at all.
+        let channel = context.session().read().secure_channel_id();
+        let gone = || {
+            let session = context.session().read();
+            !session.is_activated() || session.secure_channel_id() != channel
+        };
         let calls = methods_to_call.iter_mut().map(|method| async {
             // It may have gone since the server looked.
             let callable = self.methods.lock().get(method.method_id()).cloned();
             let called = match callable {
                 Some(callable) => {
                     let arguments = method.arguments().to_vec();
-                    callable.call(&arguments, &self.exits.questions).await
+                    callable.call(&arguments, &self.exits.questions, gone).await
                 }
                 None => Err(Refused::Status(StatusCode::BadNodeIdUnknown)),
             };

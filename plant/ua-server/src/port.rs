@@ -5,12 +5,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::{
-    Answered, AskId, CallDescription, Delivery, Described, Failure, FailureKind, Kept, Port,
-    PortEvent, TypePaths,
+    Answered, AskId, CallDescription, Delivery, Described, Execution, Failure, FailureKind, Kept,
+    Port, PortEvent, TypePaths,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
-use mappings::{Mapping, Server, SpaceId, TopicId};
+use mappings::{Mapping, SecurityPolicy, Server, SpaceId, TopicId};
 use opcua::server::address_space::AddressSpace;
 use opcua::server::node_manager::ServerContext;
 use opcua::server::node_manager::memory::{
@@ -30,8 +30,9 @@ use uadp::BuiltinType;
 use crate::browse::Ordered;
 use crate::components::Components;
 use crate::endpoint;
+use crate::executing::Executing;
 use crate::layout::Layout;
-use crate::methods::{Ask, MOST_QUESTIONS, Methods, Question};
+use crate::methods::{Heard, Methods, Questions, Wish};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
 use crate::space::Space;
 use crate::structures::Types;
@@ -72,6 +73,8 @@ pub(crate) struct ServerPort {
     components: Option<Components>,
     /// Calls of other spaces.
     methods: Methods,
+    /// Methods of other servers.
+    executing: Executing,
 }
 
 impl ServerPort {
@@ -97,10 +100,13 @@ impl ServerPort {
             .url
             .bind()
             .map_err(|error| unavailable(format!("{error} (--endpoint)")))?;
-        let port = listener
+        let address = listener
             .local_addr()
-            .map_err(|error| io(error.to_string()))?
-            .port();
+            .map_err(|error| io(error.to_string()))?;
+        let port = address.port();
+        if !address.ip().is_loopback() && described.security.contains(&SecurityPolicy::None) {
+            tell_open(&setup.url);
+        }
 
         let (exits, (writes, created_items, asked)) = exits();
         if setup.trust_any_client {
@@ -135,7 +141,8 @@ impl ServerPort {
             "serving at {} (port {port})",
             setup.url
         );
-        let methods = Methods::new(Arc::clone(&manager), mapping, asked);
+        let executing = Executing::new(mapping, &described.application_uri, setup.pki.root());
+        let methods = Methods::new(Arc::clone(&manager), mapping, (asked, &layout.structures));
         let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
         let server = told_of(described, setup.url.advertised(port));
         let (told, components) = tell(server, setup.announce, nodes)?;
@@ -158,6 +165,7 @@ impl ServerPort {
             told,
             components,
             methods,
+            executing,
         })
     }
 }
@@ -179,10 +187,13 @@ impl Port for ServerPort {
                     return PortEvent::Sample { topic, payload: block, received: source, latched_by: None };
                 }
                 ended = ended(&mut self.serving) => return PortEvent::Ended(ended),
-                asked = self.methods.next() => {
-                    let Ask { ask, topic, request, timeout } = asked;
-                    return PortEvent::Ask { ask, topic, request, timeout };
-                }
+                wish = self.methods.next() => return match wish {
+                    Wish::Ask { ask, topic, request, timeout } => {
+                        PortEvent::Ask { ask, topic, request, timeout }
+                    }
+                    Wish::GiveUp(ask) => PortEvent::AskGivenUp { ask },
+                },
+                event = self.executing.next() => return event,
                 () = next(&mut self.components) => {}
                 _ = self.look.tick() => self.pki.report_rejected(),
             }
@@ -230,6 +241,10 @@ impl Port for ServerPort {
         self.methods.answered(ask, answer);
     }
 
+    fn execute(&mut self, execution: Execution) -> bool {
+        self.executing.execute(&execution)
+    }
+
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
         let (was, is) = (&self.described, mapping.server());
         let endpoint = self.mapped_url && was.endpoint != is.endpoint;
@@ -247,6 +262,7 @@ impl Port for ServerPort {
         .collect();
         self.space.limit_writes(largest_write(mapping));
         self.types.replace(types);
+        let moved = self.methods.take_moved(mapping);
         match Layout::within(&self.namespaces, mapping, &mut self.types) {
             Ok((layout, namespaces)) => {
                 restart.extend(namespaces);
@@ -257,7 +273,8 @@ impl Port for ServerPort {
             }
             Err(error) => restart.push(format!("variables ({error})")),
         }
-        self.methods.reload(mapping);
+        self.methods.put(moved, self.space.structures());
+        self.executing.reload(mapping);
         restart
     }
 
@@ -287,25 +304,33 @@ impl Drop for ServerPort {
     }
 }
 
+/// Who asks the server is not asked for a name, and what it asks of other programs comes from its own address.
+fn tell_open(url: &EndpointUrl) {
+    warn!(
+        "whoever reaches {url} can call what programs of this host execute, whether it is open or not, and write what \
+         the server produces: server.security has None"
+    );
+}
+
 /// What leaves the node manager, and the other ends of that.
 fn exits() -> (Exits, Entries) {
     let (writes, written) = mpsc::channel(MOST_WRITES);
     let (created, created_items) = mpsc::channel(MOST_CREATED);
-    let (questions, asked) = mpsc::channel(MOST_QUESTIONS);
+    let (questions, heard) = Questions::channel();
     let exits = Exits {
         writes,
         room: Arc::new(Semaphore::new(ROOM_FOR_WRITES)),
         created,
         questions,
     };
-    (exits, (written, created_items, asked))
+    (exits, (written, created_items, heard))
 }
 
 /// What clients wrote, the monitored items they made, and what they ask.
 type Entries = (
     mpsc::Receiver<ClientWrite>,
     mpsc::Receiver<(NodeId, MonitoredItemHandle)>,
-    mpsc::Receiver<Question>,
+    Heard,
 );
 
 /// What happens next to the servers that are there.

@@ -113,6 +113,11 @@ impl Space {
         self.structures = wanted.to_vec();
     }
 
+    /// The DataTypes of the mapped variables.
+    pub(crate) fn structures(&self) -> &[Structure] {
+        &self.structures
+    }
+
     /// How large a value may be that clients write, in bytes.
     pub(crate) fn limit_writes(&self, largest: usize) {
         self.manager.inner().limit_writes(largest);

@@ -1,12 +1,12 @@
-//! The DataTypes of messages that are structures: those in arrays, those that a mapping has `as: structure`, and those
-//! nested in them.
+//! The DataTypes of messages that are structures: those in arrays, those that a mapping has `as: structure`, those of calls, and
+//! those nested in them.
 //!
 //! On the wire an ExtensionObject has the name of its message type as TypeId, in the namespace of its topic, and a TypeId
 //! is the NodeId of an encoding (OPC 10000-6, 5.2.2.15): so that is the encoding's, and the DataType has one of its own.
 
 use std::sync::Arc;
 
-use bridge_node::{Definitions, Environment, TypePaths};
+use bridge_node::{CallField, CallStructure, Definitions, Environment, TypePaths};
 use mappings::{Binding, SpaceId, Variable};
 use messages::{Dialect, MemberKind, MessageType, Rank};
 use opcua::nodes::{DataTypeBuilder, ObjectBuilder, ReferenceDirection};
@@ -135,8 +135,53 @@ impl Structure {
         }
     }
 
+    /// A message in a field of a call, and those in it, the outermost first and each once.
+    pub(crate) fn of_call(of: &CallStructure, namespace: u16) -> Vec<Self> {
+        let mut all: Vec<&CallStructure> = vec![of];
+        let mut at = 0;
+        while let Some(next) = all.get(at) {
+            let inner = next
+                .fields
+                .iter()
+                .filter_map(|field| field.structure.as_deref());
+            let inner: Vec<&CallStructure> = inner.collect();
+            for one in inner {
+                if !all.iter().any(|known| known.name == one.name) {
+                    all.push(one);
+                }
+            }
+            at += 1;
+        }
+        let member = |field: &CallField| Member {
+            name: field.name.clone(),
+            kind: match &field.structure {
+                Some(structure) => Kind::Structure(structure.name.clone()),
+                None => Kind::Value(field.builtin),
+            },
+            rank: field.rank,
+        };
+        let structures = all.into_iter().map(|one| Self {
+            namespace,
+            name: one.name.clone(),
+            fields: one.fields.iter().map(member).collect(),
+        });
+        structures.collect()
+    }
+
+    /// Its DataType.
+    pub(crate) fn data_type(&self) -> NodeId {
+        data_type(self.namespace, &self.name)
+    }
+
+    /// Takes the DataType and its encoding out of the address space.
+    pub(crate) fn remove(&self, address_space: &mut AddressSpace) {
+        for node in [self.data_type(), encoding(self.namespace, &self.name)] {
+            drop(address_space.delete(&node, true));
+        }
+    }
+
     /// Whether it has the same nodes.
-    fn is_same(&self, other: &Self) -> bool {
+    pub(crate) fn is_same(&self, other: &Self) -> bool {
         (self.namespace, &self.name) == (other.namespace, &other.name)
     }
 
@@ -169,11 +214,9 @@ impl Structure {
 
     /// Puts the DataType and its encoding into the address space, in the place of one of the same name.
     pub(crate) fn insert(&self, address_space: &mut AddressSpace) {
-        let id = data_type(self.namespace, &self.name);
+        self.remove(address_space);
+        let id = self.data_type();
         let encoding = encoding(self.namespace, &self.name);
-        for node in [&id, &encoding] {
-            drop(address_space.delete(node, true));
-        }
         DataTypeBuilder::new(
             &id,
             QualifiedName::new(self.namespace, self.name.as_str()),

@@ -1,0 +1,96 @@
+//! The DataTypes of messages in the arguments of Methods, which are there as long as a Method has them.
+
+use bridge_node::{CallDescription, CallField};
+use mappings::TopicId;
+use opcua::server::address_space::AddressSpace;
+use opcua::types::NodeId;
+use tracing::warn;
+
+use crate::layout::Shape;
+use crate::structures::Structure;
+
+/// Those that are there beside the DataTypes of variables.
+#[derive(Debug, Default)]
+pub(crate) struct ArgumentTypes {
+    /// Of variables. They stay whatever calls there are.
+    of_variables: Vec<Structure>,
+    /// Of calls, with those that have them.
+    of_calls: Vec<(Structure, Vec<TopicId>)>,
+}
+
+impl ArgumentTypes {
+    pub(crate) fn set_variables(&mut self, structures: &[Structure]) {
+        self.of_variables = structures.to_vec();
+    }
+
+    /// Puts the DataTypes of a call in that are not there. Where another definition has the name of one, or where there are too
+    /// many, the arguments with it are Structures without a definition.
+    pub(crate) fn add(
+        &mut self,
+        address_space: &mut AddressSpace,
+        (topic, description): (TopicId, &CallDescription),
+    ) {
+        let fields = description.request.iter().chain(&description.response);
+        for field in fields {
+            for structure in structures(topic, field) {
+                if self.knows(&structure) {
+                    self.of_calls
+                        .iter_mut()
+                        .filter(|(known, of)| *known == structure && !of.contains(&topic))
+                        .for_each(|(_, of)| of.push(topic));
+                } else if self.has_other(&structure) || self.of_calls.len() >= MOST_TYPES {
+                    warn!(%topic, name = structure.name, "another DataType has that name, or there are too many: arguments with it stay undefined");
+                } else {
+                    structure.insert(address_space);
+                    self.of_calls.push((structure, vec![topic]));
+                }
+            }
+        }
+    }
+
+    /// Takes those out that no other call and no variable has.
+    pub(crate) fn remove(&mut self, address_space: &mut AddressSpace, topic: TopicId) {
+        for (_, of) in &mut self.of_calls {
+            of.retain(|one| *one != topic);
+        }
+        let variables = &self.of_variables;
+        self.of_calls.retain(|(structure, of)| {
+            let stays = variables.iter().any(|one| one.is_same(structure));
+            if of.is_empty() && !stays {
+                structure.remove(address_space);
+            }
+            !of.is_empty()
+        });
+    }
+
+    /// The DataType of an argument.
+    pub(crate) fn data_type(&self, topic: TopicId, field: &CallField) -> NodeId {
+        let all = structures(topic, field);
+        match all.first() {
+            Some(first) if all.iter().all(|one| self.knows(one)) => first.data_type(),
+            Some(_) | None => Shape::of(field).data_type(),
+        }
+    }
+
+    fn knows(&self, structure: &Structure) -> bool {
+        self.all().any(|known| known == structure)
+    }
+
+    fn has_other(&self, structure: &Structure) -> bool {
+        self.all().any(|known| known.is_same(structure))
+    }
+
+    fn all(&self) -> impl Iterator<Item = &Structure> {
+        let of_calls = self.of_calls.iter().map(|(structure, _)| structure);
+        self.of_variables.iter().chain(of_calls)
+    }
+}
+
+/// The structure in a field, and those in it.
+fn structures(topic: TopicId, field: &CallField) -> Vec<Structure> {
+    let structure = field.structure.as_deref();
+    structure.map_or_else(Vec::new, |of| Structure::of_call(of, topic.namespace.get()))
+}
+
+/// DataTypes of calls: anybody in the space can announce some.
+const MOST_TYPES: usize = 1_024;

@@ -1,0 +1,342 @@
+//! Methods of other OPC UA servers, executed for whoever asks for them in the space.
+//!
+//! Each server has one client, whatever number of its Methods are mapped. A Method is offered while the server is there and
+//! its arguments can be carried, and nothing is called twice: what was sent when the connection fell may have run.
+
+mod signature;
+mod watch;
+
+use std::collections::{HashMap, VecDeque};
+use std::path::Path;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge_node::{Executed, Execution, ExecutionId, Offered, PortEvent, Refusal, now};
+use mappings::{ExecutedBy, Mapping, MethodTarget, TopicId};
+use opcua::types::{StatusCode, Variant};
+use plant_opcua::client::{CallError, CallOptions, Client, ClientConfig, ClientError};
+use tokio::sync::{mpsc, watch as cell};
+use tokio::task::{AbortHandle, JoinSet};
+use tracing::info;
+use uadp::Fields;
+
+use self::signature::Signature;
+use self::watch::{Found, News};
+use crate::layout::Shape;
+use crate::value;
+
+/// The Methods of other servers that the mapping names.
+pub(crate) struct Executing {
+    config: ClientConfig,
+    /// By their endpoints.
+    servers: HashMap<String, Server>,
+    wanted: HashMap<TopicId, Arc<Wanted>>,
+    timeouts: HashMap<TopicId, Duration>,
+    /// Those that are offered.
+    found: HashMap<TopicId, Arc<Found>>,
+    heard: mpsc::Receiver<News>,
+    tell: mpsc::Sender<News>,
+    /// What was not executed, and what is no longer offered.
+    events: VecDeque<PortEvent>,
+    running: JoinSet<Executed>,
+    executions: HashMap<tokio::task::Id, (ExecutionId, TopicId)>,
+}
+
+/// A Method as the mapping has it.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) struct Wanted {
+    topic: TopicId,
+    name: String,
+    about: String,
+    open: bool,
+    target: MethodTarget,
+}
+
+/// A server with Methods.
+struct Server {
+    wanted: cell::Sender<Vec<Arc<Wanted>>>,
+    watching: AbortHandle,
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.watching.abort();
+    }
+}
+
+impl Executing {
+    /// Looks for the Methods of `mapping` from now on, as a client with that ApplicationUri and the certificates in `pki`.
+    pub(crate) fn new(mapping: &Mapping, application_uri: &str, pki: &Path) -> Self {
+        let (tell, heard) = mpsc::channel(MOST_NEWS);
+        let mut executing = Self {
+            config: ClientConfig {
+                pki: Some(pki.to_owned()),
+                timeout: ANSWERS_WITHIN,
+                keep_alive: KEEP_ALIVE,
+                ..ClientConfig::new(application_uri, "UA bridge server")
+            },
+            servers: HashMap::new(),
+            wanted: HashMap::new(),
+            timeouts: HashMap::new(),
+            found: HashMap::new(),
+            heard,
+            tell,
+            events: VecDeque::new(),
+            running: JoinSet::new(),
+            executions: HashMap::new(),
+        };
+        executing.reload(mapping);
+        executing
+    }
+
+    /// Goes over to the Methods of another mapping. What both say alike goes on undisturbed.
+    pub(crate) fn reload(&mut self, mapping: &Mapping) {
+        let mut before = std::mem::take(&mut self.wanted);
+        self.timeouts.clear();
+        let mut servers: HashMap<String, Vec<Arc<Wanted>>> = HashMap::new();
+        for call in mapping.calls() {
+            let ExecutedBy::OpcUa(target) = &call.executed else {
+                continue;
+            };
+            let wanted = Wanted {
+                topic: call.topic,
+                name: call.name.clone(),
+                about: call.about.clone(),
+                open: call.open,
+                target: target.clone(),
+            };
+            let known = before.remove(&call.topic).filter(|one| **one == wanted);
+            let wanted = known.unwrap_or_else(|| Arc::new(wanted));
+            let url = target.endpoint.to_string();
+            servers.entry(url).or_default().push(Arc::clone(&wanted));
+            self.wanted.insert(call.topic, wanted);
+            self.timeouts.insert(call.topic, call.timeout);
+        }
+        let is_wanted = |found: &Found| {
+            let wanted = self.wanted.get(&found.wanted.topic);
+            wanted.is_some_and(|wanted| Arc::ptr_eq(wanted, &found.wanted))
+        };
+        let gone = self.found.extract_if(|_, found| !is_wanted(found));
+        self.events
+            .extend(gone.map(|(topic, _)| PortEvent::Withdrawn { topic }));
+        self.servers.retain(|url, _| servers.contains_key(url));
+        for (url, wanted) in servers {
+            match self.servers.get(&url) {
+                Some(server) => drop(server.wanted.send_replace(wanted)),
+                None => drop(self.servers.insert(url.clone(), self.watch(&url, wanted))),
+            }
+        }
+    }
+
+    fn watch(&self, url: &str, wanted: Vec<Arc<Wanted>>) -> Server {
+        let client = Client::open(self.config.clone(), url);
+        let (wanted, receiver) = cell::channel(wanted);
+        let watching = watch::run(client, url.to_owned(), receiver, self.tell.clone());
+        Server {
+            wanted,
+            watching: tokio::spawn(watching).abort_handle(),
+        }
+    }
+
+    /// What happens next. Cancel-safe.
+    pub(crate) async fn next(&mut self) -> PortEvent {
+        loop {
+            if let Some(event) = self.events.pop_front() {
+                return event;
+            }
+            tokio::select! {
+                Some(news) = self.heard.recv() => self.take(news),
+                Some(ended) = self.running.join_next_with_id() => {
+                    let (id, outcome) = match ended {
+                        Ok((id, outcome)) => (id, outcome),
+                        Err(error) => (error.id(), Executed::Lost),
+                    };
+                    if let Some((execution, _)) = self.executions.remove(&id) {
+                        return PortEvent::Executed { execution, outcome };
+                    }
+                }
+            }
+        }
+    }
+
+    fn take(&mut self, news: News) {
+        match news {
+            News::Found(found) => {
+                let topic = found.wanted.topic;
+                let wanted = self.wanted.get(&topic);
+                if wanted.is_none_or(|wanted| !Arc::ptr_eq(wanted, &found.wanted)) {
+                    return;
+                }
+                let description = found.signature.description(&found.wanted);
+                let open = found.wanted.open;
+                info!(%topic, name = found.wanted.name, url = %found.wanted.target.endpoint, "a Method can be called");
+                self.found.insert(topic, Arc::new(found));
+                let offered = Offered { description, open };
+                self.events.push_back(PortEvent::Offer { topic, offered });
+            }
+            News::Lost(topic) => {
+                if self.found.remove(&topic).is_some() {
+                    self.events.push_back(PortEvent::Withdrawn { topic });
+                }
+            }
+        }
+    }
+
+    /// Calls the Method. False where there is no room to say what became of it.
+    pub(crate) fn execute(&mut self, execution: &Execution) -> bool {
+        if self.events.len() >= MOST_EXECUTIONS {
+            return false;
+        }
+        if let Err(refusal) = self.begin(execution) {
+            self.events.push_back(PortEvent::Executed {
+                execution: execution.id,
+                outcome: Executed::Refused(refusal),
+            });
+        }
+        true
+    }
+
+    fn begin(&mut self, execution: &Execution) -> Result<(), Refusal> {
+        let Execution {
+            id,
+            topic,
+            request,
+            deadline,
+            ..
+        } = execution;
+        let found = self.found.get(topic).ok_or(Refusal::NotExecutable)?;
+        let same = self.executions.values().filter(|(_, of)| of == topic);
+        if self.executions.len() >= MOST_EXECUTIONS || same.count() >= MOST_OF_ONE {
+            return Err(Refusal::Busy);
+        }
+        let arguments = arguments(request, &found.signature)?;
+        let left = deadline.saturating_duration_since(now().monotonic);
+        let longest = self.timeouts.get(topic).copied().unwrap_or(left);
+        let within = left.min(longest);
+        if within.is_zero() {
+            return Err(Refusal::NotExecutable);
+        }
+        let call = call(Arc::clone(found), arguments, within);
+        let task = self.running.spawn(call);
+        self.executions.insert(task.id(), (*id, *topic));
+        Ok(())
+    }
+}
+
+/// The arguments that the fields of a request are.
+fn arguments(request: &[u8], signature: &Signature) -> Result<Vec<Variant>, Refusal> {
+    let wrong = |_| Refusal::InvalidArgument;
+    let fields = Fields::parse(request).map_err(wrong)?;
+    if fields.len() != signature.takes.len() {
+        return Err(Refusal::InvalidArgument);
+    }
+    let arguments = fields.zip(&signature.takes).map(|(field, wanted)| {
+        let field = field.map_err(wrong)?;
+        let fits = Shape::of(wanted).fits(&field);
+        fits.then(|| value::from_field(&field))
+            .ok_or(Refusal::InvalidArgument)
+    });
+    arguments.collect()
+}
+
+async fn call(found: Arc<Found>, arguments: Vec<Variant>, within: Duration) -> Executed {
+    let Found {
+        wanted,
+        client,
+        connects,
+        signature,
+    } = &*found;
+    let options = CallOptions {
+        within,
+        connection: Some(*connects),
+    };
+    let method = (&signature.object, &signature.method);
+    let called = client.call_within(method, arguments, options).await;
+    let outcome = match &called {
+        Ok(outputs) => answered(outputs, signature),
+        Err(error) => not_answered(error),
+    };
+    if let Err(error) = called {
+        info!(topic = %wanted.topic, url = %wanted.target.endpoint, ?outcome, "a Method came to nothing: {error}");
+    }
+    outcome
+}
+
+fn answered(outputs: &[Variant], signature: &Signature) -> Executed {
+    let fits = outputs.len() == signature.gives.len()
+        && signature
+            .gives
+            .iter()
+            .zip(outputs)
+            .all(|(wanted, output)| Shape::of(wanted).accepts(output));
+    let block = value::fields_block(outputs);
+    match block {
+        Ok(block) if fits => Executed::Answered(block),
+        // It was executed, and nobody can read what it gave.
+        Ok(_) | Err(_) => Executed::Failed(status(StatusCode::BadDecodingError)),
+    }
+}
+
+fn not_answered(error: &CallError) -> Executed {
+    match error {
+        CallError::Refused {
+            status: said,
+            arguments,
+        } => {
+            // The Method may say so too of what it has begun with, but then of no argument.
+            let of_arguments = arguments.iter().any(|status| status.is_bad());
+            match refusal(*said) {
+                Some(refusal) => Executed::Refused(refusal),
+                None if *said == StatusCode::BadInvalidArgument && of_arguments => {
+                    Executed::Refused(Refusal::InvalidArgument)
+                }
+                None => Executed::Failed(status(*said)),
+            }
+        }
+        CallError::Client(ClientError::NotConnected(_)) => {
+            Executed::Refused(Refusal::NotExecutable)
+        }
+        CallError::Client(ClientError::Status(said)) => match refusal(*said) {
+            Some(refusal) => Executed::Refused(refusal),
+            // Of the whole request, such as an answer that is too large: it may have run.
+            None => Executed::Lost,
+        },
+        CallError::Client(ClientError::Lost(_) | ClientError::Answer(_)) => Executed::Lost,
+    }
+}
+
+/// What a server says that has not called the Method (OPC 10000-4, 5.12.2, and of the session 7.39.2).
+const fn refusal(status: StatusCode) -> Option<Refusal> {
+    Some(match status {
+        StatusCode::BadMethodInvalid
+        | StatusCode::BadNodeIdUnknown
+        | StatusCode::BadNodeIdInvalid => Refusal::NoSuchAction,
+        StatusCode::BadNotExecutable
+        | StatusCode::BadSessionIdInvalid
+        | StatusCode::BadSessionNotActivated
+        | StatusCode::BadServerHalted => Refusal::NotExecutable,
+        StatusCode::BadUserAccessDenied | StatusCode::BadSecurityModeInsufficient => {
+            Refusal::NotAllowed
+        }
+        StatusCode::BadTooManyOperations => Refusal::Busy,
+        StatusCode::BadArgumentsMissing | StatusCode::BadTooManyArguments => {
+            Refusal::InvalidArgument
+        }
+        StatusCode::BadRequestTooLarge => Refusal::TooBig,
+        _ => return None,
+    })
+}
+
+fn status(status: StatusCode) -> uadp::StatusCode {
+    uadp::StatusCode(status.bits())
+}
+
+/// Executions of all Methods at a time.
+const MOST_EXECUTIONS: usize = 1_024;
+/// Executions of one Method at a time.
+const MOST_OF_ONE: usize = 256;
+/// What the clients found out, waiting for the run loop.
+const MOST_NEWS: usize = 64;
+/// How long a server may take for what is asked beside Methods. One that does its Methods and nothing beside them takes long.
+const ANSWERS_WITHIN: Duration = Duration::from_secs(5);
+const KEEP_ALIVE: Duration = Duration::from_secs(2);
