@@ -1,6 +1,6 @@
 //! The parser of `.msg` texts: genmsg's rules for ROS 1, rosidl's for ROS 2.
 
-use std::collections::HashSet;
+use std::collections::BTreeSet;
 
 use uadp::BuiltinType;
 
@@ -151,7 +151,7 @@ impl Definition {
         constants: Vec<Line>,
         fields: Vec<Line>,
     ) -> Result<Self, DefinitionError> {
-        let mut named = HashSet::new();
+        let mut named = BTreeSet::new();
         let mut made = Self {
             name: name.clone(),
             text: String::new(),
@@ -187,7 +187,7 @@ impl Definition {
         name: &TypeName,
         text: &str,
     ) -> Result<Self, DefinitionError> {
-        let mut named = HashSet::new();
+        let mut named = BTreeSet::new();
         let mut parsed = Self {
             name: name.clone(),
             text: text.to_owned(),
@@ -212,7 +212,7 @@ impl Definition {
         &mut self,
         dialect: Dialect,
         line: &str,
-        named: &mut HashSet<String>,
+        named: &mut BTreeSet<String>,
     ) -> Result<(), &'static str> {
         let clean = without_comment(dialect, line);
         if clean.is_empty() {
@@ -278,7 +278,7 @@ impl Definition {
         &mut self,
         dialect: Dialect,
         (written, rest): (&str, &str),
-        named: &mut HashSet<String>,
+        named: &mut BTreeSet<String>,
     ) -> Result<(), &'static str> {
         let (name, default) = rest.split_once(char::is_whitespace).unwrap_or((rest, ""));
         if !is_identifier(name) {

@@ -1,6 +1,6 @@
 //! From definitions to a message type: dependencies, md5, full text, flattened fields.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::sync::Arc;
 
@@ -102,8 +102,8 @@ impl Clock {
 pub(crate) struct Resolver<'r> {
     dialect: Dialect,
     sets: &'r [&'r BTreeMap<TypeName, Arc<Definition>>],
-    shapes: HashMap<TypeName, Arc<Shape>>,
-    md5s: HashMap<TypeName, String>,
+    shapes: BTreeMap<TypeName, Arc<Shape>>,
+    md5s: BTreeMap<TypeName, String>,
 }
 
 impl<'r> Resolver<'r> {
@@ -114,8 +114,8 @@ impl<'r> Resolver<'r> {
         Self {
             dialect,
             sets,
-            shapes: HashMap::new(),
-            md5s: HashMap::new(),
+            shapes: BTreeMap::new(),
+            md5s: BTreeMap::new(),
         }
     }
 
