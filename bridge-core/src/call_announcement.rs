@@ -358,15 +358,19 @@ fn read_fields(data_set: &DataSetMetaDataType<'_>) -> Result<Vec<CallField>, Str
             builtin,
             rank: read_rank(&field)?,
             optional,
-            structure: find(&structures, field.data_type).filter(|_| is_structure(builtin)),
+            structure: find(&structures, field.data_type)
+                .filter(|_| is_structure(builtin))
+                .map(|(structure, _)| Arc::clone(structure)),
         })
     });
     fields.collect()
 }
 
-type Structures<'s> = Vec<(NodeId<'s>, Arc<CallStructure>)>;
+/// Structures by their DataTypes, each with the count of all fields in it, those of structures in it included.
+type Structures<'s> = Vec<(NodeId<'s>, (Arc<CallStructure>, usize))>;
 
-/// The structures that a schema defines. Those that cannot be known whole are left out, such as one that is in itself.
+/// The structures that a schema defines. Those that cannot be known whole are left out, such as one that is in itself, and
+/// those with more in them than is believed: of structures of structures a short announcement can say any number.
 fn read_structures<'s>(schema: &DataTypeSchemaHeader<'s>) -> Structures<'s> {
     let mut open: Vec<StructureDescription<'s>> = schema
         .structure_data_types
@@ -378,8 +382,9 @@ fn read_structures<'s>(schema: &DataTypeSchemaHeader<'s>) -> Structures<'s> {
         let before = open.len();
         open.retain(|one| {
             let read = read_structure(one, &known);
-            known.extend(read.iter().map(|read| (one.data_type_id, Arc::clone(read))));
-            read.is_none()
+            let is_open = read.is_none();
+            known.extend(read.map(|read| (one.data_type_id, read)));
+            is_open
         });
         if open.len() == before {
             return known;
@@ -391,7 +396,7 @@ fn read_structures<'s>(schema: &DataTypeSchemaHeader<'s>) -> Structures<'s> {
 fn read_structure(
     described: &StructureDescription<'_>,
     known: &Structures<'_>,
-) -> Option<Arc<CallStructure>> {
+) -> Option<(Arc<CallStructure>, usize)> {
     let name = described.name.name.filter(|name| name.len() <= MAX_NAME)?;
     let definition = &described.structure_definition;
     let written = NodeId::string(described.data_type_id.namespace, name);
@@ -402,6 +407,7 @@ fn read_structure(
     {
         return None;
     }
+    let mut count = 0_usize;
     let fields = definition.fields.iter().map(|field| {
         let name = field.name.filter(|name| name.len() <= MAX_NAME)?;
         let rank = match field.value_rank {
@@ -411,7 +417,9 @@ fn read_structure(
             },
             _ => return None,
         };
-        let structure = find(known, field.data_type);
+        let found = find(known, field.data_type);
+        count = count.saturating_add(1 + found.map_or(0, |(_, inner)| *inner));
+        let structure = found.map(|(structure, _)| Arc::clone(structure));
         let builtin = match (&structure, field.data_type) {
             (Some(_), _) => BuiltinType::ExtensionObject,
             (
@@ -436,12 +444,16 @@ fn read_structure(
     });
     let name = name.to_owned();
     let fields = fields.collect::<Option<_>>()?;
-    Some(Arc::new(CallStructure { name, fields }))
+    let read = Arc::new(CallStructure { name, fields });
+    (count <= MAX_INNER_FIELDS).then_some((read, count))
 }
 
-fn find(structures: &Structures<'_>, data_type: NodeId<'_>) -> Option<Arc<CallStructure>> {
+fn find<'f>(
+    structures: &'f Structures<'_>,
+    data_type: NodeId<'_>,
+) -> Option<&'f (Arc<CallStructure>, usize)> {
     let found = structures.iter().find(|(id, _)| *id == data_type);
-    found.map(|(_, structure)| Arc::clone(structure))
+    found.map(|(_, structure)| structure)
 }
 
 fn is_structure(builtin: BuiltinType) -> bool {
@@ -505,9 +517,12 @@ const MAX_ABOUT: usize = 1_024;
 const MAX_CALL_FIELDS: usize = 256;
 /// Structures of a request or response that are believed.
 const MAX_STRUCTURES: usize = 64;
+/// Fields in one structure, those of the structures in it included.
+const MAX_INNER_FIELDS: usize = 4_096;
 
 #[cfg(test)]
 mod tests {
+    use uadp::discovery::{StructureDefinition, StructureField};
     use uadp::{BuiltinType, NetworkMessage};
 
     use super::*;
@@ -541,6 +556,53 @@ mod tests {
         let (named, name) = crate::split_name(action.name().unwrap()).unwrap();
         assert_eq!(named, topic);
         assert_eq!(read(&action, name), Ok(description));
+    }
+
+    #[test]
+    fn structures_of_structures_are_believed_up_to_a_size() {
+        let names: Vec<String> = (0..20).map(|at| format!("S{at}")).collect();
+        let of = |name| NodeId::string(2, name);
+        let fields: Vec<Vec<StructureField<'_>>> = (0..names.len())
+            .map(|at| {
+                let inner = at.checked_sub(1).map(|inner| of(&names[inner][..]));
+                let field = |name| StructureField {
+                    name: Some(name),
+                    data_type: inner.unwrap_or_else(|| NodeId::numeric(0, 11)),
+                    value_rank: -1,
+                    ..StructureField::default()
+                };
+                vec![field("left"), field("right")]
+            })
+            .collect();
+        let described: Vec<StructureDescription<'_>> = names
+            .iter()
+            .zip(&fields)
+            .map(|(name, fields)| StructureDescription {
+                data_type_id: of(name),
+                name: named_in(2, name),
+                structure_definition: StructureDefinition {
+                    default_encoding_id: of(name),
+                    fields: List::new(fields),
+                    ..StructureDefinition::default()
+                },
+            })
+            .collect();
+        let schema = DataTypeSchemaHeader {
+            structure_data_types: List::new(&described),
+            ..DataTypeSchemaHeader::default()
+        };
+        let known = read_structures(&schema);
+        let counts: Vec<usize> = known.iter().map(|(_, (_, count))| *count).collect();
+        // Each has twice what the one in it has, and two fields.
+        assert_eq!(counts[..3], [2, 6, 14]);
+        assert_eq!((known.len(), counts[10]), (11, 4094), "{counts:?}");
+    }
+
+    fn named_in(namespace: u16, name: &str) -> QualifiedName<'_> {
+        QualifiedName {
+            namespace,
+            name: Some(name),
+        }
     }
 
     #[test]
