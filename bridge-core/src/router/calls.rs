@@ -556,26 +556,24 @@ impl Router {
 
     /// What the port is to be told of calls, or the next request or response that is to be sent.
     pub(super) fn next_action(&mut self, now: Now) -> Option<Output> {
-        if let Some(chunk) = self.next_chunk(now) {
-            return Some(chunk);
-        }
-        let mut bytes = self.spare.pop().unwrap_or_default();
-        let told = self.write_action(&mut bytes, now);
-        match told {
-            Some(Told::Datagram(topic, _)) if bytes.len() <= self.most() => {
-                Some(Output::Action { topic, bytes })
+        loop {
+            if let Some(chunk) = self.next_chunk(now) {
+                return Some(chunk);
             }
-            Some(Told::Datagram(topic, of)) => {
-                self.cut_up(topic, of, bytes);
-                self.next_chunk(now).or_else(|| self.next_action(now))
-            }
-            Some(Told::News(output)) => {
-                self.recycle(bytes);
-                Some(output)
-            }
-            None => {
-                self.recycle(bytes);
-                None
+            let mut bytes = self.spare.pop().unwrap_or_default();
+            match self.write_action(&mut bytes, now) {
+                Some(Told::Datagram(topic, _)) if bytes.len() <= self.most() => {
+                    return Some(Output::Action { topic, bytes });
+                }
+                Some(Told::Datagram(topic, of)) => self.cut_up(topic, of, bytes),
+                Some(Told::News(output)) => {
+                    self.recycle(bytes);
+                    return Some(output);
+                }
+                None => {
+                    self.recycle(bytes);
+                    return None;
+                }
             }
         }
     }
