@@ -324,7 +324,8 @@ impl CallDescription {
         let origin = |field: &CallField| {
             let path = match map.source(&field.name) {
                 Some(Assigned::Constant(literal)) => {
-                    return constant::block(field, &literal).map(Origin::Constant);
+                    return constant::block(field, (field.builtin, field.rank), &literal)
+                        .map(Origin::Constant);
                 }
                 Some(Assigned::Field(path)) => path,
                 None => field.name.clone(),

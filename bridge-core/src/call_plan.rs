@@ -3,11 +3,9 @@
 use std::sync::Arc;
 
 use messages::{MessageType, Plan, PlanError, Selection, ServiceType, Wire};
-use uadp::{
-    DataSetHeader, EncodeError, FieldEncoder, Fields, NetworkHeader, NetworkMessage,
-    NetworkMessageEncoder, Variant,
-};
+use uadp::{Fields, Variant};
 
+use crate::block::{NO_FIELDS, block, too_big};
 use crate::call::{CallDescription, CallMap, Origin};
 use crate::counters::{Cause, Reason};
 use crate::fields::{self, Payload};
@@ -147,37 +145,7 @@ impl ExecutedPlan {
     }
 }
 
-/// A block of the fields that are written.
-pub(crate) fn block(
-    write: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), (Cause, String)>,
-) -> Result<Vec<u8>, (Cause, String)> {
-    let mut scratch = Vec::new();
-    let mut message = NetworkMessageEncoder::new(&mut scratch, &NetworkHeader::default(), None)
-        .map_err(too_big)?;
-    let mut frame = message
-        .key_frame(&DataSetHeader::default())
-        .map_err(too_big)?;
-    write(&mut frame)?;
-    frame.finish().map_err(too_big)?;
-    message.finish().map_err(too_big)?;
-    let message = NetworkMessage::decode(&scratch).map_err(fields::undecodable)?;
-    let fields = message
-        .messages()
-        .next()
-        .transpose()
-        .and_then(|message| message.map(|message| message.fields()).transpose())
-        .map_err(fields::undecodable)?;
-    Ok(fields.map_or_else(|| NO_FIELDS.to_vec(), |fields| fields.bytes().to_vec()))
-}
-
 fn is_identity(order: &[Origin]) -> bool {
     let mut origins = order.iter().enumerate();
     origins.all(|(at, origin)| *origin == Origin::Leaf(at))
 }
-
-pub(crate) fn too_big(error: EncodeError) -> (Cause, String) {
-    (Reason::TooBig.into(), error.to_string())
-}
-
-/// The block without fields.
-pub(crate) const NO_FIELDS: [u8; 2] = [0, 0];

@@ -1,19 +1,24 @@
 //! Constants of the mapping as fields of a request.
 
+use std::fmt::Display;
+
 use messages::{Literal, Rank};
 use uadp::{BuiltinType, DateTime, FieldEncoder, Scalar};
 
-use crate::call::CallField;
-use crate::call_plan;
+use crate::block;
 use crate::counters::Cause;
 
-/// The block with the one field that has that value: a number, text or Boolean, bytes as a list of numbers, or an array of
+/// The block with the one field, of that name and type, that has that value: a number, text or Boolean, bytes as a list of numbers, or an array of
 /// those.
 ///
 /// # Errors
 /// The value is none of the field's type, for people.
-pub(crate) fn block(field: &CallField, literal: &Literal) -> Result<Vec<u8>, String> {
-    let texts = match (literal, field.rank, field.builtin) {
+pub(crate) fn block(
+    field: &impl Display,
+    (builtin, rank): (BuiltinType, Rank),
+    literal: &Literal,
+) -> Result<Vec<u8>, String> {
+    let texts = match (literal, rank, builtin) {
         (Literal::One(text), Rank::Scalar, _) => std::slice::from_ref(text),
         (Literal::List(texts), Rank::Scalar, BuiltinType::ByteString) => {
             let numbers = texts.iter().map(|text| text.parse::<u8>());
@@ -36,13 +41,13 @@ pub(crate) fn block(field: &CallField, literal: &Literal) -> Result<Vec<u8>, Str
         }
     };
     let values = texts.iter().map(|text| {
-        scalar(field.builtin, text).ok_or_else(|| format!("`{text}` is no value of {field}"))
+        scalar(builtin, text).ok_or_else(|| format!("`{text}` is no value of {field}"))
     });
     let values: Vec<Scalar<'_>> = values.collect::<Result<_, _>>()?;
-    encode(|frame| match field.rank {
+    encode(|frame| match rank {
         Rank::Scalar => values.iter().try_for_each(|value| frame.scalar(*value)),
         Rank::Array { .. } => {
-            frame.array(field.builtin, values.len())?;
+            frame.array(builtin, values.len())?;
             values.iter().try_for_each(|value| frame.element(*value))
         }
     })
@@ -51,7 +56,7 @@ pub(crate) fn block(field: &CallField, literal: &Literal) -> Result<Vec<u8>, Str
 fn encode(
     write: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), uadp::EncodeError>,
 ) -> Result<Vec<u8>, String> {
-    let written = call_plan::block(|frame| write(frame).map_err(call_plan::too_big));
+    let written = block::block(|frame| write(frame).map_err(block::too_big));
     written.map_err(|(_, why): (Cause, String)| why)
 }
 
@@ -95,18 +100,18 @@ mod tests {
 
     #[test]
     fn a_constant_is_a_field_of_the_type_of_its_call() {
-        let speed = CallField::scalar("speed", BuiltinType::Int32);
-        let bytes = block(&speed, &Literal::One("100".to_owned())).unwrap();
+        let speed = (BuiltinType::Int32, Rank::Scalar);
+        let bytes = block(&"`speed`", speed, &Literal::One("100".to_owned())).unwrap();
         let mut fields = Fields::parse(&bytes).unwrap();
         let field = fields.next().unwrap().unwrap();
         assert_eq!(field, Variant::Scalar(Scalar::Int32(100)));
         assert!(fields.next().is_none());
-        let why = block(&speed, &Literal::One("fast".to_owned())).unwrap_err();
+        let why = block(&"`speed`", speed, &Literal::One("fast".to_owned())).unwrap_err();
         assert!(why.contains("`fast`") && why.contains("`speed`"), "{why}");
-        block(&speed, &Literal::List(vec!["1".to_owned()])).unwrap_err();
-        let list = CallField::array("joints", BuiltinType::Double);
+        block(&"`speed`", speed, &Literal::List(vec!["1".to_owned()])).unwrap_err();
+        let list = (BuiltinType::Double, Rank::Array { fixed: None });
         let literal = Literal::List(vec!["0.5".to_owned(), "1".to_owned()]);
-        let bytes = block(&list, &literal).unwrap();
+        let bytes = block(&"`joints`", list, &literal).unwrap();
         let Variant::Array(array) = Fields::parse(&bytes).unwrap().next().unwrap().unwrap() else {
             unreachable!("an array was written");
         };

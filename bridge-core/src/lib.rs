@@ -10,6 +10,7 @@
 //! and no allocation.
 
 mod base;
+mod block;
 mod call;
 mod call_announcement;
 mod call_plan;

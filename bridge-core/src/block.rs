@@ -1,0 +1,38 @@
+//! Blocks of fields, as they stand in a key frame: how many there are, and the fields as Variants.
+
+use uadp::{
+    DataSetHeader, EncodeError, FieldEncoder, NetworkHeader, NetworkMessage, NetworkMessageEncoder,
+};
+
+use crate::counters::{Cause, Reason};
+use crate::fields;
+
+/// A block of the fields that are written.
+pub(crate) fn block(
+    write: impl FnOnce(&mut FieldEncoder<'_>) -> Result<(), (Cause, String)>,
+) -> Result<Vec<u8>, (Cause, String)> {
+    let mut scratch = Vec::new();
+    let mut message = NetworkMessageEncoder::new(&mut scratch, &NetworkHeader::default(), None)
+        .map_err(too_big)?;
+    let mut frame = message
+        .key_frame(&DataSetHeader::default())
+        .map_err(too_big)?;
+    write(&mut frame)?;
+    frame.finish().map_err(too_big)?;
+    message.finish().map_err(too_big)?;
+    let message = NetworkMessage::decode(&scratch).map_err(fields::undecodable)?;
+    let fields = message
+        .messages()
+        .next()
+        .transpose()
+        .and_then(|message| message.map(|message| message.fields()).transpose())
+        .map_err(fields::undecodable)?;
+    Ok(fields.map_or_else(|| NO_FIELDS.to_vec(), |fields| fields.bytes().to_vec()))
+}
+
+pub(crate) fn too_big(error: EncodeError) -> (Cause, String) {
+    (Reason::TooBig.into(), error.to_string())
+}
+
+/// The block without fields.
+pub(crate) const NO_FIELDS: [u8; 2] = [0, 0];
