@@ -18,7 +18,7 @@ use std::task::{Context, Poll};
 use std::time::Instant;
 
 use bridge_core::{CallDescription, ExecutionId, Refusal};
-use mappings::{Mapping, TopicId};
+use mappings::{CallKind, Mapping, TopicId};
 use tokio::sync::mpsc;
 
 pub use self::graph::{
@@ -30,7 +30,8 @@ use self::executors::Executors;
 use self::facades::Facades;
 use crate::policy::Policy;
 use crate::port::{Delivery, Execution};
-use crate::{Asker, PortEvent, Present};
+use crate::present::{self, Present};
+use crate::{Asker, PortEvent};
 
 /// The actions of one bridge: those of its graph that it executes for others, and those of other spaces that it offers.
 #[derive(Debug)]
@@ -58,13 +59,13 @@ impl Actions {
     /// Whether an action of that name is one of our own space by its name, so that its type has to be found out.
     #[must_use]
     pub fn is_named(policy: &Policy, action: &str) -> bool {
-        executors::named(policy, action).is_some()
+        present::named(policy, action).is_some()
     }
 
     /// The names of the actions that the mapping has executed in our own space.
     #[must_use]
     pub fn mapped<'m>(mapping: &'m Mapping, policy: &Policy) -> BTreeSet<&'m str> {
-        executors::mapped(mapping, policy)
+        present::mapped(mapping, policy, CallKind::Action)
     }
 
     /// Compares the action servers there are, each with its type as far as that is known, with those that are offered to
@@ -157,8 +158,8 @@ impl Actions {
 
     /// Whether the values of a topic are for an action server here: they are no topic of the graph by themselves.
     #[must_use]
-    pub fn takes(&self, topic: TopicId) -> bool {
-        self.facades.takes(topic)
+    pub fn takes(&self, policy: &Policy, topic: TopicId) -> bool {
+        self.facades.takes(policy, topic)
     }
 
     /// Takes a value of a topic that it [takes](Self::takes).

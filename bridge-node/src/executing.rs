@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use bridge_core::{CallRole, Executed, ExecutionId, OfferedType, Refusal};
 use bytes::Bytes;
-use mappings::{CallKind, ExecutedBy, Mapping, TopicId};
+use mappings::{CallKind, Mapping, TopicId};
 use messages::{ServiceType, TypeName};
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tokio::task::JoinSet;
@@ -18,6 +18,7 @@ use uadp::StatusCode;
 
 use crate::policy::Policy;
 use crate::port::Execution;
+use crate::present::{self, Present};
 use crate::services::{CallFault, Ran, ServiceCall};
 use crate::{PortEvent, ServiceGraph};
 
@@ -37,9 +38,6 @@ pub trait ExecutorGraph: ServiceGraph {
         timeout: Duration,
     ) -> Result<Self::Executor, String>;
 }
-
-/// The services there are, each with its type as far as that is known.
-pub type Present = BTreeMap<String, Option<TypeName>>;
 
 /// What of a graph is executed for the space.
 #[derive(Debug)]
@@ -99,17 +97,12 @@ impl<C: ServiceCall + Sync> Executing<C> {
     /// Whether a service of that name is a call of our own space by its name, so that its type has to be found out.
     #[must_use]
     pub fn is_named(policy: &Policy, service: &str) -> bool {
-        named(policy, service).is_some()
+        present::named(policy, service).is_some()
     }
 
     /// The names of the services that the mapping has executed in our own space.
     pub fn mapped<'m>(mapping: &'m Mapping, policy: &Policy) -> BTreeSet<&'m str> {
-        let calls = mapping.executed_in(policy.own());
-        let names = calls.filter_map(|call| match &call.executed {
-            ExecutedBy::Ros(target) => Some(target.name.as_str()),
-            ExecutedBy::OpcUa(_) | ExecutedBy::Elsewhere => None,
-        });
-        names.collect()
+        present::mapped(mapping, policy, CallKind::Service)
     }
 
     /// Compares the services there are with those that are offered as calls, and begins to offer `most` at most.
@@ -120,7 +113,7 @@ impl<C: ServiceCall + Sync> Executing<C> {
         (present, mut most): (&Present, usize),
     ) -> Vec<PortEvent> {
         while self.tasks.try_join_next().is_some() {}
-        tell_other_types(policy, present);
+        present::tell_other_types(policy, present, CallKind::Service);
         let wanted = wanted(policy, present);
         let mut events = Vec::new();
         let gone = self
@@ -269,79 +262,22 @@ async fn run<C: ServiceCall + Sync>(
     drop(report.send(Done { execution, result }));
 }
 
-/// The call that a service is by its name.
-fn named(policy: &Policy, service: &str) -> Option<TopicId> {
-    let topic: TopicId = service.strip_prefix('/')?.parse().ok()?;
-    (topic.space == policy.own()).then_some(topic)
-}
-
 /// What is to be offered of the services there are.
 fn wanted(policy: &Policy, present: &Present) -> BTreeMap<TopicId, Wanted> {
-    let mapping = policy.mapping();
-    let mut wanted = BTreeMap::new();
-    let taken: BTreeSet<TopicId> = mapping
-        .executed_in(policy.own())
-        .flat_map(mappings::Call::topics)
-        .collect();
-    for (service, type_name) in present {
-        let (Some(topic), Some(type_name)) = (named(policy, service), type_name) else {
-            continue;
+    let found = present::found(policy, present, CallKind::Service);
+    let wanted = found.map(|found| {
+        let (name, about, open) = found.said();
+        let wanted = Wanted {
+            service: found.target.to_owned(),
+            type_name: found.type_name.clone(),
+            name,
+            about,
+            open,
+            timeout: found.call.map_or(TIMEOUT, |call| call.timeout),
         };
-        if taken.contains(&topic) {
-            continue;
-        }
-        let name = Wanted {
-            service: service.clone(),
-            type_name: type_name.clone(),
-            name: String::new(),
-            about: String::new(),
-            open: false,
-            timeout: TIMEOUT,
-        };
-        wanted.insert(topic, name);
-    }
-    for call in mapping.executed_in(policy.own()) {
-        let (CallKind::Service, ExecutedBy::Ros(target)) = (call.kind, &call.executed) else {
-            continue;
-        };
-        match present.get(&target.name) {
-            Some(None) => {}
-            Some(Some(type_name)) if *type_name == target.type_name => {}
-            Some(Some(_)) | None => continue,
-        }
-        wanted.insert(
-            call.topic,
-            Wanted {
-                service: target.name.clone(),
-                type_name: target.type_name.clone(),
-                name: call.name.clone(),
-                about: call.about.clone(),
-                open: call.open,
-                timeout: call.timeout,
-            },
-        );
-    }
-    wanted
-}
-
-/// Tells of services of other types than the mapping says.
-fn tell_other_types(policy: &mut Policy, present: &Present) {
-    let mapping = Arc::clone(policy.mapping());
-    for call in mapping.executed_in(policy.own()) {
-        let (CallKind::Service, ExecutedBy::Ros(target)) = (call.kind, &call.executed) else {
-            continue;
-        };
-        if let Some(Some(type_name)) = present.get(&target.name)
-            && *type_name != target.type_name
-        {
-            policy.told.once(&target.name, "other type", || {
-                format!(
-                    "the service {} is not executed as {}: it is of type {type_name}, and the mapping says {}",
-                    target.name, call.topic, target.type_name
-                )
-            });
-        }
-    }
+        (found.topic, wanted)
+    });
+    wanted.collect()
 }
 
 /// Services that are offered to other spaces: anybody in a graph can invent names.

@@ -6,7 +6,7 @@
 //! its server lists it as at work.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Arc, Weak};
+use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::actions::{
@@ -22,53 +22,16 @@ use messages::{
 };
 use tcpros::TopicType;
 use tcpros::actionlib::{
-    ActionClientOptions, ActionError, ActionServerOptions, CancelSent, CommState, GoalHandle,
-    GoalResult, LostReason, ServerGoal, Status,
+    ActionClientOptions, ActionServerOptions, CancelSent, CommState, GoalHandle, GoalResult,
+    LostReason, ServerGoal, Status,
 };
 use tokio::sync::Mutex;
 use tokio::time::{Instant, timeout_at};
 use tracing::warn;
 
 use crate::definitions::Definitions;
+use crate::ends::{self, Server};
 use crate::services::Ros1Graph;
-
-/// The clients and servers of actions that are in use, by the names of the actions: a node has one of each. Who takes one up
-/// again while its predecessor is about to go has the same.
-#[derive(Debug, Default)]
-pub(crate) struct Ends {
-    clients: BTreeMap<String, Known<tcpros::actionlib::ActionClient>>,
-    servers: BTreeMap<String, Known<Server>>,
-}
-
-/// A server that one after another waits for.
-type Server = Mutex<tcpros::actionlib::ActionServer>;
-
-/// An end of an action whose messages have that checksum.
-#[derive(Debug)]
-struct Known<E> {
-    md5: String,
-    end: Weak<E>,
-}
-
-/// The end of an action that is in use, else one that is made.
-fn shared<E>(
-    known: &mut BTreeMap<String, Known<E>>,
-    (action, md5): (&str, &str),
-    make: impl FnOnce() -> Result<E, ActionError>,
-) -> Result<Arc<E>, String> {
-    known.retain(|_, known| known.end.strong_count() > 0);
-    let in_use = known.get(action).filter(|known| known.md5 == md5);
-    if let Some(end) = in_use.and_then(|known| known.end.upgrade()) {
-        return Ok(end);
-    }
-    let end = Arc::new(make().map_err(|error| error.to_string())?);
-    let made = Known {
-        md5: md5.to_owned(),
-        end: Arc::downgrade(&end),
-    };
-    known.insert(action.to_owned(), made);
-    Ok(end)
-}
 
 impl ActionGraph for Ros1Graph<'_> {
     type Sender = Sender;
@@ -94,7 +57,7 @@ impl ActionGraph for Ros1Graph<'_> {
             ..ActionClientOptions::default()
         };
         let md5 = action_type.action().md5();
-        let client = shared(&mut self.ends.clients, (action, md5), || {
+        let client = ends::shared(&mut self.ends.clients, (action, md5), || {
             let types = types(&action_type);
             tcpros::actionlib::ActionClient::new(self.node, action, types, options)
         })?;
@@ -106,7 +69,7 @@ impl ActionGraph for Ros1Graph<'_> {
         let action_type = found.map_err(|error| unknown(self.definitions, type_name, &error))?;
         let empty_result = empty(action_type.result())?;
         let md5 = action_type.action().md5();
-        let server = shared(&mut self.ends.servers, (action, md5), || {
+        let server = ends::shared(&mut self.ends.servers, (action, md5), || {
             let options = ActionServerOptions::new(empty_result.clone());
             let types = types(&action_type);
             tcpros::actionlib::ActionServer::new(self.node, action, types, options).map(Mutex::new)

@@ -6,6 +6,7 @@
 mod actions;
 mod brought;
 mod definitions;
+mod ends;
 mod port;
 mod services;
 mod sink;

@@ -31,8 +31,8 @@ use uadp::{BuiltinType, Timestamp};
 
 use self::calls::Kinds;
 use self::found::Refused;
-use crate::actions::Ends;
 use crate::definitions::Definitions;
+use crate::ends::Ends;
 use crate::services::{Executor, Ros1Graph};
 use crate::sink::{Open, Sink};
 use crate::source::{MAX_LATCHED, Met, Source};
@@ -574,7 +574,7 @@ impl Port for Ros1Port {
         if is_bad(sample.status) {
             return Err("bad status");
         }
-        if self.actions.takes(sample.topic) {
+        if self.actions.takes(&self.policy, sample.topic) {
             return self.actions.publish(&sample);
         }
         // What was handed out before is for late joiners, and a service is none.
@@ -629,7 +629,7 @@ impl Port for Ros1Port {
         {
             return;
         }
-        if self.actions.takes(topic) {
+        if self.actions.takes(&self.policy, topic) {
             return;
         }
         if !self.take_in(topic) {

@@ -12,8 +12,8 @@ use tcpros::{
 use tokio::sync::Mutex;
 use uadp::BuiltinType;
 
-use crate::actions::Ends;
 use crate::definitions::Definitions;
+use crate::ends::Ends;
 
 /// A node and what it knows of types.
 pub(crate) struct Ros1Graph<'p> {

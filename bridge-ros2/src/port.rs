@@ -458,7 +458,7 @@ impl Port for Ros2Port {
         if type_changes(&self.events, sample.topic) {
             return Err(TYPE_CHANGES);
         }
-        if self.actions.takes(sample.topic) {
+        if self.actions.takes(&self.policy, sample.topic) {
             return self.actions.publish(&sample);
         }
         let Delivery {
@@ -521,7 +521,7 @@ impl Port for Ros2Port {
         shape: &[(BuiltinType, bool)],
         described: Option<&Described>,
     ) {
-        if self.actions.takes(topic) {
+        if self.actions.takes(&self.policy, topic) {
             // It is bound when its action is served.
             return;
         }

@@ -1,13 +1,13 @@
 //! The action servers of the graph that are executed for the space: which they are, and the task of each.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap};
+use std::collections::{BTreeMap, HashMap};
 use std::num::NonZeroU16;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use bridge_core::{ActionFamily, CallRole, ExecutionId, OfferedType, Refusal, ValueNote};
-use mappings::{CallKind, ExecutedBy, FieldMap, Mapping, Overflow, SpaceId, TopicId};
+use mappings::{CallKind, FieldMap, Mapping, Overflow, TopicId};
 use messages::{ActionCalls, TypeName};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
@@ -15,10 +15,11 @@ use tokio::task::JoinSet;
 use super::graph::{ActionGraph, Waits};
 use super::serving::{Action, Command, Part, Serving};
 use super::wire;
+use crate::PortEvent;
 use crate::clock::now;
 use crate::policy::Policy;
 use crate::port::Execution;
-use crate::{PortEvent, Present};
+use crate::present::{self, Present};
 
 /// What of a graph's actions is executed for the space.
 #[derive(Debug, Default)]
@@ -67,7 +68,7 @@ impl Executors {
         report: &mpsc::Sender<PortEvent>,
     ) -> Vec<PortEvent> {
         while self.tasks.try_join_next().is_some() {}
-        tell_other_types(policy, present);
+        present::tell_other_types(policy, present, CallKind::Action);
         let wanted = wanted(policy, present);
         let mut events = self.withdraw_missing(&wanted);
         self.refused
@@ -88,7 +89,7 @@ impl Executors {
                 break;
             }
             most -= 1;
-            match self.serve(graph, (topic, &wanted), report) {
+            match self.serve((graph, policy.mapping()), (topic, &wanted), report) {
                 Ok(offered) => events.extend(offered),
                 Err(why) => {
                     policy.told.once(&topic.to_string(), "not executed", || {
@@ -120,14 +121,28 @@ impl Executors {
             let since = *served.gone.get_or_insert(now);
             !other && now.duration_since(since) < KEPT
         });
-        let served = &self.served;
+        let (served, before) = (&self.served, self.parts.len());
         self.parts.retain(|_, (of, _)| served.contains_key(of));
+        if self.parts.len() < before {
+            // They may have been in the way of others.
+            self.refused.clear();
+        }
         events
+    }
+
+    /// Whether a topic that an action would take is a variable's, or that of an action that is served.
+    fn is_taken(&self, mapping: &Mapping, topic: TopicId) -> bool {
+        let is_behind = |served: &TopicId| {
+            let (of, (space, namespace, id)) = (served.triple(), topic.triple());
+            let behind = id.checked_sub(of.2);
+            (of.0, of.1) == (space, namespace) && behind.is_some_and(|behind| behind <= FAMILY)
+        };
+        mapping.variable(topic).is_some() || self.served.keys().any(is_behind)
     }
 
     fn serve<G: ActionGraph>(
         &mut self,
-        graph: &mut G,
+        (graph, mapping): (&mut G, &Mapping),
         (topic, wanted): (TopicId, &Wanted),
         report: &mpsc::Sender<PortEvent>,
     ) -> Result<Vec<PortEvent>, String> {
@@ -141,6 +156,12 @@ impl Executors {
         let of = |id| beside(topic, id).ok_or("0 is no identifier");
         let (cancel, result) = (of(family.cancel)?, of(family.result)?);
         let (feedback, status) = (of(family.feedback)?, of(family.status)?);
+        let all = [topic, cancel, result, feedback, status];
+        if let Some(taken) = all.into_iter().find(|of| self.is_taken(mapping, *of)) {
+            return Err(format!(
+                "it takes {topic} to {status}, and {taken} is a variable or part of another action"
+            ));
+        }
         let calls = graph.action_calls(&wanted.type_name)?;
         let client = graph.action_client(&wanted.action, &wanted.type_name, wanted.waits)?;
         let (commands, told) = mpsc::channel(MOST_COMMANDS);
@@ -321,98 +342,24 @@ pub(super) fn is_same(one: &ActionCalls, other: &ActionCalls) -> bool {
         && one.feedback().is_same(other.feedback())
 }
 
-/// The action that a server is by its name.
-pub(super) fn named(policy: &Policy, action: &str) -> Option<TopicId> {
-    let topic: TopicId = action.strip_prefix('/')?.parse().ok()?;
-    (topic.space == policy.own()).then_some(topic)
-}
-
-/// The names of the actions that the mapping has executed in our own space.
-pub(super) fn mapped<'m>(mapping: &'m Mapping, policy: &Policy) -> BTreeSet<&'m str> {
-    let targets = targets(mapping, policy.own());
-    targets.map(|(_, target)| target.name.as_str()).collect()
-}
-
-fn targets(
-    mapping: &Mapping,
-    own: SpaceId,
-) -> impl Iterator<Item = (&mappings::Call, &mappings::CallTarget)> {
-    let calls = mapping.executed_in(own);
-    calls.filter_map(|call| match (call.kind, &call.executed) {
-        (CallKind::Action, ExecutedBy::Ros(target)) => Some((call, target)),
-        (CallKind::Action | CallKind::Service, _) => None,
-    })
-}
-
 /// What is to be offered of the action servers there are.
 fn wanted(policy: &Policy, present: &Present) -> BTreeMap<TopicId, Wanted> {
-    let mapping = policy.mapping();
-    let silence = mapping.pubsub().receive_timeout;
-    let mut wanted = BTreeMap::new();
-    let taken: BTreeSet<TopicId> = mapping
-        .executed_in(policy.own())
-        .flat_map(mappings::Call::topics)
-        .collect();
-    for (action, type_name) in present {
-        let (Some(topic), Some(type_name)) = (named(policy, action), type_name) else {
-            continue;
+    let silence = policy.mapping().pubsub().receive_timeout;
+    let found = present::found(policy, present, CallKind::Action);
+    let wanted = found.map(|found| {
+        let (name, about, open) = found.said();
+        let answer = found.call.map_or(ANSWER, |call| call.timeout);
+        let wanted = Wanted {
+            action: found.target.to_owned(),
+            type_name: found.type_name.clone(),
+            name,
+            about,
+            open,
+            waits: Waits { answer, silence },
         };
-        if taken.contains(&topic) {
-            continue;
-        }
-        let found = Wanted {
-            action: action.clone(),
-            type_name: type_name.clone(),
-            name: String::new(),
-            about: String::new(),
-            open: false,
-            waits: Waits {
-                answer: ANSWER,
-                silence,
-            },
-        };
-        wanted.insert(topic, found);
-    }
-    for (call, target) in targets(mapping, policy.own()) {
-        match present.get(&target.name) {
-            Some(None) => {}
-            Some(Some(type_name)) if *type_name == target.type_name => {}
-            Some(Some(_)) | None => continue,
-        }
-        wanted.insert(
-            call.topic,
-            Wanted {
-                action: target.name.clone(),
-                type_name: target.type_name.clone(),
-                name: call.name.clone(),
-                about: call.about.clone(),
-                open: call.open,
-                waits: Waits {
-                    answer: call.timeout,
-                    silence,
-                },
-            },
-        );
-    }
-    wanted
-}
-
-/// Tells of action servers of other types than the mapping says.
-fn tell_other_types(policy: &mut Policy, present: &Present) {
-    let mapping = Arc::clone(policy.mapping());
-    for (call, target) in targets(&mapping, policy.own()) {
-        if let Some(Some(type_name)) = present.get(&target.name)
-            && *type_name != target.type_name
-        {
-            let told = &mut policy.told;
-            told.once(&target.name, "other type", || {
-                format!(
-                    "the action {} is not executed as {}: it is of type {type_name}, and the mapping says {}",
-                    target.name, call.topic, target.type_name
-                )
-            });
-        }
-    }
+        (found.topic, wanted)
+    });
+    wanted.collect()
 }
 
 /// Feedback is events: as many wait.
@@ -422,6 +369,8 @@ pub(super) const EVENTS: Overflow = Overflow::DropOldest(match NonZeroU16::new(1
 });
 /// How long the server of an action may take for its word on a goal, where the mapping does not say it.
 const ANSWER: Duration = Duration::from_secs(30);
+/// Identifiers that an action takes behind its own.
+const FAMILY: u16 = 4;
 /// Actions that are offered to other spaces: anybody in a graph can invent names.
 const MOST_SERVED: usize = 256;
 /// Requests of one action that wait to be looked at; one more is refused as busy.

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use bridge_core::{ActionFamily, CallDescription, CallMap, CallRole, ValueNote};
 use bytes::Bytes;
-use mappings::{CallKind, FieldMap, Overflow, TopicId};
+use mappings::{CallKind, FieldMap, Mapping, Overflow, TopicId};
 use messages::{ActionCalls, TypeName, Wire};
 use tokio::sync::{mpsc, watch};
 use tokio::task::{AbortHandle, JoinSet};
@@ -265,7 +265,11 @@ impl Facades {
             }
             let waits = policy.mapping().pubsub().receive_timeout;
             let with = (&asker, report, waits, tasks);
-            match known.offer(graph, (topic, target), with) {
+            let offered = match known.variable(topic, policy.mapping()) {
+                Some(variable) => Err(format!("its {variable} is a variable of the mapping")),
+                None => known.offer(graph, (topic, target), with),
+            };
+            match offered {
                 Ok(bound) => {
                     left -= 1;
                     events.extend(bound);
@@ -300,9 +304,9 @@ impl Facades {
         }
     }
 
-    /// Whether the values of that topic are an action's.
-    pub(super) fn takes(&self, topic: TopicId) -> bool {
-        self.values.contains_key(&topic)
+    /// Whether the values of that topic are an action's: anybody may say that one of the mapping is.
+    pub(super) fn takes(&self, policy: &Policy, topic: TopicId) -> bool {
+        self.values.contains_key(&topic) && policy.mapping().variable(topic).is_none()
     }
 
     /// Hands feedback to the task of its action.
@@ -332,6 +336,13 @@ type With<'w, F> = (
 );
 
 impl Known {
+    /// What of the values of its family the mapping has as a variable.
+    fn variable(&self, topic: TopicId, mapping: &Mapping) -> Option<TopicId> {
+        let values = [self.family.feedback, self.family.status];
+        let mut values = values.into_iter().filter_map(|id| beside(topic, id));
+        values.find(|value| mapping.variable(*value).is_some())
+    }
+
     /// Begins to serve the action. Reports the types of its calls and values.
     fn offer<G: ActionGraph, F: Fn(TopicId) -> Asker>(
         &mut self,

@@ -18,6 +18,8 @@ pub(super) struct Goals {
     known: HashMap<GoalId, Goal>,
     /// In the order in which they came.
     order: VecDeque<GoalId>,
+    /// Bytes of the results that are kept.
+    kept: usize,
 }
 
 #[derive(Debug)]
@@ -134,10 +136,28 @@ impl Goals {
         let Some(oldest) = self.order.iter().position(ended) else {
             return false;
         };
-        if let Some(id) = self.order.remove(oldest) {
-            self.known.remove(&id);
-        }
+        self.forget(oldest);
         true
+    }
+
+    /// Forgets the goal at that place of the order.
+    fn forget(&mut self, place: usize) {
+        let id = self.order.remove(place);
+        if let Some(goal) = id.and_then(|id| self.known.remove(&id)) {
+            self.kept -= goal.state.bytes();
+        }
+    }
+
+    /// Forgets the oldest that ended, but for one, while the results take too much.
+    fn make_room(&mut self, but: GoalId) {
+        while self.kept > MOST_BYTES {
+            let known = &self.known;
+            let ended = |id: &GoalId| *id != but && known.get(id).is_none_or(Goal::has_ended);
+            let Some(oldest) = self.order.iter().position(ended) else {
+                return;
+            };
+            self.forget(oldest);
+        }
     }
 
     /// The server works on the goal. Returns who asked for it.
@@ -220,11 +240,16 @@ impl Goals {
             answer,
             since: now,
         };
-        let asked = match std::mem::replace(&mut goal.state, state) {
+        self.kept += state.bytes();
+        let before = std::mem::replace(&mut goal.state, state);
+        self.kept -= before.bytes();
+        let asked = match before {
             State::Sent(asked) => asked,
             State::Running(_) | State::Rejected { .. } | State::Ended { .. } => Vec::new(),
         };
-        (goal.take_waiting(), asked)
+        let waiting = goal.take_waiting();
+        self.make_room(id);
+        (waiting, asked)
     }
 
     /// Somebody asks for the result of a goal, and waits for it until then.
@@ -298,6 +323,7 @@ impl Goals {
             State::Rejected { since, .. } | State::Ended { since, .. } => *since + KEPT > now,
             State::Sent(_) | State::Running(_) => true,
         });
+        self.kept = known.values().map(|goal| goal.state.bytes()).sum();
         let forgotten = known.len() < before;
         if forgotten {
             self.order.retain(|id| known.contains_key(id));
@@ -323,6 +349,16 @@ impl Goals {
     }
 }
 
+impl State {
+    /// Of the result that is kept.
+    const fn bytes(&self) -> usize {
+        match self {
+            Self::Ended { answer, .. } => answer.len(),
+            Self::Sent(_) | Self::Running(_) | Self::Rejected { .. } => 0,
+        }
+    }
+}
+
 impl Goal {
     const fn has_ended(&self) -> bool {
         match &self.state {
@@ -339,6 +375,8 @@ impl Goal {
 
 /// Goals of one action that are known; ended ones give way to new ones.
 const MOST_GOALS: usize = 1000;
+/// Bytes of the results of one action that are kept; the oldest give way, and the newest stays whatever its size.
+const MOST_BYTES: usize = 64 << 20;
 /// How long a goal is known after its end.
 const KEPT: Duration = Duration::from_secs(15 * 60);
 /// Who waits for results of one action: each request is held up by a place of the Responder.
@@ -411,6 +449,29 @@ mod tests {
         assert_eq!(goals.tidy(soon + KEPT), (vec![], true));
         assert_eq!(goals.want(id(1), run(7), soon), Wanted::NoGoal);
         assert_eq!(goals.statuses(), []);
+    }
+
+    #[test]
+    fn the_oldest_results_give_way_where_they_take_too_much() {
+        let mut goals = Goals::default();
+        let now = crate::now().monotonic;
+        let result = Bytes::from(vec![0; MOST_BYTES / 2]);
+        for number in 1..=4 {
+            goals.ask(id(number), run(1));
+            goals.accepted(id(number), at(number.into()));
+        }
+        for number in [2, 1, 3] {
+            goals.ended(id(number), (4, result.clone()), now);
+        }
+        let of = |goals: &Goals| [1, 2, 3, 4].map(|number| goals.progress(id(number)));
+        let (open, ended, unknown) = (Progress::Open, Progress::Ended, Progress::Unknown);
+        assert_eq!(of(&goals), [unknown, ended, ended, open]);
+        let large = Bytes::from(vec![0; MOST_BYTES + 1]);
+        goals.ended(id(4), (4, large.clone()), now);
+        assert_eq!(of(&goals), [unknown, unknown, unknown, ended]);
+        assert_eq!(goals.want(id(4), run(2), now), Wanted::Answer(large));
+        goals.tidy(now + KEPT);
+        assert_eq!(goals.kept, 0);
     }
 
     #[test]

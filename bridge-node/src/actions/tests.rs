@@ -373,7 +373,7 @@ impl Space {
                 self.calls.answered(ask, answer);
             }
             PortEvent::Sample { topic, payload, .. } if topic.triple().2 == 73 => {
-                assert!(self.offering.takes(topic));
+                assert!(self.offering.takes(&self.policies[1], topic));
                 let source = None;
                 let delivery = Delivery {
                     topic,
@@ -802,4 +802,37 @@ calls:
     };
     assert_eq!(map.request.0.len(), 1);
     assert_eq!(map.request.0[0].target, "goal.order");
+}
+
+#[tokio::test]
+async fn a_variable_of_the_mapping_is_no_value_of_an_action() {
+    let variable = "variables: [{node: ns=2;i=73, name: Speed, origin: 1}]\n";
+    let mut space = Space::new(&format!("{QUICK}namespaces: {{2: urn:test}}\n{variable}"));
+    assert!(space.reconcile().is_empty(), "its feedback would be that");
+    // Who has another mapping says so all the same.
+    let events = Space::new(QUICK).reconcile();
+    space.announce(&events);
+    assert!(space.offer().is_empty());
+    let [feedback, status] = [73, 74].map(|id| TopicId::new(1, 2, id).unwrap());
+    let policy = &space.policies[1];
+    assert!(!space.offering.takes(policy, feedback) && space.offering.takes(policy, status));
+    assert!(space.served.lock().unwrap().is_empty());
+}
+
+#[tokio::test]
+async fn actions_that_would_have_the_same_calls_are_not_both_offered() {
+    let mut space = Space::new(QUICK);
+    for name in ["/ua_1_2_66", "/ua_1_2_73", "/ua_1_2_75"] {
+        space.present.insert(name.to_owned(), NAME.parse().ok());
+    }
+    let offered = |events: &[PortEvent]| {
+        let goals = offers(events).filter(|(_, offered)| matches!(offered.role, CallRole::Goal(_)));
+        let mut goals: Vec<u16> = goals.map(|(topic, _)| topic.triple().2).collect();
+        goals.sort_unstable();
+        goals
+    };
+    let events = space.reconcile();
+    // The first takes 66 to 70, so the one at 70 goes without, and 75 is of the one at 73.
+    assert_eq!(offered(&events), [66, 73]);
+    assert_eq!(space.reconcile().len(), 0);
 }

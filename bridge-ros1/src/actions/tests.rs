@@ -8,6 +8,7 @@ use tcpros::{Core, Node, NodeOptions};
 use tokio::time::timeout;
 
 use super::*;
+use crate::ends::Ends;
 
 #[test]
 fn an_id_of_the_space_comes_back_from_its_text_and_others_have_one_of_their_own() {

@@ -1,14 +1,14 @@
 //! Actions of other spaces, as action servers of the domain; and action servers of the domain, executed for other spaces.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use bridge_node::{Actions, CallRole, PortEvent, Present};
+use bridge_node::policy::Policy;
+use bridge_node::{Actions, CallRole, PortEvent};
 use messages::TypeName;
 use tokio::time::Instant;
 
 use super::Ros2Port;
-use super::calls::{Left, SEEN, SETTLED};
+use super::calls::{Kind, Left, SEEN, SETTLED};
 use super::services::Ros2Graph;
 use crate::graph::Graph;
 use crate::service::{Snapshot, action_type};
@@ -68,32 +68,15 @@ impl Ros2Port {
         let snapshot = self.peers.look(Instant::now(), SEEN);
         let mapping = Arc::clone(self.policy.mapping());
         let mapped = Actions::mapped(&mapping, &self.policy);
-        let mut present = Present::new();
-        for (action, servers) in snapshot.served_actions() {
-            let action = format!("/{action}");
-            let is_named = Actions::is_named(&self.policy, &action);
-            if !is_named && !mapped.contains(action.as_str()) {
-                continue;
-            }
-            // What another bridge serves is executed elsewhere.
-            let servers = servers.iter().filter(|one| !self.graph.is_bridge(one.guid));
-            let types: BTreeSet<String> = servers.map(|one| action_type(&one.type_name)).collect();
-            let type_name = match types.first() {
-                None => continue,
-                Some(name) if types.len() == 1 => name.parse().ok(),
-                Some(_) => None,
-            };
-            if type_name.is_none() && is_named {
-                let types: Vec<String> = types.into_iter().collect();
-                self.policy.told.once(&action, "type of the action", || {
-                    format!(
-                        "the action {action} cannot be asked for from other spaces: its type is {}",
-                        types.join(" and ")
-                    )
-                });
-            }
-            present.insert(action, type_name);
-        }
+        let is_wanted = |policy: &Policy, action: &str| {
+            Actions::is_named(policy, action) || mapped.contains(action)
+        };
+        let kind = Kind {
+            noun: "action",
+            told: "type of the action",
+            type_of: action_type,
+        };
+        let present = self.present(snapshot.served_actions(), kind, is_wanted);
         let mut graph = Ros2Graph {
             peers: &self.peers,
             domain: &self.domain,

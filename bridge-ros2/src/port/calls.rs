@@ -4,7 +4,8 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::Duration;
 
-use bridge_node::{Executing, PortEvent, Present};
+use bridge_node::policy::Policy;
+use bridge_node::{Actions, Executing, PortEvent, Present};
 use mappings::{Mapping, TopicId};
 use messages::TypeName;
 use rustdds::RTPSEntity;
@@ -13,7 +14,7 @@ use tokio::time::Instant;
 use super::Ros2Port;
 use super::bridges::{Bridge, is_at_home};
 use super::services::{Client, Ros2Graph};
-use crate::graph::Graph;
+use crate::graph::{Endpoint, Graph};
 use crate::service::{Snapshot, service_type};
 
 impl Ros2Port {
@@ -69,32 +70,15 @@ impl Ros2Port {
         let snapshot = self.peers.look(Instant::now(), SEEN);
         let mapping = Arc::clone(self.policy.mapping());
         let mapped = Executing::<Client>::mapped(&mapping, &self.policy);
-        let mut present = Present::new();
-        for (service, servers) in snapshot.offered() {
-            let service = format!("/{service}");
-            let is_named = Executing::<Client>::is_named(&self.policy, &service);
-            if !is_named && !mapped.contains(service.as_str()) {
-                continue;
-            }
-            // What another bridge offers is executed elsewhere.
-            let servers = servers.iter().filter(|one| !self.graph.is_bridge(one.guid));
-            let types: BTreeSet<String> = servers.map(|one| service_type(&one.type_name)).collect();
-            let type_name = match types.first() {
-                None => continue,
-                Some(name) if types.len() == 1 => name.parse().ok(),
-                Some(_) => None,
-            };
-            if type_name.is_none() && is_named {
-                let types: Vec<String> = types.into_iter().collect();
-                self.policy.told.once(&service, "type of the service", || {
-                    format!(
-                        "the service {service} cannot be asked for from other spaces: its type is {}",
-                        types.join(" and ")
-                    )
-                });
-            }
-            present.insert(service, type_name);
-        }
+        let is_wanted = |policy: &Policy, service: &str| {
+            Executing::<Client>::is_named(policy, service) || mapped.contains(service)
+        };
+        let kind = Kind {
+            noun: "service",
+            told: "type of the service",
+            type_of: service_type,
+        };
+        let present = self.present(snapshot.offered(), kind, is_wanted);
         let called = snapshot.called().chain(snapshot.called_actions());
         let looked_for = called.filter_map(|(name, clients)| {
             let topic: TopicId = name.parse().ok()?;
@@ -122,6 +106,46 @@ impl Ros2Port {
         self.events.extend(events);
     }
 
+    /// The servers of others that are wanted, each with its type. What another bridge serves is executed elsewhere. Of two types
+    /// under one name neither can be asked.
+    pub(super) fn present<'s>(
+        &mut self,
+        offered: impl Iterator<Item = (&'s str, &'s [Endpoint])>,
+        kind: Kind,
+        is_wanted: impl Fn(&Policy, &str) -> bool,
+    ) -> Present {
+        let Kind {
+            noun,
+            told,
+            type_of,
+        } = kind;
+        let mut present = Present::new();
+        for (name, servers) in offered {
+            let name = format!("/{name}");
+            if !is_wanted(&self.policy, &name) {
+                continue;
+            }
+            let servers = servers.iter().filter(|one| !self.graph.is_bridge(one.guid));
+            let types: BTreeSet<String> = servers.map(|one| type_of(&one.type_name)).collect();
+            let type_name = match types.first() {
+                None => continue,
+                Some(name) if types.len() == 1 => name.parse().ok(),
+                Some(_) => None,
+            };
+            if type_name.is_none() && Actions::is_named(&self.policy, &name) {
+                let types: Vec<String> = types.into_iter().collect();
+                self.policy.told.once(&name, told, || {
+                    format!(
+                        "the {noun} {name} cannot be asked for from other spaces: its type is {}",
+                        types.join(" and ")
+                    )
+                });
+            }
+            present.insert(name, type_name);
+        }
+        present
+    }
+
     /// This bridge, beside others of the domain.
     pub(super) fn bridge(&self) -> Bridge {
         Bridge {
@@ -138,6 +162,17 @@ impl Ros2Port {
             self.told_types.learn(described, hashes.service);
         }
     }
+}
+
+/// What kind of servers there are.
+#[derive(Clone, Copy)]
+pub(super) struct Kind {
+    /// For people.
+    pub(super) noun: &'static str,
+    /// Under which it is told that a type is none.
+    pub(super) told: &'static str,
+    /// The ROS type by that of DDS of its requests.
+    pub(super) type_of: fn(&str) -> String,
 }
 
 /// Which calls of other spaces are left to others of the domain.
