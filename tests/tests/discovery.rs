@@ -346,10 +346,11 @@ fn the_cells_server_is_found_and_shows_who_is_there() {
     });
     let gripper = announced("gripper", &[]);
     server.wait_for_line("a server is seen", SOON);
-    let name = on_network("gripper").unwrap()["name"]
-        .as_str()
-        .unwrap()
-        .to_owned();
+    // Each of the two looks for itself.
+    let gripper_there = eventually("its discovery server sees it", SOON, || {
+        on_network("gripper")
+    });
+    let name = gripper_there["name"].as_str().unwrap();
     let node = format!("ns=1;s=UaSpace.Components.{name}");
     let [url, online] = ["Url", "Online"].map(|property| format!("{node}.{property}"));
     let read = || cell.asyncua_once("opcua_read.py", &[endpoint, &url, &online]);
