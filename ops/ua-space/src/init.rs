@@ -1,5 +1,6 @@
 //! A mapping of what is there: from live graphs, from a server, from NodeSets.
 
+mod calls;
 mod known;
 mod merge;
 mod plan;
@@ -9,11 +10,12 @@ mod yaml;
 
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read as _, Write as _};
+use std::ops::Range;
 use std::os::unix::fs::{MetadataExt as _, fchown};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use mappings::{Checked, Code, Mapping, SpaceId};
+use mappings::{Checked, Code, Diagnostic, Mapping, SpaceId};
 use serde::Serialize;
 use type_files::Disk;
 
@@ -206,12 +208,31 @@ fn written(file: &str, places: &[String], plan: &mut Plan) -> Result<String, Fai
             let any = plan.entries.iter().any(|entry| entry.faulty.is_none());
             lines.push(if any { "variables:" } else { "variables: []" }.to_owned());
         }
-        let start = lines.len();
+        let variables_at = lines.len();
         lines.extend(variables.lines);
+        let (calls, entries) = calls::render(&plan.calls, &plan.untyped, "  ");
+        if !calls.is_empty() {
+            lines.extend(CALLS.map(str::to_owned));
+        }
+        let calls_at = lines.len();
+        lines.extend(calls);
         lines.push(String::new());
-        Some((lines.join("\n"), start, variables.entries))
+        Some(Rendered {
+            text: lines.join("\n"),
+            variables: (variables_at, variables.entries),
+            calls: (calls_at, entries),
+        })
     })
 }
+
+/// What stands before the calls of a document of its own.
+const CALLS: [&str; 5] = [
+    "",
+    "# What one space executes and the others ask for: there each has its name in the space, as /ua_1_2_61, or the one that a",
+    "# binding of that space says, as `ros: [{service: /a, type: std_srvs/SetBool}, {space: 2, service: /b, type: std_srvs/SetBool}]`.",
+    "# An action takes five numbers. Requests of other hosts are executed with `open: true`.",
+    "calls:",
+];
 
 fn section(lines: &mut Vec<String>, title: &str, key: &str, block: Vec<String>) {
     if !block.is_empty() {
@@ -237,13 +258,26 @@ fn added(file: &str, (text, before): (&str, &Mapping), plan: &mut Plan) -> Resul
             }
         }
         let variables = render::variables(plan, &indent("variables"));
-        if variables.lines.is_empty() {
-            return Some((merged, 0, Vec::new()));
+        let (calls, call_entries) = calls::render(&plan.calls, &plan.untyped, &indent("calls"));
+        let (mut variables_at, mut calls_at) = (0, 0);
+        if !variables.lines.is_empty() {
+            (merged, variables_at) = merge::append(&merged, "variables", &variables.lines)?;
         }
-        let (merged, start) = merge::append(&merged, "variables", &variables.lines)?;
-        Some((merged, start, variables.entries))
+        if !calls.is_empty() {
+            let before = merged.lines().count();
+            (merged, calls_at) = merge::append(&merged, "calls", &calls)?;
+            if calls_at <= variables_at {
+                variables_at += merged.lines().count() - before;
+            }
+        }
+        Some(Rendered {
+            text: merged,
+            variables: (variables_at, variables.entries),
+            calls: (calls_at, call_entries),
+        })
     })?;
     let active = plan.entries.iter().filter(|entry| entry.faulty.is_none());
+    let active_calls = plan.calls.iter().filter(|call| call.faulty.is_none());
     let kept = Mapping::from_text(&merged, file, &Disk)
         .mapping
         .is_some_and(|after| {
@@ -252,54 +286,80 @@ fn added(file: &str, (text, before): (&str, &Mapping), plan: &mut Plan) -> Resul
                     .variables()
                     .iter()
                     .all(|one| after.variables().contains(one))
-                && after.calls() == before.calls()
+                && after.calls().len() == before.calls().len() + active_calls.count()
+                && before.calls().iter().all(|one| after.calls().contains(one))
         });
     if kept { Ok(merged) } else { Err(unmergeable()) }
 }
 
 fn unmergeable() -> Failure {
     Failure::Unconfigured(
-        "nothing can be put into the file as it is written: have each of `spaces`, `namespaces` and `variables` on lines \
+        "nothing can be put into the file as it is written: have each of `spaces`, `namespaces`, `variables` and `calls` on lines \
          of their own below the key, not in brackets or braces; it stays as it is"
             .to_owned(),
     )
 }
 
-/// A document, the line its variables begin at, and the lines of each among them.
-type Rendered = Option<(String, usize, Vec<std::ops::Range<usize>>)>;
+/// A document, and for its variables and its calls the line they begin at and the lines of each among them.
+struct Rendered {
+    text: String,
+    variables: (usize, Vec<Range<usize>>),
+    calls: (usize, Vec<Range<usize>>),
+}
+
+impl Rendered {
+    /// Makes the entry that a finding is about a comment; whether there is one that is none yet.
+    fn mark(&self, finding: &Diagnostic, plan: &mut Plan) -> bool {
+        let line = finding.at.line.saturating_sub(1);
+        let within = |(start, entries): &(usize, Vec<Range<usize>>)| {
+            let at = line.checked_sub(*start)?;
+            entries.iter().position(|lines| lines.contains(&at))
+        };
+        let variable = within(&self.variables).and_then(|at| plan.entries.get_mut(at));
+        let variable = variable.map(|entry| (&mut entry.faulty, entry.origin));
+        let call = within(&self.calls).and_then(|at| plan.calls.get_mut(at));
+        let call = call.map(|entry| (&mut entry.faulty, entry.origin));
+        match variable.or(call) {
+            Some((faulty @ None, origin)) => {
+                *faulty = Some(why(finding, origin));
+                true
+            }
+            Some((Some(_), _)) | None => false,
+        }
+    }
+}
+
+/// What a comment says of an entry that has a finding.
+fn why(finding: &Diagnostic, origin: SpaceId) -> String {
+    let why = format!("{}: {}", finding.code, finding.message);
+    let hint = if finding.code == Code::UnknownMessageType && origin == SpaceId::ROS1 {
+        "Publishers of ROS 1 bring it along: without the `#` it crosses, and check warns of it"
+    } else if finding.code == Code::UnknownMessageType {
+        "Where the bridge finds its package by AMENT_PREFIX_PATH it crosses without the `#`"
+    } else if finding.code == Code::MethodTarget {
+        "With another `endpoint` under `server`, for the cell's own server, it is called without the `#`"
+    } else if [Code::UnknownServiceType, Code::UnknownActionType].contains(&finding.code) {
+        "Where the bridge finds its package, by ROS_PACKAGE_PATH or AMENT_PREFIX_PATH, it crosses without the `#`"
+    } else {
+        return why;
+    };
+    format!("{why}\n{hint}")
+}
 
 /// Renders until no entry has a finding: those that have one become comments with its text.
 fn settled(
     file: &str,
     plan: &mut Plan,
-    render: impl Fn(&Plan) -> Rendered,
+    render: impl Fn(&Plan) -> Option<Rendered>,
 ) -> Result<String, Failure> {
     loop {
-        let (text, start, entries) = render(plan).ok_or_else(unmergeable)?;
+        let rendered = render(plan).ok_or_else(unmergeable)?;
         let Checked {
             mapping, findings, ..
-        } = Mapping::from_text(&text, file, &Disk);
-        let mut changed = false;
+        } = Mapping::from_text(&rendered.text, file, &Disk);
         let here = findings.iter().filter(|finding| *finding.at.file == *file);
-        for finding in here {
-            let at = finding.at.line.saturating_sub(1 + start);
-            let faulty = entries.iter().position(|lines| lines.contains(&at));
-            let entry = faulty.and_then(|at| plan.entries.get_mut(at));
-            let Some(entry) = entry.filter(|entry| entry.faulty.is_none()) else {
-                continue;
-            };
-            changed = true;
-            let mut why = format!("{}: {}", finding.code, finding.message);
-            if finding.code == Code::UnknownMessageType {
-                why.push_str(if entry.origin == SpaceId::ROS1 {
-                    "\nPublishers of ROS 1 bring it along: without the `#` it crosses, and check warns of it"
-                } else {
-                    "\nWhere the bridge finds its package by AMENT_PREFIX_PATH it crosses without the `#`"
-                });
-            }
-            entry.faulty = Some(why);
-        }
-        if changed {
+        let marked = here.filter(|finding| rendered.mark(finding, plan)).count();
+        if marked > 0 {
             continue;
         }
         // Such as that there is too much of it.
@@ -308,7 +368,7 @@ fn settled(
                 "what would be written could not run: {}",
                 first.message
             ))),
-            (Some(_), _) | (None, None) => Ok(text),
+            (Some(_), _) | (None, None) => Ok(rendered.text),
         };
     }
 }
@@ -410,6 +470,7 @@ struct Sum<'a> {
     changed: bool,
     variables: usize,
     guesses: usize,
+    calls: usize,
     commented_out: usize,
     left_out: usize,
 }
@@ -417,12 +478,15 @@ struct Sum<'a> {
 impl<'a> Sum<'a> {
     fn of(file: &'a str, plan: &Plan, changed: bool) -> Self {
         let active = || plan.entries.iter().filter(|entry| entry.faulty.is_none());
+        let calls = plan.calls.iter().filter(|call| call.faulty.is_none());
+        let calls = calls.count();
         Self {
             file,
             changed,
             variables: active().count(),
             guesses: active().filter(|entry| entry.guessed).count(),
-            commented_out: plan.entries.len() - active().count(),
+            calls,
+            commented_out: plan.entries.len() - active().count() + plan.calls.len() - calls,
             left_out: plan
                 .left_out
                 .values()
@@ -437,9 +501,10 @@ impl<'a> Sum<'a> {
             _ => format!("{count} {one}s"),
         };
         format!(
-            "{} ({}), {} as comments, {} left out",
+            "{} ({}), {}, {} as comments, {} left out",
             several(self.variables, "variable"),
             several(self.guesses, "guess").replace("guesss", "guesses"),
+            several(self.calls, "call"),
             several(self.commented_out, "other"),
             several(self.left_out, "topic"),
         )
@@ -638,7 +703,125 @@ mod tests {
             origins(&more),
             [("A2".to_owned(), "ua_2_2_62".to_owned(), 1)]
         );
-        assert!(more.contains("\n  #   /c (std_srvs/SetBool)\n"), "{more}");
+        let calls = mapping(&more).calls().to_vec();
+        let calls: Vec<(String, String)> = calls
+            .iter()
+            .map(|call| (call.topic.to_string(), call.name.clone()))
+            .collect();
+        let one = |topic: &str, name: &str| (topic.to_owned(), name.to_owned());
+        assert_eq!(calls, [one("ua_1_2_61", "A"), one("ua_2_2_63", "C")]);
         assert_eq!(merged(&more, &[seen]), more);
+    }
+
+    #[test]
+    fn what_is_executed_anywhere_becomes_calls_once() {
+        let mut ros1 = graph(
+            1,
+            &[(
+                "/count/feedback",
+                "actionlib_tutorials/FibonacciActionFeedback",
+                true,
+            )],
+        );
+        let kinds = |kinds: &[&str]| kinds.iter().map(|kind| (*kind).to_owned()).collect();
+        ros1.live.services = Some(
+            [
+                ("/belt/switch", kinds(&["std_srvs/SetBool"])),
+                ("/belt/odd", kinds(&["odd_msgs/Odd"])),
+                ("/belt/mute", kinds(&[])),
+                (
+                    "/belt/set_parameters",
+                    kinds(&["dynamic_reconfigure/Reconfigure"]),
+                ),
+                ("/ua_1_2_9", kinds(&["std_srvs/SetBool"])),
+            ]
+            .map(|(name, kinds)| (name.to_owned(), kinds))
+            .into(),
+        );
+        let feedback = "/nav/count/_action/feedback";
+        let kind = "example_interfaces/Fibonacci_FeedbackMessage";
+        let ros2 = graph(2, &[(feedback, kind, true)]);
+        let server = |url: &str| Nodes {
+            place: url.to_owned(),
+            endpoint: Some(url.to_owned()),
+            namespaces: ["http://opcfoundation.org/UA/", "urn:s", "urn:plc"]
+                .map(str::to_owned)
+                .to_vec(),
+            variables: Vec::new(),
+            methods: vec![survey::UaMethod {
+                object: "ns=2;s=Line".parse().unwrap(),
+                method: format!("ns=2;s=Reset of {url}").parse().unwrap(),
+                name: "Reset".to_owned(),
+                within: "Line".to_owned(),
+            }],
+        };
+        let graphs = [ros1, ros2];
+        let servers = ["opc.tcp://127.0.0.1:4840", "opc.tcp://plc:4840"].map(server);
+        let mut plan = Plan::new(&graphs, &servers, &WISHES, &mut Known::default());
+        let text = written("", &[], &mut plan).unwrap();
+        let found = mapping(&text);
+        let calls: Vec<(String, &str)> = found
+            .calls()
+            .iter()
+            .map(|call| (call.topic.to_string(), call.name.as_str()))
+            .collect();
+        let one = |topic: &str, name: &'static str| (topic.to_owned(), name);
+        // An action takes five numbers, a comment the one it says.
+        assert_eq!(
+            calls,
+            [
+                one("ua_1_2_2", "Belt.Switch"),
+                one("ua_1_2_3", "Count"),
+                one("ua_2_2_8", "Nav.Count"),
+                one("ua_0_2_14", "Line.Reset2"),
+            ],
+            "{text}"
+        );
+        for told in [
+            "  # M075: no definition of the service type `odd_msgs/Odd` is built in",
+            "  #   ros: {service: /belt/odd, type: odd_msgs/Odd}",
+            "  # M136: the endpoint is that of the cell's own server",
+            "  #   /belt/mute",
+            "    opcua: {endpoint: opc.tcp://plc:4840, object: nsu=urn:plc;s=Line, ",
+        ] {
+            assert!(text.contains(told), "{told}\n{text}");
+        }
+        let sum = Sum::of("x", &plan, true).counts();
+        assert!(sum.contains("4 calls, 2 others as comments"), "{sum}");
+        let mut known = Known::of(found.clone(), &text);
+        let mut plan = Plan::new(&graphs, &servers, &WISHES, &mut known);
+        assert_eq!(added("", (&text, &found), &mut plan).unwrap(), text);
+    }
+
+    #[test]
+    fn calls_that_stand_before_the_variables_keep_both_apart() {
+        let text = "spaces:\n  - {id: 1}\nnamespaces:\n  2: urn:cell\ncalls:\n  - {node: ns=2;i=61, name: A, origin: 1, ros: \
+                    {service: /a, type: std_srvs/SetBool}}\nvariables:\n  - {node: ns=2;i=5, name: v, origin: 1, type: Double}\n";
+        let mut seen = graph(
+            1,
+            &[
+                ("/odd", "odd_msgs/Odd", true),
+                ("/b", "std_msgs/Bool", true),
+            ],
+        );
+        let service = |name: &str, kind: &str| (name.to_owned(), BTreeSet::from([kind.to_owned()]));
+        seen.live.services = Some(
+            [
+                service("/c", "odd_msgs/Odd"),
+                service("/d", "std_srvs/Trigger"),
+            ]
+            .into(),
+        );
+        let more = merged(text, &[seen]);
+        let found = mapping(&more);
+        assert_eq!(
+            (found.calls().len(), found.variables().len()),
+            (2, 2),
+            "{more}"
+        );
+        assert!(
+            more.contains("\n  # M075: ") && more.contains("\n  # M063: "),
+            "{more}"
+        );
     }
 }

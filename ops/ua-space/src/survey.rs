@@ -33,6 +33,19 @@ pub(crate) struct Nodes {
     pub(crate) namespaces: Vec<String>,
     /// Its variables below the Objects folder, properties and parts of variables aside.
     pub(crate) variables: Vec<UaVariable>,
+    /// Of a server that runs: its Methods there, but for those by which a server of the space shows its calls.
+    pub(crate) methods: Vec<UaMethod>,
+}
+
+/// A Method of a server.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct UaMethod {
+    /// What it is called on.
+    pub(crate) object: NodeIdText,
+    pub(crate) method: NodeIdText,
+    pub(crate) name: String,
+    /// The name of the object, where that is not the Objects folder.
+    pub(crate) within: String,
 }
 
 /// A variable of a server or NodeSet.

@@ -19,6 +19,8 @@ pub(super) struct Known {
     numbers: HashMap<u16, BTreeSet<u16>>,
     /// Words of comments that begin with a slash.
     mentioned: HashSet<String>,
+    /// Methods in comments, as they are written: `object: .., method: ..`.
+    methods: HashSet<String>,
     /// Node ids in comments, as they are written.
     written: HashSet<String>,
     /// The namespace of the last of them; a node of namespace 0 has this in its topic names.
@@ -73,6 +75,9 @@ impl Known {
                 self.use_number(self.hearing, number.get());
             }
             self.written.insert(written.to_owned());
+        } else if let Some((_, target)) = comment.split_once("object: ") {
+            let target = target.trim().trim_end_matches('}');
+            self.methods.insert(format!("object: {target}"));
         } else if let Some((_, alias)) = comment.split_once("alias: ")
             && let Ok(alias) = alias.trim().parse()
         {
@@ -86,11 +91,21 @@ impl Known {
 
     /// The next number nobody has: above all there are, so that one that was given and taken back is not given again.
     pub(super) fn next_number(&mut self, namespace: u16) -> Option<u16> {
+        self.next_numbers(namespace, 1)
+    }
+
+    /// The first of so many numbers in a row that nobody has.
+    pub(super) fn next_numbers(&mut self, namespace: u16, count: u16) -> Option<u16> {
         let used = self.numbers.entry(namespace).or_default();
+        let last_of = |first: u16| first.checked_add(count.saturating_sub(1));
         let above = used.last().map_or(Some(1), |last| last.checked_add(1));
-        let number = above.or_else(|| (1..=u16::MAX).find(|number| !used.contains(number)))?;
-        used.insert(number);
-        Some(number)
+        let above = above.filter(|first| last_of(*first).is_some());
+        let free = |first: &u16| {
+            last_of(*first).is_some_and(|last| used.range(*first..=last).next().is_none())
+        };
+        let first = above.or_else(|| (1..=u16::MAX).find(free))?;
+        used.extend(first..=last_of(first)?);
+        Some(first)
     }
 
     pub(super) fn has_node(&self, node: &NodeIdText) -> bool {
@@ -128,6 +143,11 @@ impl Known {
     /// Whether a comment speaks of the topic.
     pub(super) fn mentions(&self, topic: &str) -> bool {
         self.mentioned.contains(topic)
+    }
+
+    /// Whether a comment has the Method, as `object: .., method: ..`.
+    pub(super) fn mentions_method(&self, target: &str) -> bool {
+        self.methods.contains(target)
     }
 
     /// The name of a variable the topic is bound in, or of the pattern that takes it.

@@ -6,6 +6,7 @@ use mappings::{LiveTopic, NodeIdText, SpaceId};
 use messages::{Registry, TypeName};
 use uadp::BuiltinType;
 
+use super::calls::{self, CallEntry, Untyped};
 use super::known::Known;
 use super::topics::{Form, LeftOut, camel, normal, registry};
 use crate::survey::{Graph, Nodes, UaVariable};
@@ -20,8 +21,8 @@ pub(super) struct Plan {
     pub(super) left_out: BTreeMap<(SpaceId, LeftOut), BTreeSet<String>>,
     /// Topics that a variable of the file could be bound to beside its own.
     pub(super) proposals: Vec<String>,
-    /// By their names, with their type where one is told.
-    pub(super) services: BTreeMap<SpaceId, BTreeMap<String, Option<String>>>,
+    pub(super) calls: Vec<CallEntry>,
+    pub(super) untyped: Untyped,
 }
 
 /// A variable.
@@ -77,7 +78,7 @@ impl Plan {
         planner.nodes(nodes);
         planner.topics(graphs, wishes);
         planner.rest();
-        planner.services(graphs);
+        planner.calls(graphs, nodes, wishes.namespace);
         planner.plan
     }
 }
@@ -386,52 +387,27 @@ impl Planner<'_> {
         self.plan.entries.push(entry);
     }
 
-    fn services(&mut self, graphs: &[Graph]) {
-        for graph in graphs {
-            let Some(services) = &graph.live.services else {
-                continue;
+    fn calls(&mut self, graphs: &[Graph], nodes: &[Nodes], uri: &str) {
+        let (found, untyped) = calls::candidates(graphs, nodes, self.known);
+        self.plan.untyped = untyped;
+        for one in found {
+            let Some(namespace) = self.namespace(uri) else {
+                return;
             };
-            let mapping = &self.known.mapping;
-            let executed =
-                mapping
-                    .executed_in(graph.space)
-                    .filter_map(|call| match &call.executed {
-                        mappings::ExecutedBy::Ros(target) => Some(target.name.as_str()),
-                        mappings::ExecutedBy::OpcUa(_) | mappings::ExecutedBy::Elsewhere => None,
-                    });
-            let asked = mapping.asked_in(graph.space);
-            let asked = asked.map(|(_, binding)| binding.target.name.as_str());
-            let of_mapping: BTreeSet<&str> = mapping
-                .services(graph.space)
-                .filter_map(|(_, bound)| match &bound.role {
-                    mappings::ServiceRole::Call { service, .. }
-                    | mappings::ServiceRole::Poll { service, .. } => Some(service.as_str()),
-                    mappings::ServiceRole::Answer { .. } => None,
-                })
-                .chain(executed)
-                .chain(asked)
-                .collect();
-            let wanted = services.iter().filter(|(name, _)| {
-                let last = name.rsplit('/').next().unwrap_or_default();
-                // One of the space needs no mapping.
-                let of_space = name
-                    .trim_start_matches('/')
-                    .parse::<mappings::TopicId>()
-                    .is_ok();
-                !EACH_NODE.contains(&last)
-                    && !of_space
-                    && !of_mapping.contains(name.as_str())
-                    && !self.known.mentions(name)
+            let Some(number) = self.known.next_numbers(namespace, one.numbers()) else {
+                return;
+            };
+            let node = NodeIdText {
+                namespace,
+                identifier: mappings::Identifier::Numeric(number.into()),
+            };
+            self.plan.calls.push(CallEntry {
+                node,
+                name: self.known.free_name(namespace, &one.name),
+                origin: one.origin,
+                what: one.what,
+                faulty: None,
             });
-            let wanted: BTreeMap<String, Option<String>> = wanted
-                .map(|(name, types)| {
-                    let only = types.first().filter(|_| types.len() == 1);
-                    (name.clone(), only.cloned())
-                })
-                .collect();
-            if !wanted.is_empty() {
-                self.plan.services.insert(graph.space, wanted);
-            }
         }
     }
 }
@@ -480,17 +456,3 @@ fn candidates(name: &str, bound: Vec<(Bound, bool)>) -> Vec<Candidate> {
         .chain(alone)
         .collect()
 }
-
-/// Services that nodes have for those who run them.
-const EACH_NODE: [&str; 10] = [
-    "describe_parameters",
-    "get_loggers",
-    "get_parameter_types",
-    "get_parameters",
-    "get_type_description",
-    "list_parameters",
-    "set_logger_level",
-    "set_parameters",
-    "set_parameters_atomically",
-    "tf2_frames",
-];

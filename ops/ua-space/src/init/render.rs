@@ -113,20 +113,6 @@ pub(super) fn variables(plan: &Plan, indent: &str) -> Variables {
         ]);
         lines.extend(wrapped(&lead, topics));
     }
-    for (space, services) in &plan.services {
-        lines.extend([
-            String::new(),
-            format!(
-                "{indent}# Services of space {space}: `calls` has them executed for other spaces, `call` and `poll` in a binding \
-                 make values of them"
-            ),
-        ]);
-        let services = services.iter().map(|(name, kind)| match kind {
-            Some(kind) => comment(&format!("{name} ({kind})")),
-            None => comment(name),
-        });
-        lines.extend(wrapped(&lead, services));
-    }
     Variables { lines, entries }
 }
 

@@ -260,6 +260,7 @@ impl NodeSet {
             endpoint: None,
             namespaces,
             variables: found,
+            methods: Vec::new(),
         })
     }
 

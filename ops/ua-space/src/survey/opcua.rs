@@ -19,7 +19,7 @@ use tokio::time::timeout;
 use uadp::BuiltinType;
 
 use super::data_types::{self, STRUCTURE};
-use super::{MOST, Nodes, UaVariable, away};
+use super::{MOST, Nodes, UaMethod, UaVariable, away};
 use crate::exit::Failure;
 
 /// Browses the server at `url` from its Objects folder on.
@@ -27,16 +27,17 @@ pub(crate) async fn survey(url: &str) -> Result<Nodes, Failure> {
     let server = Connected::to(url).await?;
     let browsing = async {
         let namespaces = server.namespaces().await?;
-        let variables = server.variables(namespaces.len()).await?;
-        Ok((namespaces, variables))
+        let (variables, methods) = server.nodes(namespaces.len()).await?;
+        Ok((namespaces, variables, methods))
     };
-    let (namespaces, variables) = server.within(browsing).await?;
+    let (namespaces, variables, methods) = server.within(browsing).await?;
     server.leave().await;
     Ok(Nodes {
         place: format!("OPC UA server {url}"),
         endpoint: Some(url.to_owned()),
         namespaces,
         variables,
+        methods,
     })
 }
 
@@ -250,55 +251,43 @@ impl Connected {
         Ok((told != Some(class)).then(|| format!("{} has no {word} `{node}`", self.url)))
     }
 
-    /// The variables below the Objects folder. Of variables nothing below is looked at, and no property.
-    async fn variables(&self, namespaces: usize) -> Result<Vec<UaVariable>, Failure> {
+    /// The variables and Methods below the Objects folder. Of variables nothing below is looked at, and no property.
+    async fn nodes(&self, namespaces: usize) -> Result<(Vec<UaVariable>, Vec<UaMethod>), Failure> {
+        let mut found = Found::default();
         let objects = NodeId::from(ObjectId::ObjectsFolder);
-        let mut seen = HashSet::from([objects.clone()]);
-        let mut next = VecDeque::from([(objects, String::new())]);
-        let mut found: Vec<(NodeId, UaVariable)> = Vec::new();
+        found.seen.insert(objects.clone());
+        let mut next = VecDeque::from([Object {
+            node: objects,
+            name: String::new(),
+            ours: false,
+        }]);
         while !next.is_empty() {
-            let batch: Vec<(NodeId, String)> = next.drain(..next.len().min(BATCH)).collect();
-            let nodes: Vec<NodeId> = batch.iter().map(|(node, _)| node.clone()).collect();
+            let batch: Vec<Object> = next.drain(..next.len().min(BATCH)).collect();
+            let nodes: Vec<NodeId> = batch.iter().map(|object| object.node.clone()).collect();
             let below = self.below(&nodes).await?;
-            for ((_, within), references) in batch.into_iter().zip(below) {
-                for reference in references {
-                    let node = reference.node_id.node_id;
-                    if node.namespace == 0
-                        || usize::from(node.namespace) >= namespaces
-                        || reference.node_id.server_index != 0
-                        || reference.reference_type_id == ReferenceTypeId::HasProperty
-                        || !seen.insert(node.clone())
-                    {
-                        continue;
-                    }
-                    let name = reference.browse_name.name.as_ref().to_owned();
-                    if reference.node_class == NodeClass::Object {
-                        next.push_back((node, name));
-                    } else if let Ok(text) = node.to_string().parse::<NodeIdText>() {
-                        let within = within.clone();
-                        let variable = UaVariable {
-                            node: text,
-                            name,
-                            within,
-                            value: None,
-                        };
-                        found.push((node, variable));
-                    }
-                }
+            for (object, references) in batch.into_iter().zip(below) {
+                let local = references.into_iter().filter(|reference| {
+                    let node = &reference.node_id.node_id;
+                    node.namespace != 0
+                        && usize::from(node.namespace) < namespaces
+                        && reference.node_id.server_index == 0
+                        && reference.reference_type_id != ReferenceTypeId::HasProperty
+                });
+                next.extend(local.filter_map(|reference| found.take(&object, reference)));
             }
-            if seen.len() > MOST {
+            if found.seen.len() > MOST || found.methods.len() > MOST {
                 return Err(Failure::Unavailable(format!(
                     "the OPC UA server at {} has more than {MOST} nodes, which are not looked through",
                     self.url
                 )));
             }
         }
-        let nodes: Vec<NodeId> = found.iter().map(|(node, _)| node.clone()).collect();
+        let variables = found.variables;
+        let nodes: Vec<NodeId> = variables.iter().map(|(node, _)| node.clone()).collect();
         let types = self.value_types(&nodes).await?;
-        let typed = found.into_iter().zip(types);
-        Ok(typed
-            .map(|((_, one), value)| UaVariable { value, ..one })
-            .collect())
+        let typed = variables.into_iter().zip(types);
+        let typed = typed.map(|((_, one), value)| UaVariable { value, ..one });
+        Ok((typed.collect(), found.methods))
     }
 
     /// What each node has below it.
@@ -310,7 +299,10 @@ impl Connected {
                 browse_direction: BrowseDirection::Forward,
                 reference_type_id: ReferenceTypeId::HierarchicalReferences.into(),
                 include_subtypes: true,
-                node_class_mask: (NodeClassMask::OBJECT | NodeClassMask::VARIABLE).bits(),
+                node_class_mask: (NodeClassMask::OBJECT
+                    | NodeClassMask::VARIABLE
+                    | NodeClassMask::METHOD)
+                    .bits(),
                 result_mask: BrowseResultMask::All as u32,
             })
             .collect();
@@ -435,6 +427,62 @@ impl Connected {
         Ok(None)
     }
 }
+
+/// An Object that is to be looked into.
+struct Object {
+    node: NodeId,
+    /// Empty of the Objects folder.
+    name: String,
+    /// A server of the space shows what is in the space there.
+    ours: bool,
+}
+
+/// What was found below the Objects folder.
+#[derive(Default)]
+struct Found {
+    seen: HashSet<NodeId>,
+    variables: Vec<(NodeId, UaVariable)>,
+    methods: Vec<UaMethod>,
+}
+
+impl Found {
+    /// Takes what is below an Object; one to be looked into if it is an Object, for the first time.
+    fn take(&mut self, above: &Object, reference: ReferenceDescription) -> Option<Object> {
+        let node = reference.node_id.node_id;
+        let name = reference.browse_name.name.as_ref().to_owned();
+        let within = above.name.clone();
+        let text = |node: &NodeId| node.to_string().parse::<NodeIdText>().ok();
+        if reference.node_class == NodeClass::Method {
+            if !above.ours {
+                self.methods.push(UaMethod {
+                    object: text(&above.node)?,
+                    method: text(&node)?,
+                    name,
+                    within,
+                });
+            }
+            return None;
+        }
+        if !self.seen.insert(node.clone()) {
+            return None;
+        }
+        if reference.node_class == NodeClass::Object {
+            let ours = above.ours || name == OURS;
+            return Some(Object { node, name, ours });
+        }
+        let variable = UaVariable {
+            node: text(&node)?,
+            name,
+            within,
+            value: None,
+        };
+        self.variables.push((node, variable));
+        None
+    }
+}
+
+/// The folder of a server of the space.
+const OURS: &str = "UaSpace";
 
 impl Drop for Connected {
     fn drop(&mut self) {
