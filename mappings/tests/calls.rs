@@ -150,8 +150,7 @@ fn what_a_goal_or_feedback_is_made_of_is_told_by_the_names_of_the_mapping() {
         ),
         (
             "goal: {pose: {field: target_pose}, behaviour_tree: ''}, feedback: {base_position: {field: current_pose}}",
-            "the goal of `nav2_msgs/NavigateToPose` cannot be made of that of `move_base_msgs/MoveBase`: \
-             there is no field `behaviour_tree`",
+            "the goal of `nav2_msgs/NavigateToPose` has no field `behaviour_tree`",
         ),
         (
             "goal: {pose: {field: target_pose}, behavior_tree: ''}",
@@ -186,6 +185,39 @@ fn a_method_of_another_server_is_asked_for_by_services() {
     let mapping = checked.mapping.as_ref().unwrap();
     assert_eq!(mapping.executed_in(SpaceId::UA).count(), 1);
     assert_eq!(mapping.asked_in(SpaceId::ROS1).count(), 1);
+}
+
+#[test]
+fn a_constant_is_a_value_of_its_field_whoever_executes() {
+    let told = |call: &str| {
+        let checked = check(call);
+        let found = checked.findings.iter();
+        found.map(|one| one.message.clone()).collect::<Vec<_>>()
+    };
+    let asked = |maps: &str| {
+        told(&format!(
+            "  - {{node: ns=2;i=61, name: Switch, origin: 1, ros: [{{service: /a, type: std_srvs/SetBool}},\n    \
+             {{space: 2, service: /b, type: std_srvs/Trigger, request: {{data: {maps}}}]}}\n"
+        ))
+    };
+    assert!(asked("true}").is_empty());
+    assert_eq!(
+        asked("on}"),
+        ["in the request of `std_srvs/SetBool`, `data` is Boolean, and its constant is none"]
+    );
+    let fault = asked("true}, response: {success: maybe}");
+    assert!(
+        matches!(&fault[..], [one] if one.starts_with("in the response of `std_srvs/Trigger`, ")),
+        "{fault:?}"
+    );
+    // Of a component nothing is known here but what the response is to be.
+    assert_eq!(
+        told(
+            "  - {node: ns=2;i=61, name: Grasp, origin: 0, ros: {space: 2, service: /b, type: std_srvs/Trigger, \
+             response: {done: true}}}\n"
+        ),
+        ["the response of `std_srvs/Trigger` has no field `done`"]
+    );
 }
 
 #[test]

@@ -107,14 +107,14 @@ impl Checker<'_> {
             }
             _ => None,
         };
-        let (node, topic, (origin, _)) = (node?.0, topic?, origin?);
+        let (node, topic, (origin, _), kind) = (node?.0, topic?, origin?, kind?);
         let (executed, asked) = settle(origin, found?, method.ok()?, findings)?;
         Some(Call {
             topic,
             node,
             name: name?,
             about: given(&entry.about).map_or_else(String::new, |(text, _)| text.clone()),
-            kind: kind?,
+            kind,
             executed,
             asked,
             open: given(&entry.open).is_some_and(|(open, _)| *open),
@@ -221,11 +221,9 @@ fn settle(
     }
     let mut asked = Vec::new();
     for one in asks {
-        if let Some(executor) = &executor {
-            findings.of_part([origin, one.space]);
-            fields::compare(executor, &one, findings);
-            findings.of_part(None);
-        }
+        findings.of_part([origin, one.space]);
+        fields::compare(executor.as_ref(), &one, findings);
+        findings.of_part(None);
         let of = |map: Option<(crate::call::FieldMap, Place)>| {
             map.map_or_else(Default::default, |(map, _)| map)
         };

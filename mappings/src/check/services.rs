@@ -442,7 +442,7 @@ pub(super) fn built_in(
     known
 }
 
-const fn wire(dialect: Dialect) -> Wire {
+pub(super) const fn wire(dialect: Dialect) -> Wire {
     match dialect {
         Dialect::Ros1 => Wire::Ros1,
         Dialect::Ros2 => Wire::Cdr,
