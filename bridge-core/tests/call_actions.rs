@@ -170,6 +170,26 @@ fn feedback_in_a_row_is_told_whole_once_and_by_the_names_of_its_fields() {
 }
 
 #[test]
+fn the_first_feedback_is_told_where_the_action_was_known_before_it_was_offered() {
+    let mut cell = executed(&actions(Dialect::Ros2, "demo_msgs/Count", COUNT));
+    // One that comes later has not heard what is announced at the start.
+    cell.kill(ASKING);
+    cell.start(ASKING, Program::new(1, Local::Ros1));
+    let now = cell.now();
+    cell.programs[ASKING].router.call_the_roll(now);
+    cell.run(ms(2_000));
+    let same = actions(Dialect::Ros1, "demo_msgs/Count", COUNT);
+    let now = cell.now();
+    let by_name = note("", events(), FieldMap::default());
+    let router = &mut cell.programs[ASKING].router;
+    let bound = router.bind_as(of(GOAL + 3), (same.feedback(), by_name), now);
+    bound.unwrap();
+    say(&mut cell, &feedback(1));
+    cell.run(ms(20));
+    assert_eq!(deliveries(&mut cell).len(), 1);
+}
+
+#[test]
 fn feedback_of_other_fields_is_counted_and_not_misread() {
     let mut cell = executed(&actions(Dialect::Ros2, "demo_msgs/Count", COUNT));
     let watch = actions(Dialect::Ros1, "demo_msgs/Watch", WATCH);

@@ -9,7 +9,7 @@ use uadp::discovery::ActionMetaData;
 
 use super::super::{About, Router};
 use super::Calls;
-use crate::call::{CallDescription, split_name};
+use crate::call::{CallDescription, CallRole, split_name};
 use crate::call_announcement;
 use crate::counters::Reason;
 use crate::learned::Weight;
@@ -252,10 +252,25 @@ impl Router {
         if let Some(calls) = &mut self.calls
             && let Some(known) = calls.table.get(&topic).and_then(|call| call.known.as_ref())
         {
-            calls.news.push_back(Output::CallKnown {
-                topic,
-                description: Arc::clone(&known.description),
-            });
+            let description = Arc::clone(&known.description);
+            let role = description.role;
+            calls
+                .news
+                .push_back(Output::CallKnown { topic, description });
+            self.ask_of_values(topic, role, now);
+        }
+    }
+
+    /// Asks what the values of an action are: the first feedback may come with the first goal, and is none before that is known.
+    fn ask_of_values(&mut self, topic: TopicId, role: CallRole, now: Now) {
+        let CallRole::Goal(family) = role else {
+            return;
+        };
+        let (space, namespace, _) = topic.triple();
+        for id in [family.feedback, family.status] {
+            if let Some(value) = TopicId::new(space, namespace, id) {
+                self.ask_what(value, now);
+            }
         }
     }
 
