@@ -6,7 +6,7 @@ use std::future::pending;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, SystemTime};
 
-use program::{Ending, Method, Nature, Program, Refused, Rest, RunId, State, Transition};
+use program::{Ending, Method, Nature, Program, Refused, RunId, State, Transition};
 use tokio::sync::{mpsc, oneshot, watch};
 use tokio::task::{JoinError, JoinHandle};
 use tokio::time::{Instant, sleep_until, timeout};
@@ -74,7 +74,7 @@ impl Actor {
     ) -> (Self, watch::Receiver<Arc<Shown>>) {
         let program = Program::new(Nature {
             can_suspend: driver.can_suspend(),
-            rests_in: Rest::Ready,
+            rests_in: facts.rests_in,
         });
         let created = clock();
         let now = Shown {

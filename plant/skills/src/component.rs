@@ -98,7 +98,7 @@ impl fmt::Debug for DriverSetup {
 /// How a simulation is, where it is not as usual.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Simulation {
-    /// How long a gripper takes.
+    /// How long a gripper takes, or a change of tools.
     pub duration: Option<Duration>,
     /// Whether there is a thing to grasp.
     pub object: Option<bool>,
@@ -106,6 +106,8 @@ pub struct Simulation {
     pub reach: Option<f64>,
     /// How many times faster than time it works.
     pub time_scale: Option<f64>,
+    /// Below which height of a robot's tool something pushes back, m.
+    pub contact: Option<f64>,
 }
 
 /// The servers whose skills a composite runs.

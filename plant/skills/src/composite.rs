@@ -348,6 +348,7 @@ mod tests {
             results: of.results(),
             capabilities: Vec::new(),
             timeout: None,
+            rests_in: of.rests_in,
         };
         let skill = Skill::spawn(facts, driver, authority.clone(), Vec::new());
         LocalRun {

@@ -125,6 +125,7 @@ fn skill(skill_type: &str, driver: Arc<dyn Driver>) -> Result<Skill, String> {
         results: of.results(),
         capabilities: Vec::new(),
         timeout: None,
+        rests_in: of.rests_in,
     };
     Ok(Skill::spawn(facts, driver, Authority::new(), Vec::new()))
 }

@@ -2,9 +2,11 @@
 
 mod nodeset;
 mod table;
+mod types;
 
 pub use nodeset::nodeset;
-pub use table::{Preset, SkillType, TYPES, Unit, Variable};
+pub use table::{Preset, SkillType, Unit, Variable};
+pub use types::TYPES;
 
 use crate::parameters::Parameter;
 use crate::value::{Builtin, Shape, Value};

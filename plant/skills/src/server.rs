@@ -295,6 +295,7 @@ fn make(
         types,
         capabilities: setup.capabilities.clone(),
         timeout: setup.timeout,
+        rests_in: types::rests_in(server, &instance),
     };
     let nodes = Nodes::new(server, instance, &facts);
     Ok(Made {

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use program::{Method, State};
+use program::{Method, Rest, State};
 use tokio::sync::{mpsc, oneshot, watch};
 
 use crate::actor::{Actor, Call, Order};
@@ -30,6 +30,8 @@ pub struct Facts {
     pub capabilities: Vec<String>,
     /// How long a run may take; `None` for as long as it likes.
     pub timeout: Option<Duration>,
+    /// The state after a run that did its work, as its type says.
+    pub rests_in: Rest,
 }
 
 /// A skill that is executed here. Clones are of the same one; it ends with the last of them, its run being stopped.

@@ -1,19 +1,22 @@
 //! From what a component says of its drivers to drivers.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use super::{DriverSetup, Simulation};
 use crate::client::Remote;
 use crate::driver::Driver;
 use crate::model::NAMESPACE;
 use crate::parameters::TypeName;
-use crate::simulated::{Arm, ArmSettings, Gripper, GripperSettings, Path};
+use crate::simulated::{Arm, ArmSettings, Base, Change, Changer, Gripper, GripperSettings, Path};
 
-/// Makes the drivers of one component: its skills share one gripper and one robot.
+/// Makes the drivers of one component: its skills share one gripper, one robot, one tool changer, one base.
 #[derive(Debug, Default)]
 pub struct Drivers {
     gripper: Gripper,
     arm: Option<Arm>,
+    changer: Changer,
+    base: Base,
 }
 
 /// A driver that cannot do the work of a type.
@@ -51,23 +54,37 @@ impl Drivers {
             DriverSetup::PickAndPlace(_) => Err(DriverFault(format!(
                 "`pick_and_place` does the work of PickAndPlaceSkillType, and this is {own}"
             ))),
-            DriverSetup::Simulated(how) if is("GraspSkillType") => {
-                Ok(self.gripper.grasp(Some(gripper(how))))
-            }
-            DriverSetup::Simulated(how) if is("ReleaseSkillType") => {
-                Ok(self.gripper.release(Some(gripper(how))))
-            }
-            DriverSetup::Simulated(how) if is("PtpMoveSkillType") => {
-                Ok(self.arm(how).moves(Path::PointToPoint))
-            }
-            DriverSetup::Simulated(how) if is("LinearMoveSkillType") => {
-                Ok(self.arm(how).moves(Path::Linear))
-            }
-            DriverSetup::Simulated(_) => Err(DriverFault(format!(
-                "`simulated` does the work of GraspSkillType, ReleaseSkillType, PtpMoveSkillType, LinearMoveSkillType and \
-                 what is below them, and this is {own}"
-            ))),
+            DriverSetup::Simulated(how) => self.simulated(how, &is).ok_or_else(|| {
+                DriverFault(format!(
+                    "`simulated` does the work of {} and what is below them, and this is {own}",
+                    SIMULATED.join(", ")
+                ))
+            }),
         }
+    }
+
+    fn simulated(
+        &mut self,
+        how: &Simulation,
+        is: &dyn Fn(&str) -> bool,
+    ) -> Option<Arc<dyn Driver>> {
+        let which = SIMULATED.iter().find(|name| is(name))?;
+        let (duration, scale) = (how.duration, how.time_scale.unwrap_or(1.0));
+        let takes = duration.unwrap_or(USUAL_CHANGE).div_f64(scale);
+        Some(match *which {
+            "GraspSkillType" => self.gripper.grasp(Some(gripper(how))),
+            "ReleaseSkillType" => self.gripper.release(Some(gripper(how))),
+            "MoveGripperSkillType" => self.gripper.moves(Some(gripper(how))),
+            "PtpMoveSkillType" => self.arm(how).moves(Path::PointToPoint),
+            "ForceMoveSkillType" => self.arm(how).yields(),
+            "LinearMoveSkillType" => self.arm(how).moves(Path::Linear),
+            "JointPtpMoveSkillType" | "JointLinearMoveSkillType" => self.arm(how).turns(),
+            "AttachToolSkillType" => self.changer.driver(Change::Attach, takes),
+            "DetachToolSkillType" => self.changer.driver(Change::Detach, takes),
+            "ChangeToolSkillType" => self.changer.driver(Change::Change, takes),
+            "NavigateToSkillType" => self.base.navigates(scale),
+            _ => return None,
+        })
     }
 
     fn arm(&mut self, how: &Simulation) -> Arm {
@@ -75,6 +92,7 @@ impl Drivers {
         let settings = ArmSettings {
             reach: how.reach.unwrap_or(usual.reach),
             time_scale: how.time_scale.unwrap_or(usual.time_scale),
+            contact: how.contact,
             ..usual
         };
         let arm = self.arm.get_or_insert_with(|| Arm::new(settings.clone()));
@@ -90,3 +108,21 @@ fn gripper(how: &Simulation) -> GripperSettings {
         time_scale: how.time_scale.unwrap_or(usual.time_scale),
     }
 }
+
+/// The types whose work is simulated, those below others first.
+const SIMULATED: [&str; 12] = [
+    "GraspSkillType",
+    "ReleaseSkillType",
+    "MoveGripperSkillType",
+    "PtpMoveSkillType",
+    "ForceMoveSkillType",
+    "LinearMoveSkillType",
+    "JointPtpMoveSkillType",
+    "JointLinearMoveSkillType",
+    "AttachToolSkillType",
+    "DetachToolSkillType",
+    "ChangeToolSkillType",
+    "NavigateToSkillType",
+];
+/// How long a tool takes to be attached or detached.
+const USUAL_CHANGE: Duration = Duration::from_secs(2);

@@ -2,9 +2,10 @@
 
 use std::fmt::Write as _;
 
-use program::Method;
+use program::{Method, Rest};
 
-use super::table::{SkillType, TYPES, Unit, Variable};
+use super::table::{SkillType, Unit, Variable};
+use super::types::TYPES;
 use super::{CONTROLLER_TYPE, EVENT_TYPE, NAMESPACE, SKILL_TYPE};
 use crate::value::{Builtin, Value};
 
@@ -173,6 +174,14 @@ impl Nodes {
                 Rule::Mandatory,
             );
         }
+        if of.rests_in == Rest::Halted {
+            let mut rests = Node::new("UAVariable", of.id + 3, "1:ReadyAfterSuccess")
+                .attribute("DataType", Builtin::Boolean.name())
+                .forward("HasTypeDefinition", PROPERTY_TYPE)
+                .child_of(of.id, "HasProperty", Rule::Mandatory);
+            rests.value = Some(xml_value(&Value::Boolean(false)));
+            self.add(rests);
+        }
         for (place, parameter) in (0..).zip(of.parameters) {
             let ids = Ids {
                 node: of.id + PARAMETERS + place,
@@ -268,6 +277,18 @@ impl Nodes {
                 Rule::Mandatory,
             ));
         }
+        let rests = Node::new("UAVariable", parent + 25, "1:ReadyAfterSuccess")
+            .about(
+                "Whether a run that did its work leaves it Ready; otherwise a Reset comes first.",
+            )
+            .attribute("DataType", Builtin::Boolean.name());
+        let mut rests = rests.forward("HasTypeDefinition", PROPERTY_TYPE).child_of(
+            parent,
+            "HasProperty",
+            Rule::Mandatory,
+        );
+        rests.value = Some(xml_value(&Value::Boolean(true)));
+        self.add(rests);
         self.outcome_members(parent);
     }
 

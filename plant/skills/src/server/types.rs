@@ -2,6 +2,7 @@
 
 use plant_opcua::server::{Instance, Server};
 use plant_opcua::types::{NodeId, Variant};
+use program::Rest;
 
 use crate::model::{self, NAMESPACE, SkillType};
 use crate::parameters::{Parameter, TypeName};
@@ -81,6 +82,18 @@ pub(super) fn parameters(
         });
     }
     all
+}
+
+/// Where a run ends that did its work: what the most derived type says of it.
+pub(super) fn rests_in(server: &Server, instance: &Instance) -> Rest {
+    let node = instance.node("ReadyAfterSuccess");
+    match node
+        .and_then(|node| server.value(node))
+        .and_then(|value| value.value)
+    {
+        Some(Variant::Boolean(false)) => Rest::Halted,
+        Some(_) | None => Rest::Ready,
+    }
 }
 
 fn unit(server: &Server, node: &NodeId) -> Option<String> {

@@ -22,6 +22,8 @@ pub struct ArmSettings {
     pub home: [f64; 6],
     /// How fast it turns its tool at most, rad/s.
     pub turning: f64,
+    /// Below which height of the tool something pushes back, m.
+    pub contact: Option<f64>,
 }
 
 impl Default for ArmSettings {
@@ -31,6 +33,7 @@ impl Default for ArmSettings {
             time_scale: 1.0,
             home: [0.4, 0.0, 0.5, 0.0, 0.0, 0.0],
             turning: 3.0,
+            contact: None,
         }
     }
 }
@@ -44,11 +47,12 @@ pub enum Path {
     Linear,
 }
 
-/// One robot; its drivers share where its tool is.
+/// One robot; its drivers share where its tool and its joints are. It has no kinematics: neither follows the other.
 #[derive(Debug, Clone)]
 pub struct Arm {
     settings: ArmSettings,
     position: Arc<Mutex<[f64; 6]>>,
+    joints: Arc<Mutex<[f64; 6]>>,
 }
 
 impl Arm {
@@ -56,7 +60,11 @@ impl Arm {
     #[must_use]
     pub fn new(settings: ArmSettings) -> Self {
         let position = Arc::new(Mutex::new(settings.home));
-        Self { settings, position }
+        Self {
+            settings,
+            position,
+            joints: Arc::default(),
+        }
     }
 
     /// The same robot with other settings; where its tool is stays as it is.
@@ -65,6 +73,7 @@ impl Arm {
         Self {
             settings,
             position: Arc::clone(&self.position),
+            joints: Arc::clone(&self.joints),
         }
     }
 
@@ -74,7 +83,24 @@ impl Arm {
         Arc::new(Motion {
             arm: self.clone(),
             path,
+            yields: false,
         })
+    }
+
+    /// The driver of ForceMoveSkillType.
+    #[must_use]
+    pub fn yields(&self) -> Arc<dyn Driver> {
+        Arc::new(Motion {
+            arm: self.clone(),
+            path: Path::Linear,
+            yields: true,
+        })
+    }
+
+    /// The driver of the moves of its joints.
+    #[must_use]
+    pub fn turns(&self) -> Arc<dyn Driver> {
+        Arc::new(Joints { arm: self.clone() })
     }
 
     /// Where its tool is.
@@ -87,6 +113,8 @@ impl Arm {
 struct Motion {
     arm: Arm,
     path: Path,
+    /// Whether it ends where something pushes back.
+    yields: bool,
 }
 
 #[async_trait]
@@ -122,28 +150,49 @@ impl Driver for Motion {
             .ok_or_else(|| missing("MaxAcceleration"))?;
         let from = self.arm.position();
         let profile = self.profile(from, target, (speed, acceleration));
+        let touches = self.touches(parameters);
         work.step("Move").await;
         let mut moved = Duration::ZERO;
-        loop {
+        let touched = loop {
             let seconds = moved.as_secs_f64() * self.arm.settings.time_scale;
             let share = profile.share(seconds);
             *lock(&self.arm.position) = between(from, target, share);
             #[expect(clippy::cast_possible_truncation, reason = "a share for people to see")]
             work.progress(share as f32);
-            if seconds >= profile.seconds() {
-                break;
+            let touched = touches.is_some_and(|height| self.arm.position()[2] < height);
+            if touched || seconds >= profile.seconds() {
+                break touched;
             }
             // What stands still has not moved meanwhile.
             work.going().await.map_err(|_| self.stopped())?;
             let began = Instant::now();
             work.spend(TICK).await.map_err(|_| self.stopped())?;
             moved += began.elapsed().min(2 * TICK);
+        };
+        let mut results = vec![("Position".to_owned(), self.arm.position().into())];
+        if self.yields {
+            let pushes = work.parameters().numbers("MaxForce").unwrap_or_default();
+            let force = match (touched, pushes.last()) {
+                (true, Some(along_z)) => vec![0.0, 0.0, *along_z],
+                _ => vec![0.0; 3],
+            };
+            results.push(("ForceExceeded".to_owned(), touched.into()));
+            results.push(("Force".to_owned(), force.into()));
         }
-        Ok(vec![("Position".to_owned(), self.arm.position().into())])
+        Ok(results)
     }
 }
 
 impl Motion {
+    /// Below which height it is stopped by what pushes back.
+    fn touches(&self, parameters: &Parameters) -> Option<f64> {
+        let counts = self.yields
+            && parameters
+                .numbers("MaxForce")
+                .is_some_and(|force| force.last().is_some_and(|along_z| *along_z > 0.0));
+        self.arm.settings.contact.filter(|_| counts)
+    }
+
     /// The motion of the slowest coordinate: the others keep pace with it.
     fn profile(
         &self,
@@ -181,6 +230,58 @@ impl Motion {
     }
 }
 
+/// Moves of joints.
+struct Joints {
+    arm: Arm,
+}
+
+#[async_trait]
+impl Driver for Joints {
+    fn can_suspend(&self) -> bool {
+        true
+    }
+
+    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+        target_joints(parameters).map(drop)
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let target = target_joints(work.parameters())?;
+        let number = |name: &str| {
+            let number = work.parameters().number(name);
+            number.ok_or_else(|| format!("{name} is not there"))
+        };
+        let (speed, acceleration) = (number("MaxJointVelocity")?, number("MaxJointAcceleration")?);
+        let from = *lock(&self.arm.joints);
+        let profile = target
+            .iter()
+            .zip(from)
+            .map(|(to, from)| Profile::new(to - from, speed, acceleration))
+            .max_by(|a, b| a.seconds().total_cmp(&b.seconds()))
+            .unwrap_or_else(|| Profile::new(0.0, speed, acceleration));
+        work.step("Move").await;
+        for piece in 1..=PIECES {
+            let share = f32::from(piece) / f32::from(PIECES);
+            let seconds = profile.seconds() / self.arm.settings.time_scale / f64::from(PIECES);
+            work.spend(Duration::from_secs_f64(seconds))
+                .await
+                .map_err(|_| "stopped on the way".to_owned())?;
+            *lock(&self.arm.joints) = between(
+                from,
+                target,
+                profile.share(profile.seconds() * f64::from(share)),
+            );
+            work.progress(share);
+        }
+        Ok(vec![("JointPosition".to_owned(), target.into())])
+    }
+}
+
+fn target_joints(parameters: &Parameters) -> Result<[f64; 6], String> {
+    let target = parameters.six("TargetJointPosition");
+    target.ok_or_else(|| "TargetJointPosition has six numbers, one for each joint".to_owned())
+}
+
 fn between(from: [f64; 6], target: [f64; 6], share: f64) -> [f64; 6] {
     let mut at = target;
     if share < 1.0 {
@@ -195,6 +296,8 @@ fn length(of: &[f64]) -> f64 {
     of.iter().map(|part| part * part).sum::<f64>().sqrt()
 }
 
+/// In so many pieces its joints turn.
+const PIECES: u8 = 50;
 /// How often it says where it is.
 const TICK: Duration = Duration::from_millis(10);
 
@@ -261,7 +364,11 @@ mod tests {
 
     #[test]
     fn a_straight_line_takes_the_time_of_its_length_and_a_free_way_that_of_its_slowest_part() {
-        let motion = |path| Motion { arm: quick(), path };
+        let motion = |path| Motion {
+            arm: quick(),
+            path,
+            yields: false,
+        };
         let (from, target) = ([0.0; 6], [0.3, 0.4, 0.0, 0.0, 0.0, 0.0]);
         let seconds = |path| motion(path).profile(from, target, (0.2, 1.0)).seconds();
         assert!((seconds(Path::Linear) - Profile::new(0.5, 0.2, 1.0).seconds()).abs() < 1e-9);
@@ -283,5 +390,50 @@ mod tests {
             "{refusal}"
         );
         assert_eq!(arm.position(), ArmSettings::default().home);
+    }
+
+    #[tokio::test]
+    async fn its_joints_and_its_yielding_moves_are_driven_as_drivers_should_be() {
+        let mut turns = [[0.5; 6], [-0.5; 6], [0.1, 0.2, 0.3, -0.4, -0.5, -0.6]];
+        let mut around = || {
+            turns.rotate_left(1);
+            vec![("TargetJointPosition".to_owned(), turns[0].into())]
+        };
+        for skill_type in ["JointPtpMoveSkillType", "JointLinearMoveSkillType"] {
+            conformance::check(skill_type, quick().turns(), &mut around)
+                .await
+                .unwrap();
+        }
+        let mut heights = [0.3, 0.5, 0.4];
+        let up_and_down = || {
+            heights.rotate_left(1);
+            pushing([0.4, 0.0, heights[0], 0.0, 0.0, 0.0])
+        };
+        conformance::check("ForceMoveSkillType", quick().yields(), up_and_down)
+            .await
+            .unwrap();
+    }
+
+    fn pushing(target: [f64; 6]) -> Vec<(String, Value)> {
+        let mut parameters = to(target, &[]);
+        parameters.push(("MaxForce".to_owned(), vec![0.0, 0.0, 20.0].into()));
+        parameters
+    }
+
+    #[tokio::test]
+    async fn a_yielding_move_ends_where_something_pushes_back() {
+        let arm = Arm::new(ArmSettings {
+            time_scale: 20.0,
+            contact: Some(0.3),
+            ..ArmSettings::default()
+        });
+        let target = [0.4, 0.0, 0.1, 0.0, 0.0, 0.0];
+        let moved = conformance::run_once("ForceMoveSkillType", arm.yields(), pushing(target))
+            .await
+            .unwrap();
+        assert!(moved.succeeded, "{}", moved.message);
+        assert_eq!(moved.results[1], ("ForceExceeded".to_owned(), true.into()));
+        let [_, _, z, ..] = arm.position();
+        assert!(z < 0.3 && z > 0.1, "{z}");
     }
 }

@@ -58,6 +58,16 @@ impl Gripper {
         self.motion(false, settings)
     }
 
+    /// The driver of MoveGripperSkillType and what is below it.
+    #[must_use]
+    pub fn moves(&self, settings: Option<GripperSettings>) -> Arc<dyn Driver> {
+        let settings = settings.unwrap_or_else(|| self.settings.clone());
+        Arc::new(Width {
+            settings,
+            holds: Arc::clone(&self.holds),
+        })
+    }
+
     /// Whether it holds a thing.
     #[must_use]
     pub fn holds(&self) -> bool {
@@ -95,16 +105,7 @@ impl Driver for Motion {
             ("Open", false)
         };
         work.step(step).await;
-        let piece = self
-            .settings
-            .duration
-            .div_f64(self.settings.time_scale * f64::from(PIECES));
-        for done in 1..=PIECES {
-            work.spend(piece)
-                .await
-                .map_err(|_| format!("stopped while the fingers {}", step.to_lowercase()))?;
-            work.progress(f32::from(done) / f32::from(PIECES));
-        }
+        self.settings.take_time(&work, step).await?;
         self.holds.store(holds, Ordering::SeqCst);
         if !self.closes {
             return Ok(Vec::new());
@@ -113,6 +114,47 @@ impl Driver for Motion {
             return Err("nothing is between the fingers".to_owned());
         }
         Ok(vec![("Gripped".to_owned(), true.into())])
+    }
+}
+
+/// Bringing its fingers to a width.
+#[derive(Debug)]
+struct Width {
+    settings: GripperSettings,
+    holds: Arc<AtomicBool>,
+}
+
+#[async_trait]
+impl Driver for Width {
+    fn can_suspend(&self) -> bool {
+        true
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let width = work
+            .parameters()
+            .number("Width")
+            .ok_or("Width is no number")?;
+        work.step("Move").await;
+        self.settings.take_time(&work, "move").await?;
+        self.holds.store(false, Ordering::SeqCst);
+        Ok(vec![
+            ("Width".to_owned(), width.into()),
+            ("Gripped".to_owned(), false.into()),
+        ])
+    }
+}
+
+impl GripperSettings {
+    async fn take_time(&self, work: &Work, what: &str) -> Result<(), String> {
+        let piece = self.duration.div_f64(self.time_scale * f64::from(PIECES));
+        for done in 1..=PIECES {
+            work.spend(piece)
+                .await
+                .map_err(|_| format!("stopped while the fingers {}", what.to_lowercase()))?;
+            work.progress(f32::from(done) / f32::from(PIECES));
+        }
+        Ok(())
     }
 }
 
@@ -137,6 +179,7 @@ mod tests {
         for (skill_type, driver) in [
             ("GraspSkillType", quick(true).grasp(None)),
             ("ReleaseSkillType", quick(true).release(None)),
+            ("MoveGripperSkillType", quick(true).moves(None)),
         ] {
             conformance::check(skill_type, driver, Vec::new)
                 .await

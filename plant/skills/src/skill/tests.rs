@@ -112,6 +112,7 @@ fn facts(type_name: &str, timeout: Option<Duration>) -> Facts {
         results: skill_type.results(),
         capabilities: Vec::new(),
         timeout,
+        rests_in: skill_type.rests_in,
     }
 }
 

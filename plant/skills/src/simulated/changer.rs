@@ -1,0 +1,146 @@
+//! A tool changer that has nothing real at its flange.
+
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use async_trait::async_trait;
+
+use crate::driver::{Driver, Results, Work};
+use crate::parameters::Parameters;
+use crate::skill::lock;
+
+/// One tool changer; its drivers share which tool is attached.
+#[derive(Debug, Clone, Default)]
+pub struct Changer {
+    tool: Arc<Mutex<String>>,
+}
+
+/// What to do with the tool.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Change {
+    /// AttachToolSkillType.
+    Attach,
+    /// DetachToolSkillType.
+    Detach,
+    /// ChangeToolSkillType.
+    Change,
+}
+
+impl Changer {
+    /// The driver of one of its skills, each of whose ways takes that long.
+    #[must_use]
+    pub fn driver(&self, change: Change, takes: Duration) -> Arc<dyn Driver> {
+        Arc::new(Changing {
+            changer: self.clone(),
+            change,
+            takes,
+        })
+    }
+
+    /// The ApplicationUri of the tool that is attached; nothing for none.
+    #[must_use]
+    pub fn tool(&self) -> String {
+        lock(&self.tool).clone()
+    }
+}
+
+struct Changing {
+    changer: Changer,
+    change: Change,
+    takes: Duration,
+}
+
+#[async_trait]
+impl Driver for Changing {
+    fn can_suspend(&self) -> bool {
+        true
+    }
+
+    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+        let wanted = parameters.text("ToolAppUri");
+        if self.change != Change::Detach && wanted.is_none_or(str::is_empty) {
+            return Err("ToolAppUri is empty".to_owned());
+        }
+        Ok(())
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let wanted = work.parameters().text("ToolAppUri").unwrap_or_default();
+        let attached = self.changer.tool();
+        let ways: &[&str] = match self.change {
+            Change::Attach if !attached.is_empty() && attached != wanted => {
+                return Err(format!("{attached} is attached"));
+            }
+            Change::Attach | Change::Change if attached == wanted => &[],
+            Change::Change if !attached.is_empty() => &["Detach", "Attach"],
+            Change::Attach | Change::Change => &["Attach"],
+            Change::Detach if attached.is_empty() => &[],
+            Change::Detach => &["Detach"],
+        };
+        for (done, way) in (1_u8..).zip(ways) {
+            work.step(*way).await;
+            work.spend(self.takes)
+                .await
+                .map_err(|_| format!("stopped while the tool is to {}", way.to_lowercase()))?;
+            let now = if *way == "Attach" { wanted } else { "" };
+            now.clone_into(&mut lock(&self.changer.tool));
+            work.progress(f32::from(done) / if ways.len() > 1 { 2.0 } else { 1.0 });
+        }
+        Ok(vec![("Tool".to_owned(), self.changer.tool().into())])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::conformance;
+    use crate::value::Value;
+
+    const TAKES: Duration = Duration::from_millis(40);
+
+    fn tool(uri: &str) -> Vec<(String, Value)> {
+        vec![
+            ("ToolPosition".to_owned(), [0.0; 6].into()),
+            ("ToolAppUri".to_owned(), uri.into()),
+        ]
+    }
+
+    #[tokio::test]
+    async fn its_driver_is_as_drivers_should_be() {
+        let mut tools = ["urn:a", "urn:b", "urn:c"];
+        let driver = Changer::default().driver(Change::Change, TAKES);
+        let another = || {
+            tools.rotate_left(1);
+            tool(tools[0])
+        };
+        conformance::check("ChangeToolSkillType", driver, another)
+            .await
+            .unwrap();
+    }
+
+    #[tokio::test]
+    async fn one_tool_at_a_time_is_attached() {
+        let changer = Changer::default();
+        let run = async |change, of, parameters| {
+            let driver = changer.driver(change, TAKES);
+            conformance::run_once(of, driver, parameters).await.unwrap()
+        };
+        let attached = run(Change::Attach, "AttachToolSkillType", tool("urn:a")).await;
+        assert_eq!(attached.results, [("Tool".to_owned(), "urn:a".into())]);
+        let second = run(Change::Attach, "AttachToolSkillType", tool("urn:b")).await;
+        assert_eq!(
+            (second.succeeded, second.message.as_str()),
+            (false, "urn:a is attached")
+        );
+        run(Change::Change, "ChangeToolSkillType", tool("urn:b")).await;
+        assert_eq!(changer.tool(), "urn:b");
+        run(Change::Detach, "DetachToolSkillType", Vec::new()).await;
+        assert_eq!(changer.tool(), "");
+        let nobody = changer.driver(Change::Attach, TAKES);
+        let refused = conformance::run_once("AttachToolSkillType", nobody, tool("")).await;
+        assert_eq!(
+            refused.unwrap_err(),
+            "BadInvalidArgument: ToolAppUri is empty"
+        );
+    }
+}
