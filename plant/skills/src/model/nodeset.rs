@@ -175,12 +175,7 @@ impl Nodes {
             );
         }
         if of.rests_in == Rest::Halted {
-            let mut rests = Node::new("UAVariable", of.id + 3, "1:ReadyAfterSuccess")
-                .attribute("DataType", Builtin::Boolean.name())
-                .forward("HasTypeDefinition", PROPERTY_TYPE)
-                .child_of(of.id, "HasProperty", Rule::Mandatory);
-            rests.value = Some(xml_value(&Value::Boolean(false)));
-            self.add(rests);
+            self.ready_after_success(of.id + 3, of.id, false);
         }
         for (place, parameter) in (0..).zip(of.parameters) {
             let ids = Ids {
@@ -277,19 +272,19 @@ impl Nodes {
                 Rule::Mandatory,
             ));
         }
-        let rests = Node::new("UAVariable", parent + 25, "1:ReadyAfterSuccess")
-            .about(
-                "Whether a run that did its work leaves it Ready; otherwise a Reset comes first.",
-            )
-            .attribute("DataType", Builtin::Boolean.name());
-        let mut rests = rests.forward("HasTypeDefinition", PROPERTY_TYPE).child_of(
-            parent,
-            "HasProperty",
-            Rule::Mandatory,
-        );
-        rests.value = Some(xml_value(&Value::Boolean(true)));
-        self.add(rests);
+        self.ready_after_success(parent + 25, parent, true);
         self.outcome_members(parent);
+    }
+
+    /// Said anew by a type that differs from its supertypes.
+    fn ready_after_success(&mut self, id: u32, parent: u32, value: bool) {
+        let mut rests = Node::new("UAVariable", id, "1:ReadyAfterSuccess")
+            .about("Whether a run that did its work leaves it Ready; otherwise a Reset comes first.")
+            .attribute("DataType", Builtin::Boolean.name())
+            .forward("HasTypeDefinition", PROPERTY_TYPE)
+            .child_of(parent, "HasProperty", Rule::Mandatory);
+        rests.value = Some(xml_value(&Value::Boolean(value)));
+        self.add(rests);
     }
 
     /// How a run has ended.
