@@ -1,5 +1,7 @@
 //! A component of the cell, by its own YAML.
 
+mod simulate;
+
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -12,7 +14,11 @@ use ua_component::{ComponentPort, Options, made};
 
 /// A component of the cell: an OPC UA server with skills, which are values and calls of the space too.
 #[derive(Debug, clap::Parser)]
-#[command(name = "ua-component", version)]
+#[command(
+    name = "ua-component",
+    version,
+    after_help = "`ua-component simulate --help`: devices behind their protocols, to try drivers with"
+)]
 struct UaComponent {
     /// The YAML of the component
     #[arg(
@@ -53,6 +59,13 @@ struct Read {
 }
 
 fn main() -> ExitCode {
+    let mut arguments = std::env::args_os().skip(1).peekable();
+    if arguments
+        .peek()
+        .is_some_and(|first| first == simulate::VERB)
+    {
+        return simulate::run(arguments);
+    }
     bridge_node::run::<UaComponent>()
 }
 
@@ -71,14 +84,15 @@ impl UaComponent {
             Failure::new(FailureKind::Io, format!("cannot read {file}: {error}"))
         })?;
         let folder = self.file().parent().unwrap_or_else(|| Path::new(""));
-        let mut component = Component::from_yaml(&text, folder).map_err(|findings| {
-            let count = findings.len();
-            ua_component::print(&findings.render(&file, &text));
-            Failure::new(
-                FailureKind::Configuration,
-                format!("{file}: {count} errors"),
-            )
-        })?;
+        let mut component =
+            Component::from_yaml_with(&text, folder, &devices::Kinds).map_err(|findings| {
+                let count = findings.len();
+                ua_component::print(&findings.render(&file, &text));
+                Failure::new(
+                    FailureKind::Configuration,
+                    format!("{file}: {count} errors"),
+                )
+            })?;
         if let Some(endpoint) = &self.endpoint {
             component.endpoint.clone_from(endpoint);
         }

@@ -1,5 +1,6 @@
 //! A component: what it is called, where it is, and which skills it has.
 
+mod device;
 mod document;
 mod drivers;
 
@@ -8,6 +9,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+pub use device::{Device, DeviceKinds, NoDevices};
 pub use drivers::{DriverFault, Drivers};
 
 use crate::driver::Driver;
@@ -33,6 +35,8 @@ pub struct Component {
     pub lds: Lds,
     /// Whether calls are taken from other hosts, though nothing secures them.
     pub open: bool,
+    /// What does the work of the skills whose driver is [`DriverSetup::Device`].
+    pub device: Option<Arc<dyn Device>>,
     /// Its skills, by their numbers from 1.
     pub skills: Vec<SkillSetup>,
 }
@@ -83,6 +87,8 @@ pub enum DriverSetup {
     Simulated(Simulation),
     /// The skills of a robot and a gripper.
     PickAndPlace(Partners),
+    /// The device of the component.
+    Device,
 }
 
 impl fmt::Debug for DriverSetup {
@@ -91,6 +97,7 @@ impl fmt::Debug for DriverSetup {
             Self::Given(_) => f.write_str("Given"),
             Self::Simulated(simulation) => simulation.fmt(f),
             Self::PickAndPlace(partners) => partners.fmt(f),
+            Self::Device => f.write_str("Device"),
         }
     }
 }

@@ -166,8 +166,9 @@ impl Work {
         }
     }
 
-    /// Ready when the run is suspended or stopped.
-    async fn held(&self) {
+    /// Ready when the run is suspended or stopped: what moves has to be brought to a stand. [`going`](Self::going) then says
+    /// which of the two it is.
+    pub async fn held(&self) {
         let mut signal = self.signal.clone();
         let _held_or_alone = signal.wait_for(|signal| *signal != Signal::Go).await;
     }

@@ -27,8 +27,8 @@ pub use client::{
     ClientOptions, FoundParameter, FoundSkill, FoundType, RemoteState, SkillClient, SkillHandle,
 };
 pub use component::{
-    Component, DriverFault, DriverSetup, Drivers, Lds, MOST_SKILLS, Partners, Security, Simulation,
-    SkillSetup,
+    Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, Lds, MOST_SKILLS, NoDevices,
+    Partners, Security, Simulation, SkillSetup,
 };
 pub use composite::{Broken, Job, PickAndPlace, Teller};
 pub use driver::{Driver, Results, Stopped, Work};

@@ -82,7 +82,7 @@ impl ComponentServer {
             .node("Skills")
             .cloned()
             .ok_or_else(|| ServeFault::Space("it has no folder Skills".to_owned()))?;
-        let mut drivers = Drivers::new();
+        let mut drivers = Drivers::new(component.device.clone());
         let mut findings = Findings::default();
         let mut made = Vec::new();
         for (number, setup) in (1..).zip(&component.skills) {

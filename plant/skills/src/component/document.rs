@@ -3,7 +3,10 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use super::{Component, DriverSetup, Lds, MOST_SKILLS, Partners, Security, Simulation, SkillSetup};
+use super::{
+    Component, DeviceKinds, DriverSetup, Lds, MOST_SKILLS, NoDevices, Partners, Security,
+    Simulation, SkillSetup,
+};
 use crate::parameters::{TypeName, shortened};
 use crate::yaml::{Code, Findings, Kind, Node, Place, Reader, parse};
 
@@ -13,9 +16,21 @@ impl Component {
     /// # Errors
     /// What is wrong. Whether types exist is only known with their NodeSets.
     pub fn from_yaml(text: &str, folder: &Path) -> Result<Self, Findings> {
+        Self::from_yaml_with(text, folder, &NoDevices)
+    }
+
+    /// The same with devices of these kinds.
+    ///
+    /// # Errors
+    /// As [`from_yaml`](Self::from_yaml).
+    pub fn from_yaml_with(
+        text: &str,
+        folder: &Path,
+        kinds: &dyn DeviceKinds,
+    ) -> Result<Self, Findings> {
         let mut findings = Findings::default();
         let read = match parse(text) {
-            Ok(root) => component(&root, folder, &mut Reader::new(&mut findings)),
+            Ok(root) => component(&root, folder, kinds, &mut Reader::new(&mut findings)),
             Err(finding) => {
                 findings.push(finding);
                 None
@@ -28,7 +43,12 @@ impl Component {
     }
 }
 
-fn component(root: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Component> {
+fn component(
+    root: &Node,
+    folder: &Path,
+    kinds: &dyn DeviceKinds,
+    reader: &mut Reader<'_>,
+) -> Option<Component> {
     let keys = [
         "component",
         "application_uri",
@@ -38,6 +58,7 @@ fn component(root: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Comp
         "nodesets",
         "lds",
         "open",
+        "device",
         "skills",
     ];
     let [
@@ -49,6 +70,7 @@ fn component(root: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Comp
         nodesets,
         lds,
         open,
+        device,
         skills,
     ] = reader.map(root, keys)?;
     // Each is read, so that all is told, whether or not another is wrong.
@@ -88,6 +110,7 @@ fn component(root: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Comp
         },
     };
     let open = open.map_or(Some(false), |node| reader.boolean(node));
+    let device = device.map(|node| kinds.read(node, reader));
     let skills = reader
         .needed(skills, "skills", root.place)
         .map(|node| read_skills(node, reader));
@@ -100,6 +123,10 @@ fn component(root: &Node, folder: &Path, reader: &mut Reader<'_>) -> Option<Comp
         nodesets,
         lds: lds?,
         open: open?,
+        device: match device {
+            Some(read) => Some(read?),
+            None => None,
+        },
         skills: skills?,
     })
 }
@@ -273,12 +300,15 @@ fn read_driver(node: &Node, reader: &mut Reader<'_>) -> Option<DriverSetup> {
     if matches!(&node.kind, Kind::Scalar(text) if text == "simulated") {
         return Some(DriverSetup::Simulated(Simulation::default()));
     }
+    if matches!(&node.kind, Kind::Scalar(text) if text == "device") {
+        return Some(DriverSetup::Device);
+    }
     let [simulated, pick_and_place] = reader.map(node, ["simulated", "pick_and_place"])?;
     match (simulated, pick_and_place) {
         (Some(node), None) => read_simulation(node, reader).map(DriverSetup::Simulated),
         (None, Some(node)) => read_partners(node, reader).map(DriverSetup::PickAndPlace),
         _ => {
-            let message = "a driver is exactly one of `simulated` and `pick_and_place`";
+            let message = "a driver is exactly one of `simulated`, `device` and `pick_and_place`";
             reader.findings().error(Code::Driver, node.place, message);
             None
         }

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::{DriverSetup, Simulation};
+use super::{Device, DriverSetup, Simulation};
 use crate::client::Remote;
 use crate::driver::Driver;
 use crate::model::NAMESPACE;
@@ -17,18 +17,22 @@ pub struct Drivers {
     arm: Option<Arm>,
     changer: Changer,
     base: Base,
+    device: Option<Arc<dyn Device>>,
 }
 
 /// A driver that cannot do the work of a type.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0}")]
-pub struct DriverFault(String);
+pub struct DriverFault(pub String);
 
 impl Drivers {
-    /// Those of a new component.
+    /// Those of a new component that has this device.
     #[must_use]
-    pub fn new() -> Self {
-        Self::default()
+    pub fn new(device: Option<Arc<dyn Device>>) -> Self {
+        Self {
+            device,
+            ..Self::default()
+        }
     }
 
     /// The driver of a skill whose type and supertypes these are, nearest first.
@@ -48,6 +52,10 @@ impl Drivers {
         let own = types.first().map(TypeName::to_string).unwrap_or_default();
         match setup {
             DriverSetup::Given(driver) => Ok(Arc::clone(driver)),
+            DriverSetup::Device => match &self.device {
+                Some(device) => device.driver(types),
+                None => Err(DriverFault("the component has no `device`".to_owned())),
+            },
             DriverSetup::PickAndPlace(partners) if is("PickAndPlaceSkillType") => {
                 Ok(Arc::new(Remote::new(partners.clone())))
             }

@@ -1,0 +1,265 @@
+//! `ua-component simulate`: devices that move nothing real behind the protocols of real ones.
+
+use std::io::{self, Write as _};
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use clap::Parser as _;
+use devices::{Faults, Line, Registers, Serving, kelvin, robotiq, schmalz, ur};
+use tokio::signal::unix::{SignalKind, signal};
+
+/// The word after the program's name that stands for this.
+pub(crate) const VERB: &str = "simulate";
+
+/// Simulates a device behind its protocol, until SIGINT or SIGTERM. Says on standard output where it is
+#[derive(Debug, clap::Parser)]
+#[command(name = "ua-component simulate", version)]
+struct Simulate {
+    #[command(subcommand)]
+    device: Device,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Device {
+    /// The parallel gripper 2F-85 of Robotiq: Modbus
+    #[command(name = "robotiq-2f85")]
+    Robotiq {
+        /// tcp://host:port, rtu+tcp://host:port, or serial:PATH, which is made a link to a new pseudo-terminal
+        #[arg(long, value_name = "LINE", default_value = "tcp://127.0.0.1:1502")]
+        listen: Line,
+        /// The number of the unit
+        #[arg(long, default_value_t = robotiq::UNIT)]
+        unit: u8,
+        /// How wide the thing between the fingers is, m; 0 for none
+        #[arg(long, value_name = "METRES", default_value_t = 0.04, value_parser = width)]
+        object: f64,
+        #[command(flatten)]
+        pace: Pace,
+    },
+    /// The vacuum gripper ECBPi of Schmalz behind an IO-Link master: JSON over HTTP
+    #[command(name = "schmalz-ecbpi")]
+    Schmalz {
+        /// host:port of the master
+        #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8090")]
+        listen: String,
+        /// The alias of the gripper's port
+        #[arg(long, default_value = "master1port1")]
+        alias: String,
+        /// There is no part below its cups
+        #[arg(long)]
+        no_part: bool,
+        #[command(flatten)]
+        pace: Pace,
+    },
+    /// A robot of Universal Robots: RTDE and the secondary interface
+    #[command(name = "universal-robot")]
+    Robot {
+        /// host:port of RTDE
+        #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:30004")]
+        rtde: String,
+        /// host:port of the secondary interface
+        #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:30002")]
+        secondary: String,
+        #[command(flatten)]
+        pace: Pace,
+    },
+    /// The Kelvin tool changer: an analog converter, Modbus, whose voltage follows the flange of a robot
+    #[command(name = "kelvin-tool-changer")]
+    Changer {
+        /// tcp://host:port, rtu+tcp://host:port, or serial:PATH
+        #[arg(long, value_name = "LINE", default_value = "tcp://127.0.0.1:1503")]
+        listen: Line,
+        /// The number of the unit
+        #[arg(long, default_value_t = 1)]
+        unit: u8,
+        /// host:port of the robot's RTDE
+        #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:30004")]
+        robot: String,
+        /// A tool in its dock: its number and x, y, z (m) and the rotations about them (rad) of the flange there
+        #[arg(long = "tool", value_name = "N@X,Y,Z,A,B,C", required = true, value_parser = docked, allow_hyphen_values = true)]
+        tools: Vec<kelvin::simulator::Docked>,
+    },
+}
+
+#[derive(Debug, clap::Args)]
+struct Pace {
+    /// How many times faster than time it works
+    #[arg(long, value_name = "FACTOR", default_value_t = 1.0, value_parser = factor)]
+    speed: f64,
+}
+
+fn factor(text: &str) -> Result<f64, &'static str> {
+    within(text, 0.01, 1000.0).ok_or("a number from 0.01 to 1000")
+}
+
+fn width(text: &str) -> Result<f64, &'static str> {
+    within(text, 0.0, robotiq::STROKE).ok_or("a number from 0 to 0.085")
+}
+
+fn within(text: &str, low: f64, high: f64) -> Option<f64> {
+    let number: f64 = text.parse().ok()?;
+    (low..=high).contains(&number).then_some(number)
+}
+
+fn docked(text: &str) -> Result<kelvin::simulator::Docked, &'static str> {
+    let read = || {
+        let (number, dock) = text.split_once('@')?;
+        let number = number
+            .parse()
+            .ok()
+            .filter(|number| (1..=10).contains(number))?;
+        let dock: Vec<f64> = dock
+            .split(',')
+            .map(|part| within(part, -10.0, 10.0))
+            .collect::<Option<_>>()?;
+        let dock = dock.try_into().ok()?;
+        Some(kelvin::simulator::Docked { number, dock })
+    };
+    read().ok_or("a number from 1 to 10, @, and six numbers with commas")
+}
+
+/// Simulates what the arguments say. `arguments` begin with the verb.
+pub(crate) fn run(arguments: impl Iterator<Item = std::ffi::OsString>) -> ExitCode {
+    let simulate = match Simulate::try_parse_from(arguments) {
+        Ok(simulate) => simulate,
+        Err(error) => {
+            let code = if error.use_stderr() { USAGE } else { 0 };
+            // When nothing can be printed the exit code still says it.
+            error.print().ok();
+            return ExitCode::from(code);
+        }
+    };
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    match runtime.and_then(|runtime| runtime.block_on(simulated(simulate.device))) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            ua_component::print(&format!("error: {error}\n"));
+            ExitCode::from(UNAVAILABLE)
+        }
+    }
+}
+
+async fn simulated(device: Device) -> io::Result<()> {
+    let (mut interrupt, mut terminate) = (
+        signal(SignalKind::interrupt())?,
+        signal(SignalKind::terminate())?,
+    );
+    // What is served goes when this ends.
+    let _served: Box<dyn std::any::Any> = match device {
+        Device::Robotiq {
+            listen,
+            unit,
+            object,
+            pace,
+        } => {
+            let settings = robotiq::simulator::Settings {
+                object: (object > 0.0).then_some(object),
+                time_scale: pace.speed,
+            };
+            let simulator = robotiq::simulator::Simulator::new(settings);
+            Box::new(modbus("robotiq-2f85", &listen, unit, Arc::new(simulator)).await?)
+        }
+        Device::Schmalz {
+            listen,
+            alias,
+            no_part,
+            pace,
+        } => {
+            let settings = schmalz::simulator::Settings {
+                alias,
+                part: !no_part,
+                time_scale: pace.speed,
+            };
+            let simulator = schmalz::simulator::Simulator::new(settings);
+            let serving = schmalz::simulator::Serving::start(&simulator, &listen).await?;
+            told(&format!("schmalz-ecbpi at http://{}", serving.address()))?;
+            Box::new(serving)
+        }
+        Device::Robot {
+            rtde,
+            secondary,
+            pace,
+        } => {
+            let settings = ur::simulator::Settings {
+                time_scale: pace.speed,
+                ..ur::simulator::Settings::default()
+            };
+            let simulator = ur::simulator::Simulator::new(settings);
+            let serving = ur::simulator::Serving::start(&simulator, &rtde, &secondary).await?;
+            let (rtde, secondary) = (serving.rtde(), serving.secondary());
+            told(&format!(
+                "universal-robot at rtde {rtde}, secondary {secondary}"
+            ))?;
+            Box::new(serving)
+        }
+        Device::Changer {
+            listen,
+            unit,
+            robot,
+            tools,
+        } => {
+            let simulator = kelvin::simulator::Simulator::new(tools);
+            let following = simulator.follow(&robot);
+            let serving = modbus("kelvin-tool-changer", &listen, unit, Arc::new(simulator)).await?;
+            Box::new((serving, following))
+        }
+    };
+    tokio::select! {
+        _ = interrupt.recv() => {}
+        _ = terminate.recv() => {}
+    }
+    Ok(())
+}
+
+async fn modbus(
+    name: &str,
+    listen: &Line,
+    unit: u8,
+    registers: Arc<dyn Registers>,
+) -> io::Result<Serving> {
+    let serving = Serving::start(listen, unit, registers, Faults::default()).await?;
+    told(&format!("{name} at {} unit {unit}", serving.line()))?;
+    Ok(serving)
+}
+
+fn told(line: &str) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    writeln!(out, "{line}")?;
+    out.flush()
+}
+
+/// `EX_USAGE` and `EX_UNAVAILABLE` of `sysexits.h`.
+const USAGE: u8 = 64;
+const UNAVAILABLE: u8 = 69;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_arguments_are_as_clap_wants_them() {
+        use clap::CommandFactory as _;
+        Simulate::command().debug_assert();
+    }
+
+    #[test]
+    fn a_tool_in_its_dock_is_read() {
+        let tool = docked("2@-0.3,0.3,0.2,0,0,0.5").unwrap();
+        assert_eq!(
+            (tool.number, tool.dock),
+            (2, [-0.3, 0.3, 0.2, 0.0, 0.0, 0.5])
+        );
+        for wrong in [
+            "",
+            "2",
+            "0@0,0,0,0,0,0",
+            "11@0,0,0,0,0,0",
+            "1@0,0,0,0,0",
+            "1@0,0,0,0,0,nan",
+        ] {
+            assert!(docked(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,162 @@
+//! A tool changer at a robot's flange, and the converter that its voltage is read by: it hears over RTDE where the flange is.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use tokio::task::JoinSet;
+use tokio::time::sleep;
+use tracing::debug;
+
+use super::{DIVIDER, Reading, volts};
+use crate::modbus::server::{Registers, Table};
+use crate::ur::Follower;
+
+/// A tool that stands in its dock at first.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Docked {
+    /// Its number at the changer, from 1 to 10.
+    pub number: u8,
+    /// Where the flange is before it is locked: m and rad.
+    pub dock: [f64; 6],
+}
+
+/// One changer; clones are of the same.
+#[derive(Debug, Clone)]
+pub struct Simulator {
+    changer: Arc<Mutex<Changer>>,
+}
+
+#[derive(Debug)]
+struct Changer {
+    tools: Vec<Docked>,
+    attached: Option<u8>,
+    reading: Reading,
+    cut: bool,
+}
+
+/// One that follows a robot. It stands still when this is dropped.
+#[derive(Debug)]
+pub struct Following {
+    _tasks: JoinSet<()>,
+}
+
+impl Simulator {
+    /// One without a tool.
+    #[must_use]
+    pub fn new(tools: Vec<Docked>) -> Self {
+        let changer = Changer {
+            tools,
+            attached: None,
+            reading: Reading::NoTool,
+            cut: false,
+        };
+        Self {
+            changer: Arc::new(Mutex::new(changer)),
+        }
+    }
+
+    /// Follows the robot whose RTDE is at `host:port`, also when that is not there for a while. Needs a tokio runtime.
+    #[must_use]
+    pub fn follow(&self, rtde: &str) -> Following {
+        let (simulator, rtde) = (self.clone(), rtde.to_owned());
+        let mut tasks = JoinSet::new();
+        tasks.spawn(async move {
+            loop {
+                let lost = simulator.followed(&rtde).await;
+                debug!("the tool changer does not follow: {lost:?}");
+                sleep(LATER).await;
+            }
+        });
+        Following { _tasks: tasks }
+    }
+
+    async fn followed(&self, rtde: &str) -> Result<(), String> {
+        let mut follower = Follower::open(rtde).await?;
+        loop {
+            self.flange_at(follower.position().await?);
+        }
+    }
+
+    /// What a position of the flange does to it: m and rad.
+    pub fn flange_at(&self, at: [f64; 6]) {
+        self.lock().flange_at(at);
+    }
+
+    /// Cuts the wire to the converter, or mends it.
+    pub fn set_cut(&self, cut: bool) {
+        self.lock().cut = cut;
+    }
+
+    /// What is at it.
+    #[must_use]
+    pub fn reading(&self) -> Reading {
+        self.lock().reading
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Changer> {
+        self.changer.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Registers for Simulator {
+    fn read(&self, table: Table, address: u16, count: u16) -> Option<Vec<u16>> {
+        let changer = self.lock();
+        let (line, ground) = DIVIDER;
+        // A wire that is cut is drawn above all that the changer says.
+        let volts = if changer.cut {
+            23.0
+        } else {
+            volts(changer.reading)
+        };
+        #[expect(
+            clippy::cast_possible_truncation,
+            clippy::cast_sign_loss,
+            reason = "from 0 to 3000 mV"
+        )]
+        let millivolts = (volts * 1000.0 * ground / (line + ground)).round() as u16;
+        (table == Table::Input && address == 0 && count == 1).then(|| vec![millivolts])
+    }
+
+    fn write(&self, _address: u16, _words: &[u16]) -> bool {
+        false
+    }
+}
+
+impl Changer {
+    fn flange_at(&mut self, [x, y, z, _, _, c]: [f64; 6]) {
+        let near = self.tools.iter().find(|tool| {
+            let [at_x, at_y, at_z, ..] = tool.dock;
+            ((x - at_x).powi(2) + (y - at_y).powi(2) + (z - at_z).powi(2)).sqrt() < NEAR
+        });
+        let Some(Docked {
+            number,
+            dock: [.., at_c],
+        }) = near.copied()
+        else {
+            self.reading = self.attached.map_or(Reading::NoTool, Reading::Tool);
+            return;
+        };
+        let turned = (c - at_c).to_degrees();
+        self.reading = match self.attached {
+            None if turned <= LOCKS => {
+                self.attached = Some(number);
+                Reading::Tool(number)
+            }
+            Some(attached) if attached == number && turned >= UNLOCKS => {
+                self.attached = None;
+                Reading::NoTool
+            }
+            None if turned < UNLOCKS => Reading::Intermediate,
+            Some(attached) if attached == number && turned > LOCKS => Reading::Intermediate,
+            None => Reading::NoTool,
+            Some(attached) => Reading::Tool(attached),
+        };
+    }
+}
+
+/// m
+const NEAR: f64 = 0.004;
+/// degrees
+const LOCKS: f64 = -60.0;
+const UNLOCKS: f64 = -2.0;
+const LATER: Duration = Duration::from_millis(200);

@@ -1,0 +1,131 @@
+//! What the voltage of the tool changer means.
+
+use std::fmt;
+
+/// What is at the changer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Reading {
+    /// Its ring is open, and no tool in it.
+    Ready,
+    /// Its ring is on its way.
+    Intermediate,
+    /// Nothing.
+    NoTool,
+    /// The tool of a number, from 1 to 10, is locked.
+    Tool(u8),
+}
+
+impl fmt::Display for Reading {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Ready => f.write_str("its ring is open"),
+            Self::Intermediate => f.write_str("its ring is between open and locked"),
+            Self::NoTool => f.write_str("no tool is attached"),
+            Self::Tool(number) => write!(f, "tool {number} is attached"),
+        }
+    }
+}
+
+/// The voltages at the changer, V, rising.
+pub const LEVELS: [(f64, Reading); 13] = [
+    (0.0, Reading::Ready),
+    (2.1, Reading::Intermediate),
+    (4.9, Reading::NoTool),
+    (5.7, Reading::Tool(1)),
+    (6.7, Reading::Tool(2)),
+    (7.4, Reading::Tool(3)),
+    (8.4, Reading::Tool(4)),
+    (9.5, Reading::Tool(5)),
+    (10.8, Reading::Tool(6)),
+    (11.7, Reading::Tool(7)),
+    (12.4, Reading::Tool(8)),
+    (13.2, Reading::Tool(9)),
+    (14.1, Reading::Tool(10)),
+];
+
+/// The voltage of a reading.
+#[must_use]
+pub fn volts(of: Reading) -> f64 {
+    LEVELS
+        .iter()
+        .find(|(_, reading)| *reading == of)
+        .map_or(0.0, |(volts, _)| *volts)
+}
+
+/// Tells readings from voltages. One that is near the border of two stays what it was.
+#[derive(Debug, Clone, Default)]
+pub struct Detector {
+    /// The place of the last one in the table.
+    now: Option<usize>,
+}
+
+impl Detector {
+    /// What a voltage means after those before it.
+    ///
+    /// # Errors
+    /// It is none of the changer's.
+    pub fn feed(&mut self, volts: f64) -> Result<Reading, String> {
+        if !(LOWEST..=HIGHEST).contains(&volts) {
+            self.now = None;
+            return Err(format!("{volts:.2} V is no voltage of the tool changer"));
+        }
+        let mut place = LEVELS
+            .windows(2)
+            .filter(|pair| volts > border(pair))
+            .count();
+        if let Some(now) = self.now
+            && now.abs_diff(place) == 1
+        {
+            let border = LEVELS.windows(2).nth(now.min(place)).map_or(0.0, border);
+            if (volts - border).abs() < HYSTERESIS {
+                place = now;
+            }
+        }
+        self.now = Some(place);
+        let level = LEVELS.get(place).map(|(_, reading)| *reading);
+        level.ok_or_else(|| format!("{volts:.2} V is no voltage of the tool changer"))
+    }
+}
+
+fn border(pair: &[(f64, Reading)]) -> f64 {
+    pair.iter().map(|(volts, _)| volts / 2.0).sum()
+}
+
+/// Less than half of the least distance of two levels, which is 0.35 V.
+const HYSTERESIS: f64 = 0.15;
+const LOWEST: f64 = -0.5;
+const HIGHEST: f64 = 15.0;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_level_is_told_and_nothing_beyond_them() {
+        for (volts, reading) in LEVELS {
+            assert_eq!(Detector::default().feed(volts), Ok(reading));
+            assert_eq!(super::volts(reading), volts);
+        }
+        assert_eq!(
+            Detector::default().feed(-1.0),
+            Err("-1.00 V is no voltage of the tool changer".to_owned())
+        );
+        assert!(Detector::default().feed(f64::NAN).is_err());
+        assert!(Detector::default().feed(24.0).is_err());
+    }
+
+    #[test]
+    fn a_voltage_that_flutters_at_a_border_tells_one_reading() {
+        let mut detector = Detector::default();
+        // The border of no tool and tool 1 is at 5.3 V.
+        assert_eq!(detector.feed(5.7), Ok(Reading::Tool(1)));
+        for volts in [5.31, 5.29, 5.2, 5.44, 5.16] {
+            assert_eq!(detector.feed(volts), Ok(Reading::Tool(1)), "{volts}");
+        }
+        assert_eq!(detector.feed(5.14), Ok(Reading::NoTool));
+        assert_eq!(detector.feed(5.4), Ok(Reading::NoTool));
+        assert_eq!(detector.feed(5.46), Ok(Reading::Tool(1)));
+        // Far away is far away.
+        assert_eq!(detector.feed(13.7), Ok(Reading::Tool(10)));
+    }
+}

@@ -1,0 +1,214 @@
+//! Asking a device that speaks Modbus (Application Protocol V1.1b3): bounded waits, a new connection after each fault.
+
+pub(crate) mod server;
+
+use std::borrow::Cow;
+use std::fmt;
+use std::io;
+use std::time::Duration;
+
+use tokio::net::TcpStream;
+use tokio::sync::Mutex;
+use tokio::time::timeout;
+use tokio_modbus::client::{Client as _, Context, rtu, tcp};
+use tokio_modbus::{ExceptionCode, Request, Response, Slave};
+
+use crate::line::Line;
+use crate::tty::Tty;
+
+/// How long a device may take to answer. Halt leaves a driver a second, in which it asks twice.
+const ANSWER: Duration = Duration::from_millis(300);
+
+/// One device behind a line. The connection is made when it is needed, and anew after each fault: an answer that comes too late
+/// is never taken for that of another question.
+pub(crate) struct Modbus {
+    line: Line,
+    unit: u8,
+    context: Mutex<Option<Context>>,
+}
+
+/// Why there is no answer.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum Fault {
+    /// There is no connection.
+    #[error("{line} cannot be reached: {why}")]
+    Unreachable {
+        /// Where.
+        line: String,
+        /// What the system says.
+        why: String,
+    },
+    /// It does not answer.
+    #[error("no answer from unit {unit} at {line} within {} ms", ANSWER.as_millis())]
+    Silent {
+        /// Where.
+        line: String,
+        /// Which.
+        unit: u8,
+    },
+    /// Something came that is no answer to what was asked.
+    #[error("the answer of unit {unit} at {line} is damaged: {why}")]
+    Damaged {
+        /// Where.
+        line: String,
+        /// Which.
+        unit: u8,
+        /// What is wrong with it.
+        why: String,
+    },
+    /// It answered that it will not.
+    #[error("unit {unit} at {line} refuses: {exception}")]
+    Refused {
+        /// Where.
+        line: String,
+        /// Which.
+        unit: u8,
+        /// As `Illegal data address`.
+        exception: String,
+    },
+}
+
+impl fmt::Debug for Modbus {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "unit {} at {}", self.unit, self.line)
+    }
+}
+
+impl From<Fault> for String {
+    fn from(fault: Fault) -> Self {
+        fault.to_string()
+    }
+}
+
+impl Modbus {
+    pub(crate) fn new(line: Line, unit: u8) -> Self {
+        Self {
+            line,
+            unit,
+            context: Mutex::new(None),
+        }
+    }
+
+    /// Holding registers (function 3).
+    pub(crate) async fn holding(&self, address: u16, count: u16) -> Result<Vec<u16>, Fault> {
+        match self
+            .ask(Request::ReadHoldingRegisters(address, count))
+            .await?
+        {
+            Response::ReadHoldingRegisters(words) if words.len() == usize::from(count) => Ok(words),
+            _ => Err(self.damaged("not as many registers as were asked for")),
+        }
+    }
+
+    /// Input registers (function 4).
+    pub(crate) async fn input(&self, address: u16, count: u16) -> Result<Vec<u16>, Fault> {
+        match self
+            .ask(Request::ReadInputRegisters(address, count))
+            .await?
+        {
+            Response::ReadInputRegisters(words) if words.len() == usize::from(count) => Ok(words),
+            _ => Err(self.damaged("not as many registers as were asked for")),
+        }
+    }
+
+    /// Writes holding registers (function 16).
+    pub(crate) async fn write(&self, address: u16, words: &[u16]) -> Result<(), Fault> {
+        let request = Request::WriteMultipleRegisters(address, Cow::Owned(words.to_vec()));
+        self.ask(request).await.map(drop)
+    }
+
+    /// Asks once; once more on a new connection where the first one had been there before and may have been stale.
+    async fn ask(&self, request: Request<'static>) -> Result<Response, Fault> {
+        let mut kept = self.context.lock().await;
+        // What is dropped on the way leaves no connection behind on which its answer would come.
+        if let Some(context) = kept.take()
+            && let Ok((context, response)) = self.once(context, request.clone()).await
+        {
+            *kept = Some(context);
+            return response;
+        }
+        let context = self.connect().await?;
+        let (context, response) = self.once(context, request).await?;
+        *kept = Some(context);
+        response
+    }
+
+    /// What it answered, also that it refuses, and the connection; a fault that ends the connection.
+    async fn once(
+        &self,
+        mut context: Context,
+        request: Request<'static>,
+    ) -> Result<(Context, Result<Response, Fault>), Fault> {
+        let (line, unit) = (self.line.to_string(), self.unit);
+        match timeout(ANSWER, context.call(request)).await {
+            Err(_) => Err(Fault::Silent { line, unit }),
+            Ok(Err(tokio_modbus::Error::Transport(error))) if is_broken(&error) => {
+                let why = error.to_string();
+                Err(Fault::Unreachable { line, why })
+            }
+            Ok(Err(error)) => Err(self.damaged(&error.to_string())),
+            Ok(Ok(Err(exception))) => {
+                let exception = told(exception);
+                let refused = Fault::Refused {
+                    line,
+                    unit,
+                    exception,
+                };
+                Ok((context, Err(refused)))
+            }
+            Ok(Ok(Ok(response))) => Ok((context, Ok(response))),
+        }
+    }
+
+    async fn connect(&self) -> Result<Context, Fault> {
+        let (line, unit) = (self.line.to_string(), Slave(self.unit));
+        let unreachable = |error: io::Error| Fault::Unreachable {
+            line: line.clone(),
+            why: error.to_string(),
+        };
+        match &self.line {
+            Line::Serial { path, baud } => {
+                let tty = Tty::open(path, *baud).map_err(unreachable)?;
+                Ok(rtu::attach_slave(tty, unit))
+            }
+            Line::Tcp(address) => {
+                let stream = connected(address).await.map_err(unreachable)?;
+                Ok(tcp::attach_slave(stream, unit))
+            }
+            Line::RtuOverTcp(address) => {
+                let stream = connected(address).await.map_err(unreachable)?;
+                Ok(rtu::attach_slave(stream, unit))
+            }
+        }
+    }
+
+    fn damaged(&self, why: &str) -> Fault {
+        Fault::Damaged {
+            line: self.line.to_string(),
+            unit: self.unit,
+            why: why.chars().take(200).collect(),
+        }
+    }
+}
+
+pub(crate) async fn connected(address: &str) -> io::Result<TcpStream> {
+    let stream = match timeout(ANSWER, TcpStream::connect(address)).await {
+        Ok(stream) => stream?,
+        Err(_) => return Err(io::ErrorKind::TimedOut.into()),
+    };
+    stream.set_nodelay(true)?;
+    Ok(stream)
+}
+
+/// Whether the connection is at fault rather than what came over it.
+fn is_broken(error: &io::Error) -> bool {
+    use io::ErrorKind as Kind;
+    !matches!(
+        error.kind(),
+        Kind::InvalidData | Kind::InvalidInput | Kind::Other
+    )
+}
+
+fn told(exception: ExceptionCode) -> String {
+    exception.to_string()
+}

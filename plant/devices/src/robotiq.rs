@@ -1,0 +1,289 @@
+//! The parallel gripper 2F-85 of Robotiq, by its registers (Modbus, unit 9 from the factory).
+//!
+//! Three registers from 1000 on say what to do, three from 2000 on what is: two bytes each, the first one high.
+
+pub mod simulator;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use skills::{Device, Driver, DriverFault, Parameters, Results, TypeName, Work};
+use tokio::time::{Instant, sleep};
+
+use crate::line::Line;
+use crate::modbus::Modbus;
+
+/// Where the registers are that say what to do: action, reserved; reserved, position; speed, force.
+pub const ACTION: u16 = 0x03E8;
+/// Where those are that say what is: status, reserved; fault, position wanted; position, current.
+pub const STATUS: u16 = 0x07D0;
+/// The number of the unit from the factory.
+pub const UNIT: u8 = 9;
+/// How far apart the fingers are at position 0, m.
+pub const STROKE: f64 = 0.085;
+
+/// One gripper.
+#[derive(Debug, Clone)]
+pub struct Gripper {
+    modbus: Arc<Modbus>,
+}
+
+impl Gripper {
+    /// That of a number behind a line.
+    #[must_use]
+    pub fn new(line: Line, unit: u8) -> Self {
+        Self {
+            modbus: Arc::new(Modbus::new(line, unit)),
+        }
+    }
+}
+
+impl Device for Gripper {
+    fn driver(&self, types: &[TypeName]) -> Result<Arc<dyn Driver>, DriverFault> {
+        let is = |name: &str| types.contains(&TypeName::own(name));
+        let modbus = Arc::clone(&self.modbus);
+        if is("GraspSkillType") {
+            return Ok(Arc::new(Motion {
+                modbus,
+                closes: true,
+            }));
+        }
+        if is("ReleaseSkillType") {
+            return Ok(Arc::new(Motion {
+                modbus,
+                closes: false,
+            }));
+        }
+        let own = types.first().map(TypeName::to_string).unwrap_or_default();
+        Err(DriverFault(format!(
+            "`robotiq_2f85` does the work of GraspSkillType, ReleaseSkillType and what is below them, and this is {own}"
+        )))
+    }
+}
+
+/// What the gripper says of itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Status {
+    /// gACT: it was activated.
+    active: bool,
+    /// gSTA: 0 reset, 1 being activated, 3 activated.
+    activation: u8,
+    /// gOBJ: 0 moving, 1 stopped by a thing while opening, 2 while closing, 3 at the position.
+    object: u8,
+    /// gFLT
+    fault: u8,
+    /// gPR: the position that was asked for, as it understood.
+    wanted: u8,
+    /// gPO: from 0, open, to 255, closed.
+    position: u8,
+}
+
+impl Status {
+    fn of(words: &[u16]) -> Option<Self> {
+        let [status, fault, position] = words else {
+            return None;
+        };
+        let [status, _reserved] = status.to_be_bytes();
+        let [fault, wanted] = fault.to_be_bytes();
+        let [position, _current] = position.to_be_bytes();
+        Some(Self {
+            active: status & 1 == 1,
+            activation: status >> 4 & 3,
+            object: status >> 6,
+            fault: fault & 0x0F,
+            wanted,
+            position,
+        })
+    }
+
+    /// Faults that a motion does not go on with, in words.
+    fn broken(self) -> Option<&'static str> {
+        match self.fault {
+            0x05 => Some("it has to be activated first"),
+            0x07 => Some("it was not activated"),
+            0x08 => Some("it is too hot"),
+            0x0A => Some("its voltage is too low"),
+            0x0B => Some("it is being released automatically"),
+            0x0C => Some("a fault inside it"),
+            0x0D => Some("its activation failed"),
+            0x0E => Some("its current is too high"),
+            0x0F => Some("it was released automatically, and has to be activated anew"),
+            _ => None,
+        }
+    }
+}
+
+/// Opening or closing it.
+#[derive(Debug)]
+struct Motion {
+    modbus: Arc<Modbus>,
+    closes: bool,
+}
+
+/// Where the fingers should be, and how.
+#[derive(Debug, Clone, Copy)]
+struct Goal {
+    position: u8,
+    speed: u8,
+    force: u8,
+}
+
+#[async_trait]
+impl Driver for Motion {
+    fn can_suspend(&self) -> bool {
+        true
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        self.activate(&work).await?;
+        let (step, position) = if self.closes {
+            ("Close", 255)
+        } else {
+            ("Open", 0)
+        };
+        work.step(step).await;
+        let goal = Goal {
+            position,
+            speed: 255,
+            force: force(work.parameters()),
+        };
+        let ended = self.go(goal, &work).await?;
+        match (self.closes, ended.object) {
+            (true, 2) => Ok(vec![("Gripped".to_owned(), true.into())]),
+            (true, _) => Err("nothing is between the fingers".to_owned()),
+            (false, 1) => Err(format!(
+                "something stops the fingers at position {} while they open",
+                ended.position
+            )),
+            (false, _) => Ok(Vec::new()),
+        }
+    }
+}
+
+impl Motion {
+    async fn status(&self) -> Result<Status, String> {
+        let words = self.modbus.holding(STATUS, 3).await?;
+        Status::of(&words).ok_or_else(|| "the gripper answers without its status".to_owned())
+    }
+
+    async fn act(&self, action: u8, goal: Goal) -> Result<(), String> {
+        let words = [
+            u16::from_be_bytes([action, 0]),
+            u16::from_be_bytes([0, goal.position]),
+            u16::from_be_bytes([goal.speed, goal.force]),
+        ];
+        Ok(self.modbus.write(ACTION, &words).await?)
+    }
+
+    /// Activates it where it is not: after it was switched on, or after a fault that only that ends.
+    async fn activate(&self, work: &Work) -> Result<(), String> {
+        let still = Goal {
+            position: 0,
+            speed: 0,
+            force: 0,
+        };
+        let status = self.status().await?;
+        if status.active && status.activation == 3 && status.broken().is_none() {
+            return Ok(());
+        }
+        work.step("Activate").await;
+        self.act(RESET, still).await?;
+        self.act(ACTIVATE, still).await?;
+        let until = Instant::now() + ACTIVATION;
+        loop {
+            tokio::select! {
+                () = work.stopped() => return Err("stopped while it was being activated".to_owned()),
+                () = sleep(POLL) => {}
+            }
+            let status = self.status().await?;
+            if status.activation == 3 {
+                return Ok(());
+            }
+            if let (0x0A.., Some(why)) = (status.fault, status.broken()) {
+                return Err(format!("the gripper cannot be activated: {why}"));
+            }
+            if Instant::now() >= until {
+                return Err(format!(
+                    "the gripper is not activated within {ACTIVATION:?}"
+                ));
+            }
+        }
+    }
+
+    /// Moves the fingers until they stand.
+    async fn go(&self, goal: Goal, work: &Work) -> Result<Status, String> {
+        let from = self.status().await?.position;
+        self.act(GO, goal).await?;
+        let mut until = Instant::now() + MOTION;
+        loop {
+            tokio::select! {
+                () = work.held() => {
+                    self.act(ACTIVATE, goal).await?;
+                    if work.going().await.is_err() {
+                        let at = self.status().await?.position;
+                        return Err(format!("stopped with the fingers at position {at} of 255"));
+                    }
+                    self.act(GO, goal).await?;
+                    until = Instant::now() + MOTION;
+                }
+                () = sleep(POLL) => {}
+            }
+            let status = self.status().await?;
+            if !status.active || status.activation != 3 {
+                return Err(
+                    "the gripper has lost its activation while it moved: was it switched off?"
+                        .to_owned(),
+                );
+            }
+            if let Some(why) = status.broken() {
+                return Err(format!("the gripper stopped: {why}"));
+            }
+            if status.wanted == goal.position && status.object != 0 {
+                return Ok(status);
+            }
+            work.progress(share(from, status.position, goal.position));
+            if Instant::now() >= until {
+                return Err(format!(
+                    "the fingers do not come to a stand within {MOTION:?}"
+                ));
+            }
+        }
+    }
+}
+
+/// The force of a run, N, in the gripper's own unit: 0 is 20 N, 255 is 235 N.
+fn force(parameters: &Parameters) -> u8 {
+    let newton = parameters.number("Force").unwrap_or(WEAKEST);
+    let share = ((newton - WEAKEST) / (STRONGEST - WEAKEST)).clamp(0.0, 1.0);
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "from 0 to 255"
+    )]
+    let force = (share * 255.0).round() as u8;
+    force
+}
+
+fn share(from: u8, at: u8, to: u8) -> f32 {
+    let whole = f32::from(from.abs_diff(to));
+    if whole > 0.0 {
+        f32::from(from.abs_diff(at)) / whole
+    } else {
+        1.0
+    }
+}
+
+const RESET: u8 = 0x00;
+/// rACT
+const ACTIVATE: u8 = 0x01;
+/// rACT and rGTO
+const GO: u8 = 0x09;
+const WEAKEST: f64 = 20.0;
+const STRONGEST: f64 = 235.0;
+const POLL: Duration = Duration::from_millis(20);
+const ACTIVATION: Duration = Duration::from_secs(10);
+const MOTION: Duration = Duration::from_secs(10);
+
+#[cfg(test)]
+mod tests;

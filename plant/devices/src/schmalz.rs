@@ -1,0 +1,236 @@
+//! The vacuum gripper ECBPi of Schmalz behind an IO-Link master, by the JSON interface of IO-Link over HTTP.
+//!
+//! Process data in, 4 bytes: bit 0 part present, 1 vacuum in the range of control, 5 part detached, 6 and 7 state of the device;
+//! then two values of which the second, the vacuum in mbar, has two bytes, the high one first. Process data out, 2 bytes: bit 0
+//! vacuum, bit 1 blow off.
+
+mod http;
+pub mod simulator;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use serde_json::{Value, json};
+use skills::{Device, Driver, DriverFault, Results, TypeName, Work};
+use tokio::time::{Instant, sleep};
+
+use self::http::Master;
+
+/// One gripper.
+#[derive(Debug, Clone)]
+pub struct Gripper {
+    port: Arc<Port>,
+    timing: Timing,
+}
+
+/// How long it may take.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Timing {
+    /// To hold a part.
+    pub grasp: Duration,
+    /// To be rid of it.
+    pub release: Duration,
+}
+
+impl Default for Timing {
+    fn default() -> Self {
+        Self {
+            grasp: Duration::from_secs(8),
+            release: Duration::from_secs(2),
+        }
+    }
+}
+
+impl Gripper {
+    /// The device of an alias, as `master1port1`, at the master at `host:port`.
+    #[must_use]
+    pub fn new(master: &str, alias: &str, timing: Timing) -> Self {
+        let port = Port {
+            master: Master::new(master),
+            alias: alias.to_owned(),
+        };
+        Self {
+            port: Arc::new(port),
+            timing,
+        }
+    }
+}
+
+impl Device for Gripper {
+    fn driver(&self, types: &[TypeName]) -> Result<Arc<dyn Driver>, DriverFault> {
+        let is = |name: &str| types.contains(&TypeName::own(name));
+        let motion = |holds| -> Arc<dyn Driver> {
+            Arc::new(Motion {
+                port: Arc::clone(&self.port),
+                timing: self.timing,
+                holds,
+            })
+        };
+        if is("GraspSkillType") {
+            return Ok(motion(true));
+        }
+        if is("ReleaseSkillType") {
+            return Ok(motion(false));
+        }
+        let own = types.first().map(TypeName::to_string).unwrap_or_default();
+        Err(DriverFault(format!(
+            "`schmalz_ecbpi` does the work of GraspSkillType, ReleaseSkillType and what is below them, and this is {own}"
+        )))
+    }
+}
+
+/// A port of a master.
+#[derive(Debug)]
+struct Port {
+    master: Master,
+    alias: String,
+}
+
+/// What the gripper says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Status {
+    part_present: bool,
+    in_control_range: bool,
+    part_detached: bool,
+    /// 0 works, 1 with warnings, 2 with severe ones, 3 does not.
+    health: u8,
+    /// mbar
+    vacuum: u16,
+}
+
+impl Status {
+    fn of(bytes: &[u8]) -> Option<Self> {
+        let [flags, _power, high, low] = bytes else {
+            return None;
+        };
+        Some(Self {
+            part_present: flags & 1 != 0,
+            in_control_range: flags >> 1 & 1 != 0,
+            part_detached: flags >> 5 & 1 != 0,
+            health: flags >> 6,
+            vacuum: u16::from_be_bytes([*high, *low]),
+        })
+    }
+}
+
+impl Port {
+    async fn status(&self) -> Result<Status, String> {
+        let path = format!(
+            "{}/{}/processdata/getdata/value?format=byteArray",
+            DEVICES, self.alias
+        );
+        let answer = self.master.ask("GET", &path, None).await?;
+        // Both spellings are alive.
+        let data = answer.get("ioLink").or_else(|| answer.get("iolink"));
+        let data = data.ok_or_else(|| self.damaged("it has no process data"))?;
+        if data.get("valid").and_then(Value::as_bool) == Some(false) {
+            return Err(format!(
+                "{} says that the data of {} are not valid",
+                self.master, self.alias
+            ));
+        }
+        let bytes: Option<Vec<u8>> =
+            data.get("value")
+                .and_then(Value::as_array)
+                .and_then(|bytes| {
+                    bytes
+                        .iter()
+                        .map(|byte| byte.as_u64().and_then(|byte| byte.try_into().ok()))
+                        .collect()
+                });
+        let status = bytes.as_deref().and_then(Status::of);
+        status.ok_or_else(|| self.damaged("the process data are not four bytes"))
+    }
+
+    async fn set(&self, out: u8) -> Result<(), String> {
+        let path = format!("{}/{}/processdata/value", DEVICES, self.alias);
+        let data = json!({"ioLink": {"valid": true, "value": [out, 0]}});
+        self.master.ask("POST", &path, Some(&data)).await.map(drop)
+    }
+
+    fn damaged(&self, why: &str) -> String {
+        format!("the answer of {} is damaged: {why}", self.master)
+    }
+}
+
+/// To take a part or to let it go.
+#[derive(Debug)]
+struct Motion {
+    port: Arc<Port>,
+    timing: Timing,
+    holds: bool,
+}
+
+#[async_trait]
+impl Driver for Motion {
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let (step, out) = if self.holds {
+            ("Suck", VACUUM)
+        } else {
+            ("BlowOff", BLOW_OFF)
+        };
+        work.step(step).await;
+        self.port.set(out).await?;
+        let waited = self.wait(&work).await;
+        match (self.holds, waited) {
+            (true, Ok(())) => Ok(vec![("Gripped".to_owned(), true.into())]),
+            (_, waited) => {
+                // A pump that holds nothing is switched off, and so is the air after blowing.
+                let off = self.port.set(0).await;
+                waited.and(off).map(|()| Vec::new())
+            }
+        }
+    }
+}
+
+impl Motion {
+    async fn wait(&self, work: &Work) -> Result<(), String> {
+        let within = if self.holds {
+            self.timing.grasp
+        } else {
+            self.timing.release
+        };
+        let began = Instant::now();
+        loop {
+            tokio::select! {
+                () = work.stopped() => return Err("stopped, and the vacuum is switched off".to_owned()),
+                () = sleep(POLL) => {}
+            }
+            let status = self.port.status().await?;
+            if status.health == 3 {
+                return Err("the gripper says that it does not work properly".to_owned());
+            }
+            let done = match self.holds {
+                true => status.part_present,
+                false => !status.part_present && (status.part_detached || status.vacuum < DETACHED),
+            };
+            if done && began.elapsed() >= SETTLED {
+                return Ok(());
+            }
+            work.progress(began.elapsed().as_secs_f32() / within.as_secs_f32());
+            if began.elapsed() >= within {
+                let range = if status.in_control_range { "" } else { "not " };
+                return Err(match self.holds {
+                    true => format!(
+                        "no part is held after {within:?}: the vacuum is {} mbar, {range}in the range of control",
+                        status.vacuum
+                    ),
+                    false => format!("the part is still there after {within:?}"),
+                });
+            }
+        }
+    }
+}
+
+const DEVICES: &str = "/iolink/v1/devices";
+const VACUUM: u8 = 1;
+const BLOW_OFF: u8 = 2;
+/// Less than this holds nothing, mbar.
+const DETACHED: u16 = 10;
+const POLL: Duration = Duration::from_millis(20);
+/// What was asked for before may still be in the process data until a cycle of IO-Link and one of the master are over.
+const SETTLED: Duration = Duration::from_millis(30);
+
+#[cfg(test)]
+mod tests;

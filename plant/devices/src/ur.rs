@@ -1,0 +1,360 @@
+//! A robot of Universal Robots: programs go to its secondary interface, what it does is heard over RTDE.
+//!
+//! A run is a program of a few lines. Its beginning and end are told by two registers, so that a program of somebody else is
+//! never taken for ours. Suspending sets the speed slider to nothing, halting brakes along the way.
+
+mod pose;
+mod rtde;
+mod script;
+pub mod simulator;
+pub mod wire;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use skills::{Device, Driver, DriverFault, Parameters, Results, TypeName, Work};
+use tokio::io::AsyncWriteExt as _;
+use tokio::net::TcpStream;
+use tokio::time::{Instant, timeout};
+
+pub use self::pose::{of_robot, to_robot};
+use self::rtde::Rtde;
+use self::wire::Value;
+use crate::modbus::connected;
+
+/// The port that takes programs.
+pub const SECONDARY: u16 = 30_002;
+/// How far a UR5 reaches, m.
+pub const REACH: f64 = 0.85;
+
+/// Where a robot is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// Host and port of RTDE.
+    pub rtde: String,
+    /// Host and port of the secondary interface.
+    pub secondary: String,
+    /// How far it reaches, m.
+    pub reach: f64,
+}
+
+impl Settings {
+    /// The usual ports of a host.
+    #[must_use]
+    pub fn of_host(host: &str) -> Self {
+        Self {
+            rtde: format!("{host}:{}", wire::PORT),
+            secondary: format!("{host}:{SECONDARY}"),
+            reach: REACH,
+        }
+    }
+}
+
+/// One robot.
+#[derive(Debug, Clone)]
+pub struct Robot {
+    settings: Arc<Settings>,
+}
+
+impl Robot {
+    /// That one.
+    #[must_use]
+    pub fn new(settings: Settings) -> Self {
+        Self {
+            settings: Arc::new(settings),
+        }
+    }
+}
+
+impl Device for Robot {
+    fn driver(&self, types: &[TypeName]) -> Result<Arc<dyn Driver>, DriverFault> {
+        let is = |name: &str| types.contains(&TypeName::own(name));
+        let settings = Arc::clone(&self.settings);
+        let motion = |linear| -> Arc<dyn Driver> { Arc::new(Motion { settings, linear }) };
+        if is("PtpMoveSkillType") {
+            return Ok(motion(false));
+        }
+        if is("LinearMoveSkillType") {
+            return Ok(motion(true));
+        }
+        let own = types.first().map(TypeName::to_string).unwrap_or_default();
+        Err(DriverFault(format!(
+            "`universal_robot` does the work of PtpMoveSkillType, LinearMoveSkillType and what is below them, and this is {own}"
+        )))
+    }
+}
+
+/// One move.
+#[derive(Debug)]
+struct Motion {
+    settings: Arc<Settings>,
+    linear: bool,
+}
+
+/// What the robot tells.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct State {
+    pose: [f64; 6],
+    speed: f64,
+    mode: i32,
+    safety: i32,
+    /// Whether a program runs.
+    program: bool,
+    /// Where the speed slider is, from 0 to 1.
+    slider: f64,
+    started: i32,
+    done: i32,
+}
+
+const OUTPUTS: [&str; 8] = [
+    "actual_TCP_pose",
+    "actual_TCP_speed",
+    "robot_mode",
+    "safety_mode",
+    "runtime_state",
+    "target_speed_fraction",
+    "output_int_register_24",
+    "output_int_register_25",
+];
+const INPUTS: [&str; 2] = ["speed_slider_mask", "speed_slider_fraction"];
+
+impl State {
+    fn of(values: &[Value]) -> Option<Self> {
+        let [
+            Value::Vector(pose),
+            Value::Vector([x, y, z, ..]),
+            Value::I32(mode),
+            Value::I32(safety),
+            Value::U32(runtime),
+            Value::F64(slider),
+            Value::I32(started),
+            Value::I32(done),
+        ] = values
+        else {
+            return None;
+        };
+        Some(Self {
+            pose: *pose,
+            speed: (x * x + y * y + z * z).sqrt(),
+            mode: *mode,
+            safety: *safety,
+            program: *runtime == PLAYING,
+            slider: *slider,
+            started: *started,
+            done: *done,
+        })
+    }
+
+    /// Why it cannot move, if it cannot.
+    fn fit(&self) -> Result<(), String> {
+        let why = match (self.safety, self.mode) {
+            (1 | 2, 7) => return Ok(()),
+            (3, _) => "it is in a protective stop",
+            (5, _) => "a safeguard stops it",
+            (6 | 7, _) => "its emergency stop is pressed",
+            (8 | 9, _) => "its safety system has a fault",
+            (_, ..=2) => "it is starting",
+            (_, 3) => "it is switched off",
+            (_, 4 | 5) => "its brakes are not released",
+            _ => "it is not running",
+        };
+        Err(format!("the robot does not move: {why}"))
+    }
+}
+
+#[async_trait]
+impl Driver for Motion {
+    fn can_suspend(&self) -> bool {
+        true
+    }
+
+    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+        let target = parameters.six("TargetPosition");
+        let [x, y, z, ..] = target.ok_or("TargetPosition has no six numbers")?;
+        let (far, reach) = ((x * x + y * y + z * z).sqrt(), self.settings.reach);
+        if far > reach {
+            return Err(format!(
+                "TargetPosition is {far:.3} m from the base, and the robot reaches {reach} m"
+            ));
+        }
+        match parameters.text("ToolFrame") {
+            None | Some("flange") => Ok(()),
+            Some(_) => Err("ToolFrame is `flange` with this robot".to_owned()),
+        }
+    }
+
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        let mut session = Session::open(&self.settings).await?;
+        let at = session.state().await?;
+        at.fit()?;
+        // Not that of the last program, whoever's it was.
+        let token = at.started.wrapping_add(1) & i32::MAX;
+        work.step("Move").await;
+        let program = self.program(work.parameters(), token)?;
+        let _program = self.send(&program).await?;
+        let ended = session.follow(self, &work, token).await?;
+        Ok(vec![("Position".to_owned(), of_robot(ended.pose).into())])
+    }
+}
+
+impl Motion {
+    fn program(&self, parameters: &Parameters, token: i32) -> Result<String, String> {
+        let missing = |name: &str| format!("{name} is not there");
+        let number = |name: &str| parameters.number(name).ok_or_else(|| missing(name));
+        let target = parameters
+            .six("TargetPosition")
+            .ok_or_else(|| missing("TargetPosition"))?;
+        let (speed, acceleration) = (number("MaxVelocity")?, number("MaxAcceleration")?);
+        let [x, y, z, rx, ry, rz] = to_robot(target);
+        let pose = format!("p[{x:.6}, {y:.6}, {z:.6}, {rx:.6}, {ry:.6}, {rz:.6}]");
+        // The speed of a free way is that of the joints. Three of them may add up at the full reach before the tool is too fast.
+        let (verb, by) = match self.linear {
+            true => ("movel", 1.0),
+            false => ("movej", 3.0 * self.settings.reach),
+        };
+        let (a, v) = (acceleration / by, speed / by);
+        Ok(format!(
+            "def ua_skill():\n  write_output_integer_register(24, {token})\n  {verb}({pose}, a={a:.4}, v={v:.4})\n  \
+             write_output_integer_register(25, {token})\nend\n"
+        ))
+    }
+
+    /// The connection has to stay until the program is taken.
+    async fn send(&self, program: &str) -> Result<TcpStream, String> {
+        let address = &self.settings.secondary;
+        let unreachable = |error| format!("{address} cannot be reached: {error}");
+        let mut stream = connected(address).await.map_err(unreachable)?;
+        match timeout(TAKEN, stream.write_all(program.as_bytes())).await {
+            Ok(written) => written.map_err(unreachable)?,
+            Err(_) => return Err(format!("{address} takes no program")),
+        }
+        Ok(stream)
+    }
+}
+
+/// What is heard of the robot during a run.
+struct Session {
+    rtde: Rtde,
+}
+
+impl Session {
+    async fn open(settings: &Settings) -> Result<Self, String> {
+        let rtde = Rtde::open(&settings.rtde, HERTZ, &OUTPUTS, &INPUTS).await?;
+        Ok(Self { rtde })
+    }
+
+    async fn state(&mut self) -> Result<State, String> {
+        let values = self.rtde.next().await?;
+        State::of(&values).ok_or_else(|| "the robot tells values of other types".to_owned())
+    }
+
+    async fn slide(&mut self, fraction: f64) -> Result<(), String> {
+        self.rtde.tell(&[Value::U32(1), Value::F64(fraction)]).await
+    }
+
+    /// Until the program is done. Nothing here is dropped on the way: the robot tells often enough to look at the run between.
+    async fn follow(&mut self, motion: &Motion, work: &Work, token: i32) -> Result<State, String> {
+        let asked = Instant::now();
+        let mut standing = None;
+        loop {
+            let at = self.state().await?;
+            if at.done == token {
+                return Ok(at);
+            }
+            at.fit()?;
+            if at.started == token && !at.program {
+                return Err("the program of the robot has ended before its move: another one took its place".to_owned());
+            }
+            if at.started != token && asked.elapsed() > TAKEN {
+                return Err(format!(
+                    "the robot has not taken the program within {TAKEN:?}: is it in remote control?"
+                ));
+            }
+            let can_stand = self.rtde.may_tell();
+            match (is(work.stopped()).await, is(work.held()).await, standing) {
+                (true, _, standing) => return Err(self.halt(motion, standing).await?),
+                (false, true, None) if !can_stand => {
+                    let halted = self.halt(motion, None).await?;
+                    return Err(format!("another client has the speed slider: {halted}"));
+                }
+                (false, true, None) => {
+                    standing = Some(at.slider);
+                    self.slide(0.0).await?;
+                }
+                (false, false, Some(slider)) => {
+                    standing = None;
+                    self.slide(slider).await?;
+                }
+                (false, true, Some(_)) | (false, false, None) => {}
+            }
+        }
+    }
+
+    /// Brakes, and says where it stands then.
+    async fn halt(&mut self, motion: &Motion, slider: Option<f64>) -> Result<String, String> {
+        let _program = motion.send("def ua_halt():\n  stopl(3.0)\nend\n").await?;
+        let asked = Instant::now();
+        let at = loop {
+            let at = self.state().await?;
+            let taken = asked.elapsed() > SETTLED;
+            if taken && (at.speed < STILL || asked.elapsed() > BRAKED) {
+                break at;
+            }
+        };
+        if let Some(slider) = slider {
+            self.slide(slider).await?;
+        }
+        let [x, y, z, ..] = at.pose;
+        Ok(format!("stopped at {x:.3}, {y:.3}, {z:.3} m"))
+    }
+}
+
+/// One who hears where the tool of a robot is.
+#[derive(Debug)]
+pub struct Follower(Rtde);
+
+impl Follower {
+    /// Of the robot whose RTDE is at `host:port`.
+    ///
+    /// # Errors
+    /// It does not answer, for people.
+    pub async fn open(rtde: &str) -> Result<Self, String> {
+        Rtde::open(rtde, FOLLOWED, &["actual_TCP_pose"], &[])
+            .await
+            .map(Self)
+    }
+
+    /// The next position: m, and rotations about x, y and z in rad. Not to be dropped on the way.
+    ///
+    /// # Errors
+    /// It is lost, or silent for a second.
+    pub async fn position(&mut self) -> Result<[f64; 6], String> {
+        match self.0.next().await?.as_slice() {
+            [Value::Vector(pose)] => Ok(of_robot(*pose)),
+            _ => Err("the robot tells a position of another type".to_owned()),
+        }
+    }
+}
+
+/// Whether something is ready now.
+async fn is(ready: impl Future<Output = ()>) -> bool {
+    tokio::select! {
+        biased;
+        () = ready => true,
+        () = std::future::ready(()) => false,
+    }
+}
+
+/// `runtime_state` of a program that runs.
+const PLAYING: u32 = 2;
+const HERTZ: f64 = 50.0;
+const FOLLOWED: f64 = 500.0;
+const TAKEN: Duration = Duration::from_secs(2);
+const SETTLED: Duration = Duration::from_millis(60);
+const BRAKED: Duration = Duration::from_millis(700);
+/// Slower than this it stands, m/s.
+const STILL: f64 = 0.001;
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,155 @@
+//! What the robot tells and is told over RTDE, by name and type, as the guide of the maker lists them.
+
+use super::super::wire::{Kind, Value};
+use super::{Robot, Simulator};
+
+/// The type of a value that the robot tells.
+pub(super) fn output(name: &str) -> Option<Kind> {
+    if let Some(kind) = register(name, "output_") {
+        return Some(kind);
+    }
+    let of = |names: &[&str]| names.contains(&name);
+    if of(&VECTORS) {
+        Some(Kind::Vector)
+    } else if of(&DOUBLES) {
+        Some(Kind::F64)
+    } else if of(&["robot_mode", "safety_mode", "tool_mode"]) {
+        Some(Kind::I32)
+    } else if of(&["joint_mode"]) {
+        Some(Kind::Whole)
+    } else if of(&[
+        "runtime_state",
+        "robot_status_bits",
+        "safety_status_bits",
+        "safety_status",
+        "analog_io_types",
+    ]) {
+        Some(Kind::U32)
+    } else if of(&["actual_digital_input_bits", "actual_digital_output_bits"]) {
+        Some(Kind::U64)
+    } else {
+        None
+    }
+}
+
+/// The type of a value that it is told.
+pub(super) fn input(name: &str) -> Option<Kind> {
+    if let Some(kind) = register(name, "input_") {
+        return Some(kind);
+    }
+    match name {
+        "speed_slider_mask" => Some(Kind::U32),
+        "speed_slider_fraction" | "standard_analog_output_0" | "standard_analog_output_1" => {
+            Some(Kind::F64)
+        }
+        "standard_digital_output_mask"
+        | "standard_digital_output"
+        | "configurable_digital_output_mask"
+        | "configurable_digital_output"
+        | "tool_digital_output_mask"
+        | "tool_digital_output"
+        | "standard_analog_output_mask"
+        | "standard_analog_output_type" => Some(Kind::U8),
+        "external_force_torque" => Some(Kind::Vector),
+        _ => None,
+    }
+}
+
+/// General purpose registers: 48 whole numbers, 48 real ones, 64 bits in two words and from 64 on one by one.
+fn register(name: &str, direction: &str) -> Option<Kind> {
+    let rest = name.strip_prefix(direction)?;
+    if rest == "bit_registers0_to_31" || rest == "bit_registers32_to_63" {
+        return Some(Kind::U32);
+    }
+    let (of, number) = rest.rsplit_once('_')?;
+    let number: u8 = number.parse().ok()?;
+    match of {
+        "int_register" if number < 48 => Some(Kind::I32),
+        "double_register" if number < 48 => Some(Kind::F64),
+        "bit_register" if (64..128).contains(&number) => Some(Kind::Bool),
+        _ => None,
+    }
+}
+
+impl Robot {
+    /// What it tells now; what is not simulated is nothing.
+    pub(super) fn tells(&self, name: &str, kind: Kind) -> Value {
+        let number = name.strip_prefix("output_int_register_");
+        if let Some(register) = number
+            .and_then(|number| number.parse::<usize>().ok())
+            .and_then(|number| self.registers.get(number))
+        {
+            return Value::I32(*register);
+        }
+        let runs = self.program.is_some();
+        match name {
+            "timestamp" => Value::F64(self.seen.duration_since(self.switched_on).as_secs_f64()),
+            "actual_TCP_pose" | "target_TCP_pose" => Value::Vector(self.pose),
+            "actual_TCP_speed" | "target_TCP_speed" => Value::Vector(self.velocity()),
+            "robot_mode" => Value::I32(self.mode()),
+            "safety_mode" => Value::I32(self.safety),
+            "runtime_state" => Value::U32(if runs { 2 } else { 1 }),
+            // Power is on; a program runs.
+            "robot_status_bits" => Value::U32(1 | u32::from(runs) << 1),
+            "safety_status_bits" => Value::U32(if self.safety == 1 { 1 } else { 1 << 2 }),
+            "safety_status" => Value::U32(u32::try_from(self.safety).unwrap_or_default()),
+            "speed_scaling" | "target_speed_fraction" => Value::F64(self.slider),
+            "actual_main_voltage" => Value::F64(230.0),
+            "actual_robot_voltage" => Value::F64(48.0),
+            _ => kind.zero(),
+        }
+    }
+}
+
+impl Simulator {
+    /// Takes what it was told by the recipe of a client.
+    pub(super) fn told(&self, values: &[(String, Value)]) {
+        let named = |wanted: &str| values.iter().find(|(name, _)| name == wanted);
+        let mask = named("speed_slider_mask").map(|(_, value)| *value);
+        if let (Some(Value::U32(1)), Some((_, Value::F64(fraction)))) =
+            (mask, named("speed_slider_fraction"))
+            && fraction.is_finite()
+        {
+            self.lock().slider = fraction.clamp(0.0, 1.0);
+        }
+    }
+}
+
+const VECTORS: [&str; 19] = [
+    "target_q",
+    "target_qd",
+    "target_qdd",
+    "target_current",
+    "target_moment",
+    "actual_q",
+    "actual_qd",
+    "actual_current",
+    "joint_control_output",
+    "actual_TCP_pose",
+    "actual_TCP_speed",
+    "actual_TCP_force",
+    "target_TCP_pose",
+    "target_TCP_speed",
+    "joint_temperatures",
+    "actual_joint_voltage",
+    "ft_raw_wrench",
+    "actual_current_window",
+    "tcp_offset",
+];
+const DOUBLES: [&str; 15] = [
+    "timestamp",
+    "actual_execution_time",
+    "speed_scaling",
+    "target_speed_fraction",
+    "actual_momentum",
+    "actual_main_voltage",
+    "actual_robot_voltage",
+    "actual_robot_current",
+    "standard_analog_input0",
+    "standard_analog_input1",
+    "standard_analog_output0",
+    "standard_analog_output1",
+    "io_current",
+    "tool_output_current",
+    "payload",
+];

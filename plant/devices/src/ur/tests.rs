@@ -1,0 +1,148 @@
+use skills::{Outcome, conformance};
+
+use super::simulator::{Serving, Simulator};
+use super::*;
+
+struct Bench {
+    simulator: Simulator,
+    serving: Serving,
+}
+
+async fn bench() -> Bench {
+    let settings = simulator::Settings {
+        time_scale: 20.0,
+        ..simulator::Settings::default()
+    };
+    let simulator = Simulator::new(settings);
+    let serving = Serving::start(&simulator, "127.0.0.1:0", "127.0.0.1:0")
+        .await
+        .unwrap();
+    Bench { simulator, serving }
+}
+
+fn to(target: [f64; 6]) -> Vec<(String, skills::Value)> {
+    vec![("TargetPosition".to_owned(), target.into())]
+}
+
+impl Bench {
+    fn driver(&self, of: &str) -> Arc<dyn Driver> {
+        let settings = Settings {
+            rtde: self.serving.rtde().to_string(),
+            secondary: self.serving.secondary().to_string(),
+            reach: REACH,
+        };
+        Robot::new(settings).driver(&[TypeName::own(of)]).unwrap()
+    }
+
+    async fn run(&self, of: &str, target: [f64; 6]) -> Outcome {
+        conformance::run_once(of, self.driver(of), to(target))
+            .await
+            .unwrap()
+    }
+}
+
+#[tokio::test]
+async fn its_drivers_are_as_drivers_should_be() {
+    for of in ["PtpMoveSkillType", "LinearMoveSkillType"] {
+        let bench = bench().await;
+        let mut corners = [[-0.4, 0.3, 0.2], [0.4, 0.3, -0.2], [0.1, -0.5, 0.4]];
+        let around = || {
+            corners.rotate_left(1);
+            let [x, y, z] = corners[0];
+            to([x, y, z, 0.0, x, 0.0])
+        };
+        conformance::check(of, bench.driver(of), around)
+            .await
+            .unwrap_or_else(|why| panic!("{of}: {why}"));
+    }
+}
+
+#[tokio::test]
+async fn its_tool_arrives_where_it_was_told_to_be() {
+    let bench = bench().await;
+    let target = [0.2, 0.3, 0.1, 0.0, 0.5, 1.0];
+    let outcome = bench.run("LinearMoveSkillType", target).await;
+    assert!(outcome.succeeded, "{}", outcome.message);
+    let (_, position) = &outcome.results[0];
+    let position = position.as_f64s().unwrap();
+    assert!(
+        position
+            .iter()
+            .zip(target)
+            .all(|(is, wanted)| (is - wanted).abs() < 1e-5),
+        "{position:?}"
+    );
+}
+
+#[tokio::test]
+async fn silence_a_protective_stop_and_a_reboot_are_told_and_do_not_last() {
+    let bench = bench().await;
+    let (near, far) = (
+        [0.4, 0.1, 0.4, 0.0, 0.0, 0.0],
+        [-0.4, -0.3, 0.3, 0.0, 0.0, 0.0],
+    );
+    bench.simulator.set_silent(true);
+    let told = bench.run("LinearMoveSkillType", near).await.message;
+    assert!(told.contains(" is silent for 1s"), "{told}");
+    bench.simulator.set_silent(false);
+    assert!(bench.run("LinearMoveSkillType", near).await.succeeded);
+
+    let between = |change: fn(&Simulator)| {
+        let simulator = bench.simulator.clone();
+        let running = bench.run("LinearMoveSkillType", far);
+        async move {
+            let changed = async {
+                while simulator.pose()[0] > 0.3 {
+                    tokio::time::sleep(Duration::from_millis(2)).await;
+                }
+                change(&simulator);
+            };
+            tokio::join!(running, changed).0.message
+        }
+    };
+    let told = between(|robot| robot.set_protective_stop(true)).await;
+    assert_eq!(told, "the robot does not move: it is in a protective stop");
+    let told = bench.run("LinearMoveSkillType", near).await.message;
+    assert_eq!(told, "the robot does not move: it is in a protective stop");
+    bench.simulator.set_protective_stop(false);
+    assert!(bench.run("LinearMoveSkillType", near).await.succeeded);
+    let told = between(Simulator::reboot).await;
+    assert!(told.contains(" is lost: "), "{told}");
+    assert!(bench.run("LinearMoveSkillType", near).await.succeeded);
+}
+
+#[tokio::test]
+async fn a_program_of_somebody_else_is_told_and_not_taken_for_ours() {
+    let bench = bench().await;
+    let far = [-0.4, -0.3, 0.3, 0.0, 0.0, 0.0];
+    let secondary = bench.serving.secondary();
+    let simulator = bench.simulator.clone();
+    let intruder = async move {
+        while simulator.pose()[0] > 0.3 {
+            tokio::time::sleep(Duration::from_millis(2)).await;
+        }
+        let mut stream = TcpStream::connect(secondary).await.unwrap();
+        stream
+            .write_all(b"def other():\n  sleep(0.01)\nend\n")
+            .await
+            .unwrap();
+        tokio::time::sleep(Duration::from_millis(300)).await;
+    };
+    let (outcome, ()) = tokio::join!(bench.run("LinearMoveSkillType", far), intruder);
+    assert!(
+        outcome.message.contains("another one took its place"),
+        "{}",
+        outcome.message
+    );
+}
+
+#[tokio::test]
+async fn what_it_cannot_reach_is_refused_before_anything_is_sent() {
+    let bench = bench().await;
+    let of = "PtpMoveSkillType";
+    let refused =
+        conformance::run_once(of, bench.driver(of), to([0.9, 0.0, 0.0, 0.0, 0.0, 0.0])).await;
+    let expected =
+        "BadInvalidArgument: TargetPosition is 0.900 m from the base, and the robot reaches 0.85 m";
+    assert_eq!(refused.unwrap_err(), expected);
+}
