@@ -91,24 +91,28 @@ impl Modbus {
 
     /// Holding registers (function 3).
     pub(crate) async fn holding(&self, address: u16, count: u16) -> Result<Vec<u16>, Fault> {
-        match self
+        let answer = self
             .ask(Request::ReadHoldingRegisters(address, count))
-            .await?
+            .await?;
+        if let Response::ReadHoldingRegisters(words) = answer
+            && words.len() == usize::from(count)
         {
-            Response::ReadHoldingRegisters(words) if words.len() == usize::from(count) => Ok(words),
-            _ => Err(self.damaged("not as many registers as were asked for")),
+            return Ok(words);
         }
+        Err(self.damaged("not as many registers as were asked for"))
     }
 
     /// Input registers (function 4).
     pub(crate) async fn input(&self, address: u16, count: u16) -> Result<Vec<u16>, Fault> {
-        match self
+        let answer = self
             .ask(Request::ReadInputRegisters(address, count))
-            .await?
+            .await?;
+        if let Response::ReadInputRegisters(words) = answer
+            && words.len() == usize::from(count)
         {
-            Response::ReadInputRegisters(words) if words.len() == usize::from(count) => Ok(words),
-            _ => Err(self.damaged("not as many registers as were asked for")),
+            return Ok(words);
         }
+        Err(self.damaged("not as many registers as were asked for"))
     }
 
     /// Writes holding registers (function 16).

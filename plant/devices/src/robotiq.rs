@@ -43,21 +43,19 @@ impl Device for Gripper {
     fn driver(&self, types: &[TypeName]) -> Result<Arc<dyn Driver>, DriverFault> {
         let is = |name: &str| types.contains(&TypeName::own(name));
         let modbus = Arc::clone(&self.modbus);
+        let of = |what| -> Arc<dyn Driver> { Arc::new(Motion { modbus, what }) };
         if is("GraspSkillType") {
-            return Ok(Arc::new(Motion {
-                modbus,
-                closes: true,
-            }));
+            return Ok(of(What::Close));
         }
         if is("ReleaseSkillType") {
-            return Ok(Arc::new(Motion {
-                modbus,
-                closes: false,
-            }));
+            return Ok(of(What::Open));
+        }
+        if is("MoveGripperSkillType") {
+            return Ok(of(What::Width));
         }
         let own = types.first().map(TypeName::to_string).unwrap_or_default();
         Err(DriverFault(format!(
-            "`robotiq_2f85` does the work of GraspSkillType, ReleaseSkillType and what is below them, and this is {own}"
+            "`robotiq_2f85` does the work of GraspSkillType, ReleaseSkillType, MoveGripperSkillType and what is below them, and this is {own}"
         )))
     }
 }
@@ -118,7 +116,16 @@ impl Status {
 #[derive(Debug)]
 struct Motion {
     modbus: Arc<Modbus>,
-    closes: bool,
+    what: What,
+}
+
+/// Where the fingers are to go.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum What {
+    Close,
+    Open,
+    /// As far apart as the parameter Width says.
+    Width,
 }
 
 /// Where the fingers should be, and how.
@@ -135,12 +142,21 @@ impl Driver for Motion {
         true
     }
 
+    fn check(&self, parameters: &Parameters) -> Result<(), String> {
+        match parameters.number("Width") {
+            Some(width) if self.what == What::Width && width > STROKE => Err(format!(
+                "Width is {width} m, and the fingers open {STROKE} m"
+            )),
+            _ => Ok(()),
+        }
+    }
+
     async fn run(&self, work: Work) -> Result<Results, String> {
         self.activate(&work).await?;
-        let (step, position) = if self.closes {
-            ("Close", 255)
-        } else {
-            ("Open", 0)
+        let (step, position) = match self.what {
+            What::Close => ("Close", 255),
+            What::Open => ("Open", 0),
+            What::Width => ("Move", position(work.parameters())),
         };
         work.step(step).await;
         let goal = Goal {
@@ -149,14 +165,18 @@ impl Driver for Motion {
             force: force(work.parameters()),
         };
         let ended = self.go(goal, &work).await?;
-        match (self.closes, ended.object) {
-            (true, 2) => Ok(vec![("Gripped".to_owned(), true.into())]),
-            (true, _) => Err("nothing is between the fingers".to_owned()),
-            (false, 1) => Err(format!(
+        match (self.what, ended.object) {
+            (What::Close, 2) => Ok(vec![("Gripped".to_owned(), true.into())]),
+            (What::Close, _) => Err("nothing is between the fingers".to_owned()),
+            (What::Open, 1) => Err(format!(
                 "something stops the fingers at position {} while they open",
                 ended.position
             )),
-            (false, _) => Ok(Vec::new()),
+            (What::Open, _) => Ok(Vec::new()),
+            (What::Width, object) => Ok(vec![
+                ("Width".to_owned(), width(ended.position).into()),
+                ("Gripped".to_owned(), (object != 3).into()),
+            ]),
         }
     }
 }
@@ -263,6 +283,24 @@ fn force(parameters: &Parameters) -> u8 {
     )]
     let force = (share * 255.0).round() as u8;
     force
+}
+
+/// The position in which the fingers are as far apart as the parameter Width says.
+fn position(parameters: &Parameters) -> u8 {
+    let apart = parameters.number("Width").unwrap_or(STROKE);
+    let closed = (1.0 - apart / STROKE).clamp(0.0, 1.0);
+    #[expect(
+        clippy::cast_possible_truncation,
+        clippy::cast_sign_loss,
+        reason = "from 0 to 255"
+    )]
+    let position = (closed * 255.0).round() as u8;
+    position
+}
+
+/// How far apart the fingers are in a position, m.
+fn width(position: u8) -> f64 {
+    (1.0 - f64::from(position) / 255.0) * STROKE
 }
 
 fn share(from: u8, at: u8, to: u8) -> f32 {

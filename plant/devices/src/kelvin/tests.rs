@@ -27,6 +27,7 @@ fn skill(name: &str, driver: Arc<dyn Driver>, authority: &Authority) -> Arc<dyn 
         results: of.results(),
         capabilities: Vec::new(),
         timeout: None,
+        rests_in: of.rests_in,
     };
     let skill = Skill::spawn(facts, driver, authority.clone(), Vec::new());
     Arc::new(LocalRun {

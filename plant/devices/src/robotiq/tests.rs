@@ -77,6 +77,38 @@ async fn it_says_whether_something_is_between_its_fingers_and_where_they_stopped
 }
 
 #[tokio::test]
+async fn its_fingers_go_to_a_width_and_stop_at_what_is_between_them() {
+    let bench = bench(LINES[0], Some(0.04)).await;
+    let of = "MoveGripperSkillType";
+    let to = |width: f64| vec![("Width".to_owned(), width.into())];
+    let run = async |width| {
+        let outcome = conformance::run_once(of, bench.driver(of), to(width)).await?;
+        let gripped = outcome.results.iter().find(|(name, _)| name == "Gripped");
+        let width = outcome.results.iter().find(|(name, _)| name == "Width");
+        let (width, gripped) = (
+            width.unwrap().1.as_f64().unwrap(),
+            gripped.unwrap().1.as_bool(),
+        );
+        Ok::<_, String>(((width * 1000.0).round(), gripped.unwrap()))
+    };
+    assert_eq!(run(0.06).await, Ok((60.0, false)));
+    assert_eq!(run(0.02).await, Ok((40.0, true)));
+    let refused = run(0.1).await.unwrap_err();
+    assert_eq!(
+        refused,
+        "BadInvalidArgument: Width is 0.1 m, and the fingers open 0.085 m"
+    );
+    let mut widths = [0.06, 0.08];
+    let parameters = || {
+        widths.rotate_left(1);
+        to(widths[0])
+    };
+    conformance::check(of, bench.driver(of), parameters)
+        .await
+        .unwrap();
+}
+
+#[tokio::test]
 async fn silence_damaged_frames_and_a_reboot_are_told_and_do_not_last() {
     for line in LINES {
         let bench = bench(line, Some(0.03)).await;

@@ -287,7 +287,8 @@ impl<'s> Client<'s> {
             .collect();
         match all {
             Some(all) => self.outputs = all,
-            None => answer[..1].fill(0),
+            // No recipe.
+            None => answer.iter_mut().take(1).for_each(|number| *number = 0),
         }
         answer
     }
