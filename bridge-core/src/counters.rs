@@ -67,11 +67,23 @@ pub enum Reason {
     NotAsked,
     /// A response of somebody who does not execute the call.
     Forged,
+    /// In clear, where the group is secured.
+    Unsecured,
+    /// Signed alone, where the group encrypts; or encrypted and not signed.
+    Downgraded,
+    /// Not written with the key of the group, or changed since.
+    Signature,
+    /// It was there before, or is so far from the newest of its sender that nothing tells whether it was.
+    Replayed,
+    /// Secured with a key that is not known here, or is out of use.
+    UnknownKey,
+    /// There is no key to secure with what is to be sent.
+    NoKeys,
 }
 
 impl Reason {
     /// All of them, in the order of their counters.
-    pub const ALL: [Self; 30] = [
+    pub const ALL: [Self; 36] = [
         Self::Looped,
         Self::SpaceTaken,
         Self::NotInSpace,
@@ -102,6 +114,12 @@ impl Reason {
         Self::CallRefused,
         Self::NotAsked,
         Self::Forged,
+        Self::Unsecured,
+        Self::Downgraded,
+        Self::Signature,
+        Self::Replayed,
+        Self::UnknownKey,
+        Self::NoKeys,
     ];
 
     /// The label of its counter.
@@ -138,6 +156,12 @@ impl Reason {
             Self::CallRefused => "call_refused",
             Self::NotAsked => "not_asked",
             Self::Forged => "forged",
+            Self::Unsecured => "unsecured",
+            Self::Downgraded => "downgraded",
+            Self::Signature => "signature",
+            Self::Replayed => "replayed",
+            Self::UnknownKey => "unknown_key",
+            Self::NoKeys => "no_keys",
         }
     }
 

@@ -19,6 +19,7 @@ mod counters;
 mod description;
 mod fields;
 mod gate;
+mod guard;
 mod hops;
 mod layout;
 mod learned;
@@ -46,6 +47,7 @@ pub use call::{
 pub use counters::{Counters, Reason, Verdict};
 pub use description::Described;
 pub use fields::{decode_fields, encode_fields};
+pub use guard::{GroupState, Guard, KeyDelivery, Unopened, policy_of};
 pub use hops::{Delays, Hop, Hops};
 pub use loop_rule::{Owned, Side, What, may_cross};
 pub use output::{Delivery, Heard, Kept, Notice, Output, PublisherKey};

@@ -107,6 +107,11 @@ pub enum Output {
         /// Who; nobody any more without one.
         by: Option<SocketAddr>,
     },
+    /// The keys of a secured group are out of date: somebody uses one that is not known here, or there is no next one.
+    KeysWanted {
+        /// Its SecurityGroupId.
+        group: String,
+    },
     /// Something to log.
     Notice(Notice),
 }

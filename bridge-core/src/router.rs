@@ -8,6 +8,7 @@ mod chunks;
 mod content;
 mod discovery;
 mod follow;
+mod guarded;
 mod own;
 mod receive;
 mod reload;
@@ -27,6 +28,7 @@ use uadp::{Fields, Timestamp};
 use crate::counters::{Cause, Counters, Reason, Verdict};
 use crate::fields;
 use crate::gate::{Passage, Waiting};
+use crate::guard::Guard;
 use crate::hops::{Hop, Hops};
 use crate::loop_rule::{Owned, Side, What};
 use crate::network::{check_size, data_set_header, encode, keep_alive};
@@ -72,6 +74,10 @@ pub struct Router {
     instance: [u8; 16],
     /// The namespaces of ours in which nothing is sent; `None` where there is none.
     claims: Option<Box<Claims>>,
+    /// The secured groups; `None` where there is none.
+    guard: Option<Box<Guard>>,
+    /// Whether what is handled came in clear.
+    in_clear: bool,
     /// What is told besides samples.
     told: VecDeque<Output>,
     /// Topics of other spaces of which the port is to be told something, each once.
@@ -92,6 +98,7 @@ impl Router {
     /// A Router for one space. `mapping` says how each topic queues and how often values are repeated.
     #[must_use]
     pub fn new(settings: Settings, mapping: Arc<Mapping>) -> Self {
+        let guard = Guard::new(mapping.security()).map(Box::new);
         Self {
             settings,
             owned: Owned::All,
@@ -107,6 +114,8 @@ impl Router {
             calls: None,
             instance: [0; 16],
             claims: None,
+            guard,
+            in_clear: true,
             told: VecDeque::new(),
             news: VecDeque::new(),
             news_first: false,
@@ -385,6 +394,10 @@ impl Router {
         self.look_at_calls(now);
         self.discover(now);
         self.expire_chunks(now);
+        if let Some(guard) = &mut self.guard {
+            guard.turn(now.monotonic);
+            self.want_keys(now);
+        }
     }
 
     /// When [`handle_timeout`](Self::handle_timeout) is wanted next.
@@ -400,7 +413,8 @@ impl Router {
         let calls = self.calls.as_ref().and_then(|calls| calls.due());
         let claims = self.claims.as_ref();
         let claims = claims.and_then(|claims| claims.due(self.mapping.pubsub().receive_timeout));
-        [timer, pace, chunks, discovery, calls, claims]
+        let keys = self.guard.as_ref().and_then(|guard| guard.due());
+        [timer, pace, chunks, discovery, calls, claims, keys]
             .into_iter()
             .flatten()
             .min()
@@ -620,7 +634,13 @@ impl Router {
 
     fn sizes(&self) -> (u16, u32) {
         let pubsub = self.mapping.pubsub();
-        (pubsub.max_datagram, pubsub.max_message)
+        let room = match self.guard {
+            // What is sealed is longer.
+            Some(_) => u16::try_from(Guard::OVERHEAD).unwrap_or_default(),
+            None => 0,
+        };
+        let max_datagram = pubsub.max_datagram.saturating_sub(room);
+        (max_datagram, pubsub.max_message)
     }
 
     /// Counts a sample of the local side that does not cross.

@@ -11,13 +11,13 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use bridge_core::{Heard, Local, Now, Output, Router, Settings};
-use mappings::{Mapping, SpaceId, TopicId};
+use bridge_core::{Heard, KeyDelivery, Local, Now, Output, Router, Settings};
+use mappings::{GroupMode, Mapping, SpaceId, TopicId};
 use messages::{Dialect, Registry, Selection};
 use proptest::prelude::*;
-use uadp::Timestamp;
+use uadp::{Keys, SecurityPolicy, Timestamp};
 
 /// A cell: one bridge per space, a group that every datagram returns from to everybody, and local graphs that echo
 /// every publication to the bridge itself.
@@ -46,8 +46,18 @@ enum Event {
 
 impl Cell {
     #[expect(clippy::disallowed_methods, reason = "some instant to count from")]
-    fn new(spaces: &[SpaceId]) -> Self {
-        let mapping = Arc::new(Mapping::default());
+    fn new(spaces: &[SpaceId], mode: GroupMode) -> Self {
+        let yaml = match mode {
+            GroupMode::None => String::new(),
+            secured => format!(
+                "security: [{{group: cell, mode: {}, keys: {{file: k}}}}]",
+                secured.name()
+            ),
+        };
+        let mapping = Mapping::from_yaml(&yaml, "cell.yaml").mapping.unwrap();
+        let mapping = Arc::new(mapping);
+        let keys = Keys::from_bytes(SecurityPolicy::PubSubAes256Ctr, &[7; 68]).unwrap();
+        let started = Instant::now();
         let bridges = spaces
             .iter()
             .map(|own| {
@@ -56,7 +66,20 @@ impl Cell {
                     local: Local::Ros1,
                     source: Some(address(*own)),
                 };
-                (*own, Router::new(settings, Arc::clone(&mapping)))
+                let mut router = Router::new(settings, Arc::clone(&mapping));
+                router.set_instance([own.get().wrapping_add(1); 16]);
+                let now = Now {
+                    monotonic: started,
+                    utc: Timestamp::from_unix_nanos(0),
+                };
+                let delivery = KeyDelivery {
+                    first_token_id: 1,
+                    keys: vec![keys.clone()],
+                    time_to_next: None,
+                    lifetime: Duration::ZERO,
+                };
+                router.set_keys("cell", &delivery, now).unwrap();
+                (*own, router)
             })
             .collect();
         Self {
@@ -65,7 +88,7 @@ impl Cell {
             delivered: BTreeMap::new(),
             datagrams: 0,
             clock: 1_700_000_000_000_000_000,
-            started: Instant::now(),
+            started,
         }
     }
 
@@ -173,9 +196,10 @@ proptest! {
     fn a_value_enters_every_other_space_once_and_never_comes_home(
         numbers in proptest::collection::btree_set(0_u16..=232, 1..=5),
         sent in proptest::collection::vec((any::<proptest::sample::Index>(), 1_u16.., 1_u16..), 1..8),
+        mode in proptest::sample::select(vec![GroupMode::None, GroupMode::Sign, GroupMode::SignAndEncrypt]),
     ) {
         let spaces: Vec<_> = numbers.into_iter().filter_map(SpaceId::new).collect();
-        let mut cell = Cell::new(&spaces);
+        let mut cell = Cell::new(&spaces, mode);
         let mut expected: BTreeMap<(SpaceId, TopicId), Vec<Vec<u8>>> = BTreeMap::new();
         for (number, (origin, namespace, identifier)) in sent.iter().enumerate() {
             let origin = *origin.get(&spaces);

@@ -35,6 +35,9 @@ pub struct Flags {
     /// The PubSub group, as opc.udp://239.192.0.40:4840
     #[arg(long, value_name = "URL", env = "UA_ADDRESS")]
     pub address: Option<String>,
+    /// Take the secured groups of this mapping YAML, its key `security`, in place of those of the own configuration
+    #[arg(long, value_name = "MAPPING", env = "UA_SECURITY")]
+    pub security: Option<PathBuf>,
     /// How log lines look
     #[arg(
         long,

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use bridge_core::{Local, Owned, Router, Settings};
 use clap::Parser;
-use mappings::{Mapping, PubSub, SpaceId};
+use mappings::{Mapping, PubSub, SecurityGroup, SpaceId};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::sync::watch;
 use tokio::task::{JoinError, JoinSet};
@@ -23,6 +23,7 @@ use crate::busy_poll::BusyPoll;
 use crate::clock::now;
 use crate::descriptors;
 use crate::exit::{Failure, FailureKind};
+use crate::keys::{KeyRing, KeyService};
 use crate::logging;
 use crate::mapping_file::{MappingFile, Running};
 use crate::metrics::{self, Requests};
@@ -62,6 +63,15 @@ pub trait Program: Parser {
     fn owned(mapping: &Mapping) -> Owned {
         let _whole_space = mapping;
         Owned::All
+    }
+
+    /// How it fetches keys from a Security Key Service; `None` where it does not.
+    ///
+    /// # Errors
+    /// When what it needs for that cannot be used.
+    fn key_service(&self, mapping: &Mapping) -> Result<Option<Arc<dyn KeyService>>, Failure> {
+        let _none = mapping;
+        Ok(None)
     }
 
     /// The spaces it serves, none of them twice: each with a local side, a Router and a place in the group of its own.
@@ -208,9 +218,13 @@ async fn prepare<P: Program>(
         local: P::LOCAL,
         source: Some(udp.source()),
     };
+    let mut keys = KeyRing::new(groups(arguments)?, program.key_service(&mapping)?);
+    let taken = mapping;
+    let mapping = keys.applied(Arc::clone(&taken));
     let mut router = Router::new(settings, Arc::clone(&mapping));
     router.set_owned(P::owned(&mapping), now());
     router.set_instance(instance()?);
+    keys.start(&mapping, &mut router)?;
     router.call_the_roll(now());
     let context = Context {
         mapping: Arc::clone(&mapping),
@@ -229,8 +243,10 @@ async fn prepare<P: Program>(
         claims: P::CLAIMS,
         requests,
         changes: changes.clone(),
+        keys,
         fixed: Fixed {
             started: mapping,
+            taken,
             address: arguments.flags.address.is_none(),
             interface: arguments.flags.interface.is_none(),
         },
@@ -256,6 +272,28 @@ fn instance() -> Result<[u8; 16], Failure> {
 }
 
 const RANDOM: &str = "/dev/urandom";
+
+/// The secured groups of the mapping that the command line names for them.
+fn groups(arguments: &Arguments) -> Result<Option<Vec<SecurityGroup>>, Failure> {
+    let Some(path) = &arguments.flags.security else {
+        return Ok(None);
+    };
+    let name = path.display().to_string();
+    let text = std::fs::read_to_string(path).map_err(|error| {
+        let message = format!("--security: cannot read {name}: {error}");
+        Failure::new(FailureKind::Configuration, message)
+    })?;
+    let checked = Mapping::from_yaml(&text, &name);
+    let Some(mapping) = checked.outline() else {
+        let message = format!("--security: {name} cannot run: `ua-space check {name}` says why");
+        return Err(Failure::new(FailureKind::Configuration, message));
+    };
+    if mapping.security().is_empty() {
+        let message = format!("--security: {name} has no `security`");
+        return Err(Failure::new(FailureKind::Configuration, message));
+    }
+    Ok(Some(mapping.security().to_vec()))
+}
 
 /// How a space's run loop ended.
 fn how(ended: Option<Result<Result<(), Failure>, JoinError>>) -> Result<(), Failure> {

@@ -21,6 +21,7 @@ use transport::{Change, Finding, Held, SendError, Udp};
 use crate::busy_poll::BusyPoll;
 use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
+use crate::keys::{self, KeyRing, NewKeys};
 use crate::mapping_file::Running;
 use crate::metrics::{Requests, Told as _};
 use crate::port::{Delivery, Port, PortEvent};
@@ -41,6 +42,7 @@ pub(crate) struct Shell<P> {
     pub(crate) claims: bool,
     pub(crate) requests: Requests<Status>,
     pub(crate) changes: watch::Receiver<Running>,
+    pub(crate) keys: KeyRing,
     pub(crate) fixed: Fixed,
     /// What of the mapping waits for the next start.
     pub(crate) restart: Vec<String>,
@@ -54,6 +56,8 @@ pub(crate) struct Shell<P> {
 #[derive(Debug)]
 pub(crate) struct Fixed {
     pub(crate) started: Arc<Mapping>,
+    /// The mapping that was taken last.
+    pub(crate) taken: Arc<Mapping>,
     /// Whether the mapping says the address; else the command line does.
     pub(crate) address: bool,
     /// Likewise the interface.
@@ -122,6 +126,9 @@ impl<P: Port> Shell<P> {
                     self.look_at_held()?;
                 }
                 Ok(()) = self.changes.changed() => self.reload(),
+                Some(NewKeys { group, delivery }) = self.keys.next() => {
+                    keys::give(&mut self.router, &group, &delivery);
+                }
                 // Who asked may have gone; there is nobody else to tell.
                 Some(reply) = self.requests.recv() => drop(reply.send(self.status())),
             }
@@ -208,10 +215,18 @@ impl<P: Port> Shell<P> {
                     .into_iter()
                     .flatten()
                     .chain(self.taken.values().cloned())
+                    .chain(self.keyless())
                     .collect(),
                 interfaces,
             },
         )
+    }
+
+    /// What is told of secured groups without keys.
+    fn keyless(&self) -> impl Iterator<Item = String> {
+        let groups = self.router.groups();
+        let keyless = groups.filter(|state| state.token_id.is_none());
+        keyless.map(|state| format!("there are no keys of the group `{}` yet", state.group))
     }
 
     /// Goes with the network interface of the group, whatever becomes of it.
@@ -258,10 +273,13 @@ impl<P: Port> Shell<P> {
     /// Goes over to another mapping, where it is another.
     fn reload(&mut self) {
         let Running { mapping, types, .. } = self.changes.borrow_and_update().clone();
-        if Arc::ptr_eq(&mapping, self.router.mapping()) {
+        if Arc::ptr_eq(&mapping, &self.fixed.taken) {
             return;
         }
+        self.fixed.taken = Arc::clone(&mapping);
+        let mapping = self.keys.applied(mapping);
         self.router.replace_mapping(Arc::clone(&mapping), now());
+        self.keys.follow(&mapping);
         self.router.set_owned((self.owned)(&mapping), now());
         self.restart = self.fixed.differing(&mapping);
         self.restart.extend(self.port.reload(&mapping, &types));
@@ -397,6 +415,7 @@ impl<P: Port> Shell<P> {
                 } => self.silent(topic, silent, dropped),
                 Output::Retired { topic, instance } => self.port.retired(topic, instance),
                 Output::Notice(notice) => tell(&notice),
+                Output::KeysWanted { group } => self.keys.want(&group),
                 other => self.call_output(other),
             }
         }

@@ -18,6 +18,8 @@ pub(crate) struct Status {
     #[serde(flatten)]
     readiness: Readiness,
     mapping: MappingStatus,
+    /// The secured groups, by their SecurityGroupId.
+    groups: BTreeMap<String, GroupStatus>,
     topics: BTreeMap<String, TopicStatus>,
     /// Calls that are known, asked for or executed here.
     calls: BTreeMap<String, CallStatus>,
@@ -49,6 +51,17 @@ struct MappingStatus {
     about: About,
     /// Its keys that count only after a restart.
     restart_needed: Vec<String>,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct GroupStatus {
+    mode: &'static str,
+    /// The key that is used, by its SecurityTokenId.
+    token: Option<u32>,
+    /// The one that comes next.
+    next_token: Option<u32>,
+    /// Whether there should be a next one by now.
+    overdue: bool,
 }
 
 #[derive(Debug, Clone, Serialize)]
@@ -99,6 +112,15 @@ impl Status {
             .topics()
             .map(|(topic, counters)| (topic.to_string(), counters.into()))
             .collect();
+        let groups = router.groups().map(|state| {
+            let status = GroupStatus {
+                mode: state.mode.name(),
+                token: state.token_id,
+                next_token: state.next_token_id,
+                overdue: state.overdue,
+            };
+            (state.group, status)
+        });
         let calls = router
             .calls()
             .map(|(topic, counters)| {
@@ -119,6 +141,7 @@ impl Status {
                 about: about.clone(),
                 restart_needed: restart.to_vec(),
             },
+            groups: groups.collect(),
             topics,
             calls,
             others: router.others().into(),
@@ -173,6 +196,12 @@ impl Told for Status {
         for (name, value) in self.mapping.about.figures() {
             line(name, &own, &value);
         }
+        for (group, status) in &self.groups {
+            let labels = format!("{own},group=\"{}\"", escaped(group));
+            let token = status.token.unwrap_or_default();
+            line("group_security_token", &labels, &token);
+            line("group_keys_overdue", &labels, &u8::from(status.overdue));
+        }
         let restart = u8::from(!self.mapping.restart_needed.is_empty());
         line("mapping_restart_needed", &own, &restart);
         let none = [("none".to_owned(), &self.others)];
@@ -225,6 +254,11 @@ impl Told for Status {
         }
         text
     }
+}
+
+/// As the value of a label has to be written.
+fn escaped(text: &str) -> String {
+    text.replace('\\', "\\\\").replace('"', "\\\"")
 }
 
 impl CallStatus {

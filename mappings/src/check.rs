@@ -8,6 +8,7 @@ mod meaning;
 mod names;
 mod network;
 mod patterns;
+mod security;
 mod selection;
 mod services;
 mod several;
@@ -319,12 +320,19 @@ fn compile(
         }
         None => Vec::new(),
     };
+    let groups = document.security.as_ref();
+    let groups = groups
+        .and_then(|at| at.value.as_deref())
+        .unwrap_or_default();
+    let security = security::check(groups, &server.endpoint, findings);
     let mapping = Mapping::new(pubsub, spaces.known, namespaces.known, server, variables);
     *used = types.used();
     let mapping = mapping
         .with_calls(calls)
+        .with_security(security)
         .with_patterns(patterns)
         .with_type_paths(paths);
+    security::left_open(&mapping, &document, findings);
     let minded_by_all = findings.errors().iter().any(Vec::is_empty);
     if let Some(environment) = around.environment()
         && !minded_by_all

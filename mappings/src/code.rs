@@ -128,6 +128,10 @@ codes! {
     CallBinding = "M134", "Under `ros` of a call stands a `service` with its `request` and `response`, or an `action` with its `goal`, `feedback` and `result`. All of a call are of one kind, as a service has an answer at once, and an action takes its time. A Method of an OPC UA server is asked for by services.";
     UnknownActionType = "M135", "No definition of the action type is built in, so a package with the .action file must be in `type_paths`, or below one of the folders of ROS_PACKAGE_PATH or AMENT_PREFIX_PATH, when the bridge runs.";
     MethodTarget = "M136", "`opcua` says which Method of which other OPC UA server executes a call: `endpoint`, `object` and `method`, the nodes as nsu=urn:plc;s=Line.Reset. The cell's own server calls it, so the call has `origin: 0`, a node of a namespace of `namespaces`, and the endpoint is not that of the cell's server itself.";
+    SecurityGroup = "M150", "An entry of `security` is a SecurityGroup of OPC UA PubSub: a `group`, each once, and the `namespaces` that are its, none of them in two groups. One group may be without `namespaces`: it has all that no other names.";
+    GroupKeys = "M151", "The `keys` of a secured group come from a file that only its owner can read, from a credential of systemd, or from a Security Key Service. They never stand in the mapping itself, which is copied to every host of the cell.";
+    HalfSecured = "M152", "Some of what is sent is secured, and a namespace is not. Who can write there can steer what is read there. `mode: none` in a group with that namespace says that it is meant.";
+    OpenCall = "M153", "A call can be asked for without a key, in a cell where values are secured. To execute something is worth more protection than to read something, and not less.";
 }
 
 impl Code {
@@ -174,7 +178,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M136")]
+#[error("no finding has that code; codes are M001 to M153")]
 pub struct UnknownCode;
 
 #[cfg(test)]

@@ -1,5 +1,7 @@
 //! The document as it is written. The keys, their meaning for a reader of the schema, and nothing checked across them.
 
+mod security;
+
 use std::collections::BTreeMap;
 
 use messages::Literal;
@@ -10,6 +12,10 @@ use crate::code::Code;
 use crate::mapping::UaField;
 use crate::read::{At, Read, Reader, choice, document, short};
 use crate::tree::{Kind, Node, Place};
+
+pub(crate) use security::{
+    GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry, SksEntry,
+};
 
 document! {
     /// One cell: its ROS spaces, its OPC UA nodes, and which ROS topic is which node.
@@ -25,6 +31,8 @@ document! {
         type_paths: Vec<At<String>>,
         /// How values travel between the spaces.
         pubsub: PubSubEntry,
+        /// Who may write and read what is sent: SecurityGroups of OPC UA PubSub, at most 64. Left out: anybody may.
+        security: Vec<At<GroupEntry>>,
         /// The OPC UA server of the cell.
         server: ServerEntry,
         /// Namespace index in node ids -> namespace URI. A server may number its namespaces otherwise; the URI counts.
@@ -824,6 +832,7 @@ impl Default for Document {
             spaces: None,
             type_paths: None,
             pubsub: None,
+            security: None,
             server: None,
             namespaces: None,
             variables: None,

@@ -106,6 +106,9 @@ impl<'a> Loader<'a> {
                 }
             }
         }
+        for file in key_files(&mut document) {
+            *file = beside(&path, file);
+        }
         self.take(document);
         self.open.push(path);
         for At { place, value } in includes.and_then(|at| at.value).map_or(Vec::new(), |i| i.0) {
@@ -251,6 +254,7 @@ impl<'a> Loader<'a> {
             spaces,
             type_paths,
             pubsub,
+            security,
             server,
             namespaces,
             variables,
@@ -262,10 +266,20 @@ impl<'a> Loader<'a> {
         append(&mut self.whole.variables, variables);
         append(&mut self.whole.patterns, patterns);
         append(&mut self.whole.calls, calls);
+        append(&mut self.whole.security, security);
         append(&mut self.whole.namespaces, namespaces);
         once("pubsub", &mut self.whole.pubsub, pubsub, self.findings);
         once("server", &mut self.whole.server, server, self.findings);
     }
+}
+
+/// The files with keys that a document names; an empty one stays what it is, for a finding.
+fn key_files(document: &mut Document) -> impl Iterator<Item = &mut String> {
+    let groups = document.security.as_mut().and_then(|at| at.value.as_mut());
+    let groups = groups.into_iter().flatten();
+    let keys = groups.filter_map(|at| at.value.as_mut()?.keys.as_mut()?.value.as_mut());
+    let files = keys.filter_map(|keys| keys.file.as_mut()?.value.as_mut());
+    files.filter(|file| !file.is_empty())
 }
 
 /// What a faulty entry comes to.

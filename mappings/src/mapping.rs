@@ -12,6 +12,7 @@ use uadp::BuiltinType;
 use crate::call::{Call, CallBinding};
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
+use crate::security::SecurityGroup;
 use crate::topic::{SpaceId, TopicId};
 use crate::unit::Unit;
 
@@ -30,6 +31,7 @@ pub struct Mapping {
     calls: Vec<Call>,
     patterns: Vec<Pattern>,
     type_paths: Vec<PathBuf>,
+    pub(crate) security: Vec<SecurityGroup>,
 }
 
 impl Mapping {
@@ -55,6 +57,7 @@ impl Mapping {
             calls: Vec::new(),
             patterns: Vec::new(),
             type_paths: Vec::new(),
+            security: Vec::new(),
         }
     }
 

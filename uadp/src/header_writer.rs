@@ -251,7 +251,7 @@ fn write_promoted_fields(buf: &mut Vec<u8>, fields: &[Variant<'_>]) -> Result<()
 }
 
 impl SecurityHeader<'_> {
-    fn write(&self, buf: &mut Vec<u8>) -> Result<(), EncodeError> {
+    pub(crate) fn write(&self, buf: &mut Vec<u8>) -> Result<(), EncodeError> {
         let nonce_length = u8::try_from(self.nonce.len()).map_err(|_| EncodeError::TooBig {
             what: "MessageNonce",
             len: self.nonce.len(),

@@ -129,8 +129,8 @@ pub use reassembler::{
 };
 pub use scalar::{ExtensionBody, ExtensionObject, LocalizedText, QualifiedName, Scalar};
 pub use security::{
-    KeyError, Keys, Opened, Opener, OpenerOptions, Seal, SealError, Sealer, SecurityError,
-    SecurityMode, SecurityPolicy,
+    CountedBy, KeyError, Keys, Opened, Opener, OpenerOptions, Seal, SealError, Sealer,
+    SecurityError, SecurityMode, SecurityPolicy,
 };
 pub use sequence::{SequenceCounter, SequenceOrder};
 pub use state::{PubSubState, StateEvent, StateMachine, StateRefused};

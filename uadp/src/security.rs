@@ -9,10 +9,11 @@ mod opener;
 mod replay;
 mod ring;
 mod sealer;
+mod securing;
 
 pub use error::{KeyError, SealError, SecurityError};
 pub use keys::Keys;
-pub use opener::{Opened, Opener, OpenerOptions};
+pub use opener::{CountedBy, Opened, Opener, OpenerOptions};
 pub use sealer::{Seal, Sealer};
 
 /// The algorithms of a SecurityGroup: HMAC-SHA2-256 signs, AES in counter mode encrypts (OPC 10000-7).

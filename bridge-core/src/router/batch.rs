@@ -4,6 +4,7 @@ use mappings::{Overflow, TopicId};
 
 use super::{About, Router};
 use crate::counters::Reason;
+use crate::guard::Guard;
 use crate::network::join;
 use crate::output::Output;
 use crate::settings::Now;
@@ -51,7 +52,8 @@ impl Router {
         let mut gathered = Vec::new();
         let pubsub = self.mapping.pubsub();
         let most = usize::from(pubsub.messages_per_datagram);
-        let room = usize::from(pubsub.max_datagram).min(ETHERNET);
+        let overhead = self.guard.as_ref().map_or(0, |_| Guard::OVERHEAD);
+        let room = usize::from(pubsub.max_datagram).min(ETHERNET) - overhead;
         // That there are several costs the first one its place among the Sizes.
         let mut len = first.bytes.len() + SIZE;
         let mut passed = Vec::new();

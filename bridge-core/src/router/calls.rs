@@ -163,10 +163,11 @@ impl Calls {
 }
 
 impl Router {
-    /// Gives it random bytes, which tell its requests from those of other programs of the space and of its own earlier runs.
+    /// Gives it random bytes, with which it seals what is sent in secured groups, and which tell its requests from those of other programs of the space and of its own earlier runs.
     /// To be given before the first call is known.
-    pub const fn set_instance(&mut self, instance: [u8; 16]) {
+    pub fn set_instance(&mut self, instance: [u8; 16]) {
         self.instance = instance;
+        self.mark_guard();
     }
 
     fn calls_mut(&mut self, now: Now) -> &mut Calls {

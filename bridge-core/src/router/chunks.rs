@@ -108,6 +108,12 @@ impl Router {
                     Ok(message) if message.is_chunk() => {
                         self.drop_undecoded(None, from, &CHUNK_IN_CHUNKS);
                     }
+                    Ok(message) if self.is_smuggled(&message, namespace) => {
+                        let cause = (Reason::Unsecured, "in chunks");
+                        self.count(About::sender(from), cause, 1, || {
+                            "a message of a secured group in chunks of another".to_owned()
+                        });
+                    }
                     Ok(message) => self.handle_network_message(&message, from, now),
                     Err(error) => self.drop_undecoded(None, from, &error),
                 },
@@ -128,6 +134,17 @@ impl Router {
         }
         self.count_given_up(&mut chunks.reassembler);
         self.chunks = Some(chunks);
+    }
+
+    /// Whether a message came in chunks of a namespace that is secured otherwise than its own.
+    fn is_smuggled(&self, message: &NetworkMessage<'_>, chunked_in: u16) -> bool {
+        let Some(guard) = &self.guard else {
+            return false;
+        };
+        let data = message.message_type() == NetworkMessageType::DataSet;
+        let namespace = message.group().and_then(|group| group.writer_group_id);
+        let alike = namespace.is_some_and(|namespace| guard.is_alike(namespace, chunked_in));
+        !data || !alike
     }
 
     /// Gives up the messages whose chunks have not come in time.

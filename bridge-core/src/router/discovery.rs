@@ -321,6 +321,11 @@ impl Router {
             self.drop_undecoded(None, from, &DISCOVERY);
             return;
         };
+        let named = meta_data.name.and_then(split_name);
+        let namespace = named.map(|(topic, _)| topic.triple().1);
+        if self.guard.is_some() && self.is_unsaid(namespace, from) {
+            return;
+        }
         let Some(topic) = self.subject_of((*writer_id, *status), meta_data, (space, from), now)
         else {
             return;

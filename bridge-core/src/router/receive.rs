@@ -25,6 +25,7 @@ impl Router {
     /// A datagram came from the UA side. What its messages hold is queued; what is wrong with it is counted.
     pub fn handle_datagram(&mut self, datagram: &[u8], from: SocketAddr, now: Now) {
         match NetworkMessage::decode(datagram) {
+            Ok(message) if self.guard.is_some() => self.handle_guarded(&message, from, now),
             Ok(message) => self.handle_network_message(&message, from, now),
             Err(error) => self.drop_undecoded(None, from, &error),
         }

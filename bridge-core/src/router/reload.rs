@@ -28,6 +28,7 @@ impl Router {
     pub fn replace_mapping(&mut self, mapping: Arc<Mapping>, now: Now) {
         let before = std::mem::replace(&mut self.mapping, mapping);
         self.renew_chunks(before.pubsub());
+        self.renew_guard();
         let receive_timeout = self.mapping.pubsub().receive_timeout;
         if let Some(calls) = &mut self.calls {
             calls.set_receive_timeout(receive_timeout);

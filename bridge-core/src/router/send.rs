@@ -13,6 +13,19 @@ use crate::writer::Message;
 impl Router {
     /// The next thing to do, topic by topic in turn. `None`: nothing until the next `handle_*`.
     pub fn poll_output(&mut self, now: Now) -> Option<Output> {
+        loop {
+            let output = self.next_output(now)?;
+            if self.guard.is_none() {
+                return Some(output);
+            }
+            if let Some(output) = self.sealed(output) {
+                return Some(output);
+            }
+        }
+    }
+
+    /// As [`poll_output`](Self::poll_output), in clear.
+    fn next_output(&mut self, now: Now) -> Option<Output> {
         if let Some(told) = self.told.pop_front() {
             return Some(told);
         }

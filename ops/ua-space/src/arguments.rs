@@ -52,6 +52,13 @@ pub(crate) enum Verb {
     /// With `# yaml-language-server: $schema=PATH` as a mapping's first line, editors that know YAML schemas complete its
     /// keys and show what they mean.
     Schema,
+    /// Make a file with keys for a secured group, or change the one there is
+    ///
+    /// Only its owner can read it. Bring it to each host of the cell; `keys: {file: FILE}` under `security` in the mapping
+    /// names it. To change keys while everything runs: --next, bring it to all, --drop, bring it to all.
+    ///
+    /// Exit codes: 0 done, 64 usage, 65 a file that holds no keys, 74 a file that cannot be read or written, or is there.
+    Keys(MakeKeys),
     /// Show what a datagram, or each datagram of a capture, holds
     ///
     /// Reads a datagram as hexadecimal text or as its bytes, or the UDP datagrams of a pcap or pcapng file. One datagram
@@ -215,6 +222,31 @@ pub(crate) struct Explain {
     /// Such as M014
     #[arg(value_name = "CODE")]
     pub(crate) code: Option<Code>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct MakeKeys {
+    /// The file
+    #[arg(value_name = "FILE")]
+    pub(crate) file: PathBuf,
+    /// How long the keys for encryption are
+    #[arg(long, value_name = "POLICY", value_enum, default_value_t = KeyPolicy::Aes256)]
+    pub(crate) policy: KeyPolicy,
+    /// Put a new key behind those of the file
+    #[arg(long, conflicts_with_all = ["drop", "policy"])]
+    pub(crate) next: bool,
+    /// Take the first key out of the file, so that the second is used
+    #[arg(long, conflicts_with = "policy")]
+    pub(crate) drop: bool,
+}
+
+/// The SecurityPolicy of a group.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum KeyPolicy {
+    /// PubSub-Aes128-CTR
+    Aes128,
+    /// PubSub-Aes256-CTR
+    Aes256,
 }
 
 #[derive(Debug, Args)]

@@ -1,5 +1,6 @@
 //! Keys of secured messages, from a file.
 
+use std::io::Read as _;
 use std::path::Path;
 use std::time::Duration;
 
@@ -113,10 +114,25 @@ impl KeyFile {
         self.entries.iter().find(wanted).map(|entry| &entry.keys)
     }
 
+    /// The first key, with its SecurityTokenId.
+    pub(crate) fn first(&self) -> Option<(u32, &Keys)> {
+        let first = self.entries.first()?;
+        Some((first.written.security_token_id, &first.keys))
+    }
+
     pub(crate) fn name(&self) -> &str {
         &self.name
     }
 }
+
+/// Fills `bytes` with random ones.
+pub(crate) fn random(bytes: &mut [u8]) -> Result<(), Failure> {
+    std::fs::File::open(RANDOM)
+        .and_then(|mut random| random.read_exact(bytes))
+        .map_err(|error| Failure::reading(RANDOM, &error))
+}
+
+const RANDOM: &str = "/dev/urandom";
 
 /// Opens a message, into `scratch` if it is encrypted.
 pub(crate) fn open<'a>(

@@ -9,6 +9,7 @@ mod parameters;
 mod plain;
 mod prober;
 mod run;
+mod sealing;
 mod skills;
 mod text;
 mod trace;
@@ -28,6 +29,7 @@ use mappings::{PubSub, TopicId};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::time::Instant;
 use transport::{Options, Udp};
+use uadp::NetworkMessage;
 
 use crate::arguments::Group;
 use crate::exit::Failure;
@@ -35,6 +37,7 @@ use crate::report::warn;
 use crate::survey::look;
 use book::{Book, News};
 use prober::Prober;
+use sealing::Sealing;
 
 /// A place in the group.
 pub(crate) struct Live {
@@ -49,6 +52,8 @@ pub(crate) struct Live {
     interrupt: Signal,
     terminate: Signal,
     buffer: Vec<u8>,
+    /// Of a secured group.
+    sealing: Option<Sealing>,
     shown_group: SocketAddr,
 }
 
@@ -108,6 +113,10 @@ impl Live {
             interrupt: on(SignalKind::interrupt())?,
             terminate: on(SignalKind::terminate())?,
             buffer: vec![0; 65_536],
+            sealing: match &group.keys {
+                Some(path) => Some(Sealing::read(path, group.sign)?),
+                None => None,
+            },
             shown_group: address,
         })
     }
@@ -141,8 +150,18 @@ impl Live {
         self.prober.want(space, writer_id, self.start.elapsed());
     }
 
-    pub(crate) fn send(&self, datagram: &[u8]) {
-        if let Err(error) = self.udp.try_send(datagram) {
+    pub(crate) fn send(&mut self, datagram: &[u8]) {
+        let sealed = self.sealing.as_mut().map(|sealing| sealing.seal(datagram));
+        let sent = match sealed.transpose() {
+            Ok(sealed) => {
+                let datagram = sealed.as_deref().unwrap_or(datagram);
+                self.udp
+                    .try_send(datagram)
+                    .map_err(|error| error.to_string())
+            }
+            Err(error) => Err(error),
+        };
+        if let Err(error) = sent {
             warn(&format!("a datagram was not sent: {error}"));
         }
     }
@@ -186,7 +205,8 @@ impl Live {
                 let (length, from) = received
                     .map_err(|error| Failure::Io(format!("cannot hear the group: {error}")))?;
                 let datagram = self.buffer.get(..length).unwrap_or_default();
-                Ok(take(&mut self.book, (datagram, from), self.start.elapsed(), each))
+                let sealing = self.sealing.as_mut();
+                Ok(take((&mut self.book, sealing), (datagram, from), self.start.elapsed(), each))
             }
         }
     }
@@ -230,17 +250,27 @@ impl Live {
 
 /// Whether `each` has enough after a datagram.
 fn take(
-    book: &mut Book,
-    datagram: (&[u8], SocketAddr),
+    (book, sealing): (&mut Book, Option<&mut Sealing>),
+    (datagram, from): (&[u8], SocketAddr),
     now: Duration,
     each: &mut dyn FnMut(News<'_>, Duration) -> Go,
 ) -> Option<Ended> {
     let mut go = Go::On;
-    book.handle(datagram, now, &mut |news| {
+    let mut each = |news: News<'_>| {
         if go == Go::On {
             go = each(news, now);
         }
-    });
+    };
+    let Ok(message) = NetworkMessage::decode(datagram) else {
+        book.malformed();
+        return None;
+    };
+    let mut scratch = Vec::new();
+    let message = match sealing {
+        Some(sealing) => sealing.open(message, &mut scratch),
+        None => message,
+    };
+    book.handle((&message, from), now, &mut each);
     (go == Go::Enough).then_some(Ended::Enough)
 }
 

@@ -21,6 +21,7 @@ mod json_file;
 mod keys;
 mod layout;
 mod live;
+mod make_keys;
 mod messages;
 mod metadata;
 mod node_ids;
@@ -61,6 +62,7 @@ fn main() -> ExitCode {
         Verb::Init(arguments) => init::init(arguments),
         Verb::Explain(arguments) => explain::explain(arguments),
         Verb::Schema => explain::schema(),
+        Verb::Keys(arguments) => make_keys::make_keys(arguments),
         Verb::Decode(arguments) => session::decode(arguments),
         Verb::Encode(arguments) => session::encode(arguments),
         Verb::List(arguments) => live::list(arguments),

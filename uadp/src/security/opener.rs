@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::replay::{Accepted, StreamId, Streams};
 use super::ring::KeyRing;
 use super::{KeyError, Keys, Nonce, SIGNATURE, SecurityError, SecurityMode};
-use crate::{NetworkMessage, SecurityHeader};
+use crate::{NetworkMessage, NetworkMessageType, SecurityHeader};
 
 /// Opens the secured messages of one SecurityGroup (OPC 10000-14, 7.2.4.4.3).
 ///
@@ -69,9 +69,27 @@ pub struct OpenerOptions {
     /// (OPC 10000-14, 7.2.3). What was recorded of a publisher can be replayed when it was silent for as long; so by
     /// default this is `None`, and such a publisher is refused until there are new keys.
     pub forget_after: Option<Duration>,
+    /// Whose messages share a sequence; [`CountedBy::Publisher`] by default.
+    pub counted_by: CountedBy,
     /// Accept publishers that leave the sequence number at 1, as open62541 does up to version 1.5.7; `false` by
     /// default. Their messages are marked [`Opened::constant_sequence`] and can be replayed, bar the last one.
     pub accept_constant_sequence: bool,
+}
+
+/// Whose messages share a sequence.
+///
+/// Several programs may send with one PublisherId and WriterGroupId, each with sequence numbers of its own: those that
+/// ask for Actions do, with those of the responder, and those that probe. A sender that keeps the random half of its nonces
+/// for as long as it runs can be told from the others by it, since the signature covers the nonce. Nothing of it can be
+/// replayed either, as long as it is followed; and it may count anew when it restarts, with another random half.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum CountedBy {
+    /// Those of a PublisherId and WriterGroupId, as the standard has it (OPC 10000-14, 7.2.3).
+    Publisher,
+    /// As `Publisher`; of Actions, probes and announcements those of a sender.
+    PublisherOrSender,
+    /// Those of a sender. One that takes other random bytes for each message takes up a place with each.
+    Sender,
 }
 
 /// A message that was opened, and what to note about it.
@@ -95,6 +113,7 @@ impl Default for OpenerOptions {
             past_keys: 2,
             max_streams: 1024,
             forget_after: None,
+            counted_by: CountedBy::Publisher,
             accept_constant_sequence: false,
         }
     }
@@ -169,9 +188,12 @@ impl Opener {
         if !entry.keys.verify(parts.signed, parts.signature) {
             return Err(SecurityError::Signature);
         }
-        let accepted = entry
-            .state
-            .accept(stream_id(message), nonce, now, &self.options)?;
+        let accepted = entry.state.accept(
+            stream_id(message, nonce, self.options.counted_by),
+            nonce,
+            now,
+            &self.options,
+        )?;
         let body = match header.encrypted {
             true => decrypt(&entry.keys, nonce, parts.body, scratch)?,
             false => parts.body,
@@ -250,9 +272,21 @@ fn read_nonce(nonce: &[u8]) -> Result<Nonce, SecurityError> {
         .map_err(|_| SecurityError::NonceLength(nonce.len()))
 }
 
-fn stream_id<'a>(message: &NetworkMessage<'a>) -> StreamId<'a> {
+fn stream_id<'a>(
+    message: &NetworkMessage<'a>,
+    nonce: Nonce,
+    counted_by: CountedBy,
+) -> StreamId<'a> {
     let writer_group_id = message.group().and_then(|group| group.writer_group_id);
-    (message.publisher_id(), writer_group_id)
+    let by_sender = match counted_by {
+        CountedBy::Publisher => false,
+        CountedBy::PublisherOrSender => {
+            message.is_action() || message.message_type() != NetworkMessageType::DataSet
+        }
+        CountedBy::Sender => true,
+    };
+    let sender = by_sender.then_some(nonce.random);
+    (message.publisher_id(), writer_group_id, sender)
 }
 
 fn decrypt<'a>(

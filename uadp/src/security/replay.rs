@@ -12,13 +12,15 @@ pub(super) struct Streams {
     streams: Vec<Stream>,
 }
 
-/// Who counts: the sequence numbers of two of these have nothing to do with each other.
-pub(super) type StreamId<'a> = (Option<PublisherId<'a>>, Option<u16>);
+/// Who counts: the sequence numbers of two of these have nothing to do with each other. The last part is the random half of
+/// the nonce, where that tells the senders apart.
+pub(super) type StreamId<'a> = (Option<PublisherId<'a>>, Option<u16>, Option<[u8; 4]>);
 
 #[derive(Debug)]
 struct Stream {
     publisher: Publisher,
     writer_group_id: Option<u16>,
+    sender: Option<[u8; 4]>,
     window: Window,
     heard: Duration,
 }
@@ -89,7 +91,11 @@ impl Streams {
 }
 
 impl Stream {
-    fn new((publisher_id, writer_group_id): StreamId<'_>, nonce: Nonce, now: Duration) -> Self {
+    fn new(
+        (publisher_id, writer_group_id, sender): StreamId<'_>,
+        nonce: Nonce,
+        now: Duration,
+    ) -> Self {
         Self {
             publisher: match publisher_id {
                 None => Publisher::Unnamed,
@@ -100,6 +106,7 @@ impl Stream {
                 Some(PublisherId::String(id)) => Publisher::Named(id.into()),
             },
             writer_group_id,
+            sender,
             window: Window::new(nonce),
             heard: now,
         }
@@ -111,7 +118,7 @@ impl Stream {
             Publisher::Numbered(id) => Some(*id),
             Publisher::Named(id) => Some(PublisherId::String(id)),
         };
-        (publisher_id, self.writer_group_id)
+        (publisher_id, self.writer_group_id, self.sender)
     }
 
     /// Silent for so long that the publisher may count anew.

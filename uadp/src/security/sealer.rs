@@ -260,4 +260,4 @@ impl<'a> Seal<'a> {
 }
 
 /// Bytes of the SecurityHeader without SecurityFooterSize: flags, SecurityTokenId, NonceLength and nonce.
-const HEADER: usize = 1 + 4 + 1 + MESSAGE_NONCE;
+pub(super) const HEADER: usize = 1 + 4 + 1 + MESSAGE_NONCE;

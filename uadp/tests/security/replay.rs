@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use proptest::collection::vec;
 use proptest::prelude::*;
-use uadp::{OpenerOptions, PublisherId, SecurityError, SecurityMode};
+use uadp::{CountedBy, OpenerOptions, PublisherId, SecurityError, SecurityMode};
 
 use super::{START, keys, open, open_at, opener, opener_with, sealed, sealed_by};
 
@@ -212,4 +212,38 @@ proptest! {
             prop_assert_eq!(open(&mut opener, &sealed(1, number)), expected);
         }
     }
+}
+
+#[test]
+fn senders_that_share_a_publisher_id_are_told_apart_by_their_nonces() {
+    let by = |random: u8, sequence: u32| {
+        let keys = keys(1);
+        let nonce = super::nonce([random; 4], sequence);
+        let seal = uadp::Seal::with_nonce(&keys, 1, ENCRYPT, nonce);
+        let mut datagram = Vec::new();
+        let header = super::header(PublisherId::UInt16(2), Some(5));
+        super::write(&mut datagram, &header, seal).unwrap();
+        datagram
+    };
+    let options = OpenerOptions {
+        counted_by: CountedBy::Sender,
+        max_streams: 2,
+        ..OpenerOptions::default()
+    };
+    let mut opener = opener_with(options, ENCRYPT);
+    assert_eq!(open(&mut opener, &by(1, 5000)), Ok(false));
+    // Another run counts from 1.
+    assert_eq!(open(&mut opener, &by(2, 1)), Ok(false));
+    assert_eq!(open(&mut opener, &by(2, 2)), Ok(false));
+    for (random, sequence) in [(1, 5000), (2, 1), (2, 2)] {
+        let again = open(&mut opener, &by(random, sequence));
+        assert_eq!(again, Err(SecurityError::Replayed(sequence)));
+    }
+    let full = open(&mut opener, &by(3, 1));
+    assert_eq!(full, Err(SecurityError::TooManyPublishers));
+
+    let mut opener = opener_with(OpenerOptions::default(), ENCRYPT);
+    assert_eq!(open(&mut opener, &by(1, 5000)), Ok(false));
+    let restarted = open(&mut opener, &by(2, 1));
+    assert!(matches!(restarted, Err(SecurityError::TooOld { .. })));
 }

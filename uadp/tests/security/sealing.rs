@@ -236,3 +236,57 @@ fn several_messages_in_one_buffer_are_sealed_each_by_itself() {
         );
     }
 }
+
+#[test]
+fn a_message_secured_on_its_way_out_is_as_one_that_was_written_so() {
+    for mode in [SecurityMode::Sign, SecurityMode::SignAndEncrypt] {
+        let keys = keys(1);
+        let seal = || Seal::with_nonce(&keys, 1, mode, nonce([1, 2, 3, 4], 9));
+        let header = header(PublisherId::UInt16(2), Some(5));
+        let mut expected = Vec::new();
+        write(&mut expected, &header, seal()).unwrap();
+        // In clear, with and without a SecurityHeader that says so.
+        for security in [None, Some(SecurityHeader::NONE)] {
+            let extras = Extras {
+                security,
+                ..Extras::default()
+            };
+            let mut clear = Vec::new();
+            let mut message =
+                NetworkMessageEncoder::with(&mut clear, &header, Some(&[10]), &extras).unwrap();
+            let mut fields = message.key_frame(&DataSetHeader::default()).unwrap();
+            fields.scalar(uadp::Scalar::Int32(42)).unwrap();
+            fields.finish().unwrap();
+            message.finish().unwrap();
+            let mut out = vec![0xAA];
+            seal().secure(&clear, &mut out).unwrap();
+            assert_eq!(out[1..], expected, "{mode:?} {security:?}");
+            assert!(out.len() - 1 <= clear.len() + Seal::OVERHEAD);
+        }
+        // What is sealed already, or no message, is left alone.
+        for bad in [&expected[..], &[], &[0xF1], b"no message"] {
+            let mut out = vec![0xAA];
+            assert!(seal().secure(bad, &mut out).is_err());
+            assert_eq!(out, [0xAA]);
+        }
+    }
+}
+
+#[test]
+fn a_message_without_extended_flags_can_be_secured_too() {
+    // PublisherId 2 as Byte, and one DataSetMessage without anything.
+    let clear = [0x11, 2, 0x01, 0, 0];
+    let mut sealer = Sealer::new(SecurityMode::SignAndEncrypt);
+    sealer.update_keys(1, [keys(1)]).unwrap();
+    let mut out = Vec::new();
+    let seal = sealer.seal([5; 4]).unwrap();
+    seal.secure(&clear, &mut out).unwrap();
+    assert_eq!(out.len(), clear.len() + Seal::OVERHEAD);
+    let mut opener = Opener::new(SecurityMode::SignAndEncrypt);
+    opener.update_keys(1, [keys(1)]).unwrap();
+    let message = NetworkMessage::decode(&out).unwrap();
+    let mut scratch = Vec::new();
+    let opened = opener.open(&message, START, &mut scratch).unwrap();
+    assert_eq!(opened.message.publisher_id(), Some(PublisherId::Byte(2)));
+    assert_eq!(opened.message.payload(), &clear[2..]);
+}

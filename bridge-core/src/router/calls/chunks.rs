@@ -141,7 +141,7 @@ impl Large {
 impl Router {
     /// Bytes of a datagram.
     pub(super) fn most(&self) -> usize {
-        self.mapping.pubsub().max_datagram.into()
+        self.sizes().0.into()
     }
 
     /// Takes in a request or response that fits no datagram.

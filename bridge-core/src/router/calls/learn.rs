@@ -144,6 +144,9 @@ impl Router {
             return self.count(About::sender(from), Reason::NotInSpace, 1, String::new);
         };
         let (_, namespace, _) = topic.triple();
+        if self.guard.is_some() && self.is_unsaid(Some(namespace), from) {
+            return;
+        }
         if self.is_home(topic) {
             return self.drop_own(Some(namespace), from, now);
         }

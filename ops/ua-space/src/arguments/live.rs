@@ -1,6 +1,7 @@
 //! The words of the verbs that look into a running space.
 
 use std::fmt;
+use std::path::PathBuf;
 use std::str::FromStr;
 
 use clap::Args;
@@ -15,6 +16,13 @@ pub(crate) struct Group {
     /// The PubSub group, as opc.udp://239.192.0.40:4840
     #[arg(long, value_name = "URL", env = "UA_ADDRESS")]
     pub(crate) address: Option<String>,
+    /// The keys of a secured group, as `ua-space keys` makes them and `decode` takes them: messages are opened with them, and
+    /// what is sent is sealed with the first
+    #[arg(long, value_name = "FILE", env = "UA_KEYS")]
+    pub(crate) keys: Option<PathBuf>,
+    /// What is sent is signed alone, as of a group of `mode: sign`
+    #[arg(long, requires = "keys")]
+    pub(crate) sign: bool,
 }
 
 #[derive(Debug, Args)]

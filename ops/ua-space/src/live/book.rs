@@ -123,16 +123,18 @@ impl Book {
         }
     }
 
+    /// A datagram was none of UADP.
+    pub(crate) fn malformed(&mut self) {
+        self.count(Drop::Malformed);
+    }
+
     /// Takes a datagram; `each` is given what is in it that passes by.
     pub(crate) fn handle(
         &mut self,
-        (datagram, from): (&[u8], SocketAddr),
+        (message, from): (&NetworkMessage<'_>, SocketAddr),
         now: Duration,
         each: &mut dyn FnMut(News<'_>),
     ) {
-        let Ok(message) = NetworkMessage::decode(datagram) else {
-            return self.count(Drop::Malformed);
-        };
         if message.message_type() == NetworkMessageType::Probe {
             return;
         }
@@ -140,19 +142,19 @@ impl Book {
             return self.count(Drop::NotInSpace);
         };
         if message.is_action() && !message.is_sealed() {
-            return self.actions(&message, each);
+            return self.actions(message, each);
         }
         if message.is_chunk() && !message.is_sealed() {
-            return self.chunk(&message, (space, from), now, each);
+            return self.chunk(message, (space, from), now, each);
         }
         if message.message_type() == NetworkMessageType::Announcement {
-            match Announcement::decode(&message) {
+            match Announcement::decode(message) {
                 Ok(announcement) => self.announcement(&announcement, (space, from), now, each),
                 Err(_) => self.count(Drop::Malformed),
             }
             return;
         }
-        self.data(&message, (space, from), now, each);
+        self.data(message, (space, from), now, each);
     }
 
     /// Topics of which values or signs of life were heard.

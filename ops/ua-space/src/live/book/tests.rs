@@ -81,7 +81,8 @@ fn describes(writer_id: u16, name: &str, status: StatusCode) -> Vec<u8> {
 }
 
 fn take(book: &mut Book, datagram: &[u8], port: u16) {
-    book.handle((datagram, from(port)), NOW, &mut |_| {});
+    let message = NetworkMessage::decode(datagram).unwrap();
+    book.handle((&message, from(port)), NOW, &mut |_| {});
 }
 
 fn name(book: &Book, of: &str) -> Option<String> {
@@ -198,7 +199,8 @@ fn a_call_is_known_by_its_name_with_what_may_be_left_out_of_it() {
     let mut book = Book::new();
     let mut heard = Vec::new();
     for port in [1, 1, 2] {
-        book.handle((&datagram, from(port)), NOW, &mut |news| {
+        let message = NetworkMessage::decode(&datagram).unwrap();
+        book.handle((&message, from(port)), NOW, &mut |news| {
             if let News::Announced(topic, kind, described) = news {
                 heard.push((topic, kind, described.summary()));
             }

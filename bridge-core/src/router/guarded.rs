@@ -1,0 +1,183 @@
+//! What is heard and sent in secured groups.
+
+use std::net::SocketAddr;
+
+use uadp::{KeyError, NetworkMessage};
+
+use super::{About, Router};
+use crate::guard::{GroupState, Guard, KeyDelivery, Unopened};
+use crate::output::Output;
+use crate::settings::Now;
+
+impl Router {
+    /// Gives a secured group its keys. Those of a group that is not in the mapping are not kept.
+    ///
+    /// # Errors
+    /// [`KeyError`]; the keys there were stay.
+    pub fn set_keys(
+        &mut self,
+        group: &str,
+        delivery: &KeyDelivery,
+        now: Now,
+    ) -> Result<(), KeyError> {
+        match &mut self.guard {
+            Some(guard) => guard.set_keys(group, delivery, now.monotonic),
+            None => Ok(()),
+        }
+    }
+
+    /// How each secured group is.
+    pub fn groups(&self) -> impl Iterator<Item = GroupState> {
+        self.guard.iter().flat_map(|guard| guard.states())
+    }
+
+    /// Whether what is said in a namespace needs keys.
+    pub(super) fn is_secured(&self, namespace: u16) -> bool {
+        let guard = self.guard.as_ref();
+        guard.is_some_and(|guard| guard.is_secured(namespace))
+    }
+
+    /// Follows the groups of the mapping.
+    pub(super) fn renew_guard(&mut self) {
+        let groups = self.mapping.security();
+        match &mut self.guard {
+            Some(guard) => {
+                if !guard.replace(groups) {
+                    self.guard = None;
+                }
+            }
+            None => {
+                self.guard = Guard::new(groups).map(Box::new);
+                self.mark_guard();
+            }
+        }
+    }
+
+    /// Gives the guard its random bytes, where there are any.
+    pub(super) fn mark_guard(&mut self) {
+        let [a, b, c, d, ..] = self.instance;
+        let random = self.instance.iter().any(|byte| *byte != 0);
+        if let Some(guard) = self.guard.as_mut().filter(|_| random) {
+            guard.set_mark([a, b, c, d]);
+        }
+    }
+
+    /// A datagram where there are secured groups.
+    pub(super) fn handle_guarded(
+        &mut self,
+        message: &NetworkMessage<'_>,
+        from: SocketAddr,
+        now: Now,
+    ) {
+        // Our own, heard again: to open it would cost as much as one of others.
+        if message.is_sealed() && self.settings.source.is_some() && self.is_source(from) {
+            let about = About::sender(from);
+            self.count(about, crate::Reason::Looped, 1, String::new);
+            return;
+        }
+        let mut scratch = self.buffer();
+        let opened = match &mut self.guard {
+            Some(guard) => guard.open(message, now.monotonic, &mut scratch),
+            None => Ok(None),
+        };
+        match opened {
+            Ok(Some(opened)) => {
+                self.in_clear = false;
+                self.handle_network_message(&opened, from, now);
+            }
+            Ok(None) => {
+                self.in_clear = true;
+                self.handle_network_message(message, from, now);
+            }
+            Err(Unopened {
+                reason,
+                case,
+                detail,
+            }) => self.count(About::sender(from), (reason, case), 1, || detail),
+        }
+        self.recycle(scratch);
+        self.want_keys(now);
+    }
+
+    pub(super) fn want_keys(&mut self, now: Now) {
+        let guard = self.guard.as_mut();
+        if let Some(group) = guard.and_then(|guard| guard.wanted(now.monotonic)) {
+            self.tell(Output::KeysWanted { group });
+        }
+    }
+
+    /// Whether what was just heard says it in clear of a namespace that is secured, which is counted.
+    pub(super) fn is_unsaid(&mut self, namespace: Option<u16>, from: SocketAddr) -> bool {
+        let secured = namespace.is_none_or(|namespace| self.is_secured(namespace));
+        let unsaid = self.in_clear && secured;
+        if unsaid {
+            let cause = (crate::Reason::Unsecured, "announcement");
+            self.count(About::sender(from), cause, 1, || match namespace {
+                Some(namespace) => {
+                    format!("it says in clear what is in namespace {namespace}, which is secured")
+                }
+                None => "it says in clear what there is, and there are secured groups".to_owned(),
+            });
+        }
+        unsaid
+    }
+
+    /// Seals what goes out; `None` for what cannot be sent, which is counted.
+    #[expect(
+        clippy::wildcard_enum_match_arm,
+        reason = "all but datagrams are for this program"
+    )]
+    pub(super) fn sealed(&mut self, output: Output) -> Option<Output> {
+        let guard = self.guard.as_mut()?;
+        let (bytes, topic) = match &output {
+            Output::Datagram { topic, bytes, .. } | Output::Action { topic, bytes } => {
+                (bytes, Some(*topic))
+            }
+            Output::Discovery { bytes } => (bytes, None),
+            _ => return Some(output),
+        };
+        let mut sealed = self.spare.pop().unwrap_or_default();
+        match guard.seal(bytes, &mut sealed) {
+            Ok(false) => {
+                self.recycle(sealed);
+                Some(output)
+            }
+            Ok(true) => {
+                let (clear, output) = match output {
+                    Output::Datagram { topic, with, bytes } => {
+                        let bytes_out = sealed;
+                        (
+                            bytes,
+                            Output::Datagram {
+                                topic,
+                                with,
+                                bytes: bytes_out,
+                            },
+                        )
+                    }
+                    Output::Action { topic, bytes } => (
+                        bytes,
+                        Output::Action {
+                            topic,
+                            bytes: sealed,
+                        },
+                    ),
+                    Output::Discovery { bytes } => (bytes, Output::Discovery { bytes: sealed }),
+                    other => (sealed, other),
+                };
+                self.recycle(clear);
+                Some(output)
+            }
+            Err(Unopened {
+                reason,
+                case,
+                detail,
+            }) => {
+                self.recycle(sealed);
+                let about = About { topic, from: None };
+                self.count(about, (reason, case), 1, || detail);
+                None
+            }
+        }
+    }
+}

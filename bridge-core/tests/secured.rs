@@ -1,0 +1,350 @@
+//! Secured groups between Routers: who has the keys is heard, and nobody else.
+#![expect(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::wildcard_enum_match_arm,
+    reason = "test code"
+)]
+
+mod cell;
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge_core::{
+    AskId, CallDescription, CallField, CallRole, Executed, KeyDelivery, Local, Offered, Reason,
+};
+use cell::{Cell, Program, component, ms, topic};
+use mappings::{Mapping, TopicId};
+use proptest::prelude::*;
+use uadp::{BuiltinType, Keys, NetworkMessage, Scalar, SecurityPolicy, Variant};
+
+const WRITER: usize = 0;
+const READER: usize = 1;
+/// One that has no key, or another.
+const THIRD: usize = 2;
+
+const ENCRYPTED: &str = "security: [{group: cell, keys: {file: k}}]";
+const SIGNED: &str = "security: [{group: cell, mode: sign, keys: {file: k}}]";
+/// Namespace 9 is for everybody.
+const MIXED: &str =
+    "security: [{group: cell, keys: {file: k}}, {group: all, mode: none, namespaces: [9]}]";
+
+fn key(byte: u8) -> Keys {
+    Keys::from_bytes(SecurityPolicy::PubSubAes256Ctr, &[byte; 68]).unwrap()
+}
+
+fn delivery(first_token_id: u32, keys: &[u8]) -> KeyDelivery {
+    KeyDelivery {
+        first_token_id,
+        keys: keys.iter().map(|byte| key(*byte)).collect(),
+        time_to_next: None,
+        lifetime: Duration::ZERO,
+    }
+}
+
+/// A program of that mapping.
+fn follows(cell: &mut Cell, at: usize, yaml: &str) {
+    let mapping = Mapping::from_yaml(yaml, "cell.yaml").mapping.unwrap();
+    let now = cell.now();
+    cell.programs[at]
+        .router
+        .replace_mapping(Arc::new(mapping), now);
+}
+
+fn give(cell: &mut Cell, at: usize, delivery: &KeyDelivery) {
+    let now = cell.now();
+    cell.programs[at]
+        .router
+        .set_keys("cell", delivery, now)
+        .unwrap();
+}
+
+/// Components of the namespaces 7, 8 and 9 that speak in fields; the first two have the key.
+fn secured(yaml: &str) -> Cell {
+    let mut cell = Cell::new(vec![component(7), component(8), component(9)]);
+    for at in [WRITER, READER] {
+        follows(&mut cell, at, yaml);
+        give(&mut cell, at, &delivery(1, &[1]));
+    }
+    cell
+}
+
+fn said() -> TopicId {
+    topic(0, 7, 10)
+}
+
+/// The newest value a program got.
+fn last(cell: &mut Cell, at: usize, topic: TopicId) -> Option<String> {
+    cell.texts(at, topic).pop()
+}
+
+#[test]
+fn who_has_the_key_hears_and_who_has_none_neither_hears_nor_is_heard() {
+    for yaml in [ENCRYPTED, SIGNED] {
+        let mut cell = secured(yaml);
+        cell.say(WRITER, said(), "secret");
+        cell.run(ms(100));
+        assert_eq!(last(&mut cell, READER, said()).as_deref(), Some("secret"));
+        assert_eq!(last(&mut cell, THIRD, said()), None, "{yaml}");
+        let forged = topic(0, 9, 10);
+        cell.say(THIRD, forged, "forged");
+        cell.run(ms(100));
+        assert_eq!(last(&mut cell, READER, forged), None);
+        assert!(cell.dropped(READER, Reason::Unsecured) > 0);
+        assert_eq!(cell.dropped(READER, Reason::Signature), 0);
+        let clear = cell.datagrams_of(WRITER);
+        let encrypted = !clear.iter().any(|datagram| contains(datagram, b"secret"));
+        assert_eq!(encrypted, yaml == ENCRYPTED);
+        for datagram in clear {
+            assert!(NetworkMessage::decode(&datagram).unwrap().is_sealed());
+        }
+    }
+}
+
+fn contains(bytes: &[u8], part: &[u8]) -> bool {
+    bytes.windows(part.len()).any(|window| window == part)
+}
+
+#[test]
+fn what_is_wrong_with_a_message_is_counted_by_its_reason() {
+    for (yaml, given, reason) in [
+        (ENCRYPTED, delivery(1, &[2]), Reason::Signature),
+        (ENCRYPTED, delivery(5, &[1]), Reason::UnknownKey),
+        (SIGNED, delivery(1, &[1]), Reason::Downgraded),
+    ] {
+        let mut cell = secured(ENCRYPTED);
+        follows(&mut cell, THIRD, yaml);
+        give(&mut cell, THIRD, &given);
+        let forged = topic(0, 9, 10);
+        cell.say(THIRD, forged, "forged");
+        cell.run(ms(100));
+        assert_eq!(last(&mut cell, READER, forged), None, "{reason}");
+        assert!(cell.dropped(READER, reason) > 0, "{reason}");
+        assert_eq!(cell.dropped(READER, Reason::Unsecured), 0);
+    }
+}
+
+#[test]
+fn what_was_recorded_is_refused_also_after_its_sender_restarted() {
+    let mut cell = secured(ENCRYPTED);
+    cell.say(WRITER, said(), "old");
+    cell.run(ms(50));
+    assert_eq!(last(&mut cell, READER, said()).as_deref(), Some("old"));
+    let recorded = cell.datagrams_of(WRITER);
+    let from = cell.programs[WRITER].address;
+    // Another run has other random bytes, and counts from 1.
+    let mut instance = [9; 16];
+    instance[0] = 77;
+    cell.start(WRITER, component(7));
+    cell.programs[WRITER].router.set_instance(instance);
+    follows(&mut cell, WRITER, ENCRYPTED);
+    give(&mut cell, WRITER, &delivery(1, &[1]));
+    cell.say(WRITER, said(), "new");
+    cell.run(ms(3_500));
+    assert_eq!(last(&mut cell, READER, said()).as_deref(), Some("new"));
+    for datagram in &recorded {
+        cell.hear(READER, datagram, from);
+    }
+    let refused = cell.dropped(READER, Reason::Replayed);
+    assert_eq!(refused, recorded.len() as u64);
+    assert_eq!(last(&mut cell, READER, said()), None);
+}
+
+#[test]
+fn keys_change_while_values_run_and_none_is_lost() {
+    let mut cell = secured(ENCRYPTED);
+    let mut delivered = delivery(1, &[1, 2, 3, 4]);
+    delivered.time_to_next = Some(ms(200));
+    delivered.lifetime = ms(200);
+    give(&mut cell, WRITER, &delivered);
+    cell.run(ms(30));
+    give(&mut cell, READER, &delivered);
+    let mut tokens = Vec::new();
+    for number in 0..60 {
+        let text = number.to_string();
+        cell.say(WRITER, said(), &text);
+        cell.run(ms(10));
+        assert_eq!(last(&mut cell, READER, said()), Some(text));
+        let token = cell.programs[WRITER]
+            .router
+            .groups()
+            .next()
+            .unwrap()
+            .token_id;
+        tokens.push(token.unwrap());
+    }
+    tokens.dedup();
+    assert_eq!(tokens, [1, 2, 3, 4]);
+    // Nobody hands out more: the last one goes on, and that is told.
+    cell.run(ms(1_000));
+    cell.say(WRITER, said(), "late");
+    cell.run(ms(10));
+    assert_eq!(last(&mut cell, READER, said()).as_deref(), Some("late"));
+    let state = cell.programs[WRITER].router.groups().next().unwrap();
+    assert_eq!((state.token_id, state.overdue), (Some(4), true));
+    let wanted = cell.outputs(WRITER);
+    let wanted = wanted.iter().any(
+        |output| matches!(output, bridge_core::Output::KeysWanted { group } if group == "cell"),
+    );
+    assert!(wanted);
+}
+
+#[test]
+fn without_keys_nothing_is_said_and_what_was_said_last_comes_with_them() {
+    let mut cell = secured(ENCRYPTED);
+    cell.start(WRITER, component(7));
+    follows(&mut cell, WRITER, ENCRYPTED);
+    cell.say(WRITER, said(), "early");
+    cell.run(ms(100));
+    assert_eq!(last(&mut cell, READER, said()), None);
+    assert!(cell.datagrams_of(WRITER).is_empty());
+    assert!(cell.dropped(WRITER, Reason::NoKeys) > 0);
+    give(&mut cell, WRITER, &delivery(1, &[1]));
+    cell.run(ms(1_500));
+    assert_eq!(last(&mut cell, READER, said()).as_deref(), Some("early"));
+}
+
+#[test]
+fn a_namespace_for_everybody_stays_so_beside_a_secured_one() {
+    let mut cell = secured(MIXED);
+    let open = topic(0, 9, 10);
+    cell.say(THIRD, open, "hello");
+    cell.say(WRITER, said(), "secret");
+    cell.run(ms(100));
+    assert_eq!(last(&mut cell, READER, open).as_deref(), Some("hello"));
+    assert_eq!(last(&mut cell, READER, said()).as_deref(), Some("secret"));
+    // What it says of another namespace is not believed.
+    let forged = topic(0, 4, 10);
+    cell.programs[THIRD] = component(4);
+    cell.say(THIRD, forged, "forged");
+    cell.run(ms(100));
+    assert_eq!(last(&mut cell, READER, forged), None);
+    assert!(cell.dropped(READER, Reason::Unsecured) > 0);
+}
+
+fn start() -> TopicId {
+    topic(0, 7, 105)
+}
+
+fn offer(cell: &mut Cell) {
+    let description = CallDescription {
+        name: "gripper.Grasp.Start".to_owned(),
+        about: String::new(),
+        role: CallRole::Call,
+        request: vec![CallField::scalar("Text", BuiltinType::String)],
+        response: vec![CallField::scalar("Text", BuiltinType::String)],
+    };
+    let offered = Offered {
+        description,
+        open: false,
+    };
+    cell.offer(WRITER, start(), offered);
+    cell.run(ms(300));
+}
+
+/// Has a program ask; what it is answered, where it is.
+fn ask(cell: &mut Cell, at: usize, text: &str) -> Option<Vec<u8>> {
+    let request = cell::block(&[Variant::Scalar(Scalar::String(Some(text)))]);
+    cell.ask(at, AskId(1), (start(), &request), ms(2_000));
+    cell.run(ms(500));
+    for execution in cell.executions(WRITER) {
+        cell.executed(WRITER, execution.id, Executed::Answered(execution.request));
+    }
+    cell.run(ms(3_000));
+    cell.answers(at).pop().and_then(|(_, answer)| answer.ok())
+}
+
+#[test]
+fn a_call_is_executed_for_who_has_the_key_wherever_it_is_and_for_nobody_else() {
+    let mut cell = secured(ENCRYPTED);
+    // Another host.
+    cell.programs[READER].address = "192.0.2.7:4000".parse().unwrap();
+    cell.programs[THIRD].address = "192.0.2.8:4000".parse().unwrap();
+    offer(&mut cell);
+    assert_eq!(cell.known(READER), [start()]);
+    assert!(cell.known(THIRD).is_empty());
+    let large = "x".repeat(200_000);
+    for text in ["short", &large] {
+        let answer = ask(&mut cell, READER, text);
+        let expected = cell::block(&[Variant::Scalar(Scalar::String(Some(text)))]);
+        assert_eq!(answer, Some(expected));
+    }
+    assert_eq!(cell.counters(WRITER, start()).executed, 2);
+    assert_eq!(ask(&mut cell, THIRD, "forged"), None);
+    assert_eq!(cell.counters(WRITER, start()).executed, 2);
+}
+
+#[test]
+fn without_a_secured_group_a_call_of_another_host_stays_refused() {
+    let mut cell = Cell::new(vec![component(7), component(8), component(9)]);
+    cell.programs[READER].address = "192.0.2.7:4000".parse().unwrap();
+    offer(&mut cell);
+    assert_eq!(ask(&mut cell, READER, "short"), None);
+    assert_eq!(cell.counters(WRITER, start()).executed, 0);
+}
+
+#[test]
+fn a_group_that_is_no_longer_secured_speaks_in_clear_after_a_reload() {
+    let mut cell = secured(ENCRYPTED);
+    for at in [WRITER, READER] {
+        follows(&mut cell, at, "");
+    }
+    cell.say(WRITER, said(), "plain");
+    cell.run(ms(100));
+    assert_eq!(last(&mut cell, THIRD, said()).as_deref(), Some("plain"));
+    // And a group that is as it was keeps its keys.
+    let mut cell = secured(ENCRYPTED);
+    let other = "security: [{group: cell, namespaces: [7, 8], keys: {file: other}}]";
+    follows(&mut cell, WRITER, other);
+    cell.say(WRITER, said(), "still");
+    cell.run(ms(100));
+    assert_eq!(last(&mut cell, READER, said()).as_deref(), Some("still"));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(200))]
+
+    /// Whoever has no key changes, cuts or repeats what it heard, and nothing comes of it.
+    #[test]
+    fn nothing_that_was_changed_is_believed(
+        text in "[a-z]{1,40}",
+        changes in proptest::collection::vec((any::<proptest::sample::Index>(), 1_u8.., any::<bool>()), 1..6),
+        signed in any::<bool>(),
+    ) {
+        let yaml = if signed { SIGNED } else { ENCRYPTED };
+        let mut cell = secured(yaml);
+        cell.say(WRITER, said(), &text);
+        cell.run(ms(20));
+        prop_assert_eq!(last(&mut cell, READER, said()), Some(text));
+        let from = "192.0.2.9:4000".parse().unwrap();
+        let topics = cell.programs[READER].router.topics().count();
+        for datagram in cell.datagrams_of(WRITER) {
+            for (place, by, cut) in &changes {
+                let mut changed = datagram.clone();
+                let at = place.index(changed.len());
+                match cut {
+                    true => changed.truncate(at),
+                    false => changed[at] ^= by,
+                }
+                cell.hear(READER, &changed, from);
+            }
+        }
+        cell.run(ms(20));
+        prop_assert_eq!(last(&mut cell, READER, said()), None);
+        prop_assert_eq!(cell.programs[READER].router.topics().count(), topics);
+        prop_assert!(cell.known(READER).is_empty());
+    }
+}
+
+#[test]
+fn bridges_of_both_ros_are_as_closed() {
+    let mut cell = Cell::new(vec![component(7), Program::new(1, Local::Ros1)]);
+    for at in [WRITER, READER] {
+        follows(&mut cell, at, ENCRYPTED);
+        give(&mut cell, at, &delivery(1, &[1]));
+    }
+    offer(&mut cell);
+    assert_eq!(cell.known(READER), [start()]);
+}

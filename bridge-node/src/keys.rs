@@ -1,0 +1,224 @@
+//! The keys of secured groups: read from files, looked at again from time to time, and fetched from Security Key Services.
+
+mod fetch;
+mod file;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use bridge_core::{KeyDelivery, Router};
+use mappings::{KeySource, Mapping, SecurityGroup};
+use tokio::sync::{mpsc, watch};
+use tokio::time::{MissedTickBehavior, interval};
+use tracing::{info, warn};
+
+pub use self::fetch::{Fetched, Fetching, KeyRequest, KeyService};
+use crate::clock::now;
+use crate::exit::{Failure, FailureKind};
+
+/// New keys of a group.
+#[derive(Debug)]
+pub(crate) struct NewKeys {
+    pub(crate) group: String,
+    pub(crate) delivery: KeyDelivery,
+}
+
+/// Where a run loop has its keys from.
+#[derive(Debug)]
+pub(crate) struct KeyRing {
+    /// The groups in place of those of the mapping, where the command line says so.
+    groups: Option<Vec<SecurityGroup>>,
+    /// What the keepers bring.
+    incoming: mpsc::Receiver<NewKeys>,
+    outgoing: mpsc::Sender<NewKeys>,
+    service: Option<Arc<dyn KeyService>>,
+    /// The keepers of the groups there are; each ends when its sender goes.
+    keepers: BTreeMap<String, Keeper>,
+}
+
+#[derive(Debug)]
+struct Keeper {
+    group: SecurityGroup,
+    wanted: watch::Sender<u64>,
+}
+
+impl KeyRing {
+    pub(crate) fn new(
+        groups: Option<Vec<SecurityGroup>>,
+        service: Option<Arc<dyn KeyService>>,
+    ) -> Self {
+        let (outgoing, incoming) = mpsc::channel(WAITING);
+        Self {
+            groups,
+            incoming,
+            outgoing,
+            service,
+            keepers: BTreeMap::new(),
+        }
+    }
+
+    /// The mapping with the groups of the command line, if that has any.
+    pub(crate) fn applied(&self, mapping: Arc<Mapping>) -> Arc<Mapping> {
+        match &self.groups {
+            Some(groups) => {
+                let mapping = Mapping::clone(&mapping);
+                Arc::new(mapping.with_security(groups.clone()))
+            }
+            None => mapping,
+        }
+    }
+
+    /// Reads the keys that stand in files, and begins to look after those of each group.
+    ///
+    /// # Errors
+    /// When a file is not there or not to be used: the program would hear and say nothing.
+    pub(crate) fn start(&mut self, mapping: &Mapping, router: &mut Router) -> Result<(), Failure> {
+        for group in mapping.security() {
+            if let Some(path) = path_of(group) {
+                let delivery = file::read(&path?, group)?;
+                give(router, &group.id, &delivery);
+            }
+        }
+        self.follow(mapping);
+        Ok(())
+    }
+
+    /// Looks after the keys of the groups of a mapping from now on. Those of files are read by their keepers.
+    pub(crate) fn follow(&mut self, mapping: &Mapping) {
+        let groups = mapping.security();
+        let stays = |keeper: &Keeper| groups.contains(&keeper.group);
+        self.keepers.retain(|_, keeper| stays(keeper));
+        for group in groups {
+            if group.keys.is_some() && !self.keepers.contains_key(&group.id) {
+                let (wanted, wants) = watch::channel(0);
+                let keeper = Keeper {
+                    group: group.clone(),
+                    wanted,
+                };
+                self.keepers.insert(group.id.clone(), keeper);
+                let out = self.outgoing.clone();
+                match (&group.keys, &self.service) {
+                    (Some(KeySource::Own(_) | KeySource::Sks(_)), Some(service)) => {
+                        let service = Arc::clone(service);
+                        drop(tokio::spawn(fetch::keep(
+                            group.clone(),
+                            service,
+                            (out, wants),
+                        )));
+                    }
+                    (Some(KeySource::Own(_) | KeySource::Sks(_)), None) => warn!(
+                        group = group.id,
+                        "this program fetches no keys from a Security Key Service: nothing is said or heard in the group"
+                    ),
+                    (Some(KeySource::File(_) | KeySource::Credential(_)) | None, _) => {
+                        drop(tokio::spawn(watch_file(group.clone(), (out, wants))));
+                    }
+                }
+            }
+        }
+    }
+
+    /// The next keys that are new. Whoever drops it before loses none.
+    pub(crate) async fn next(&mut self) -> Option<NewKeys> {
+        self.incoming.recv().await
+    }
+
+    /// The keys of a group are out of date.
+    pub(crate) fn want(&self, group: &str) {
+        if let Some(keeper) = self.keepers.get(group) {
+            keeper.wanted.send_modify(|count| *count += 1);
+        }
+    }
+}
+
+/// Gives a group its keys.
+pub(crate) fn give(router: &mut Router, group: &str, delivery: &KeyDelivery) {
+    match router.set_keys(group, delivery, now()) {
+        Ok(()) => info!(
+            group,
+            token = delivery.first_token_id,
+            keys = delivery.keys.len(),
+            "keys of a secured group"
+        ),
+        Err(error) => warn!(group, %error, "keys of a secured group are not taken"),
+    }
+}
+
+/// The file with the keys of a group, if they are in one.
+fn path_of(group: &SecurityGroup) -> Option<Result<PathBuf, Failure>> {
+    match group.keys.as_ref()? {
+        KeySource::File(path) => Some(Ok(path.clone())),
+        KeySource::Credential(name) => Some(credential(name)),
+        KeySource::Own(_) | KeySource::Sks(_) => None,
+    }
+}
+
+/// Where systemd puts the credentials of a service.
+fn credential(name: &str) -> Result<PathBuf, Failure> {
+    let folder = std::env::var_os("CREDENTIALS_DIRECTORY").ok_or_else(|| {
+        let message = format!(
+            "the keys are in the credential {name}, and CREDENTIALS_DIRECTORY is not set: is the program started by \
+             systemd, with LoadCredential={name}:FILE?"
+        );
+        Failure::new(FailureKind::Configuration, message)
+    })?;
+    Ok(Path::new(&folder).join(name))
+}
+
+/// Looks at a file from time to time, and brings what it has when it is another.
+async fn watch_file(
+    group: SecurityGroup,
+    (out, mut wants): (mpsc::Sender<NewKeys>, watch::Receiver<u64>),
+) {
+    let Some(Ok(path)) = path_of(&group) else {
+        return;
+    };
+    let mut looks = interval(LOOK);
+    looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut before: Option<Seen> = None;
+    loop {
+        tokio::select! {
+            _ = looks.tick() => {}
+            changed = wants.changed() => if changed.is_err() {
+                return;
+            },
+        }
+        let seen = seen(&path);
+        // At first too: a reload may have brought the group.
+        if seen == before {
+            continue;
+        }
+        before = seen;
+        if let Some(delivery) = read_again(&path, &group) {
+            let group = group.id.clone();
+            if out.send(NewKeys { group, delivery }).await.is_err() {
+                return;
+            }
+        }
+    }
+}
+
+fn read_again(path: &Path, group: &SecurityGroup) -> Option<KeyDelivery> {
+    match file::read(path, group) {
+        Ok(delivery) => Some(delivery),
+        Err(failure) => {
+            warn!("{failure}; the keys there were stay in use");
+            None
+        }
+    }
+}
+
+/// When a file was written, and how long it is.
+type Seen = (Option<SystemTime>, u64);
+
+fn seen(path: &Path) -> Option<Seen> {
+    let about = std::fs::metadata(path).ok()?;
+    Some((about.modified().ok(), about.len()))
+}
+
+/// Keys that wait to be taken.
+const WAITING: usize = 16;
+/// How often a file is looked at.
+const LOOK: Duration = Duration::from_secs(1);

@@ -1,0 +1,241 @@
+//! A file with keys: a JSON list of them, the one that is used first.
+
+use std::fs::File;
+use std::io::Read as _;
+use std::os::unix::fs::PermissionsExt as _;
+use std::path::Path;
+use std::time::Duration;
+
+use bridge_core::{KeyDelivery, policy_of};
+use mappings::{KeySource, SecurityGroup};
+use serde::Deserialize;
+use uadp::{Keys, SecurityPolicy};
+
+use crate::exit::{Failure, FailureKind};
+
+/// One key of a SecurityGroup, in its parts; those of text are hexadecimal.
+#[derive(Deserialize)]
+#[serde(rename_all = "camelCase", deny_unknown_fields)]
+struct Written {
+    /// SecurityPolicyUri.
+    policy: String,
+    security_token_id: u32,
+    signing_key: String,
+    encrypting_key: String,
+    key_nonce: String,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum OneOrMany {
+    Many(Vec<Written>),
+    One(Written),
+}
+
+/// The keys of a group, in the order of the file.
+///
+/// # Errors
+/// When the file cannot be read, others can read it too, or what stands in it are no keys of the group. No key is told.
+pub(super) fn read(path: &Path, group: &SecurityGroup) -> Result<KeyDelivery, Failure> {
+    let name = path.display();
+    let unreadable = |error: std::io::Error| {
+        Failure::new(
+            FailureKind::Configuration,
+            format!(
+                "the keys of the group `{}`: cannot read {name}: {error}",
+                group.id
+            ),
+        )
+    };
+    let wrong = |why: String| {
+        Failure::new(
+            FailureKind::Configuration,
+            format!("the keys of the group `{}`: {name}: {why}", group.id),
+        )
+    };
+    let mut file = File::open(path).map_err(unreadable)?;
+    let about = file.metadata().map_err(unreadable)?;
+    // Of what is handed over by systemd that sees to it.
+    let handed = matches!(group.keys, Some(KeySource::Credential(_)));
+    let mode = about.permissions().mode() & 0o777;
+    if !handed && mode & 0o077 != 0 {
+        return Err(wrong(format!(
+            "mode {mode:04o} lets others read or change the keys; chmod 600 {name}"
+        )));
+    }
+    let mut text = String::new();
+    let mut bounded = (&mut file).take(MOST_BYTES);
+    bounded.read_to_string(&mut text).map_err(unreadable)?;
+    parse(&text, policy_of(group.policy)).map_err(wrong)
+}
+
+fn parse(text: &str, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
+    let written: OneOrMany = serde_json::from_str(text).map_err(|error| {
+        // What the file holds is not told.
+        format!(
+            "line {}: no list of keys as `ua-space keys` writes it",
+            error.line()
+        )
+    })?;
+    let written = match written {
+        OneOrMany::Many(many) => many,
+        OneOrMany::One(one) => vec![one],
+    };
+    let first = written.first().map(|key| key.security_token_id);
+    let first = first.ok_or("there is no key in it")?;
+    let mut keys = Vec::new();
+    for (at, key) in (0_u32..).zip(&written) {
+        let expected = first.checked_add(at);
+        if expected != Some(key.security_token_id) {
+            return Err(format!(
+                "key {at}: its securityTokenId is {}; they ascend by one",
+                key.security_token_id
+            ));
+        }
+        keys.push(key.keys(policy).map_err(|why| format!("key {at}: {why}"))?);
+    }
+    if keys.len() > MOST_KEYS {
+        return Err(format!("{} keys; at most {MOST_KEYS}", keys.len()));
+    }
+    Ok(KeyDelivery {
+        first_token_id: first,
+        keys,
+        time_to_next: None,
+        lifetime: Duration::ZERO,
+    })
+}
+
+impl Written {
+    fn keys(&self, policy: SecurityPolicy) -> Result<Keys, String> {
+        if self.security_token_id == 0 {
+            return Err("0 is no securityTokenId".to_owned());
+        }
+        if SecurityPolicy::from_uri(&self.policy) != Some(policy) {
+            return Err(format!(
+                "its policy is not {}, which the group has in the mapping",
+                policy.uri()
+            ));
+        }
+        let parts = [
+            ("signingKey", &self.signing_key),
+            ("encryptingKey", &self.encrypting_key),
+            ("keyNonce", &self.key_nonce),
+        ];
+        let mut data = Vec::new();
+        for (name, text) in parts {
+            let bytes = bytes(text).ok_or_else(|| format!("{name} is not hexadecimal"))?;
+            data.extend(bytes);
+        }
+        Keys::from_bytes(policy, &data).map_err(|error| error.to_string())
+    }
+}
+
+fn bytes(hex: &str) -> Option<Vec<u8>> {
+    let digits: Option<Vec<u8>> = hex
+        .chars()
+        .map(|digit| u8::try_from(digit.to_digit(16)?).ok())
+        .collect();
+    let digits = digits?;
+    let pairs = digits.chunks_exact(2);
+    if !pairs.remainder().is_empty() {
+        return None;
+    }
+    let pairs = pairs.map(|pair| match pair {
+        [high, low] => Some(high << 4 | low),
+        _ => None,
+    });
+    pairs.collect()
+}
+
+/// Far more than keys take.
+const MOST_BYTES: u64 = 64 * 1024;
+const MOST_KEYS: usize = 64;
+
+#[cfg(test)]
+mod tests {
+    use mappings::{GroupMode, GroupPolicy, Replay};
+
+    use super::*;
+
+    fn key(token: u32, policy: &str, signing: &str) -> String {
+        format!(
+            r#"{{"policy": "http://opcfoundation.org/UA/SecurityPolicy#PubSub-{policy}-CTR", "securityTokenId": {token},
+            "signingKey": "{signing}", "encryptingKey": "{}", "keyNonce": "00112233"}}"#,
+            "0b".repeat(16)
+        )
+    }
+
+    fn signing() -> String {
+        "0A".repeat(32)
+    }
+
+    fn group(file: &Path) -> SecurityGroup {
+        SecurityGroup {
+            id: "cell".to_owned(),
+            mode: GroupMode::Sign,
+            policy: GroupPolicy::Aes128,
+            keys: Some(KeySource::File(file.to_owned())),
+            namespaces: Vec::new(),
+            replay: Replay::Sender,
+        }
+    }
+
+    #[test]
+    fn the_first_key_of_a_file_is_the_one_that_is_used() {
+        let text = format!(
+            "[{}, {}]",
+            key(7, "Aes128", &signing()),
+            key(8, "Aes128", &signing())
+        );
+        let delivery = parse(&text, SecurityPolicy::PubSubAes128Ctr).unwrap();
+        assert_eq!((delivery.first_token_id, delivery.keys.len()), (7, 2));
+        assert_eq!(delivery.time_to_next, None);
+        let one = parse(
+            &key(3, "Aes128", &signing()),
+            SecurityPolicy::PubSubAes128Ctr,
+        );
+        assert_eq!(one.unwrap().first_token_id, 3);
+    }
+
+    #[test]
+    fn what_is_no_key_is_told_without_telling_what_stands_there() {
+        let (good, policy) = (signing(), SecurityPolicy::PubSubAes128Ctr);
+        for (text, told) in [
+            ("[]".to_owned(), "no key"),
+            ("{\"policy\": 1}".to_owned(), "line 1"),
+            (key(1, "Aes256", &good), "its policy is not"),
+            (key(0, "Aes128", &good), "0 is no securityTokenId"),
+            (key(1, "Aes128", "0a0a"), "22 bytes of key data"),
+            (
+                key(1, "Aes128", &"xy".repeat(32)),
+                "signingKey is not hexadecimal",
+            ),
+            (
+                format!("[{}, {}]", key(1, "Aes128", &good), key(3, "Aes128", &good)),
+                "they ascend by one",
+            ),
+        ] {
+            let why = parse(&text, policy).unwrap_err();
+            assert!(why.contains(told), "{why}");
+            assert!(!why.contains("0a0a") && !why.contains("xyxy"), "{why}");
+        }
+    }
+
+    #[test]
+    fn a_file_that_others_can_read_is_not_used() {
+        let path = std::env::temp_dir().join(format!("ua-keys-{}.json", std::process::id()));
+        std::fs::write(&path, key(1, "Aes128", &signing())).unwrap();
+        let set = |mode| {
+            let mode = std::fs::Permissions::from_mode(mode);
+            std::fs::set_permissions(&path, mode).unwrap();
+        };
+        set(0o640);
+        let refused = read(&path, &group(&path)).unwrap_err();
+        assert!(refused.to_string().contains("chmod 600"), "{refused}");
+        set(0o600);
+        assert_eq!(read(&path, &group(&path)).unwrap().first_token_id, 1);
+        std::fs::remove_file(&path).unwrap();
+        let gone = read(&path, &group(&path)).unwrap_err();
+        assert!(gone.to_string().contains("cannot read"), "{gone}");
+    }
+}

@@ -1,0 +1,313 @@
+//! SecurityGroups: what each is, and what is left open beside them.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use super::network::{duration, parse_endpoint};
+use super::required;
+use crate::call::Call;
+use crate::code::Code;
+use crate::document::{
+    Document, GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry, SksEntry,
+};
+use crate::findings::Findings;
+use crate::mapping::{Endpoint, Mapping};
+use crate::read::{At, given, short};
+use crate::security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
+use crate::tree::Place;
+
+/// Most groups of a document.
+const MAX_GROUPS: usize = 64;
+/// How long a key is used where nothing is said.
+const LIFETIME: Duration = Duration::from_secs(3600);
+
+/// `server` is the endpoint of the cell's own server.
+pub(super) fn check(
+    entries: &[At<GroupEntry>],
+    server: &Endpoint,
+    findings: &mut Findings,
+) -> Vec<SecurityGroup> {
+    if let Some(first) = entries.get(MAX_GROUPS) {
+        let message = format!("{} groups; at most {MAX_GROUPS} are read", entries.len());
+        findings.error(Code::TooLarge, first.place, message);
+        return Vec::new();
+    }
+    let mut ids: BTreeMap<String, Place> = BTreeMap::new();
+    let mut taken: BTreeMap<Option<u16>, Place> = BTreeMap::new();
+    let mut groups = Vec::new();
+    for at in entries {
+        let Some(entry) = &at.value else { continue };
+        let Some(group) = group(entry, at.place, server, findings) else {
+            continue;
+        };
+        if let Some(first) = ids.insert(group.id.clone(), at.place) {
+            let line = findings.line(first, at.place);
+            let message = format!("the group `{}` is there twice", short(&group.id));
+            findings
+                .error(Code::SecurityGroup, at.place, message)
+                .label(format!("first at {line}"))
+                .help("one entry with all its namespaces");
+            continue;
+        }
+        claim(entry, at.place, &mut taken, findings);
+        groups.push(group);
+    }
+    groups
+}
+
+/// Notes namespaces that two groups have.
+fn claim(
+    entry: &GroupEntry,
+    owner: Place,
+    taken: &mut BTreeMap<Option<u16>, Place>,
+    findings: &mut Findings,
+) {
+    let listed = entry.namespaces.as_ref().and_then(|at| at.value.as_deref());
+    let listed: Vec<(Option<u16>, Place)> = match listed {
+        Some(list) => {
+            let sound = list.iter().filter(|at| at.value.is_some());
+            sound.map(|at| (at.value, at.place)).collect()
+        }
+        None => vec![(None, owner)],
+    };
+    for (namespace, place) in listed {
+        let Some(first) = taken.insert(namespace, place) else {
+            continue;
+        };
+        let line = findings.line(first, place);
+        let message = match namespace {
+            Some(namespace) => format!("namespace {namespace} is in two groups"),
+            None => "two groups are without `namespaces`".to_owned(),
+        };
+        findings
+            .error(Code::SecurityGroup, place, message)
+            .label(format!("first at {line}"));
+    }
+}
+
+fn group(
+    entry: &GroupEntry,
+    owner: Place,
+    server: &Endpoint,
+    findings: &mut Findings,
+) -> Option<SecurityGroup> {
+    let (id, place) = required(&entry.group, "group", "the entry", owner, findings)?;
+    if id.is_empty() || id.chars().count() > 128 || id.chars().any(char::is_control) {
+        let message = "a SecurityGroupId has 1 to 128 characters, none a control character";
+        findings.error(Code::SecurityGroup, place, message);
+        return None;
+    }
+    let mode = match given(&entry.mode) {
+        Some((GroupModeEntry::None, _)) => GroupMode::None,
+        Some((GroupModeEntry::Sign, _)) => GroupMode::Sign,
+        Some((GroupModeEntry::SignAndEncrypt, _)) | None => GroupMode::SignAndEncrypt,
+    };
+    let policy = match given(&entry.policy) {
+        Some((GroupPolicyEntry::Aes128, _)) => GroupPolicy::Aes128,
+        Some((GroupPolicyEntry::Aes256, _)) | None => GroupPolicy::Aes256,
+    };
+    let replay = match given(&entry.replay) {
+        Some((ReplayEntry::Publisher, _)) => Replay::Publisher,
+        Some((ReplayEntry::Uncounted, _)) => Replay::Uncounted,
+        Some((ReplayEntry::Sender, _)) | None => Replay::Sender,
+    };
+    let namespaces = entry.namespaces.as_ref().and_then(|at| at.value.as_deref());
+    let mut listed = Vec::new();
+    for at in namespaces.unwrap_or_default() {
+        match at.value {
+            Some(0) => {
+                let message = "namespace 0 is that of OPC UA itself, and no WriterGroupId";
+                findings.error(Code::SecurityGroup, at.place, message);
+            }
+            Some(namespace) => listed.push(namespace),
+            None => {}
+        }
+    }
+    if let Some(at) = &entry.namespaces
+        && at.value.as_ref().is_some_and(Vec::is_empty)
+    {
+        let message = "a group with an empty list of namespaces is about nothing";
+        findings
+            .error(Code::SecurityGroup, at.place, message)
+            .help("without the key it has all that no other group names");
+    }
+    let keys = keys(entry, (mode, owner), server, findings);
+    Some(SecurityGroup {
+        id: id.clone(),
+        mode,
+        policy,
+        keys,
+        namespaces: listed,
+        replay,
+    })
+}
+
+fn keys(
+    entry: &GroupEntry,
+    (mode, owner): (GroupMode, Place),
+    server: &Endpoint,
+    findings: &mut Findings,
+) -> Option<KeySource> {
+    let Some(at) = &entry.keys else {
+        if mode != GroupMode::None {
+            findings
+                .error(Code::GroupKeys, owner, "a secured group without `keys`")
+                .help("keys: {file: cell.keys}, which `ua-space keys cell.keys` makes; or keys: {sks: {}}, the cell's own server");
+        }
+        return None;
+    };
+    let keys = at.value.as_ref()?;
+    if mode == GroupMode::None {
+        findings
+            .error(
+                Code::GroupKeys,
+                at.place,
+                "keys of a group that is not secured",
+            )
+            .help("leave out `mode: none`, or the keys");
+        return None;
+    }
+    source(keys, at.place, server, findings)
+}
+
+fn source(
+    keys: &KeysEntry,
+    place: Place,
+    server: &Endpoint,
+    findings: &mut Findings,
+) -> Option<KeySource> {
+    let count = usize::from(keys.file.is_some())
+        + usize::from(keys.credential.is_some())
+        + usize::from(keys.sks.is_some());
+    if count != 1 {
+        findings
+            .error(
+                Code::GroupKeys,
+                place,
+                "keys come from exactly one of `file`, `credential` and `sks`",
+            )
+            .help("the keys themselves never stand in the mapping: whoever can read it would have them");
+        return None;
+    }
+    if let Some((file, place)) = given(&keys.file) {
+        if file.is_empty() || is_key(file) {
+            findings
+                .error(Code::GroupKeys, place, "this is no file")
+                .help("the keys stand in a file of their own that only its owner can read (chmod 600)");
+            return None;
+        }
+        return Some(KeySource::File(PathBuf::from(file)));
+    }
+    if let Some((name, place)) = given(&keys.credential) {
+        if name.is_empty() || name.contains('/') || name.starts_with('.') || is_key(name) {
+            findings
+                .error(Code::GroupKeys, place, "this is no name of a credential")
+                .help("the ID in LoadCredential=ID:PATH of the unit");
+            return None;
+        }
+        return Some(KeySource::Credential(name.clone()));
+    }
+    given(&keys.sks).and_then(|(sks, place)| service(sks, place, server, findings))
+}
+
+/// Whether somebody wrote a key there.
+fn is_key(text: &str) -> bool {
+    let text = text.rsplit('/').next().unwrap_or_default();
+    text.len() >= 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
+}
+
+fn service(
+    entry: &SksEntry,
+    place: Place,
+    server: &Endpoint,
+    findings: &mut Findings,
+) -> Option<KeySource> {
+    let lifetime = duration(&entry.key_lifetime, findings);
+    let members = entry.members.as_ref().and_then(|at| at.value.as_deref());
+    let members: Vec<String> = members
+        .unwrap_or_default()
+        .iter()
+        .filter_map(|at| at.value.clone())
+        .collect();
+    let own = || {
+        KeySource::Own(Served {
+            endpoint: server.clone(),
+            lifetime: lifetime.unwrap_or(LIFETIME),
+            members: members.clone(),
+        })
+    };
+    let Some((text, at)) = given(&entry.endpoint) else {
+        return entry.endpoint.is_none().then(own);
+    };
+    let Some(endpoint) = parse_endpoint(text) else {
+        let message = format!("`{}` is no endpoint", short(text));
+        findings
+            .error(Code::Endpoint, at, message)
+            .help("for example opc.tcp://sks.local:4840");
+        return None;
+    };
+    if endpoint == *server {
+        return Some(own());
+    }
+    if entry.key_lifetime.is_some() || entry.members.is_some() {
+        findings
+            .error(
+                Code::GroupKeys,
+                place,
+                "`key_lifetime` and `members` are that service's own affair",
+            )
+            .help("they go with the cell's own server: sks: {}");
+        return None;
+    }
+    Some(KeySource::Sks(endpoint))
+}
+
+/// What of a cell that is secured in part is not.
+pub(super) fn left_open(mapping: &Mapping, document: &Document, findings: &mut Findings) {
+    let secured = |group: &SecurityGroup| group.mode != GroupMode::None;
+    let Some(at) = &document.security else { return };
+    if !mapping.security().iter().any(secured) {
+        return;
+    }
+    for namespace in mapping.namespaces().keys() {
+        if mapping.group_of(*namespace).is_none() {
+            let message = format!(
+                "namespace {namespace} is in no group: anybody can write and read its values"
+            );
+            findings
+                .warning(Code::HalfSecured, at.place, message)
+                .help("a group without `namespaces` has all that no other names; `mode: none` says that it is meant");
+        }
+    }
+    for call in mapping.calls() {
+        let (_, namespace, _) = call.topic.triple();
+        let open = !mapping.group_of(namespace).is_some_and(secured);
+        if open {
+            let call_place = place_of(document, call).unwrap_or(at.place);
+            let message = format!(
+                "the call {} is in no secured group, and others are: anybody on this host can ask for it{}",
+                short(&call.name),
+                if call.open {
+                    ", and anybody on the network"
+                } else {
+                    ""
+                }
+            );
+            findings
+                .warning(Code::OpenCall, call_place, message)
+                .help("put its namespace into a secured group");
+        }
+    }
+}
+
+/// Where a call stands.
+fn place_of(document: &Document, call: &Call) -> Option<Place> {
+    let entries = document.calls.as_ref()?.value.as_deref()?;
+    let mut named = entries
+        .iter()
+        .filter_map(|at| given(&at.value.as_ref()?.name));
+    named
+        .find(|(name, _)| **name == call.name)
+        .map(|(_, place)| place)
+}

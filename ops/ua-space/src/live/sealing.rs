@@ -1,0 +1,79 @@
+//! Keys in a running space: what is heard is opened with them, and what is asked is sealed.
+
+use std::path::Path;
+
+use uadp::{NetworkMessage, Seal, Sealer, SecurityMode};
+
+use crate::exit::Failure;
+use crate::keys::{self, KeyFile};
+use crate::report::warn;
+
+/// The keys of a file, and what is sealed with the first of them.
+#[derive(Debug)]
+pub(crate) struct Sealing {
+    file: KeyFile,
+    sealer: Sealer,
+    /// Random bytes of this run, which tell its messages from those of others.
+    mark: [u8; 4],
+    refused: u64,
+}
+
+impl Sealing {
+    pub(crate) fn read(path: &Path, signs_only: bool) -> Result<Self, Failure> {
+        let file = KeyFile::read(path, warn)?;
+        let mode = match signs_only {
+            true => SecurityMode::Sign,
+            false => SecurityMode::SignAndEncrypt,
+        };
+        let mut sealer = Sealer::new(mode);
+        let (token_id, first) = file
+            .first()
+            .ok_or_else(|| Failure::Data(format!("{}: there is no key in it", file.name())))?;
+        sealer
+            .update_keys(token_id, [first.clone()])
+            .map_err(|error| Failure::Data(format!("{}: {error}", file.name())))?;
+        let mut mark = [0; 4];
+        keys::random(&mut mark)?;
+        Ok(Self {
+            file,
+            sealer,
+            mark,
+            refused: 0,
+        })
+    }
+
+    /// Opens a message into `scratch` where that can be done; it stays as it is where not.
+    pub(crate) fn open<'a>(
+        &mut self,
+        message: NetworkMessage<'a>,
+        scratch: &'a mut Vec<u8>,
+    ) -> NetworkMessage<'a> {
+        if !message.is_sealed() {
+            return message;
+        }
+        let found = self.file.find(&message);
+        let found = found.map(|found| found.first().copied().cloned());
+        match found {
+            Ok(Some(found)) => keys::open(&found, &message, scratch).unwrap_or(message),
+            Ok(None) => message,
+            Err(why) => {
+                self.refused += 1;
+                if self.refused == 1 {
+                    warn(&format!("a secured message is not read: {why}"));
+                }
+                message
+            }
+        }
+    }
+
+    pub(crate) fn seal(&mut self, datagram: &[u8]) -> Result<Vec<u8>, String> {
+        let seal = self
+            .sealer
+            .seal(self.mark)
+            .map_err(|error| error.to_string())?;
+        let mut sealed = Vec::with_capacity(datagram.len() + Seal::OVERHEAD);
+        let written = seal.secure(datagram, &mut sealed);
+        written.map_err(|error| error.to_string())?;
+        Ok(sealed)
+    }
+}

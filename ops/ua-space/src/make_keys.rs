@@ -1,0 +1,123 @@
+//! Files with keys: made, and changed so that everybody can follow.
+
+use std::fs::{File, OpenOptions};
+use std::io::Write as _;
+use std::os::unix::fs::OpenOptionsExt as _;
+use std::path::{Path, PathBuf};
+
+use serde_json::{Value, json};
+use uadp::SecurityPolicy;
+
+use crate::arguments::{KeyPolicy, MakeKeys};
+use crate::exit::Failure;
+use crate::keys::{self, KeyFile};
+use crate::report::warn;
+use crate::{hex, json_file};
+
+pub(crate) fn make_keys(arguments: &MakeKeys) -> Result<(), Failure> {
+    let file = &arguments.file;
+    let name = file.display();
+    let told = if arguments.next {
+        let mut all = listed(file)?;
+        let last = all.last().and_then(|key| key["securityTokenId"].as_u64());
+        let last = last.and_then(|token| u32::try_from(token).ok());
+        let policy = all.last().and_then(|key| key["policy"].as_str());
+        let policy = policy.and_then(SecurityPolicy::from_uri);
+        let (Some(last), Some(policy)) = (last, policy) else {
+            return Err(Failure::Data(format!("{name}: there is no key in it")));
+        };
+        let token = last.checked_add(1).unwrap_or(1);
+        all.push(made(token, policy)?);
+        replace(file, &all)?;
+        format!(
+            "{name}: key {token} comes next; bring the file to all programs, then --drop the first"
+        )
+    } else if arguments.drop {
+        let mut all = listed(file)?;
+        if all.len() < 2 {
+            let why = format!("{name}: there is no other key in it; --next makes one");
+            return Err(Failure::Data(why));
+        }
+        let gone = all.remove(0);
+        replace(file, &all)?;
+        format!("{name}: key {} is out of it", gone["securityTokenId"])
+    } else {
+        let policy = match arguments.policy {
+            KeyPolicy::Aes128 => SecurityPolicy::PubSubAes128Ctr,
+            KeyPolicy::Aes256 => SecurityPolicy::PubSubAes256Ctr,
+        };
+        write(file, &[made(1, policy)?])?;
+        format!("{name}: key 1; bring the file to all programs of the group, and to nobody else")
+    };
+    let mut out = std::io::stdout().lock();
+    writeln!(out, "{told}")?;
+    Ok(())
+}
+
+/// The keys of a file, as they stand there.
+fn listed(file: &Path) -> Result<Vec<Value>, Failure> {
+    // What is no key is told as by everybody else.
+    KeyFile::read(file, warn)?;
+    let name = file.display().to_string();
+    let text = json_file::read(file)?;
+    json_file::one_or_many(&text).map_err(|error| json_file::explain(&name, &error))
+}
+
+fn made(token: u32, policy: SecurityPolicy) -> Result<Value, Failure> {
+    let part = |len: usize| {
+        let mut bytes = vec![0; len];
+        keys::random(&mut bytes).map(|()| hex::text(&bytes))
+    };
+    // Beside the encrypting key.
+    let others = SIGNING + NONCE;
+    Ok(json!({
+        "policy": policy.uri(),
+        "securityTokenId": token,
+        "signingKey": part(SIGNING)?,
+        "encryptingKey": part(policy.key_data_length() - others)?,
+        "keyNonce": part(NONCE)?,
+    }))
+}
+
+/// Writes a file that is not there yet, for its owner alone.
+fn write(file: &Path, keys: &[Value]) -> Result<(), Failure> {
+    let mut made = create(file)?;
+    put(&mut made, keys).map_err(|error| writing(file, &error))
+}
+
+/// Puts another file in the place of the one that is there, at once.
+fn replace(file: &Path, keys: &[Value]) -> Result<(), Failure> {
+    let mut beside = file.as_os_str().to_owned();
+    beside.push(".new");
+    let beside = PathBuf::from(beside);
+    let mut made = create(&beside)?;
+    let done = put(&mut made, keys).and_then(|()| std::fs::rename(&beside, file));
+    done.map_err(|error| {
+        drop(std::fs::remove_file(&beside));
+        writing(file, &error)
+    })
+}
+
+fn create(file: &Path) -> Result<File, Failure> {
+    let made = OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .mode(0o600)
+        .open(file);
+    made.map_err(|error| writing(file, &error))
+}
+
+fn put(file: &mut File, keys: &[Value]) -> std::io::Result<()> {
+    let text = serde_json::to_string_pretty(keys).map_err(std::io::Error::other)?;
+    file.write_all(text.as_bytes())?;
+    file.write_all(b"\n")?;
+    file.sync_all()
+}
+
+fn writing(file: &Path, error: &std::io::Error) -> Failure {
+    Failure::Io(format!("cannot write {}: {error}", file.display()))
+}
+
+/// Bytes of the SigningKey and of the KeyNonce (OPC 10000-14, 7.2.4.4.3.1).
+const SIGNING: usize = 32;
+const NONCE: usize = 4;
