@@ -19,9 +19,11 @@ pub(crate) fn make_keys(arguments: &MakeKeys) -> Result<(), Failure> {
     let name = file.display();
     let told = if arguments.next {
         let mut all = listed(file)?;
-        let last = all.last().and_then(|key| key["securityTokenId"].as_u64());
+        let last = all
+            .last()
+            .and_then(|key| key.get("securityTokenId")?.as_u64());
         let last = last.and_then(|token| u32::try_from(token).ok());
-        let policy = all.last().and_then(|key| key["policy"].as_str());
+        let policy = all.last().and_then(|key| key.get("policy")?.as_str());
         let policy = policy.and_then(SecurityPolicy::from_uri);
         let (Some(last), Some(policy)) = (last, policy) else {
             return Err(Failure::Data(format!("{name}: there is no key in it")));
@@ -40,7 +42,8 @@ pub(crate) fn make_keys(arguments: &MakeKeys) -> Result<(), Failure> {
         }
         let gone = all.remove(0);
         replace(file, &all)?;
-        format!("{name}: key {} is out of it", gone["securityTokenId"])
+        let token = gone.get("securityTokenId").map(ToString::to_string);
+        format!("{name}: key {} is out of it", token.unwrap_or_default())
     } else {
         let policy = match arguments.policy {
             KeyPolicy::Aes128 => SecurityPolicy::PubSubAes128Ctr,

@@ -279,7 +279,9 @@ impl Nodes {
     /// Said anew by a type that differs from its supertypes.
     fn ready_after_success(&mut self, id: u32, parent: u32, value: bool) {
         let mut rests = Node::new("UAVariable", id, "1:ReadyAfterSuccess")
-            .about("Whether a run that did its work leaves it Ready; otherwise a Reset comes first.")
+            .about(
+                "Whether a run that did its work leaves it Ready; otherwise a Reset comes first.",
+            )
             .attribute("DataType", Builtin::Boolean.name())
             .forward("HasTypeDefinition", PROPERTY_TYPE)
             .child_of(parent, "HasProperty", Rule::Mandatory);
