@@ -1,12 +1,12 @@
-//! Two stories with simulated robots and the programs people run: the fault-tolerant product assembly line, and plug and
-//! produce.
+//! Stories with simulated robots and the programs people run: the fault-tolerant product assembly line, plug and produce, and
+//! the change of tools.
 //!
 //! One binary is all the demo's own processes: started plainly it starts the others, which are hidden subcommands of
 //! it, and the programs that stand beside it. The robots know one another, and components, through the topics of the space
 //! alone; what they print is for the timeline.
 //!
 //! Reading order: `robots::niryo` and `robots::turtlebot` (what the robots decide), `line` (the values they share),
-//! `supervisor`, `orchestra` (who starts and watches them all); `plug` (the other story); `stage` (what both stand on).
+//! `supervisor`, `orchestra` (who starts and watches them all); `plug` and `tools` (the other stories); `stage` (what both stand on).
 
 mod clock;
 mod event;
@@ -19,6 +19,7 @@ mod robots;
 mod stage;
 mod stop;
 mod supervisor;
+mod tools;
 
 use std::io::Write as _;
 use std::path::PathBuf;
@@ -56,6 +57,9 @@ struct PlanArguments {
     /// Of plug and produce: the manifest (MTP) of the module that is imported, in place of that of the example plant
     #[arg(long, value_name = "FILE")]
     manifest: Option<PathBuf>,
+    /// Of the tool change: the tools are in each other's docks
+    #[arg(long)]
+    swap_tools: bool,
     /// Print one JSON object on standard output, and the timeline on standard error
     #[arg(long)]
     json: bool,
@@ -68,6 +72,8 @@ enum Scenario {
     AssemblyLine,
     /// Components that are plugged in, found, started from ROS, run by the MES, lost and replaced
     PlugAndProduce,
+    /// A robot that changes its tools, with devices behind their protocols; one is lost and plugged in again
+    ToolChange,
 }
 
 /// The demo's own processes.
@@ -136,6 +142,7 @@ fn main() -> ExitCode {
                 covers,
                 conveyor_off_at,
                 manifest,
+                swap_tools,
                 json,
             } = arguments.plan;
             let code = match scenario {
@@ -155,6 +162,14 @@ fn main() -> ExitCode {
                         manifest,
                     };
                     runtime.block_on(Box::pin(plug::play(plan)))
+                }
+                Scenario::ToolChange => {
+                    let plan = tools::Plan {
+                        speed,
+                        json,
+                        swapped: swap_tools,
+                    };
+                    runtime.block_on(Box::pin(tools::play(plan)))
                 }
             };
             ExitCode::from(code)

@@ -63,3 +63,90 @@ fn components_are_found_run_lost_and_replaced_within_the_published_times() {
     }
     assert_eq!(report["question"]["skills"], 5, "{report}");
 }
+
+/// The steps that a composite may show, in their order; short ones are not seen by who looks now and then.
+fn are_in_order(seen: &Value, steps: &[&str]) -> bool {
+    let mut left = steps.iter();
+    let seen = seen.as_array().unwrap();
+    seen.iter().all(|step| left.any(|known| step == known))
+}
+
+fn tool_change(more: &[&str]) -> Value {
+    let mut demo = Started::new("demo", &program("demo"))
+        .args(["--scenario", "tool-change", "--speed", "16", "--json"])
+        .args(more)
+        .start();
+    let ended = demo.wait_for_end(Duration::from_secs(150));
+    let report = demo.json_lines().pop().unwrap_or_default();
+    assert!(ended.success(), "{report} {demo}");
+    report
+}
+
+#[test]
+fn a_robot_changes_its_tools_and_survives_the_loss_of_one_wherever_they_hang() {
+    let Some(_cell) = Cell::with(&[]) else { return };
+    for more in [&[][..], &["--swap-tools"]] {
+        let report = tool_change(more);
+        assert_eq!(
+            (&report["finished"], &report["robots"]),
+            (&Value::from(true), &Value::from(2)),
+            "{report}"
+        );
+        let runs = report["runs"].as_array().unwrap();
+        let ran: Vec<(&str, &str, bool)> = runs
+            .iter()
+            .map(|run| {
+                let succeeded = run["succeeded"].as_bool().unwrap();
+                (
+                    run["skill"].as_str().unwrap(),
+                    run["what"].as_str().unwrap(),
+                    succeeded,
+                )
+            })
+            .collect();
+        let expected = [
+            ("tool-changer.ChangeTool", "robotiq-2f85", true),
+            ("handling.PlaceByFingers", "a part", true),
+            ("tool-changer.ChangeTool", "schmalz-ecbpi", true),
+            ("handling.PlaceByVacuum", "a part", false),
+            ("handling.PlaceByVacuum", "a part", true),
+            ("tool-changer.DetachTool", "no tool", true),
+        ];
+        assert_eq!(ran, expected);
+        let told = runs[3]["message"].as_str().unwrap();
+        assert!(
+            told.contains("is lost") && told.ends_with("the robot has retreated"),
+            "{told}"
+        );
+        let take = [
+            "BackDoor",
+            "Park",
+            "Lock",
+            "BackRotate",
+            "FrontDoor",
+            "WaitForTool",
+            "Approach",
+        ];
+        assert!(are_in_order(&runs[0]["steps"], &take), "{}", runs[0]);
+        let put = [
+            "Approach",
+            "FrontDoor",
+            "Start",
+            "Unlock",
+            "Park",
+            "BackDoor",
+            "WaitForRelease",
+        ];
+        assert!(
+            are_in_order(&runs[2]["steps"], &[put, take].concat()),
+            "{}",
+            runs[2]
+        );
+        assert!(are_in_order(&runs[5]["steps"], &put), "{}", runs[5]);
+        assert!(report["told_lost_ms"].as_f64() < Some(10_000.0), "{report}");
+        assert!(
+            report["found_again_ms"].as_f64() < Some(10_000.0),
+            "{report}"
+        );
+    }
+}

@@ -265,3 +265,104 @@ fn a_yaml_with_faults_is_refused_with_all_of_them() {
         assert!(child.wait_for_end(SOON).success(), "{child}");
     }
 }
+
+/// A simulator of a device, and where it says that it is.
+fn simulator(args: &[&str]) -> (Child, String) {
+    let child = Started::new("ua-component", &program("ua-component"))
+        .args(["simulate"])
+        .args(args)
+        .start();
+    let at = eventually("the simulator says where it is", SOON, || {
+        let line = child
+            .lines()
+            .into_iter()
+            .find(|line| line.contains(" at "))?;
+        let (_, at) = line.split_once(" at ")?;
+        Some(at.split(" unit ").next().unwrap_or_default().to_owned())
+    });
+    (child, at)
+}
+
+fn line_of<'l>(lines: &'l [Value], what: &str) -> &'l Value {
+    let found = lines.iter().find(|line| line["what"] == what);
+    found.unwrap_or_else(|| panic!("nothing of {what} in {lines:?}"))
+}
+
+#[test]
+fn simulated_grippers_are_what_the_tables_of_their_makers_say_to_another_client() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let tty = cell.folder().join("gripper");
+    for line in [
+        "tcp://127.0.0.1:1502",
+        "rtu+tcp://127.0.0.1:1504",
+        &format!("serial:{}", tty.display()),
+    ] {
+        let (_simulator, at) = simulator(&[
+            "robotiq-2f85",
+            "--listen",
+            line,
+            "--object",
+            "0.0425",
+            "--speed",
+            "4",
+        ]);
+        let seen = cell.asyncua_once("device_registers.py", &["robotiq", &at]);
+        let fault = |what: &str| line_of(&seen, what)["gFLT"].clone();
+        assert_eq!(
+            (
+                fault("reset"),
+                fault("told to go too early"),
+                fault("activated")
+            ),
+            (json!(0), json!(5), json!(0))
+        );
+        let moving = line_of(&seen, "moving");
+        assert_eq!(
+            (&moving["gGTO"], &moving["gOBJ"], &moving["gPR"]),
+            (&json!(1), &json!(0), &json!(255)),
+            "{line}"
+        );
+        let closed = line_of(&seen, "closed");
+        assert_eq!(
+            (&closed["gOBJ"], &closed["gPO"]),
+            (&json!(2), &json!(128)),
+            "{line}"
+        );
+        let opened = line_of(&seen, "opened");
+        assert_eq!(
+            (&opened["gOBJ"], &opened["gPO"]),
+            (&json!(3), &json!(0)),
+            "{line}"
+        );
+        let refused = line_of(&seen, "exceptions");
+        let codes = ["register 3000", "coil", "write 2000"].map(|what| refused[what].clone());
+        assert_eq!(codes, [json!(2), json!(1), json!(2)]);
+        // gACT and gSTA.
+        assert_eq!(
+            line_of(&seen, "read and written")["status"]
+                .as_u64()
+                .map(|status| status & 0x31),
+            Some(0x31)
+        );
+    }
+
+    let (_simulator, at) = simulator(&["schmalz-ecbpi", "--speed", "4"]);
+    let seen = cell.asyncua_once("device_registers.py", &["schmalz", &at]);
+    let of = |what: &str, field: &str| line_of(&seen, what)[field].clone();
+    assert_eq!(
+        (of("at first", "present"), of("at first", "mbar")),
+        (json!(0), json!(0))
+    );
+    assert_eq!(
+        (of("vacuum", "code"), of("held", "in_range")),
+        (json!(204), json!(1))
+    );
+    assert!(of("held", "mbar").as_u64() > Some(500), "{seen:?}");
+    assert_eq!(of("let go", "detached"), json!(1));
+    assert_eq!(
+        (of("wrong", "code"), of("elsewhere", "code")),
+        (json!(400), json!(404))
+    );
+}

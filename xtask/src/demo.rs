@@ -11,10 +11,10 @@ use crate::{
 pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     step("building the programs (some minutes the first time)");
     let mut build = vec!["build", "--locked"];
-    let is_plug_and_produce = arguments
-        .iter()
-        .any(|argument| argument.ends_with("plug-and-produce"));
-    let others: &[&str] = if is_plug_and_produce {
+    let has_components = arguments.iter().any(|argument| {
+        argument.ends_with("plug-and-produce") || argument.ends_with("tool-change")
+    });
+    let others: &[&str] = if has_components {
         &PLUG_AND_PRODUCE
     } else {
         &[]
@@ -31,5 +31,5 @@ pub(crate) fn run(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<E
 
 /// The packages of the assembly line, which every story needs.
 const LINE: [&str; 4] = ["bridge-ros1", "bridge-ros2", "ua-server", "demo"];
-/// Those of plug and produce beside them.
+/// Those of the stories with components beside them.
 const PLUG_AND_PRODUCE: [&str; 4] = ["discovery", "ua-component", "ua-mes", "ua-space"];

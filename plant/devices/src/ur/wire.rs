@@ -76,12 +76,14 @@ pub enum Kind {
     F64,
     /// Six of those.
     Vector,
+    /// Three of those.
+    Triple,
     /// Six of four bytes with a sign.
     Whole,
 }
 
 impl Kind {
-    const ALL: [(Self, &'static str); 8] = [
+    const ALL: [(Self, &'static str); 9] = [
         (Self::Bool, "BOOL"),
         (Self::U8, "UINT8"),
         (Self::U32, "UINT32"),
@@ -89,6 +91,7 @@ impl Kind {
         (Self::I32, "INT32"),
         (Self::F64, "DOUBLE"),
         (Self::Vector, "VECTOR6D"),
+        (Self::Triple, "VECTOR3D"),
         (Self::Whole, "VECTOR6INT32"),
     ];
 
@@ -121,6 +124,7 @@ impl Kind {
             Self::I32 => Value::I32(0),
             Self::F64 => Value::F64(0.0),
             Self::Vector => Value::Vector([0.0; 6]),
+            Self::Triple => Value::Triple([0.0; 3]),
             Self::Whole => Value::Whole([0; 6]),
         }
     }
@@ -140,6 +144,13 @@ impl Kind {
                     *slot = f64::from_be_bytes(chunk(bytes)?);
                 }
                 Value::Vector(six)
+            }
+            Self::Triple => {
+                let mut three = [0.0; 3];
+                for slot in &mut three {
+                    *slot = f64::from_be_bytes(chunk(bytes)?);
+                }
+                Value::Triple(three)
             }
             Self::Whole => {
                 let mut six = [0; 6];
@@ -176,6 +187,8 @@ pub enum Value {
     F64(f64),
     /// As [`Kind::Vector`].
     Vector([f64; 6]),
+    /// As [`Kind::Triple`].
+    Triple([f64; 3]),
     /// As [`Kind::Whole`].
     Whole([i32; 6]),
 }
@@ -191,6 +204,7 @@ impl Value {
             Self::I32(value) => bytes.extend(value.to_be_bytes()),
             Self::F64(value) => bytes.extend(value.to_be_bytes()),
             Self::Vector(six) => bytes.extend(six.into_iter().flat_map(f64::to_be_bytes)),
+            Self::Triple(three) => bytes.extend(three.into_iter().flat_map(f64::to_be_bytes)),
             Self::Whole(six) => bytes.extend(six.into_iter().flat_map(i32::to_be_bytes)),
         }
     }

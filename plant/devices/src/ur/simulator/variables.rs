@@ -15,6 +15,8 @@ pub(super) fn output(name: &str) -> Option<Kind> {
         Some(Kind::F64)
     } else if of(&["robot_mode", "safety_mode", "tool_mode"]) {
         Some(Kind::I32)
+    } else if of(&["actual_tool_accelerometer", "payload_cog"]) {
+        Some(Kind::Triple)
     } else if of(&["joint_mode"]) {
         Some(Kind::Whole)
     } else if of(&[
@@ -115,7 +117,8 @@ impl Simulator {
     }
 }
 
-const VECTORS: [&str; 19] = [
+const VECTORS: [&str; 20] = [
+    "payload_inertia",
     "target_q",
     "target_qd",
     "target_qdd",

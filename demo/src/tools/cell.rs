@@ -1,0 +1,168 @@
+//! The cell of the story: the simulators of the devices and the components before them, at the addresses of the examples.
+
+use std::fs;
+use std::io;
+use std::path::Path;
+
+use crate::pace::Speed;
+
+/// A component: the name it is told by, its YAML, where clients connect.
+pub(super) struct Part {
+    pub(super) name: &'static str,
+    pub(super) uri: &'static str,
+    yaml: &'static str,
+    pub(super) port: Option<u16>,
+}
+
+/// The components. The last is a second robot, which has nothing to do.
+pub(super) const PARTS: [Part; 6] = [
+    Part {
+        name: "ur5",
+        uri: "urn:example:ur5",
+        yaml: include_str!("../../../examples/plant/ur5.yaml"),
+        port: Some(24_840),
+    },
+    Part {
+        name: FINGERS,
+        uri: "urn:example:robotiq-2f85",
+        yaml: include_str!("../../../examples/plant/robotiq-2f85.yaml"),
+        port: Some(10_254),
+    },
+    Part {
+        name: VACUUM,
+        uri: "urn:example:schmalz-ecbpi",
+        yaml: include_str!("../../../examples/plant/schmalz-ecbpi.yaml"),
+        port: Some(10_255),
+    },
+    Part {
+        name: CHANGER,
+        uri: "urn:example:tool-changer",
+        yaml: include_str!("../../../examples/plant/tool-changer.yaml"),
+        port: Some(14_840),
+    },
+    Part {
+        name: HANDLING,
+        uri: "urn:example:handling",
+        yaml: include_str!("../../../examples/plant/handling.yaml"),
+        port: Some(12_346),
+    },
+    Part {
+        name: "robot",
+        uri: "urn:example:robot",
+        yaml: include_str!("../../../examples/plant/robot.yaml"),
+        port: None,
+    },
+];
+
+pub(super) const FINGERS: &str = "robotiq-2f85";
+pub(super) const VACUUM: &str = "schmalz-ecbpi";
+pub(super) const CHANGER: &str = "tool-changer";
+pub(super) const HANDLING: &str = "handling";
+
+/// Where the simulators listen: RTDE, secondary interface, gripper, IO-Link master, converter.
+pub(super) const DEVICE_PORTS: [u16; 5] = [30_004, 30_002, 1502, 8090, 1503];
+const DOCKS: [[f64; 6]; 2] = [
+    [0.3, 0.35, 0.2, 0.0, 0.0, 0.0],
+    [-0.3, 0.35, 0.2, 0.0, 0.0, 0.0],
+];
+
+/// Where the dock of a tool is: of the fingers, or of the vacuum.
+pub(super) fn dock(tool: &str, swapped: bool) -> [f64; 6] {
+    let [first, second] = DOCKS;
+    if (tool == FINGERS) == swapped {
+        second
+    } else {
+        first
+    }
+}
+
+/// Writes the YAML of the components into a directory: with the tools in each other's docks if they are swapped.
+///
+/// # Errors
+/// A file cannot be written.
+pub(super) fn write(directory: &Path, speed: Speed, swapped: bool) -> io::Result<()> {
+    for part in &PARTS {
+        let mut text = part.yaml.replace(
+            "{simulated: {",
+            &format!("{{simulated: {{time_scale: {}, ", speed.factor()),
+        );
+        if swapped && part.name == CHANGER {
+            text = text
+                .replace("number: 1", "number: X")
+                .replace("number: 2", "number: 1")
+                .replace("number: X", "number: 2")
+                .replace("dock: [0.3", "dock: [X")
+                .replace("dock: [-0.3", "dock: [0.3")
+                .replace("dock: [X", "dock: [-0.3");
+        }
+        fs::write(directory.join(format!("{}.yaml", part.name)), text)?;
+    }
+    Ok(())
+}
+
+/// The simulators: what each is called, and its arguments after `simulate`.
+pub(super) fn simulators(speed: Speed) -> [(&'static str, Vec<String>); 4] {
+    let speed = ["--speed".to_owned(), speed.factor().to_string()];
+    let of = |device: &str, more: &[String]| {
+        let first = ["simulate", device].map(str::to_owned);
+        first.into_iter().chain(more.iter().cloned()).collect()
+    };
+    let docked = (1..).zip(DOCKS).flat_map(|(number, [x, y, z, a, b, c])| {
+        let tool = format!("{number}@{x},{y},{z},{a},{b},{c}");
+        ["--tool".to_owned(), tool]
+    });
+    let docked: Vec<String> = docked.collect();
+    [
+        ("simulated-robot", of("universal-robot", &speed)),
+        ("simulated-fingers", of("robotiq-2f85", &speed)),
+        ("simulated-vacuum", of("schmalz-ecbpi", &speed)),
+        ("simulated-changer", of("kelvin-tool-changer", &docked)),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_examples_are_those_of_the_story() {
+        for part in &PARTS {
+            let mut lines = vec![
+                format!("component: {}", part.name),
+                format!("application_uri: {}", part.uri),
+            ];
+            lines.extend(
+                part.port
+                    .map(|port| format!("endpoint: opc.tcp://127.0.0.1:{port}")),
+            );
+            for line in lines {
+                assert!(
+                    part.yaml.lines().any(|known| known == line),
+                    "{}: {line}",
+                    part.name
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn tools_are_swapped_by_the_yaml_of_the_changer_alone() {
+        let directory = std::env::temp_dir().join(format!("tools-{}", std::process::id()));
+        fs::create_dir_all(&directory).unwrap();
+        write(&directory, Speed::new(2.0).unwrap(), true).unwrap();
+        let read = |name: &str| fs::read_to_string(directory.join(format!("{name}.yaml"))).unwrap();
+        let changer = read(CHANGER);
+        for line in [
+            "      - {number: 2, uri: urn:example:robotiq-2f85, dock: [-0.3, 0.35, 0.2, 0, 0, 0]}",
+            "      - {number: 1, uri: urn:example:schmalz-ecbpi, dock: [0.3, 0.35, 0.2, 0, 0, 0]}",
+        ] {
+            assert!(changer.lines().any(|known| known == line), "{changer}");
+        }
+        assert_eq!(
+            read(HANDLING),
+            include_str!("../../../examples/plant/handling.yaml")
+        );
+        assert!(dock(FINGERS, true)[0] < 0.0 && dock(VACUUM, true)[0] > 0.0);
+        fs::remove_dir_all(directory).unwrap();
+    }
+}

@@ -1,0 +1,523 @@
+//! Tools are changed: a robot takes its fingers, brings a part from one place to another, changes to vacuum, brings it back,
+//! and puts the tool away. On the way a gripper is killed and plugged in again.
+//!
+//! All programs are those that people run; the devices are simulated behind the protocols of their makers.
+//! Reading order: this (what happens), `cell` (who is there), `report`.
+
+mod cell;
+mod report;
+
+use std::path::PathBuf;
+use std::process::ExitStatus;
+use std::time::Duration;
+
+use serde_json::Value as Json;
+use skills::{
+    ClientOptions, Outcome, Runs as _, SkillClient, SkillFault, SkillHandle, TypeName, Value,
+};
+use tokio::sync::mpsc;
+use tokio::time::{Instant, sleep, timeout};
+
+use self::cell::{CHANGER, DEVICE_PORTS, FINGERS, HANDLING, PARTS, Part, VACUUM};
+use self::report::{Report, Run};
+use crate::clock::wall_nanos;
+use crate::pace::Speed;
+use crate::stage::{
+    Failure, Interrupt, LOOPBACK, Program, Programs, Report as Told, Stage, Timeline, Who, fetch,
+    find, free_port, must_be_free,
+};
+
+/// What the story is to be.
+#[derive(Clone, Debug)]
+pub(crate) struct Plan {
+    pub(crate) speed: Speed,
+    pub(crate) json: bool,
+    /// The tools are in each other's docks.
+    pub(crate) swapped: bool,
+}
+
+/// Plays the story and prints it. Returns the exit code.
+pub(crate) async fn play(plan: Plan) -> u8 {
+    let mut show = Show {
+        timeline: Timeline::open(plan.json),
+        report: Report {
+            speed: plan.speed.factor(),
+            swapped: plan.swapped,
+            ..Report::default()
+        },
+        began_at: wall_nanos(),
+    };
+    let outcome = perform(&plan, &mut show).await;
+    show.report.finished = outcome.is_ok();
+    show.report.failure = outcome.as_ref().err().map(ToString::to_string);
+    let printed = show.conclude(plan.json);
+    match (outcome, printed) {
+        (Err(failure), _) => failure.exit_code(),
+        // Nobody reads any more, as with `| head`.
+        (Ok(()), Err(_)) => 74,
+        (Ok(()), Ok(())) => 0,
+    }
+}
+
+/// What people see.
+struct Show {
+    timeline: Timeline,
+    report: Report,
+    began_at: i64,
+}
+
+impl Show {
+    fn note(&mut self, who: Who, what: String) -> Result<(), Failure> {
+        let now = wall_nanos();
+        self.timeline.note(now, who, what);
+        let began_at = self.began_at;
+        let seconds = |at_ns: i64| Some(millis(at_ns - began_at) / 1e3);
+        let printed = self.timeline.print_all(&seconds);
+        printed.map_err(Failure::io("cannot print"))
+    }
+
+    fn conclude(&mut self, json: bool) -> std::io::Result<()> {
+        self.timeline.print_text(&self.report.table())?;
+        if let Some(failure) = &self.report.failure {
+            self.timeline.print_text(&format!("error: {failure}\n"))?;
+        }
+        if json {
+            use std::io::Write as _;
+            let mut out = std::io::stdout().lock();
+            serde_json::to_writer(&mut out, &self.report)?;
+            out.write_all(b"\n")?;
+            out.flush()?;
+        }
+        Ok(())
+    }
+}
+
+async fn perform(plan: &Plan, show: &mut Show) -> Result<(), Failure> {
+    let (_, [lds, component]) = find(["ua-lds", "ua-component"])?;
+    let mut interrupt = Interrupt::listen()?;
+    must_be_free(LDS_PORT, "discovery server")?;
+    let ports = PARTS.iter().filter_map(|part| part.port);
+    for port in ports.chain(DEVICE_PORTS) {
+        must_be_free(port, "component or simulator")?;
+    }
+    let (programs, mut reports) =
+        Programs::prepare().map_err(Failure::io("cannot make a directory for the logs"))?;
+    let mut story = Story {
+        plan,
+        lds,
+        component,
+        programs,
+        page: free_port()?,
+        show,
+    };
+    let played = tokio::select! {
+        played = story.play() => played,
+        (name, status) = unexpected(&mut reports) => Err(Stop::Ended(name, status)),
+        () = interrupt.come() => Err(Stop::Interrupted),
+    };
+    reports.close();
+    let outcome = played.map_err(|stop| story.failure(stop));
+    story.programs.end().await;
+    // The logs are for those who wonder what went wrong.
+    if matches!(outcome, Ok(()) | Err(Failure::Interrupted { .. }))
+        && let Err(error) = story.programs.clean_up()
+    {
+        tracing::debug!(%error, "the logs were not removed");
+    }
+    outcome
+}
+
+/// Why the story stops.
+enum Stop {
+    Failed(Failure),
+    Broken(String),
+    Ended(&'static str, ExitStatus),
+    Interrupted,
+}
+
+impl From<Failure> for Stop {
+    fn from(failure: Failure) -> Self {
+        Self::Failed(failure)
+    }
+}
+
+/// The first program that ends without being told to.
+async fn unexpected(reports: &mut mpsc::Receiver<Told>) -> (&'static str, ExitStatus) {
+    loop {
+        match reports.recv().await {
+            Some(Told::Ended { name, status }) => return (name, status),
+            Some(Told::Killed { .. } | Told::Told(_) | Told::Garbled { .. }) => {}
+            // The programs hold a sender, so it does not end before them.
+            None => std::future::pending().await,
+        }
+    }
+}
+
+struct Story<'a> {
+    plan: &'a Plan,
+    lds: PathBuf,
+    component: PathBuf,
+    programs: Programs,
+    /// Where the discovery server shows its page.
+    page: u16,
+    show: &'a mut Show,
+}
+
+impl Story<'_> {
+    async fn play(&mut self) -> Result<(), Stop> {
+        let text = format!(
+            "Tool change: a robot, two grippers and a tool changer; speed {}{}.\nTimes are seconds since the beginning; the logs are \
+             in {}.\n\n",
+            self.plan.speed.factor(),
+            if self.plan.swapped {
+                ", the tools in each other's docks"
+            } else {
+                ""
+            },
+            self.programs.directory().display()
+        );
+        let printed = self.show.timeline.print_text(&text);
+        printed.map_err(Failure::io("cannot print"))?;
+        self.start_all()?;
+        let began = Instant::now();
+        for part in &PARTS {
+            self.found(part, began).await?;
+        }
+        self.show.report.found_ms = Some(elapsed(began));
+        self.count_robots().await?;
+
+        self.change(FINGERS).await?;
+        self.handle("PlaceByFingers", (PICK, PLACE)).await?;
+        self.change(VACUUM).await?;
+        self.lose_and_plug_in().await?;
+        self.handle("PlaceByVacuum", (PLACE, PICK)).await?;
+        let detached = self
+            .run((CHANGER, "DetachTool"), "no tool", Vec::new())
+            .await?;
+        must(&detached)?;
+        self.show.note(Who::DEMO, "all of it happened".to_owned())?;
+        Ok(())
+    }
+
+    fn start_all(&mut self) -> Result<(), Failure> {
+        let directory = self.programs.directory().to_owned();
+        cell::write(&directory, self.plan.speed, self.plan.swapped)
+            .map_err(Failure::io("cannot write the files of the programs"))?;
+        let endpoint = format!("opc.tcp://{LOOPBACK}:{LDS_PORT}");
+        let metrics = format!("{LOOPBACK}:{}", self.page);
+        let arguments = ["--endpoint", &endpoint, "--metrics", &metrics].map(str::to_owned);
+        self.start("ua-lds", self.lds.clone(), arguments.into(), Stage::Bridges)?;
+        for (name, arguments) in cell::simulators(self.plan.speed) {
+            self.start(name, self.component.clone(), arguments, Stage::Master)?;
+        }
+        for part in &PARTS {
+            self.plug_in(part.name)?;
+        }
+        Ok(())
+    }
+
+    fn plug_in(&mut self, name: &'static str) -> Result<(), Failure> {
+        let yaml = self.programs.directory().join(format!("{name}.yaml"));
+        let arguments = [&yaml.display().to_string(), "--interface", LOOPBACK].map(str::to_owned);
+        self.start(
+            name,
+            self.component.clone(),
+            arguments.into(),
+            Stage::Components,
+        )?;
+        self.show.note(Who(name, "36"), "is plugged in".to_owned())
+    }
+
+    fn start(
+        &mut self,
+        name: &'static str,
+        path: PathBuf,
+        arguments: Vec<String>,
+        stage: Stage,
+    ) -> Result<(), Failure> {
+        self.programs.start(Program {
+            name,
+            path,
+            arguments,
+            environment: Vec::new(),
+            tells: false,
+            hears: false,
+            stage,
+        })?;
+        Ok(())
+    }
+
+    /// Waits until a component is registered.
+    async fn found(&mut self, part: &Part, began: Instant) -> Result<(), Stop> {
+        loop {
+            let page: Json = fetch(self.page).await.unwrap_or_default();
+            let servers = page.get("servers").and_then(Json::as_array);
+            let known = servers
+                .into_iter()
+                .flatten()
+                .any(|server| server.get("uri").and_then(Json::as_str) == Some(part.uri));
+            let answers = match part.port {
+                Some(port) if known => self.skills(port).await.is_some_and(|skills| skills > 0),
+                Some(_) | None => known,
+            };
+            if answers {
+                let text = format!("is found after {:.0} ms", elapsed(began));
+                self.show.note(Who(part.name, "36"), text)?;
+                return Ok(());
+            }
+            if began.elapsed() > FOUND {
+                return Err(Stop::Broken(format!(
+                    "{} is not found within {FOUND:?}",
+                    part.name
+                )));
+            }
+            sleep(POLL).await;
+        }
+    }
+
+    async fn skills(&self, port: u16) -> Option<usize> {
+        let client = connect(port).await.ok()?;
+        let skills = client.skills().await.ok().map(|skills| skills.len());
+        client.close().await;
+        skills
+    }
+
+    /// Two robots are there, and the story is about one of them.
+    async fn count_robots(&mut self) -> Result<(), Stop> {
+        let page: Json = fetch(self.page)
+            .await
+            .map_err(|error| Stop::Broken(format!("ua-lds does not tell who is there: {error}")))?;
+        let servers = page.get("servers").and_then(Json::as_array);
+        let robots = ["urn:example:ur5", "urn:example:robot"];
+        self.show.report.robots = servers
+            .into_iter()
+            .flatten()
+            .filter_map(|server| server.get("uri")?.as_str())
+            .filter(|uri| robots.contains(uri))
+            .count();
+        Ok(())
+    }
+
+    async fn change(&mut self, tool: &'static str) -> Result<(), Stop> {
+        let uri = PARTS
+            .iter()
+            .find(|part| part.name == tool)
+            .map_or("", |part| part.uri);
+        let dock = cell::dock(tool, self.plan.swapped);
+        let parameters = vec![
+            ("ToolPosition".to_owned(), dock.into()),
+            ("ToolAppUri".to_owned(), uri.into()),
+        ];
+        let run = self.run((CHANGER, "ChangeTool"), tool, parameters).await?;
+        must(&run)
+    }
+
+    async fn handle(&mut self, skill: &'static str, way: ([f64; 6], [f64; 6])) -> Result<(), Stop> {
+        let run = self.run((HANDLING, skill), "a part", places(way)).await?;
+        must(&run)
+    }
+
+    /// The vacuum gripper is killed while the robot carries the part, and plugged in again.
+    async fn lose_and_plug_in(&mut self) -> Result<(), Stop> {
+        let client = connect_to(HANDLING).await?;
+        let handle = handle_of(&client, "PlaceByVacuum").await?;
+        let began = Instant::now();
+        let mut steps = Steps::default();
+        let mut killed = None;
+        let running = handle.run(places((PLACE, PICK)), WITHIN);
+        tokio::pin!(running);
+        let outcome = loop {
+            tokio::select! {
+                outcome = &mut running => break outcome,
+                () = sleep(LOOK) => {}
+            }
+            steps.look(&handle).await;
+            if killed.is_none() && steps.0.iter().any(|step| step == "MovePickApproachAfter") {
+                self.programs.kill(VACUUM);
+                killed = Some(Instant::now());
+                self.show.note(
+                    Who(VACUUM, "31"),
+                    "is killed while the robot carries the part".to_owned(),
+                )?;
+            }
+        };
+        client.close().await;
+        let outcome = outcome.map_err(|fault| Stop::Broken(format!("PlaceByVacuum: {fault}")))?;
+        let run = self.ran(
+            (HANDLING, "PlaceByVacuum"),
+            "a part",
+            (outcome, steps.0, began),
+        )?;
+        let Some(killed) = killed else {
+            return Err(Stop::Broken(
+                "the run was over before the gripper was killed".to_owned(),
+            ));
+        };
+        self.show.report.told_lost_ms = Some(elapsed(killed));
+        if run.succeeded
+            || !run.message.contains("is lost")
+            || !run.message.contains("has retreated")
+        {
+            let told = run.message;
+            return Err(Stop::Broken(format!(
+                "the run does not say that the gripper was lost: {told}"
+            )));
+        }
+        self.plug_in(VACUUM)?;
+        let again = Instant::now();
+        let part = PARTS.iter().find(|part| part.name == VACUUM);
+        if let Some(part) = part {
+            self.found(part, again).await?;
+        }
+        self.show.report.found_again_ms = Some(elapsed(again));
+        Ok(())
+    }
+
+    async fn run(
+        &mut self,
+        (component, skill): (&'static str, &'static str),
+        what: &str,
+        parameters: Vec<(String, Value)>,
+    ) -> Result<Run, Stop> {
+        let client = connect_to(component).await?;
+        let handle = handle_of(&client, skill).await?;
+        let text = format!("{skill} begins: {what}");
+        self.show.note(Who(component, "36"), text)?;
+        let began = Instant::now();
+        let mut steps = Steps::default();
+        let running = handle.run(parameters, WITHIN);
+        tokio::pin!(running);
+        let outcome = loop {
+            tokio::select! {
+                outcome = &mut running => break outcome,
+                () = sleep(LOOK) => {}
+            }
+            steps.look(&handle).await;
+        };
+        client.close().await;
+        let outcome =
+            outcome.map_err(|fault| Stop::Broken(format!("{component}.{skill}: {fault}")))?;
+        self.ran((component, skill), what, (outcome, steps.0, began))
+    }
+
+    fn ran(
+        &mut self,
+        (component, skill): (&'static str, &'static str),
+        what: &str,
+        (outcome, steps, began): (Outcome, Vec<String>, Instant),
+    ) -> Result<Run, Stop> {
+        let run = Run {
+            skill: format!("{component}.{skill}"),
+            what: what.to_owned(),
+            succeeded: outcome.succeeded,
+            message: outcome.message,
+            lasted_ms: elapsed(began),
+            steps,
+        };
+        let ended = if run.succeeded {
+            "is done"
+        } else {
+            &run.message
+        };
+        self.show
+            .note(Who(component, "36"), format!("{skill}: {ended}"))?;
+        self.show.report.runs.push(run.clone());
+        Ok(run)
+    }
+
+    fn failure(&self, stop: Stop) -> Failure {
+        let logs = self.programs.directory().to_owned();
+        match stop {
+            Stop::Failed(failure) => failure,
+            Stop::Broken(why) => Failure::Broken { why, logs },
+            Stop::Ended(name, status) => Failure::ChildEnded {
+                name,
+                status,
+                last_lines: self.programs.last_lines(name),
+                logs,
+            },
+            Stop::Interrupted => Failure::Interrupted {
+                standing: format!("{} runs were over", self.show.report.runs.len()),
+            },
+        }
+    }
+}
+
+/// The steps of a run that were seen.
+#[derive(Default)]
+struct Steps(Vec<String>);
+
+impl Steps {
+    /// Looks at what the run is about now. A look that gets no answer has seen nothing.
+    async fn look(&mut self, handle: &SkillHandle) {
+        if let Ok(Ok(state)) = timeout(LOOKS, handle.state()).await
+            && !state.step.is_empty()
+            && self.0.last() != Some(&state.step)
+        {
+            self.0.push(state.step);
+        }
+    }
+}
+
+async fn connect(port: u16) -> Result<SkillClient, SkillFault> {
+    SkillClient::connect(
+        &format!("opc.tcp://{LOOPBACK}:{port}"),
+        &ClientOptions::default(),
+    )
+    .await
+}
+
+async fn connect_to(component: &'static str) -> Result<SkillClient, Stop> {
+    let part = PARTS.iter().find(|part| part.name == component);
+    let port = part.and_then(|part| part.port).unwrap_or_default();
+    connect(port)
+        .await
+        .map_err(|fault| Stop::Broken(format!("{component}: {fault}")))
+}
+
+async fn handle_of(client: &SkillClient, skill: &str) -> Result<SkillHandle, Stop> {
+    let of = TypeName::own("SkillType");
+    let found = client.skills_of(&of).await;
+    let found = found.map_err(|fault| Stop::Broken(format!("{}: {fault}", client.endpoint())))?;
+    let skill = found
+        .iter()
+        .find(|found| found.name == skill)
+        .ok_or_else(|| Stop::Broken(format!("{} has no {skill}", client.endpoint())))?;
+    Ok(client.handle(skill))
+}
+
+fn places((pick, place): ([f64; 6], [f64; 6])) -> Vec<(String, Value)> {
+    vec![
+        ("PickPosition".to_owned(), pick.into()),
+        ("PlacePosition".to_owned(), place.into()),
+    ]
+}
+
+fn must(run: &Run) -> Result<(), Stop> {
+    match run.succeeded {
+        true => Ok(()),
+        false => Err(Stop::Broken(format!(
+            "{} failed: {}",
+            run.skill, run.message
+        ))),
+    }
+}
+
+fn elapsed(since: Instant) -> f64 {
+    since.elapsed().as_secs_f64() * 1e3
+}
+
+fn millis(nanos: i64) -> f64 {
+    #[expect(clippy::cast_precision_loss, reason = "a time for people to see")]
+    let millis = nanos as f64 / 1e6;
+    millis
+}
+
+const LDS_PORT: u16 = 4840;
+const PICK: [f64; 6] = [0.4, -0.2, 0.1, 0.0, 0.0, 0.0];
+const PLACE: [f64; 6] = [0.2, -0.45, 0.1, 0.0, 0.0, 0.0];
+const FOUND: Duration = Duration::from_secs(30);
+const WITHIN: Duration = Duration::from_secs(180);
+const POLL: Duration = Duration::from_millis(50);
+const LOOK: Duration = Duration::from_millis(20);
+const LOOKS: Duration = Duration::from_millis(500);
