@@ -1,4 +1,5 @@
-"""Loads NodeSet files one after the other into a server of its own, and says which object types they bring.
+"""Loads NodeSet files one after the other into a server of its own, and says which object types they bring, and the
+values of their variables.
 
 opcua_import.py FILE...
 """
@@ -20,6 +21,13 @@ class Complaints(logging.Handler):
         self.said.append(record.getMessage())
 
 
+async def type_of(node):
+    """The name of the object type that has the node, at whatever depth: two types may have variables of one name."""
+    while node is not None and await node.read_node_class() != ua.NodeClass.ObjectType:
+        node = await node.get_parent()
+    return None if node is None else (await node.read_browse_name()).Name
+
+
 async def main():
     server = Server()
     await server.init()
@@ -38,7 +46,7 @@ async def main():
             elif kind == ua.NodeClass.Variable:
                 value = (await node.read_data_value(raise_on_bad_status=False)).Value
                 if value is not None and isinstance(value.Value, (int, float, str)):
-                    values[name] = value.Value
+                    values[f"{await type_of(node)}.{name}"] = value.Value
         print(json.dumps({"types": types, "values": values, "complaints": complaints.said}), flush=True)
 
 

@@ -218,7 +218,9 @@ fn a_type_of_another_maker_is_loaded_found_by_its_supertype_and_run_by_other_cli
         loaded[0]["types"]["SkillType"],
         json!(["ProgramStateMachineType"])
     );
-    assert_eq!(loaded[0]["values"]["Force"], json!(20.0));
+    let values = &loaded[0]["values"];
+    assert_eq!(values["GraspSkillType.Force"], json!(20.0));
+    assert_eq!(values["MoveGripperSkillType.Force"], json!(10.0));
     assert_eq!(
         loaded[1]["types"]["VacuumGraspSkillType"],
         json!(["GraspSkillType"])
