@@ -25,13 +25,6 @@ struct Written {
     key_nonce: String,
 }
 
-#[derive(Deserialize)]
-#[serde(untagged)]
-enum OneOrMany {
-    Many(Vec<Written>),
-    One(Written),
-}
-
 /// The keys of a group, in the order of the file.
 ///
 /// # Errors
@@ -70,17 +63,17 @@ pub(super) fn read(path: &Path, group: &SecurityGroup) -> Result<KeyDelivery, Fa
 }
 
 fn parse(text: &str, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
-    let written: OneOrMany = serde_json::from_str(text).map_err(|error| {
+    let written = match text.trim_start().starts_with('[') {
+        true => serde_json::from_str(text),
+        false => serde_json::from_str(text).map(|one| vec![one]),
+    };
+    let written: Vec<Written> = written.map_err(|error| {
         // What the file holds is not told.
         format!(
             "line {}: no list of keys as `ua-space keys` writes it",
             error.line()
         )
     })?;
-    let written = match written {
-        OneOrMany::Many(many) => many,
-        OneOrMany::One(one) => vec![one],
-    };
     let first = written.first().map(|key| key.security_token_id);
     let first = first.ok_or("there is no key in it")?;
     let mut keys = Vec::new();

@@ -81,8 +81,10 @@ fn describes(writer_id: u16, name: &str, status: StatusCode) -> Vec<u8> {
 }
 
 fn take(book: &mut Book, datagram: &[u8], port: u16) {
-    let message = NetworkMessage::decode(datagram).unwrap();
-    book.handle((&message, from(port)), NOW, &mut |_| {});
+    match NetworkMessage::decode(datagram) {
+        Ok(message) => book.handle((&message, from(port)), NOW, &mut |_| {}),
+        Err(_) => book.malformed(),
+    }
 }
 
 fn name(book: &Book, of: &str) -> Option<String> {
