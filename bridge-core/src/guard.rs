@@ -231,6 +231,17 @@ impl Guard {
         }
         let start = *self.start.get_or_insert(now);
         let since = now.saturating_duration_since(start);
+        // Our own comes from our own address, and is not looked at there.
+        let nonce = message.security().map_or(&[][..], |header| header.nonce);
+        if let Some(mark) = self.mark
+            && nonce.starts_with(&mark)
+        {
+            return Err(Unopened {
+                reason: Reason::Replayed,
+                case: "own",
+                detail: "somebody sends again what this program has sent".to_owned(),
+            });
+        }
         let Some(Group {
             described,
             secured: Some(secured),

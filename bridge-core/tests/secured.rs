@@ -153,6 +153,19 @@ fn what_was_recorded_is_refused_also_after_its_sender_restarted() {
 }
 
 #[test]
+fn a_program_is_not_driven_out_of_its_namespace_by_its_own_messages() {
+    let mut cell = secured(ENCRYPTED);
+    cell.say(WRITER, said(), "mine");
+    cell.run(ms(50));
+    let from = "192.0.2.9:4000".parse().unwrap();
+    for datagram in cell.datagrams_of(WRITER) {
+        cell.hear(WRITER, &datagram, from);
+    }
+    assert!(cell.dropped(WRITER, Reason::Replayed) > 0);
+    assert_eq!(cell.dropped(WRITER, Reason::SpaceTaken), 0);
+}
+
+#[test]
 fn keys_change_while_values_run_and_none_is_lost() {
     let mut cell = secured(ENCRYPTED);
     let mut delivered = delivery(1, &[1, 2, 3, 4]);

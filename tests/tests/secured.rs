@@ -1,0 +1,143 @@
+//! A secured group, live: both bridges have its keys, and a third program has none.
+
+use std::path::Path;
+use std::process::Command;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use system_tests::{
+    Cell, METRICS_ROS1, METRICS_ROS2, Peer, UaSide, UadpSocket, eventually, metrics, program,
+};
+use uadp::{NetworkMessage, Scalar};
+
+const SOON: Duration = Duration::from_secs(30);
+const TOPIC: [&str; 2] = ["/ua_1_5_10", "std_msgs/String"];
+const SECRET: &str = "a recipe nobody may know";
+
+/// Runs `ua-space` and gives what it printed.
+fn space(args: &[&str]) -> String {
+    let output = Command::new(program("ua-space")).args(args).output();
+    let output = output.unwrap();
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{args:?}: {told}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn path(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// The key a program uses, by its SecurityTokenId.
+fn token(address: &str) -> Option<u64> {
+    metrics(address)?["groups"]["cell"]["token"].as_u64()
+}
+
+/// Every drop for that reason, of topics and of none.
+fn dropped(address: &str, reason: &str) -> u64 {
+    let status = metrics(address).unwrap_or_default();
+    status["others"]["dropped"][reason]
+        .as_u64()
+        .unwrap_or_default()
+}
+
+#[test]
+fn bridges_with_the_keys_hear_each_other_and_a_third_program_neither_hears_nor_is_heard() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
+        return;
+    };
+    let keys = cell.folder().join("cell.keys");
+    space(&["keys", path(&keys)]);
+    let mapping = cell.file(
+        "cell.yaml",
+        "security: [{group: cell, keys: {file: cell.keys}}]\n",
+    );
+    let _master = cell.roscore();
+    let secured = ["--security", path(&mapping)];
+    let _bridges = (cell.bridge_ros1(&secured), cell.bridge_ros2(&secured));
+    let text = json!(SECRET).to_string();
+    let _sends = cell.rospy(
+        "ros1_pub.py",
+        &[&TOPIC[..], &["--repeat", "0", "--value", &text]].concat(),
+    );
+    let value = |line: &Value| line.get("value").cloned();
+    let mut heard = cell.cyclone("ros2_sub.py", &[&TOPIC[..], &["--domain", "2"]].concat());
+    let got = heard.wait_for_json("the string in ROS 2", SOON, value);
+    assert_eq!(got, json!({ "data": SECRET }));
+
+    // Whoever listens without the keys learns that somebody speaks, and no more.
+    let datagrams = UadpSocket::join().receive_for(Duration::from_secs(2));
+    assert!(!datagrams.is_empty());
+    for datagram in &datagrams {
+        assert!(NetworkMessage::decode(datagram).unwrap().is_sealed());
+        let readable = datagram.windows(SECRET.len());
+        assert_eq!(
+            readable.filter(|part| *part == SECRET.as_bytes()).count(),
+            0
+        );
+    }
+    // Whoever speaks without them is not heard, nor one who repeats what it heard.
+    let mut third = UaSide::join();
+    third.write((0, 5, 11), Scalar::String(Some("forged")));
+    let socket = UadpSocket::join();
+    for datagram in &datagrams {
+        socket.send(datagram);
+    }
+    for address in [METRICS_ROS1, METRICS_ROS2] {
+        eventually("what is in clear is counted", SOON, || {
+            (dropped(address, "unsecured") > 0).then_some(())
+        });
+        eventually("what is sent again is counted", SOON, || {
+            (dropped(address, "replayed") > 0).then_some(())
+        });
+        let topics = metrics(address).unwrap()["topics"].clone();
+        assert_eq!(topics.get("ua_0_5_11"), None, "{topics}");
+    }
+    // Who has them looks in.
+    let echoed = space(&[
+        "echo",
+        "ua_1_5_10",
+        "-n",
+        "1",
+        "--seconds",
+        "20",
+        "--interface",
+        "lo",
+        "--keys",
+        path(&keys),
+    ]);
+    assert!(echoed.contains(SECRET), "{echoed}");
+
+    // Another key, while values run.
+    space(&["keys", "--next", path(&keys)]);
+    space(&["keys", "--drop", path(&keys)]);
+    for address in [METRICS_ROS1, METRICS_ROS2] {
+        let second = || (token(address) == Some(2)).then_some(());
+        eventually("the second key is used", SOON, second);
+    }
+    let before = dropped(METRICS_ROS2, "unknown_key");
+    let count = heard.values().len();
+    eventually("values go on", SOON, || {
+        (heard.values().len() > count + 10).then_some(())
+    });
+    assert_eq!(dropped(METRICS_ROS2, "unknown_key"), before);
+}
+
+#[test]
+fn keys_that_others_can_read_are_not_used() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let keys = cell.folder().join("cell.keys");
+    space(&["keys", path(&keys)]);
+    let open = std::os::unix::fs::PermissionsExt::from_mode(0o644);
+    std::fs::set_permissions(&keys, open).unwrap();
+    let mapping = cell.file(
+        "cell.yaml",
+        "security: [{group: cell, keys: {file: cell.keys}}]\n",
+    );
+    let mut server = cell.ua_server_started(&[path(&mapping)]).start();
+    let ended = server.wait_for_end(SOON);
+    assert_eq!(ended.code(), Some(78));
+    let told = server.lines().join("\n");
+    assert!(told.contains("chmod 600"), "{told}");
+}
