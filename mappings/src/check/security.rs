@@ -153,7 +153,7 @@ fn keys(
         if mode != GroupMode::None {
             findings
                 .error(Code::GroupKeys, owner, "a secured group without `keys`")
-                .help("keys: {file: cell.keys}, which `ua-space keys cell.keys` makes; or keys: {sks: {}}, the cell's own server");
+                .help("keys: {file: cell.keys}, which `ua-space keys cell.keys` makes");
         }
         return None;
     };
@@ -223,6 +223,13 @@ fn service(
     server: &Endpoint,
     findings: &mut Findings,
 ) -> Option<KeySource> {
+    findings
+        .warning(
+            Code::GroupKeys,
+            place,
+            "no program fetches keys from a Security Key Service yet: in this group nothing is said or heard",
+        )
+        .help("keys: {file: cell.keys}, which `ua-space keys cell.keys` makes");
     let lifetime = duration(&entry.key_lifetime, findings);
     let members = entry.members.as_ref().and_then(|at| at.value.as_deref());
     let members: Vec<String> = members
