@@ -368,3 +368,54 @@ fn simulated_grippers_are_what_the_tables_of_their_makers_say_to_another_client(
         (json!(400), json!(404))
     );
 }
+
+#[test]
+fn a_simulated_robot_and_its_tool_changer_are_what_clients_of_other_makers_expect() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let (_robot, _) = simulator(&["universal-robot"]);
+    let dock = "3@0.4,0,0.5,0,0,1.5";
+    let (_changer, at) = simulator(&["kelvin-tool-changer", "--tool", dock]);
+    // The flange stands in that dock, turned by more than the ring needs: the tool is locked.
+    let seen = eventually("the tool is locked", SOON, || {
+        let seen = cell.asyncua_once("device_registers.py", &["converter", &at]);
+        (seen[0]["volts"] == json!(7.4)).then_some(seen)
+    });
+    assert_eq!(seen.len(), 1);
+
+    let seen = cell.asyncua_once("ur_judge.py", &["127.0.0.1"]);
+    let first = line_of(&seen, "at first");
+    assert_eq!(first["pose"], json!([0.4, 0.0, 0.5, 0.0, 0.0, 0.0]));
+    assert_eq!(
+        (&first["mode"], &first["safety"], &first["connected"]),
+        (&json!(7), &json!(1), &json!(true))
+    );
+    let secondary = line_of(&seen, "secondary");
+    assert_eq!(
+        (
+            &secondary["powered"],
+            &secondary["running"],
+            &secondary["mode"]
+        ),
+        (&json!(true), &json!(false), &json!(7))
+    );
+    assert_eq!(secondary["place"], json!([0.4, 0.0, 0.5, 0.0, 0.0, 0.0]));
+    let moved = line_of(&seen, "moved");
+    let half = (std::f64::consts::FRAC_PI_2 * 1e4).round() / 1e4;
+    assert_eq!(moved["pose"], json!([0.2, 0.1, 0.4, 0.0, half, 0.0]));
+    assert!(moved["fastest"].as_f64() <= Some(0.2505), "{moved}");
+    // The turn is longer than the way: pi/2 rad, 0.25 s to gain the speed, 0.25 s to lose it.
+    let seconds = |what: &str| line_of(&seen, what)["seconds"].as_f64().unwrap();
+    let expected = std::f64::consts::FRAC_PI_2 / 0.25 + 0.25;
+    assert!((seconds("moved") - expected).abs() < 0.5, "{moved}");
+    assert!(
+        (seconds("moved slowly") - 2.0 * 1.05).abs() < 0.5,
+        "{seen:?}"
+    );
+    let stands = line_of(&seen, "stands");
+    assert_eq!(
+        (&stands["still"], &stands["register"], &stands["program"]),
+        (&json!(true), &json!(8), &json!(2))
+    );
+}

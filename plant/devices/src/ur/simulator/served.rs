@@ -275,8 +275,7 @@ impl<'s> Client<'s> {
     }
 
     fn outputs_agreed(&mut self, names: &str) -> Vec<u8> {
-        let found: Vec<(&str, Option<Kind>)> = names
-            .split(',')
+        let found: Vec<(&str, Option<Kind>)> = listed(names)
             .map(|name| (name, variables::output(name)))
             .collect();
         let mut answer = vec![1];
@@ -297,8 +296,10 @@ impl<'s> Client<'s> {
         let mut taken = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
         let mut told = Vec::new();
         let mut recipe = Vec::new();
-        for name in names.split(',') {
-            let in_use = taken.iter().any(|of| of == name);
+        for name in listed(names) {
+            // A client may have an input in several recipes of its own.
+            let own = self.has.iter().any(|of| of == name);
+            let in_use = !own && taken.iter().any(|of| of == name);
             match variables::input(name) {
                 Some(_) if in_use => told.push("IN_USE"),
                 Some(kind) => {
@@ -343,6 +344,11 @@ impl Drop for Client<'_> {
         let mut taken = self.taken.lock().unwrap_or_else(PoisonError::into_inner);
         taken.retain(|name| !self.has.contains(name));
     }
+}
+
+/// The names of a list; a comma behind the last one, as some clients write it, says nothing.
+fn listed(names: &str) -> impl Iterator<Item = &str> {
+    names.strip_suffix(',').unwrap_or(names).split(',')
 }
 
 fn kinds(found: &[(&str, Option<Kind>)]) -> String {
