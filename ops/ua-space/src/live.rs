@@ -11,6 +11,7 @@ mod prober;
 mod run;
 mod sealing;
 mod skills;
+mod structure;
 mod text;
 mod trace;
 

@@ -317,6 +317,15 @@ impl Book {
                     Err(_) => self.count(Drop::Malformed),
                 }
             }
+            // Without a payload header it is an encoded NetworkMessage that was cut up, as those of calls are.
+            Ok(Some(whole)) if whole.writer_id.is_none() => {
+                match NetworkMessage::decode(whole.bytes) {
+                    Ok(inner) if inner.is_action() && !inner.is_sealed() => {
+                        self.actions(&inner, each);
+                    }
+                    Ok(_) | Err(_) => self.count(Drop::Malformed),
+                }
+            }
             Ok(Some(whole)) => {
                 let group = whole.header.group;
                 let namespace = group.and_then(|group| group.writer_group_id);

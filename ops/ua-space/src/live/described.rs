@@ -6,8 +6,10 @@
 
 use mappings::TopicId;
 use serde::Serialize;
-use uadp::discovery::{ActionMetaData, DataSetMetaDataType, FieldMetaData};
+use uadp::discovery::{ActionMetaData, DataSetMetaDataType, DataTypeSchemaHeader, FieldMetaData};
 use uadp::{BuiltinType, Scalar, Variant};
+
+use super::structure::Structure;
 
 /// A topic or call as it was announced.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -49,6 +51,8 @@ pub(crate) struct Field {
     pub(crate) description: String,
     /// May be left out of a request.
     pub(crate) optional: bool,
+    /// What the messages in it consist of.
+    pub(crate) structure: Option<Structure>,
 }
 
 /// A field as `--json` shows it.
@@ -144,7 +148,8 @@ impl Described {
     pub(crate) fn weight(&self) -> usize {
         let of = |fields: &[Field]| -> usize {
             let texts = fields.iter().map(|field| {
-                field.name.len() + field.description.len() + field.dimensions.len() * 4
+                let structure = field.structure.as_ref().map_or(0, Structure::weight);
+                field.name.len() + field.description.len() + field.dimensions.len() * 4 + structure
             });
             texts.sum::<usize>() + size_of_val(fields)
         };
@@ -211,16 +216,28 @@ fn fields(meta_data: &DataSetMetaDataType<'_>) -> Result<Vec<Field>, &'static st
     if meta_data.fields.len() > MOST_FIELDS {
         return Err("too many fields");
     }
-    meta_data.fields.iter().map(|field| read(&field)).collect()
+    let mut room = MOST_FIELDS;
+    let fields = meta_data.fields.iter();
+    fields
+        .map(|field| read(&field, &meta_data.schema, &mut room))
+        .collect()
 }
 
-fn read(field: &FieldMetaData<'_>) -> Result<Field, &'static str> {
+fn read(
+    field: &FieldMetaData<'_>,
+    schema: &DataTypeSchemaHeader<'_>,
+    room: &mut usize,
+) -> Result<Field, &'static str> {
     if field.array_dimensions.len() > MOST_DIMENSIONS {
         return Err("too many dimensions");
     }
+    let builtin = field.builtin_type();
+    let is_structure = builtin == Some(BuiltinType::ExtensionObject);
+    let structure = is_structure.then(|| Structure::of(schema, field.data_type, room));
     Ok(Field {
         name: bounded(field.name, "the name of a field")?,
-        builtin: field.builtin_type(),
+        builtin,
+        structure: structure.flatten(),
         rank: field.value_rank,
         dimensions: field.array_dimensions.iter().collect(),
         max_string_length: field.max_string_length,
@@ -287,6 +304,7 @@ mod tests {
             max_string_length: 0,
             description: String::new(),
             optional: false,
+            structure: None,
         };
         assert_eq!(field(-1, &[]).kind(), "Double");
         assert_eq!(field(1, &[6]).kind(), "Double[6]");

@@ -163,6 +163,7 @@ mod tests {
             max_string_length: 0,
             description: String::new(),
             optional,
+            structure: None,
         }
     }
 

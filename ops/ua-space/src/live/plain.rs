@@ -92,7 +92,7 @@ pub(crate) fn message(
             .value
             .value
             .as_ref()
-            .map_or(Ok(Value::Null), variant)?;
+            .map_or(Ok(Value::Null), |value| field(value, fields, index.into()))?;
         let name = name(fields, index.into());
         if let Some(status) = status.filter(|status| status.0 != 0) {
             named.0.push((
@@ -118,9 +118,26 @@ pub(crate) fn response(
     }
     let mut named = Named::default();
     for (value, index) in fields.variants()?.zip(0..) {
-        named.0.push((name(described, index), variant(&value?)?));
+        let shown = field(&value?, described, index)?;
+        named.0.push((name(described, index), shown));
     }
     Ok(named)
+}
+
+/// A value of the field with that number: messages by the names of their fields, where they were announced.
+fn field(value: &Variant<'_>, fields: &[Field], index: usize) -> Result<Value, DecodeError> {
+    let Some(structure) = fields.get(index).and_then(|field| field.structure.as_ref()) else {
+        return variant(value);
+    };
+    let one = |value| match structure.show(value)? {
+        Some(shown) => Ok(shown),
+        None => scalar(value),
+    };
+    match value {
+        Variant::Scalar(value) => one(*value),
+        Variant::Array(array) => array.iter().map(one).collect(),
+        Variant::Null | Variant::Matrix(_) => variant(value),
+    }
 }
 
 fn name(fields: &[Field], index: usize) -> String {
@@ -180,7 +197,7 @@ pub(crate) fn variant(value: &Variant<'_>) -> Result<Value, DecodeError> {
     }
 }
 
-fn scalar(value: Scalar<'_>) -> Result<Value, DecodeError> {
+pub(super) fn scalar(value: Scalar<'_>) -> Result<Value, DecodeError> {
     #[expect(
         clippy::wildcard_enum_match_arm,
         reason = "all others as `decode` has them"
@@ -193,7 +210,7 @@ fn scalar(value: Scalar<'_>) -> Result<Value, DecodeError> {
     }
 }
 
-fn elements(array: Array<'_>) -> Result<Value, DecodeError> {
+pub(super) fn elements(array: Array<'_>) -> Result<Value, DecodeError> {
     array.iter().map(scalar).collect()
 }
 

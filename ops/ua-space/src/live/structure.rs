@@ -1,0 +1,123 @@
+//! Messages in arrays: structures, whose fields the announcement of a topic or call defines.
+
+use serde_json::{Map, Value};
+use uadp::discovery::{DataTypeSchemaHeader, StructureField, StructureType};
+use uadp::{BuiltinType, DecodeError, ExtensionBody, Identifier, NodeId, Scalar, StructureReader};
+
+use super::plain;
+
+/// What a structure consists of, those in it included.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Structure(Vec<Part>);
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Part {
+    name: String,
+    kind: Kind,
+    is_array: bool,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+enum Kind {
+    Builtin(BuiltinType),
+    Structure(Structure),
+}
+
+impl Structure {
+    /// The structure of a DataType; `None` for one that is not defined there, or has too much in it. `room` is how many
+    /// fields there may be, those of structures in structures included: a short schema can say any number of them.
+    pub(super) fn of(
+        schema: &DataTypeSchemaHeader<'_>,
+        data_type: NodeId<'_>,
+        room: &mut usize,
+    ) -> Option<Self> {
+        Self::within(schema, data_type, (MOST_NESTED, room))
+    }
+
+    fn within(
+        schema: &DataTypeSchemaHeader<'_>,
+        data_type: NodeId<'_>,
+        (depth, room): (usize, &mut usize),
+    ) -> Option<Self> {
+        let depth = depth.checked_sub(1)?;
+        let found = schema.structure(data_type)?.structure_definition;
+        if found.structure_type != StructureType::STRUCTURE {
+            return None;
+        }
+        *room = room.checked_sub(found.fields.len())?;
+        let parts = found.fields.iter().map(|field| {
+            Some(Part {
+                name: field.name.unwrap_or_default().to_owned(),
+                kind: match builtin(&field) {
+                    Some(builtin) => Kind::Builtin(builtin),
+                    None => Kind::Structure(Self::within(schema, field.data_type, (depth, room))?),
+                },
+                is_array: match field.value_rank {
+                    -1 => false,
+                    1 => true,
+                    _ => return None,
+                },
+            })
+        });
+        parts.collect::<Option<Vec<_>>>().map(Self)
+    }
+
+    /// Roughly the bytes it takes up.
+    pub(super) fn weight(&self) -> usize {
+        let of = |part: &Part| {
+            let inner = match &part.kind {
+                Kind::Builtin(_) => 0,
+                Kind::Structure(structure) => structure.weight(),
+            };
+            size_of::<Part>() + part.name.len() + inner
+        };
+        self.0.iter().map(of).sum()
+    }
+
+    /// The fields of a value; `None` for what is no structure in the binary encoding.
+    ///
+    /// # Errors
+    /// [`DecodeError`] for what is not what was announced.
+    pub(super) fn show(&self, value: Scalar<'_>) -> Result<Option<Value>, DecodeError> {
+        let Scalar::ExtensionObject(object) = value else {
+            return Ok(None);
+        };
+        let ExtensionBody::Binary(body) = object.body else {
+            return Ok(None);
+        };
+        let mut room = MOST_VALUES;
+        self.read(&mut StructureReader::new(body), &mut room)
+            .map(Some)
+    }
+
+    fn read(&self, body: &mut StructureReader<'_>, room: &mut usize) -> Result<Value, DecodeError> {
+        const TOO_MUCH: DecodeError = DecodeError::Misread("more structures than are shown");
+        *room = room.checked_sub(1).ok_or(TOO_MUCH)?;
+        let mut shown = Map::new();
+        for part in &self.0 {
+            let value = match (&part.kind, part.is_array) {
+                (Kind::Builtin(builtin), false) => plain::scalar(body.scalar(*builtin)?)?,
+                (Kind::Builtin(builtin), true) => plain::elements(body.array(*builtin)?)?,
+                (Kind::Structure(structure), false) => structure.read(body, room)?,
+                (Kind::Structure(structure), true) => (0..body.length()?.unwrap_or_default())
+                    .map(|_| structure.read(body, room))
+                    .collect::<Result<_, _>>()?,
+            };
+            shown.insert(part.name.clone(), value);
+        }
+        Ok(Value::Object(shown))
+    }
+}
+
+/// The builtin type that a field is of itself.
+fn builtin(field: &StructureField<'_>) -> Option<BuiltinType> {
+    match (field.data_type.namespace, field.data_type.identifier) {
+        (0, Identifier::Numeric(number)) => BuiltinType::from_id(number.try_into().ok()?),
+        _ => None,
+    }
+}
+
+/// Structures in structures.
+const MOST_NESTED: usize = 16;
+/// Structures that are shown of one value.
+const MOST_VALUES: usize = 1 << 16;
