@@ -7,7 +7,20 @@ from types import new_class
 from cyclonedds.core import Policy, Qos
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.annotations import final
-from cyclonedds.idl.types import array, float32, float64, int8, int32, int64, sequence, uint8, uint32, uint64
+from cyclonedds.idl.types import (
+    array,
+    float32,
+    float64,
+    int8,
+    int16,
+    int32,
+    int64,
+    sequence,
+    uint8,
+    uint16,
+    uint32,
+    uint64,
+)
 from cyclonedds.util import duration
 
 from ros2_types import Time
@@ -99,6 +112,24 @@ ParameterEvent = struct(
 # Messages that nothing but the services of parameters brings about.
 MESSAGES = {"rcl_interfaces/ParameterEvent": ParameterEvent}
 
+BASIC = [
+    ("bool_value", bool, False),
+    ("byte_value", uint8, 0),
+    ("char_value", uint8, 0),
+    ("float32_value", float32, 0.0),
+    ("float64_value", float64, 0.0),
+    ("int8_value", int8, 0),
+    ("uint8_value", uint8, 0),
+    ("int16_value", int16, 0),
+    ("uint16_value", uint16, 0),
+    ("int32_value", int32, 0),
+    ("uint32_value", uint32, 0),
+    ("int64_value", int64, 0),
+    ("uint64_value", uint64, 0),
+    ("string_value", str, ""),
+]
+State = struct("lifecycle_msgs/msg/State", [("id", uint8, 0), ("label", str, "")])
+
 NAMES = [("names", sequence[str], list)]
 PARAMETERS = [("parameters", sequence[Parameter], list)]
 
@@ -133,6 +164,10 @@ SERVICES = {
         "action_msgs/srv/CancelGoal",
         [("goal_info", GoalInfo, GoalInfo)],
         [("return_code", int8, 0), ("goals_canceling", sequence[GoalInfo], list)],
+    ),
+    "test_msgs/BasicTypes": service("test_msgs/srv/BasicTypes", BASIC, BASIC),
+    "lifecycle_msgs/GetAvailableStates": service(
+        "lifecycle_msgs/srv/GetAvailableStates", [], [("available_states", sequence[State], list)]
     ),
     # As tests/tests/shaped.rs defines it.
     "robot_msgs/Move": service(

@@ -4,19 +4,39 @@ use std::time::Duration;
 
 use serde_json::{Value, json};
 
-use crate::{Cell, Child, Distribution};
+use crate::cell::{ROSCPP, compiled};
+use crate::{Cell, Child, Distribution, SERVER_ENDPOINT, Started, program};
 
 /// More than the longest order of a test takes.
 const PATIENCE: Duration = Duration::from_secs(90);
 
-/// `peers/calls/ros1_asker.py` or `ros2_asker.py`.
+/// `peers/calls/ros1_asker.py` or another that takes the same orders.
 pub struct Asker {
     peer: Child,
     asked: u64,
 }
 
-/// `peers/calls/ros1_executor.py` or `ros2_executor.py`.
+/// `peers/calls/ros1_executor.py` or another that answers as it does.
 pub struct Counting(Child);
+
+/// Who asks for calls, of those in `peers/calls`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Asking {
+    /// A rospy client.
+    Rospy,
+    /// A roscpp client.
+    Roscpp,
+    /// An rclpy client in a domain.
+    Rclpy(Distribution, u16),
+    /// A client of Cyclone DDS in a domain.
+    Cyclone(u16),
+    /// An asyncua client of the cell's ua-server.
+    Asyncua,
+    /// A node-opcua client of the cell's ua-server.
+    NodeOpcua,
+    /// `ua-space call`.
+    UaSpace,
+}
 
 /// A type that programs know from files only.
 const BASIC_TYPES: &str = "\
@@ -52,6 +72,19 @@ impl Cell {
     /// When it cannot be written.
     #[must_use]
     pub fn call_mapping(&self, space: u16, more: &str) -> String {
+        let name = self.call_types(space);
+        let yaml =
+            format!("spaces: [{{id: 1}}, {{id: 2}}]\ntype_paths: [{name}]\nvariables: []\n{more}");
+        let path = self.file(&format!("{name}.yaml"), &yaml);
+        path.to_str().unwrap().to_owned()
+    }
+
+    /// The definitions of those cases as the ROS of `space`, 1 or 2, has them; the name of their folder.
+    ///
+    /// # Panics
+    /// When they cannot be written.
+    #[must_use]
+    pub fn call_types(&self, space: u16) -> &'static str {
         let (name, basic) = if space == 1 {
             // What ROS 2 calls a byte is an int8 under that name in ROS 1.
             ("ros1", BASIC_TYPES.replace("byte ", "uint8 "))
@@ -66,10 +99,41 @@ impl Cell {
         for (file, text) in STATES {
             let _ = self.file(&format!("{name}/lifecycle_msgs/{file}"), text);
         }
-        let yaml =
-            format!("spaces: [{{id: 1}}, {{id: 2}}]\ntype_paths: [{name}]\nvariables: []\n{more}");
-        let path = self.file(&format!("{name}.yaml"), &yaml);
-        path.to_str().unwrap().to_owned()
+        name
+    }
+
+    /// Those who ask, which start beside each other.
+    #[must_use]
+    pub fn askers(&self, askers: &[Asking]) -> Vec<Asker> {
+        let started = askers.iter().map(|of| self.asker_started(*of).told());
+        let started: Vec<Child> = started.map(Started::start).collect();
+        started.into_iter().map(Asker::of).collect()
+    }
+
+    fn asker_started(&self, of: Asking) -> Started {
+        match of {
+            Asking::Rospy => self.rospy_started("calls/ros1_asker.py", &[]),
+            Asking::Roscpp => self.roscpp_started(&["ask"]),
+            Asking::Rclpy(distribution, domain) => self
+                .rclpy_started(distribution, "calls/ros2_asker.py", &[])
+                .env("ROS_DOMAIN_ID", domain.to_string()),
+            Asking::Cyclone(domain) => {
+                let args = ["ask", "--domain", &domain.to_string()];
+                self.cyclone_started("calls/cyclone.py", &args)
+            }
+            Asking::Asyncua => self.asyncua_started("calls/opcua_asker.py", &[SERVER_ENDPOINT]),
+            Asking::NodeOpcua => self.node_opcua_started("ask.js", &[SERVER_ENDPOINT]),
+            Asking::UaSpace => self
+                .asyncua_started("calls/ua_space_asker.py", &[])
+                .args([program("ua-space")]),
+        }
+    }
+
+    /// The roscpp peer, not started yet.
+    #[must_use]
+    pub fn roscpp_started(&self, args: &[&str]) -> Started {
+        self.with_ros1(Started::new(ROSCPP, &compiled(ROSCPP)))
+            .args(args)
     }
 
     /// A rospy client of the cases in `peers/calls/cases.py`.
@@ -96,11 +160,37 @@ impl Cell {
         Counting(peer.told().start().ready(PATIENCE))
     }
 
+    /// Peers that execute, which start beside each other.
+    #[must_use]
+    pub fn executors(&self, started: impl IntoIterator<Item = Started>) -> Vec<Counting> {
+        let started = started.into_iter().map(|started| started.told().start());
+        let started: Vec<Child> = started.collect();
+        let ready = started.into_iter().map(|child| child.ready(PATIENCE));
+        ready.map(Counting).collect()
+    }
+
     /// An rclpy server of services, each `CASE=/name`, with options.
     #[must_use]
     pub fn rclpy_executor(&self, distribution: Distribution, args: &[&str]) -> Counting {
         let peer = self.rclpy_started(distribution, "calls/ros2_executor.py", args);
         Counting(peer.told().start().ready(PATIENCE))
+    }
+}
+
+impl Asking {
+    /// As the guide calls it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Rospy => "rospy",
+            Self::Roscpp => "roscpp",
+            Self::Rclpy(Distribution::Jazzy, _) => "rclpy (Jazzy)",
+            Self::Rclpy(Distribution::Kilted, _) => "rclpy (Kilted)",
+            Self::Cyclone(_) => "Cyclone DDS",
+            Self::Asyncua => "asyncua",
+            Self::NodeOpcua => "node-opcua",
+            Self::UaSpace => "ua-space",
+        }
     }
 }
 

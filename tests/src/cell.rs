@@ -27,6 +27,8 @@ pub enum Peer {
     FastDds,
     /// Cyclone DDS from Debian or Ubuntu, in a program that `cargo xtask test` compiles.
     CycloneC,
+    /// roscpp from Debian or Ubuntu, in a program that `cargo xtask test` compiles.
+    Roscpp,
     /// rclpy over Fast DDS, of each [`Distribution`], in the Python environments that `cargo xtask test` makes.
     Ros2,
     /// node-opcua, which `cargo xtask test` installs from npm.
@@ -82,6 +84,7 @@ static ONLY: Mutex<()> = Mutex::new(());
 pub(crate) const TSHARK: &str = "/usr/bin/tshark";
 pub(crate) const FASTDDS: &str = "fastdds-peer";
 pub(crate) const CYCLONE: &str = "cyclone-peer";
+pub(crate) const ROSCPP: &str = "roscpp-peer";
 pub(crate) const NODE_OPCUA: &str = "node-opcua";
 
 impl Cell {
@@ -220,7 +223,7 @@ pub(crate) fn compiled(name: &str) -> PathBuf {
 }
 
 fn find(peer: Peer, python: &Path) -> Result<(), String> {
-    let (fastdds, cyclone) = (compiled(FASTDDS), compiled(CYCLONE));
+    let [fastdds, cyclone, roscpp] = [FASTDDS, CYCLONE, ROSCPP].map(compiled);
     let [jazzy, kilted] = Distribution::ALL.map(Distribution::python);
     let node_opcua = compiled(NODE_OPCUA).join("node_modules/node-opcua-client");
     let needed: &[&Path] = match peer {
@@ -237,6 +240,7 @@ fn find(peer: Peer, python: &Path) -> Result<(), String> {
         Peer::Python => &[python],
         Peer::FastDds => &[&fastdds],
         Peer::CycloneC => &[&cyclone],
+        Peer::Roscpp => &[&roscpp],
         Peer::Ros2 => &[&jazzy, &kilted],
         Peer::NodeOpcua => &[&node_opcua],
         Peer::Tshark => &[Path::new(TSHARK)],

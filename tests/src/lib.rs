@@ -34,7 +34,7 @@ mod wait;
 
 pub use announcer::Announcer;
 pub use arrows::{forbidden, tree};
-pub use asker::{Asker, Counting};
+pub use asker::{Asker, Asking, Counting};
 pub use bare_node::{BareNode, BareSubscription, PATIENCE, string_frame};
 pub use capture::{Capture, Dissected, hex, is_true};
 pub use cell::{Cell, Distribution, Peer, without_data};

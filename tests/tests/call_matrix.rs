@@ -2,127 +2,315 @@
 //!
 //! The table of the guide is the one that this test sees.
 
-use std::time::Duration;
-
 use serde_json::{Value, json};
-use system_tests::{Asker, Cell, Counting, Distribution, Peer, Started, program};
+use system_tests::{Asker, Asking, Cell, Child, Distribution, Peer, Started, program};
 
-const CASES: [&str; 5] = ["bundled", "files", "empty", "megabyte", "messages"];
-const COUNT: u32 = 10;
+/// A letter of the guide for each case, and its name there.
+const CASES: [(char, &str); 5] = [
+    ('B', "bundled"),
+    ('F', "files"),
+    ('E', "empty"),
+    ('L', "megabyte"),
+    ('M', "messages"),
+];
+/// Calls of each who asks, of each case of each who executes.
+const COUNT: u64 = 2;
+const ASKING: [Asking; 8] = [
+    Asking::Rospy,
+    Asking::Roscpp,
+    Asking::Rclpy(Distribution::Jazzy, 3),
+    Asking::Rclpy(Distribution::Kilted, 3),
+    Asking::Cyclone(3),
+    Asking::Asyncua,
+    Asking::NodeOpcua,
+    Asking::UaSpace,
+];
+const PLC: &str = "opc.tcp://127.0.0.1:4841";
 
-/// The service of a case that is executed in that space.
-fn service(space: u16, case: usize) -> String {
-    format!("/ua_{space}_2_{}", 60 + case)
+const METHOD: &str = "Method (asyncua)";
+
+/// One call, under all its names.
+struct Call {
+    letter: char,
+    /// Of `peers/calls/cases.py`.
+    case: &'static str,
+    service: String,
+    method: String,
+    topic: String,
 }
 
-fn services(space: u16) -> Vec<String> {
-    let all = CASES.iter().enumerate();
-    all.map(|(number, case)| format!("{case}={}", service(space, number)))
-        .collect()
+/// Somebody who executes, and what.
+struct Executing {
+    name: &'static str,
+    space: u16,
+    calls: Vec<Call>,
 }
 
-/// Asks for each case of a space; the cases that are answered, and right each time.
-fn asks(asker: &mut Asker, space: u16) -> Vec<&'static str> {
-    let answered = |(number, case): (usize, &&'static str)| {
-        let told = asker.ask(json!({
-            "case": case, "service": service(space, number), "count": COUNT, "at_once": 2,
-            "wait": 15, "patience": 10,
-        }));
-        // A wrong answer is worse than none. What a failure makes of a response of ROS 2 is no answer.
-        assert!(
-            told["failures"] != 0 || told["wrongs"] == 0,
-            "{case} of {space}: {told}"
-        );
-        if told["right"] != COUNT {
-            eprintln!("{case} of {space}: {told}");
+impl Executing {
+    /// Services of ROS with the numbers from `first` on, for which nothing is mapped.
+    fn services(name: &'static str, space: u16, first: usize) -> Self {
+        let calls = CASES.iter().zip(first..).map(|((letter, case), number)| {
+            let topic = format!("ua_{space}_2_{number}");
+            Call {
+                letter: *letter,
+                case,
+                service: format!("/{topic}"),
+                method: format!("UaSpace/Calls/{topic}"),
+                topic,
+            }
+        });
+        Self {
+            name,
+            space,
+            calls: calls.collect(),
         }
-        (told["right"] == COUNT).then_some(*case)
-    };
-    CASES.iter().enumerate().filter_map(answered).collect()
+    }
+
+    /// Methods of another server. That of the type from files has a type in ROS by the mapping.
+    fn methods() -> Self {
+        let mut methods = Self::services(METHOD, 0, 60);
+        methods.calls.pop();
+        for (call, number) in methods.calls.iter_mut().zip(60..) {
+            call.topic = format!("ua_0_3_{number}");
+            call.service = match call.case {
+                "files" => "/plc/files".to_owned(),
+                _ => format!("/ua_0_3_{number}"),
+            };
+            call.method = format!("UaSpace/Calls/Plc/{}", call.case);
+        }
+        methods
+    }
+
+    /// Methods of a skill.
+    fn skill() -> Self {
+        let call = |letter, case, service: &str, method: &str, number| Call {
+            letter,
+            case,
+            service: service.to_owned(),
+            method: format!("UaSpace/Calls/parallel-gripper/Grasp/{method}"),
+            topic: format!("ua_0_7_{number}"),
+        };
+        Self {
+            name: "skill of a component",
+            space: 0,
+            calls: vec![
+                call('B', "skill", "/ua_0_7_109", "Reset", 109),
+                call('F', "grasp", "/grasp", "Start", 105),
+                call('E', "skill", "/ua_0_7_106", "Halt", 106),
+            ],
+        }
+    }
+
+    /// As its peers take them.
+    fn words(&self) -> Vec<String> {
+        let calls = self.calls.iter();
+        calls
+            .map(|call| format!("{}={}", call.case, call.service))
+            .collect()
+    }
 }
 
-/// What the guide says crosses, in the order of [`CASES`].
-fn in_the_guide(executing: &str, asking: &str) -> Vec<&'static str> {
-    let guide = include_str!("../../docs/guide.md");
-    let row = format!("| {executing} | {asking} |");
-    let line = guide.lines().find(|line| line.starts_with(&row));
-    let line = line.unwrap_or_else(|| panic!("the guide has no row `{row}`"));
-    let cells = line[row.len()..].split('|').map(str::trim);
-    let yes = CASES.iter().zip(cells).filter(|(_, cell)| *cell == "yes");
-    yes.map(|(case, _)| *case).collect()
+/// Who has no need of a bridge or of the server: those of the same ROS, and OPC UA clients of a server's Methods.
+fn is_at_home(asking: Asking, executing: &Executing) -> bool {
+    match asking {
+        Asking::Rospy | Asking::Roscpp => executing.space == 1,
+        Asking::Asyncua | Asking::NodeOpcua => executing.name == METHOD,
+        Asking::Rclpy(..) | Asking::Cyclone(_) | Asking::UaSpace => false,
+    }
 }
 
-fn all_executed(executor: &mut Counting, askers: &[Vec<&str>]) {
-    let counts: Value = executor.counts();
-    let least = askers.iter().map(Vec::len).sum::<usize>() * 10;
-    assert!(
-        counts["executed"].as_u64().unwrap() >= least as u64,
-        "{counts}"
+/// What is asked for in ROS by a name or a type of its own.
+fn methods() -> String {
+    let node = "nsu=urn:ua-bridge:system-tests:plc;s=Line";
+    let methods = Executing::methods();
+    let methods = methods.calls.iter().zip(60..).map(|(call, number)| {
+        let case = call.case;
+        let ros = "type: test_msgs/BasicTypes";
+        let ros = match case {
+            "files" => format!(
+                ", ros: [{{space: 1, service: /plc/files, {ros}}}, {{space: 3, service: /plc/files, {ros}}}]"
+            ),
+            _ => String::new(),
+        };
+        format!(
+            "  - {{node: ns=3;i={number}, name: Plc.{case}, origin: 0, \
+             opcua: {{endpoint: '{PLC}', object: '{node}', method: '{node}.{case}'}}{ros}}}\n"
+        )
+    });
+    format!(
+        "namespaces: {{3: 'urn:test:plc-calls', 7: 'urn:test:gripper'}}\ncalls:\n{}",
+        methods.collect::<String>()
+    )
+}
+
+/// The Start of a skill, asked for in ROS by a type that has nothing to do with it.
+fn start() -> String {
+    let zeros = [
+        "byte", "char", "float32", "float64", "int8", "uint8", "int16", "uint16", "int32",
+        "uint32", "int64", "uint64",
+    ];
+    let zeros = zeros.map(|name| format!("{name}_value: 0")).join(", ");
+    let grasp = format!(
+        "service: /grasp, type: test_msgs/BasicTypes, request: {{Force: {{field: float64_value}}}}, \
+         response: {{bool_value: {{field: success}}, string_value: {{field: message}}, {zeros}}}"
     );
+    format!(
+        "  - {{node: ns=7;i=105, name: parallel-gripper.Grasp.Start, origin: 0, \
+         ros: [{{space: 1, {grasp}}}, {{space: 3, {grasp}}}]}}\n"
+    )
+}
+
+fn mapping(cell: &Cell, name: &str, space: u16, calls: &str) -> String {
+    let types = cell.call_types(space);
+    let yaml = format!(
+        "spaces: [{{id: 1}}, {{id: 2, domain: 2}}, {{id: 3, domain: 3}}]\ntype_paths: [{types}]\n{calls}"
+    );
+    let file = cell.file(name, &yaml);
+    file.to_str().unwrap().to_owned()
+}
+
+/// Those who execute Methods of a component's skill need nothing but it.
+fn component(cell: &Cell) -> Child {
+    let yaml = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../examples/plant/parallel-gripper.yaml"
+    );
+    Started::new("ua-component", &program("ua-component"))
+        .args([yaml, "--interface", "lo", "--lds", "none"])
+        .args(["--pki".into(), cell.folder().join("pki-component")])
+        .start()
+}
+
+/// Asks all at once for one call; whether each is answered, and right each time.
+fn asked(askers: &mut [(Asking, Asker)], executing: &Executing, call: &Call) -> Vec<Option<bool>> {
+    let away = |asking: &Asking| !is_at_home(*asking, executing);
+    for ((asking, asker), turn) in askers.iter_mut().zip(0..).filter(|((of, _), _)| away(of)) {
+        let service = match asking {
+            Asking::Asyncua | Asking::NodeOpcua => &call.method,
+            Asking::UaSpace => &call.topic,
+            Asking::Rospy | Asking::Roscpp | Asking::Rclpy(..) | Asking::Cyclone(_) => {
+                &call.service
+            }
+        };
+        asker.begin(json!({
+            "case": call.case, "service": service, "first": 10 * turn, "count": COUNT,
+            "wait": 20, "patience": 20,
+        }));
+    }
+    let told = askers.iter_mut().map(|(asking, asker)| {
+        away(asking).then(|| {
+            let told = asker.told();
+            let right = told["right"] == COUNT;
+            if !right {
+                let (case, asking) = (call.case, asking.name());
+                eprintln!("{case} of {} asked by {asking}: {told}", executing.name);
+            }
+            right
+        })
+    });
+    told.collect()
+}
+
+/// The row of the guide for what was seen, a word for each who asks.
+fn row(askers: &mut [(Asking, Asker)], executing: &Executing) -> Vec<String> {
+    let mut cells = vec![executing.name.to_owned()];
+    cells.extend(askers.iter().map(|_| String::new()));
+    for call in &executing.calls {
+        let seen = asked(askers, executing, call);
+        for (cell, right) in cells[1..].iter_mut().zip(seen) {
+            match right {
+                Some(true) => cell.push(call.letter),
+                Some(false) => {}
+                None => *cell = "direct".to_owned(),
+            }
+        }
+    }
+    cells
+}
+
+/// The rows of the guide below those words.
+fn in_the_guide(head: &[String]) -> Vec<Vec<String>> {
+    let cells = |line: &str| -> Vec<String> {
+        let cells = line.trim().trim_matches('|').split('|');
+        cells.map(|cell| cell.trim().to_owned()).collect()
+    };
+    let guide = concat!(env!("CARGO_MANIFEST_DIR"), "/../docs/guide.md");
+    let guide = std::fs::read_to_string(guide).unwrap();
+    let mut lines = guide.lines();
+    lines
+        .find(|line| line.starts_with('|') && cells(line) == head)
+        .unwrap_or_else(|| panic!("the guide has no table of {head:?}"));
+    let rows = lines.skip(1).take_while(|line| line.starts_with('|'));
+    rows.map(cells).collect()
 }
 
 #[test]
-fn services_of_rospy_are_asked_for_by_rclpy_of_both_distributions() {
-    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2]) else {
+fn all_who_execute_are_asked_by_all_who_ask() {
+    let Some(cell) = Cell::with(&[
+        Peer::Ros1,
+        Peer::Roscpp,
+        Peer::Ros2,
+        Peer::Python,
+        Peer::NodeOpcua,
+    ]) else {
         return;
     };
-    let [one, two] = [1, 2].map(|of| cell.call_mapping(of, ""));
     let _core = cell.roscore();
-    let names = services(1);
-    let names: Vec<&str> = names.iter().map(String::as_str).collect();
-    let mut executor = cell.rospy_executor(&names);
-    let _bridges = (cell.bridge_ros1(&[&one]), cell.bridge_ros2(&[&two]));
-    let mut seen = Vec::new();
-    for (distribution, name) in [
-        (Distribution::Jazzy, "rclpy (Jazzy)"),
-        (Distribution::Kilted, "rclpy (Kilted)"),
-    ] {
-        let answered = asks(&mut cell.rclpy_asker(distribution), 1);
-        assert_eq!(answered, in_the_guide("rospy", name), "{name}");
-        seen.push(answered);
-    }
-    all_executed(&mut executor, &seen);
-    let told = call_by_name(&cell, "ua_1_2_60", &["data=true"]);
+    let all = [
+        Executing::services("rospy", 1, 60),
+        Executing::services("roscpp", 1, 65),
+        Executing::services("rclpy (Jazzy)", 2, 60),
+        Executing::services("rclpy (Kilted)", 2, 65),
+        Executing::services("Cyclone DDS", 2, 70),
+        Executing::methods(),
+        Executing::skill(),
+    ];
+    let [rospy, roscpp, jazzy, kilted, cyclone] = [0, 1, 2, 3, 4].map(|of: usize| all[of].words());
+    let cases = all[5].calls.iter().map(|call| call.case);
+    let mut executors = cell.executors([
+        cell.rospy_started("calls/ros1_executor.py", &[])
+            .args(rospy),
+        cell.roscpp_started(&["serve"]).args(roscpp),
+        cell.rclpy_started(Distribution::Jazzy, "calls/ros2_executor.py", &[])
+            .args(jazzy),
+        cell.rclpy_started(Distribution::Kilted, "calls/ros2_executor.py", &[])
+            .args(kilted),
+        cell.cyclone_started("calls/cyclone.py", &["serve", "--domain", "2"])
+            .args(cyclone),
+        cell.asyncua_started("calls/opcua_executor.py", &[PLC])
+            .args(cases),
+    ]);
+    let _component = component(&cell);
+    let calls = [methods(), start()].concat();
+    let one = mapping(&cell, "one.yaml", 1, &calls);
+    let two = mapping(&cell, "two.yaml", 2, &calls);
+    // Where a namespace of space 0 is named, ua-server takes it for its own.
+    let zero = methods().replace(", 7: 'urn:test:gripper'", "");
+    let zero = mapping(&cell, "zero.yaml", 2, &zero);
+    let _programs = (
+        cell.bridge_ros1(&[&one]),
+        cell.bridge_ros2_alone(&[&two, "--space", "2,3"]).start(),
+        cell.ua_server(&[&zero]),
+    );
+    let mut askers: Vec<_> = ASKING.into_iter().zip(cell.askers(&ASKING)).collect();
+    let mut head = vec!["executed by".to_owned()];
+    head.extend(ASKING.map(|asking| asking.name().to_owned()));
+    let seen: Vec<Vec<String>> = all.iter().map(|of| row(&mut askers, of)).collect();
+    let table: String = seen
+        .iter()
+        .map(|row| format!("| {} |\n", row.join(" | ")))
+        .collect();
     assert_eq!(
-        told["fields"],
-        json!({"success": true, "message": "odd"}),
-        "{told}"
+        seen,
+        in_the_guide(&head),
+        "seen:\n| {} |\n{table}",
+        head.join(" | ")
     );
-}
-
-#[test]
-fn services_of_rclpy_are_asked_for_by_rospy() {
-    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2]) else {
-        return;
-    };
-    let [one, two] = [1, 2].map(|of| cell.call_mapping(of, ""));
-    let _core = cell.roscore();
-    let names = services(2);
-    let names: Vec<&str> = names.iter().map(String::as_str).collect();
-    let _bridges = (cell.bridge_ros1(&[&one]), cell.bridge_ros2(&[&two]));
-    for (distribution, name) in [
-        (Distribution::Jazzy, "rclpy (Jazzy)"),
-        (Distribution::Kilted, "rclpy (Kilted)"),
-    ] {
-        let mut executor = cell.rclpy_executor(distribution, &names);
-        let answered = asks(&mut cell.rospy_asker(), 2);
-        assert_eq!(answered, in_the_guide(name, "rospy"), "{name}");
-        all_executed(&mut executor, &[answered]);
+    // Each call that was answered was executed once.
+    for (executor, row) in executors.iter_mut().zip(&seen) {
+        let calls = row[1..].iter().filter(|cell| *cell != "direct");
+        let calls = calls.map(|cell| cell.len() as u64 * COUNT).sum::<u64>();
+        let counts: Value = executor.counts();
+        assert_eq!(counts["executed"], calls, "{}: {counts}", row[0]);
     }
-    let tool = cell.ros1_tool("rosservice", &["list"]);
-    assert!(tool.contains(&service(2, 0)), "{tool:?}");
-}
-
-/// The response of `ua-space call`, from beside the bridges.
-fn call_by_name(cell: &Cell, topic: &str, fields: &[&str]) -> Value {
-    let args = [&["call", topic], fields, &["--json", "--interface", "lo"]].concat();
-    let mut tool = Started::new("ua-space", &program("ua-space"))
-        .args(args)
-        .start();
-    let status = tool.wait_for_end(Duration::from_secs(20));
-    assert!(
-        status.success() && cell.folder().exists(),
-        "{status}: {tool}"
-    );
-    tool.json_lines().first().cloned().unwrap_or(Value::Null)
 }

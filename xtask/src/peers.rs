@@ -44,13 +44,14 @@ const APT: &[&str] = &[
     "openssl",
 ];
 
-/// For the peers of ROS 2 that are compiled here.
-const APT_DDS: &[&str] = &[
+/// For the peers that are compiled here.
+const APT_COMPILED: &[&str] = &[
     "g++",
     "libfastrtps-dev",
     "libfastcdr-dev",
     "cyclonedds-dev",
     "cyclonedds-tools",
+    "libroscpp-dev",
 ];
 
 /// Python environments among the peers, and the lists of `tests/peers` of what is in each. Distributions of ROS 2 have
@@ -81,7 +82,7 @@ pub(crate) fn install(workspace: &Workspace) -> Ended {
         told("from PyPI", venv(workspace, folder, requirements));
     }
     told("from npm", node_opcua(workspace));
-    told("of DDS", native::build(workspace));
+    told("that are compiled", native::build(workspace));
     ended
 }
 
@@ -148,7 +149,7 @@ fn python_of(venv: &Path) -> PathBuf {
 
 fn apt() -> anyhow::Result<()> {
     // One at a time: a distribution that lacks a name of one installs nothing of it, and all of the others.
-    [APT_BUILD, APT, APT_DDS]
+    [APT_BUILD, APT, APT_COMPILED]
         .into_iter()
         .map(apt_install)
         .fold(Ok(()), Result::and)

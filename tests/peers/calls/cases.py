@@ -11,6 +11,7 @@ class Bundled:
     """Built in: std_srvs/SetBool."""
 
     type = "std_srvs/SetBool"
+    takes = {"data": False}
 
     @staticmethod
     def ask(request, number):
@@ -35,6 +36,22 @@ class Files:
     """Known from files only: test_msgs/BasicTypes."""
 
     type = "test_msgs/BasicTypes"
+    takes = {
+        "bool_value": False,
+        "byte_value": 0,
+        "char_value": 0,
+        "float32_value": 0.0,
+        "float64_value": 0.0,
+        "int8_value": 0,
+        "uint8_value": 0,
+        "int16_value": 0,
+        "uint16_value": 0,
+        "int32_value": 0,
+        "uint32_value": 0,
+        "int64_value": 0,
+        "uint64_value": 0,
+        "string_value": "",
+    }
 
     @staticmethod
     def ask(request, number):
@@ -71,6 +88,7 @@ class Empty:
     """A request without fields: std_srvs/Trigger."""
 
     type = "std_srvs/Trigger"
+    takes = {}
 
     @staticmethod
     def ask(request, number):
@@ -130,11 +148,32 @@ class Switch(Bundled):
 
 
 class Skill(Empty):
-    """A Method of a component's skill, which says whether it was done."""
+    """A Method of a component's skill: done, or refused in its own words, as its state or somebody's lease demands."""
+
+    @staticmethod
+    def allowed(success, message):
+        return bool(success) or message.startswith(("BadInvalidState", "BadLocked"))
+
+    @classmethod
+    def right(cls, response, number):
+        return cls.allowed(response.success, response.message)
+
+
+class Grasp(Files):
+    """The Start of a skill with a parameter, where the mapping asks for it by a type known from files only."""
+
+    takes = {"Force": 0.0}
+
+    @staticmethod
+    def ask(request, number):
+        force = "Force" if hasattr(request, "Force") else "float64_value"
+        setattr(request, force, 10.0 + number)
 
     @staticmethod
     def right(response, number):
-        return response.success is True
+        if hasattr(response, "success"):
+            return Skill.right(response, number)
+        return Skill.allowed(response.bool_value, response.string_value)
 
 
 class Loggers(Empty):
@@ -161,4 +200,15 @@ class Level(Empty):
         return True
 
 
-CASES = {"bundled": Bundled, "files": Files, "empty": Empty, "megabyte": Big, "messages": Messages, "switch": Switch, "skill": Skill, "loggers": Loggers, "level": Level}
+CASES = {
+    "bundled": Bundled,
+    "files": Files,
+    "empty": Empty,
+    "megabyte": Big,
+    "messages": Messages,
+    "switch": Switch,
+    "skill": Skill,
+    "grasp": Grasp,
+    "loggers": Loggers,
+    "level": Level,
+}

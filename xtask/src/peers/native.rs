@@ -1,4 +1,5 @@
-//! The peers that are compiled here: Fast DDS and Cyclone DDS by their own libraries, from `tests/peers/dds`.
+//! The peers that are compiled here: Fast DDS, Cyclone DDS and roscpp by their own libraries, from `tests/peers/dds` and
+//! `tests/peers/calls`.
 
 use std::{fs, path::Path, process::Command};
 
@@ -12,6 +13,7 @@ use crate::{
 /// One program and what it is made of.
 struct Program {
     name: &'static str,
+    /// Below `tests/peers/dds`.
     sources: &'static [&'static str],
     /// The types it knows, which Cyclone's own compiler turns into C.
     types: Option<&'static str>,
@@ -35,6 +37,19 @@ const PROGRAMS: &[Program] = &[
         sources: &["cyclone.cpp", "commands.cpp", "measure.cpp"],
         types: Some("ros_types"),
         libraries: &["-lddsc", "-pthread"],
+    },
+    Program {
+        name: "roscpp-peer",
+        sources: &["../calls/roscpp.cpp"],
+        types: None,
+        libraries: &[
+            "-lroscpp",
+            "-lroscpp_serialization",
+            "-lrosconsole",
+            "-lrostime",
+            "-lboost_system",
+            "-pthread",
+        ],
     },
 ];
 
