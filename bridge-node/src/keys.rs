@@ -1,6 +1,5 @@
-//! The keys of secured groups: read from files, looked at again from time to time, and fetched from Security Key Services.
+//! The keys of secured groups: read from files, which are looked at again from time to time.
 
-mod fetch;
 mod file;
 
 use std::collections::BTreeMap;
@@ -14,7 +13,6 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
 
-pub use self::fetch::{Fetched, Fetching, KeyRequest, KeyService};
 use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
 
@@ -33,7 +31,6 @@ pub(crate) struct KeyRing {
     /// What the keepers bring.
     incoming: mpsc::Receiver<NewKeys>,
     outgoing: mpsc::Sender<NewKeys>,
-    service: Option<Arc<dyn KeyService>>,
     /// The keepers of the groups there are; each ends when its sender goes.
     keepers: BTreeMap<String, Keeper>,
 }
@@ -45,16 +42,12 @@ struct Keeper {
 }
 
 impl KeyRing {
-    pub(crate) fn new(
-        groups: Option<Vec<SecurityGroup>>,
-        service: Option<Arc<dyn KeyService>>,
-    ) -> Self {
+    pub(crate) fn new(groups: Option<Vec<SecurityGroup>>) -> Self {
         let (outgoing, incoming) = mpsc::channel(WAITING);
         Self {
             groups,
             incoming,
             outgoing,
-            service,
             keepers: BTreeMap::new(),
         }
     }
@@ -99,23 +92,7 @@ impl KeyRing {
                 };
                 self.keepers.insert(group.id.clone(), keeper);
                 let out = self.outgoing.clone();
-                match (&group.keys, &self.service) {
-                    (Some(KeySource::Own(_) | KeySource::Sks(_)), Some(service)) => {
-                        let service = Arc::clone(service);
-                        drop(tokio::spawn(fetch::keep(
-                            group.clone(),
-                            service,
-                            (out, wants),
-                        )));
-                    }
-                    (Some(KeySource::Own(_) | KeySource::Sks(_)), None) => warn!(
-                        group = group.id,
-                        "this program fetches no keys from a Security Key Service: nothing is said or heard in the group"
-                    ),
-                    (Some(KeySource::File(_) | KeySource::Credential(_)) | None, _) => {
-                        drop(tokio::spawn(watch_file(group.clone(), (out, wants))));
-                    }
-                }
+                drop(tokio::spawn(watch_file(group.clone(), (out, wants))));
             }
         }
     }
@@ -151,7 +128,6 @@ fn path_of(group: &SecurityGroup) -> Option<Result<PathBuf, Failure>> {
     match group.keys.as_ref()? {
         KeySource::File(path) => Some(Ok(path.clone())),
         KeySource::Credential(name) => Some(credential(name)),
-        KeySource::Own(_) | KeySource::Sks(_) => None,
     }
 }
 

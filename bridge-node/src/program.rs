@@ -23,7 +23,7 @@ use crate::busy_poll::BusyPoll;
 use crate::clock::now;
 use crate::descriptors;
 use crate::exit::{Failure, FailureKind};
-use crate::keys::{KeyRing, KeyService};
+use crate::keys::KeyRing;
 use crate::logging;
 use crate::mapping_file::{MappingFile, Running};
 use crate::metrics::{self, Requests};
@@ -63,15 +63,6 @@ pub trait Program: Parser {
     fn owned(mapping: &Mapping) -> Owned {
         let _whole_space = mapping;
         Owned::All
-    }
-
-    /// How it fetches keys from a Security Key Service; `None` where it does not.
-    ///
-    /// # Errors
-    /// When what it needs for that cannot be used.
-    fn key_service(&self, mapping: &Mapping) -> Result<Option<Arc<dyn KeyService>>, Failure> {
-        let _none = mapping;
-        Ok(None)
     }
 
     /// The spaces it serves, none of them twice: each with a local side, a Router and a place in the group of its own.
@@ -218,7 +209,7 @@ async fn prepare<P: Program>(
         local: P::LOCAL,
         source: Some(udp.source()),
     };
-    let mut keys = KeyRing::new(groups(arguments)?, program.key_service(&mapping)?);
+    let mut keys = KeyRing::new(groups(arguments)?);
     let taken = mapping;
     let mapping = keys.applied(Arc::clone(&taken));
     let mut router = Router::new(settings, Arc::clone(&mapping));

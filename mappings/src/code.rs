@@ -129,7 +129,7 @@ codes! {
     UnknownActionType = "M135", "No definition of the action type is built in, so a package with the .action file must be in `type_paths`, or below one of the folders of ROS_PACKAGE_PATH or AMENT_PREFIX_PATH, when the bridge runs.";
     MethodTarget = "M136", "`opcua` says which Method of which other OPC UA server executes a call: `endpoint`, `object` and `method`, the nodes as nsu=urn:plc;s=Line.Reset. The cell's own server calls it, so the call has `origin: 0`, a node of a namespace of `namespaces`, and the endpoint is not that of the cell's server itself.";
     SecurityGroup = "M150", "An entry of `security` is a SecurityGroup of OPC UA PubSub: a `group`, each once, and the `namespaces` that are its, none of them in two groups. One group may be without `namespaces`: it has all that no other names.";
-    GroupKeys = "M151", "The `keys` of a secured group come from a file that only its owner can read, from a credential of systemd, or from a Security Key Service. They never stand in the mapping itself, which is copied to every host of the cell.";
+    GroupKeys = "M151", "The `keys` of a secured group come from a file that only its owner can read, or from a credential of systemd. They never stand in the mapping itself, which is copied to every host of the cell.";
     HalfSecured = "M152", "Some of what is sent is secured, and a namespace is not. Who can write there can steer what is read there. `mode: none` in a group with that namespace says that it is meant.";
     OpenCall = "M153", "A call can be asked for without a key, in a cell where values are secured. To execute something is worth more protection than to read something, and not less.";
 }

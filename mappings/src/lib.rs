@@ -39,7 +39,7 @@ pub use mapping::{
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use schema::schema;
-pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
+pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup};
 pub use surroundings::{Readers, Surroundings};
 pub use topic::{Part, SpaceId, TopicError, TopicId};
 pub use unit::Unit;

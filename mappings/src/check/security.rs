@@ -2,32 +2,23 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::time::Duration;
 
-use super::network::{duration, parse_endpoint};
 use super::required;
 use crate::call::Call;
 use crate::code::Code;
 use crate::document::{
-    Document, GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry, SksEntry,
+    Document, GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry,
 };
 use crate::findings::Findings;
-use crate::mapping::{Endpoint, Mapping};
+use crate::mapping::Mapping;
 use crate::read::{At, given, short};
-use crate::security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
+use crate::security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup};
 use crate::tree::Place;
 
 /// Most groups of a document.
 const MAX_GROUPS: usize = 64;
-/// How long a key is used where nothing is said.
-const LIFETIME: Duration = Duration::from_secs(3600);
 
-/// `server` is the endpoint of the cell's own server.
-pub(super) fn check(
-    entries: &[At<GroupEntry>],
-    server: &Endpoint,
-    findings: &mut Findings,
-) -> Vec<SecurityGroup> {
+pub(super) fn check(entries: &[At<GroupEntry>], findings: &mut Findings) -> Vec<SecurityGroup> {
     if let Some(first) = entries.get(MAX_GROUPS) {
         let message = format!("{} groups; at most {MAX_GROUPS} are read", entries.len());
         findings.error(Code::TooLarge, first.place, message);
@@ -38,7 +29,7 @@ pub(super) fn check(
     let mut groups = Vec::new();
     for at in entries {
         let Some(entry) = &at.value else { continue };
-        let Some(group) = group(entry, at.place, server, findings) else {
+        let Some(group) = group(entry, at.place, findings) else {
             continue;
         };
         if let Some(first) = ids.insert(group.id.clone(), at.place) {
@@ -86,12 +77,7 @@ fn claim(
     }
 }
 
-fn group(
-    entry: &GroupEntry,
-    owner: Place,
-    server: &Endpoint,
-    findings: &mut Findings,
-) -> Option<SecurityGroup> {
+fn group(entry: &GroupEntry, owner: Place, findings: &mut Findings) -> Option<SecurityGroup> {
     let (id, place) = required(&entry.group, "group", "the entry", owner, findings)?;
     if id.is_empty() || id.chars().count() > 128 || id.chars().any(char::is_control) {
         let message = "a SecurityGroupId has 1 to 128 characters, none a control character";
@@ -132,7 +118,7 @@ fn group(
             .error(Code::SecurityGroup, at.place, message)
             .help("without the key it has all that no other group names");
     }
-    let keys = keys(entry, (mode, owner), server, findings);
+    let keys = keys(entry, (mode, owner), findings);
     Some(SecurityGroup {
         id: id.clone(),
         mode,
@@ -146,7 +132,6 @@ fn group(
 fn keys(
     entry: &GroupEntry,
     (mode, owner): (GroupMode, Place),
-    server: &Endpoint,
     findings: &mut Findings,
 ) -> Option<KeySource> {
     let Some(at) = &entry.keys else {
@@ -168,24 +153,16 @@ fn keys(
             .help("leave out `mode: none`, or the keys");
         return None;
     }
-    source(keys, at.place, server, findings)
+    source(keys, at.place, findings)
 }
 
-fn source(
-    keys: &KeysEntry,
-    place: Place,
-    server: &Endpoint,
-    findings: &mut Findings,
-) -> Option<KeySource> {
-    let count = usize::from(keys.file.is_some())
-        + usize::from(keys.credential.is_some())
-        + usize::from(keys.sks.is_some());
-    if count != 1 {
+fn source(keys: &KeysEntry, place: Place, findings: &mut Findings) -> Option<KeySource> {
+    if keys.file.is_some() == keys.credential.is_some() {
         findings
             .error(
                 Code::GroupKeys,
                 place,
-                "keys come from exactly one of `file`, `credential` and `sks`",
+                "keys come from exactly one of `file` and `credential`",
             )
             .help("the keys themselves never stand in the mapping: whoever can read it would have them");
         return None;
@@ -199,75 +176,20 @@ fn source(
         }
         return Some(KeySource::File(PathBuf::from(file)));
     }
-    if let Some((name, place)) = given(&keys.credential) {
-        if name.is_empty() || name.contains('/') || name.starts_with('.') || is_key(name) {
-            findings
-                .error(Code::GroupKeys, place, "this is no name of a credential")
-                .help("the ID in LoadCredential=ID:PATH of the unit");
-            return None;
-        }
-        return Some(KeySource::Credential(name.clone()));
+    let (name, place) = given(&keys.credential)?;
+    if name.is_empty() || name.contains('/') || name.starts_with('.') || is_key(name) {
+        findings
+            .error(Code::GroupKeys, place, "this is no name of a credential")
+            .help("the ID in LoadCredential=ID:PATH of the unit");
+        return None;
     }
-    given(&keys.sks).and_then(|(sks, place)| service(sks, place, server, findings))
+    Some(KeySource::Credential(name.clone()))
 }
 
 /// Whether somebody wrote a key there.
 fn is_key(text: &str) -> bool {
     let text = text.rsplit('/').next().unwrap_or_default();
     text.len() >= 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
-}
-
-fn service(
-    entry: &SksEntry,
-    place: Place,
-    server: &Endpoint,
-    findings: &mut Findings,
-) -> Option<KeySource> {
-    findings
-        .warning(
-            Code::GroupKeys,
-            place,
-            "no program fetches keys from a Security Key Service yet: in this group nothing is said or heard",
-        )
-        .help("keys: {file: cell.keys}, which `ua-space keys cell.keys` makes");
-    let lifetime = duration(&entry.key_lifetime, findings);
-    let members = entry.members.as_ref().and_then(|at| at.value.as_deref());
-    let members: Vec<String> = members
-        .unwrap_or_default()
-        .iter()
-        .filter_map(|at| at.value.clone())
-        .collect();
-    let own = || {
-        KeySource::Own(Served {
-            endpoint: server.clone(),
-            lifetime: lifetime.unwrap_or(LIFETIME),
-            members: members.clone(),
-        })
-    };
-    let Some((text, at)) = given(&entry.endpoint) else {
-        return entry.endpoint.is_none().then(own);
-    };
-    let Some(endpoint) = parse_endpoint(text) else {
-        let message = format!("`{}` is no endpoint", short(text));
-        findings
-            .error(Code::Endpoint, at, message)
-            .help("for example opc.tcp://sks.local:4840");
-        return None;
-    };
-    if endpoint == *server {
-        return Some(own());
-    }
-    if entry.key_lifetime.is_some() || entry.members.is_some() {
-        findings
-            .error(
-                Code::GroupKeys,
-                place,
-                "`key_lifetime` and `members` are that service's own affair",
-            )
-            .help("they go with the cell's own server: sks: {}");
-        return None;
-    }
-    Some(KeySource::Sks(endpoint))
 }
 
 /// What of a cell that is secured in part is not.
