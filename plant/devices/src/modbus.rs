@@ -11,7 +11,7 @@ use tokio::net::TcpStream;
 use tokio::sync::Mutex;
 use tokio::time::timeout;
 use tokio_modbus::client::{Client as _, Context, rtu, tcp};
-use tokio_modbus::{ExceptionCode, Request, Response, Slave};
+use tokio_modbus::{Request, Response, Slave};
 
 use crate::line::Line;
 use crate::tty::Tty;
@@ -152,7 +152,7 @@ impl Modbus {
             }
             Ok(Err(error)) => Err(self.damaged(&error.to_string())),
             Ok(Ok(Err(exception))) => {
-                let exception = told(exception);
+                let exception = exception.to_string();
                 let refused = Fault::Refused {
                     line,
                     unit,
@@ -211,8 +211,4 @@ fn is_broken(error: &io::Error) -> bool {
         error.kind(),
         Kind::InvalidData | Kind::InvalidInput | Kind::Other
     )
-}
-
-fn told(exception: ExceptionCode) -> String {
-    exception.to_string()
 }

@@ -137,7 +137,11 @@ async fn silence_damaged_frames_and_a_reboot_are_told_and_do_not_last() {
         let driver = bench.driver("GraspSkillType");
         let running = conformance::run_once("GraspSkillType", driver, Vec::new());
         let rebooted = async {
-            sleep(Duration::from_millis(30)).await;
+            let until = Instant::now() + Duration::from_secs(5);
+            while bench.simulator.position() < 20 {
+                assert!(Instant::now() < until, "{line}: the fingers do not move");
+                sleep(Duration::from_millis(2)).await;
+            }
             bench.simulator.reboot();
         };
         let (outcome, ()) = tokio::join!(running, rebooted);

@@ -96,28 +96,18 @@ impl Rtde {
     /// Asks, and takes the next package of that type for the answer.
     async fn ask(&mut self, of: Type, body: &[u8]) -> Result<Vec<u8>, String> {
         self.write(of, body).await?;
-        loop {
-            let (answered, body) = self.package().await?;
-            if answered == of {
-                return Ok(body);
-            }
-        }
+        self.package(of).await
     }
 
     /// The next values, in the order of the recipe. Not to be dropped on the way.
     pub(crate) async fn next(&mut self) -> Result<Vec<Value>, String> {
-        loop {
-            let (of, body) = self.package().await?;
-            if of != Type::Data {
-                continue;
-            }
-            let mut rest = body.as_slice();
-            let (recipe, kinds) = &self.outputs;
-            let values = chunk(&mut rest)
-                .filter(|[of]: &[u8; 1]| of == recipe)
-                .and_then(|_| kinds.iter().map(|kind| kind.take(&mut rest)).collect());
-            return values.ok_or_else(|| self.damaged("values of another recipe"));
-        }
+        let body = self.package(Type::Data).await?;
+        let mut rest = body.as_slice();
+        let (recipe, kinds) = &self.outputs;
+        let values = chunk(&mut rest)
+            .filter(|[of]: &[u8; 1]| of == recipe)
+            .and_then(|_| kinds.iter().map(|kind| kind.take(&mut rest)).collect());
+        values.ok_or_else(|| self.damaged("values of another recipe"))
     }
 
     /// Whether the robot takes the inputs from here.
@@ -138,9 +128,18 @@ impl Rtde {
         self.write(Type::Data, &body).await
     }
 
-    async fn package(&mut self) -> Result<(Type, Vec<u8>), String> {
-        match timeout(ANSWER, next(&mut self.stream)).await {
-            Ok(Ok(package)) => Ok(package),
+    /// The next package of a type; whoever says other things only is silent, too.
+    async fn package(&mut self, of: Type) -> Result<Vec<u8>, String> {
+        let wanted = async {
+            loop {
+                let (said, body) = next(&mut self.stream).await?;
+                if said == of {
+                    return Ok::<_, io::Error>(body);
+                }
+            }
+        };
+        match timeout(ANSWER, wanted).await {
+            Ok(Ok(body)) => Ok(body),
             Ok(Err(error)) if error.kind() == io::ErrorKind::InvalidData => {
                 Err(self.damaged(&error.to_string()))
             }
@@ -160,5 +159,34 @@ impl Rtde {
 
     fn damaged(&self, why: &str) -> String {
         format!("what {} says is damaged: {why}", self.address)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tokio::net::TcpListener;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn a_robot_that_says_other_things_only_is_not_waited_for() {
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = listener.local_addr().unwrap().to_string();
+        let talks = async {
+            let (mut stream, _) = listener.accept().await.unwrap();
+            let text = package(Type::Text, b"still here").unwrap();
+            let mut pause = tokio::time::interval(Duration::from_millis(20));
+            // Until the other side has gone.
+            while stream.write_all(&text).await.is_ok() {
+                pause.tick().await;
+            }
+        };
+        let asks = async {
+            Rtde::open(&address, 50.0, &["actual_TCP_pose"], &[])
+                .await
+                .unwrap_err()
+        };
+        let (told, ()) = tokio::join!(asks, talks);
+        assert_eq!(told, format!("{address} is silent for 1s"));
     }
 }

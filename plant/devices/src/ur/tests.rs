@@ -126,9 +126,10 @@ async fn a_program_of_somebody_else_is_told_and_not_taken_for_ours() {
             .write_all(b"def other():\n  sleep(0.01)\nend\n")
             .await
             .unwrap();
-        tokio::time::sleep(Duration::from_millis(300)).await;
+        // Open until the run has ended.
+        stream
     };
-    let (outcome, ()) = tokio::join!(bench.run("LinearMoveSkillType", far), intruder);
+    let (outcome, _open) = tokio::join!(bench.run("LinearMoveSkillType", far), intruder);
     assert!(
         outcome.message.contains("another one took its place"),
         "{}",
