@@ -148,12 +148,20 @@ async fn watch_file(
     group: SecurityGroup,
     (out, mut wants): (mpsc::Sender<NewKeys>, watch::Receiver<u64>),
 ) {
-    let Some(Ok(path)) = path_of(&group) else {
-        return;
+    let path = match path_of(&group) {
+        Some(Ok(path)) => path,
+        Some(Err(failure)) => {
+            warn!(
+                group = group.id,
+                "{failure}; nothing is said or heard in the group"
+            );
+            return;
+        }
+        None => return,
     };
     let mut looks = interval(LOOK);
     looks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-    let mut before: Option<Seen> = None;
+    let mut before: Option<Option<Seen>> = None;
     loop {
         tokio::select! {
             _ = looks.tick() => {}
@@ -162,11 +170,11 @@ async fn watch_file(
             },
         }
         let seen = seen(&path);
-        // At first too: a reload may have brought the group.
-        if seen == before {
+        // At first too, also where there is no file: a reload may have brought the group.
+        if before == Some(seen) {
             continue;
         }
-        before = seen;
+        before = Some(seen);
         if let Some(delivery) = read_again(&path, &group) {
             let group = group.id.clone();
             if out.send(NewKeys { group, delivery }).await.is_err() {
