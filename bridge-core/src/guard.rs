@@ -270,9 +270,12 @@ impl Guard {
     /// # Errors
     /// Why it cannot be sent.
     pub fn seal(&mut self, datagram: &[u8], out: &mut Vec<u8>) -> Result<bool, Unopened> {
-        let Ok(message) = NetworkMessage::decode(datagram) else {
-            return Ok(false);
-        };
+        // What nobody knows the group of is not said in clear either.
+        let message = NetworkMessage::decode(datagram).map_err(|error| Unopened {
+            reason: Reason::Malformed,
+            case: "seal",
+            detail: format!("what is to be sent is no message: {error}"),
+        })?;
         let data = message.message_type() == NetworkMessageType::DataSet;
         let namespace = message.group().and_then(|group| group.writer_group_id);
         let Some(at) = self.of(namespace.filter(|_| data)) else {

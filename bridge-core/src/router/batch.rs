@@ -53,7 +53,9 @@ impl Router {
         let pubsub = self.mapping.pubsub();
         let most = usize::from(pubsub.messages_per_datagram);
         let overhead = self.guard.as_ref().map_or(0, |_| Guard::OVERHEAD);
-        let room = usize::from(pubsub.max_datagram).min(ETHERNET) - overhead;
+        let room = usize::from(pubsub.max_datagram)
+            .min(ETHERNET)
+            .saturating_sub(overhead);
         // That there are several costs the first one its place among the Sizes.
         let mut len = first.bytes.len() + SIZE;
         let mut passed = Vec::new();

@@ -163,8 +163,8 @@ impl Calls {
 }
 
 impl Router {
-    /// Gives it random bytes, with which it seals what is sent in secured groups, and which tell its requests from those of other programs of the space and of its own earlier runs.
-    /// To be given before the first call is known.
+    /// Gives it random bytes of this run. It seals with them what is sent in secured groups, and they tell its requests from
+    /// those of other programs of the space and of its own earlier runs. To be given before the first call is known.
     pub fn set_instance(&mut self, instance: [u8; 16]) {
         self.instance = instance;
         self.mark_guard();
