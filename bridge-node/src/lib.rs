@@ -23,6 +23,7 @@ mod program;
 mod run;
 mod service;
 mod services;
+mod signals;
 mod stamp;
 mod status;
 

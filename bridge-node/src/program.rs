@@ -11,7 +11,7 @@ use std::time::Duration;
 use bridge_core::{Local, Owned, Router, Settings};
 use clap::Parser;
 use mappings::{Mapping, PubSub, SecurityGroup, SpaceId};
-use tokio::signal::unix::{Signal, SignalKind, signal};
+use tokio::signal::unix::SignalKind;
 use tokio::sync::watch;
 use tokio::task::{JoinError, JoinSet};
 use tracing::{Instrument, Span, error, info, info_span};
@@ -30,6 +30,7 @@ use crate::metrics::{self, Requests};
 use crate::port::Port;
 use crate::run::{Fixed, Shell};
 use crate::service;
+use crate::signals;
 use crate::status::Status;
 
 /// What one program is, for [`run`].
@@ -144,8 +145,8 @@ fn serve<P: Program>(program: P, file: MappingFile) -> Result<(), Failure> {
         let arguments = program.arguments();
         let running = file.running().clone();
         let spaces = program.spaces(&running.mapping)?;
-        let signal = stopped()?;
-        let hangup = listen(SignalKind::hangup())?;
+        let signal = signals::stopped()?;
+        let hangup = signals::listen(SignalKind::hangup())?;
         let (changed, changes) = watch::channel(running);
         let mut requests = metrics::serve(arguments.flags.metrics, spaces.len()).await?;
         let several = spaces.len() > 1;
@@ -322,27 +323,4 @@ fn open(arguments: &Arguments, mapping: &Mapping, several: bool) -> Result<Udp, 
         return Err(Failure::new(FailureKind::Usage, message));
     }
     Udp::open(&options).map_err(|error| Failure::new(FailureKind::Unavailable, error.to_string()))
-}
-
-/// Ready at the first SIGINT or SIGTERM.
-pub(crate) fn stopped() -> Result<impl Future<Output = ()> + Send + 'static, Failure> {
-    let (mut interrupt, mut terminate) = (
-        listen(SignalKind::interrupt())?,
-        listen(SignalKind::terminate())?,
-    );
-    Ok(async move {
-        tokio::select! {
-            _ = interrupt.recv() => {}
-            _ = terminate.recv() => {}
-        }
-    })
-}
-
-fn listen(kind: SignalKind) -> Result<Signal, Failure> {
-    signal(kind).map_err(|error| {
-        Failure::new(
-            FailureKind::Io,
-            format!("cannot listen for signals: {error}"),
-        )
-    })
 }

@@ -8,7 +8,7 @@ use tracing::error;
 
 use crate::exit::{Failure, FailureKind};
 use crate::logging::{self, LogFormat};
-use crate::{descriptors, program};
+use crate::{descriptors, signals};
 
 /// What one program is, for [`run_service`].
 pub trait Service: Parser {
@@ -51,7 +51,7 @@ fn serve<S: Service>(service: S) -> Result<(), Failure> {
         .enable_all()
         .build()
         .map_err(|error| Failure::new(FailureKind::Io, format!("cannot start: {error}")))?;
-    let ended = runtime.block_on(async move { service.serve(program::stopped()?).await });
+    let ended = runtime.block_on(async move { service.serve(signals::stopped()?).await });
     runtime.shutdown_background();
     ended
 }

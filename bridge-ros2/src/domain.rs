@@ -31,7 +31,7 @@ use crate::qos::{Offered, Requested};
 use crate::raw::{Opaque, Payload, RawReader, RawWriter, Reader, Writer};
 use crate::rosout;
 use crate::security::{Enclave, SecurityError};
-use crate::service::{changes_of, offered};
+use crate::service::peers::{changes_of, offered};
 
 /// Which domain to join and how.
 #[derive(Debug, Clone)]

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use tokio::sync::Notify;
 
-use super::client::Shared;
+use super::asking::Shared;
 use super::client_goals::{GoalEvent, Outcome};
 use super::error::LostReason;
 use super::types::{CancelAnswer, CancelWhat, GoalId, Status};

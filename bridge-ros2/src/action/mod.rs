@@ -9,6 +9,7 @@
 //! `X_Result`: what comes behind one byte is aligned otherwise than by itself, so that only who knows the type can take
 //! it apart.
 
+mod asking;
 mod client;
 mod client_goals;
 mod error;
@@ -25,13 +26,15 @@ use messages::{ActionTypeHashes, Dialect, Registry, TypeName};
 use rustdds::policy::{Durability, History, ResourceLimits};
 use rustdds::{QosPolicies, QosPolicyBuilder};
 
-pub use self::client::{ActionClient, ActionClientOptions};
+pub use self::asking::ActionClientOptions;
+pub use self::client::ActionClient;
 pub use self::client_goals::{ClientCounters, GoalEvent, Outcome};
 pub use self::error::{ActionError, IdInUse, LostReason, NoServer};
 pub use self::goal::GoalHandle;
-pub use self::server::{ActionServer, ActionServerOptions, ServerEvent};
+pub use self::server::{ActionServer, ServerEvent};
 pub use self::server_goals::{GoalError, ServerCounters};
 pub use self::server_handles::{CancelRequest, NewGoal, ServerGoal};
+pub use self::serving::ActionServerOptions;
 pub use self::types::{CancelAnswer, CancelCode, CancelWhat, GoalId, GoalInfo, Status};
 
 use crate::domain::Domain;

@@ -1,48 +1,17 @@
 //! The server: takes goals and requests to cancel, and tells clients what becomes of them.
 
 use std::sync::Arc;
-use std::time::Duration;
 
-use bytes::Bytes;
 use tokio::task::AbortHandle;
 
 use super::error::ActionError;
 use super::server_goals::ServerCounters;
 use super::server_handles::{CancelRequest, NewGoal};
-use super::serving::{Arrived, Shared, run};
+use super::serving::{ActionServerOptions, Arrived, Shared, run};
 use super::types::Status;
 use super::{Action, wire};
 use crate::domain::Domain;
 use crate::service::{ServicePeers, ServiceServer};
-
-/// What a server holds, and for how long.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ActionServerOptions {
-    /// An `X_GetResult_Response` with nothing in it, little endian CDR with its encapsulation header: for goals that are
-    /// unknown, and those that end without a result of yours. Clients of the type have to be able to read it.
-    pub empty_result: Bytes,
-    /// How long the result of a goal is kept after its end, by the steady clock; `None` keeps it until there is no
-    /// room. `rcl_action_server_get_default_options` says 10 seconds, up to ROS 2 Humble 15 minutes.
-    pub result_timeout: Option<Duration>,
-    /// How many goals are known at once, ended ones included. When there are more, ended ones are forgotten early; when
-    /// none has ended, goals are rejected.
-    pub max_goals: usize,
-    /// How long a request to cancel waits for your decision. Past that it counts as rejected.
-    pub cancel_timeout: Duration,
-}
-
-impl ActionServerOptions {
-    /// Results are kept for 10 seconds; 1000 goals; 5 seconds to decide about cancelling.
-    #[must_use]
-    pub const fn new(empty_result: Bytes) -> Self {
-        Self {
-            empty_result,
-            result_timeout: Some(Duration::from_secs(10)),
-            max_goals: 1000,
-            cancel_timeout: Duration::from_secs(5),
-        }
-    }
-}
 
 /// What clients want of a server.
 #[derive(Debug)]

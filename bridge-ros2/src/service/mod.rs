@@ -11,7 +11,7 @@ mod mapping;
 mod met;
 mod opening;
 mod pace;
-mod peers;
+pub(crate) mod peers;
 mod server;
 
 use std::future::poll_fn;
@@ -31,7 +31,7 @@ pub use self::server::{ServiceCounters, ServiceOptions, ServiceRequest, ServiceS
 pub(crate) use self::audience::Audience;
 pub(crate) use self::mapping::Received;
 pub(crate) use self::opening::Opening;
-pub(crate) use self::peers::{Snapshot, action_type, changes_of, offered, service_type};
+pub(crate) use self::peers::{Snapshot, action_type, service_type};
 pub(crate) use self::server::{Answer, Never};
 use crate::domain::Domain;
 use crate::raw::Reader;

@@ -1,0 +1,29 @@
+//! The signals that end a program.
+
+use tokio::signal::unix::{Signal, SignalKind, signal};
+
+use crate::exit::{Failure, FailureKind};
+
+/// Ready at the first SIGINT or SIGTERM.
+pub(crate) fn stopped() -> Result<impl Future<Output = ()> + Send + 'static, Failure> {
+    let (mut interrupt, mut terminate) = (
+        listen(SignalKind::interrupt())?,
+        listen(SignalKind::terminate())?,
+    );
+    Ok(async move {
+        tokio::select! {
+            _ = interrupt.recv() => {}
+            _ = terminate.recv() => {}
+        }
+    })
+}
+
+/// That signal, each time it comes.
+pub(crate) fn listen(kind: SignalKind) -> Result<Signal, Failure> {
+    signal(kind).map_err(|error| {
+        Failure::new(
+            FailureKind::Io,
+            format!("cannot listen for signals: {error}"),
+        )
+    })
+}
