@@ -186,8 +186,33 @@ fn skills_know_neither_discovery_nor_rdf_nor_the_space_nor_ros() {
             "bridge-*",
             "tcpros",
             "transport",
+            "devices",
         ],
     );
+}
+
+#[test]
+fn devices_know_neither_discovery_nor_rdf_nor_the_space_nor_ros() {
+    does_not_reach(
+        "devices",
+        &[
+            "discovery",
+            "registry",
+            "mdns-sd",
+            "knowledge",
+            "oxigraph",
+            "uadp",
+            "messages",
+            "bridge-*",
+            "tcpros",
+            "transport",
+        ],
+    );
+}
+
+#[test]
+fn the_mes_knows_no_devices() {
+    does_not_reach("ua-mes", &["devices", "tokio-modbus", "serial2"]);
 }
 
 #[test]
