@@ -13,7 +13,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_core::{
-    AskId, CallDescription, CallField, CallRole, Executed, KeyDelivery, Local, Offered, Reason,
+    AskId, CallDescription, CallField, CallRole, Executed, Guard, KeyDelivery, Local, Offered,
+    Reason,
 };
 use cell::{Cell, Program, component, ms, topic};
 use mappings::{Mapping, TopicId};
@@ -105,6 +106,16 @@ fn who_has_the_key_hears_and_who_has_none_neither_hears_nor_is_heard() {
 
 fn contains(bytes: &[u8], part: &[u8]) -> bool {
     bytes.windows(part.len()).any(|window| window == part)
+}
+
+#[test]
+fn what_is_no_message_is_not_sent_in_clear_either() {
+    let mapping = Mapping::from_yaml(MIXED, "cell.yaml").mapping.unwrap();
+    let mut guard = Guard::new(mapping.security()).unwrap();
+    guard.set_mark([1; 4]);
+    let mut sealed = Vec::new();
+    let refused = guard.seal(&[0xFF; 3], &mut sealed).unwrap_err();
+    assert_eq!((refused.reason, sealed.len()), (Reason::Malformed, 0));
 }
 
 #[test]
