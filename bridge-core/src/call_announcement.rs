@@ -33,11 +33,12 @@ pub(crate) struct Types<'m> {
     pub(crate) response: &'m MessageType,
 }
 
-/// What is said of a call: itself, its types where it has some, and the URIs of namespaces by their index.
+/// What is said of a call: itself, its types where it has some, the URIs of namespaces by their index, and its target.
 pub(crate) type Said<'s> = (
     &'s CallDescription,
     Option<Types<'s>>,
     &'s BTreeMap<u16, String>,
+    u16,
 );
 
 /// What is announced of a call of ours.
@@ -102,13 +103,13 @@ impl CallAnnouncement {
 /// The announcement, and where its body begins.
 fn encode(
     topic: TopicId,
-    (description, types, namespaces): Said<'_>,
+    (description, types, namespaces, target): Said<'_>,
     version: ConfigurationVersion,
 ) -> Result<(Vec<u8>, usize), EncodeError> {
     let (space, _, writer_id) = topic.triple();
     let name = join_name(topic, &description.name);
     let target = [ActionTargetDataType {
-        action_target_id: TARGET,
+        action_target_id: target,
         name: Some(&description.name),
         description: text(""),
     }];
@@ -274,25 +275,39 @@ impl Side<'_> {
     }
 }
 
-/// Reads what is announced of a call; its name is what stands behind that of the topic.
+/// Reads what is announced of a call, and the ActionTargetId it is asked for by; its name is what stands behind that of
+/// the topic.
 ///
 /// # Errors
 /// In words, what makes it useless.
-pub(crate) fn read(action: &ActionMetaData<'_>, name: &str) -> Result<CallDescription, String> {
-    if action.target(TARGET).is_none() {
-        return Err(format!("it has no target {TARGET}"));
-    }
+pub(crate) fn read(
+    action: &ActionMetaData<'_>,
+    name: &str,
+) -> Result<(CallDescription, u16), String> {
+    let target = action.action_targets.get(0);
+    let target = target.ok_or("it has no target")?.action_target_id;
     let about = action.request.description.text.unwrap_or_default();
     if name.len() > MAX_NAME || about.len() > MAX_ABOUT {
         return Err("its name or description is too long".to_owned());
     }
-    Ok(CallDescription {
+    let description = CallDescription {
         name: name.to_owned(),
         about: about.to_owned(),
         role: read_role(&action.request),
         request: read_fields(&action.request)?,
         response: read_fields(&action.response)?,
-    })
+    };
+    Ok((description, target))
+}
+
+/// The ActionTargetId of all calls of a program in one of its lives, from random bytes of that life. A request that was
+/// meant for an earlier life has another one: it may have been executed then, and is not executed again.
+pub(crate) fn target_of(instance: [u8; 16]) -> u16 {
+    let (pairs, _) = instance.as_chunks::<2>();
+    let folded = pairs
+        .iter()
+        .fold(0, |all, pair| all ^ u16::from_le_bytes(*pair));
+    folded.max(LASTING_TARGET)
 }
 
 /// What the first field says the call is to an action. What makes no sense is a call of its own.
@@ -488,8 +503,9 @@ fn weight(field: &CallField, seen: &mut Vec<*const CallStructure>) -> usize {
     own + structure.name.len() + inner
 }
 
-/// The one target of each call.
-pub(crate) const TARGET: u16 = 1;
+/// The ActionTargetId by which each call can be asked for in every life of its program, by who is configured by hand and does
+/// not hear what is announced.
+pub(crate) const LASTING_TARGET: u16 = 1;
 /// Of a field of a request: it may be left out, with all others.
 const OPTIONAL: QualifiedName<'static> = QualifiedName {
     namespace: 0,
@@ -541,9 +557,13 @@ mod tests {
         };
         let topic: TopicId = "ua_0_7_105".parse().unwrap();
         let utc = Timestamp::from_unix_nanos(1_700_000_000_000_000_000);
-        let announcement =
-            CallAnnouncement::new(topic, (&description, None, &BTreeMap::new()), None, utc)
-                .unwrap();
+        let announcement = CallAnnouncement::new(
+            topic,
+            (&description, None, &BTreeMap::new(), 4711),
+            None,
+            utc,
+        )
+        .unwrap();
         let mut bytes = Vec::new();
         announcement.write(3, &mut bytes);
         let message = NetworkMessage::decode(&bytes).unwrap();
@@ -555,7 +575,7 @@ mod tests {
         assert_eq!(action.writer_id, 105);
         let (named, name) = crate::split_name(action.name().unwrap()).unwrap();
         assert_eq!(named, topic);
-        assert_eq!(read(&action, name), Ok(description));
+        assert_eq!(read(&action, name), Ok((description, 4711)));
     }
 
     #[test]
@@ -621,7 +641,7 @@ mod tests {
         };
         let topic: TopicId = "ua_2_3_7".parse().unwrap();
         let types = Types { request, response };
-        let said = (&description, Some(types), &BTreeMap::new());
+        let said = (&description, Some(types), &BTreeMap::new(), LASTING_TARGET);
         let utc = Timestamp::from_unix_nanos(1_700_000_000_000_000_000);
         let announcement = CallAnnouncement::new(topic, said, None, utc).unwrap();
         let mut bytes = Vec::new();
@@ -631,7 +651,7 @@ mod tests {
         else {
             unreachable!();
         };
-        let heard = read(&action, "").unwrap();
+        let (heard, _) = read(&action, "").unwrap();
         let poses = heard
             .response
             .iter()

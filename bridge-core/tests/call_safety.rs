@@ -232,3 +232,44 @@ fn who_lets_a_request_go_unheard_is_gone_until_it_speaks_again() {
     cell.run(ms(600));
     assert_eq!(cell.known(BRIDGE), [start()]);
 }
+
+#[test]
+fn what_was_asked_of_a_program_before_it_was_started_anew_is_not_executed_again() {
+    let mut cell = plugged_in();
+    // No answer arrives: who asks goes on to ask, and knows nothing of what becomes of it.
+    let mute = Rc::new(Shared::new(true));
+    let muted = Rc::clone(&mute);
+    cell.copies = Box::new(move |bytes| {
+        let message = NetworkMessage::decode(bytes).unwrap();
+        let is_response = message
+            .actions(ActionDialect::Standard)
+            .is_ok_and(|mut actions| {
+                actions.any(|action| action.unwrap().action.kind == ActionKind::Response)
+            });
+        usize::from(!(is_response && muted.get()))
+    });
+    cell.ask(BRIDGE, AskId(1), (start(), &large(1)), ms(20_000));
+    cell.run(ms(50));
+    let execution = cell.executions(GRIPPER).pop().unwrap();
+    cell.executed(GRIPPER, execution.id, Executed::Answered(large(1)));
+    cell.run(ms(300));
+    cell.kill(GRIPPER);
+    cell.start(GRIPPER, component(7).at_port(7_777));
+    cell.offer(GRIPPER, start(), offered(true));
+    cell.run(ms(1_500));
+    assert_eq!(cell.executions(GRIPPER).len(), 0, "it was executed before");
+    assert_eq!(cell.dropped(GRIPPER, Reason::CallRefused), 1);
+    mute.set(false);
+    cell.run(ms(2_000));
+    let (_, told) = cell.answers(BRIDGE).pop().unwrap();
+    assert_eq!(told.unwrap_err().kind, AskErrorKind::Unknown);
+
+    // Once it has said what it is, it is asked as any other, and by who is configured by hand too.
+    cell.run(ms(90_000));
+    cell.ask(BRIDGE, AskId(2), (start(), &large(2)), ms(3_000));
+    cell.run(ms(50));
+    assert_eq!(cell.executions(GRIPPER).len(), 1);
+    let from = SocketAddr::from(([192, 0, 2, 9], 5_000));
+    cell.hear(GRIPPER, &request(None, 1), from);
+    assert_eq!(cell.executions(GRIPPER).len(), 1);
+}

@@ -34,6 +34,7 @@ pub struct Weather {
 /// Carries datagrams between [`GROUP`] and [`OTHER_GROUP`] for as long as it lives.
 pub struct Relay {
     stop: Arc<AtomicBool>,
+    silent: Arc<AtomicBool>,
     bad: Arc<AtomicU32>,
     threads: Vec<JoinHandle<()>>,
 }
@@ -45,8 +46,20 @@ struct Direction {
     /// Where this relay itself sends from.
     own: [SocketAddr; 2],
     weather: Weather,
+    /// Nothing arrives.
+    silent: Arc<AtomicBool>,
     random: u64,
     under_way: BinaryHeap<Reverse<(Instant, Vec<u8>)>>,
+}
+
+impl Weather {
+    /// All arrives at once.
+    pub const FAIR: Self = Self {
+        lost: 0.0,
+        doubled: 0.0,
+        late: 0.0,
+        delay: Duration::ZERO,
+    };
 }
 
 impl Relay {
@@ -57,26 +70,39 @@ impl Relay {
     #[must_use]
     pub fn start(weather: Weather) -> Self {
         let (stop, bad) = (Arc::<AtomicBool>::default(), Arc::<AtomicU32>::default());
+        let silent = Arc::<AtomicBool>::default();
+        let silences = [Arc::clone(&silent), Arc::default()];
         let senders = [sender(), sender()];
         let own = senders
             .each_ref()
             .map(|socket| socket.local_addr().unwrap());
         let ways = [(GROUP, OTHER_GROUP), (OTHER_GROUP, GROUP)];
         let mut threads = Vec::new();
-        for (sender, (from, to)) in senders.into_iter().zip(ways) {
+        for ((sender, (from, to)), silent) in senders.into_iter().zip(ways).zip(silences) {
             let mut direction = Direction {
                 from: group_member(from),
                 to: sender,
                 group: to,
                 own,
                 weather,
+                silent,
                 random: 0x2545_f491 + u64::from(u32::from(*from.ip())),
                 under_way: BinaryHeap::new(),
             };
             let (stop, bad) = (Arc::clone(&stop), Arc::clone(&bad));
             threads.push(std::thread::spawn(move || direction.carry(&stop, &bad)));
         }
-        Self { stop, bad, threads }
+        Self {
+            stop,
+            silent,
+            bad,
+            threads,
+        }
+    }
+
+    /// Whether all that [`GROUP`] says is lost on its way to [`OTHER_GROUP`] from now on.
+    pub fn hush(&self, silent: bool) {
+        self.silent.store(silent, Ordering::Relaxed);
     }
 
     /// How many datagrams were lost, doubled or late.
@@ -139,7 +165,7 @@ impl Direction {
         } = self.weather;
         let (now, chance) = (Instant::now(), self.chance());
         let later = now + delay.mul_f64(self.chance());
-        let arrive: &[Instant] = if chance < lost {
+        let arrive: &[Instant] = if chance < lost || self.silent.load(Ordering::Relaxed) {
             &[]
         } else if chance < lost + doubled {
             &[now, later]

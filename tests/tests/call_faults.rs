@@ -6,8 +6,9 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{
-    Asker, Cell, CodecAsker, Counting, Distribution, Ended, Executes, Executor, METRICS_ROS2,
-    OTHER_GROUP, Peer, Relay, UadpSocket, Weather, drops, eventually, metrics, send_from,
+    Asker, Cell, CodecAsker, Counting, Distribution, Ended, Executes, Executor, METRICS_ROS1,
+    METRICS_ROS2, OTHER_GROUP, Peer, Relay, UadpSocket, Weather, drops, eventually, metrics,
+    send_from,
 };
 use uadp::action::{
     ActionAddress, ActionDialect, ActionFields, ActionHeader, ActionKind, ActionState, ActionToSend,
@@ -147,6 +148,83 @@ fn a_bridge_that_is_killed_while_it_executes_is_told_and_the_next_one_executes_n
     );
 }
 
+/// When a bridge is killed that executes a call.
+#[derive(Clone, Copy, PartialEq)]
+enum Killed {
+    /// It has the request in its socket.
+    Before,
+    /// It has executed it, and its answer is lost.
+    After,
+}
+
+/// The next bridge hears the request, which is still repeated, and who asks is told that nothing is known of it.
+fn a_killed_bridge_and_the_next_one_execute_once(killed: Killed) {
+    let Some(cell) = Cell::with(BOTH) else {
+        return;
+    };
+    let relay = Relay::start(Weather::FAIR);
+    let one = cell.call_mapping(1, "");
+    // A request goes on for as long as that.
+    let two = format!("pubsub: {{address: \"opc.udp://{OTHER_GROUP}\", receive_timeout: 40s}}\n");
+    let two = cell.call_mapping(2, &two);
+    let _core = cell.roscore();
+    let mut executor = cell.rospy_executor(&[&format!("empty={SERVICE}")]);
+    let mut responder = cell.bridge_ros1(&[&one]);
+    let _requestor = cell.bridge_ros2(&[&two]);
+    let mut asker = cell.rclpy_asker(Distribution::Jazzy);
+    assert_eq!(asker.ask(order("empty", 0, 1, 1))["right"], 1);
+    let executed = match killed {
+        Killed::Before => {
+            responder.signal(Signal::SIGSTOP);
+            let group = UadpSocket::join();
+            asker.begin(order("empty", 0, 1, 1));
+            eventually("the request is in the group", SOON, || {
+                forged(&group.receive(Duration::from_millis(50))?, SERVICE_ID)
+            });
+            1
+        }
+        Killed::After => {
+            relay.hush(true);
+            asker.begin(order("empty", 0, 1, 1));
+            eventually("it is executed", SOON, || {
+                let counts = executor.counts();
+                (counts["executed"] == 2 && counts["running"] == 0).then_some(())
+            });
+            2
+        }
+    };
+    responder.signal(Signal::SIGKILL);
+    responder.wait_for_end(SOON);
+    let _responder = cell.bridge_ros1(&[&one]);
+    announced(&cell, SERVICE);
+    eventually("the next bridge has heard the request", SOON, || {
+        let status = metrics(METRICS_ROS1)?;
+        (system_tests::number(&status, "call_refused") > 0).then_some(())
+    });
+    relay.hush(false);
+    let told = asker.told();
+    assert_eq!(told["wrongs"], 1, "{told}");
+    let why = told["wrong"][0].as_str().unwrap();
+    assert!(
+        why.contains("success=False") && why.contains("known"),
+        "{why}"
+    );
+    each_executed(&mut executor, executed);
+    let told = asker.ask(order("empty", 0, 3, 1));
+    assert_eq!(told["right"], 3, "{told}");
+    each_executed(&mut executor, executed + 3);
+}
+
+#[test]
+fn a_bridge_that_is_killed_before_it_executes_leaves_nothing_to_the_next_one() {
+    a_killed_bridge_and_the_next_one_execute_once(Killed::Before);
+}
+
+#[test]
+fn a_bridge_that_is_killed_before_its_answer_arrives_leaves_nothing_to_the_next_one() {
+    a_killed_bridge_and_the_next_one_execute_once(Killed::After);
+}
+
 /// `call_failed` of bridge-ros2, wherever it counts.
 fn failed_calls() -> u64 {
     metrics(METRICS_ROS2).map_or(0, |status| system_tests::number(&status, "call_failed"))
@@ -195,7 +273,7 @@ fn ended(askers: &mut [CodecAsker], count: usize) -> Vec<Vec<Ended>> {
 
 fn announced(cell: &Cell, service: &str) {
     eventually("the bridge executes the service", SOON, || {
-        let status = metrics(system_tests::METRICS_ROS1)?;
+        let status = metrics(METRICS_ROS1)?;
         status.to_string().contains(&service[1..]).then_some(())
     });
     // The folder is not needed; the cell has to live as long as what is asked in it.

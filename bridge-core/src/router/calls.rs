@@ -28,7 +28,7 @@ use self::execute::{Own, Running};
 use self::learn::{Group, Known};
 use super::{About, Router};
 use crate::call::{AskError, AskErrorKind, AskId, CallCounters, CallDescription, CallMap};
-use crate::call_announcement::TARGET;
+use crate::call_announcement::{LASTING_TARGET, target_of};
 use crate::call_plan::CallPlan;
 use crate::counters::{Cause, Reason};
 use crate::fields;
@@ -44,6 +44,8 @@ pub(super) struct Calls {
     requestor: Requestor,
     /// It answers to the group, whoever asks.
     responder: Responder<()>,
+    /// ActionTargetId of our own in this life of the program.
+    target: u16,
     table: HashMap<TopicId, Call>,
     /// Who executes the calls of a namespace.
     groups: HashMap<(SpaceId, u16), Group>,
@@ -114,6 +116,7 @@ impl Calls {
                 max_bytes_per_requestor: 2 * MAX_BLOCK,
                 ..ResponderSettings::default()
             }),
+            target: target_of(instance),
             table: HashMap::new(),
             groups: HashMap::new(),
             weight: 0,
@@ -365,7 +368,10 @@ impl Router {
                 publisher_id: OwnedPublisherId::UInt16(space),
                 writer_group_id: Some(namespace),
                 writer_id,
-                target_id: TARGET,
+                target_id: call
+                    .known
+                    .as_ref()
+                    .map_or(LASTING_TARGET, |known| known.target),
             },
             dialect: ActionDialect::Standard,
             fields: ActionFields::Variants(fields),

@@ -60,11 +60,7 @@ impl Program {
             source: Some(address),
         };
         let mut router = Router::new(settings, Arc::new(Mapping::default()));
-        let mut instance = [7; 16];
-        for (place, byte) in instance.iter_mut().zip(address.port().to_le_bytes()) {
-            *place = byte;
-        }
-        router.set_instance(instance);
+        router.set_instance(instance(address));
         Self {
             router,
             address,
@@ -74,9 +70,11 @@ impl Program {
         }
     }
 
+    /// Another program, or another life of one.
     pub(crate) fn at_port(mut self, port: u16) -> Self {
         self.address.set_port(port);
         self.router.set_source(self.address);
+        self.router.set_instance(instance(self.address));
         self
     }
 
@@ -85,6 +83,15 @@ impl Program {
         self.router.set_owned(owned, start());
         self
     }
+}
+
+/// What is random elsewhere.
+fn instance(address: SocketAddr) -> [u8; 16] {
+    let mut instance = [7; 16];
+    for (place, byte) in instance.iter_mut().zip(address.port().to_le_bytes()) {
+        *place = byte;
+    }
+    instance
 }
 
 /// A program that writes one namespace of space 0.

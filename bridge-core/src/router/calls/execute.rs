@@ -18,7 +18,7 @@ use super::super::{About, Router};
 use crate::call::{
     CallDescription, CallField, Executed, Execution, Offered, OfferedType, join_name,
 };
-use crate::call_announcement::{CallAnnouncement, TARGET, Types};
+use crate::call_announcement::{CallAnnouncement, LASTING_TARGET, Types};
 use crate::call_plan::ExecutedPlan;
 use crate::counters::{Cause, Reason};
 use crate::loop_rule::{Side, What};
@@ -108,7 +108,7 @@ impl Router {
         let call = calls.table.entry(topic).or_default();
         let before = call.own.take().and_then(|own| own.announcement);
         let (_, _, writer_id) = topic.triple();
-        let said = (description, types, namespaces);
+        let said = (description, types, namespaces, calls.target);
         let made = CallAnnouncement::new(topic, said, before.as_ref(), now.utc);
         let (announcement, fault) = match made {
             Ok(announcement) => (Some(announcement), None),
@@ -235,6 +235,17 @@ impl Router {
         let since = calls.since_start(now);
         let group = self.mapping.pubsub().address;
         match calls.responder.handle_request(request, (), since) {
+            // A life of this program before may have executed it, of which nothing is known.
+            Ok(Requested::Execute(id)) if !calls.is_of_this_life(request) => {
+                let lost = Outcome::Unknown(uadp::action::Unknown::Lost);
+                // Whom it is told is who asks for it again.
+                let _told = calls.responder.finish(id, lost, since).is_ok();
+                let cause = (Reason::CallRefused, "earlier life");
+                self.count_call(topic, Some(from), cause, || {
+                    "what was asked of this program before it was started anew is not executed"
+                        .to_owned()
+                });
+            }
             Ok(Requested::Execute(id)) => {
                 let own = calls.table.get(&topic).and_then(|call| call.own.as_ref());
                 match may_be_executed(own, request, (from, group), known) {
@@ -383,6 +394,12 @@ impl Router {
 }
 
 impl super::Calls {
+    /// Whether a request was meant for this life of the program: one that was started anew is asked by another target once
+    /// it has said so.
+    fn is_of_this_life(&self, request: &ActionMessage<'_>) -> bool {
+        [self.target, LASTING_TARGET].contains(&request.target_id)
+    }
+
     /// Forgets executions of which nothing was heard long after their deadline.
     pub(super) fn forget_executions(&mut self, now: Instant) {
         self.executions
@@ -402,7 +419,7 @@ fn may_be_executed<'a>(
     (from, group): (SocketAddr, SocketAddr),
     known: bool,
 ) -> Result<Executable<'a>, (Refusal, &'static str, String)> {
-    let Some(own) = own.filter(|_| request.target_id == TARGET) else {
+    let Some(own) = own else {
         let detail = "it is no call of this program".to_owned();
         return Err((Refusal::NoSuchAction, "unknown", detail));
     };

@@ -22,6 +22,8 @@ pub(super) struct Known {
     pub(super) description: Arc<CallDescription>,
     /// Who executes it.
     pub(super) from: SocketAddr,
+    /// ActionTargetId of it in this life of that program.
+    pub(super) target: u16,
     /// When that was last said.
     said: Instant,
     /// When it was last another than before.
@@ -160,7 +162,7 @@ impl Router {
             });
         }
         match call_announcement::read(action, name) {
-            Ok(description) => self.take_in_call(topic, description, from, now),
+            Ok(said) => self.take_in_call(topic, said, from, now),
             Err(why) => {
                 let cause = (Reason::MetaData, "useless");
                 self.count_call(topic, Some(from), cause, || why);
@@ -188,7 +190,7 @@ impl Router {
     fn take_in_call(
         &mut self,
         topic: TopicId,
-        description: CallDescription,
+        (description, target): (CallDescription, u16),
         from: SocketAddr,
         now: Now,
     ) {
@@ -230,12 +232,14 @@ impl Router {
         let call = calls.table.entry(topic).or_default();
         match &mut call.known {
             Some(known) if same => {
-                (known.from, known.said, known.gone) = (from, now.monotonic, false);
+                (known.from, known.target) = (from, target);
+                (known.said, known.gone) = (now.monotonic, false);
             }
             known => {
                 let before = known.replace(Known {
                     description: Arc::new(description),
                     from,
+                    target,
                     said: now.monotonic,
                     changed: now.monotonic,
                     gone: false,
