@@ -300,7 +300,8 @@ impl CallDescription {
 
     /// Whether it can be asked for as that ROS type: each field of the type's response is in the response of the call, and
     /// the fields of the requests are the same, in whatever order; or the type's request has none, and the call can be
-    /// asked for so. Further fields of the response are left out. What `map` names is made as it says; where it says anything
+    /// asked for so. A field of the request that is optional and that the type has not is not given. Further fields of the response
+    /// are left out. What `map` names is made as it says; where it says anything
     /// of the request, further fields of the type's request are left out.
     ///
     /// # Errors
@@ -336,6 +337,15 @@ impl CallDescription {
                     && field.builtin == leaf.builtin
             };
             let found = leaves.iter().position(find).map(Origin::Leaf);
+            // Not given, where it has a value of its own.
+            let found = found.or_else(|| {
+                let is_left_out = field.optional
+                    && path == field.name
+                    && !leaves
+                        .iter()
+                        .any(|leaf| path.eq_ignore_ascii_case(&leaf.path));
+                is_left_out.then(|| Origin::Constant(constant::NULL.to_vec()))
+            });
             found.ok_or_else(|| match path == field.name {
                 true => format!("its request has {field}, and {} has not", message.name()),
                 false => format!(

@@ -8,6 +8,9 @@ use uadp::{BuiltinType, DateTime, FieldEncoder, Scalar};
 use crate::block;
 use crate::counters::Cause;
 
+/// The block with one field that is null: it is not given.
+pub(crate) const NULL: [u8; 3] = [1, 0, 0];
+
 /// The block with the one field, of that name and type, that has that value: a number, text or Boolean, bytes as a list of numbers, or an array of
 /// those.
 ///

@@ -4,10 +4,13 @@
 //! others: a goal is a request, and so are cancelling and waiting for a result; feedback and the statuses of goals are values.
 //! The action of another space is offered as an action server of the graph.
 
+mod block;
+mod encoding;
 mod executors;
 mod facade;
 mod facades;
 mod graph;
+mod own;
 mod serving;
 mod table;
 mod wire;
@@ -25,6 +28,8 @@ pub use self::graph::{
     ActionClient, ActionGraph, ActionServer, CancelAnswer, CancelRequest, CancelWhat, GoalEvent,
     GoalId, NO_GOAL, NewGoal, SentGoal, ServedGoal, ServerEvent, Waits,
 };
+
+pub use self::own::{OwnAction, OwnActions};
 
 use self::executors::Executors;
 use self::facades::Facades;

@@ -516,6 +516,14 @@ fn the_package_people_build_has_the_skill_messages_that_are_built_in() {
             files.add(&name(&format!("ua_msgs/{stem}")), &text).unwrap();
             assert!(cmake.contains(&format!(" {stem}.msg")), "{stem}");
         }
+        for entry in std::fs::read_dir(folder.join("action")).unwrap() {
+            let path = entry.unwrap().path();
+            let stem = path.file_stem().unwrap().to_str().unwrap().to_owned();
+            let text = std::fs::read_to_string(&path).unwrap();
+            let action = name(&format!("ua_msgs/{stem}"));
+            files.add_action(&action, &text).unwrap();
+            assert!(cmake.contains(&format!(" {stem}.action")), "{stem}");
+        }
         let of_ours: Vec<&TypeName> = built_in
             .names()
             .filter(|known| known.package() == "ua_msgs")

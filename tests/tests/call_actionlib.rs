@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, Distribution, Peer};
+use system_tests::{Cell, Child, Distribution, Peer, Started, eventually, program};
 
 /// rospy and rclpy need seconds to start on a busy machine.
 const SOON: Duration = Duration::from_secs(60);
@@ -424,4 +424,142 @@ fn a_client_of_ros_2_moves_an_arm_of_ros_1_along_a_trajectory() {
         (&ended["status"], &ended["code"], &ended["text"]),
         (&json!("SUCCEEDED"), &json!(-2), &json!("elbow"))
     );
+}
+
+/// A skill that goes on until it is halted, one that is done at once, and one that must be told where to.
+const COMPONENT: &str = "
+component: bench
+application_uri: urn:ua-bridge:system-tests:component
+namespace: 9
+skills:
+  - {name: Hold, type: GraspSkillType, driver: {simulated: {duration: 10 min}}}
+  - {name: Let, type: ReleaseSkillType, driver: {simulated: {duration: 50 ms}}}
+  - {name: Move, type: PtpMoveSkillType, driver: {simulated: {time_scale: 100}}}
+";
+
+/// The one line for who has an action type of their own.
+const HOLD: &str = "
+spaces: [{id: 1}, {id: 2, domain: 2}]
+namespaces: {9: 'urn:ua-bridge:system-tests:component'}
+calls:
+  - node: ns=9;i=110
+    name: bench.Hold.Goal
+    origin: 0
+    ros:
+      - {space: 2, action: /hold, type: test_msgs/Fibonacci, goal: {force: 12.5}, feedback: {sequence: [1]}, result: {sequence: [2]}}
+";
+
+/// A component that serves at that address.
+fn skills(cell: &Cell, url: &str) -> Child {
+    let file = cell.file("component.yaml", COMPONENT);
+    let child = Started::new("ua-component", &program("ua-component"))
+        .args([file.to_str().unwrap(), "--endpoint", url, "--lds", "none"])
+        .args(["--interface", "lo", "--metrics", "127.0.0.1:9855"])
+        .start();
+    eventually("the component serves", SOON, || {
+        std::net::TcpStream::connect(url.trim_start_matches("opc.tcp://")).ok()
+    });
+    child
+}
+
+/// Waits until a client of OPC UA is told that state.
+fn stands(watch: &mut Child, state: &str) {
+    watch.wait_for_json(&format!("a skill that is {state}"), SOON, |line| {
+        (line.get("value")? == state).then_some(())
+    });
+}
+
+#[test]
+fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_component() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2, Peer::Python]) else {
+        return;
+    };
+    let url = "opc.tcp://127.0.0.1:4856";
+    let _core = cell.roscore();
+    let mut component = skills(&cell, url);
+    let file = cell.file("hold.yaml", HOLD);
+    let path = file.to_str().unwrap();
+    let _bridges = (cell.bridge_ros1(&[path]), cell.bridge_ros2(&[path]));
+    let mut watch = cell.asyncua("opcua_subscribe.py", &[url, "ns=1;i=101"]);
+    stands(&mut watch, "Halted");
+
+    // Without a mapping, by its type of ua_msgs. It is not ready, and becomes it.
+    let mut hold = actionlib_client(&cell, &["/ua_0_9_110", "ua_msgs/Grasp"]);
+    send(&mut hold, &json!({}));
+    let told = hold.wait_for_json("feedback", SOON, |line| {
+        (line["goal"] == 0).then(|| line.get("feedback").cloned())?
+    });
+    assert_eq!(
+        (&told["state"], &told["run"]),
+        (&json!("Running"), &json!(1))
+    );
+    stands(&mut watch, "Running");
+    // A component does one thing at a time.
+    let mut moves = actionlib_client(&cell, &["/ua_0_9_310", "ua_msgs/PtpMove"]);
+    let target = json!([0.3, 0.0, 0.3, 0.0, 0.0, 0.0]);
+    send(&mut moves, &json!({"target_position": target}));
+    let refused = end(&mut moves, 0);
+    let why = refused[1].as_str().unwrap();
+    assert_eq!(refused[0], "REJECTED");
+    assert!(
+        why.contains("BadInvalidState") && why.contains("Hold"),
+        "{why}"
+    );
+    hold.tell("{\"cancel\": 0}");
+    let halted = end(&mut hold, 0);
+    assert_eq!(
+        (&halted[0], &halted[2]),
+        (&json!("PREEMPTED"), &json!({"run": 1, "gripped": false}))
+    );
+    stands(&mut watch, "Halted");
+
+    // A wrong parameter moves nothing; of a right goal the result comes.
+    send(
+        &mut moves,
+        &json!({"target_position": target, "max_velocity": 99.0}),
+    );
+    let refused = end(&mut moves, 1);
+    let why = refused[1].as_str().unwrap();
+    assert!(why.contains("MaxVelocity is from"), "{why}");
+    send(&mut moves, &json!({"target_position": target}));
+    let moved = end(&mut moves, 2);
+    assert_eq!(
+        (&moved[0], &moved[2]["run"]),
+        (&json!("SUCCEEDED"), &json!(1))
+    );
+    let near = |(at, of): (&Value, &Value)| (at.as_f64().unwrap() - of.as_f64().unwrap()).abs();
+    let position = moved[2]["position"].as_array().unwrap();
+    let off = position.iter().zip(target.as_array().unwrap()).map(near);
+    assert!(off.fold(0.0, f64::max) < 1e-3, "{position:?}");
+
+    // By the one line of the mapping, for who knows another type.
+    let mut rclpy = rclpy_client(&cell, "/hold");
+    rclpy.tell("send 7");
+    assert_eq!(line(&mut rclpy, "goal", &json!(0), "accepted"), true);
+    let progress = line(&mut rclpy, "feedback", &json!(0), "sequence");
+    assert_eq!(progress, json!([1]));
+    rclpy.tell("cancel 0");
+    rclpy.wait_for_json("the component agrees", SOON, |line| {
+        (line.get("cancel")? == "NONE" && line["goals"] == json!([0])).then_some(())
+    });
+    assert_eq!(line(&mut rclpy, "result", &json!(0), "status"), "CANCELED");
+    assert_eq!(
+        line(&mut rclpy, "result", &json!(0), "sequence"),
+        json!([2])
+    );
+
+    // A component that dies takes its goals along; the next one runs others.
+    rclpy.tell("send 8");
+    assert_eq!(line(&mut rclpy, "goal", &json!(1), "accepted"), true);
+    component.signal(Signal::SIGKILL);
+    component.wait_for_end(SOON);
+    assert_eq!(line(&mut rclpy, "result", &json!(1), "status"), "ABORTED");
+    let _next = skills(&cell, url);
+    let mut number = 2;
+    eventually("a goal is taken by the next component", SOON, || {
+        rclpy.tell("send 9");
+        let answer = line(&mut rclpy, "goal", &json!(number), "accepted");
+        number += 1;
+        (answer == true).then_some(())
+    });
 }

@@ -12,9 +12,9 @@ use messages::{ActionCalls, TypeName};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 
+use super::encoding::Encoding;
 use super::graph::{ActionGraph, Waits};
 use super::serving::{Action, Command, Part, Serving};
-use super::wire;
 use crate::PortEvent;
 use crate::clock::now;
 use crate::policy::Policy;
@@ -166,9 +166,9 @@ impl Executors {
         let client = graph.action_client(&wanted.action, &wanted.type_name, wanted.waits)?;
         let (commands, told) = mpsc::channel(MOST_COMMANDS);
         let offered = Arc::new(AtomicBool::new(false));
+        let encoding = Encoding::Ros(G::WIRE, Arc::clone(&calls));
         let action = Action {
-            wire: G::WIRE,
-            calls: Arc::clone(&calls),
+            encoding: encoding.clone(),
             topic,
             feedback,
             status,
@@ -187,7 +187,7 @@ impl Executors {
         let mut events = served.offer(topic);
         events.push(PortEvent::Sample {
             topic: status,
-            payload: wire::statuses(G::WIRE, &[]),
+            payload: encoding.statuses(&[]),
             received: now().utc,
             latched_by: None,
         });
@@ -374,8 +374,8 @@ const FAMILY: u16 = 4;
 /// Actions that are offered to other spaces: anybody in a graph can invent names.
 const MOST_SERVED: usize = 256;
 /// Requests of one action that wait to be looked at; one more is refused as busy.
-const MOST_COMMANDS: usize = 256;
+pub(super) const MOST_COMMANDS: usize = 256;
 /// Requests that wait for results of all actions: others have places left.
-const MOST_HELD: usize = 512;
+pub(super) const MOST_HELD: usize = 512;
 /// How long the goals of a server that is gone are kept, so that their ends can be asked for once it is there again.
 const KEPT: Duration = Duration::from_secs(15 * 60);

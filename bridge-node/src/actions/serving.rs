@@ -7,15 +7,15 @@ use std::time::Duration;
 use bridge_core::{Executed, ExecutionId, Refusal};
 use bytes::Bytes;
 use mappings::TopicId;
-use messages::{ActionCalls, Wire};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use tokio::time::timeout_at;
 use uadp::StatusCode;
 
+use super::encoding::Encoding;
 use super::graph::{ActionClient, CancelAnswer, CancelWhat, GoalEvent, GoalId, NO_GOAL, SentGoal};
 use super::table::{Asked, Goals, Progress, Wanted};
-use super::wire::{self, CancelRequest};
+use super::wire::CancelRequest;
 use crate::PortEvent;
 use crate::clock::now;
 use crate::port::Execution;
@@ -41,8 +41,7 @@ pub(super) enum Command {
 /// What an action is, and where its values go.
 #[derive(Debug)]
 pub(super) struct Action {
-    pub(super) wire: Wire,
-    pub(super) calls: Arc<ActionCalls>,
+    pub(super) encoding: Encoding,
     /// Of its goals.
     pub(super) topic: TopicId,
     pub(super) feedback: TopicId,
@@ -124,7 +123,7 @@ impl<C: ActionClient> Serving<C> {
         let Execution {
             id: run, request, ..
         } = execution;
-        let Some((id, body)) = wire::split(self.action.wire, &request) else {
+        let Some((id, body)) = self.action.encoding.split(&request) else {
             return self.refuse(run, Refusal::InvalidArgument).await;
         };
         let id = match id {
@@ -139,7 +138,7 @@ impl<C: ActionClient> Serving<C> {
             }
             Asked::Waits => Ok(()),
             Asked::Answer(answer) => {
-                let answer = wire::goal_answer(self.action.wire, &answer);
+                let answer = self.action.encoding.goal_answer(&answer);
                 self.finish(run, answered(&answer)).await
             }
             Asked::Full => self.refuse(run, Refusal::Busy).await,
@@ -153,7 +152,7 @@ impl<C: ActionClient> Serving<C> {
             deadline,
             ..
         } = execution;
-        let Some(id) = wire::read_result_request(self.action.wire, &request) else {
+        let Some(id) = self.action.encoding.read_result_request(&request) else {
             return self.refuse(run, Refusal::InvalidArgument).await;
         };
         // In time for the answer to get there.
@@ -178,8 +177,7 @@ impl<C: ActionClient> Serving<C> {
     }
 
     fn empty(&self, status: i8, why: &str) -> Option<Bytes> {
-        let Action { wire, calls, .. } = &self.action;
-        wire::empty_result_answer(*wire, calls, (status, why)).ok()
+        self.action.encoding.empty_result_answer((status, why))
     }
 
     async fn cancel(&mut self, execution: Execution) -> Result<(), Over> {
@@ -189,7 +187,7 @@ impl<C: ActionClient> Serving<C> {
             deadline,
             ..
         } = execution;
-        let Some(request) = wire::read_cancel_request(self.action.wire, &request) else {
+        let Some(request) = self.action.encoding.read_cancel_request(&request) else {
             return self.refuse(run, Refusal::InvalidArgument).await;
         };
         let what = match request {
@@ -242,7 +240,7 @@ impl<C: ActionClient> Serving<C> {
     ) -> Result<(), Over> {
         match answer {
             Ok(answer) => {
-                let answer = wire::cancel_answer(self.action.wire, &answer);
+                let answer = self.action.encoding.cancel_answer(&answer);
                 self.finish(run, answered(&answer)).await
             }
             Err(CallFault { text, ran, .. }) => {
@@ -253,11 +251,10 @@ impl<C: ActionClient> Serving<C> {
     }
 
     async fn goal_event(&mut self, id: GoalId, event: GoalEvent) -> Result<(), Over> {
-        let wire = self.action.wire;
         match event {
             GoalEvent::Accepted(stamp) => {
                 if let Some((asked, answer)) = self.goals.accepted(id, stamp) {
-                    let answer = wire::goal_answer(wire, &answer);
+                    let answer = self.action.encoding.goal_answer(&answer);
                     self.finish_all(asked, &answered(&answer)).await?;
                     self.tell_statuses().await?;
                 }
@@ -266,7 +263,7 @@ impl<C: ActionClient> Serving<C> {
             GoalEvent::Rejected(why) => match self.goals.rejected(id, why, now().monotonic) {
                 Some((asked, answer, waiting)) => {
                     let none = self.no_result(&answer.message);
-                    let answer = wire::goal_answer(wire, &answer);
+                    let answer = self.action.encoding.goal_answer(&answer);
                     self.finish_all(asked, &answered(&answer)).await?;
                     self.finish_all(waiting, &none).await
                 }
@@ -276,7 +273,7 @@ impl<C: ActionClient> Serving<C> {
                 true => self.tell_statuses().await,
                 false => Ok(()),
             },
-            GoalEvent::Feedback(body) => match wire::join(wire, id, &body) {
+            GoalEvent::Feedback(body) => match self.action.encoding.join(id, &body) {
                 Some(value) => self.sample(self.action.feedback, value).await,
                 None => Ok(()),
             },
@@ -285,7 +282,10 @@ impl<C: ActionClient> Serving<C> {
                 message,
                 result,
             } => {
-                let answer = wire::result_answer(wire, (status, &message), &result);
+                let answer = self
+                    .action
+                    .encoding
+                    .result_answer((status, &message), &result);
                 let answer = answer.or_else(|| self.empty(status, &message));
                 self.ended(id, (status, answer)).await
             }
@@ -343,7 +343,7 @@ impl<C: ActionClient> Serving<C> {
     }
 
     async fn tell_statuses(&self) -> Result<(), Over> {
-        let value = wire::statuses(self.action.wire, &self.goals.statuses());
+        let value = self.action.encoding.statuses(&self.goals.statuses());
         self.sample(self.action.status, value).await
     }
 

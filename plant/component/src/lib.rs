@@ -4,7 +4,9 @@
 //! The program `ua-component` is [`ComponentPort`] with the YAML of a component; a program with drivers of its own is the
 //! same with a [`skills::Component`] that it makes.
 
+pub mod definition;
 mod fields;
+mod goals;
 mod port;
 mod space;
 

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
+use bridge_node::actions::OwnActions;
 use bridge_node::{
     Delivery, Described, Executed, Execution, ExecutionId, Failure, FailureKind, Port, PortEvent,
     TypePaths,
@@ -19,7 +20,8 @@ use tracing::{info, warn};
 use uadp::BuiltinType;
 
 use crate::fields;
-use crate::space::{Outbox, Place, Speaker};
+use crate::goals::{self, Doer, Reporter};
+use crate::space::{GOAL, Outbox, Place, Speaker};
 
 /// What a component is started with beside what it is.
 #[derive(Debug, Clone, Default)]
@@ -48,10 +50,12 @@ pub struct ComponentPort {
     server: ComponentServer,
     announced: Option<Announced>,
     outbox: Outbox,
-    /// What is said before all else.
+    /// What is said before all else: what there is, and the requests that are refused.
     first: VecDeque<PortEvent>,
     executed: mpsc::Receiver<PortEvent>,
     executes: mpsc::Sender<PortEvent>,
+    /// The skills as actions.
+    actions: OwnActions,
 }
 
 impl ComponentPort {
@@ -71,15 +75,27 @@ impl ComponentPort {
             pki: options.pki.clone(),
             trust_any_client: options.trust_any_client,
         };
+        let mut reporters = Vec::new();
         let server = ComponentServer::build(component, &settings, |number, facts| {
+            let reporter = Reporter::new();
+            reporters.push(reporter.clone());
             first.extend(place.announce(number, facts));
             let Some(speaker) = Speaker::new(outbox.clone(), &place, number) else {
-                return Vec::new();
+                return vec![Box::new(reporter)];
             };
             speaker.at_first(facts);
-            vec![Box::new(speaker)]
+            vec![Box::new(speaker), Box::new(reporter)]
         });
         let server = server.map_err(|fault| failure(fault, options))?;
+        let mut actions = OwnActions::default();
+        for (number, (skill, reporter)) in (1..).zip(server.skills().iter().zip(reporters)) {
+            if let Some(topic) = place.topic(number, GOAL) {
+                let with = (&*place.component, place.open);
+                let action = goals::action(topic, with, skill.facts());
+                let added = actions.add(&action, Doer::new(skill.clone(), reporter));
+                first.extend(added.unwrap_or_default());
+            }
+        }
         server.start();
         let announced = announce(component, server.url(), options);
         info!(
@@ -97,6 +113,7 @@ impl ComponentPort {
             first,
             executed,
             executes,
+            actions,
         })
     }
 
@@ -130,6 +147,7 @@ impl Port for ComponentPort {
         tokio::select! {
             biased;
             Some(event) = self.executed.recv() => event,
+            event = self.actions.recv() => event,
             event = self.outbox.next() => event,
         }
     }
@@ -151,6 +169,16 @@ impl Port for ComponentPort {
     fn silent(&mut self, _topic: TopicId, _silent: bool) {}
 
     fn execute(&mut self, execution: Execution) -> bool {
+        if self.actions.serves(execution.topic) {
+            let id = execution.id;
+            if let Err(refusal) = self.actions.execute(execution) {
+                self.first.push_back(PortEvent::Executed {
+                    execution: id,
+                    outcome: Executed::Refused(refusal),
+                });
+            }
+            return true;
+        }
         let Some((skill, method)) = self.skill(execution.topic) else {
             return false;
         };
@@ -175,8 +203,9 @@ impl Port for ComponentPort {
         true
     }
 
-    fn abandoned(&mut self, _execution: ExecutionId, _topic: TopicId) {
+    fn abandoned(&mut self, execution: ExecutionId, _topic: TopicId) {
         // A call is over within a second or two, and a run that it began goes on: its outcome can be asked for later.
+        self.actions.abandoned(execution);
     }
 
     fn reload(&mut self, _mapping: &Arc<Mapping>, _types: &Arc<TypePaths>) -> Vec<String> {

@@ -18,7 +18,7 @@ use uadp::{BuiltinType, Timestamp};
 
 use crate::fields;
 
-/// What each of the nine identifiers of a skill is.
+/// What the identifiers of a skill are.
 pub(crate) const STATE: u16 = 1;
 pub(crate) const EVENTS: u16 = 2;
 pub(crate) const PARAMETERS: u16 = 3;
@@ -31,6 +31,9 @@ pub(crate) const CALLS: [(u16, Method); 5] = [
     (8, Method::Resume),
     (9, Method::Reset),
 ];
+
+/// The goals of a skill that is an action; the four behind it are its cancel, result, feedback and status.
+pub(crate) const GOAL: u16 = 10;
 
 /// Where a component is in the space.
 #[derive(Debug, Clone)]

@@ -2,6 +2,8 @@
 
 import importlib
 
+from pathlib import Path
+
 import genpy
 import genpy.dynamic
 
@@ -31,6 +33,9 @@ MESSAGES = {
     "trajectory_msgs/JointTrajectoryPoint": "float64[] positions\nfloat64[] velocities\nfloat64[] accelerations\n"
     "float64[] effort\nduration time_from_start",
 }
+# The actions of skills, as they are shipped.
+SKILLS = Path(__file__).resolve().parents[3] / "ros/ua_msgs/action"
+TEXTS |= {f"ua_msgs/{file.stem}": file.read_text() for file in SKILLS.glob("*.action")}
 BASIC = "bool byte char int8 uint8 int16 uint16 int32 uint32 int64 uint64 float32 float64 string time duration".split()
 
 

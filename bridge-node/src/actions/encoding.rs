@@ -1,0 +1,92 @@
+//! How the calls and values of an action that is executed here are on the wire of its port.
+
+use std::sync::Arc;
+
+use bytes::Bytes;
+use messages::{ActionCalls, Wire};
+
+use super::block;
+use super::graph::{CancelAnswer, GoalId};
+use super::wire::{self, CancelRequest, GoalAnswer};
+
+/// The encoding of one action.
+#[derive(Debug, Clone)]
+pub(super) enum Encoding {
+    /// As messages of either ROS, of these types.
+    Ros(Wire, Arc<ActionCalls>),
+    /// As blocks of OPC UA fields.
+    Fields {
+        /// The fields of a result with nothing in them.
+        empty_result: Bytes,
+    },
+}
+
+impl Encoding {
+    /// The id, and the goal behind it.
+    pub(super) fn split(&self, request: &[u8]) -> Option<(GoalId, Bytes)> {
+        match self {
+            Self::Ros(wire, _) => wire::split(*wire, request),
+            Self::Fields { .. } => block::split(request),
+        }
+    }
+
+    /// Feedback behind its id.
+    pub(super) fn join(&self, id: GoalId, body: &[u8]) -> Option<Bytes> {
+        match self {
+            Self::Ros(wire, _) => wire::join(*wire, id, body),
+            Self::Fields { .. } => block::join(id, body),
+        }
+    }
+
+    pub(super) fn goal_answer(&self, answer: &GoalAnswer) -> Bytes {
+        match self {
+            Self::Ros(wire, _) => wire::goal_answer(*wire, answer),
+            Self::Fields { .. } => block::goal_answer(answer),
+        }
+    }
+
+    pub(super) fn read_result_request(&self, request: &[u8]) -> Option<GoalId> {
+        match self {
+            Self::Ros(wire, _) => wire::read_result_request(*wire, request),
+            Self::Fields { .. } => block::split(request).map(|(id, _)| id),
+        }
+    }
+
+    pub(super) fn read_cancel_request(&self, request: &[u8]) -> Option<CancelRequest> {
+        match self {
+            Self::Ros(wire, _) => wire::read_cancel_request(*wire, request),
+            Self::Fields { .. } => block::read_cancel_request(request),
+        }
+    }
+
+    pub(super) fn cancel_answer(&self, answer: &CancelAnswer) -> Bytes {
+        match self {
+            Self::Ros(wire, _) => wire::cancel_answer(*wire, answer),
+            Self::Fields { .. } => block::cancel_answer(answer),
+        }
+    }
+
+    /// The answer with a result. `None` where the result is none of that encoding.
+    pub(super) fn result_answer(&self, said: (i8, &str), result: &[u8]) -> Option<Bytes> {
+        match self {
+            Self::Ros(wire, _) => wire::result_answer(*wire, said, result),
+            Self::Fields { .. } => block::result_answer(said, result),
+        }
+    }
+
+    /// The answer without a result: all its fields are zero or empty. `None` where there can be none.
+    pub(super) fn empty_result_answer(&self, said: (i8, &str)) -> Option<Bytes> {
+        match self {
+            Self::Ros(wire, calls) => wire::empty_result_answer(*wire, calls, said).ok(),
+            Self::Fields { empty_result } => block::result_answer(said, empty_result),
+        }
+    }
+
+    /// The value with the statuses of goals.
+    pub(super) fn statuses(&self, goals: &[(GoalId, i8)]) -> Bytes {
+        match self {
+            Self::Ros(wire, _) => wire::statuses(*wire, goals),
+            Self::Fields { .. } => block::statuses(goals),
+        }
+    }
+}
