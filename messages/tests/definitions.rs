@@ -529,7 +529,11 @@ fn the_package_people_build_has_the_skill_messages_that_are_built_in() {
             .filter(|known| known.package() == "ua_msgs")
             .collect();
         assert_eq!(files.names().collect::<Vec<_>>(), of_ours);
-        for each in of_ours {
+        // What actionlib wraps around the parts of an action is of other packages.
+        let parts = of_ours
+            .iter()
+            .filter(|name| !name.name().contains("Action"));
+        for each in parts.copied() {
             let (ours, file) = (built_in.get(each).unwrap(), files.get(each).unwrap());
             assert_eq!(ours.leaves(), file.leaves(), "{each}");
             assert_eq!(ours.constants(), file.constants(), "{each}");

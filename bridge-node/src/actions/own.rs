@@ -11,7 +11,7 @@ use bridge_core::{
 };
 use bytes::Bytes;
 use mappings::{Overflow, TopicId};
-use messages::{Leaf, Rank};
+use messages::{Leaf, Rank, TypeName};
 use tokio::sync::mpsc;
 use tokio::task::JoinSet;
 use uadp::BuiltinType;
@@ -191,27 +191,35 @@ impl OwnAction {
         let statuses = statuses.map(|name| leaf(name, BuiltinType::ByteString));
         let values = [
             (
-                (feedback, ".Feedback"),
+                (feedback, ".Feedback", "_FeedbackValue"),
                 id.into_iter().chain(of_feedback).collect(),
                 EVENTS,
             ),
             (
-                (status, ".Status"),
+                (status, ".Status", "_StatusValue"),
                 Vec::from(statuses),
                 Overflow::KeepLatest,
             ),
         ];
-        let values = values.into_iter().map(|((topic, part), fields, overflow)| {
-            let description = ValueDescription {
-                name: format!("{}{part}", self.name),
-                message_type: None,
-                about: String::new(),
-                fields,
-                overflow,
-            };
-            let described = PortEvent::Described { topic, description };
-            [described, PortEvent::Live { topic, live: true }]
-        });
+        let own_type = self.about.split(';').next().unwrap_or_default();
+        let own_type: Option<TypeName> = own_type.trim().parse().ok();
+        let values = values
+            .into_iter()
+            .map(|((topic, part, suffix), fields, overflow)| {
+                // Without a type nobody in a graph would take note of what the fields are.
+                let message_type = own_type.as_ref().and_then(|of| {
+                    TypeName::new(of.package(), &format!("{}{suffix}", of.name())).ok()
+                });
+                let description = ValueDescription {
+                    name: format!("{}{part}", self.name),
+                    message_type,
+                    about: String::new(),
+                    fields,
+                    overflow,
+                };
+                let described = PortEvent::Described { topic, description };
+                [described, PortEvent::Live { topic, live: true }]
+            });
         values.flatten().collect()
     }
 

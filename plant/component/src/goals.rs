@@ -145,6 +145,7 @@ impl ActionClient for Doer {
             events: VecDeque::new(),
             passing: None,
             told: None,
+            last: None,
         }
     }
 
@@ -236,14 +237,17 @@ pub(crate) struct Sent {
     events: VecDeque<GoalEvent>,
     /// Progress that is not told yet, since the last was a moment ago.
     passing: Option<[Value; 4]>,
-    /// When feedback was told last.
+    /// When feedback was told last, and what: a run that stands still is heard all the same by who came late.
     told: Option<Instant>,
+    last: Option<[Value; 4]>,
 }
 
 #[derive(Debug)]
 enum Stage {
     Begins(JoinHandle<Result<u32, String>>),
     Runs(u32),
+    /// It has ended, which is told then.
+    Cancelled(Arc<Outcome>, Instant),
     Ended,
 }
 
@@ -260,13 +264,21 @@ impl SentGoal for Sent {
                 }
                 Stage::Runs(run) => {
                     let run = *run;
-                    let next = self.told.filter(|_| self.passing.is_some());
-                    let next = next.map(|told| told + BETWEEN_PROGRESS);
+                    let pause = match self.passing {
+                        Some(_) => BETWEEN_PROGRESS,
+                        None => REPEATED,
+                    };
+                    let next = self.told.map(|told| told + pause);
                     // Both are cancel-safe.
                     tokio::select! {
                         heard = self.heard.recv() => self.heard(run, heard),
                         () = at(next) => self.tell(None),
                     }
+                }
+                Stage::Cancelled(outcome, until) => {
+                    let outcome = Arc::clone(outcome);
+                    sleep_until(*until).await;
+                    self.end(&outcome);
                 }
                 Stage::Ended => return None,
             }
@@ -312,7 +324,16 @@ impl Sent {
                     false => self.tell(Some(feedback)),
                 }
             }
-            Ok(Heard::Ended(outcome)) if outcome.run == run => self.end(&outcome),
+            Ok(Heard::Ended(outcome)) if outcome.run == run => {
+                match !outcome.succeeded && self.is_cancelled(run) {
+                    true => {
+                        let until = Instant::now() + BEHIND_CANCEL;
+                        self.stage = Stage::Cancelled(outcome, until);
+                        self.events.push_back(GoalEvent::Status(CANCELING));
+                    }
+                    false => self.end(&outcome),
+                }
+            }
             Ok(Heard::Stands { .. } | Heard::Ended(_)) => {}
             // Too much of it was not taken: its end may have been among that.
             Err(broadcast::error::RecvError::Lagged(_)) => {
@@ -333,21 +354,27 @@ impl Sent {
         }
     }
 
-    /// Tells that feedback, or what waits to be told.
+    /// Tells that feedback, or what waits to be told, or the last once more.
     fn tell(&mut self, feedback: Option<[Value; 4]>) {
         let waited = self.passing.take();
-        if let Some(feedback) = feedback.or(waited) {
+        if let Some(feedback) = feedback.or(waited).or_else(|| self.last.clone()) {
             self.told = Some(Instant::now());
+            self.last = Some(feedback.clone());
             let body = Bytes::from(fields::block(&feedback));
             self.events.push_back(GoalEvent::Feedback(body));
         }
     }
 
-    fn end(&mut self, outcome: &Outcome) {
-        self.tell(None);
+    fn is_cancelled(&self, run: u32) -> bool {
         let current = *lock(&self.current);
-        let cancelled = current.is_some_and(|of| of.run == outcome.run && of.cancelled);
-        let status = match (outcome.succeeded, cancelled) {
+        current.is_some_and(|of| of.run == run && of.cancelled)
+    }
+
+    fn end(&mut self, outcome: &Outcome) {
+        if let Some(passing) = self.passing.take() {
+            self.tell(Some(passing));
+        }
+        let status = match (outcome.succeeded, self.is_cancelled(outcome.run)) {
             (true, _) => SUCCEEDED,
             (false, true) => CANCELED,
             (false, false) => ABORTED,
@@ -372,8 +399,13 @@ const OWNER: Owner = Owner::Local("a goal of the space");
 const MOST_HEARD: usize = 256;
 /// Progress alone is told no more often: 20 times a second.
 const BETWEEN_PROGRESS: Duration = Duration::from_millis(50);
+/// The end of a goal that is cancelled comes so long behind: a client of ROS 2 that has it first is told that it cancelled nothing.
+const BEHIND_CANCEL: Duration = Duration::from_millis(200);
+/// The last feedback is told again while nothing changes.
+const REPEATED: Duration = Duration::from_secs(1);
 /// As `action_msgs/GoalStatus` has them.
 const EXECUTING: i8 = 2;
+const CANCELING: i8 = 3;
 const SUCCEEDED: i8 = 4;
 const CANCELED: i8 = 5;
 const ABORTED: i8 = 6;
