@@ -146,7 +146,15 @@ fn a_type_that_lacks_what_the_call_wants_is_refused_with_the_name_of_the_field()
     assert!(why.contains("`Force` (Double)"), "{why}");
     let set_bool = service(Dialect::Ros1, "std_srvs/SetBool");
     let why = grasp().fits(&set_bool, &CallMap::default()).unwrap_err();
-    assert!(why.contains("`Force`"), "{why}");
+    assert!(why.contains("`data`"), "{why}");
+    // What may be left out is, and nothing else.
+    let mut also = grasp();
+    also.request
+        .push(CallField::scalar("data", BuiltinType::Boolean));
+    assert_eq!(also.fits(&set_bool, &CallMap::default()), Ok(()));
+    also.request[0].optional = false;
+    let why = also.fits(&set_bool, &CallMap::default()).unwrap_err();
+    assert!(why.contains("`Force` (Double)"), "{why}");
     let mut silent = grasp();
     silent.response.remove(1);
     let why = silent.fits(&trigger, &CallMap::default()).unwrap_err();
