@@ -1,10 +1,14 @@
 //! Who is there: `ua-lds`, servers that tell of themselves, and clients and packets of other makers as judges.
 
+#[path = "discovery/faults.rs"]
+mod faults;
 #[path = "discovery/rules.rs"]
 mod rules;
 
 use std::io::{Read as _, Write as _};
-use std::net::{Ipv4Addr, SocketAddrV4, TcpListener, TcpStream};
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, TcpListener, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
@@ -28,10 +32,49 @@ fn lds(args: &[&str]) -> Child {
 
 /// The example `who`, ready.
 fn who(args: &[&str]) -> Child {
-    Started::new("who", &program("examples/who"))
-        .args(args)
-        .start()
-        .ready(SOON)
+    who_started(args).start().ready(SOON)
+}
+
+fn who_started(args: &[&str]) -> Started {
+    Started::new("who", &program("examples/who")).args(args)
+}
+
+/// Somebody who has no room for any client, and is there.
+struct Greeter {
+    url: String,
+    end: Arc<AtomicBool>,
+    at: SocketAddr,
+}
+
+impl Greeter {
+    fn start() -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let at = listener.local_addr().unwrap();
+        let end = Arc::new(AtomicBool::new(false));
+        let ends = Arc::clone(&end);
+        std::thread::spawn(move || {
+            for client in listener.incoming() {
+                if ends.load(Ordering::Relaxed) {
+                    return;
+                }
+                drop(client);
+            }
+        });
+        let url = format!("opc.tcp://{at}");
+        Self { url, end, at }
+    }
+
+    fn url(&self) -> &str {
+        &self.url
+    }
+}
+
+impl Drop for Greeter {
+    fn drop(&mut self) {
+        self.end.store(true, Ordering::Relaxed);
+        // So that it looks.
+        drop(TcpStream::connect(self.at));
+    }
 }
 
 fn announced(name: &str, args: &[&str]) -> Child {
@@ -137,8 +180,8 @@ fn asyncua_registers_is_announced_and_gone_at_once_when_it_takes_that_back() {
     };
     let _lds = lds(&[]);
     let mut watch = who(&["watch"]);
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let url = format!("opc.tcp://{}/arm", listener.local_addr().unwrap());
+    let greeter = Greeter::start();
+    let url = format!("{}/arm", greeter.url());
     let register = |args: &[&str]| {
         let all = [&["register", LDS, "--url", &url][..], args].concat();
         cell.asyncua_once("opcua_discovery.py", &all).remove(0)
@@ -186,8 +229,8 @@ fn a_secured_channel_is_for_whom_it_trusts_who_registers_only_itself() {
     };
     let [ours, theirs] = ["lds-pki", "client"].map(|name| cell.folder().join(name));
     let [ours, theirs] = [ours.to_str().unwrap(), theirs.to_str().unwrap()];
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let url = format!("opc.tcp://{}", listener.local_addr().unwrap());
+    let greeter = Greeter::start();
+    let url = greeter.url().to_owned();
     let register = |uri: &str| {
         let secured = ["--security", "Basic256Sha256", "--certificates", theirs];
         let all = [

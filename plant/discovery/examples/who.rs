@@ -6,7 +6,9 @@ use std::process::ExitCode;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bridge_node::{Failure, FailureKind, LogFormat, Service, run_service};
-use discovery::{AnnounceSettings, Found, Interface, Server, WatchSettings, announce, watch};
+use discovery::{
+    AnnounceSettings, Announced, Found, Interface, Server, WatchSettings, announce, be_there, watch,
+};
 use serde_json::{Value, json};
 use tokio::net::TcpListener;
 
@@ -20,38 +22,85 @@ struct Who {
 #[derive(Debug, clap::Subcommand)]
 enum What {
     /// Be there: listen, announce by mDNS, register
-    Announce {
-        /// The ApplicationName; the ApplicationUri is `urn:who:` with it
-        name: String,
-        /// Where to listen, and on which interface to be announced
-        #[arg(long, default_value = "127.0.0.1")]
-        address: Ipv4Addr,
-        #[arg(long, default_value = "0")]
-        port: u16,
-        /// The path of the URL
-        #[arg(long, default_value = "/")]
-        path: String,
-        /// The discovery server to register with
-        #[arg(long)]
-        lds: Option<String>,
-        /// Leave mDNS to the discovery server
-        #[arg(long)]
-        no_mdns: bool,
-        /// How often to register, in seconds
-        #[arg(long, default_value = "60")]
-        register_period: u64,
-        /// The certificate store, with a pair, to register over a secured channel
-        #[arg(long)]
-        pki: Option<std::path::PathBuf>,
-        /// The ApplicationUri
-        #[arg(long)]
-        uri: Option<String>,
-        /// Codes of what it can do
-        #[arg(long, default_value = "DA", value_delimiter = ',')]
-        capabilities: Vec<String>,
-    },
+    Announce(Presence),
     /// Print who comes and goes
-    Watch,
+    Watch {
+        /// Where to hear
+        #[arg(long, default_value = "127.0.0.1")]
+        interface: String,
+    },
+}
+
+#[derive(Debug, Clone, clap::Args)]
+struct Presence {
+    /// The ApplicationName; the ApplicationUri is `urn:who:` with it
+    name: String,
+    /// Where to listen, and on which interface to be announced
+    #[arg(long, default_value = "127.0.0.1")]
+    address: Ipv4Addr,
+    #[arg(long, default_value = "0")]
+    port: u16,
+    /// The path of the URL
+    #[arg(long, default_value = "/")]
+    path: String,
+    /// The discovery server to register with
+    #[arg(long)]
+    lds: Option<String>,
+    /// Leave mDNS to the discovery server
+    #[arg(long)]
+    no_mdns: bool,
+    /// How often to register, in seconds
+    #[arg(long, default_value = "60")]
+    register_period: u64,
+    /// The certificate store, with a pair, to register over a secured channel
+    #[arg(long)]
+    pki: Option<std::path::PathBuf>,
+    /// The ApplicationUri
+    #[arg(long)]
+    uri: Option<String>,
+    /// Codes of what it can do
+    #[arg(long, default_value = "DA", value_delimiter = ',')]
+    capabilities: Vec<String>,
+    /// Be so many servers, `NAME-0` and so on, each at a port of its own
+    #[arg(long, conflicts_with_all = ["port", "uri"])]
+    count: Option<u16>,
+}
+
+impl Presence {
+    /// The servers to be.
+    fn all(&self) -> Vec<Self> {
+        let numbered = |number| Self {
+            name: format!("{}-{number}", self.name),
+            ..self.clone()
+        };
+        match self.count {
+            None => vec![self.clone()],
+            Some(count) => (0..count).map(numbered).collect(),
+        }
+    }
+
+    /// Is there from now on. Gives what tells of it, and the port.
+    async fn begin(self) -> Result<(Announced, u16), Failure> {
+        let address = SocketAddr::from((self.address, self.port));
+        let listener = TcpListener::bind(address).await.map_err(unavailable)?;
+        let at = listener.local_addr().map_err(unavailable)?;
+        let server = Server {
+            application_uri: self.uri.unwrap_or_else(|| format!("urn:who:{}", self.name)),
+            product_uri: String::new(),
+            name: self.name,
+            url: format!("opc.tcp://{at}{}", self.path),
+            capabilities: self.capabilities,
+        };
+        let settings = AnnounceSettings {
+            lds: self.lds,
+            register_every: Duration::from_secs(self.register_period),
+            pki: self.pki,
+            mdns: (!self.no_mdns).then(|| Interface::parse(&self.address.to_string())),
+        };
+        let told = announce(server.clone(), settings).map_err(unavailable)?;
+        tokio::spawn(async move { be_there(listener, &server).await });
+        Ok((told, at.port()))
+    }
 }
 
 fn main() -> ExitCode {
@@ -64,53 +113,28 @@ impl Service for Who {
     }
 
     async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {
-        let unavailable = |error: &dyn std::fmt::Display| {
-            Failure::new(FailureKind::Unavailable, error.to_string())
-        };
         match self.what {
-            What::Announce {
-                name,
-                address,
-                port,
-                path,
-                lds,
-                no_mdns,
-                register_period,
-                pki,
-                uri,
-                capabilities,
-            } => {
-                let listener = TcpListener::bind(SocketAddr::from((address, port))).await;
-                let listener = listener.map_err(|error| unavailable(&error))?;
-                let at = listener.local_addr().map_err(|error| unavailable(&error))?;
-                let server = Server {
-                    application_uri: uri.unwrap_or_else(|| format!("urn:who:{name}")),
-                    product_uri: String::new(),
-                    name,
-                    url: format!("opc.tcp://{at}{path}"),
-                    capabilities,
-                };
-                let settings = AnnounceSettings {
-                    lds,
-                    register_every: Duration::from_secs(register_period),
-                    pki,
-                    mdns: (!no_mdns).then(|| Interface::parse(&address.to_string())),
-                };
-                let told = announce(server, settings).map_err(|error| unavailable(&error))?;
-                say(&json!({"ready": true, "port": at.port()}));
-                tokio::pin!(stop);
-                loop {
-                    tokio::select! {
-                        () = &mut stop => break,
-                        client = listener.accept() => drop(client),
-                    }
+            What::Announce(presence) => {
+                let mut told = Vec::new();
+                let mut port = 0;
+                for presence in presence.all() {
+                    let (announced, at) = presence.begin().await?;
+                    told.push(announced);
+                    port = at;
                 }
-                told.leave().await;
+                say(&json!({"ready": true, "port": port}));
+                stop.await;
+                for announced in told {
+                    announced.leave().await;
+                }
                 Ok(())
             }
-            What::Watch => {
-                let mut watcher =
-                    watch(WatchSettings::default()).map_err(|error| unavailable(&error))?;
+            What::Watch { interface } => {
+                let settings = WatchSettings {
+                    mdns: Some(Interface::parse(&interface)),
+                    ..WatchSettings::default()
+                };
+                let mut watcher = watch(settings).map_err(unavailable)?;
                 say(&json!({"ready": true}));
                 tokio::pin!(stop);
                 loop {
@@ -122,6 +146,10 @@ impl Service for Who {
             }
         }
     }
+}
+
+fn unavailable(error: impl std::fmt::Display) -> Failure {
+    Failure::new(FailureKind::Unavailable, error.to_string())
 }
 
 fn line(found: &Found) -> Value {
@@ -138,14 +166,18 @@ fn line(found: &Found) -> Value {
         "url": known.url,
         "capabilities": known.capabilities,
         "uri": known.application_uri,
+        "started_ms": known.started.map(since_1970),
         "at_ms": millis(),
     })
 }
 
 #[expect(clippy::disallowed_methods, reason = "the lines say when")]
 fn millis() -> u128 {
-    SystemTime::now()
-        .duration_since(UNIX_EPOCH)
+    since_1970(SystemTime::now())
+}
+
+fn since_1970(at: SystemTime) -> u128 {
+    at.duration_since(UNIX_EPOCH)
         .unwrap_or_default()
         .as_millis()
 }

@@ -14,11 +14,13 @@ use opcua::core::comms::tcp_types::{AcknowledgeMessage, HelloMessage};
 use opcua::core::{RequestMessage, ResponseMessage};
 use opcua::crypto::SecurityPolicy;
 use opcua::types::{
-    ApplicationType, ByteString, CloseSecureChannelRequest, DateTime, EndpointDescription,
-    ExtensionObject, FindServersOnNetworkRequest, FindServersRequest, GetEndpointsRequest,
-    LocalizedText, MdnsDiscoveryConfiguration, MessageSecurityMode, NodeId,
-    OpenSecureChannelRequest, RegisterServer2Request, RegisterServerRequest, RegisteredServer,
-    RequestHeader, SecurityTokenRequestType, StatusCode, UAString,
+    ActivateSessionRequest, AnonymousIdentityToken, ApplicationDescription, ApplicationType,
+    ByteString, CloseSecureChannelRequest, CloseSessionRequest, CreateSessionRequest, DateTime,
+    EndpointDescription, ExtensionObject, FindServersOnNetworkRequest, FindServersRequest,
+    GetEndpointsRequest, LocalizedText, MdnsDiscoveryConfiguration, MessageSecurityMode, NodeId,
+    OpenSecureChannelRequest, ReadRequest, ReadValueId, RegisterServer2Request,
+    RegisterServerRequest, RegisteredServer, RequestHeader, SecurityTokenRequestType, StatusCode,
+    TimestampsToReturn, UAString, UserTokenType, VariableId, Variant,
 };
 use tokio::net::TcpStream;
 use tokio::time::timeout;
@@ -139,6 +141,96 @@ pub async fn find_servers_on_network(
             })
             .collect()),
         other => Err(unexpected(&other)),
+    }
+}
+
+/// When the program behind an endpoint started, in 100 ns since 1601: the StartTime of its ServerStatus (OPC 10000-5, 12.10),
+/// read in a session without a name, which is closed again.
+///
+/// # Errors
+/// [`AskFault`], after `limit` at the latest; a server without such sessions refuses.
+pub(crate) async fn start_time(url: &str, limit: Duration) -> Result<i64, AskFault> {
+    match timeout(limit, Box::pin(read_start_time(url))).await {
+        Ok(read) => read,
+        Err(_) => Err(AskFault::Late(limit)),
+    }
+}
+
+async fn read_start_time(url: &str) -> Result<i64, AskFault> {
+    let mut conversation = opened(url, None).await?;
+    let request = CreateSessionRequest {
+        request_header: header(),
+        client_description: ApplicationDescription {
+            application_uri: "urn:ua-bridge:discovery".into(),
+            application_type: ApplicationType::Client,
+            ..ApplicationDescription::default()
+        },
+        endpoint_url: url.into(),
+        session_name: "discovery".into(),
+        requested_session_timeout: 10_000.0,
+        max_response_message_size: number(MOST_HEARD),
+        ..CreateSessionRequest::default()
+    };
+    let session = match answer(&mut conversation, 2, &request.into()).await? {
+        ResponseMessage::CreateSession(session) => session,
+        other => return Err(unexpected(&other)),
+    };
+    let request_header = RequestHeader {
+        authentication_token: session.authentication_token.clone(),
+        ..header()
+    };
+    let none_of =
+        |endpoint: &&EndpointDescription| endpoint.security_mode == MessageSecurityMode::None;
+    let endpoints = session.server_endpoints.as_deref().unwrap_or_default();
+    let tokens = endpoints.iter().filter(none_of);
+    let tokens = tokens.flat_map(|endpoint| endpoint.user_identity_tokens.iter().flatten());
+    let anonymous = tokens
+        .into_iter()
+        .find(|token| token.token_type == UserTokenType::Anonymous)
+        .map(|token| token.policy_id.clone());
+    let read = match anonymous {
+        Some(policy) => read_in_session(&mut conversation, &request_header, policy).await,
+        None => Err(AskFault::Refused(StatusCode::BadIdentityTokenRejected)),
+    };
+    let close = CloseSessionRequest {
+        request_header,
+        delete_subscriptions: true,
+    };
+    // What was read stays read.
+    drop(answer(&mut conversation, 5, &close.into()).await);
+    read
+}
+
+async fn read_in_session(
+    conversation: &mut Conversation<TcpStream>,
+    request_header: &RequestHeader,
+    policy_id: UAString,
+) -> Result<i64, AskFault> {
+    let request = ActivateSessionRequest {
+        request_header: request_header.clone(),
+        user_identity_token: ExtensionObject::from_message(AnonymousIdentityToken { policy_id }),
+        ..ActivateSessionRequest::default()
+    };
+    match answer(conversation, 3, &request.into()).await? {
+        ResponseMessage::ActivateSession(_) => {}
+        other => return Err(unexpected(&other)),
+    }
+    let start_time = VariableId::Server_ServerStatus_StartTime;
+    let request = ReadRequest {
+        request_header: request_header.clone(),
+        max_age: 0.0,
+        timestamps_to_return: TimestampsToReturn::Neither,
+        nodes_to_read: Some(vec![ReadValueId::new_value(start_time.into())]),
+    };
+    let results = match answer(conversation, 4, &request.into()).await? {
+        ResponseMessage::Read(read) => read.results.unwrap_or_default(),
+        other => return Err(unexpected(&other)),
+    };
+    match results.first().and_then(|result| result.value.as_ref()) {
+        Some(Variant::DateTime(at)) => Ok(at.ticks()),
+        _ => Err(AskFault::Protocol(
+            "it does not say when it started".to_owned(),
+        )),
     }
 }
 
@@ -271,6 +363,18 @@ async fn converse(
     way: Option<&Way>,
     request: RequestMessage,
 ) -> Result<ResponseMessage, AskFault> {
+    let mut conversation = opened(url, way).await?;
+    let answered = answer(&mut conversation, 2, &request).await?;
+    // The answer is there; whether the peer hears of the end changes nothing.
+    let close = CloseSecureChannelRequest {
+        request_header: header(),
+    };
+    drop(conversation.send(3, &RequestMessage::from(close)).await);
+    Ok(answered)
+}
+
+/// A channel of its own.
+async fn opened(url: &str, way: Option<&Way>) -> Result<Conversation<TcpStream>, AskFault> {
     let place = Url::parse(url).ok_or_else(|| AskFault::Url(url.to_owned()))?;
     let stream = TcpStream::connect((place.host.as_str(), place.port)).await?;
     stream.set_nodelay(true)?;
@@ -285,13 +389,7 @@ async fn converse(
         acknowledge.max_message_size,
     );
     open(&mut conversation, way).await?;
-    let answered = answer(&mut conversation, 2, &request).await?;
-    // The answer is there; whether the peer hears of the end changes nothing.
-    let close = CloseSecureChannelRequest {
-        request_header: header(),
-    };
-    drop(conversation.send(3, &RequestMessage::from(close)).await);
-    Ok(answered)
+    Ok(conversation)
 }
 
 /// Opens the channel.
@@ -376,6 +474,10 @@ fn unexpected(answer: &ResponseMessage) -> AskFault {
         "{} is no answer to what was asked",
         answer.type_name()
     ))
+}
+
+fn number(size: usize) -> u32 {
+    u32::try_from(size).unwrap_or(u32::MAX)
 }
 
 fn text(text: &UAString) -> String {

@@ -402,6 +402,7 @@ mod tests {
             application_uri: "urn:lds".to_owned(),
             name: "lds".to_owned(),
             url: "opc.tcp://h:4840".to_owned(),
+            application_type: opcua::types::ApplicationType::DiscoveryServer,
             certificate: ByteString::null(),
         };
         Arc::new(Shared::new(own, None, ask))

@@ -4,26 +4,39 @@ use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use registry::{Announcement, Event, Loss, Outcome, Registry, Settings};
-use tokio::task::JoinSet;
 use tokio::time::sleep_until;
 
 use crate::clock::now;
+use crate::liveness::{Liveness, Told, Try};
 use crate::mdns::{Heard, Mdns, Ours};
-use crate::probe::probe;
 
 /// See the module's page. Drive it by [`step`](Self::step), then take every [`event`](Self::event).
 pub(crate) struct Keeper {
     pub(crate) registry: Registry,
     pub(crate) mdns: Option<Mdns>,
-    probes: JoinSet<(String, Outcome)>,
+    liveness: Liveness,
+    /// Those that are not under watch any more are let go of then.
+    tidy_at: Instant,
+    /// Where this program itself answers: that is not tried.
+    own: Option<String>,
     /// Lost without a goodbye: mDNS still has their records, and would not tell of them anew when they come back as they
     /// were.
     asleep: BTreeMap<String, Asleep>,
     /// When an endpoint answered last.
     answered: BTreeMap<String, Instant>,
     /// When the program behind an endpoint started, in 100 ns since 1601, where it tells.
-    started: BTreeMap<String, i64>,
+    started: BTreeMap<String, Started>,
+    /// What servers said when they were asked for that, not told of yet.
+    new_starts: Vec<(String, i64)>,
     most: usize,
+}
+
+/// When a program started, in 100 ns since 1601.
+#[derive(Debug, Clone, Copy)]
+struct Started {
+    at: i64,
+    /// Whether it tells by mDNS. Others are asked.
+    tells: bool,
 }
 
 #[derive(Debug)]
@@ -34,14 +47,18 @@ struct Asleep {
 }
 
 impl Keeper {
-    pub(crate) fn new(settings: Settings, mdns: Option<Mdns>) -> Self {
+    /// With the URL at which the program itself answers, if it does.
+    pub(crate) fn new(settings: Settings, mdns: Option<Mdns>, own: Option<String>) -> Self {
         Self {
             registry: Registry::new(settings),
             mdns,
-            probes: JoinSet::new(),
+            liveness: Liveness::new(),
+            tidy_at: now(),
+            own,
             asleep: BTreeMap::new(),
             answered: BTreeMap::new(),
             started: BTreeMap::new(),
+            new_starts: Vec::new(),
             most: settings.most,
         }
     }
@@ -49,7 +66,7 @@ impl Keeper {
     /// Waits until something has happened, and takes it in. Whoever drops it before loses nothing.
     pub(crate) async fn step(&mut self) {
         self.try_endpoints();
-        let room = self.probes.len() < MOST_PROBES;
+        let room = self.liveness.has_room();
         let due = self.registry.poll_timeout();
         let due = due
             .into_iter()
@@ -70,11 +87,10 @@ impl Keeper {
         };
         tokio::select! {
             heard = heard => self.hear(heard),
-            Some(probed) = self.probes.join_next(), if !self.probes.is_empty() => {
-                if let Ok((url, outcome)) = probed {
-                    self.probed(&url, outcome);
-                }
-            }
+            told = self.liveness.next() => match told {
+                Told::Tried { url, outcome } => self.probed(&url, outcome),
+                Told::Broken { url } => self.registry.suspect(&url),
+            },
             () = timer => self.registry.handle_timeout(now()),
         }
     }
@@ -86,14 +102,14 @@ impl Keeper {
             match (&event, &mut self.mdns) {
                 (Event::Announce(announcement), Some(mdns)) => mdns.put(Ours {
                     announcement: announcement.clone(),
-                    start_time: self.started.get(&announcement.url).copied(),
+                    start_time: self.started.get(&announcement.url).map(|known| known.at),
                 }),
                 (Event::Withdraw { instance }, Some(mdns)) => drop(mdns.take_back(instance)),
                 (Event::Announce(_) | Event::Withdraw { .. }, None) => {}
                 (
                     Event::Vanished {
                         record,
-                        loss: Loss::Unreachable,
+                        loss: Loss::Unreachable | Loss::Hanging,
                     },
                     _,
                 ) => {
@@ -113,7 +129,12 @@ impl Keeper {
 
     /// When the program behind an endpoint started, in 100 ns since 1601, where it tells.
     pub(crate) fn started(&self, url: &str) -> Option<i64> {
-        self.started.get(url).copied()
+        self.started.get(url).map(|known| known.at)
+    }
+
+    /// Of whom it has become known by asking when they started, and when. To be asked after each step.
+    pub(crate) fn take_started(&mut self) -> Vec<(String, i64)> {
+        std::mem::take(&mut self.new_starts)
     }
 
     fn hear(&mut self, heard: Heard) {
@@ -126,7 +147,11 @@ impl Keeper {
                 self.asleep.remove(&announcement.instance);
                 let url = announcement.url.clone();
                 if let Some(start_time) = start_time {
-                    keep(&mut self.started, self.most, &url, start_time);
+                    let started = Started {
+                        at: start_time,
+                        tells: true,
+                    };
+                    keep(&mut self.started, self.most, &url, started);
                 }
                 self.registry.announced(announcement, at);
                 if start_time.is_some() {
@@ -138,8 +163,7 @@ impl Keeper {
                 self.asleep.remove(&instance);
                 self.registry.withdrawn(&instance);
             }
-            // The names of servers that register are chosen by the registry, which hears of the conflict first.
-            Heard::Renamed { .. } => {}
+            Heard::Renamed { from, to } => self.registry.renamed(&from, &to),
         }
     }
 
@@ -156,11 +180,20 @@ impl Keeper {
         }
     }
 
-    /// Opens connections to those whose turn it is.
+    /// Tries those whose turn it is.
     fn try_endpoints(&mut self) {
         let at = now();
         self.asleep.retain(|_, asleep| at < asleep.forget_at);
-        while self.probes.len() < MOST_PROBES {
+        if self.tidy_at <= at {
+            self.tidy_at = at + TIDY_EVERY;
+            let sleeping = |url: &str| {
+                let mut all = self.asleep.values();
+                all.any(|asleep| asleep.announcement.url == url)
+            };
+            self.liveness
+                .keep(|url| self.registry.watches(url) || sleeping(url));
+        }
+        while self.liveness.has_room() {
             let next = self.asleep.values_mut().find(|asleep| asleep.try_at <= at);
             let url = match next {
                 Some(asleep) => {
@@ -172,14 +205,28 @@ impl Keeper {
                     None => break,
                 },
             };
-            self.probes.spawn(probe(url));
+            if self.own.as_ref() == Some(&url) {
+                let alive = Outcome::Alive { start_time: None };
+                self.registry.probed(&url, alive, at);
+                continue;
+            }
+            let tells = self.started.get(&url).is_some_and(|known| known.tells);
+            self.liveness.attempt(&url, Try { ask_start: !tells });
         }
     }
 
     fn probed(&mut self, url: &str, outcome: Outcome) {
         let at = now();
-        if let Outcome::Alive { .. } = outcome {
+        if let Outcome::Alive { start_time } = outcome {
             keep(&mut self.answered, self.most, url, at);
+            if let Some(at) = start_time {
+                let started = Started { at, tells: false };
+                let before = self.started.get(url).map(|known| known.at);
+                keep(&mut self.started, self.most, url, started);
+                if before.is_none() {
+                    self.new_starts.push((url.to_owned(), at));
+                }
+            }
             let back = self
                 .asleep
                 .iter()
@@ -202,7 +249,7 @@ fn keep<T>(map: &mut BTreeMap<String, T>, most: usize, url: &str, value: T) {
     map.insert(url.to_owned(), value);
 }
 
-const MOST_PROBES: usize = 64;
+const TIDY_EVERY: Duration = Duration::from_secs(1);
 const TRY_ASLEEP: Duration = Duration::from_secs(1);
 /// By then mDNS has forgotten them too, and tells of them when they come back.
 const FORGET_ASLEEP: Duration = Duration::from_secs(150);

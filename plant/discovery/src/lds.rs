@@ -7,6 +7,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use bridge_node::{Failure, FailureKind, Requests};
+use opcua::types::ApplicationType;
 use registry::{Announcement, Event, Loss, Settings, instance_name};
 use serde::Serialize;
 use tokio::net::TcpListener;
@@ -147,6 +148,13 @@ pub async fn run(
         while let Some(event) = lds.keeper.event() {
             lds.take(event);
         }
+        for (url, started) in lds.keeper.take_started() {
+            info!(
+                url,
+                started_ms = clock::millis(clock::of_ticks(started)),
+                "it says when it started"
+            );
+        }
     }
     lds.leave().await;
     Ok(())
@@ -207,6 +215,7 @@ impl Lds {
             application_uri,
             name: "UA bridge discovery server".to_owned(),
             url: url.clone(),
+            application_type: ApplicationType::DiscoveryServer,
             certificate: certificate.unwrap_or_default(),
         };
         let started = clock::wall();
@@ -229,7 +238,7 @@ impl Lds {
             ..Settings::default()
         };
         let lds = Self {
-            keeper: Keeper::new(registry, Some(mdns)),
+            keeper: Keeper::new(registry, Some(mdns), Some(url)),
             shared,
             interface: settings.interface.clone(),
             instance,

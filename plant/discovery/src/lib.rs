@@ -3,9 +3,9 @@
 //! [`announce`] tells of a server: by mDNS to whoever is on the network, and by registration to the Local Discovery
 //! Server. [`watch`] tells who is there. [`lds`] is the Local Discovery Server itself, the program `ua-lds`.
 //!
-//! Reading order: `url` and `interface` (where), `mdns` and `goodbye` (announcements and what is heard of others), `probe` (who still
-//! answers), `keeper` (all of that around one registry), `watch` and `announce` (for programs), `wire` (OPC UA over TCP
-//! without sessions), `client` (asking by it), `endpoint`, `connection`, `security` and `services` (answering by it), `lds`.
+//! Reading order: `url` and `interface` (where), `mdns` and `goodbye` (announcements and what is heard of others), `wire` (OPC UA
+//! over TCP), `client` (asking by it), `line` and `liveness` (who still answers), `keeper` (all of that around one registry),
+//! `watch` and `announce` (for programs), `endpoint`, `connection`, `security` and `services` (answering by it), `lds`, `presence`.
 
 mod announce;
 pub mod client;
@@ -16,8 +16,10 @@ mod goodbye;
 mod interface;
 mod keeper;
 pub mod lds;
+mod line;
+mod liveness;
 mod mdns;
-mod probe;
+mod presence;
 mod security;
 mod services;
 mod url;
@@ -27,6 +29,7 @@ mod wire;
 pub use announce::{AnnounceSettings, AnnounceState, Announced, Server, announce};
 pub use interface::Interface;
 pub use mdns::MdnsFault;
+pub use presence::be_there;
 pub use watch::{Found, Known, WatchSettings, Watcher, watch};
 
 /// Where the Local Discovery Server of a host is (OPC 10000-12, 4.2.2).

@@ -74,6 +74,8 @@ pub(crate) struct Mdns {
 struct Announced {
     ours: Ours,
     fullname: String,
+    /// How often another was heard under its name that was to give way.
+    contested: u32,
 }
 
 impl Mdns {
@@ -121,7 +123,12 @@ impl Mdns {
         let fullname = info.get_fullname().to_owned();
         self.register(info);
         let instance = ours.announcement.instance.clone();
-        self.ours.insert(instance, Announced { ours, fullname });
+        let announced = Announced {
+            ours,
+            fullname,
+            contested: 0,
+        };
+        self.ours.insert(instance, announced);
     }
 
     /// Takes back what is announced under a name. The goodbye has been sent when the answer comes.
@@ -294,10 +301,13 @@ impl Mdns {
         }
     }
 
-    /// Somebody else has one of our names (RFC 6762, 9). Of two that are ours the one whose URL comes later gives way.
+    /// Somebody else has one of our names (RFC 6762, 9). Of two programs of this project the one whose URL comes later gives
+    /// way; who does not, though told of ours again and again, is of another make, and keeps it.
     fn conflict(&mut self, from: &str, theirs: &str) -> Option<Heard> {
-        let announced = self.ours.get(from)?;
-        if *announced.ours.announcement.url < *theirs {
+        let announced = self.ours.get_mut(from)?;
+        announced.contested += 1;
+        let first = *announced.ours.announcement.url < *theirs;
+        if first && announced.contested < MOST_CONTESTED {
             self.announce_at = self.announce_at.min(Instant::now() + SETTLE);
             return None;
         }
@@ -450,6 +460,7 @@ const PACKET: usize = 9000;
 /// Instances that are kept in mind.
 const MOST: usize = 4096;
 const MOST_CAPABILITIES: usize = 32;
+const MOST_CONTESTED: u32 = 4;
 
 #[cfg(test)]
 mod tests {

@@ -49,13 +49,14 @@ pub(crate) enum Answer {
     Refused(u32),
 }
 
-/// The discovery server, as it says it itself.
+/// The one who answers, as it says it itself.
 #[derive(Debug, Clone)]
 pub(crate) struct Own {
     pub(crate) application_uri: String,
     pub(crate) name: String,
     /// As clients reach it.
     pub(crate) url: String,
+    pub(crate) application_type: ApplicationType,
     /// Null without secured channels.
     pub(crate) certificate: ByteString,
 }
@@ -65,7 +66,7 @@ impl Own {
         ApplicationDescription {
             application_uri: self.application_uri.as_str().into(),
             application_name: LocalizedText::new("en", &self.name),
-            application_type: ApplicationType::DiscoveryServer,
+            application_type: self.application_type,
             discovery_urls: Some(vec![self.url.as_str().into()]),
             ..ApplicationDescription::default()
         }

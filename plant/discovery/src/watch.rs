@@ -49,6 +49,8 @@ pub struct Known {
     pub application_uri: Option<String>,
     /// Since when it is there.
     pub since: SystemTime,
+    /// When its program started, where it tells: by mDNS, or as the StartTime of its ServerStatus.
+    pub started: Option<SystemTime>,
 }
 
 impl Known {
@@ -112,7 +114,7 @@ pub fn watch(settings: WatchSettings) -> Result<Watcher, MdnsFault> {
     };
     let (tell, found) = mpsc::channel(16);
     let watching = Watching {
-        keeper: Keeper::new(registry, mdns),
+        keeper: Keeper::new(registry, mdns, None),
         servers: Servers::default(),
         asking: JoinSet::new(),
         ask: VecDeque::new(),
@@ -152,6 +154,9 @@ impl Watching {
             while let Some(event) = self.keeper.event() {
                 self.take(event);
             }
+            for (url, started) in self.keeper.take_started() {
+                self.servers.started(&url, clock::of_ticks(started));
+            }
             while self.asking.len() < MOST_ASKED
                 && let Some(url) = self.ask.pop_front()
             {
@@ -164,13 +169,20 @@ impl Watching {
     fn take(&mut self, event: Event) {
         match event {
             Event::Seen(record) => {
+                let url = record.announcement.url.clone();
                 let ask = self.servers.seen(record.announcement, clock::wall());
                 self.ask.extend(ask);
+                if let Some(started) = self.keeper.started(&url) {
+                    self.servers.started(&url, clock::of_ticks(started));
+                }
             }
             Event::Vanished { record, loss } => {
                 self.servers.vanished(&record.announcement.instance, loss);
             }
-            Event::Restarted { url } => self.servers.restarted(&url),
+            Event::Restarted { url } => {
+                let started = self.keeper.started(&url).map(clock::of_ticks);
+                self.servers.restarted(&url, started);
+            }
             _ => {}
         }
     }
@@ -255,6 +267,7 @@ impl Servers {
             capabilities,
             application_uri: None,
             since,
+            started: None,
         };
         let server = Server {
             known,
@@ -288,8 +301,20 @@ impl Servers {
         }
     }
 
-    fn restarted(&mut self, url: &str) {
+    /// When a server started is known.
+    fn started(&mut self, url: &str, at: SystemTime) {
+        if let Some((_, server)) = self.of_url(url)
+            && server.known.started.replace(at) != Some(at)
+            && server.asked
+        {
+            let known = server.known.clone();
+            self.push(Found::Seen(known));
+        }
+    }
+
+    fn restarted(&mut self, url: &str, at: Option<SystemTime>) {
         if let Some((_, server)) = self.of_url(url) {
+            server.known.started = at.or(server.known.started);
             let known = server.known.clone();
             if server.asked {
                 self.push(Found::Restarted(known));
@@ -395,10 +420,10 @@ mod tests {
         assert!(told(&mut servers).is_empty(), "it came and went meanwhile");
         seen(&mut servers, robot("arm", 1));
         assert_eq!(told(&mut servers), ["seen arm"]);
-        servers.restarted("opc.tcp://127.0.0.1:1/");
+        servers.restarted("opc.tcp://127.0.0.1:1/", None);
         servers.vanished("arm", Loss::Unreachable);
         seen(&mut servers, robot("arm", 1));
-        servers.restarted("opc.tcp://127.0.0.1:1/");
+        servers.restarted("opc.tcp://127.0.0.1:1/", None);
         assert_eq!(
             told(&mut servers),
             ["gone arm", "seen arm"],

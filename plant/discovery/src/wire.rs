@@ -208,6 +208,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Conversation<S> {
         Ok(())
     }
 
+    /// Waits until the peer closes, or says something. What it says is lost: for whom it is the end in any case. Whoever
+    /// drops it before loses nothing.
+    pub(crate) async fn stirred(&mut self) {
+        let mut byte = [0];
+        // An error is an end, too.
+        let _ended = self.stream.read(&mut byte).await.is_err();
+    }
+
     /// Tells the peer why the conversation ends.
     pub(crate) async fn tell(&mut self, status: StatusCode, why: &str) {
         // Most likely it is gone.

@@ -9,13 +9,15 @@
 //! [`Registry::poll_event`]; when [`Registry::poll_timeout`] has passed, call [`Registry::handle_timeout`].
 
 mod asked;
+mod loss;
 mod name;
 mod network;
 mod registry;
 mod watch;
 
 pub use asked::{ApplicationType, Asked, Channel, MdnsConfiguration, RegisterFault};
+pub use loss::Loss;
 pub use name::{instance_name, label, renamed};
 pub use network::{Announcement, NetworkRecord};
-pub use registry::{Event, Loss, Registered, Registry, Settings};
+pub use registry::{Event, Registered, Registry, Settings};
 pub use watch::{Outcome, Probe};

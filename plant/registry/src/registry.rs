@@ -4,9 +4,10 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use crate::asked::{Asked, Channel, RegisterFault};
+use crate::loss::Loss;
 use crate::name::{label, renamed};
 use crate::network::{Announcement, Network, NetworkRecord};
-use crate::watch::{Outcome, Probe, Sign, Watch};
+use crate::watch::{Outcome, Patience, Probe, Sign, Watch};
 
 /// How careful and how patient a registry is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -15,10 +16,13 @@ pub struct Settings {
     pub allow_unsecured: bool,
     /// How long a registration without semaphore file counts: twice the period in which servers repeat it.
     pub forget_after: Duration,
-    /// How often each endpoint is tried.
+    /// How often each endpoint is tried. Where there are more than 500 they are tried less often, 500 in a second.
     pub probe_every: Duration,
     /// How long one that gives no answer at all still counts as there.
     pub lost_after: Duration,
+    /// How long one whose host takes connections and that says nothing itself counts as there: longer, since a program that
+    /// computes is not gone.
+    pub hangs_after: Duration,
     /// Servers that may be registered, and records of the network, each. What is more is refused or not taken in.
     pub most: usize,
 }
@@ -30,6 +34,7 @@ impl Default for Settings {
             forget_after: Duration::from_secs(1200),
             probe_every: Duration::from_secs(1),
             lost_after: Duration::from_secs(2),
+            hangs_after: Duration::from_secs(3),
             most: 1024,
         }
     }
@@ -46,35 +51,6 @@ pub enum Registered {
     Again,
     /// The end of one, or of none.
     Withdrawn,
-}
-
-/// Why a server is no longer there.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Loss {
-    /// It took its registration back.
-    Unregistered,
-    /// It said so by mDNS, or its announcement ran out.
-    Goodbye,
-    /// It registered no more.
-    Expired,
-    /// Its semaphore file is gone.
-    SemaphoreGone,
-    /// It does not answer.
-    Unreachable,
-}
-
-impl Loss {
-    /// For logs and counters.
-    #[must_use]
-    pub fn label(self) -> &'static str {
-        match self {
-            Self::Unregistered => "unregistered",
-            Self::Goodbye => "goodbye",
-            Self::Expired => "expired",
-            Self::SemaphoreGone => "semaphore_gone",
-            Self::Unreachable => "unreachable",
-        }
-    }
 }
 
 /// What has happened.
@@ -292,6 +268,32 @@ impl Registry {
         self.end(server_uri, Loss::SemaphoreGone);
     }
 
+    /// What we announce for a server is called otherwise from now on: another host has that name (RFC 6762, 9).
+    pub fn renamed(&mut self, from: &str, to: &str) {
+        let mut announced = self
+            .servers
+            .values_mut()
+            .filter_map(|server| server.announced.as_mut());
+        let Some(ours) = announced.find(|ours| ours.instance.eq_ignore_ascii_case(from)) else {
+            return;
+        };
+        to.clone_into(&mut ours.instance);
+        let ours = ours.clone();
+        self.network.remove(from);
+        self.network.put(ours);
+    }
+
+    /// Whether an endpoint is looked after.
+    #[must_use]
+    pub fn watches(&self, url: &str) -> bool {
+        self.watch.contains(url)
+    }
+
+    /// Something says that a server may have ended, as a connection that broke off: it is tried at once.
+    pub fn suspect(&mut self, url: &str) {
+        self.watch.hasten(url);
+    }
+
     /// The endpoint to try now, if any is due. To be asked until there is none.
     pub fn poll_probe(&mut self, now: Instant) -> Option<Probe> {
         self.watch.next(self.settings.probe_every, now)
@@ -304,15 +306,19 @@ impl Registry {
             // The host is there and the program is not: another run of it registers anew, and whoever else
             // gets its port is not it.
             Outcome::Refused => self.forget_away_at(url),
-            Outcome::Silent | Outcome::Untried => {}
+            Outcome::Silent | Outcome::Hanging | Outcome::Untried => {}
         }
-        let patience = (self.settings.probe_every, self.settings.lost_after);
+        let patience = Patience {
+            every: self.settings.probe_every,
+            silent: self.settings.lost_after,
+            hanging: self.settings.hangs_after,
+        };
         match self.watch.probed(url, outcome, patience, now) {
             Sign::Nothing => {}
             Sign::Restarted => self.events.push_back(Event::Restarted {
                 url: url.to_owned(),
             }),
-            Sign::Lost => self.lose(url, outcome == Outcome::Refused, now),
+            Sign::Lost(loss) => self.lose(url, loss, outcome == Outcome::Refused, now),
         }
     }
 
@@ -376,7 +382,7 @@ impl Registry {
     }
 
     /// Nobody answers at a URL: all that was said of it goes.
-    fn lose(&mut self, url: &str, ended: bool, now: Instant) {
+    fn lose(&mut self, url: &str, loss: Loss, ended: bool, now: Instant) {
         self.watch.remove(url);
         let has = |asked: &Asked| asked.discovery_urls.iter().any(|known| known == url);
         let servers: Vec<String> = self
@@ -397,7 +403,7 @@ impl Registry {
                 continue;
             };
             if server.asked.discovery_urls.iter().all(|known| known == url) {
-                self.leave(&uri, ended);
+                self.leave(&uri, loss, ended);
                 continue;
             }
             server.asked.discovery_urls.retain(|known| known != url);
@@ -412,7 +418,7 @@ impl Registry {
         }
         for instance in records {
             if !self.is_ours(&instance) {
-                self.vanish(&instance, Loss::Unreachable);
+                self.vanish(&instance, loss);
             }
         }
         if self.away.values().any(|server| has(&server.asked)) {
@@ -422,9 +428,9 @@ impl Registry {
 
     /// A registered server is not to be reached. Unless it has ended its program may run on behind a cable that is cut,
     /// and registers again in some minutes only.
-    fn leave(&mut self, server_uri: &str, ended: bool) {
+    fn leave(&mut self, server_uri: &str, loss: Loss, ended: bool) {
         let server = self.servers.get(server_uri).cloned();
-        self.end(server_uri, Loss::Unreachable);
+        self.end(server_uri, loss);
         let room = !ended && self.away.len() < self.settings.most;
         if let Some(server) = server.filter(|_| room) {
             self.away.insert(server_uri.to_owned(), server);

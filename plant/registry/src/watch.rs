@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
+use crate::loss::Loss;
+
 /// An endpoint to try now: open a connection to it, and tell [`Registry::probed`](crate::Registry::probed) what came of it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Probe {
@@ -22,6 +24,8 @@ pub enum Outcome {
     Refused,
     /// Nothing came back.
     Silent,
+    /// The host takes the connection, and the program behind it says nothing: it hangs, or is stopped.
+    Hanging,
     /// It could not be tried, as when the name of the host is not known here: that says nothing of the server.
     Untried,
 }
@@ -33,8 +37,19 @@ pub(crate) enum Sign {
     Nothing,
     /// It is another run of the program.
     Restarted,
-    /// It has not answered for too long.
-    Lost,
+    /// It is not there, or has not answered for too long.
+    Lost(Loss),
+}
+
+/// How patient a watch is.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Patience {
+    /// How often an endpoint is tried, while there are few.
+    pub(crate) every: Duration,
+    /// How long a host may be silent.
+    pub(crate) silent: Duration,
+    /// How long a program may, whose host is there.
+    pub(crate) hanging: Duration,
 }
 
 /// The endpoints under watch.
@@ -50,24 +65,35 @@ struct Watched {
 
 impl Watch {
     /// Looks after a URL from now on. What is heard of a server is a sign of life only the first time: an announcement
-    /// outlives its server.
+    /// outlives its server. Many that appear together are not tried together.
     pub(crate) fn add(&mut self, url: &str, every: Duration, now: Instant) {
         if !self.0.contains_key(url) {
             let watched = Watched {
                 answered: now,
-                try_at: now + every,
+                try_at: now + every.mul_f64(spread(url)),
                 start_time: None,
             };
             self.0.insert(url.to_owned(), watched);
         }
     }
 
+    pub(crate) fn contains(&self, url: &str) -> bool {
+        self.0.contains_key(url)
+    }
+
+    /// How often each of them is tried: less often where there are many.
+    fn pace(&self, every: Duration) -> Duration {
+        let count = u32::try_from(self.0.len()).unwrap_or(u32::MAX);
+        every.max(LEAST_APART.saturating_mul(count))
+    }
+
     pub(crate) fn remove(&mut self, url: &str) {
         self.0.remove(url);
     }
 
-    /// The endpoint whose turn it is, if any; its next turn is after `every`.
+    /// The endpoint whose turn it is, if any; its next turn is after `every`, or later where there are many.
     pub(crate) fn next(&mut self, every: Duration, now: Instant) -> Option<Probe> {
+        let every = self.pace(every);
         let (url, watched) = self
             .0
             .iter_mut()
@@ -93,7 +119,7 @@ impl Watch {
         &mut self,
         url: &str,
         outcome: Outcome,
-        (every, lost_after): (Duration, Duration),
+        patience: Patience,
         now: Instant,
     ) -> Sign {
         let Some(watched) = self.0.get_mut(url) else {
@@ -109,16 +135,37 @@ impl Watch {
                     _ => Sign::Nothing,
                 }
             }
-            Outcome::Refused => Sign::Lost,
-            Outcome::Silent if now.saturating_duration_since(watched.answered) >= lost_after => {
-                Sign::Lost
-            }
-            Outcome::Silent => {
-                // Tried again soon, so that two tries that wait fit into the time.
-                watched.try_at = now + every / 10;
+            Outcome::Refused => Sign::Lost(Loss::Unreachable),
+            Outcome::Silent => watched.waits(patience.silent, Loss::Unreachable, patience, now),
+            Outcome::Hanging => watched.waits(patience.hanging, Loss::Hanging, patience, now),
+            Outcome::Untried => {
+                // A name that nobody knows is not asked for each second.
+                watched.try_at = now + patience.every * UNTRIED;
                 Sign::Nothing
             }
-            Outcome::Untried => Sign::Nothing,
         }
     }
 }
+
+impl Watched {
+    /// No answer came: for how long that goes.
+    fn waits(&mut self, most: Duration, loss: Loss, patience: Patience, now: Instant) -> Sign {
+        if now.saturating_duration_since(self.answered) >= most {
+            return Sign::Lost(loss);
+        }
+        // Tried again soon, so that two tries that wait fit into the time.
+        self.try_at = now + patience.every / 10;
+        Sign::Nothing
+    }
+}
+
+/// A share of the time for each URL, of a tenth to all of it, the same each time (FNV-1a).
+fn spread(url: &str) -> f64 {
+    let mix = |hash: u32, byte: u8| (hash ^ u32::from(byte)).wrapping_mul(16_777_619);
+    let hash = url.bytes().fold(2_166_136_261, mix);
+    0.1 + 0.9 * f64::from(hash >> 8) / f64::from(u32::MAX >> 8)
+}
+
+/// 500 tries a second are made at most.
+const LEAST_APART: Duration = Duration::from_millis(2);
+const UNTRIED: u32 = 10;

@@ -1,12 +1,10 @@
 //! What a discovery server owes whoever registers with it (OPC 10000-4, 5.5 and OPC 10000-12, 4), both ways round.
 
-use std::net::TcpListener;
-
 use nix::sys::signal::Signal;
 use serde_json::{Value, json};
 use system_tests::{Cell, Child, Peer, eventually, metrics, number};
 
-use super::{LDS, SOON, STATUS, announced, lds, list, on_network, registered, who};
+use super::{Greeter, LDS, SOON, STATUS, announced, lds, list, on_network, registered, who};
 
 const NODE: &str = "opc.tcp://127.0.0.1:4843";
 const CLIENT_URI: &str = "urn:ua-bridge:system-tests:client";
@@ -17,10 +15,10 @@ fn register(cell: &Cell, args: &[&str]) -> Value {
     cell.asyncua_once("opcua_discovery.py", &all).remove(0)
 }
 
-fn listener() -> (TcpListener, String) {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let url = format!("opc.tcp://{}", listener.local_addr().unwrap());
-    (listener, url)
+fn listener() -> (Greeter, String) {
+    let greeter = Greeter::start();
+    let url = greeter.url().to_owned();
+    (greeter, url)
 }
 
 #[test]

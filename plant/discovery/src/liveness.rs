@@ -1,0 +1,329 @@
+//! Who still answers: a task for each endpoint under watch, which holds a [`Line`] to it where the server gives one, and
+//! connects anew where it does not.
+//!
+//! When to try is the registry's to say. A line that breaks off is told at once.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use registry::Outcome;
+use tokio::sync::mpsc;
+use tokio::time::{sleep, timeout};
+
+use crate::client;
+use crate::line::{Line, Reached};
+use crate::url::Url;
+
+/// What is told of an endpoint.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) enum Told {
+    /// What came of a try.
+    Tried { url: String, outcome: Outcome },
+    /// The connection to it broke off.
+    Broken { url: String },
+}
+
+/// A try.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Try {
+    /// Whether the server is asked when it started, too, where a channel to it is new.
+    pub(crate) ask_start: bool,
+}
+
+/// All endpoints under watch.
+#[derive(Debug)]
+pub(crate) struct Liveness {
+    endpoints: BTreeMap<String, Watched>,
+    under_way: usize,
+    tell: mpsc::Sender<Told>,
+    told: mpsc::Receiver<Told>,
+}
+
+#[derive(Debug)]
+struct Watched {
+    ask: mpsc::Sender<Try>,
+    under_way: bool,
+}
+
+impl Liveness {
+    pub(crate) fn new() -> Self {
+        let (tell, told) = mpsc::channel(64);
+        Self {
+            endpoints: BTreeMap::new(),
+            under_way: 0,
+            tell,
+            told,
+        }
+    }
+
+    /// Whether more may be tried now.
+    pub(crate) fn has_room(&self) -> bool {
+        self.under_way < MOST_TRIES
+    }
+
+    /// Has an endpoint tried, unless it is being tried.
+    pub(crate) fn attempt(&mut self, url: &str, attempt: Try) {
+        if !self.endpoints.contains_key(url) {
+            let may_hold = self.endpoints.len() < MOST_LINES;
+            let watched = Watched::start(url, may_hold, self.tell.clone());
+            self.endpoints.insert(url.to_owned(), watched);
+        }
+        if let Some(watched) = self.endpoints.get_mut(url)
+            && !watched.under_way
+            && watched.ask.try_send(attempt).is_ok()
+        {
+            watched.under_way = true;
+            self.under_way += 1;
+        }
+    }
+
+    /// What is told next. Whoever drops it before loses nothing.
+    pub(crate) async fn next(&mut self) -> Told {
+        loop {
+            let Some(told) = self.told.recv().await else {
+                // Not while we hold an end ourselves.
+                return std::future::pending().await;
+            };
+            let url = match &told {
+                Told::Tried { url, .. } | Told::Broken { url } => url,
+            };
+            // What is not under watch any more is not told of.
+            let Some(watched) = self.endpoints.get_mut(url) else {
+                continue;
+            };
+            if matches!(told, Told::Tried { .. }) && watched.under_way {
+                watched.under_way = false;
+                self.under_way = self.under_way.saturating_sub(1);
+            }
+            return told;
+        }
+    }
+
+    /// Lets go of all but these.
+    pub(crate) fn keep(&mut self, wanted: impl Fn(&str) -> bool) {
+        let under_way = &mut self.under_way;
+        self.endpoints.retain(|url, watched| {
+            let stays = wanted(url);
+            if !stays && watched.under_way {
+                *under_way = under_way.saturating_sub(1);
+            }
+            stays
+        });
+    }
+}
+
+impl Watched {
+    /// Its task ends when it is dropped.
+    fn start(url: &str, may_hold: bool, tell: mpsc::Sender<Told>) -> Self {
+        let (ask, asked) = mpsc::channel(1);
+        let endpoint = Endpoint {
+            place: Url::parse(url),
+            url: url.to_owned(),
+            line: None,
+            lines_left: if may_hold { LINES } else { 0 },
+        };
+        tokio::spawn(endpoint.run(asked, tell));
+        Self {
+            ask,
+            under_way: false,
+        }
+    }
+}
+
+struct Endpoint {
+    url: String,
+    place: Option<Url>,
+    line: Option<Line>,
+    /// How often a channel that broke off may be opened anew: some servers close those without a session.
+    lines_left: u32,
+}
+
+impl Endpoint {
+    async fn run(mut self, mut asked: mpsc::Receiver<Try>, tell: mpsc::Sender<Told>) {
+        loop {
+            let broken = async {
+                match &mut self.line {
+                    Some(line) => line.broken().await,
+                    None => std::future::pending().await,
+                }
+            };
+            let told = tokio::select! {
+                attempt = asked.recv() => {
+                    let Some(attempt) = attempt else { return };
+                    // Who gives it up while it is tried does not wait for it.
+                    let outcome = tokio::select! {
+                        outcome = self.attempt(attempt) => outcome,
+                        () = closed(&mut asked) => return,
+                    };
+                    Told::Tried { url: self.url.clone(), outcome }
+                }
+                () = broken => {
+                    self.line = None;
+                    // A program that ends closes one thing after the other; its listener may be next.
+                    sleep(SETTLE).await;
+                    Told::Broken { url: self.url.clone() }
+                }
+            };
+            if tell.send(told).await.is_err() {
+                return;
+            }
+        }
+    }
+
+    /// One try, of a second at most: on the line, and where no answer comes soon, beside it on another connection.
+    async fn attempt(&mut self, attempt: Try) -> Outcome {
+        let Some(place) = self.place.clone() else {
+            // Another kind of endpoint, such as one of HTTPS.
+            return Outcome::Untried;
+        };
+        let alive = Outcome::Alive { start_time: None };
+        let line = self.line.take().filter(Line::is_good);
+        let asking = ask(line);
+        tokio::pin!(asking);
+        let soon = timeout(SOON, &mut asking).await;
+        if let Ok(Some(line)) = soon {
+            self.line = Some(line);
+            return alive;
+        }
+        let hold = self.lines_left > 0;
+        let rest = match soon {
+            Ok(_) => LIMIT,
+            Err(_) => LIMIT.saturating_sub(SOON),
+        };
+        let anew = Line::reach(&self.url, &place, hold, rest);
+        tokio::pin!(anew);
+        let reached = tokio::select! {
+            Some(line) = &mut asking, if soon.is_err() => {
+                self.line = Some(line);
+                return alive;
+            }
+            reached = &mut anew => reached,
+        };
+        match reached {
+            Reached::Line(line) => {
+                self.lines_left = self.lines_left.saturating_sub(1);
+                self.line = Some(line);
+                let start_time = match attempt.ask_start {
+                    true => client::start_time(&self.url, START_LIMIT).await.ok(),
+                    false => None,
+                };
+                Outcome::Alive { start_time }
+            }
+            Reached::Answers => alive,
+            Reached::Accepts => Outcome::Hanging,
+            Reached::Refused => Outcome::Refused,
+            Reached::Nobody => Outcome::Silent,
+            Reached::Untried => Outcome::Untried,
+        }
+    }
+}
+
+async fn ask(line: Option<Line>) -> Option<Line> {
+    line?.ask().await
+}
+
+async fn closed(asked: &mut mpsc::Receiver<Try>) {
+    // One is asked at a time, so the next thing is the end.
+    while asked.recv().await.is_some() {}
+}
+
+/// Tries at one time: more than there are of those that wait for an answer when a cable is cut, but for large plants.
+const MOST_TRIES: usize = 256;
+/// A process has 1024 descriptors where nobody says otherwise.
+const MOST_LINES: usize = 600;
+const LINES: u32 = 4;
+const SETTLE: Duration = Duration::from_millis(30);
+/// An answer on an open connection comes in milliseconds, or after a packet was lost in some 200 ms.
+const SOON: Duration = Duration::from_millis(400);
+/// Two tries that wait fit into the time in which a loss is to be told.
+const LIMIT: Duration = Duration::from_secs(1);
+const START_LIMIT: Duration = Duration::from_secs(2);
+
+#[cfg(test)]
+mod tests {
+    use tokio::net::TcpListener;
+
+    use super::*;
+    use crate::announce::Server;
+    use crate::presence::be_there;
+
+    async fn tried(liveness: &mut Liveness, url: &str) -> Outcome {
+        liveness.attempt(url, Try { ask_start: false });
+        match liveness.next().await {
+            Told::Tried { outcome, .. } => outcome,
+            Told::Broken { .. } => panic!("there is no line"),
+        }
+    }
+
+    #[tokio::test]
+    async fn what_comes_of_a_try_says_what_kind_of_silence_it_is() {
+        let mut liveness = Liveness::new();
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let url = format!("opc.tcp://{}", listener.local_addr().unwrap());
+        assert_eq!(tried(&mut liveness, &url).await, Outcome::Hanging);
+        drop(listener);
+        assert_eq!(tried(&mut liveness, &url).await, Outcome::Refused);
+        for url in [
+            "https://127.0.0.1:1/",
+            "opc.tcp://no-such-host.invalid:4840",
+        ] {
+            assert_eq!(tried(&mut liveness, url).await, Outcome::Untried, "{url}");
+        }
+        assert_eq!(liveness.endpoints.len(), 3);
+        liveness.keep(|known| known == url);
+        assert_eq!(liveness.endpoints.len(), 1);
+        assert!(liveness.has_room());
+        assert_eq!(liveness.under_way, 0);
+    }
+
+    #[tokio::test]
+    async fn a_line_breaks_off_in_the_moment_in_which_the_server_ends() {
+        let mut liveness = Liveness::new();
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let url = format!("opc.tcp://{}", listener.local_addr().unwrap());
+        let server = Server {
+            application_uri: "urn:here".to_owned(),
+            product_uri: String::new(),
+            name: "here".to_owned(),
+            url: url.clone(),
+            capabilities: Vec::new(),
+        };
+        // A runtime of its own, which takes all its connections along when it ends.
+        let runtime = std::thread::spawn(|| {
+            tokio::runtime::Builder::new_multi_thread()
+                .worker_threads(1)
+                .enable_all()
+                .build()
+                .unwrap()
+        });
+        let runtime = runtime.join().unwrap();
+        let listener = listener.into_std().unwrap();
+        runtime.spawn(async move {
+            be_there(TcpListener::from_std(listener).unwrap(), &server).await;
+        });
+        let alive = Outcome::Alive { start_time: None };
+        for _ in 0..3 {
+            assert_eq!(tried(&mut liveness, &url).await, alive);
+        }
+        runtime.shutdown_background();
+        let told = timeout(Duration::from_secs(5), liveness.next()).await;
+        assert_eq!(told, Ok(Told::Broken { url: url.clone() }));
+        // What it held may be taken down one after the other.
+        let gone = async { while tried(&mut liveness, &url).await != Outcome::Refused {} };
+        timeout(Duration::from_secs(5), gone).await.unwrap();
+    }
+
+    #[tokio::test]
+    async fn who_accepts_and_closes_is_there() {
+        let mut liveness = Liveness::new();
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let url = format!("opc.tcp://{}", listener.local_addr().unwrap());
+        tokio::spawn(async move {
+            while let Ok((stream, _)) = listener.accept().await {
+                drop(stream);
+            }
+        });
+        let alive = Outcome::Alive { start_time: None };
+        assert_eq!(tried(&mut liveness, &url).await, alive);
+    }
+}

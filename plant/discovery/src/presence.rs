@@ -1,0 +1,43 @@
+//! A server that can do nothing but be there: [`be_there`].
+
+use std::sync::Arc;
+
+use opcua::types::{ApplicationType, ByteString};
+use tokio::net::TcpListener;
+use tokio::sync::mpsc;
+
+use crate::announce::Server;
+use crate::connection::{Asking, Shared};
+use crate::endpoint;
+use crate::services::{Answer, Own, Question};
+
+/// Answers at a listener for a server that has nothing else to say: who it is (FindServers, GetEndpoints), over channels
+/// that are not secured. Sessions and all else it does not support. Ends when it is dropped.
+pub async fn be_there(listener: TcpListener, server: &Server) {
+    let own = Own {
+        application_uri: server.application_uri.clone(),
+        name: server.name.clone(),
+        url: server.url.clone(),
+        application_type: ApplicationType::Server,
+        certificate: ByteString::null(),
+    };
+    let (ask, mut questions) = mpsc::channel::<Asking>(16);
+    let answers = async {
+        while let Some((question, _, reply)) = questions.recv().await {
+            let answer = match question {
+                // It adds itself.
+                Question::FindServers { .. } => Answer::Servers(Vec::new()),
+                Question::FindOnNetwork { .. } | Question::Register { .. } => {
+                    Answer::Refused(UNSUPPORTED)
+                }
+            };
+            // A client that has gone does not wait for it.
+            drop(reply.send(answer));
+        }
+    };
+    let shared = Arc::new(Shared::new(own, None, ask));
+    tokio::join!(endpoint::accept(listener, shared), answers);
+}
+
+/// BadServiceUnsupported.
+const UNSUPPORTED: u32 = 0x800B_0000;
