@@ -16,7 +16,7 @@ use nix::{
 };
 use serde_json::Value;
 
-use crate::Host;
+use crate::{Cable, Host};
 
 /// How long a process has between the signal that asks it to end and the one that makes it.
 const GRACE: Duration = Duration::from_secs(5);
@@ -71,11 +71,21 @@ impl Started {
 
     /// The process runs on that host instead of the cell's.
     #[must_use]
-    pub fn on(mut self, host: &Host) -> Self {
+    pub fn on(self, host: &Host) -> Self {
+        self.in_network(&host.path())
+    }
+
+    /// The process runs at the far end of that cable instead of on the cell's host.
+    #[must_use]
+    pub fn beyond(self, cable: &Cable) -> Self {
+        self.in_network(&cable.path())
+    }
+
+    fn in_network(mut self, path: &Path) -> Self {
         // It becomes setpriv, which becomes the program: one process, with one id.
         let mut command = Command::new("nsenter");
         command
-            .arg(format!("--net={}", host.path().display()))
+            .arg(format!("--net={}", path.display()))
             .arg("--")
             .arg(self.command.get_program())
             .args(self.command.get_args())

@@ -105,6 +105,27 @@ impl Cable {
         self.here.ip(&["link", "delete", WIRE]);
     }
 
+    /// Takes the link down at its far end: nothing crosses, and the addresses stay.
+    ///
+    /// # Panics
+    /// When there is no cable.
+    pub fn cut(&self) {
+        self.there.ip(&["link", "set", WIRE, "down"]);
+    }
+
+    /// Ends [`cut`](Self::cut).
+    ///
+    /// # Panics
+    /// When there is no cable.
+    pub fn mend(&self) {
+        self.there.ip(&["link", "set", WIRE, "up"]);
+    }
+
+    /// The other host's namespace, for programs that are to run in it.
+    pub(crate) fn path(&self) -> PathBuf {
+        self.there.path()
+    }
+
     /// Has multicast without a named interface leave the cell by the cable, and no longer by loopback.
     ///
     /// # Panics

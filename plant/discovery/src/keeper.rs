@@ -8,7 +8,7 @@ use tokio::time::sleep_until;
 
 use crate::clock::now;
 use crate::liveness::{Liveness, Told, Try};
-use crate::mdns::{Heard, Mdns, Ours};
+use crate::mdns::{Heard, Mdns, Ours, same_place};
 
 /// See the module's page. Drive it by [`step`](Self::step), then take every [`event`](Self::event).
 pub(crate) struct Keeper {
@@ -17,6 +17,8 @@ pub(crate) struct Keeper {
     liveness: Liveness,
     /// Those that are not under watch any more are let go of then.
     tidy_at: Instant,
+    /// When this program was last seen to run.
+    awake_at: Instant,
     /// Where this program itself answers: that is not tried.
     own: Option<String>,
     /// Lost without a goodbye: mDNS still has their records, and would not tell of them anew when they come back as they
@@ -39,6 +41,13 @@ struct Started {
     tells: bool,
 }
 
+/// What a step waits for.
+enum Happened {
+    Heard(Heard),
+    Told(Told),
+    Due,
+}
+
 #[derive(Debug)]
 struct Asleep {
     announcement: Announcement,
@@ -54,6 +63,7 @@ impl Keeper {
             mdns,
             liveness: Liveness::new(),
             tidy_at: now(),
+            awake_at: now(),
             own,
             asleep: BTreeMap::new(),
             answered: BTreeMap::new(),
@@ -65,14 +75,9 @@ impl Keeper {
 
     /// Waits until something has happened, and takes it in. Whoever drops it before loses nothing.
     pub(crate) async fn step(&mut self) {
+        self.notice_standstill();
         self.try_endpoints();
-        let room = self.liveness.has_room();
-        let due = self.registry.poll_timeout();
-        let due = due
-            .into_iter()
-            .chain(self.asleep.values().map(|asleep| asleep.try_at))
-            .min();
-        let due = due.filter(|_| room).map(tokio::time::Instant::from_std);
+        let due = self.due().map(tokio::time::Instant::from_std);
         let timer = async {
             match due {
                 Some(due) => sleep_until(due).await,
@@ -85,14 +90,38 @@ impl Keeper {
                 None => std::future::pending().await,
             }
         };
-        tokio::select! {
-            heard = heard => self.hear(heard),
-            told = self.liveness.next() => match told {
-                Told::Tried { url, outcome } => self.probed(&url, outcome),
-                Told::Broken { url } => self.registry.suspect(&url),
-            },
-            () = timer => self.registry.handle_timeout(now()),
+        let happened = tokio::select! {
+            heard = heard => Happened::Heard(heard),
+            told = self.liveness.next() => Happened::Told(told),
+            () = timer => Happened::Due,
+        };
+        self.notice_standstill();
+        match happened {
+            Happened::Heard(heard) => self.hear(heard),
+            Happened::Told(Told::Tried { url, outcome }) => self.probed(&url, outcome),
+            Happened::Told(Told::Broken { url }) => self.registry.suspect(&url),
+            Happened::Due => self.registry.handle_timeout(now()),
         }
+    }
+
+    /// When there is something to do next; `None` where an answer has to come first.
+    fn due(&self) -> Option<Instant> {
+        let due = self.registry.poll_timeout();
+        let asleep = self.asleep.values().map(|asleep| asleep.try_at);
+        let due = due.into_iter().chain(asleep).min();
+        due.filter(|_| self.liveness.has_room())
+    }
+
+    /// Whoever stood still, stopped or without processor, has heard no answer, and holds that against nobody.
+    fn notice_standstill(&mut self) {
+        let at = now();
+        let late = self
+            .due()
+            .map(|due| at.saturating_duration_since(due.max(self.awake_at)));
+        if let Some(late) = late.filter(|late| *late > LATE) {
+            self.registry.stood_still(late);
+        }
+        self.awake_at = at;
     }
 
     /// What has happened, oldest first; what concerns mDNS has been done.
@@ -205,7 +234,7 @@ impl Keeper {
                     None => break,
                 },
             };
-            if self.own.as_ref() == Some(&url) {
+            if self.own.as_ref().is_some_and(|own| same_place(own, &url)) {
                 let alive = Outcome::Alive { start_time: None };
                 self.registry.probed(&url, alive, at);
                 continue;
@@ -249,6 +278,8 @@ fn keep<T>(map: &mut BTreeMap<String, T>, most: usize, url: &str, value: T) {
     map.insert(url.to_owned(), value);
 }
 
+/// How late a step may come on a machine with much to do.
+const LATE: Duration = Duration::from_millis(500);
 const TIDY_EVERY: Duration = Duration::from_secs(1);
 const TRY_ASLEEP: Duration = Duration::from_secs(1);
 /// By then mDNS has forgotten them too, and tells of them when they come back.

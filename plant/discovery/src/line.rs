@@ -32,7 +32,7 @@ pub(crate) struct Line {
 /// How far a connection came.
 pub(crate) enum Reached {
     /// To a channel.
-    Line(Line),
+    Line(Box<Line>),
     /// The server is there, and gives us no channel.
     Answers,
     /// The host takes the connection; the program says nothing.
@@ -69,7 +69,7 @@ impl Line {
             return Reached::Answers;
         }
         match timeout(OPEN_LIMIT, open(conversation, url)).await {
-            Ok(Some(line)) => Reached::Line(line),
+            Ok(Some(line)) => Reached::Line(Box::new(line)),
             Ok(None) | Err(_) => Reached::Answers,
         }
     }

@@ -202,7 +202,7 @@ impl Endpoint {
         match reached {
             Reached::Line(line) => {
                 self.lines_left = self.lines_left.saturating_sub(1);
-                self.line = Some(line);
+                self.line = Some(*line);
                 let start_time = match attempt.ask_start {
                     true => client::start_time(&self.url, START_LIMIT).await.ok(),
                     false => None,

@@ -17,6 +17,7 @@ use tokio::time::{Instant, sleep_until};
 use tracing::{debug, info, warn};
 
 use crate::goodbye::{goodbyes, listen};
+use crate::host_name;
 use crate::interface::Interface;
 use crate::url::Url;
 
@@ -74,6 +75,8 @@ pub(crate) struct Mdns {
 struct Announced {
     ours: Ours,
     fullname: String,
+    /// The URL that is heard of it: an address where it has a name for its host.
+    place: String,
     /// How often another was heard under its name that was to give way.
     contested: u32,
 }
@@ -115,17 +118,24 @@ impl Mdns {
             warn!(
                 name = ours.announcement.instance,
                 url = ours.announcement.url,
-                "a server cannot be announced on {}: it listens on no address there",
+                "a server cannot be announced on {}: it listens on no address there, or is of another host by name",
                 self.interface
             );
             return;
         };
         let fullname = info.get_fullname().to_owned();
+        let loopback = self.interface.is_loopback();
+        let place = heard(&info.clone().as_resolved_service(), loopback);
+        let place = place.map_or_else(
+            || ours.announcement.url.clone(),
+            |(announcement, _)| announcement.url,
+        );
         self.register(info);
         let instance = ours.announcement.instance.clone();
         let announced = Announced {
             ours,
             fullname,
+            place,
             contested: 0,
         };
         self.ours.insert(instance, announced);
@@ -269,7 +279,7 @@ impl Mdns {
                 };
                 if let Some(ours) = self.ours.get(&announcement.instance) {
                     let theirs = &announcement.url;
-                    return match same_place(&ours.ours.announcement.url, theirs) {
+                    return match same_place(&ours.place, theirs) {
                         true => Some(Heard::Announced {
                             announcement,
                             start_time,
@@ -306,7 +316,7 @@ impl Mdns {
     fn conflict(&mut self, from: &str, theirs: &str) -> Option<Heard> {
         let announced = self.ours.get_mut(from)?;
         announced.contested += 1;
-        let first = *announced.ours.announcement.url < *theirs;
+        let first = *announced.place < *theirs;
         if first && announced.contested < MOST_CONTESTED {
             self.announce_at = self.announce_at.min(Instant::now() + SETTLE);
             return None;
@@ -340,6 +350,8 @@ impl Mdns {
             }
             Some(IpAddr::V4(ip)) if !ip.is_unspecified() => vec![ip],
             Some(IpAddr::V6(ip)) if !ip.is_unspecified() => return None,
+            // Where another host is, is not ours to say.
+            None if !is_own(&url.host) => return None,
             _ => self.interface.addresses(),
         };
         let first = addresses.first()?;
@@ -381,6 +393,18 @@ fn hear_goodbyes(interface: &Interface) -> Option<UdpSocket> {
         debug!(%error, "goodbyes on {interface} are heard a second late");
     }
     socket.ok()
+}
+
+/// Whether a name is that of this host, with or without a domain.
+fn is_own(name: &str) -> bool {
+    let first = |name: &str| {
+        name.split('.')
+            .next()
+            .unwrap_or_default()
+            .to_ascii_lowercase()
+    };
+    let name = first(name);
+    name == "localhost" || name == first(&host_name())
 }
 
 /// Whether two URLs are of one endpoint.

@@ -21,7 +21,7 @@ pub struct Settings {
     /// How long one that gives no answer at all still counts as there.
     pub lost_after: Duration,
     /// How long one whose host takes connections and that says nothing itself counts as there: longer, since a program that
-    /// computes is not gone.
+    /// computes is not gone. Ten times as long where it has never answered, since it may be starting.
     pub hangs_after: Duration,
     /// Servers that may be registered, and records of the network, each. What is more is refused or not taken in.
     pub most: usize,
@@ -292,6 +292,16 @@ impl Registry {
     /// Something says that a server may have ended, as a connection that broke off: it is tried at once.
     pub fn suspect(&mut self, url: &str) {
         self.watch.hasten(url);
+    }
+
+    /// The program did not run for some time, so that no answer and no repeated registration could come: that time does not
+    /// count.
+    pub fn stood_still(&mut self, how_long: Duration) {
+        self.watch.stood_still(how_long);
+        let servers = self.servers.values_mut().chain(self.away.values_mut());
+        for server in servers {
+            server.forget_at += how_long;
+        }
     }
 
     /// The endpoint to try now, if any is due. To be asked until there is none.

@@ -54,11 +54,17 @@ pub(crate) struct Patience {
 
 /// The endpoints under watch.
 #[derive(Debug, Default)]
-pub(crate) struct Watch(BTreeMap<String, Watched>);
+pub(crate) struct Watch {
+    endpoints: BTreeMap<String, Watched>,
+    /// Until when the tries that were made take up what may be tried.
+    taken_until: Option<Instant>,
+}
 
 #[derive(Debug)]
 struct Watched {
     answered: Instant,
+    /// Whether it ever did; before, `answered` is when it was heard of.
+    has_answered: bool,
     try_at: Instant,
     start_time: Option<i64>,
 }
@@ -67,51 +73,70 @@ impl Watch {
     /// Looks after a URL from now on. What is heard of a server is a sign of life only the first time: an announcement
     /// outlives its server. Many that appear together are not tried together.
     pub(crate) fn add(&mut self, url: &str, every: Duration, now: Instant) {
-        if !self.0.contains_key(url) {
+        if !self.endpoints.contains_key(url) {
             let watched = Watched {
                 answered: now,
+                has_answered: false,
                 try_at: now + every.mul_f64(spread(url)),
                 start_time: None,
             };
-            self.0.insert(url.to_owned(), watched);
+            self.endpoints.insert(url.to_owned(), watched);
         }
     }
 
     pub(crate) fn contains(&self, url: &str) -> bool {
-        self.0.contains_key(url)
+        self.endpoints.contains_key(url)
     }
 
     /// How often each of them is tried: less often where there are many.
     fn pace(&self, every: Duration) -> Duration {
-        let count = u32::try_from(self.0.len()).unwrap_or(u32::MAX);
+        let count = u32::try_from(self.endpoints.len()).unwrap_or(u32::MAX);
         every.max(LEAST_APART.saturating_mul(count))
     }
 
     pub(crate) fn remove(&mut self, url: &str) {
-        self.0.remove(url);
+        self.endpoints.remove(url);
     }
 
     /// The endpoint whose turn it is, if any; its next turn is after `every`, or later where there are many.
     pub(crate) fn next(&mut self, every: Duration, now: Instant) -> Option<Probe> {
         let every = self.pace(every);
+        if self.taken_until.is_some_and(|until| until > now + BURST) {
+            return None;
+        }
         let (url, watched) = self
-            .0
+            .endpoints
             .iter_mut()
             .filter(|(_, watched)| watched.try_at <= now)
             .min_by_key(|(_, watched)| watched.try_at)?;
         watched.try_at = now + every;
+        let from = self.taken_until.map_or(now, |until| until.max(now));
+        self.taken_until = Some(from + LEAST_APART);
         Some(Probe { url: url.clone() })
     }
 
     /// Has a URL tried at the next opportunity.
     pub(crate) fn hasten(&mut self, url: &str) {
-        if let Some(watched) = self.0.get_mut(url) {
+        if let Some(watched) = self.endpoints.get_mut(url) {
             watched.try_at = watched.answered;
         }
     }
 
+    /// Nobody could have answered meanwhile.
+    pub(crate) fn stood_still(&mut self, how_long: Duration) {
+        for watched in self.endpoints.values_mut() {
+            watched.answered += how_long;
+        }
+    }
+
     pub(crate) fn due(&self) -> Option<Instant> {
-        self.0.values().map(|watched| watched.try_at).min()
+        let due = self
+            .endpoints
+            .values()
+            .map(|watched| watched.try_at)
+            .min()?;
+        let free = self.taken_until.and_then(|until| until.checked_sub(BURST));
+        Some(free.map_or(due, |free| free.max(due)))
     }
 
     /// Takes note of what came of a try.
@@ -122,12 +147,13 @@ impl Watch {
         patience: Patience,
         now: Instant,
     ) -> Sign {
-        let Some(watched) = self.0.get_mut(url) else {
+        let Some(watched) = self.endpoints.get_mut(url) else {
             return Sign::Nothing;
         };
         match outcome {
             Outcome::Alive { start_time } => {
                 watched.answered = now;
+                watched.has_answered = true;
                 let before = watched.start_time;
                 watched.start_time = start_time.or(before);
                 match (before, start_time) {
@@ -137,7 +163,14 @@ impl Watch {
             }
             Outcome::Refused => Sign::Lost(Loss::Unreachable),
             Outcome::Silent => watched.waits(patience.silent, Loss::Unreachable, patience, now),
-            Outcome::Hanging => watched.waits(patience.hanging, Loss::Hanging, patience, now),
+            Outcome::Hanging => {
+                // Who has never answered may be starting: it listens, and serves a while later.
+                let most = match watched.has_answered {
+                    true => patience.hanging,
+                    false => patience.hanging * STARTING,
+                };
+                watched.waits(most, Loss::Hanging, patience, now)
+            }
             Outcome::Untried => {
                 // A name that nobody knows is not asked for each second.
                 watched.try_at = now + patience.every * UNTRIED;
@@ -150,7 +183,8 @@ impl Watch {
 impl Watched {
     /// No answer came: for how long that goes.
     fn waits(&mut self, most: Duration, loss: Loss, patience: Patience, now: Instant) -> Sign {
-        if now.saturating_duration_since(self.answered) >= most {
+        // A try that ends a moment before counts: the next one would take its time once more.
+        if now.saturating_duration_since(self.answered) + patience.every / 4 >= most {
             return Sign::Lost(loss);
         }
         // Tried again soon, so that two tries that wait fit into the time.
@@ -168,4 +202,7 @@ fn spread(url: &str) -> f64 {
 
 /// 500 tries a second are made at most.
 const LEAST_APART: Duration = Duration::from_millis(2);
+/// How many may be made at once: ten.
+const BURST: Duration = Duration::from_millis(20);
 const UNTRIED: u32 = 10;
+const STARTING: u32 = 10;

@@ -261,6 +261,7 @@ fn a_program_that_takes_connections_and_says_nothing_hangs() {
     registry.announced(robot(), now);
     events(&mut registry);
     let url = robot().url;
+    registry.probed(&url, Outcome::Alive { start_time: None }, now);
     registry.probed(&url, Outcome::Hanging, now + SECOND * 2);
     assert_eq!(registry.poll_event(), None, "it may compute");
     registry.probed(&url, Outcome::Hanging, now + SECOND * 3);
@@ -275,6 +276,34 @@ fn a_program_that_takes_connections_and_says_nothing_hangs() {
         ),
         "{happened:?}"
     );
+}
+
+#[test]
+fn one_that_listens_and_has_never_answered_is_given_time_to_start() {
+    let (mut registry, now) = start();
+    registry.announced(robot(), now);
+    events(&mut registry);
+    let url = robot().url;
+    for second in 1..30 {
+        registry.probed(&url, Outcome::Hanging, now + SECOND * second);
+        assert_eq!(registry.poll_event(), None, "after {second} s");
+    }
+    registry.probed(&url, Outcome::Hanging, now + SECOND * 30);
+    assert_eq!(events(&mut registry).len(), 1, "it hangs");
+}
+
+#[test]
+fn the_time_in_which_nobody_listened_is_held_against_nobody() {
+    let (mut registry, now) = start();
+    registry.announced(robot(), now);
+    events(&mut registry);
+    let url = robot().url;
+    registry.probed(&url, Outcome::Alive { start_time: None }, now);
+    registry.stood_still(SECOND * 10);
+    registry.probed(&url, Outcome::Silent, now + SECOND * 11);
+    assert_eq!(registry.poll_event(), None, "a second of it counts");
+    registry.probed(&url, Outcome::Silent, now + SECOND * 12);
+    assert_eq!(events(&mut registry).len(), 1, "two seconds do");
 }
 
 #[test]

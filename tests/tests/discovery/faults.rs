@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
-use system_tests::{Cell, Child, HERE, Peer, THERE, WIRE, Wire, eventually, metrics, number};
+use system_tests::{Cell, Child, HERE, Peer, THERE, WIRE, eventually, metrics, number};
 
 use super::{
     Greeter, LDS, SOON, STATUS, after, announced, lds, now, on_network, registered, told, who,
@@ -49,17 +49,18 @@ fn a_cable_that_is_cut_is_noticed_in_two_seconds_and_one_that_is_mended_too() {
     let Some(cell) = Cell::with(&[]) else {
         return;
     };
-    let host = cell.host(Wire::default());
+    let cable = cell.cable();
+    cable.lay(HERE);
     let _lds = lds(&["--interface", WIRE]);
     let _gripper = who_started(&["announce", "gripper", "--address", THERE])
-        .on(&host)
+        .beyond(&cable)
         .start()
         .ready(SOON);
     let mut watch = who(&["watch", "--interface", WIRE]);
     told(&mut watch, "seen", "gripper");
     eventually("it is seen", SOON, || on_network("gripper"));
     let before = now();
-    host.cut();
+    cable.cut();
     let gone = told(&mut watch, "gone", "gripper");
     assert_eq!(gone["loss"], "unreachable");
     assert!(after(before, &gone) < 3000, "{gone}, cut at {before:?}");
@@ -67,7 +68,7 @@ fn a_cable_that_is_cut_is_noticed_in_two_seconds_and_one_that_is_mended_too() {
         on_network("gripper").is_none().then_some(())
     });
     let before = now();
-    host.mend();
+    cable.mend();
     let back = told_again(&mut watch, "seen", "gripper");
     assert!(after(before, &back) < 5000, "{back}, mended at {before:?}");
     eventually("it is seen again", SOON, || on_network("gripper"));
@@ -78,13 +79,14 @@ fn two_hosts_that_announce_one_name_are_told_apart() {
     let Some(cell) = Cell::with(&[]) else {
         return;
     };
-    let host = cell.host(Wire::default());
+    let cable = cell.cable();
+    cable.lay(HERE);
     let mut watch = who(&["watch", "--interface", WIRE]);
     // One host name, one port, one name: as images of one disk have them.
     let port = ["--port", "4850"];
     let _here = who(&[&["announce", "arm", "--address", HERE][..], &port].concat());
     let _there = who_started(&[&["announce", "arm", "--address", THERE][..], &port].concat())
-        .on(&host)
+        .beyond(&cable)
         .start()
         .ready(SOON);
     let [here, there] = [HERE, THERE].map(|address| format!("opc.tcp://{address}:4850/"));
@@ -104,8 +106,8 @@ fn two_hosts_that_announce_one_name_are_told_apart() {
 /// The name under which a server was seen last, and not lost since.
 fn last_name(watch: &Child, url: &str) -> Option<String> {
     let lines = watch.json_lines();
-    let of_it = lines.iter().filter(|line| line["url"] == url);
-    let last = of_it.last().filter(|line| line["found"] != "gone")?;
+    let mut of_it = lines.iter().filter(|line| line["url"] == url);
+    let last = of_it.next_back().filter(|line| line["found"] != "gone")?;
     last["name"].as_str().map(str::to_owned)
 }
 
@@ -131,7 +133,7 @@ fn a_name_that_two_want_and_a_host_that_nobody_knows_disturb_no_other() {
         let seen = watch.wait_for_json(name, SOON, |line| {
             (line["name"] == name && line["found"] == "seen").then(|| line["url"].clone())
         });
-        assert_eq!(seen, url, "{name}");
+        assert_eq!(seen, format!("{url}/"), "{name}");
     }
     let gripper = announced("gripper", &[]);
     told(&mut watch, "seen", "gripper");
@@ -201,6 +203,28 @@ fn another_start_time_behind_one_url_is_a_restart() {
     assert!(took < Duration::from_secs(3), "{took:?}");
     let later = eventually("it is known when", SOON, started);
     assert!(later > before, "{later} after {before}");
+    assert_eq!(number(&metrics(STATUS).unwrap(), "lost_total"), 0);
+}
+
+#[test]
+fn a_discovery_server_that_stood_still_holds_that_against_nobody() {
+    let Some(_cell) = Cell::with(&[]) else {
+        return;
+    };
+    let mut server = lds(&["--register-period", "2"]);
+    let _gripper = announced("gripper", &["--register-period", "1"]);
+    eventually("it is registered", SOON, || registered("urn:who:gripper"));
+    let since = registered("urn:who:gripper").unwrap()["since_ms"].clone();
+    for _ in 0..3 {
+        server.signal(Signal::SIGSTOP);
+        // As long as a registration counts, and twice as long as a silence may take.
+        std::thread::sleep(Duration::from_secs(5));
+        server.signal(Signal::SIGCONT);
+        eventually("it goes on", SOON, || metrics(STATUS));
+        let found = registered("urn:who:gripper").unwrap();
+        assert_eq!(found["since_ms"], since, "{found}");
+    }
+    assert!(server.runs());
     assert_eq!(number(&metrics(STATUS).unwrap(), "lost_total"), 0);
 }
 
