@@ -17,7 +17,13 @@ async def find(client, args):
     servers = await client.find_servers()
     lifetime.say(
         registered=[
-            {"uri": one.ApplicationUri, "name": one.ApplicationName.Text, "urls": one.DiscoveryUrls} for one in servers
+            {
+                "uri": one.ApplicationUri,
+                "name": one.ApplicationName.Text,
+                "urls": one.DiscoveryUrls,
+                "gateway": one.GatewayServerUri,
+            }
+            for one in servers
         ]
     )
     if args.what == "find-servers":

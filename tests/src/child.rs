@@ -16,7 +16,7 @@ use nix::{
 };
 use serde_json::Value;
 
-use crate::{Cable, Host};
+use crate::{Cable, Host, Site};
 
 /// How long a process has between the signal that asks it to end and the one that makes it.
 const GRACE: Duration = Duration::from_secs(5);
@@ -79,6 +79,12 @@ impl Started {
     #[must_use]
     pub fn beyond(self, cable: &Cable) -> Self {
         self.in_network(&cable.path())
+    }
+
+    /// The process runs at that site instead of the cell's.
+    #[must_use]
+    pub fn at(self, site: &Site) -> Self {
+        self.in_network(&site.path())
     }
 
     fn in_network(mut self, path: &Path) -> Self {

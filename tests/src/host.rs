@@ -202,14 +202,14 @@ impl Drop for Host {
 }
 
 /// A network namespace, which lives as long as this.
-struct Namespace(File);
+pub(crate) struct Namespace(File);
 
 impl Namespace {
     fn current() -> Self {
         Self(File::open("/proc/thread-self/ns/net").unwrap())
     }
 
-    fn fresh() -> Self {
+    pub(crate) fn fresh() -> Self {
         let made = std::thread::spawn(|| {
             unshare(CloneFlags::CLONE_NEWNET).unwrap();
             Self::current()
@@ -219,12 +219,23 @@ impl Namespace {
         made
     }
 
-    fn path(&self) -> PathBuf {
+    pub(crate) fn path(&self) -> PathBuf {
         PathBuf::from(format!(
             "/proc/{}/fd/{}",
             std::process::id(),
             self.0.as_raw_fd()
         ))
+    }
+
+    /// Does something in it, on a thread of its own.
+    pub(crate) fn within<T: Send>(&self, what: impl FnOnce() -> T + Send) -> T {
+        std::thread::scope(|scope| {
+            let done = scope.spawn(|| {
+                setns(&self.0, CloneFlags::CLONE_NEWNET).unwrap();
+                what()
+            });
+            done.join().unwrap()
+        })
     }
 
     /// Lays a wire from here to `other`, where its end is called `name`.
@@ -236,7 +247,7 @@ impl Namespace {
         self.ip(&["link", "set", WIRE, "mtu", "1500", "multicast", "on", "up"]);
     }
 
-    fn ip(&self, args: &[&str]) {
+    pub(crate) fn ip(&self, args: &[&str]) {
         let output = Command::new("nsenter")
             .arg(format!("--net={}", self.path().display()))
             .args(["--", "ip"])

@@ -23,6 +23,7 @@ mod judge;
 mod net;
 mod numbered;
 mod peers;
+mod plant;
 mod programs;
 mod relay;
 mod rtps;
@@ -50,6 +51,7 @@ pub use net::{
 };
 pub use numbered::{Numbered, numbered};
 pub use peers::MASTER;
+pub use plant::{Segment, Site};
 pub use programs::{
     METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, SERVER_ENDPOINT, drops, number, program,
 };

@@ -2,6 +2,8 @@
 
 #[path = "discovery/faults.rs"]
 mod faults;
+#[path = "discovery/levels.rs"]
+mod levels;
 #[path = "discovery/rules.rs"]
 mod rules;
 

@@ -4,12 +4,14 @@ use std::path::PathBuf;
 use std::pin::Pin;
 use std::time::{Duration, SystemTime};
 
+use registry::hierarchy::Choice;
 use registry::{Announcement, instance_name};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, info, warn};
 
+use crate::chosen::find_lds;
 use crate::client::{self, AskFault};
 use crate::clock;
 use crate::host_name;
@@ -35,7 +37,8 @@ pub struct Server {
 /// To whom a server is told of.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct AnnounceSettings {
-    /// The Local Discovery Server to register with; `None` for none.
+    /// The Local Discovery Server to register with; `None` for none. Its URL, or which of those it is that are heard of by
+    /// mDNS, as a [`Choice`] is written: `any`, `uri=urn:cell:*`, `name=cell-lds`.
     pub lds: Option<String>,
     /// Where it is announced by mDNS; `None` for nowhere: then the Local Discovery Server is asked to do it.
     pub mdns: Option<Interface>,
@@ -122,12 +125,14 @@ pub fn announce(server: Server, settings: AnnounceSettings) -> Result<Announced,
         register_every,
         ..settings
     };
+    let (settings, found) = found(settings)?;
     let (sender, changes) = watch::channel(server);
     let (tell, state) = watch::channel(AnnounceState::default());
     let (stop, stopped) = mpsc::channel(1);
     let telling = Telling {
         settings,
         mdns,
+        found,
         server: changes,
         state: tell,
         start_time: clock::ticks(clock::wall()),
@@ -145,9 +150,31 @@ pub fn announce(server: Server, settings: AnnounceSettings) -> Result<Announced,
     })
 }
 
+/// Which discovery server is found, where one is looked for.
+type Looked = Option<watch::Receiver<Option<String>>>;
+
+/// Looks for the discovery server where it is not said by its URL.
+fn found(settings: AnnounceSettings) -> Result<(AnnounceSettings, Looked), MdnsFault> {
+    let choice = settings.lds.as_deref().map(str::parse::<Choice>);
+    match (choice, &settings.mdns) {
+        (Some(Ok(choice)), Some(interface)) if !matches!(choice, Choice::At(_)) => {
+            let found = find_lds(choice, interface, None)?;
+            let settings = AnnounceSettings {
+                lds: None,
+                ..settings
+            };
+            Ok((settings, Some(found)))
+        }
+        // What is no URL is told when it is tried.
+        _ => Ok((settings, None)),
+    }
+}
+
 struct Telling {
     settings: AnnounceSettings,
     mdns: Option<Mdns>,
+    /// The discovery server, where it is looked for.
+    found: Looked,
     server: watch::Receiver<Server>,
     state: watch::Sender<AnnounceState>,
     start_time: i64,
@@ -179,9 +206,19 @@ impl Telling {
                     None => std::future::pending().await,
                 }
             };
+            let found = async {
+                match &mut self.found {
+                    Some(found) => found.changed().await,
+                    None => std::future::pending().await,
+                }
+            };
             tokio::select! {
                 _ = stopped.recv() => break,
                 heard = heard => self.hear(heard),
+                found = found => {
+                    registering = None;
+                    self.another(found.is_ok());
+                }
                 Ok(()) = self.server.changed() => {
                     self.put();
                     self.soon();
@@ -265,6 +302,21 @@ impl Telling {
             }
             Heard::Withdrawn { .. } => {}
         }
+    }
+
+    /// The discovery server is another from now on, or none.
+    fn another(&mut self, is_looked_for: bool) {
+        self.settings.lds = match &mut self.found {
+            Some(found) if is_looked_for => found.borrow_and_update().clone(),
+            // Nobody looks any more: it stays as it is.
+            _ => {
+                self.found = None;
+                return;
+            }
+        };
+        self.state.send_modify(|state| state.registered = None);
+        self.lds_run = None;
+        self.soon();
     }
 
     fn soon(&mut self) {

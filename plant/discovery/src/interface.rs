@@ -37,7 +37,8 @@ impl Interface {
     }
 
     /// Its IPv4 addresses, which is what is announced and heard by.
-    pub(crate) fn addresses(&self) -> Vec<Ipv4Addr> {
+    #[must_use]
+    pub fn addresses(&self) -> Vec<Ipv4Addr> {
         let all = if_addrs::get_if_addrs().unwrap_or_default();
         let addresses = all.iter().filter(|interface| self.is(interface));
         addresses

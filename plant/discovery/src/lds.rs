@@ -8,10 +8,10 @@ use std::time::{Duration, SystemTime};
 
 use bridge_node::{Failure, FailureKind, Requests};
 use opcua::types::ApplicationType;
-use registry::{Announcement, Event, Loss, Settings, instance_name};
+use registry::{Announcement, Asked, Event, Loss, Settings, instance_name};
 use serde::Serialize;
 use tokio::net::TcpListener;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tracing::{info, warn};
 
@@ -29,6 +29,8 @@ use crate::url::Url;
 /// How a discovery server runs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LdsSettings {
+    /// Its ApplicationUri, where it is part of another application; one of the host's name otherwise.
+    pub application_uri: Option<String>,
     /// Where it listens, as `opc.tcp://127.0.0.1:4840`.
     pub endpoint: String,
     /// Where it announces and hears by mDNS.
@@ -45,6 +47,60 @@ pub struct LdsSettings {
     pub trust_any: bool,
 }
 
+/// A server of another level that is reached through this one (OPC 10000-4, 7.2: GatewayServerUri).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Gated {
+    /// Its ApplicationUri.
+    pub application_uri: String,
+    /// Its name.
+    pub name: String,
+    /// Who passes on what it is asked.
+    pub gateway_uri: String,
+    /// Where that is asked, on this level.
+    pub url: String,
+}
+
+/// What a program around the discovery server adds to what it tells.
+#[derive(Debug, Clone, Default)]
+pub struct Added {
+    /// Listed by FindServers.
+    pub gated: Vec<Gated>,
+    /// Shown in `/status` as `level`.
+    pub status: Option<serde_json::Value>,
+}
+
+/// How a program around the discovery server takes part.
+#[derive(Debug)]
+pub struct Around {
+    /// Is told who comes and goes. What does not fit in is lost, and counted as `level_missed_total`: the discovery server
+    /// waits for nobody.
+    pub events: mpsc::Sender<OnLevel>,
+    /// What it adds.
+    pub added: watch::Receiver<Added>,
+}
+
+/// Who comes and goes.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum OnLevel {
+    /// A source, as an ApplicationUri or an mDNS name, tells of a server.
+    Told {
+        /// Who tells of it.
+        source: String,
+        /// Where the server is.
+        url: String,
+    },
+    /// A source tells of nobody any more.
+    Left {
+        /// Who told of it.
+        source: String,
+    },
+    /// The program behind a URL was started anew.
+    Restarted {
+        /// Where it is.
+        url: String,
+    },
+}
+
 /// What it knows at one moment.
 #[derive(Debug, Clone, Serialize)]
 pub struct LdsStatus {
@@ -58,6 +114,8 @@ pub struct LdsStatus {
     network: Vec<RecordStatus>,
     losses: VecDeque<LossStatus>,
     counters: BTreeMap<&'static str, u64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    level: Option<serde_json::Value>,
 }
 
 /// A registered server.
@@ -126,10 +184,24 @@ impl bridge_node::Told for LdsStatus {
 /// The endpoint or the interface cannot be used.
 pub async fn run(
     settings: LdsSettings,
+    pages: Requests<LdsStatus>,
+    stop: impl Future<Output = ()>,
+) -> Result<(), Failure> {
+    run_around(settings, None, pages, stop).await
+}
+
+/// The same with a program around it.
+///
+/// # Errors
+/// The endpoint or the interface cannot be used.
+pub async fn run_around(
+    settings: LdsSettings,
+    around: Option<Around>,
     mut pages: Requests<LdsStatus>,
     stop: impl Future<Output = ()>,
 ) -> Result<(), Failure> {
     let (mut lds, mut questions) = Lds::start(&settings).await?;
+    lds.around = around;
     let mut semaphores = interval(SEMAPHORES_EVERY.min(settings.register_every));
     semaphores.set_missed_tick_behavior(MissedTickBehavior::Delay);
     tokio::pin!(stop);
@@ -170,6 +242,8 @@ struct Lds {
     since: BTreeMap<String, SystemTime>,
     losses: VecDeque<LossStatus>,
     lost: u64,
+    around: Option<Around>,
+    missed: u64,
 }
 
 impl Lds {
@@ -202,7 +276,8 @@ impl Lds {
             path: place.path,
         }
         .to_string();
-        let application_uri = format!("urn:{}:ua-lds", host_name());
+        let given = settings.application_uri.clone();
+        let application_uri = given.unwrap_or_else(|| format!("urn:{}:ua-lds", host_name()));
         let security = settings.pki.as_deref().map(|root| {
             let host = Url::parse(&url).map_or_else(host_name, |url| url.host);
             Security::open(root, &application_uri, &host, settings.trust_any)
@@ -246,6 +321,8 @@ impl Lds {
             since: BTreeMap::new(),
             losses: VecDeque::new(),
             lost: 0,
+            around: None,
+            missed: 0,
         };
         Ok((lds, questions))
     }
@@ -256,7 +333,9 @@ impl Lds {
             Question::FindServers { uris } => {
                 let uris: Vec<&str> = uris.iter().map(String::as_str).collect();
                 let found = registry.find_servers(&uris);
-                Answer::Servers(found.map(|(asked, _)| asked.clone()).collect())
+                let found = found.map(|(asked, _)| asked.clone());
+                let gated = self.around.iter().flat_map(|around| gated(around, &uris));
+                Answer::Servers(found.chain(gated).collect())
             }
             Question::FindOnNetwork {
                 from,
@@ -297,10 +376,17 @@ impl Lds {
                 discovery_urls,
             } => {
                 info!(uri = ?server_uri, urls = ?discovery_urls, "registered");
+                if let Some(url) = discovery_urls.into_iter().next() {
+                    let source = server_uri.clone();
+                    self.tell(OnLevel::Told { source, url });
+                }
                 self.since.entry(server_uri).or_insert_with(clock::wall);
             }
             Event::Seen(record) => self.seen(record.announcement),
-            Event::Restarted { url } => info!(url, "restarted"),
+            Event::Restarted { url } => {
+                info!(url, "restarted");
+                self.tell(OnLevel::Restarted { url });
+            }
             Event::Gone { server_uri, loss } => self.lose(server_uri, String::new(), loss),
             Event::Vanished { record, loss } => {
                 let Announcement { instance, url, .. } = record.announcement;
@@ -317,6 +403,8 @@ impl Lds {
         let after = started.and_then(|at| now.duration_since(at).ok());
         let after_ms = after.map(|after| after.as_millis());
         info!(name = ?instance, url, after_ms, "seen on the network");
+        let source = instance.clone();
+        self.tell(OnLevel::Told { source, url });
         self.since.entry(instance).or_insert(now);
     }
 
@@ -325,6 +413,8 @@ impl Lds {
         let silent_ms = silent.map(|silent| u64::try_from(silent.as_millis()).unwrap_or(u64::MAX));
         info!(?name, url, loss = loss.label(), silent_ms, "gone");
         self.since.remove(&name);
+        let source = name.clone();
+        self.tell(OnLevel::Left { source });
         self.lost += 1;
         if self.losses.len() >= MOST_LOSSES {
             self.losses.pop_front();
@@ -336,6 +426,14 @@ impl Lds {
             at_ms: clock::millis(clock::wall()),
             silent_ms,
         });
+    }
+
+    fn tell(&mut self, told: OnLevel) {
+        if let Some(around) = &self.around
+            && around.events.try_send(told).is_err()
+        {
+            self.missed += 1;
+        }
     }
 
     fn look_at_semaphores(&mut self) {
@@ -385,6 +483,10 @@ impl Lds {
             network: network.collect(),
             losses: self.losses.clone(),
             counters: self.counters(),
+            level: self
+                .around
+                .as_ref()
+                .and_then(|around| around.added.borrow().status.clone()),
         }
     }
 
@@ -406,6 +508,7 @@ impl Lds {
             ("malformed_total", get(malformed)),
             ("timed_out_total", get(timed_out)),
             ("lost_total", self.lost),
+            ("level_missed_total", self.missed),
             ("no_room_total", self.keeper.registry.refused()),
             (
                 "announcements_ignored_total",
@@ -445,6 +548,24 @@ async fn listen(endpoint: &str) -> Result<(TcpListener, Url), Failure> {
             Failure::new(FailureKind::Unavailable, message)
         })?;
     Ok((listener, place))
+}
+
+/// The servers of other levels with these URIs, or all of them, as if they had registered.
+fn gated(around: &Around, uris: &[&str]) -> Vec<Asked> {
+    let added = around.added.borrow();
+    let wanted = |one: &&Gated| uris.is_empty() || uris.contains(&&*one.application_uri);
+    let gated = added.gated.iter().filter(wanted).map(|one| Asked {
+        server_uri: one.application_uri.clone(),
+        product_uri: String::new(),
+        names: vec![(String::new(), one.name.clone())],
+        application_type: registry::ApplicationType::Server,
+        gateway_server_uri: one.gateway_uri.clone(),
+        discovery_urls: vec![one.url.clone()],
+        semaphore_file_path: String::new(),
+        is_online: true,
+        mdns: None,
+    });
+    gated.collect()
 }
 
 /// As much of a text from outside as a log line is to hold.

@@ -5,9 +5,10 @@
 //!
 //! Reading order: `url` and `interface` (where), `mdns` and `goodbye` (announcements and what is heard of others), `wire` (OPC UA
 //! over TCP), `client` (asking by it), `line` and `liveness` (who still answers), `keeper` (all of that around one registry),
-//! `watch` and `announce` (for programs), `endpoint`, `connection`, `security` and `services` (answering by it), `lds`, `presence`.
+//! `watch`, `chosen` and `announce` (for programs), `endpoint`, `connection`, `security` and `services` (answering by it), `lds`, `presence`.
 
 mod announce;
+mod chosen;
 pub mod client;
 mod clock;
 mod connection;
@@ -27,6 +28,7 @@ mod watch;
 mod wire;
 
 pub use announce::{AnnounceSettings, AnnounceState, Announced, Server, announce};
+pub use chosen::{Marks, find_lds};
 pub use interface::Interface;
 pub use mdns::MdnsFault;
 pub use presence::be_there;
@@ -35,8 +37,9 @@ pub use watch::{Found, Known, WatchSettings, Watcher, watch};
 /// Where the Local Discovery Server of a host is (OPC 10000-12, 4.2.2).
 pub const DEFAULT_LDS: &str = "opc.tcp://127.0.0.1:4840";
 
-/// Of this host, without a domain.
-fn host_name() -> String {
+/// The name of this host, without a domain.
+#[must_use]
+pub fn host_name() -> String {
     let name = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let name = name.trim();
     match name.split('.').next() {

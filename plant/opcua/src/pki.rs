@@ -87,6 +87,14 @@ impl Pki {
     /// # Errors
     /// Files that cannot be read or written, or half a pair.
     pub fn ensure_own(&self, application_uri: &str, host: &str) -> Result<(), PkiError> {
+        self.ensure_own_at(application_uri, &[host.to_owned()])
+    }
+
+    /// The same for an application that is reached under several hosts.
+    ///
+    /// # Errors
+    /// Files that cannot be read or written, or half a pair.
+    pub fn ensure_own_at(&self, application_uri: &str, hosts: &[String]) -> Result<(), PkiError> {
         let _alone = self.lock()?;
         let certificate = self.root.join(OWN_CERTIFICATE);
         let key = self.root.join(OWN_KEY);
@@ -101,7 +109,7 @@ impl Pki {
                 missing: certificate,
             }),
             (false, false) => {
-                let data = certificate_data(application_uri, host);
+                let data = certificate_data(application_uri, hosts);
                 CertificateStore::create_certificate_and_key(&data, false, &certificate, &key)
                     .map_err(PkiError::Make)?;
                 info!(certificate = %certificate.display(), application_uri, "made the application's own certificate");
@@ -177,8 +185,9 @@ fn remove(refused: &Path) {
     }
 }
 
-fn certificate_data(application_uri: &str, host: &str) -> X509Data {
-    let mut addresses = vec![host.to_owned(), "127.0.0.1".to_owned(), "::1".to_owned()];
+fn certificate_data(application_uri: &str, hosts: &[String]) -> X509Data {
+    let mut addresses = hosts.to_vec();
+    addresses.extend(["127.0.0.1", "::1"].map(str::to_owned));
     addresses.dedup();
     X509Data {
         key_size: 2048,

@@ -9,6 +9,7 @@
 //! [`Registry::poll_event`]; when [`Registry::poll_timeout`] has passed, call [`Registry::handle_timeout`].
 
 mod asked;
+pub mod hierarchy;
 mod loss;
 mod name;
 mod network;

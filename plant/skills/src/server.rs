@@ -1,7 +1,8 @@
 //! A component as an OPC UA server: its skills as instances of their types, with methods, events and parameters.
 //!
-//! Reading order: this, `types` (what a skill is, from the instance of its type), `show` (what clients see).
+//! Reading order: this, `place` (where it is in the plant), `types` (what a skill is, from the instance of its type), `show` (what clients see).
 
+mod place;
 mod show;
 mod types;
 
@@ -78,6 +79,8 @@ impl ComponentServer {
         let server = server_of(component, settings)?;
         let mut ids = IdRange::new(OWN, FIRST_FREE_ID);
         let root = root(&server, component, &mut ids)?;
+        place::configurable(&server, &root.node_id, &mut ids)
+            .map_err(|error| ServeFault::Space(error.to_string()))?;
         let folder = root
             .node("Skills")
             .cloned()

@@ -70,6 +70,7 @@ impl Service for UaLds {
         let pages = serve_pages(self.metrics).await?;
         let interface = self.interface.as_deref().map(Interface::parse);
         let settings = LdsSettings {
+            application_uri: None,
             endpoint: self.endpoint,
             interface: interface.unwrap_or(Interface::LOOPBACK),
             allow_unsecured: self.allow_unsecured,

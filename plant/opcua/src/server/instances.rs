@@ -368,7 +368,12 @@ impl Server {
         Ok(())
     }
 
-    fn checked(&self, view: View<'_>, id: &NodeId, parent: &NodeId) -> Result<(), InstanceError> {
+    pub(super) fn checked(
+        &self,
+        view: View<'_>,
+        id: &NodeId,
+        parent: &NodeId,
+    ) -> Result<(), InstanceError> {
         if !self.inner.spaces.owns(id) {
             return Err(InstanceError::Foreign(id.clone()));
         }
@@ -437,7 +442,7 @@ fn notifier(events: bool) -> EventNotifier {
     }
 }
 
-fn insert(own: &mut AddressSpace, node: NodeType, parent: &NodeId, reference: &NodeId) {
+pub(super) fn insert(own: &mut AddressSpace, node: NodeType, parent: &NodeId, reference: &NodeId) {
     let id = node.as_node().node_id().clone();
     own.insert(
         node,

@@ -1,12 +1,13 @@
 //! A server whose nodes are instances of the types of NodeSets.
 //!
-//! Reading order: `build` (from a configuration to a server), `view` (all nodes as one), `instances` (nodes from types),
+//! Reading order: `build` (from a configuration to a server), `view` (all nodes as one), `instances` (nodes from types), `methods` (without types),
 //! `nodes` (values and writes), `calls` and `routed` (methods), `sessions`, `events`.
 
 mod build;
 mod calls;
 mod events;
 mod instances;
+mod methods;
 mod nodes;
 mod routed;
 mod sessions;
@@ -34,6 +35,7 @@ pub use self::events::{StateRef, TransitionEvent};
 pub use self::instances::{
     IdRange, Instance, InstanceError, InstanceSpec, ObjectSpec, VariableSpec,
 };
+pub use self::methods::MethodSpec;
 pub use self::nodes::{WriteHandler, WriteRequest, write};
 pub use self::sessions::Caller;
 pub use self::view::Child;

@@ -1,0 +1,161 @@
+//! The discovery server to register with, found on the network: [`find_lds`].
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use async_trait::async_trait;
+use registry::hierarchy::{Candidate, Choice, Chosen};
+use tokio::sync::watch;
+use tokio::time::{MissedTickBehavior, interval};
+use tracing::{info, warn};
+
+use crate::interface::Interface;
+use crate::mdns::MdnsFault;
+use crate::watch::{Found, Known, WatchSettings, Watcher};
+
+/// Looks into the address space of a discovery server, which takes a session.
+#[async_trait]
+pub trait Marks: Send + Sync + 'static {
+    /// Whether the server at `url` has that node, as `nsu=urn:cell;s=Marker`. `false` where it does not answer in time.
+    async fn has(&self, url: &str, node: &str) -> bool;
+}
+
+/// Follows which discovery server of a network is the chosen one, for as long as somebody listens. `None` while there is
+/// none, or while several fit and nobody said which: that is told in the log.
+///
+/// # Errors
+/// No mDNS daemon can be started.
+pub fn find_lds(
+    choice: Choice,
+    interface: &Interface,
+    marks: Option<Arc<dyn Marks>>,
+) -> Result<watch::Receiver<Option<String>>, MdnsFault> {
+    if let Choice::At(url) = choice {
+        // There is nothing to find, and what nobody sends any more stays as it is.
+        return Ok(watch::channel(Some(url)).1);
+    }
+    let watcher = crate::watch(WatchSettings {
+        mdns: Some(interface.clone()),
+        ..WatchSettings::default()
+    })?;
+    let (tell, chosen) = watch::channel(None);
+    let finding = Finding {
+        choice,
+        marks,
+        there: BTreeMap::new(),
+        told: Chosen::Nobody,
+    };
+    tokio::spawn(finding.run(watcher, tell));
+    Ok(chosen)
+}
+
+struct Finding {
+    choice: Choice,
+    marks: Option<Arc<dyn Marks>>,
+    there: BTreeMap<String, Candidate>,
+    told: Chosen,
+}
+
+impl Finding {
+    async fn run(mut self, mut watcher: Watcher, tell: watch::Sender<Option<String>>) {
+        let mut again = interval(LOOK_AGAIN);
+        again.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            tokio::select! {
+                found = watcher.next() => match found {
+                    Some(found) => self.take(&found).await,
+                    None => return,
+                },
+                // A server may come by its marker later than by its name.
+                _ = again.tick() => self.look_again().await,
+                () = tell.closed() => return,
+            }
+            let chosen = self.choose();
+            tell.send_if_modified(|known| {
+                let changed = *known != chosen;
+                *known = chosen;
+                changed
+            });
+        }
+    }
+
+    async fn take(&mut self, found: &Found) {
+        match found {
+            Found::Seen(known) | Found::Restarted(known) if known.is_lds() => {
+                let candidate = self.candidate(known).await;
+                self.there.insert(known.name.clone(), candidate);
+            }
+            Found::Seen(known) | Found::Restarted(known) | Found::Gone { known, .. } => {
+                self.there.remove(&known.name);
+            }
+        }
+    }
+
+    async fn candidate(&self, known: &Known) -> Candidate {
+        Candidate {
+            name: known.name.clone(),
+            url: known.url.clone(),
+            application_uri: known.application_uri.clone(),
+            is_marked: self.is_marked(&known.url).await,
+        }
+    }
+
+    async fn look_again(&mut self) {
+        let unmarked: Vec<(String, String)> = self
+            .there
+            .values()
+            .filter(|one| !one.is_marked)
+            .map(|one| (one.name.clone(), one.url.clone()))
+            .collect();
+        for (name, url) in unmarked {
+            if self.is_marked(&url).await
+                && let Some(candidate) = self.there.get_mut(&name)
+            {
+                candidate.is_marked = true;
+            }
+        }
+    }
+
+    async fn is_marked(&self, url: &str) -> bool {
+        match (&self.choice, &self.marks) {
+            (Choice::Marker(node), Some(marks)) => marks.has(url, node).await,
+            (
+                Choice::Marker(_) | Choice::Any | Choice::At(_) | Choice::Uri(_) | Choice::Name(_),
+                _,
+            ) => false,
+        }
+    }
+
+    fn tell(&self, chosen: &Chosen) {
+        let choice = &self.choice;
+        let message = match chosen {
+            Chosen::Nobody => "no discovery server is there".to_owned(),
+            Chosen::At(url) => format!("the discovery server is found at {url}"),
+            Chosen::Several(names) => {
+                let names = names.join(", ");
+                warn!(
+                    %choice,
+                    "several discovery servers are there, and none is registered with: {names}; say which, as name=..."
+                );
+                return;
+            }
+        };
+        info!(%choice, "{message}");
+    }
+
+    fn choose(&mut self) -> Option<String> {
+        let candidates: Vec<Candidate> = self.there.values().cloned().collect();
+        let chosen = self.choice.among(&candidates);
+        if chosen != self.told {
+            self.tell(&chosen);
+            self.told = chosen.clone();
+        }
+        match chosen {
+            Chosen::At(url) => Some(url),
+            Chosen::Nobody | Chosen::Several(_) => None,
+        }
+    }
+}
+
+const LOOK_AGAIN: Duration = Duration::from_secs(5);

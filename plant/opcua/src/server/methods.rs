@@ -1,0 +1,103 @@
+//! Methods that no type declares.
+
+use std::sync::Arc;
+
+use opcua::nodes::{Base, Method, Variable};
+use opcua::server::address_space::AccessLevel;
+use opcua::types::{
+    Argument, DataTypeId, DataValue, ExtensionObject, LocalizedText, NodeClass, NodeId,
+    QualifiedName, ReferenceTypeId, VariableTypeId, Variant,
+};
+
+use super::Server;
+use super::calls::MethodHandler;
+use super::instances::{InstanceError, insert};
+
+/// A method of one object, with what it takes and gives.
+#[derive(Debug, Clone)]
+pub struct MethodSpec {
+    /// The method; the properties with its arguments have the NodeIds that [`arguments`](Self::arguments) says.
+    pub node_id: NodeId,
+    /// Its BrowseName.
+    pub browse_name: QualifiedName,
+    /// The object it is of.
+    pub object: NodeId,
+    /// The NodeIds of InputArguments and OutputArguments.
+    pub arguments: (NodeId, NodeId),
+    /// What it takes.
+    pub takes: Vec<Argument>,
+    /// What it gives.
+    pub gives: Vec<Argument>,
+}
+
+impl Server {
+    /// Makes a method of an object, and has a handler carry it out.
+    ///
+    /// # Errors
+    /// A NodeId that cannot be, or an object that is not there. Nothing is made then.
+    pub fn add_method(
+        &self,
+        spec: MethodSpec,
+        handler: Arc<dyn MethodHandler>,
+    ) -> Result<(), InstanceError> {
+        let alone = self.inner.making.lock();
+        let spaces = &self.inner.spaces;
+        let arguments = [
+            ("InputArguments", spec.arguments.0, spec.takes),
+            ("OutputArguments", spec.arguments.1, spec.gives),
+        ];
+        spaces.with(|view| {
+            self.checked(view, &spec.node_id, &spec.object)?;
+            let mut properties = arguments.iter();
+            properties.try_for_each(|(_, id, _)| self.checked(view, id, &spec.object))
+        })?;
+        let mut own = spaces.own().write();
+        let name = spec.browse_name.name.as_ref().to_owned();
+        let display_name = LocalizedText::new("", &name);
+        let method = Method::new(&spec.node_id, spec.browse_name, display_name, true, true);
+        let component = ReferenceTypeId::HasComponent.into();
+        insert(&mut own, method.into(), &spec.object, &component);
+        for (which, id, arguments) in arguments {
+            if arguments.is_empty() {
+                continue;
+            }
+            let property = property(&id, which, arguments);
+            let reference = ReferenceTypeId::HasProperty.into();
+            insert(&mut own, property.into(), &spec.node_id, &reference);
+            own.insert_reference(
+                &id,
+                &VariableTypeId::PropertyType.into(),
+                ReferenceTypeId::HasTypeDefinition,
+            );
+        }
+        drop(own);
+        let calls = &self.inner.calls;
+        calls.add(&spec.object, &spec.node_id, &name, &[]);
+        calls.handle(&spec.object, &spec.node_id, handler);
+        drop(alone);
+        Ok(())
+    }
+}
+
+fn property(id: &NodeId, name: &str, arguments: Vec<Argument>) -> Variable {
+    let base = Base::new(
+        NodeClass::Variable,
+        id,
+        QualifiedName::new(0, name),
+        LocalizedText::new("", name),
+    );
+    let each = arguments.into_iter().map(ExtensionObject::from_message);
+    let value: Vec<ExtensionObject> = each.collect();
+    let readable = AccessLevel::CURRENT_READ.bits();
+    Variable::new_full(
+        base,
+        DataTypeId::Argument.into(),
+        false,
+        1,
+        DataValue::new_now(Variant::from(value)),
+        readable,
+        readable,
+        None,
+        None,
+    )
+}

@@ -1,0 +1,240 @@
+//! The right discovery server among several.
+
+use std::fmt;
+use std::str::FromStr;
+
+/// Which discovery server is wanted.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Choice {
+    /// The only one that there is.
+    Any,
+    /// The one at this URL, announced or not.
+    At(String),
+    /// By its ApplicationUri.
+    Uri(Pattern),
+    /// By its mDNS instance name.
+    Name(Pattern),
+    /// The one whose address space has this node, as `nsu=urn:cell;s=Marker`.
+    Marker(String),
+}
+
+/// A text, or how it begins.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Pattern {
+    text: String,
+    is_prefix: bool,
+}
+
+/// What is no choice.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "`{0}` names no discovery server: an opc.tcp:// URL, any, uri=<ApplicationUri>, name=<mDNS name> (both may end with *) \
+     or node=<NodeId> are possible"
+)]
+pub struct ChoiceFault(String);
+
+/// A discovery server that is there.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Candidate {
+    /// Its mDNS instance name.
+    pub name: String,
+    /// Where it is.
+    pub url: String,
+    /// What it says it is; `None` where it says nothing.
+    pub application_uri: Option<String>,
+    /// Whether it has the node of [`Choice::Marker`].
+    pub is_marked: bool,
+}
+
+/// What a choice came to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Chosen {
+    /// None of them fits.
+    Nobody,
+    /// Where the right one is.
+    At(String),
+    /// Several fit, and one alone may be meant: their names.
+    Several(Vec<String>),
+}
+
+impl Choice {
+    /// Chooses. One that is heard of at several addresses is one, and taken at the first of them.
+    #[must_use]
+    pub fn among(&self, candidates: &[Candidate]) -> Chosen {
+        if let Self::At(url) = self {
+            return Chosen::At(url.clone());
+        }
+        let mut fit: Vec<&Candidate> = candidates.iter().filter(|one| self.fits(one)).collect();
+        fit.sort_by(|a, b| a.url.cmp(&b.url));
+        let Some(first) = fit.first() else {
+            return Chosen::Nobody;
+        };
+        let same = |one: &&&Candidate| {
+            one.url == first.url
+                || (one.application_uri.is_some() && one.application_uri == first.application_uri)
+        };
+        if fit.iter().all(|one| same(&one)) {
+            return Chosen::At(first.url.clone());
+        }
+        let mut names: Vec<String> = fit.iter().map(|one| one.name.clone()).collect();
+        names.sort();
+        Chosen::Several(names)
+    }
+
+    fn fits(&self, candidate: &Candidate) -> bool {
+        match self {
+            Self::Any => true,
+            Self::At(url) => candidate.url == *url,
+            Self::Uri(pattern) => {
+                let uri = candidate.application_uri.as_deref();
+                uri.is_some_and(|uri| pattern.fits(uri))
+            }
+            Self::Name(pattern) => pattern.fits(&candidate.name),
+            Self::Marker(_) => candidate.is_marked,
+        }
+    }
+}
+
+impl Pattern {
+    fn parse(text: &str) -> Option<Self> {
+        let (text, is_prefix) = match text.strip_suffix('*') {
+            Some(prefix) => (prefix, true),
+            None => (text, false),
+        };
+        (!text.is_empty()).then(|| Self {
+            text: text.to_owned(),
+            is_prefix,
+        })
+    }
+
+    fn fits(&self, text: &str) -> bool {
+        match self.is_prefix {
+            true => text.starts_with(&self.text),
+            false => text == self.text,
+        }
+    }
+}
+
+impl FromStr for Choice {
+    type Err = ChoiceFault;
+
+    fn from_str(text: &str) -> Result<Self, ChoiceFault> {
+        let strange = text
+            .chars()
+            .any(|letter| letter.is_control() || letter.is_whitespace());
+        let known = match text.split_once('=') {
+            _ if strange || text.len() > MOST_TEXT => None,
+            _ if text == "any" => Some(Self::Any),
+            _ if text.starts_with("opc.tcp://") => Some(Self::At(text.to_owned())),
+            Some(("uri", pattern)) => Pattern::parse(pattern).map(Self::Uri),
+            Some(("name", pattern)) => Pattern::parse(pattern).map(Self::Name),
+            Some(("node", node)) if !node.is_empty() => Some(Self::Marker(node.to_owned())),
+            Some(_) | None => None,
+        };
+        known.ok_or_else(|| ChoiceFault(text.chars().take(80).collect()))
+    }
+}
+
+impl fmt::Display for Choice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Any => f.write_str("any"),
+            Self::At(url) => f.write_str(url),
+            Self::Uri(pattern) => write!(f, "uri={pattern}"),
+            Self::Name(pattern) => write!(f, "name={pattern}"),
+            Self::Marker(node) => write!(f, "node={node}"),
+        }
+    }
+}
+
+impl fmt::Display for Pattern {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { text, is_prefix } = self;
+        write!(f, "{text}{}", if *is_prefix { "*" } else { "" })
+    }
+}
+
+const MOST_TEXT: usize = 1024;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn candidate(name: &str, url: &str, uri: Option<&str>) -> Candidate {
+        Candidate {
+            name: name.to_owned(),
+            url: url.to_owned(),
+            application_uri: uri.map(str::to_owned),
+            is_marked: name == "marked",
+        }
+    }
+
+    fn chosen(choice: &str, candidates: &[Candidate]) -> Chosen {
+        choice.parse::<Choice>().unwrap().among(candidates)
+    }
+
+    #[test]
+    fn of_several_discovery_servers_the_one_that_is_meant_is_taken() {
+        let all = [
+            candidate("cell-lds", "opc.tcp://10.0.0.9:4840", Some("urn:cell:lds")),
+            candidate("marked", "opc.tcp://10.0.0.8:4840", Some("urn:station:a")),
+            candidate("mute", "opc.tcp://10.0.0.7:4840", None),
+        ];
+        let at = |url: &str| Chosen::At(format!("opc.tcp://10.0.0.{url}:4840"));
+        for (choice, wanted) in [
+            ("uri=urn:cell:lds", at("9")),
+            ("uri=urn:cell:*", at("9")),
+            ("name=mute", at("7")),
+            ("name=cell*", at("9")),
+            ("node=nsu=urn:cell;s=Marker", at("8")),
+            ("opc.tcp://10.0.0.7:4840", at("7")),
+            ("uri=urn:cell:ld", Chosen::Nobody),
+            (
+                "opc.tcp://10.0.0.1:1",
+                Chosen::At("opc.tcp://10.0.0.1:1".to_owned()),
+            ),
+        ] {
+            assert_eq!(chosen(choice, &all), wanted, "{choice}");
+        }
+        let names = ["cell-lds", "marked", "mute"].map(str::to_owned);
+        assert_eq!(chosen("any", &all), Chosen::Several(names.to_vec()));
+        assert_eq!(chosen("any", &all[..1]), at("9"));
+        assert_eq!(chosen("any", &[]), Chosen::Nobody);
+    }
+
+    #[test]
+    fn one_that_is_heard_of_at_two_addresses_is_one() {
+        let both = [
+            candidate("lds (2)", "opc.tcp://10.0.1.1:4840", Some("urn:lds")),
+            candidate("lds", "opc.tcp://10.0.0.1:4840", Some("urn:lds")),
+        ];
+        assert_eq!(
+            chosen("any", &both),
+            Chosen::At("opc.tcp://10.0.0.1:4840".to_owned())
+        );
+        let unknown = both.map(|one| Candidate {
+            application_uri: None,
+            ..one
+        });
+        assert!(matches!(chosen("any", &unknown), Chosen::Several(_)));
+    }
+
+    #[test]
+    fn choices_are_written_as_they_are_read_and_others_are_refused() {
+        for text in [
+            "any",
+            "opc.tcp://h:1/",
+            "uri=urn:a",
+            "uri=urn:*",
+            "name=n*",
+            "node=i=7",
+        ] {
+            assert_eq!(text.parse::<Choice>().unwrap().to_string(), text);
+        }
+        for text in [
+            "", "some", "uri=", "uri=*", "name=", "node=", "name=a b", "uri=a\n", "http://h",
+        ] {
+            assert!(text.parse::<Choice>().is_err(), "{text:?}");
+        }
+    }
+}

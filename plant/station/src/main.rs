@@ -1,0 +1,119 @@
+//! One level of a plant: the program around [`ua_station`].
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use bridge_node::{Failure, LogFormat, Service, run_service, serve_pages};
+use discovery::lds::LdsSettings;
+use discovery::{DEFAULT_LDS, Interface};
+use plant_opcua::server::EndpointUrl;
+use registry::hierarchy::{Choice, Place};
+use ua_station::{StationSettings, Upper, run};
+
+/// One level of a plant: the discovery server of a workstation and its devices, or of a whole cell.
+///
+/// Servers of the level below register here as with ua-lds, are told their place (their method `Configure` is called), and
+/// are hidden from the level above: there the station shows their methods as its own, below Devices, and passes calls on.
+/// To the devices it shows the methods of its neighbours above, below Neighbours. Without --upper-interface it is the top
+/// level, and shows nothing to anybody.
+#[derive(Debug, clap::Parser)]
+#[command(name = "ua-station", version)]
+struct UaStation {
+    /// What it is called on the level above
+    #[arg(long, value_name = "NAME", env = "UA_STATION")]
+    name: String,
+    /// The place of the level in the plant, as plant/cell-1; the level above may say another
+    #[arg(long, value_name = "PLACE", env = "UA_PLACE")]
+    place: Option<Place>,
+    /// Where servers of the level below register and clients ask
+    #[arg(long, value_name = "URL", env = "UA_LDS_ENDPOINT", default_value = DEFAULT_LDS)]
+    endpoint: String,
+    /// The network interface of the level below, by name or address. Without it only this host is told and heard
+    #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
+    interface: Option<String>,
+    /// Where the methods of neighbours are called by devices; any port of the interface without it
+    #[arg(long, value_name = "URL")]
+    devices_endpoint: Option<EndpointUrl>,
+    /// The network interface of the level above, by name or address
+    #[arg(long, value_name = "NAME|ADDRESS", env = "UA_UPPER_INTERFACE")]
+    upper_interface: Option<String>,
+    /// Where the methods of devices are called from above; any port of the upper interface without it
+    #[arg(long, value_name = "URL", requires = "upper_interface")]
+    upper_endpoint: Option<EndpointUrl>,
+    /// The discovery server above: an opc.tcp:// URL, `any` (the only one there), uri=<ApplicationUri>, name=<mDNS name>
+    /// (both may end with *), or node=<NodeId> for the one that has a node, as node=nsu=urn:cell;s=Marker
+    #[arg(
+        long,
+        value_name = "CHOICE",
+        default_value = "any",
+        env = "UA_UPPER_LDS"
+    )]
+    upper_lds: Choice,
+    /// Serve and use channels that are not secured, too. Without --pki there are no others, and without this option servers
+    /// of other hosts cannot register then
+    #[arg(long)]
+    allow_unsecured: bool,
+    /// How often servers are expected to register, in seconds. A registration without semaphore file counts twice as long
+    #[arg(long, value_name = "SECONDS", default_value = "600", value_parser = clap::value_parser!(u32).range(1..=86_400))]
+    register_period: u32,
+    /// The certificate store, for secured channels (Basic256Sha256): own, private, trusted and rejected under one directory
+    #[arg(long, value_name = "DIR", env = "UA_PKI")]
+    pki: Option<PathBuf>,
+    /// Trust every certificate. For tests and demonstrations only
+    #[arg(long, requires = "pki")]
+    trust_any_certificate: bool,
+    /// Serve what is known at this address: /status as JSON, /metrics for Prometheus, and /readyz
+    #[arg(long, value_name = "ADDRESS:PORT", env = "UA_METRICS")]
+    metrics: Option<SocketAddr>,
+    /// How log lines look
+    #[arg(
+        long,
+        value_name = "FORMAT",
+        env = "UA_LOG_FORMAT",
+        default_value = "text"
+    )]
+    log: LogFormat,
+}
+
+fn main() -> ExitCode {
+    run_service::<UaStation>()
+}
+
+impl Service for UaStation {
+    const QUIET: &'static str = "opcua_server=warn,opcua_server::session::controller=off,opcua_client=off,\
+        opcua_core=off,opcua_crypto=off,opcua_nodes=warn,opcua_types=off,mdns_sd=off";
+
+    fn log(&self) -> LogFormat {
+        self.log
+    }
+
+    async fn serve(self, stop: impl Future<Output = ()> + Send + 'static) -> Result<(), Failure> {
+        let pages = serve_pages(self.metrics).await?;
+        let interface = self.interface.as_deref().map(Interface::parse);
+        let lds = LdsSettings {
+            application_uri: None,
+            endpoint: self.endpoint,
+            interface: interface.unwrap_or(Interface::LOOPBACK),
+            allow_unsecured: self.allow_unsecured,
+            secured_only: false,
+            register_every: Duration::from_secs(self.register_period.into()),
+            pki: self.pki,
+            trust_any: self.trust_any_certificate,
+        };
+        let upper = self.upper_interface.as_deref().map(|interface| Upper {
+            interface: Interface::parse(interface),
+            endpoint: self.upper_endpoint,
+            discovery: self.upper_lds,
+        });
+        let settings = StationSettings {
+            name: self.name,
+            place: self.place,
+            lds,
+            devices_endpoint: self.devices_endpoint,
+            upper,
+        };
+        run(settings, pages, stop).await
+    }
+}

@@ -1,0 +1,47 @@
+//! Looking for a node in the address space of a discovery server.
+
+use std::time::Duration;
+
+use async_trait::async_trait;
+use discovery::Marks;
+use plant_opcua::client::{Client, ClientConfig};
+use plant_opcua::types::{AttributeId, NodeId};
+
+/// Looks with a session.
+pub(crate) struct Sessions(pub(crate) ClientConfig);
+
+#[async_trait]
+impl Marks for Sessions {
+    async fn has(&self, url: &str, node: &str) -> bool {
+        let client = Client::open(self.0.clone(), url);
+        let has = match client.up(LIMIT).await {
+            Ok(()) => has(&client, node).await,
+            Err(_) => false,
+        };
+        client.close().await;
+        has
+    }
+}
+
+async fn has(client: &Client, text: &str) -> bool {
+    let Some(node) = node(client, text) else {
+        return false;
+    };
+    let read = client
+        .read_attributes(&[(node, AttributeId::NodeClass)])
+        .await;
+    let value = read.ok().and_then(|values| values.into_iter().next());
+    value.is_some_and(|value| value.status().is_good() && value.value.is_some())
+}
+
+/// A NodeId as text, whose namespace may be said by its URI.
+fn node(client: &Client, text: &str) -> Option<NodeId> {
+    let Some(rest) = text.strip_prefix("nsu=") else {
+        return text.parse().ok();
+    };
+    let (uri, identifier) = rest.split_once(';')?;
+    let index = client.namespace(uri)?;
+    format!("ns={index};{identifier}").parse().ok()
+}
+
+const LIMIT: Duration = Duration::from_secs(2);

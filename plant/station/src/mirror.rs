@@ -1,0 +1,189 @@
+//! Which methods a server has, by the objects they are below of.
+
+use std::collections::{BTreeSet, VecDeque};
+
+use plant_opcua::client::{Browse, Client, ClientError};
+use plant_opcua::types::{
+    Argument, DataTypeId, DataValue, NodeClass, NodeClassMask, NodeId, ObjectId, ReferenceTypeId,
+    Variant,
+};
+use tracing::debug;
+
+use crate::configure::is_configure;
+
+/// What a server has.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Mirror {
+    /// Methods that can be passed on.
+    pub(crate) methods: Vec<Found>,
+    /// Object and method of its `Configure`.
+    pub(crate) configure: Option<(NodeId, NodeId)>,
+    /// Methods that cannot be: their arguments mean something only at that server.
+    pub(crate) kept_back: usize,
+}
+
+/// A method of a server.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Found {
+    /// The BrowseNames of the objects from Objects down, that of the method last.
+    pub(crate) path: Vec<String>,
+    pub(crate) object: NodeId,
+    pub(crate) method: NodeId,
+    pub(crate) takes: Vec<Argument>,
+    pub(crate) gives: Vec<Argument>,
+}
+
+/// Reads it, over the connection there is.
+///
+/// # Errors
+/// There is no answer.
+pub(crate) async fn look(client: &Client) -> Result<Mirror, ClientError> {
+    let mut mirror = Mirror::default();
+    let objects: NodeId = ObjectId::ObjectsFolder.into();
+    let mut seen = BTreeSet::from([objects.to_string()]);
+    let mut waiting = VecDeque::from([(objects, Vec::new())]);
+    while let Some((object, path)) = waiting.pop_front() {
+        let below = Browse {
+            classes: NodeClassMask::OBJECT | NodeClassMask::METHOD,
+            ..Browse::hierarchical()
+        };
+        for reference in client.browse(&object, below).await? {
+            let id = reference.node_id.node_id;
+            let elsewhere = reference.node_id.server_index != 0;
+            // What each server has, as the object Server, is not what it is for.
+            if id.namespace == 0 || elsewhere || path.len() >= DEEPEST {
+                continue;
+            }
+            let mut path = path.clone();
+            path.push(
+                reference
+                    .browse_name
+                    .name
+                    .as_ref()
+                    .chars()
+                    .take(LONGEST_NAME)
+                    .collect(),
+            );
+            if reference.node_class == NodeClass::Method {
+                if mirror.methods.len() < MOST_METHODS {
+                    take(client, &mut mirror, (&object, id), path).await?;
+                }
+            } else if seen.len() < MOST_OBJECTS && seen.insert(id.to_string()) {
+                waiting.push_back((id, path));
+            }
+        }
+    }
+    Ok(mirror)
+}
+
+async fn take(
+    client: &Client,
+    mirror: &mut Mirror,
+    (object, method): (&NodeId, NodeId),
+    path: Vec<String>,
+) -> Result<(), ClientError> {
+    let Some([takes, gives]) = signature(client, &method).await? else {
+        mirror.kept_back += 1;
+        debug!(?path, "a method that is not passed on");
+        return Ok(());
+    };
+    let name = path.last().map(String::as_str).unwrap_or_default();
+    if is_configure(name, &takes, &gives) {
+        // Whose place it is says the station alone.
+        let known = mirror.configure.take();
+        mirror.configure = known.or_else(|| Some((object.clone(), method)));
+        return Ok(());
+    }
+    mirror.methods.push(Found {
+        path,
+        object: object.clone(),
+        method,
+        takes,
+        gives,
+    });
+    Ok(())
+}
+
+/// What a method takes and gives; `None` where that cannot be passed on.
+async fn signature(
+    client: &Client,
+    method: &NodeId,
+) -> Result<Option<[Vec<Argument>; 2]>, ClientError> {
+    let properties = Browse::of(ReferenceTypeId::HasProperty);
+    let properties = client.browse(method, properties).await?;
+    let mut both = [Vec::new(), Vec::new()];
+    for (which, into) in ["InputArguments", "OutputArguments"].iter().zip(&mut both) {
+        let named = |one: &&plant_opcua::types::ReferenceDescription| {
+            one.browse_name.name.as_ref() == *which
+        };
+        let Some(property) = properties.iter().find(named) else {
+            continue;
+        };
+        let read = client
+            .read(std::slice::from_ref(&property.node_id.node_id))
+            .await?;
+        let Some(all) = arguments(read.into_iter().next()) else {
+            return Ok(None);
+        };
+        if all.len() > MOST_ARGUMENTS {
+            return Ok(None);
+        }
+        for argument in all {
+            match passed(client, argument).await? {
+                Some(argument) => into.push(argument),
+                None => return Ok(None),
+            }
+        }
+    }
+    Ok(Some(both))
+}
+
+/// The argument as it is shown here; `None` where its values name nodes or are structures of that server's own, whose
+/// numbers mean something else here.
+async fn passed(client: &Client, argument: Argument) -> Result<Option<Argument>, ClientError> {
+    let mut data_type = argument.data_type.clone();
+    if data_type.namespace != 0 {
+        let above = match client.supertypes(&data_type).await {
+            Ok(above) => above,
+            Err(ClientError::Status(_)) => return Ok(None),
+            Err(error) => return Err(error),
+        };
+        match above.into_iter().find(|one| one.namespace == 0) {
+            // An enumeration, or a number with a meaning.
+            Some(known) if known != DataTypeId::Structure => data_type = known,
+            Some(_) | None => return Ok(None),
+        }
+    }
+    let names = [
+        DataTypeId::NodeId,
+        DataTypeId::ExpandedNodeId,
+        DataTypeId::QualifiedName,
+        DataTypeId::Structure,
+    ];
+    if names.iter().any(|one| data_type == *one) {
+        return Ok(None);
+    }
+    Ok(Some(Argument {
+        data_type,
+        ..argument
+    }))
+}
+
+fn arguments(read: Option<DataValue>) -> Option<Vec<Argument>> {
+    let Variant::Array(array) = read?.value? else {
+        return None;
+    };
+    let each = array.values.into_iter().map(|value| {
+        let Variant::ExtensionObject(object) = value else {
+            return None;
+        };
+        object.into_inner_as::<Argument>().map(|one| *one)
+    });
+    each.collect()
+}
+
+const DEEPEST: usize = 12;
+const LONGEST_NAME: usize = 128;
+const MOST_OBJECTS: usize = 2000;
+pub(crate) const MOST_METHODS: usize = 1000;
+const MOST_ARGUMENTS: usize = 64;

@@ -1,0 +1,476 @@
+//! All of a station: the discovery server of the level below, both faces, and who is tended.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge_node::{Failure, FailureKind, Requests};
+use discovery::lds::{self, Around, Gated, LdsSettings, LdsStatus, OnLevel};
+use discovery::{
+    AnnounceSettings, Announced, Found, Interface, MdnsFault, Server, WatchSettings, Watcher,
+    announce, find_lds, watch as watch_level,
+};
+use plant_opcua::client::{ClientConfig, SecurityChoice};
+use plant_opcua::pki::Pki;
+use plant_opcua::server::{EndpointUrl, MethodRequest, MethodSpec, Refusal, ServerError, method};
+use plant_opcua::types::{ObjectId, QualifiedName, StatusCode};
+use registry::hierarchy::{Change, Choice, Place, Roster};
+use tokio::sync::{mpsc, watch};
+use tokio::task::AbortHandle;
+use tracing::{info, warn};
+
+use crate::board::{Board, Level};
+use crate::configure::{self, Told};
+use crate::face::{Face, FaceSettings, id};
+use crate::marks::Sessions;
+use crate::tend::Tending;
+
+/// What a station is.
+#[derive(Debug, Clone)]
+pub struct StationSettings {
+    /// Its name on the level above.
+    pub name: String,
+    /// The place of the level, where nobody above says it.
+    pub place: Option<Place>,
+    /// The discovery server of the level below.
+    pub lds: LdsSettings,
+    /// Where the face below listens; any port of the interface below without it.
+    pub devices_endpoint: Option<EndpointUrl>,
+    /// The level above; `None` for the top.
+    pub upper: Option<Upper>,
+}
+
+/// The level above.
+#[derive(Debug, Clone)]
+pub struct Upper {
+    /// The network interface.
+    pub interface: Interface,
+    /// Where the face above listens; any port of the interface without it.
+    pub endpoint: Option<EndpointUrl>,
+    /// The discovery server to register with.
+    pub discovery: Choice,
+}
+
+/// Runs a station until it is told to stop.
+///
+/// # Errors
+/// An endpoint, an interface or the certificate store cannot be used.
+pub async fn run(
+    settings: StationSettings,
+    pages: Requests<LdsStatus>,
+    stop: impl Future<Output = ()>,
+) -> Result<(), Failure> {
+    let uri = format!(
+        "urn:{}:ua-station:{}",
+        discovery::host_name(),
+        settings.name
+    );
+    let certificates = certificates(&settings, &uri)?;
+    let below = match &settings.upper {
+        Some(_) => Some(open_below(&settings, &uri, certificates.clone())?),
+        None => None,
+    };
+    let own = below.as_ref().map(|face| Gated {
+        application_uri: uri.clone(),
+        name: settings.name.clone(),
+        gateway_uri: String::new(),
+        url: face.server.url().to_owned(),
+    });
+    let (board, added) = Board::new(own);
+    let board = Arc::new(board);
+    board.place(settings.place.as_ref().map(Place::to_string));
+    let (place, places) = watch::channel(settings.place.clone());
+    let client = client(&settings, &uri, certificates.clone());
+    let mut levels = Levels::default();
+    let mut above = None;
+    if let (Some(upper), Some(below)) = (&settings.upper, &below) {
+        let face = open_above(&settings, upper, &uri, certificates.clone())?;
+        configurable(&face, &settings.name, &board, place.clone())?;
+        face.server.start();
+        below.server.start();
+        let tending = Tending {
+            level: Level::Above,
+            board: Arc::clone(&board),
+            face: Some(below.clone()),
+            client: client.clone(),
+            place: None,
+            discovery_url: String::new(),
+            own_uri: uri.clone(),
+        };
+        levels.above = Some(follow(upper, tending)?);
+        levels.announced = tell(&settings, upper, &uri, (&face, below))?;
+        levels.registered = Some(register(
+            &settings,
+            upper,
+            &face,
+            &client,
+            Arc::clone(&board),
+        )?);
+        above = Some(face);
+    }
+    let (tell, events) = mpsc::channel(MOST_EVENTS);
+    let tending = Tending {
+        level: Level::Below,
+        board,
+        face: above.clone(),
+        client,
+        place: Some(places),
+        discovery_url: settings.lds.endpoint.clone(),
+        own_uri: uri.clone(),
+    };
+    levels.below = Some(Abort(
+        tokio::spawn(tend_below(events, tending)).abort_handle(),
+    ));
+    let around = Around {
+        events: tell,
+        added,
+    };
+    let lds = LdsSettings {
+        application_uri: Some(uri),
+        ..settings.lds
+    };
+    let ended = lds::run_around(lds, Some(around), pages, stop).await;
+    // The place is kept until nobody can be told it any more.
+    drop(place);
+    levels.leave().await;
+    for face in above.into_iter().chain(below) {
+        face.server.stop().await;
+    }
+    ended
+}
+
+/// How the station connects to others.
+fn client(settings: &StationSettings, uri: &str, pki: Option<PathBuf>) -> ClientConfig {
+    ClientConfig {
+        accept_untrusted: settings.lds.trust_any,
+        security: match (&pki, settings.lds.allow_unsecured) {
+            (Some(_), false) => SecurityChoice::Basic256Sha256,
+            (Some(_), true) => SecurityChoice::Best,
+            (None, _) => SecurityChoice::None,
+        },
+        pki,
+        ..ClientConfig::new(uri, &settings.name)
+    }
+}
+
+/// Ends a task with it.
+struct Abort(AbortHandle);
+
+impl Drop for Abort {
+    fn drop(&mut self) {
+        self.0.abort();
+    }
+}
+
+/// What runs beside the discovery server.
+#[derive(Default)]
+struct Levels {
+    above: Option<Abort>,
+    below: Option<Abort>,
+    announced: Vec<Announced>,
+    /// Closed, it ends the registration; the task ends when that is taken back.
+    registered: Option<(mpsc::Sender<()>, tokio::task::JoinHandle<()>)>,
+}
+
+impl Levels {
+    async fn leave(self) {
+        drop((self.above, self.below));
+        if let Some((stop, task)) = self.registered {
+            drop(stop);
+            drop(tokio::time::timeout(LEAVE_LIMIT, task).await);
+        }
+        for announced in self.announced {
+            announced.leave().await;
+        }
+    }
+}
+
+/// Makes the one certificate of the station, for all addresses it is reached under.
+fn certificates(settings: &StationSettings, uri: &str) -> Result<Option<PathBuf>, Failure> {
+    let Some(root) = &settings.lds.pki else {
+        return Ok(None);
+    };
+    let failed = |error: plant_opcua::pki::PkiError| {
+        Failure::new(FailureKind::Io, format!("{error} (--pki)"))
+    };
+    let mut hosts = Vec::new();
+    let levels = settings.upper.iter().map(|upper| &upper.interface);
+    for interface in levels.chain([&settings.lds.interface]) {
+        hosts.extend(interface.addresses().iter().map(ToString::to_string));
+    }
+    let pki = Pki::open(root.clone()).map_err(failed)?;
+    pki.ensure_own_at(uri, &hosts).map_err(failed)?;
+    Ok(Some(root.clone()))
+}
+
+fn open_below(
+    settings: &StationSettings,
+    uri: &str,
+    pki: Option<PathBuf>,
+) -> Result<Face, Failure> {
+    let endpoint = endpoint(
+        settings.devices_endpoint.as_ref(),
+        &settings.lds.interface,
+        "--devices-endpoint",
+    )?;
+    let settings = FaceSettings {
+        application_uri: uri.to_owned(),
+        name: settings.name.clone(),
+        endpoint,
+        pki,
+        allow_unsecured: settings.lds.allow_unsecured,
+        trust_any: settings.lds.trust_any,
+    };
+    Face::open(settings, "Neighbours").map_err(|error| unavailable(&error))
+}
+
+fn open_above(
+    settings: &StationSettings,
+    upper: &Upper,
+    uri: &str,
+    pki: Option<PathBuf>,
+) -> Result<Face, Failure> {
+    let endpoint = endpoint(
+        upper.endpoint.as_ref(),
+        &upper.interface,
+        "--upper-endpoint",
+    )?;
+    let settings = FaceSettings {
+        application_uri: uri.to_owned(),
+        name: settings.name.clone(),
+        endpoint,
+        pki,
+        allow_unsecured: settings.lds.allow_unsecured,
+        trust_any: settings.lds.trust_any,
+    };
+    Face::open(settings, "Devices").map_err(|error| unavailable(&error))
+}
+
+fn unavailable(error: &ServerError) -> Failure {
+    Failure::new(FailureKind::Unavailable, error.to_string())
+}
+
+/// That given, or any port of the first address of an interface.
+fn endpoint(
+    given: Option<&EndpointUrl>,
+    interface: &Interface,
+    option: &str,
+) -> Result<EndpointUrl, Failure> {
+    if let Some(given) = given {
+        return Ok(given.clone());
+    }
+    let address = interface.addresses().into_iter().next().ok_or_else(|| {
+        let message = format!(
+            "the interface {interface} has no IPv4 address to listen at: give it one, or say {option}"
+        );
+        Failure::new(FailureKind::Unavailable, message)
+    })?;
+    format!("opc.tcp://{address}:0/")
+        .parse()
+        .map_err(|error| Failure::new(FailureKind::Unavailable, format!("{error}")))
+}
+
+/// The object of the station itself, whose place the level above may say.
+fn configurable(
+    face: &Face,
+    name: &str,
+    board: &Arc<Board>,
+    place: watch::Sender<Option<Place>>,
+) -> Result<(), Failure> {
+    let failed = |error: plant_opcua::server::InstanceError| {
+        Failure::new(FailureKind::Unavailable, error.to_string())
+    };
+    let told = place.borrow().as_ref().map(Place::to_string);
+    let told = told.unwrap_or_default();
+    face.object(STATION, &ObjectId::ObjectsFolder.into(), name)
+        .map_err(failed)?;
+    let shown = face.property(STATION, "Place", &told).map_err(failed)?;
+    let by = face.property(STATION, "Supervisor", "").map_err(failed)?;
+    let (server, board) = (face.server.clone(), Arc::clone(board));
+    let handler = method(move |request: MethodRequest| {
+        let invalid = Refusal::Status(StatusCode::BadInvalidArgument);
+        let told = Told::read(&request.arguments).ok_or_else(|| invalid.clone())?;
+        let new: Place = told.place.parse().map_err(|_| invalid)?;
+        info!(place = %new, supervisor = told.supervisor_uri, "configured from above");
+        server.show(&shown, told.place.as_str())?;
+        server.show(&by, told.supervisor_uri.as_str())?;
+        board.place(Some(told.place));
+        place.send_replace(Some(new));
+        Ok(Vec::new())
+    });
+    let path = format!("{STATION}/{}", configure::CONFIGURE);
+    let spec = MethodSpec {
+        node_id: id(&path),
+        browse_name: QualifiedName::new(1, configure::CONFIGURE),
+        object: id(STATION),
+        arguments: (id(&format!("{path}.in")), id(&format!("{path}.out"))),
+        takes: configure::takes(),
+        gives: Vec::new(),
+    };
+    face.server.add_method(spec, handler).map_err(failed)
+}
+
+/// Tells of each face on its own level alone.
+fn tell(
+    settings: &StationSettings,
+    upper: &Upper,
+    uri: &str,
+    (above, below): (&Face, &Face),
+) -> Result<Vec<Announced>, Failure> {
+    let faces = [(above, &upper.interface), (below, &settings.lds.interface)];
+    let told = faces.map(|(face, interface)| {
+        let how = AnnounceSettings {
+            lds: None,
+            mdns: Some(interface.clone()),
+            ..AnnounceSettings::default()
+        };
+        announce(server(&settings.name, uri, face), how)
+    });
+    told.into_iter().collect::<Result<_, _>>().map_err(no_mdns)
+}
+
+fn server(name: &str, uri: &str, face: &Face) -> Server {
+    Server {
+        application_uri: uri.to_owned(),
+        product_uri: "urn:ua-bridge:plant".to_owned(),
+        name: name.to_owned(),
+        url: face.server.url().to_owned(),
+        capabilities: vec!["NA".to_owned()],
+    }
+}
+
+fn no_mdns(fault: MdnsFault) -> Failure {
+    Failure::new(FailureKind::Unavailable, fault.to_string())
+}
+
+/// Registers the face above with the discovery server that is chosen there, whenever that is another.
+fn register(
+    settings: &StationSettings,
+    upper: &Upper,
+    face: &Face,
+    client: &ClientConfig,
+    board: Arc<Board>,
+) -> Result<(mpsc::Sender<()>, tokio::task::JoinHandle<()>), Failure> {
+    let marks = Arc::new(Sessions(client.clone()));
+    let chosen = find_lds(upper.discovery.clone(), &upper.interface, Some(marks));
+    let mut chosen = chosen.map_err(no_mdns)?;
+    let server = server(&settings.name, face.server.application_uri(), face);
+    let pki = settings.lds.pki.clone();
+    let (stop, mut stopped) = mpsc::channel::<()>(1);
+    let task = tokio::spawn(async move {
+        loop {
+            let lds = chosen.borrow_and_update().clone();
+            board.discovery_above(lds.clone());
+            let how = AnnounceSettings {
+                lds: lds.clone(),
+                // It announces itself.
+                mdns: None,
+                pki: pki.clone(),
+                ..AnnounceSettings::default()
+            };
+            let registered = lds.and_then(|_| announce(server.clone(), how).ok());
+            let changed = tokio::select! {
+                changed = chosen.changed() => changed.is_ok(),
+                _ = stopped.recv() => false,
+            };
+            if !changed && !stopped.is_closed() {
+                // Where it is was said once for all.
+                stopped.recv().await;
+            }
+            if let Some(registered) = registered {
+                registered.leave().await;
+            }
+            if !changed {
+                return;
+            }
+        }
+    });
+    Ok((stop, task))
+}
+
+/// Tends whoever is announced on the level above.
+fn follow(upper: &Upper, tending: Tending) -> Result<Abort, Failure> {
+    let settings = WatchSettings {
+        mdns: Some(upper.interface.clone()),
+        ..WatchSettings::default()
+    };
+    let watcher = watch_level(settings).map_err(no_mdns)?;
+    Ok(Abort(
+        tokio::spawn(tend_above(watcher, tending)).abort_handle(),
+    ))
+}
+
+async fn tend_above(mut watcher: Watcher, tending: Tending) {
+    let mut tended = Tended::new(tending);
+    while let Some(found) = watcher.next().await {
+        match found {
+            Found::Seen(known) if !known.is_lds() => tended.told(&known.name, &known.url),
+            Found::Seen(_) | Found::Restarted(_) => {}
+            Found::Gone { known, .. } => tended.left(&known.name),
+        }
+    }
+}
+
+async fn tend_below(mut events: mpsc::Receiver<OnLevel>, tending: Tending) {
+    let mut tended = Tended::new(tending);
+    while let Some(event) = events.recv().await {
+        match event {
+            OnLevel::Told { source, url } => tended.told(&source, &url),
+            OnLevel::Left { source } => tended.left(&source),
+            // Its client sees that for itself.
+            OnLevel::Restarted { .. } => {}
+        }
+    }
+}
+
+/// Who is tended on one level.
+struct Tended {
+    tending: Arc<Tending>,
+    roster: Roster,
+    tasks: BTreeMap<String, Abort>,
+}
+
+impl Tended {
+    fn new(tending: Tending) -> Self {
+        Self {
+            tending: Arc::new(tending),
+            roster: Roster::new(MOST_TENDED),
+            tasks: BTreeMap::new(),
+        }
+    }
+
+    fn told(&mut self, source: &str, url: &str) {
+        let changes = self.roster.put(source, url);
+        self.take(changes);
+    }
+
+    fn left(&mut self, source: &str) {
+        let changes = self.roster.remove(source);
+        self.take(changes);
+    }
+
+    fn take(&mut self, changes: Vec<Change>) {
+        for change in changes {
+            match change {
+                Change::Joined(url) => {
+                    let task = tokio::spawn(Arc::clone(&self.tending).tend(url.clone()));
+                    self.tasks.insert(url, Abort(task.abort_handle()));
+                }
+                Change::Left(url) => {
+                    self.tasks.remove(&url);
+                    self.tending.leave(&url);
+                }
+            }
+        }
+        if self.tasks.len() >= MOST_TENDED {
+            warn!("{MOST_TENDED} servers are tended on a level, and there is no room for more");
+        }
+    }
+}
+
+/// The path of the station's own object.
+const STATION: &str = "Station";
+const MOST_EVENTS: usize = 1024;
+const MOST_TENDED: usize = 256;
+const LEAVE_LIMIT: Duration = Duration::from_secs(1);

@@ -1,0 +1,80 @@
+"""A device by asyncua: a server with a method Add and one to be configured by, registered with the discovery server of its
+level. It says each place that it is told."""
+
+import argparse
+import asyncio
+
+from asyncua import Client, Server, ua, uamethod
+
+import lifetime
+
+
+@uamethod
+def add(parent, a, b):
+    return a + b
+
+
+@uamethod
+def configure(parent, place, supervisor, discovery):
+    lifetime.say(place=place, supervisor=supervisor, discovery=discovery)
+
+
+def argument(name, kind):
+    one = ua.Argument()
+    one.Name = name
+    one.DataType = ua.NodeId(kind)
+    one.ValueRank = -1
+    return one
+
+
+async def register(args):
+    server = ua.RegisteredServer()
+    server.ServerUri = args.uri
+    server.DiscoveryUrls = [args.endpoint]
+    server.ServerType = ua.ApplicationType.Server
+    server.ServerNames = [ua.LocalizedText(args.name)]
+    server.IsOnline = True
+    client = Client(args.lds, timeout=2)
+    while True:
+        try:
+            await client.connect_sessionless()
+            await client.uaclient.register_server(server)
+            break
+        except (ua.UaError, OSError, asyncio.TimeoutError):
+            await asyncio.sleep(0.1)
+    await client.disconnect_sessionless()
+
+
+async def run(args):
+    server = Server()
+    await server.init()
+    await server.set_application_uri(args.uri)
+    server.name = args.name
+    server.set_endpoint(args.endpoint)
+    server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    space = await server.register_namespace(args.uri)
+    device = await server.nodes.objects.add_object(space, "device")
+    double, text = ua.ObjectIds.Double, ua.ObjectIds.String
+    await device.add_method(space, "Add", add, [argument("a", double), argument("b", double)], [argument("sum", double)])
+    told = [argument(name, text) for name in ["Place", "SupervisorUri", "DiscoveryUrl"]]
+    await device.add_method(space, "Configure", configure, told, [])
+    await device.add_method(space, "Follow", add, [argument("node", ua.ObjectIds.NodeId)], [])
+    async with server:
+        await register(args)
+        lifetime.say(ready=True)
+        await asyncio.Event().wait()
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("endpoint")
+    parser.add_argument("lds")
+    parser.add_argument("name")
+    parser.add_argument("uri")
+    parser.add_argument("--limit", type=float, default=120.0)
+    args = parser.parse_args()
+    lifetime.bound(args.limit)
+    asyncio.run(run(args))
+
+
+main()

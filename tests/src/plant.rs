@@ -1,0 +1,84 @@
+//! Several hosts on several networks: a plant with its levels.
+
+use std::path::PathBuf;
+
+use crate::Cell;
+use crate::host::Namespace;
+
+/// A host with no network but those it is plugged into, and its own loopback.
+pub struct Site(Namespace);
+
+/// A network of level 2: a bridge.
+pub struct Segment(Namespace);
+
+impl Cell {
+    /// A host.
+    #[must_use]
+    pub fn site(&self) -> Site {
+        Site(Namespace::fresh())
+    }
+
+    /// A network without hosts.
+    #[must_use]
+    pub fn segment(&self) -> Segment {
+        let segment = Namespace::fresh();
+        segment.ip(&[
+            "link",
+            "add",
+            BRIDGE,
+            "type",
+            "bridge",
+            "mcast_snooping",
+            "0",
+        ]);
+        segment.ip(&["link", "set", BRIDGE, "up"]);
+        Segment(segment)
+    }
+}
+
+impl Segment {
+    /// Gives a host an interface here, with an address of a network of 24 bits.
+    ///
+    /// # Panics
+    /// When it has one of that name.
+    pub fn plug(&self, site: &Site, interface: &str, address: &str) {
+        let Self(here) = self;
+        // Names are at most 15 letters, and have to differ here.
+        let end = format!("p{}", address.replace('.', "-"));
+        let path = site.path();
+        let path = path.to_string_lossy();
+        here.ip(&[
+            "link", "add", &end, "type", "veth", "peer", "name", interface, "netns", &path,
+        ]);
+        here.ip(&["link", "set", &end, "master", BRIDGE, "up"]);
+        let address = format!("{address}/24");
+        for args in [
+            &["address", "add", &address, "dev", interface][..],
+            &["link", "set", interface, "multicast", "on", "up"],
+        ] {
+            site.0.ip(args);
+        }
+    }
+
+    /// Pulls the cable of the host with an address, and takes the interface away.
+    ///
+    /// # Panics
+    /// When nobody is plugged in there.
+    pub fn pull(&self, address: &str) {
+        let end = format!("p{}", address.replace('.', "-"));
+        self.0.ip(&["link", "delete", &end]);
+    }
+}
+
+impl Site {
+    pub(crate) fn path(&self) -> PathBuf {
+        self.0.path()
+    }
+
+    /// Does something there.
+    pub fn within<T: Send>(&self, what: impl FnOnce() -> T + Send) -> T {
+        self.0.within(what)
+    }
+}
+
+const BRIDGE: &str = "bridge0";

@@ -1,0 +1,300 @@
+//! A plant of two levels: a cell, two workstations, two devices each. Each level is a network of its own.
+
+use std::collections::BTreeSet;
+use std::net::{Ipv4Addr, UdpSocket};
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::Signal;
+use serde_json::{Value, json};
+use system_tests::{
+    Capture, Cell, Child, Peer, Segment, Site, Started, eventually, metrics, program,
+};
+
+use super::{MDNS, SOON, STATUS, list};
+
+/// The level of the cell, and that of each workstation.
+const BUS: &str = "10.80.0";
+const INSIDE: [&str; 2] = ["10.81.0", "10.82.0"];
+
+struct Plant {
+    /// A network lasts as long as this.
+    _bus: Segment,
+    /// Of each workstation: the network, the host of the station, those of its devices.
+    stations: [(Segment, Site, [Site; 2]); 2],
+    cell: Site,
+    /// Hears all that is multicast on the bus and in each workstation.
+    ears: [(Site, UdpSocket); 3],
+}
+
+fn plant(cell: &Cell) -> Plant {
+    let bus = cell.segment();
+    let top = cell.site();
+    bus.plug(&top, "bus0", &format!("{BUS}.1"));
+    let stations = [0, 1].map(|at| {
+        let (inside, site) = (cell.segment(), cell.site());
+        bus.plug(&site, "upper0", &format!("{BUS}.{}", 11 + at));
+        inside.plug(&site, "lower0", &format!("{}.1", INSIDE[at]));
+        let devices = [21, 22].map(|last| {
+            let device = cell.site();
+            inside.plug(&device, "dev0", &format!("{}.{last}", INSIDE[at]));
+            device
+        });
+        (inside, site, devices)
+    });
+    let ear = |segment: &Segment, network: &str| {
+        let site = cell.site();
+        let address = format!("{network}.99");
+        segment.plug(&site, "ear0", &address);
+        let socket = site.within(|| {
+            let socket = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, MDNS.port())).unwrap();
+            let address: Ipv4Addr = address.parse().unwrap();
+            socket.join_multicast_v4(MDNS.ip(), &address).unwrap();
+            socket
+        });
+        socket.set_nonblocking(true).unwrap();
+        (site, socket)
+    };
+    let ears = [
+        ear(&bus, BUS),
+        ear(&stations[0].0, INSIDE[0]),
+        ear(&stations[1].0, INSIDE[1]),
+    ];
+    Plant {
+        _bus: bus,
+        stations,
+        cell: top,
+        ears,
+    }
+}
+
+fn top(plant: &Plant) -> Child {
+    let endpoint = format!("opc.tcp://{BUS}.1:4840");
+    let args = [
+        "--name",
+        "cell",
+        "--place",
+        "plant/cell-1",
+        "--interface",
+        "bus0",
+    ];
+    Started::new("cell", &program("ua-station"))
+        .args(args)
+        .args([
+            "--endpoint",
+            &endpoint,
+            "--allow-unsecured",
+            "--metrics",
+            STATUS,
+        ])
+        .at(&plant.cell)
+        .start()
+}
+
+fn station(plant: &Plant, at: usize, more: &[&str]) -> Child {
+    let name = ["station-a", "station-b"][at];
+    let endpoint = format!("opc.tcp://{}.1:4840", INSIDE[at]);
+    Started::new(name, &program("ua-station"))
+        .args([
+            "--name",
+            name,
+            "--endpoint",
+            &endpoint,
+            "--interface",
+            "lower0",
+        ])
+        .args(["--upper-interface", "upper0", "--allow-unsecured"])
+        .args(["--metrics", STATUS])
+        .args(more)
+        .at(&plant.stations[at].1)
+        .start()
+}
+
+/// A gripper of ours, which looks for the discovery server of its level.
+fn gripper(plant: &Plant, at: usize) -> Child {
+    let example = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../examples/plant/parallel-gripper.yaml");
+    let endpoint = format!("opc.tcp://{}.21:0", INSIDE[at]);
+    Started::new("ua-component", &program("ua-component"))
+        .args([&example])
+        .args([
+            "--endpoint",
+            &endpoint,
+            "--lds",
+            "any",
+            "--interface",
+            "dev0",
+        ])
+        .at(&plant.stations[at].2[0])
+        .start()
+}
+
+/// A device of asyncua, which is told where the discovery server is.
+fn device(cell: &Cell, plant: &Plant, at: usize) -> Child {
+    let endpoint = format!("opc.tcp://{}.22:4850/", INSIDE[at]);
+    let lds = format!("opc.tcp://{}.1:4840", INSIDE[at]);
+    let name = ["adder-a", "adder-b"][at];
+    let args = [&*endpoint, &lds, name, &format!("urn:asyncua:{name}")];
+    cell.asyncua_started("opcua_device.py", &args)
+        .at(&plant.stations[at].2[1])
+        .start()
+}
+
+/// What a station knows.
+fn status(site: &Site) -> Option<Value> {
+    site.within(|| metrics(STATUS))
+}
+
+fn below(site: &Site, name: &str) -> Option<Value> {
+    shown(site, "below", name)
+}
+
+fn shown(site: &Site, level: &str, name: &str) -> Option<Value> {
+    let status = status(site)?;
+    let peers = status["level"][level].as_array()?;
+    let of = |one: &&Value| one["server"]["name"] == name;
+    peers.iter().find(of).map(|one| one["server"].clone())
+}
+
+fn place(site: &Site, name: &str) -> Option<String> {
+    below(site, name)?["place"].as_str().map(str::to_owned)
+}
+
+/// The answer of asyncua, run at a site, that calls a method.
+fn call(cell: &Cell, site: &Site, url: &str, path: &str, value: &str) -> Value {
+    let args = [url, path, "--value", value];
+    let mut asked = cell
+        .asyncua_started("opcua_call.py", &args)
+        .at(site)
+        .start();
+    assert!(asked.wait_for_end(SOON * 3).success());
+    asked.json_lines().pop().unwrap()
+}
+
+/// Addresses in the records of mDNS that an ear has heard.
+fn told(cell: &Cell, (_, ear): &(Site, UdpSocket)) -> BTreeSet<String> {
+    let mut packets = Vec::new();
+    let mut buffer = [0; 9000];
+    while let Ok(length) = ear.recv(&mut buffer) {
+        packets.push(buffer[..length].to_vec());
+    }
+    assert!(!packets.is_empty());
+    let lines = cell.fields(&Capture::of(packets).to_port(MDNS.port()), &["dns.a"]);
+    let addresses = lines.iter().flat_map(|line| line.split(','));
+    addresses
+        .filter(|address| !address.is_empty())
+        .map(str::to_owned)
+        .collect()
+}
+
+/// The configuration phase: from the top down, whoever comes first.
+fn are_configured(plant: &Plant, adders: &mut [Child; 2]) {
+    let [a, b] = [0, 1].map(|at| &plant.stations[at].1);
+    for (at, site) in [a, b].into_iter().enumerate() {
+        let name = ["station-a", "station-b"][at];
+        let wanted = format!("plant/cell-1/{name}/parallel-gripper");
+        eventually("the gripper is configured", SOON * 2, || {
+            (place(site, "parallel-gripper")? == wanted).then_some(())
+        });
+        let adder = ["adder-a", "adder-b"][at];
+        let wanted = format!("plant/cell-1/{name}/{adder}");
+        let line = adders[at].wait_for_json("its place", SOON, |line| {
+            (line["place"] == wanted).then(|| line.clone())
+        });
+        assert_eq!(
+            line["discovery"],
+            format!("opc.tcp://{}.1:4840", INSIDE[at])
+        );
+        let lines = eventually("it is registered above", SOON, || {
+            let registered = status(&plant.cell)?["servers"].clone();
+            let urls = registered
+                .as_array()?
+                .iter()
+                .map(|one| one["urls"][0].clone());
+            let urls: Vec<Value> = urls.collect();
+            let wanted = format!("opc.tcp://{BUS}.{}:", 11 + at);
+            let starts = |url: &Value| url.as_str().is_some_and(|url| url.starts_with(&wanted));
+            urls.iter().any(starts).then_some(urls)
+        });
+        assert!(lines.iter().all(|url| url.as_str().unwrap().contains(BUS)));
+    }
+}
+
+#[test]
+fn a_device_calls_a_device_of_another_workstation_and_no_level_sees_another() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::Tshark]) else {
+        return;
+    };
+    let plant = plant(&cell);
+    let _top = top(&plant);
+    let _stations = [0, 1].map(|at| station(&plant, at, &["--upper-lds", "uri=urn:*"]));
+    let _grippers = [0, 1].map(|at| gripper(&plant, at));
+    let mut adders = [0, 1].map(|at| device(&cell, &plant, at));
+    are_configured(&plant, &mut adders);
+    let [a, b] = [0, 1].map(|at| &plant.stations[at].1);
+    eventually("each sees the other's devices", SOON, || {
+        let seen = |site: &Site, other| shown(site, "above", other)?["methods"].as_u64();
+        let [on_a, on_b] = [seen(a, "station-b")?, seen(b, "station-a")?];
+        (on_a > 10 && on_b > 10).then_some(())
+    });
+    // A device on A asks the discovery server of its own level, finds B's server there, and calls its method.
+    let device_on_a = &plant.stations[0].2[1];
+    let lds = format!("opc.tcp://{}.1:4840", INSIDE[0]);
+    let found = cell.asyncua_started("opcua_discovery.py", &["find", &lds]);
+    let mut found = found.at(device_on_a).start();
+    assert!(found.wait_for_end(SOON * 3).success());
+    let lines = found.json_lines();
+    let other = list(&lines, "registered")
+        .iter()
+        .find(|one| one["name"] == "station-b");
+    let other = other.unwrap_or_else(|| panic!("no station-b in {lines:?}"));
+    assert!(
+        other["gateway"]
+            .as_str()
+            .unwrap()
+            .ends_with(":ua-station:station-a"),
+        "{other}"
+    );
+    let said = json!(lines).to_string();
+    assert!(!said.contains(BUS) && !said.contains(INSIDE[1]), "{said}");
+    let url = other["urls"][0].as_str().unwrap();
+    let path = "Neighbours/station-b/Devices/adder-b/device/Add";
+    let sum = call(&cell, device_on_a, url, path, "[2.5, 4.0]");
+    assert_eq!(
+        sum,
+        json!({"status": "Good", "arguments": [], "value": [6.5]})
+    );
+    let wrong = call(&cell, device_on_a, url, path, r#"[{"String": "x"}, 4.0]"#);
+    assert_eq!(wrong["status"], "BadInvalidArgument", "{wrong}");
+    // What means something at that server alone is not passed on, and says so.
+    assert_eq!(below(b, "adder-b").unwrap()["methods_kept_back"], 1);
+    let networks = [BUS, INSIDE[0], INSIDE[1]];
+    for (ear, network) in plant.ears.iter().zip(networks) {
+        let addresses = told(&cell, ear);
+        let of_it = |address: &String| address.starts_with(network);
+        assert!(
+            !addresses.is_empty() && addresses.iter().all(of_it),
+            "{network}: {addresses:?}"
+        );
+    }
+    // A device that is killed is missed where its methods were, and one that is back is there again.
+    adders[1].signal(Signal::SIGKILL);
+    let before = Instant::now();
+    eventually("it is missed below", SOON, || {
+        below(b, "adder-b").is_none().then_some(())
+    });
+    assert!(
+        before.elapsed() < Duration::from_secs(3),
+        "{:?}",
+        before.elapsed()
+    );
+    eventually("and through both stations", SOON, || {
+        let args = [url, path, "--wait", "0", "--value", "[1.0, 1.0]"];
+        let mut asked = cell
+            .asyncua_started("opcua_call.py", &args)
+            .at(device_on_a)
+            .start();
+        assert!(asked.wait_for_end(SOON * 3).success());
+        let answer = asked.json_lines().pop()?;
+        (answer["status"] == "BadNodeIdUnknown" || answer.get("missing").is_some()).then_some(())
+    });
+}
