@@ -216,6 +216,14 @@ fn the_mes_knows_no_devices() {
 }
 
 #[test]
+fn a_station_knows_neither_skills_nor_rdf_nor_the_space() {
+    does_not_reach(
+        "ua-station",
+        &["skills", "devices", "knowledge", "oxigraph", "transport"],
+    );
+}
+
+#[test]
 fn discovery_knows_neither_skills_nor_rdf() {
     does_not_reach(
         "discovery",
@@ -241,7 +249,7 @@ fn knowledge_has_no_sessions_of_opc_ua() {
 
 #[test]
 fn no_program_of_the_plant_knows_a_ros_library() {
-    for program in ["ua-component", "ua-mes"] {
+    for program in ["ua-component", "ua-mes", "ua-station"] {
         does_not_reach(program, &["tcpros", "rosrust*", "ros2-client", "rustdds"]);
     }
 }

@@ -11,7 +11,7 @@ use crate::{
 };
 
 /// Packages, and the program of each that is handed out.
-const PROGRAMS: [(&str, &str); 7] = [
+const PROGRAMS: [(&str, &str); 8] = [
     ("bridge-ros1", "bridge-ros1"),
     ("bridge-ros2", "bridge-ros2"),
     ("discovery", "ua-lds"),
@@ -19,6 +19,7 @@ const PROGRAMS: [(&str, &str); 7] = [
     ("ua-mes", "ua-mes"),
     ("ua-server", "ua-server"),
     ("ua-space", "ua-space"),
+    ("ua-station", "ua-station"),
 ];
 
 /// Builds the programs with optimisation and puts them into `target/dist`.

@@ -36,8 +36,9 @@ struct UaComponent {
     /// Where clients connect, as opc.tcp://127.0.0.1:0, in place of what the YAML says
     #[arg(long, value_name = "URL", env = "UA_ENDPOINT")]
     endpoint: Option<String>,
-    /// The local discovery server it registers with, or `none`, in place of what the YAML says
-    #[arg(long, value_name = "URL", env = "UA_LDS")]
+    /// The discovery server it registers with, in place of what the YAML says: its URL; one that is heard of on --interface,
+    /// as `any` (the only one there), uri=<ApplicationUri> or name=<mDNS name> (both may end with *); or `none`
+    #[arg(long, value_name = "URL|CHOICE", env = "UA_LDS")]
     lds: Option<String>,
     /// The certificate store: own, private, trusted and rejected under one directory
     #[arg(long, value_name = "DIR", env = "UA_PKI")]
