@@ -16,7 +16,8 @@ ros1_md5.txt    name and md5 of each ROS 1 type: rosbags' store ROS1_NOETIC
 ros1_services.txt name and md5 of each service of those packages, of roscpp/Logger, and of the messages genaction made
                 of two actions: the classes genpy made
 ros1_actions.txt name and md5 of each message genaction made of the actions of actionlib and move_base_msgs: the classes
-                genpy made; and those genpy makes of the Fibonacci of other packages here
+                genpy made; and those genpy makes of the Fibonacci of other packages and
+                of the actions of ua_msgs here
 ros2_fields.txt name and fields of each ROS 2 type: rosbags' store ROS2_JAZZY
 ros2_type_hashes.txt for each of rosbags' stores from Humble to Lyrical a line `# store`, then type hash, name and fields of
                 each type that the store before has not or has otherwise
@@ -159,6 +160,9 @@ def actions():
         script = pathlib.Path(__file__).resolve().parent / "genmsg_md5.py"
         made = subprocess.run([sys.executable, script, root], capture_output=True, text=True, check=True)
         table += made.stdout.splitlines()
+    ua_msgs = script.parents[3] / "ros/ua_msgs"
+    made = subprocess.run([sys.executable, script, ua_msgs], capture_output=True, text=True, check=True)
+    table += made.stdout.splitlines()
     with open("ros1_actions.txt", "w") as out:
         out.write("\n".join(sorted(table)) + "\n")
 
