@@ -66,8 +66,11 @@ pub(crate) struct Mdns {
     packet: Vec<u8>,
     /// Goodbyes that have not been told of yet.
     left: Vec<String>,
-    /// Instances that are there: a new one has not heard of ours.
-    there: BTreeMap<String, ()>,
+    /// Instances that are there, as they were heard last: a new one has not heard of ours.
+    there: BTreeMap<String, (Announcement, Option<i64>)>,
+    /// What a goodbye was heard of that the daemon has not taken yet, and when it must have. A goodbye may be that of another
+    /// host to a name that two had, or the server is back at once: what stays in the daemon's cache is told by nobody.
+    doubted: BTreeMap<String, (Announcement, Option<i64>, Instant)>,
     ignored: u64,
 }
 
@@ -108,6 +111,7 @@ impl Mdns {
             packet: vec![0; PACKET],
             left: Vec::new(),
             there: BTreeMap::new(),
+            doubted: BTreeMap::new(),
             ignored: 0,
         })
     }
@@ -163,11 +167,21 @@ impl Mdns {
     pub(crate) async fn next(&mut self) -> Heard {
         loop {
             while let Some(instance) = self.left.pop() {
-                if !self.ours.contains_key(&instance) && self.there.remove(&instance).is_some() {
+                if !self.ours.contains_key(&instance)
+                    && let Some((announcement, start_time)) = self.there.remove(&instance)
+                {
+                    let until = Instant::now() + DOUBT;
+                    self.doubted
+                        .insert(instance.clone(), (announcement, start_time, until));
                     return Heard::Withdrawn { instance };
                 }
             }
+            if let Some(heard) = self.still_there() {
+                return heard;
+            }
             let announce_at = self.announce_at;
+            let doubted = self.doubted.values().map(|(_, _, until)| *until).min();
+            let wake_at = doubted.map_or(announce_at, |until| until.min(announce_at));
             let Self {
                 goodbyes,
                 packet,
@@ -186,8 +200,10 @@ impl Mdns {
                     self.take_goodbyes(heard);
                     continue;
                 }
-                () = sleep_until(announce_at) => {
-                    self.announce_again();
+                () = sleep_until(wake_at) => {
+                    if Instant::now() >= announce_at {
+                        self.announce_again();
+                    }
                     continue;
                 }
             };
@@ -200,6 +216,23 @@ impl Mdns {
                 Err(_closed) => self.browse_again().await,
             }
         }
+    }
+
+    /// A server to which a goodbye was heard and that the daemon has kept for longer than it keeps one that left.
+    fn still_there(&mut self) -> Option<Heard> {
+        let now = Instant::now();
+        let mut due = self
+            .doubted
+            .iter()
+            .filter(|(_, (_, _, until))| *until <= now);
+        let instance = due.next()?.0.clone();
+        let (announcement, start_time, _) = self.doubted.remove(&instance)?;
+        self.there
+            .insert(instance, (announcement.clone(), start_time));
+        Some(Heard::Announced {
+            announcement,
+            start_time,
+        })
     }
 
     fn take_goodbyes(&mut self, heard: std::io::Result<usize>) {
@@ -287,12 +320,13 @@ impl Mdns {
                         false => self.conflict(&announcement.instance, theirs),
                     };
                 }
-                if self.there.len() < MOST
-                    && self
-                        .there
-                        .insert(announcement.instance.clone(), ())
-                        .is_none()
-                {
+                self.doubted.remove(&announcement.instance);
+                let is_known = self.there.contains_key(&announcement.instance);
+                if is_known || self.there.len() < MOST {
+                    let heard = (announcement.clone(), start_time);
+                    self.there.insert(announcement.instance.clone(), heard);
+                }
+                if !is_known && self.there.len() < MOST {
                     // At once, but not for each of many that appear together: a record is sent once a second at most.
                     self.announce_at = self.announce_at.min(Instant::now() + SETTLE);
                 }
@@ -304,6 +338,7 @@ impl Mdns {
             ServiceEvent::ServiceRemoved(_, fullname) => {
                 let instance = instance(&fullname)?;
                 self.there.remove(&instance);
+                self.doubted.remove(&instance);
                 // Ours is announced still: the goodbye is of another of that name.
                 (!self.ours.contains_key(&instance)).then_some(Heard::Withdrawn { instance })
             }
@@ -356,9 +391,15 @@ impl Mdns {
         };
         let first = addresses.first()?;
         // Of its own: the goodbye of one server takes the host's address away from all that share the name. And no other
-        // program of this host has it.
+        // program of this host has it. A server that gave way to another has a new one: the goodbye to its name before
+        // goes out twice, and an address is told once a second at most.
         let host = first.to_string().replace('.', "-");
-        let host = format!("ua-{host}-{}.local.", url.port);
+        let number = instance
+            .strip_suffix(')')
+            .and_then(|name| name.rsplit_once(" ("))
+            .and_then(|(_, number)| number.parse::<u32>().ok())
+            .map_or_else(String::new, |number| format!("-{number}"));
+        let host = format!("ua-{host}-{}{number}.local.", url.port);
         let addresses: Vec<IpAddr> = addresses.iter().copied().map(IpAddr::V4).collect();
         let path = match url.path.as_str() {
             "" => "/",
@@ -479,6 +520,8 @@ const SERVICE: &str = "_opcua-tcp._tcp.local.";
 const START: &str = "start";
 const ANNOUNCE_EVERY: Duration = Duration::from_secs(5);
 const SETTLE: Duration = Duration::from_millis(200);
+/// The daemon keeps a server that left for a second (RFC 6762, 10.1).
+const DOUBT: Duration = Duration::from_millis(2500);
 /// The largest packet of mDNS (RFC 6762, 17).
 const PACKET: usize = 9000;
 /// Instances that are kept in mind.

@@ -251,7 +251,9 @@ impl Servers {
                 return Some(url);
             }
             server.instances.remove(&instance);
-            debug_assert!(self.known.contains_key(&name), "it has other instances");
+            if name == instance {
+                self.renamed(&name);
+            }
         }
         if let Some((_, server)) = self.of_url(&url) {
             server.instances.insert(instance);
@@ -276,6 +278,26 @@ impl Servers {
         };
         self.known.insert(name, server);
         Some(url)
+    }
+
+    /// A server has lost its name to another that is called so, too: it is there under another of its names from now on.
+    fn renamed(&mut self, name: &str) {
+        let Some(mut server) = self.known.remove(name) else {
+            return;
+        };
+        let before = server.known.clone();
+        if let Some(other) = server.instances.first() {
+            server.known.name.clone_from(other);
+        }
+        let (after, asked) = (server.known.clone(), server.asked);
+        self.known.insert(after.name.clone(), server);
+        self.push(Found::Gone {
+            known: before,
+            loss: Loss::Goodbye,
+        });
+        if asked {
+            self.push(Found::Seen(after));
+        }
     }
 
     /// A server has said who it is, or has not.
@@ -429,6 +451,20 @@ mod tests {
             ["gone arm", "seen arm"],
             "the end of the one before is not passed over"
         );
+    }
+
+    #[test]
+    fn a_server_that_gave_its_name_away_is_there_under_the_one_it_took() {
+        let mut servers = Servers::default();
+        // Two have one name: what is heard of them is one that moves.
+        seen(&mut servers, robot("arm", 2));
+        seen(&mut servers, robot("arm (2)", 2));
+        assert_eq!(told(&mut servers), ["seen arm"]);
+        seen(&mut servers, robot("arm", 1));
+        assert_eq!(told(&mut servers), ["seen arm (2)", "gone arm", "seen arm"]);
+        servers.vanished("arm", Loss::Goodbye);
+        servers.vanished("arm (2)", Loss::Goodbye);
+        assert_eq!(told(&mut servers), ["gone arm", "gone arm (2)"]);
     }
 
     #[test]
