@@ -345,6 +345,7 @@ impl Speaker {
             succeeded: false,
             message: String::new(),
             results: Vec::new(),
+            trace: Vec::new(),
         });
         let [state, ..] = self.topics;
         let halted = State::Halted;

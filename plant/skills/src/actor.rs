@@ -13,7 +13,7 @@ use tokio::time::{Instant, sleep_until, timeout};
 use tracing::{debug, info, warn};
 
 use crate::authority::{Authority, Owner};
-use crate::driver::{Driver, Reins, Results, Signal, Work};
+use crate::driver::{Driver, Line, Reins, Results, Signal, Work};
 use crate::parameters::Parameters;
 use crate::refusal::{Code, Refusal};
 use crate::shown::{Diagnostic, LastCall, Observer, Outcome, Shown, Told, Transitioned};
@@ -33,8 +33,19 @@ pub(crate) enum Order {
 pub(crate) struct Call {
     pub(crate) by: Owner,
     pub(crate) method: Method,
-    pub(crate) parameters: Option<Vec<(String, Value)>>,
+    pub(crate) given: Given,
     pub(crate) reply: oneshot::Sender<Result<u32, Refusal>>,
+}
+
+/// What comes with a Start.
+#[derive(Debug, Default)]
+pub(crate) struct Given {
+    /// The parameters; `None` for those that were written before.
+    pub(crate) parameters: Option<Vec<(String, Value)>>,
+    /// How long the run may take, where that is shorter than what the skill allows.
+    pub(crate) within: Option<Duration>,
+    /// Whether a Halted skill is made ready first.
+    pub(crate) readies: bool,
 }
 
 pub(crate) struct Actor {
@@ -48,6 +59,8 @@ pub(crate) struct Actor {
     shown: watch::Sender<Arc<Shown>>,
     now: Shown,
     work: Option<Running>,
+    /// What was said of the run that goes on.
+    trace: Vec<String>,
 }
 
 /// The work of a run, until it has really ended.
@@ -55,6 +68,9 @@ struct Running {
     run: RunId,
     task: JoinHandle<Result<Results, String>>,
     reins: Reins,
+    /// How long it may take.
+    within: Option<Duration>,
+    began: Instant,
     /// When it has to be done, while it may go on.
     deadline: Option<Instant>,
     /// How long it may take from then on, while it is suspended.
@@ -104,6 +120,7 @@ impl Actor {
             shown,
             now,
             work: None,
+            trace: Vec::new(),
         };
         (actor, watched)
     }
@@ -125,7 +142,7 @@ impl Actor {
             };
             match happened {
                 Happened::Call(call) => self.obey(call).await,
-                Happened::Step(step) => self.step(step),
+                Happened::Line(line) => self.line(line),
                 Happened::Progress(done) => self.progress(done),
                 Happened::Ended(result) => self.settle(result),
                 Happened::Late => self.late().await,
@@ -147,10 +164,10 @@ impl Actor {
         let Call {
             by,
             method,
-            parameters,
+            given,
             reply,
         } = call;
-        let answer = self.call(&by, method, parameters).await;
+        let answer = self.call(&by, method, given).await;
         self.authority.settle();
         self.now.diagnostic.last_call = Some(LastCall {
             method,
@@ -169,21 +186,17 @@ impl Actor {
         let _told = reply.send(answer);
     }
 
-    async fn call(
-        &mut self,
-        by: &Owner,
-        method: Method,
-        given: Option<Vec<(String, Value)>>,
-    ) -> Result<u32, Refusal> {
+    async fn call(&mut self, by: &Owner, method: Method, given: Given) -> Result<u32, Refusal> {
         self.authority.claim(by)?;
         // Mode before capability: what cannot be suspended is refused as such only where it runs.
         let is_running = self.program.state() == State::Running;
         let is_its_capability = method == Method::Suspend && is_running;
-        if !self.program.is_executable(method) && !is_its_capability {
+        let is_made_ready = given.readies && self.program.state() == State::Halted;
+        if !self.program.is_executable(method) && !is_its_capability && !is_made_ready {
             return Err(not_now(method, self.program.state()));
         }
         match method {
-            Method::Start => self.start(by, given)?,
+            Method::Start => self.start(by, given).await?,
             Method::Halt => self.halt(&by.to_string()).await?,
             Method::Reset => self.reset(by).await?,
             Method::Suspend => {
@@ -210,27 +223,28 @@ impl Actor {
         Ok(self.now.run)
     }
 
-    fn start(&mut self, by: &Owner, given: Option<Vec<(String, Value)>>) -> Result<(), Refusal> {
-        if let Some(work) = &self.work {
+    async fn start(&mut self, by: &Owner, given: Given) -> Result<(), Refusal> {
+        let is_halted = self.program.state() == State::Halted;
+        if let Some(work) = &self.work
+            && !(is_halted && work.task.is_finished())
+        {
             return Err(still_at_work(work.run));
         }
-        let given = given.unwrap_or_else(|| lock(&self.pending).given(by));
+        let within = [given.within, self.facts.timeout]
+            .into_iter()
+            .flatten()
+            .min();
+        let given = given
+            .parameters
+            .unwrap_or_else(|| lock(&self.pending).given(by));
         let parameters = Parameters::complete(&self.facts.parameters, given)?;
         self.driver
             .check(&parameters)
             .map_err(|why| Refusal::new(Code::InvalidArgument, why))?;
         self.authority.begin(&self.facts.name)?;
-        let transition = match self.program.call(Method::Start) {
-            Ok(transition) => transition,
-            Err(refused) => {
-                self.authority.end(&self.facts.name);
-                return Err(refusal(refused));
-            }
-        };
-        let Some(run) = self.program.run() else {
-            self.authority.end(&self.facts.name);
-            return Err(not_now(Method::Start, self.program.state()));
-        };
+        let begun = self.begin(by, is_halted).await;
+        let (transition, run) = begun.inspect_err(|_| self.authority.end(&self.facts.name))?;
+        self.trace.clear();
         lock(&self.pending).kept(by, parameters.all());
         self.now.parameters = Arc::new(parameters.clone());
         self.now.run = run.number();
@@ -248,11 +262,28 @@ impl Actor {
             run,
             task: tokio::spawn(async move { driver.run(work).await }),
             reins,
-            deadline: self.facts.timeout.map(|timeout| Instant::now() + timeout),
+            within,
+            began: Instant::now(),
+            deadline: within.map(|within| Instant::now() + within),
             left: None,
             ended: None,
         });
         Ok(())
+    }
+
+    /// The transition to Running, from Halted by way of Ready.
+    async fn begin(
+        &mut self,
+        by: &Owner,
+        is_halted: bool,
+    ) -> Result<(&'static Transition, RunId), Refusal> {
+        if is_halted {
+            self.reset(by).await?;
+        }
+        let transition = self.program.call(Method::Start).map_err(refusal)?;
+        let run = self.program.run();
+        let run = run.ok_or_else(|| not_now(Method::Start, self.program.state()))?;
+        Ok((transition, run))
     }
 
     async fn halt(&mut self, by: &str) -> Result<(), Refusal> {
@@ -293,7 +324,8 @@ impl Actor {
 
     /// The run has taken longer than it may.
     async fn late(&mut self) {
-        let within = self.facts.timeout.unwrap_or_default();
+        let within = self.work.as_ref().and_then(|work| work.within);
+        let within = within.unwrap_or_default();
         match self.stop_work().await {
             Stop::Done(result) => self.settle(Ok(result)),
             Stop::Stopped | Stop::BrokenOff(_) => {
@@ -376,6 +408,7 @@ impl Actor {
                 message.clone()
             },
             results: self.in_order(result.unwrap_or_default()),
+            trace: std::mem::take(&mut self.trace),
         };
         self.keep(outcome);
         match self.program.ended(run, ending) {
@@ -389,12 +422,14 @@ impl Actor {
         let Some(run) = self.program.run() else {
             return;
         };
-        self.keep(Outcome {
+        let outcome = Outcome {
             run: run.number(),
             succeeded: false,
             message,
             results: Vec::new(),
-        });
+            trace: std::mem::take(&mut self.trace),
+        };
+        self.keep(outcome);
     }
 
     fn keep(&mut self, outcome: Outcome) {
@@ -440,6 +475,10 @@ impl Actor {
         self.now.executable = Method::ALL.map(|method| self.program.is_executable(method));
         if matches!(transition.to, State::Halted | State::Ready) {
             self.now.step.clear();
+        }
+        if matches!(transition.from, State::Running | State::Suspended)
+            && !matches!(transition.to, State::Running | State::Suspended)
+        {
             self.authority.end(&self.facts.name);
         }
         debug!(skill = self.facts.name, "{}: {message}", transition.name);
@@ -451,9 +490,21 @@ impl Actor {
         }));
     }
 
-    fn step(&mut self, step: String) {
-        self.now.step = step;
-        self.tell(Told::Step);
+    fn line(&mut self, line: Line) {
+        let text = match &line {
+            Line::Step(text) | Line::Note(text) => text,
+        };
+        if let Some(work) = &self.work
+            && self.trace.len() < MOST_TRACED
+        {
+            let text: String = text.chars().take(LONGEST_TRACED).collect();
+            let seconds = work.began.elapsed().as_secs_f64();
+            self.trace.push(format!("{seconds:.3} {text}"));
+        }
+        if let Line::Step(step) = line {
+            self.now.step = step;
+            self.tell(Told::Step);
+        }
     }
 
     fn progress(&mut self, done: f32) {
@@ -463,14 +514,14 @@ impl Actor {
 
     /// Steps that were said before the work ended.
     fn take_steps(&mut self) {
-        let mut steps = Vec::new();
+        let mut lines = Vec::new();
         if let Some(work) = &mut self.work {
-            while let Ok(step) = work.reins.steps.try_recv() {
-                steps.push(step);
+            while let Ok(line) = work.reins.steps.try_recv() {
+                lines.push(line);
             }
         }
-        for step in steps {
-            self.step(step);
+        for line in lines {
+            self.line(line);
         }
     }
 
@@ -490,7 +541,7 @@ impl Actor {
 
 enum Happened {
     Call(Call),
-    Step(String),
+    Line(Line),
     Progress(f32),
     Ended(Result<Results, String>),
     Late,
@@ -529,7 +580,7 @@ async fn happens(work: &mut Option<Running>) -> Happened {
     };
     tokio::select! {
         biased;
-        Some(step) = reins.steps.recv() => Happened::Step(step),
+        Some(line) = reins.steps.recv() => Happened::Line(line),
         ended = task => Happened::Ended(outcome_of(ended)),
         Ok(()) = reins.progress.changed() => Happened::Progress(*reins.progress.borrow_and_update()),
         () = late => Happened::Late,
@@ -582,5 +633,8 @@ fn still_at_work(run: RunId) -> Refusal {
 const TIME_TO_STOP: Duration = Duration::from_secs(1);
 /// And so long its future to be dropped after that; what blocks its thread takes longer.
 const TIME_TO_BREAK_OFF: Duration = Duration::from_millis(100);
+/// So many lines of a run are traced, of so many characters at most.
+const MOST_TRACED: usize = 256;
+const LONGEST_TRACED: usize = 240;
 /// The outcomes of so many runs can be asked for.
 const MOST_OUTCOMES: usize = 64;

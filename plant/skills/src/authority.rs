@@ -64,12 +64,23 @@ impl Authority {
     /// BadLocked when it is somebody else's.
     pub fn claim(&self, by: &Owner) -> Result<(), Refusal> {
         let mut inner = self.lock();
-        inner.lease.claim(by.clone()).map_err(|held| {
-            let text = format!("{} has the lease of this component", held.by);
-            Refusal::new(Code::Locked, text)
-        })?;
+        inner
+            .lease
+            .claim(by.clone())
+            .map_err(|held| locked(&held.by))?;
         self.show(&inner);
         Ok(())
+    }
+
+    /// Whether the lease is theirs, or nobody's.
+    ///
+    /// # Errors
+    /// BadLocked when it is somebody else's.
+    pub fn allows(&self, by: &Owner) -> Result<(), Refusal> {
+        match self.lock().lease.holder() {
+            Some(holder) if holder != by => Err(locked(holder)),
+            Some(_) | None => Ok(()),
+        }
     }
 
     /// Gives the lease back, as when a session closes. A run that goes on does so.
@@ -141,6 +152,11 @@ impl Authority {
         // Each change is whole before the lock is given back.
         self.inner.lock().unwrap_or_else(PoisonError::into_inner)
     }
+}
+
+fn locked(holder: &Owner) -> Refusal {
+    let text = format!("{holder} has the lease of this component");
+    Refusal::new(Code::Locked, text)
 }
 
 impl Default for Authority {

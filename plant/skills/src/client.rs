@@ -101,7 +101,16 @@ impl SkillClient {
             .await
     }
 
-    /// Those of a type and its subtypes.
+    /// All Programs of the server, whether or not they are skills.
+    ///
+    /// # Errors
+    /// No answer.
+    pub async fn programs(&self) -> Result<Vec<FoundSkill>, SkillFault> {
+        find::all_programs(&self.client).await
+    }
+
+    /// Those of a type and its subtypes. A type of the earlier system ([`alias`](crate::model::alias)) is the one here, and the
+    /// other way round.
     ///
     /// # Errors
     /// No answer. A server that does not know the type has none.
@@ -351,6 +360,150 @@ mod tests {
         server.stop().await;
     }
 
+    const EARLIER: &str = r#"<?xml version="1.0" encoding="utf-8"?>
+<UANodeSet xmlns="http://opcfoundation.org/UA/2011/03/UANodeSet.xsd">
+  <NamespaceUris><Uri>https://fortiss.org/UA/Device/</Uri></NamespaceUris>
+  <Models><Model ModelUri="https://fortiss.org/UA/Device/" /></Models>
+  <UAObjectType NodeId="ns=1;i=1" BrowseName="1:SkillType" IsAbstract="true">
+    <DisplayName>SkillType</DisplayName>
+    <References><Reference ReferenceType="i=45" IsForward="false">i=2391</Reference></References>
+  </UAObjectType>
+  <UAObjectType NodeId="ns=1;i=2" BrowseName="1:GraspGripperSkillType">
+    <DisplayName>GraspGripperSkillType</DisplayName>
+    <References><Reference ReferenceType="i=45" IsForward="false">ns=1;i=1</Reference></References>
+  </UAObjectType>
+  <UAObjectType NodeId="ns=1;i=3" BrowseName="1:VacuumGraspSkillType">
+    <DisplayName>VacuumGraspSkillType</DisplayName>
+    <References><Reference ReferenceType="i=45" IsForward="false">ns=1;i=2</Reference></References>
+  </UAObjectType>
+</UANodeSet>"#;
+
+    fn earlier_server() -> plant_opcua::server::Server {
+        use plant_opcua::server::{InstanceSpec, ServerBuilder, ServerConfig};
+        use plant_opcua::types::{NodeId, ObjectId, ObjectTypeId, QualifiedName};
+        let endpoint = "opc.tcp://127.0.0.1:0".parse().unwrap();
+        let config = ServerConfig::new("urn:example:earlier", "earlier", endpoint);
+        let builder = ServerBuilder::new(config).nodeset_str("earlier", EARLIER);
+        let server = builder.build().unwrap();
+        let of = server.find_type("https://fortiss.org/UA/Device/", "VacuumGraspSkillType");
+        let types = [of.unwrap(), ObjectTypeId::ProgramStateMachineType.into()];
+        for (id, (type_id, name)) in (1_u32..).zip(types.into_iter().zip(["Grasp", "Wash"])) {
+            let mut next = 1_000 * id;
+            let spec = InstanceSpec::new(
+                type_id,
+                NodeId::new(1, id),
+                QualifiedName::new(1, name),
+                ObjectId::ObjectsFolder.into(),
+            );
+            let made = server.instantiate(&spec, &mut |_| {
+                next += 1;
+                NodeId::new(1, next)
+            });
+            made.unwrap();
+        }
+        server.start();
+        server
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn skills_of_the_earlier_system_are_found_by_both_names_and_plain_programs_beside_them() {
+        let server = earlier_server();
+        let client = SkillClient::connect(server.url(), &ClientOptions::default())
+            .await
+            .unwrap();
+        let earlier = "nsu=https://fortiss.org/UA/Device/;GraspGripperSkillType";
+        let mut found = Vec::new();
+        for wanted in ["GraspSkillType", "SkillType", earlier] {
+            found = client.skills_of(&wanted.parse().unwrap()).await.unwrap();
+            assert_eq!(found.len(), 1, "{wanted}");
+        }
+        let types: Vec<&str> = found[0]
+            .types
+            .iter()
+            .map(|of| of.name.name.as_str())
+            .collect();
+        assert_eq!(
+            types,
+            [
+                "VacuumGraspSkillType",
+                "GraspGripperSkillType",
+                "SkillType",
+                "GraspSkillType",
+                "GripperSkillType",
+                "SkillType"
+            ]
+        );
+        assert!(
+            client
+                .skills_of(&of("ReleaseSkillType"))
+                .await
+                .unwrap()
+                .is_empty()
+        );
+        let all = client.programs().await.unwrap();
+        let names: Vec<&str> = all.iter().map(|found| found.name.as_str()).collect();
+        assert_eq!(names, ["Grasp", "Wash"]);
+        assert_eq!(all[1].types[0].name.name, "ProgramStateMachineType");
+        client.close().await;
+        server.stop().await;
+    }
+
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_run_begins_in_one_call_and_its_outcome_is_read_by_its_number_by_anybody() {
+        let server = serve("parallel-gripper.yaml", &[("400 ms", "30 ms")]);
+        let (first, second) = (client(&server).await, client(&server).await);
+        let found = first.skills().await.unwrap();
+        let (mine, theirs) = (first.handle(&found[0]), second.handle(&found[0]));
+        let code = |fault: SkillFault| match &fault {
+            SkillFault::Refused { status, .. } => status.clone(),
+            SkillFault::Lost(_) | SkillFault::TimedOut(_) | SkillFault::Unexpected(_) => {
+                panic!("{fault}")
+            }
+        };
+        // What is refused leaves a Halted skill Halted.
+        let force = |force: f64| vec![("Force".to_owned(), Value::from(force))];
+        let strong = mine.execute(force(1e9), None).await.unwrap_err();
+        assert_eq!(code(strong), "BadInvalidArgument");
+        assert_eq!(mine.state().await.unwrap().state, State::Halted);
+        let unknown = theirs.outcome_of(1).await.unwrap_err();
+        assert_eq!(code(unknown), "BadNotFound");
+
+        assert_eq!(mine.execute(force(7.0), None).await, Ok(1));
+        let again = mine.execute(force(8.0), None).await.unwrap_err();
+        assert_eq!(code(again), "BadInvalidState");
+        let other = theirs.execute(force(8.0), None).await.unwrap_err();
+        assert_eq!(code(other), "BadLocked");
+        first.close().await;
+        let outcome = theirs.wait(1, Duration::from_secs(5)).await.unwrap();
+        assert_eq!((outcome.run, outcome.succeeded), (1, true));
+        assert_eq!(outcome.results, [("Gripped".to_owned(), Value::from(true))]);
+        assert_eq!(outcome.trace.len(), 1);
+        assert!(outcome.trace[0].ends_with(" Close"), "{:?}", outcome.trace);
+        let taken = async {
+            loop {
+                match theirs
+                    .execute(force(8.0), Some(Duration::from_millis(5)))
+                    .await
+                {
+                    Ok(run) => return run,
+                    Err(fault) => assert_eq!(code(fault), "BadLocked"),
+                }
+                tokio::time::sleep(Duration::from_millis(10)).await;
+            }
+        };
+        let run = tokio::time::timeout(Duration::from_secs(5), taken)
+            .await
+            .unwrap();
+        let outcome = theirs.wait(run, Duration::from_secs(5)).await.unwrap();
+        assert_eq!(
+            (run, outcome.succeeded, outcome.message.as_str()),
+            (2, false, "the work was not done within 5ms")
+        );
+        assert!(theirs.outcome_of(1).await.unwrap().unwrap().succeeded);
+        second.close().await;
+        server.stop().await;
+    }
+
     #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
     async fn a_composite_runs_the_skills_of_two_servers_and_gives_their_leases_back() {
         let robot = serve(
@@ -379,6 +532,13 @@ mod tests {
                 .await
                 .unwrap();
         assert!(outcome.succeeded, "{}", outcome.message);
+        let traced = |what: &str| outcome.trace.iter().any(|line| line.ends_with(what));
+        assert!(traced(" MovePick"), "{:?}", outcome.trace);
+        assert!(
+            traced("robot.LinearMove run 1 is done"),
+            "{:?}",
+            outcome.trace
+        );
         let free = |server: &ComponentServer| server.authority().holder();
         for mut holder in [free(&robot), free(&gripper)] {
             let freed = holder.wait_for(Option::is_none);

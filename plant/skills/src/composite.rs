@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use async_trait::async_trait;
-use tracing::warn;
+use tracing::{debug, warn};
 
 use crate::driver::{Driver, Results, Work};
 use crate::parameters::Parameters;
@@ -58,6 +58,11 @@ pub trait Teller: Send + Sync {
     /// A step begins.
     async fn step(&self, step: &'static str);
 
+    /// A part of the step has come to its end.
+    async fn did(&self, what: &str) {
+        debug!("{what}");
+    }
+
     /// Ready when nothing more is to be done.
     async fn stopped(&self) {
         std::future::pending().await
@@ -68,6 +73,10 @@ pub trait Teller: Send + Sync {
 impl Teller for Work {
     async fn step(&self, step: &'static str) {
         Self::step(self, step).await;
+    }
+
+    async fn did(&self, what: &str) {
+        self.note(what).await;
     }
 
     async fn stopped(&self) {
@@ -181,7 +190,7 @@ impl PickAndPlace {
         teller: &dyn Teller,
     ) -> Result<(), Fault> {
         let fault = tokio::select! {
-            fault = run(&**skill, target, self.within) => match fault {
+            fault = run(&**skill, target, self.within, teller) => match fault {
                 Ok(()) => return Ok(()),
                 Err(Ran::Lost(why)) if target.is_some() => return Err(Fault::RobotLost(why)),
                 Err(Ran::Lost(why) | Ran::Failed(why)) => return Err(Fault::Other(why)),
@@ -210,7 +219,7 @@ impl PickAndPlace {
     ) -> Result<(), String> {
         teller.step(step).await;
         tokio::select! {
-            retreated = run(&**skill, Some(to), self.within) => retreated.map_err(|fault| match fault {
+            retreated = run(&**skill, Some(to), self.within, teller) => retreated.map_err(|fault| match fault {
                 Ran::Lost(why) | Ran::Failed(why) => why,
             }),
             () = teller.stopped() => {
@@ -228,10 +237,22 @@ enum Ran {
     Failed(String),
 }
 
-async fn run(skill: &dyn Runs, target: Option<[f64; 6]>, within: Duration) -> Result<(), Ran> {
+async fn run(
+    skill: &dyn Runs,
+    target: Option<[f64; 6]>,
+    within: Duration,
+    teller: &dyn Teller,
+) -> Result<(), Ran> {
     let parameters = target.map(|target| ("TargetPosition".to_owned(), Value::from(target)));
     let name = skill.name();
-    match skill.run(parameters.into_iter().collect(), within).await {
+    let ran = skill.run(parameters.into_iter().collect(), within).await;
+    let what = match &ran {
+        Ok(outcome) if outcome.succeeded => format!("{name} run {} is done", outcome.run),
+        Ok(outcome) => format!("{name} run {} failed: {}", outcome.run, outcome.message),
+        Err(fault) => format!("{name}: {fault}"),
+    };
+    teller.did(&what).await;
+    match ran {
         Ok(outcome) if outcome.succeeded => Ok(()),
         Ok(outcome) => Err(Ran::Failed(format!("{name} failed: {}", outcome.message))),
         Err(SkillFault::Lost(why)) => Err(Ran::Lost(lost(skill, &why))),

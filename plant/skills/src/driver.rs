@@ -30,6 +30,11 @@ pub trait Driver: Send + Sync + 'static {
         Ok(())
     }
 
+    /// The skills of other components that its work is done with, as `<endpoint> <type>`, for people to see.
+    fn uses(&self) -> Vec<String> {
+        Vec::new()
+    }
+
     /// Does the work of one run. It is told of Halt by [`Work::stopped`], and has a second to bring the machine to a stand;
     /// then the future is dropped.
     ///
@@ -44,8 +49,16 @@ pub struct Work {
     run: u32,
     parameters: Parameters,
     signal: watch::Receiver<Signal>,
-    steps: mpsc::Sender<String>,
+    steps: mpsc::Sender<Line>,
     progress: watch::Sender<f32>,
+}
+
+/// What is said of the way of a run.
+#[derive(Debug)]
+pub(crate) enum Line {
+    Step(String),
+    /// Of a part of the step, for the trace only.
+    Note(String),
 }
 
 /// The work was stopped by Halt, Reset, or the end of the program.
@@ -70,7 +83,7 @@ pub(crate) enum Signal {
 #[derive(Debug)]
 pub(crate) struct Reins {
     pub(crate) signal: watch::Sender<Signal>,
-    pub(crate) steps: mpsc::Receiver<String>,
+    pub(crate) steps: mpsc::Receiver<Line>,
     pub(crate) progress: watch::Receiver<f32>,
 }
 
@@ -108,9 +121,19 @@ impl Work {
 
     /// Says what the run is about now. Waits while too much of that is not told yet; no step is left out.
     pub async fn step(&self, step: impl Into<String>) {
+        self.say(Line::Step(step.into())).await;
+    }
+
+    /// Puts something that was done on the way into the trace of the run.
+    pub async fn note(&self, what: impl Into<String>) {
+        self.say(Line::Note(what.into())).await;
+    }
+
+    async fn say(&self, line: Line) {
         tokio::select! {
+            biased;
             // Nobody is left to be told where the skill is gone, and `stopped` says so.
-            _told = self.steps.send(step.into()) => {}
+            _told = self.steps.send(line) => {}
             () = self.stopped() => {}
         }
     }

@@ -1,5 +1,6 @@
 //! The skill types of namespace [`NAMESPACE`], out of one table.
 
+pub mod alias;
 mod nodeset;
 mod table;
 mod types;

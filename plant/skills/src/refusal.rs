@@ -17,6 +17,8 @@ pub enum Code {
     TypeMismatch,
     /// A parameter has a value that is not taken.
     InvalidArgument,
+    /// What is asked for is not known, or not any more.
+    NotFound,
     /// The component ends.
     Shutdown,
     /// Too much waits already.
@@ -34,6 +36,7 @@ impl Code {
             Self::ArgumentsMissing => "BadArgumentsMissing",
             Self::TypeMismatch => "BadTypeMismatch",
             Self::InvalidArgument => "BadInvalidArgument",
+            Self::NotFound => "BadNotFound",
             Self::Shutdown => "BadShutdown",
             Self::TooManyOperations => "BadTooManyOperations",
         }
@@ -49,6 +52,7 @@ impl Code {
             Self::ArgumentsMissing => 0x8076_0000,
             Self::TypeMismatch => 0x8074_0000,
             Self::InvalidArgument => 0x80AB_0000,
+            Self::NotFound => 0x803E_0000,
             Self::Shutdown => 0x800C_0000,
             Self::TooManyOperations => 0x8010_0000,
         }

@@ -1,7 +1,10 @@
 //! A component as an OPC UA server: its skills as instances of their types, with methods, events and parameters.
 //!
-//! Reading order: this, `place` (where it is in the plant), `types` (what a skill is, from the instance of its type), `show` (what clients see).
+//! Reading order: this, `place` (where it is in the plant), `types` (what a skill is, from the instance of its type), `show`
+//! (what clients see), `methods` (what they have it do), `lock` (the lease, as OPC 10000-100 has it).
 
+mod lock;
+mod methods;
 mod place;
 mod show;
 mod types;
@@ -9,17 +12,16 @@ mod types;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use async_trait::async_trait;
 use plant_opcua::server::{
-    EndpointUrl, IdRange, Instance, InstanceError, InstanceSpec, MethodHandler, MethodRequest,
-    Refusal as CallRefusal, Security as Policy, Server, ServerBuilder, ServerConfig, ServerError,
-    write,
+    EndpointUrl, IdRange, Instance, InstanceError, InstanceSpec, Security as Policy, Server,
+    ServerBuilder, ServerConfig, ServerError,
 };
-use plant_opcua::types::{NodeId, ObjectId, ObjectTypeId, QualifiedName, StatusCode, Variant};
-use program::Method;
+use plant_opcua::types::{NodeId, ObjectId, ObjectTypeId, QualifiedName};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
 
+use self::lock::Lock;
+use self::methods::status;
 use self::show::{Nodes, Shower};
 pub(crate) use self::types::OUTCOME;
 use crate::authority::{Authority, Owner};
@@ -27,10 +29,8 @@ use crate::component::{Component, Drivers, Security, SkillSetup};
 use crate::driver::Driver;
 use crate::model::{self, NAMESPACE};
 use crate::parameters::TypeName;
-use crate::refusal::Refusal;
 use crate::shown::Observer;
 use crate::skill::{Facts, Skill};
-use crate::variant::from_variant;
 use crate::yaml::{Code, Finding, Findings};
 
 /// What the server of a component needs beside the component.
@@ -111,14 +111,16 @@ impl ComponentServer {
             let mut all: Vec<Box<dyn Observer>> =
                 vec![Box::new(Shower::new(server.clone(), Arc::clone(&nodes)))];
             all.extend(observers(number, &facts));
-            nodes.show_at_first(&server, &facts);
+            nodes.show_at_first(&server, &facts, &driver.uses());
             let skill = Skill::spawn(facts, driver, authority.clone(), all);
-            serve(&server, &nodes, &skill);
+            methods::serve(&server, &nodes, &skill);
             served.push((skill, nodes));
         }
         let skills = served.iter().map(|(skill, _)| skill.clone()).collect();
         let mut tasks = JoinSet::new();
         tasks.spawn(free_when_closed(server.clone(), served, authority.clone()));
+        let locking = Lock::serve(&server, &authority, &root.node_id, &mut ids);
+        tasks.spawn(locking.map_err(|error| ServeFault::Space(error.to_string()))?);
         if let Some(node) = root.node("LeaseHolder") {
             tasks.spawn(show_holder(
                 server.clone(),
@@ -182,6 +184,9 @@ fn server_of(component: &Component, settings: &ServeSettings) -> Result<Server, 
         ..ServerConfig::new(&component.application_uri, &component.name, endpoint)
     };
     let mut builder = ServerBuilder::new(config).nodeset_str(NAMESPACE, &model::nodeset());
+    if !component.nodesets.iter().any(|file| lock::has_di(file)) {
+        builder = builder.nodeset_str(lock::NAMESPACE, lock::NODESET);
+    }
     for file in &component.nodesets {
         builder = builder.nodeset_file(file);
     }
@@ -319,55 +324,10 @@ fn kept(path: &str) -> Option<u32> {
         "Suspend" => 7,
         "Resume" => 8,
         "Reset" => 9,
+        "Execute" => 20,
+        "ReadOutcome" => 21,
         _ => return None,
     })
-}
-
-/// Has clients write parameters and call methods.
-fn serve(server: &Server, nodes: &Nodes, skill: &Skill) {
-    for (name, node) in nodes.parameters() {
-        let (skill, name) = (skill.clone(), name.to_owned());
-        server.on_write(
-            node,
-            write(move |request| {
-                let value = request.value.value.as_ref().and_then(from_variant);
-                let value = value.ok_or(StatusCode::BadTypeMismatch)?;
-                let by = Owner::Session(request.caller.session);
-                skill
-                    .write(&by, &name, value)
-                    .map_err(|refusal| status(&refusal))
-            }),
-        );
-    }
-    for method in Method::ALL {
-        if let Some(node) = nodes.method(method) {
-            let handler = Call {
-                skill: skill.clone(),
-                method,
-            };
-            server.on_call(nodes.skill(), node, Arc::new(handler));
-        }
-    }
-}
-
-struct Call {
-    skill: Skill,
-    method: Method,
-}
-
-#[async_trait]
-impl MethodHandler for Call {
-    async fn call(&self, request: MethodRequest) -> Result<Vec<Variant>, CallRefusal> {
-        let by = Owner::Session(request.caller.session);
-        match self.skill.call(by, self.method).await {
-            Ok(_) => Ok(Vec::new()),
-            Err(refusal) => Err(status(&refusal).into()),
-        }
-    }
-}
-
-fn status(refusal: &Refusal) -> StatusCode {
-    StatusCode::from(refusal.code.number())
 }
 
 /// A session that is gone has no lease any more, and what it wrote counts for nothing.
@@ -418,10 +378,12 @@ mod tests {
     use std::path::Path;
     use std::time::Duration;
 
-    use program::State;
+    use plant_opcua::types::Variant;
+    use program::{Method, State};
 
     use super::*;
     use crate::value::Value;
+    use crate::variant::from_variant;
 
     const EXAMPLES: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/plant");
 

@@ -46,6 +46,8 @@ pub struct Outcome {
     pub message: String,
     /// Its results, in the order of the type; where it failed, none.
     pub results: Vec<(String, Value)>,
+    /// Its steps and what was done in them, in order, each with the seconds since its beginning: `0.412 MovePick`.
+    pub trace: Vec<String>,
 }
 
 /// What ProgramDiagnostic says (OPC 10000-10, 5.2.9).

@@ -7,10 +7,10 @@ use std::time::Duration;
 use program::{Method, Rest, State};
 use tokio::sync::{mpsc, oneshot, watch};
 
-use crate::actor::{Actor, Call, Order};
+use crate::actor::{Actor, Call, Given, Order};
 use crate::authority::{Authority, Owner};
 use crate::driver::Driver;
-use crate::parameters::{Parameter, TypeName, shortened};
+use crate::parameters::{Parameter, Parameters, TypeName, shortened};
 use crate::refusal::{Code, Refusal};
 use crate::shown::{Observer, Outcome, Shown};
 use crate::value::Value;
@@ -175,9 +175,10 @@ impl Skill {
     ///
     /// # Errors
     /// In this order: BadLocked (authority), BadInvalidState (mode), BadNotSupported (capability), BadArgumentsMissing,
-    /// BadTypeMismatch or BadInvalidArgument (parameters). Nothing has changed then.
+    /// BadTypeMismatch or BadInvalidArgument (parameters), BadInvalidState while another skill of the component runs and
+    /// BadTooManyOperations (queue). Nothing has changed then.
     pub async fn call(&self, by: Owner, method: Method) -> Result<u32, Refusal> {
-        self.order(by, method, None).await
+        self.order(by, method, Given::default()).await
     }
 
     /// Begins a run with these parameters, whatever was written before.
@@ -189,7 +190,49 @@ impl Skill {
         by: Owner,
         parameters: Vec<(String, Value)>,
     ) -> Result<u32, Refusal> {
-        self.order(by, Method::Start, Some(parameters)).await
+        let given = Given {
+            parameters: Some(parameters),
+            ..Given::default()
+        };
+        self.order(by, Method::Start, given).await
+    }
+
+    /// Begins a run with these parameters in one call, a Halted skill being made ready first; the run fails when it is not
+    /// done `within` that time, or within that of the skill where that is shorter. Gives the number by which
+    /// [`outcome_of`](Self::outcome_of) is asked.
+    ///
+    /// # Errors
+    /// As [`call`](Self::call).
+    pub async fn execute(
+        &self,
+        by: Owner,
+        parameters: Vec<(String, Value)>,
+        within: Option<Duration>,
+    ) -> Result<u32, Refusal> {
+        let given = Given {
+            parameters: Some(parameters),
+            within,
+            readies: true,
+        };
+        self.order(by, Method::Start, given).await
+    }
+
+    /// How a run ended; `None` while it goes on. Run 0 is the newest one.
+    ///
+    /// # Errors
+    /// BadNotFound for a run that never was, or of which nothing is known any more.
+    pub fn outcome_of(&self, run: u32) -> Result<Option<Arc<Outcome>>, Refusal> {
+        // In this order: a run that ends meanwhile is found.
+        let newest = self.shown.borrow().run;
+        let run = if run == 0 { newest } else { run };
+        match self.outcome(run) {
+            Some(outcome) => Ok(Some(outcome)),
+            None if run == newest && run != 0 => Ok(None),
+            None => Err(Refusal::new(
+                Code::NotFound,
+                format!("nothing is known of run {run}; the newest is {newest}"),
+            )),
+        }
     }
 
     /// Ends the skill: what runs is halted, whoever has the lease. Every later call is refused.
@@ -201,29 +244,37 @@ impl Skill {
         }
     }
 
-    async fn order(
-        &self,
-        by: Owner,
-        method: Method,
-        parameters: Option<Vec<(String, Value)>>,
-    ) -> Result<u32, Refusal> {
+    async fn order(&self, by: Owner, method: Method, given: Given) -> Result<u32, Refusal> {
         let (reply, answer) = oneshot::channel();
-        let call = Call {
+        let room = match self.orders.try_reserve() {
+            Ok(room) => room,
+            Err(mpsc::error::TrySendError::Full(())) => {
+                return Err(self.no_room(&by, given.parameters));
+            }
+            Err(mpsc::error::TrySendError::Closed(())) => return Err(ends()),
+        };
+        room.send(Order::Call(Call {
             by,
             method,
-            parameters,
+            given,
             reply,
-        };
-        self.orders
-            .try_send(Order::Call(call))
-            .map_err(|error| match error {
-                mpsc::error::TrySendError::Full(_) => Refusal::new(
-                    Code::TooManyOperations,
-                    "too many calls of this skill wait already",
-                ),
-                mpsc::error::TrySendError::Closed(_) => ends(),
-            })?;
+        }));
         answer.await.unwrap_or_else(|_| Err(ends()))
+    }
+
+    /// Why a call is refused for which there is no room: what would be wrong with it at any time comes first.
+    fn no_room(&self, by: &Owner, given: Option<Vec<(String, Value)>>) -> Refusal {
+        if let Err(refusal) = self.authority.allows(by) {
+            return refusal;
+        }
+        let wrong =
+            given.and_then(|given| Parameters::complete(&self.facts.parameters, given).err());
+        wrong.unwrap_or_else(|| {
+            Refusal::new(
+                Code::TooManyOperations,
+                "too many calls of this skill wait already",
+            )
+        })
     }
 }
 

@@ -30,6 +30,50 @@ pub(crate) fn to_variant(value: &Value) -> Variant {
     }
 }
 
+/// Names and values in two arrays, as methods have them.
+pub(crate) fn to_pairs(of: &[(String, Value)]) -> [Variant; 2] {
+    let array = |value_type, values| {
+        Variant::Array(Box::new(Array {
+            value_type,
+            values,
+            dimensions: None,
+        }))
+    };
+    let names = of
+        .iter()
+        .map(|(name, _)| Variant::String(UAString::from(name.as_str())));
+    let values = of
+        .iter()
+        .map(|(_, value)| Variant::Variant(Box::new(to_variant(value))));
+    [
+        array(VariantScalarTypeId::String, names.collect()),
+        array(VariantScalarTypeId::Variant, values.collect()),
+    ]
+}
+
+/// The pairs of two arrays; none where they are not of one length, or hold what skills have no values of.
+pub(crate) fn from_pairs(names: &Variant, values: &Variant) -> Option<Vec<(String, Value)>> {
+    let elements = |of: &Variant| {
+        if let Variant::Array(array) = of {
+            return Some(array.values.clone());
+        }
+        matches!(of, Variant::Empty).then(Vec::new)
+    };
+    let (names, values) = (elements(names)?, elements(values)?);
+    if names.len() != values.len() {
+        return None;
+    }
+    let pair = |(name, value): (&Variant, &Variant)| {
+        let value = if let Variant::Variant(inner) = value {
+            from_variant(inner)
+        } else {
+            from_variant(value)
+        };
+        Some((from_variant(name)?.as_str()?.to_owned(), value?))
+    };
+    names.iter().zip(&values).map(pair).collect()
+}
+
 /// From OPC UA; none for what skills have no values of: other types, arrays of several dimensions, nothing.
 #[expect(
     clippy::wildcard_enum_match_arm,
@@ -116,5 +160,20 @@ mod tests {
         };
         assert_eq!(from_variant(&Variant::Array(Box::new(mixed))), None);
         assert_eq!(builtin_of(&NodeId::new(0, 10_u32)), Some(Builtin::Float));
+    }
+
+    #[test]
+    fn pairs_are_the_same_after_their_way_and_others_are_none() {
+        let all = vec![
+            ("Force".to_owned(), Value::from(0.5)),
+            ("Target".to_owned(), [0.5; 6].into()),
+        ];
+        let [names, values] = to_pairs(&all);
+        assert_eq!(from_pairs(&names, &values), Some(all));
+        assert_eq!(
+            from_pairs(&Variant::Empty, &Variant::Empty),
+            Some(Vec::new())
+        );
+        assert_eq!(from_pairs(&names, &Variant::Empty), None);
     }
 }

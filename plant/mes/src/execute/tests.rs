@@ -139,6 +139,7 @@ impl Runs for FakeSkill {
                 succeeded: false,
                 message: "nothing was gripped".into(),
                 results: vec![],
+                trace: vec![],
             });
         }
         Ok(Outcome {
@@ -146,6 +147,7 @@ impl Runs for FakeSkill {
             succeeded: true,
             message: String::new(),
             results: vec![],
+            trace: vec![],
         })
     }
 

@@ -266,7 +266,15 @@ pub(crate) fn fits(value: &Variant, data_type: &NodeId, rank: i32, types: &dyn T
     if !fits_rank {
         return false;
     }
-    let Some(given) = value.data_type() else {
+    let given = if let Variant::Array(array) = value
+        && array.values.is_empty()
+    {
+        // The library knows no type of an array without elements; its own says it.
+        Some(NodeId::new(0, array.value_type as u32).into())
+    } else {
+        value.data_type()
+    };
+    let Some(given) = given else {
         return false;
     };
     let Some(given) = given.try_resolve(types.namespaces()) else {

@@ -4,12 +4,12 @@ use std::collections::HashSet;
 
 use plant_opcua::client::{Browse, Client};
 use plant_opcua::types::{
-    AttributeId, EUInformation, NodeClass, NodeClassMask, NodeId, ObjectId, QualifiedName,
-    ReferenceDescription, Variant,
+    AttributeId, EUInformation, NodeClass, NodeClassMask, NodeId, ObjectId, ObjectTypeId,
+    QualifiedName, ReferenceDescription, Variant,
 };
 
 use super::lost;
-use crate::model::{NAMESPACE, SKILL_TYPE};
+use crate::model::{NAMESPACE, SKILL_TYPE, SkillType, alias};
 use crate::parameters::TypeName;
 use crate::runs::SkillFault;
 use crate::server::OUTCOME;
@@ -29,7 +29,8 @@ pub struct FoundSkill {
     pub name: String,
     /// Its node, as `nsu=<namespace uri>;i=100`.
     pub node: String,
-    /// Its type and all supertypes up to SkillType, nearest first.
+    /// Its type and all supertypes up to SkillType, nearest first. Those of the earlier system are followed by the types here
+    /// that they are; a Program that is no skill ends with ProgramStateMachineType.
     pub types: Vec<FoundType>,
     /// What a run is told.
     pub parameters: Vec<FoundParameter>,
@@ -82,63 +83,82 @@ impl Nodes {
     }
 }
 
-/// All instances of a type and its subtypes.
+/// All instances of a type and its subtypes, by the names here or those of the earlier system.
 pub(super) async fn skills(
     client: &Client,
     wanted: &TypeName,
 ) -> Result<Vec<FoundSkill>, SkillFault> {
-    let Some(root) = type_id(client, &TypeName::own(SKILL_TYPE)).await? else {
+    let wanted = known_as(wanted).unwrap_or_else(|| wanted.clone());
+    let mut roots = Vec::new();
+    let mut types = HashSet::new();
+    for of in programs(client).await? {
+        let name = of.name.as_ref();
+        let known = name.map(|name| known_as(name).unwrap_or_else(|| name.clone()));
+        if known == Some(TypeName::own(SKILL_TYPE)) {
+            roots.push(of.id.clone());
+        }
+        if known.as_ref() == Some(&wanted) && !types.contains(&of.id) {
+            types.extend(
+                client
+                    .subtypes(&of.id)
+                    .await
+                    .map_err(|error| lost(&error))?,
+            );
+        }
+    }
+    if roots.is_empty() {
         return Ok(Vec::new());
-    };
-    let all = client.subtypes(&root).await.map_err(|error| lost(&error))?;
-    let wanted = if *wanted == TypeName::own(SKILL_TYPE) {
-        Some(root.clone())
-    } else {
-        named(client, wanted, &all).await?
-    };
-    let Some(wanted) = wanted else {
-        return Ok(Vec::new());
-    };
-    let types: HashSet<NodeId> = client
-        .subtypes(&wanted)
-        .await
-        .map_err(|error| lost(&error))?
-        .into_iter()
-        .collect();
+    }
+    all(client, &types, &roots).await
+}
+
+/// All Programs, skills or not.
+pub(super) async fn all_programs(client: &Client) -> Result<Vec<FoundSkill>, SkillFault> {
+    let root: NodeId = ObjectTypeId::ProgramStateMachineType.into();
+    let types = programs(client).await?.into_iter().map(|of| of.id);
+    all(client, &types.collect(), &[root]).await
+}
+
+async fn all(
+    client: &Client,
+    types: &HashSet<NodeId>,
+    roots: &[NodeId],
+) -> Result<Vec<FoundSkill>, SkillFault> {
     let mut found = Vec::new();
-    for instance in instances(client, &types).await? {
-        found.push(read(client, &root, instance).await?);
+    if types.is_empty() {
+        return Ok(found);
+    }
+    for instance in instances(client, types).await? {
+        found.push(read(client, roots, instance).await?);
     }
     Ok(found)
 }
 
-/// SkillType, by its place in the namespace of ours.
-async fn type_id(client: &Client, of: &TypeName) -> Result<Option<NodeId>, SkillFault> {
-    let id = crate::model::find(&of.name).map(|known| known.id);
-    let (Some(namespace), Some(id)) = (client.namespace(&of.namespace), id) else {
-        return Ok(None);
-    };
-    let node = NodeId::new(namespace, id);
-    let class = client
-        .read_attributes(&[(node.clone(), AttributeId::NodeClass)])
-        .await
-        .map_err(|error| lost(&error))?;
-    let is_there = class.first().is_some_and(|class| class.value.is_some());
-    Ok(is_there.then_some(node))
+/// The type here that it is, where it has another name.
+fn known_as(name: &TypeName) -> Option<TypeName> {
+    alias::of(name).map(|known| TypeName::own(known.name))
 }
 
-/// The type of that name among these.
-async fn named(
-    client: &Client,
-    wanted: &TypeName,
-    among: &[NodeId],
-) -> Result<Option<NodeId>, SkillFault> {
-    let names = names(client, among).await?;
-    let found = among
-        .iter()
-        .zip(names)
-        .find(|(_, name)| name.as_ref() == Some(wanted));
-    Ok(found.map(|(node, _)| node.clone()))
+/// A type of Programs.
+struct ProgramType {
+    id: NodeId,
+    name: Option<TypeName>,
+}
+
+/// ProgramStateMachineType and what is below it. A server that does not know it has none.
+async fn programs(client: &Client) -> Result<Vec<ProgramType>, SkillFault> {
+    let root: NodeId = ObjectTypeId::ProgramStateMachineType.into();
+    let class = client
+        .read_attributes(&[(root.clone(), AttributeId::NodeClass)])
+        .await
+        .map_err(|error| lost(&error))?;
+    if class.first().is_none_or(|class| class.value.is_none()) {
+        return Ok(Vec::new());
+    }
+    let ids = client.subtypes(&root).await.map_err(|error| lost(&error))?;
+    let names = names(client, &ids).await?;
+    let both = ids.into_iter().zip(names);
+    Ok(both.map(|(id, name)| ProgramType { id, name }).collect())
 }
 
 async fn names(client: &Client, nodes: &[NodeId]) -> Result<Vec<Option<TypeName>>, SkillFault> {
@@ -220,7 +240,7 @@ fn order(id: &NodeId) -> (u16, u32, String) {
 
 async fn read(
     client: &Client,
-    root: &NodeId,
+    roots: &[NodeId],
     instance: Instance,
 ) -> Result<FoundSkill, SkillFault> {
     let Instance { reference, above } = instance;
@@ -272,7 +292,7 @@ async fn read(
         number: number.filter(|number| *number > 0),
         name: name_of(&reference),
         node: text_of(client, &skill),
-        types: chain(client, root, &reference.type_definition.node_id).await?,
+        types: chain(client, roots, &reference.type_definition.node_id).await?,
         parameters,
         results,
         capabilities,
@@ -304,10 +324,14 @@ async fn component(
     Ok((name.clone(), number))
 }
 
-async fn chain(client: &Client, root: &NodeId, own: &NodeId) -> Result<Vec<FoundType>, SkillFault> {
+async fn chain(
+    client: &Client,
+    roots: &[NodeId],
+    own: &NodeId,
+) -> Result<Vec<FoundType>, SkillFault> {
     let mut ids = vec![own.clone()];
     ids.extend(client.supertypes(own).await.map_err(|error| lost(&error))?);
-    if let Some(last) = ids.iter().position(|id| id == root) {
+    if let Some(last) = ids.iter().rposition(|id| roots.contains(id)) {
         ids.truncate(last + 1);
     }
     let names = names(client, &ids).await?;
@@ -317,7 +341,18 @@ async fn chain(client: &Client, root: &NodeId, own: &NodeId) -> Result<Vec<Found
             identifier: id.identifier.to_string(),
         })
     };
-    Ok(ids.iter().zip(names).filter_map(found).collect())
+    let mut types: Vec<FoundType> = ids.iter().zip(names).filter_map(found).collect();
+    // One of the earlier system is what the type here is that it is known as.
+    let known = types.iter().find_map(|of| alias::of(&of.name));
+    types.extend(known.into_iter().flat_map(SkillType::chain).map(own_type));
+    Ok(types)
+}
+
+fn own_type(of: &'static SkillType) -> FoundType {
+    FoundType {
+        name: TypeName::own(of.name),
+        identifier: format!("i={}", of.id),
+    }
 }
 
 /// The variables of a group, with what they show.
@@ -405,7 +440,7 @@ async fn value(client: &Client, node: &NodeId) -> Result<Option<Value>, SkillFau
         .and_then(from_variant))
 }
 
-fn texts(value: Option<Value>) -> Vec<String> {
+pub(super) fn texts(value: Option<Value>) -> Vec<String> {
     match value {
         Some(Value::Array(_, texts)) => texts
             .iter()

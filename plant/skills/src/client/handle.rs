@@ -12,7 +12,7 @@ use super::{called, lost, refused};
 use crate::runs::{Runs, SkillFault};
 use crate::shown::Outcome;
 use crate::value::Value;
-use crate::variant::{from_variant, to_variant};
+use crate::variant::{from_pairs, from_variant, to_pairs, to_variant};
 
 /// A skill of another component, to be run. Clones are of the same one.
 #[derive(Clone)]
@@ -94,29 +94,128 @@ impl SkillHandle {
         Ok(run.as_ref().map_or(0, number))
     }
 
+    /// Begins a run in one call, a Halted skill being made ready first: by Execute where the skill has it, else step by step.
+    /// Gives the number of the run, 0 where the skill has none.
+    ///
+    /// # Errors
+    /// A refusal, or no answer. With [`SkillFault::Lost`] nobody knows whether it has begun.
+    pub async fn execute(
+        &self,
+        parameters: Vec<(String, Value)>,
+        within: Option<Duration>,
+    ) -> Result<u32, SkillFault> {
+        let Some(node) = self.found.nodes.get("Execute") else {
+            return self.step_by_step(parameters).await;
+        };
+        let parameters = parameters
+            .into_iter()
+            .map(|(name, value)| Ok((name.clone(), self.taken(&name, value)?.1)))
+            .collect::<Result<Vec<_>, SkillFault>>()?;
+        let [names, values] = to_pairs(&parameters);
+        let timeout = within.map_or(0.0, |within| within.as_secs_f64() * 1_000.0);
+        let arguments = vec![names, values, timeout.into()];
+        let skill = &self.found.nodes.skill;
+        match self.client.call(skill, node, arguments).await {
+            Ok(outputs) => Ok(outputs.first().map_or(0, number)),
+            Err(error) => Err(called(&error, &format!("Execute of {}", self.name()))),
+        }
+    }
+
+    async fn step_by_step(&self, parameters: Vec<(String, Value)>) -> Result<u32, SkillFault> {
+        if self.state().await?.state == State::Halted {
+            let reset = self.call(Method::Reset).await;
+            // One that was given up before may have come first.
+            if reset.is_err() && self.state().await?.state != State::Ready {
+                reset?;
+            }
+        }
+        self.start(parameters).await
+    }
+
+    /// How a run ended, whoever began it; `None` while it goes on. Run 0 is the newest.
+    ///
+    /// # Errors
+    /// BadNotFound for one of which nothing is known any more, no answer, or a skill without ReadOutcome.
+    pub async fn outcome_of(&self, run: u32) -> Result<Option<Outcome>, SkillFault> {
+        let node = self.found.nodes.get("ReadOutcome");
+        let node = node.ok_or_else(|| self.unexpected("it has no ReadOutcome"))?;
+        let outputs = self
+            .client
+            .call(&self.found.nodes.skill, node, vec![run.into()])
+            .await
+            .map_err(|error| called(&error, &format!("ReadOutcome of {}", self.name())))?;
+        let [ended, succeeded, message, names, values, trace] = outputs.as_slice() else {
+            return Err(self.unexpected("its ReadOutcome says something else"));
+        };
+        if *ended != Variant::Boolean(true) {
+            return Ok(None);
+        }
+        let results = from_pairs(names, values)
+            .ok_or_else(|| self.unexpected("its results are none of a skill"))?;
+        Ok(Some(Outcome {
+            run,
+            succeeded: *succeeded == Variant::Boolean(true),
+            message: text(message),
+            results,
+            trace: super::find::texts(from_variant(trace)),
+        }))
+    }
+
+    /// Waits for the end of a run that was begun before, also by another session; while its component is away, until that is
+    /// back. A component that was started anew knows nothing of it.
+    ///
+    /// # Errors
+    /// As [`outcome_of`](Self::outcome_of), and [`SkillFault::TimedOut`]; the run is left alone.
+    pub async fn wait(&self, run: u32, within: Duration) -> Result<Outcome, SkillFault> {
+        let ended = async {
+            let mut look = tokio::time::interval(PUBLISHING);
+            look.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+            loop {
+                look.tick().await;
+                match self.outcome_of(run).await {
+                    Ok(Some(outcome)) => return Ok(outcome),
+                    Ok(None) => {}
+                    // It comes back, or it does not.
+                    Err(SkillFault::Lost(why)) => {
+                        if self.client.up(within).await.is_err() {
+                            return Err(SkillFault::Lost(why));
+                        }
+                    }
+                    Err(fault) => return Err(fault),
+                }
+            }
+        };
+        match tokio::time::timeout(within, ended).await {
+            Ok(ended) => ended,
+            Err(_) => Err(SkillFault::TimedOut(within)),
+        }
+    }
+
+    /// A parameter by its name, and the value as it has it.
+    fn taken(&self, name: &str, value: Value) -> Result<(&NodeId, Value), SkillFault> {
+        let wrong = |status: &str, text: String| SkillFault::Refused {
+            status: status.to_owned(),
+            text,
+        };
+        let declared = self.found.parameters.iter().find(|of| of.name == name);
+        let declared = declared.ok_or_else(|| {
+            let text = format!("{} has no parameter {name}", self.name());
+            wrong("BadInvalidArgument", text)
+        })?;
+        let given = value.shape();
+        let value = declared.shape.take(value).ok_or_else(|| {
+            let text = format!("{name} is {}, and {given} was given", declared.shape);
+            wrong("BadTypeMismatch", text)
+        })?;
+        Ok((&declared.id, value))
+    }
+
     async fn write(&self, parameters: Vec<(String, Value)>) -> Result<(), SkillFault> {
         let mut writes = Vec::new();
         let mut names = Vec::new();
         for (name, value) in parameters {
-            let declared = self.found.parameters.iter().find(|of| of.name == name);
-            let wrong = |status: &str, text: String| SkillFault::Refused {
-                status: status.to_owned(),
-                text,
-            };
-            let declared = declared.ok_or_else(|| {
-                wrong(
-                    "BadInvalidArgument",
-                    format!("{} has no parameter {name}", self.name()),
-                )
-            })?;
-            let given = value.shape();
-            let value = declared.shape.take(value).ok_or_else(|| {
-                wrong(
-                    "BadTypeMismatch",
-                    format!("{name} is {}, and {given} was given", declared.shape),
-                )
-            })?;
-            writes.push((declared.id.clone(), to_variant(&value)));
+            let (node, value) = self.taken(&name, value)?;
+            writes.push((node.clone(), to_variant(&value)));
             names.push(name);
         }
         if writes.is_empty() {
@@ -177,8 +276,9 @@ impl SkillHandle {
             "FinalResultData/Succeeded",
             "FinalResultData/Message",
             "FinalResultData/Run",
+            "FinalResultData/Trace",
         ];
-        let [succeeded, message, of] = self.read(paths).await?;
+        let [succeeded, message, of, trace] = self.read(paths).await?;
         if of.as_ref().is_some_and(|of| run != 0 && number(of) != run) {
             return Err(self.unexpected(&format!("its outcome is of another run than {run}")));
         }
@@ -207,6 +307,7 @@ impl SkillHandle {
             } else {
                 Vec::new()
             },
+            trace: super::find::texts(trace.as_ref().and_then(from_variant)),
         })
     }
 
@@ -247,14 +348,7 @@ impl Runs for SkillHandle {
         parameters: Vec<(String, Value)>,
         within: Duration,
     ) -> Result<Outcome, SkillFault> {
-        if self.state().await?.state == State::Halted {
-            let reset = self.call(Method::Reset).await;
-            // One that was given up before may have come first.
-            if reset.is_err() && self.state().await?.state != State::Ready {
-                reset?;
-            }
-        }
-        let run = self.start(parameters).await?;
+        let run = self.execute(parameters, None).await?;
         let ended = tokio::time::timeout(within, self.ended()).await;
         let Ok(state) = ended else {
             self.halt().await?;

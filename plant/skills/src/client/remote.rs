@@ -31,6 +31,16 @@ impl Driver for Remote {
         composite::job(parameters).map(drop)
     }
 
+    fn uses(&self) -> Vec<String> {
+        let Partners { robot, gripper, .. } = &self.partners;
+        vec![
+            format!("{robot} PtpMoveSkillType"),
+            format!("{robot} LinearMoveSkillType"),
+            format!("{gripper} GraspSkillType"),
+            format!("{gripper} ReleaseSkillType"),
+        ]
+    }
+
     async fn run(&self, work: Work) -> Result<Results, String> {
         let robot = connect(&self.partners.robot).await?;
         let done = match connect(&self.partners.gripper).await {

@@ -1,5 +1,7 @@
 //! The table as a NodeSet2 document (OPC 10000-6, annex F).
 
+mod methods;
+
 use std::fmt::Write as _;
 
 use program::{Method, Rest};
@@ -207,49 +209,7 @@ impl Nodes {
             let node = Node::new("UAMethod", parent + FIRST_METHOD + place, method.name());
             self.add(node.child_of(parent, "HasComponent", Rule::Mandatory));
         }
-        let members: [(u32, &str, Builtin, bool, bool, &str); 5] = [
-            (
-                20,
-                "1:Name",
-                Builtin::String,
-                false,
-                true,
-                "What its component calls it.",
-            ),
-            (
-                21,
-                "1:Capabilities",
-                Builtin::String,
-                true,
-                true,
-                "The IRIs of the capabilities that it provides.",
-            ),
-            (
-                22,
-                "1:RunId",
-                Builtin::UInt32,
-                false,
-                false,
-                "The number of the newest run; 0 before the first one.",
-            ),
-            (
-                23,
-                "1:Progress",
-                Builtin::Float,
-                false,
-                false,
-                "How much of the run is done, from 0 to 1.",
-            ),
-            (
-                24,
-                "1:SkillStep",
-                Builtin::String,
-                false,
-                false,
-                "What the run is about now.",
-            ),
-        ];
-        for (offset, browse_name, builtin, array, is_property, about) in members {
+        for (offset, browse_name, builtin, array, is_property, about) in MEMBERS {
             let reference = if is_property {
                 "HasProperty"
             } else {
@@ -274,6 +234,9 @@ impl Nodes {
         }
         self.ready_after_success(parent + 25, parent, true);
         self.outcome_members(parent);
+        for method in &methods::OF_A_SKILL {
+            self.method(method, parent);
+        }
     }
 
     /// Said anew by a type that differs from its supertypes.
@@ -305,11 +268,20 @@ impl Nodes {
                 "Whether the run did its work.",
             ),
             (32, "1:Message", Builtin::String, "Why it did not."),
+            (
+                33,
+                "1:Trace",
+                Builtin::String,
+                "Its steps and what was done in them, each with the seconds since its beginning.",
+            ),
         ];
         for (offset, browse_name, builtin, about) in outcome {
-            let node = Node::new("UAVariable", parent + offset, browse_name)
+            let mut node = Node::new("UAVariable", parent + offset, browse_name)
                 .about(about)
                 .attribute("DataType", builtin.name());
+            if browse_name == "1:Trace" {
+                node = node.attribute("ValueRank", "1");
+            }
             let node = node.forward("HasTypeDefinition", BASE_DATA_VARIABLE_TYPE);
             self.add(node.child_of(parent + FINAL_RESULT_DATA, "HasComponent", Rule::Mandatory));
         }
@@ -443,6 +415,58 @@ fn escaped(text: &str) -> String {
         .replace('<', "&lt;")
         .replace('>', "&gt;")
 }
+
+/// Offset, BrowseName, type, whether it is an array, whether it is a property, and what it says.
+const MEMBERS: [(u32, &str, Builtin, bool, bool, &str); 6] = [
+    (
+        20,
+        "1:Name",
+        Builtin::String,
+        false,
+        true,
+        "What its component calls it.",
+    ),
+    (
+        21,
+        "1:Capabilities",
+        Builtin::String,
+        true,
+        true,
+        "The IRIs of the capabilities that it provides.",
+    ),
+    (
+        22,
+        "1:RunId",
+        Builtin::UInt32,
+        false,
+        false,
+        "The number of the newest run; 0 before the first one.",
+    ),
+    (
+        23,
+        "1:Progress",
+        Builtin::Float,
+        false,
+        false,
+        "How much of the run is done, from 0 to 1.",
+    ),
+    (
+        24,
+        "1:SkillStep",
+        Builtin::String,
+        false,
+        false,
+        "What the run is about now.",
+    ),
+    (
+        26,
+        "1:UsesSkills",
+        Builtin::String,
+        true,
+        true,
+        "The skills of other components that its work is done with, each as its endpoint and type.",
+    ),
+];
 
 const METHODS: [Method; 5] = [
     Method::Start,

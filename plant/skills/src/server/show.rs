@@ -15,7 +15,7 @@ use crate::model::{EVENT_TYPE, NAMESPACE};
 use crate::parameters::{Parameter, Parameters};
 use crate::shown::{Observer, Outcome, Shown, Told, Transitioned};
 use crate::skill::Facts;
-use crate::value::Value;
+use crate::value::{Builtin, Value};
 use crate::variant::to_variant;
 
 /// The nodes of one skill.
@@ -60,22 +60,20 @@ impl Nodes {
     }
 
     pub(super) fn method(&self, method: Method) -> Option<&NodeId> {
-        self.instance.node(method.name())
+        self.named(method.name())
+    }
+
+    /// A member that the type has.
+    pub(super) fn named(&self, name: &str) -> Option<&NodeId> {
+        self.instance.node(name)
     }
 
     /// What is so for as long as the skill is there, and how it is before anything happens.
-    pub(super) fn show_at_first(&self, server: &Server, facts: &Facts) {
+    pub(super) fn show_at_first(&self, server: &Server, facts: &Facts, uses: &[String]) {
         let mut values = Values::new(self);
         values.add("Name", facts.name.as_str());
-        let capabilities = facts
-            .capabilities
-            .iter()
-            .map(|iri| Value::from(iri.as_str()))
-            .collect();
-        values.add(
-            "Capabilities",
-            to_variant(&Value::Array(crate::value::Builtin::String, capabilities)),
-        );
+        values.add("Capabilities", texts(&facts.capabilities));
+        values.add("UsesSkills", texts(uses));
         values.add("Deletable", false);
         values.add("AutoDelete", false);
         values.add("RecycleCount", 0_i32);
@@ -86,6 +84,7 @@ impl Nodes {
         values.add("FinalResultData/Run", 0_u32);
         values.add("FinalResultData/Succeeded", false);
         values.add("FinalResultData/Message", "");
+        values.add("FinalResultData/Trace", texts(&[]));
         values.show(server);
         self.show_defaults(server, facts);
         for method in Method::ALL {
@@ -122,6 +121,7 @@ impl Nodes {
         values.add("FinalResultData/Run", outcome.run);
         values.add("FinalResultData/Succeeded", outcome.succeeded);
         values.add("FinalResultData/Message", outcome.message.as_str());
+        values.add("FinalResultData/Trace", texts(&outcome.trace));
         values.values.extend(named(&self.results, &outcome.results));
         values.show(server);
     }
@@ -285,6 +285,11 @@ impl<'n> Values<'n> {
     fn show(self, server: &Server) {
         show(server, &self.nodes.name, self.values);
     }
+}
+
+pub(super) fn texts(of: &[String]) -> Variant {
+    let of = of.iter().map(|text| Value::from(text.as_str())).collect();
+    to_variant(&Value::Array(Builtin::String, of))
 }
 
 fn named(nodes: &BTreeMap<String, NodeId>, values: &[(String, Value)]) -> Vec<(NodeId, DataValue)> {

@@ -115,4 +115,4 @@ fn range(server: &Server, node: &NodeId) -> Option<(f64, f64)> {
 }
 
 /// What SkillType itself has among its results.
-pub(crate) const OUTCOME: [&str; 3] = ["Run", "Succeeded", "Message"];
+pub(crate) const OUTCOME: [&str; 4] = ["Run", "Succeeded", "Message", "Trace"];

@@ -322,6 +322,79 @@ async fn of_two_clients_that_race_one_begins_one_run_with_its_own_parameters() {
 }
 
 #[tokio::test]
+async fn a_type_that_rests_in_halted_ends_there_and_its_success_is_told() {
+    let facts = Facts {
+        rests_in: Rest::Halted,
+        ..facts("GraspSkillType", None)
+    };
+    let driver = Arc::new(Scripted {
+        how: How::AtOnce,
+        gate: Arc::new(Semaphore::new(0)),
+        began: AtomicU32::new(0),
+    });
+    let skill = Skill::spawn(facts, driver, Authority::new(), Vec::new());
+    for run in 1..=2 {
+        assert_eq!(skill.execute(ME, Vec::new(), None).await, Ok(run));
+        let mut watch = skill.watch();
+        let halted = watch.wait_for(|shown| shown.state == State::Halted && shown.run == run);
+        tokio::time::timeout(Duration::from_secs(5), halted)
+            .await
+            .unwrap()
+            .unwrap();
+        assert!(skill.outcome_of(run).unwrap().unwrap().succeeded);
+    }
+    assert_eq!(skill.outcome_of(3).unwrap_err().code, Code::NotFound);
+    assert_eq!(skill.outcome_of(0).unwrap().unwrap().run, 2);
+}
+
+#[tokio::test]
+async fn execute_makes_ready_and_begins_at_once_or_changes_nothing() {
+    let bench = bench(How::WhenLet);
+    let wrong = vec![("Force".to_owned(), Value::from("much"))];
+    let refusal = bench.skill.execute(ME, wrong, None).await.unwrap_err();
+    assert_eq!(refusal.code, Code::TypeMismatch);
+    assert_eq!(bench.numbers(), Vec::<u32>::new());
+    assert_eq!(bench.skill.execute(ME, Vec::new(), None).await, Ok(1));
+    assert_eq!(bench.skill.outcome_of(1), Ok(None));
+    let refusal = bench.skill.execute(ME, Vec::new(), None).await;
+    assert_eq!(refusal.unwrap_err().code, Code::InvalidState);
+    let within = Some(Duration::from_millis(20));
+    bench.call(Method::Halt).await.unwrap();
+    assert_eq!(bench.skill.execute(ME, Vec::new(), within).await, Ok(2));
+    let shown = bench.until(State::Halted).await;
+    assert_eq!(
+        shown.outcome.as_ref().unwrap().message,
+        "the work was not done within 20ms"
+    );
+    assert_eq!(bench.numbers(), [1, 2, 3, 1, 2, 3]);
+}
+
+#[tokio::test]
+async fn a_full_queue_is_told_of_only_where_nothing_else_is_wrong() {
+    let bench = bench(How::Deaf);
+    bench.run_to(State::Running).await;
+    // Halt of what does not hear takes a second, in which calls wait.
+    let halting = bench.skill.call(ME, Method::Halt);
+    let mut waiting: Vec<_> = (0..MOST_ORDERS)
+        .map(|_| Box::pin(bench.skill.call(ME, Method::Halt)))
+        .collect();
+    let mut halting = Box::pin(halting);
+    assert!(futures_util::poll!(&mut halting).is_pending());
+    tokio::task::yield_now().await;
+    for call in &mut waiting {
+        assert!(futures_util::poll!(call).is_pending());
+    }
+    let force = |of: f64| vec![("Force".to_owned(), Value::from(of))];
+    let code = async |by, given| {
+        let refusal = bench.skill.start_with(by, given).await.unwrap_err();
+        refusal.code
+    };
+    assert_eq!(code(OTHER, force(1e9)).await, Code::Locked);
+    assert_eq!(code(ME, force(1e9)).await, Code::InvalidArgument);
+    assert_eq!(code(ME, force(1.0)).await, Code::TooManyOperations);
+}
+
+#[tokio::test]
 async fn a_space_has_the_lease_while_its_run_goes_on_and_no_longer() {
     let bench = bench(How::WhenLet);
     let space = Owner::Space(2);

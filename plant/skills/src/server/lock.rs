@@ -1,0 +1,207 @@
+//! Locking of a component (OPC 10000-100, 7): the lease of its skills, held by a session without having it do anything.
+
+use std::future::Future;
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+use std::time::Duration;
+
+use plant_opcua::server::{
+    IdRange, Instance, InstanceError, InstanceSpec, MethodRequest, Server, method,
+};
+use plant_opcua::types::{NodeId, QualifiedName, StatusCode, Variant};
+use tokio::sync::watch;
+use tokio::time::{Instant, sleep_until};
+
+use crate::authority::{Authority, Owner};
+use crate::skill::lock;
+
+/// The namespace of OPC 10000-100.
+pub(super) const NAMESPACE: &str = "http://opcfoundation.org/UA/DI/";
+/// The part of it that is about locking, for components whose types need no more of it.
+pub(super) const NODESET: &str = include_str!("locking.xml");
+
+/// Whether a NodeSet file has that namespace as a whole. One that cannot be read is told of by who loads it.
+pub(super) fn has_di(file: &Path) -> bool {
+    let text = std::fs::read_to_string(file).unwrap_or_default();
+    let model = format!("<Model ModelUri=\"{NAMESPACE}\"");
+    text.contains(&model)
+}
+
+/// The object Lock of a component.
+#[derive(Clone)]
+pub(super) struct Lock {
+    server: Server,
+    authority: Authority,
+    object: Instance,
+    held: Arc<Mutex<Option<Held>>>,
+    changed: watch::Sender<()>,
+}
+
+/// A lock that a session has.
+#[derive(Debug, Clone)]
+struct Held {
+    session: u32,
+    until: Instant,
+}
+
+impl Lock {
+    /// Makes the object below the component. What comes back ends locks that are not renewed, and those of sessions that have
+    /// lost the lease.
+    pub(super) fn serve(
+        server: &Server,
+        authority: &Authority,
+        component: &NodeId,
+        ids: &mut IdRange,
+    ) -> Result<impl Future<Output = ()> + use<>, InstanceError> {
+        let none = || InstanceError::NoType(NodeId::null());
+        let of_type = server
+            .find_type(NAMESPACE, "LockingServicesType")
+            .ok_or_else(none)?;
+        let name = QualifiedName::new(server.namespace(NAMESPACE).unwrap_or_default(), "Lock");
+        let spec = InstanceSpec::new(of_type, ids.next(), name, component.clone());
+        let object = server.instantiate(&spec, &mut |_| ids.next())?;
+        let lock = Self {
+            server: server.clone(),
+            authority: authority.clone(),
+            object,
+            held: Arc::default(),
+            changed: watch::channel(()).0,
+        };
+        lock.show(None);
+        for (name, call) in [
+            (
+                "InitLock",
+                Self::init as fn(&Self, &MethodRequest) -> Answer,
+            ),
+            ("RenewLock", Self::renew),
+            ("ExitLock", Self::exit),
+            ("BreakLock", Self::break_lock),
+        ] {
+            let Some(node) = lock.object.node(name).cloned() else {
+                continue;
+            };
+            let own = lock.clone();
+            let handler = method(move |request| match call(&own, &request) {
+                Ok(status) => Ok(vec![status.into()]),
+                Err(status) => Err(status.into()),
+            });
+            server.on_call(&lock.object.node_id, &node, handler);
+        }
+        Ok(lock.watch())
+    }
+
+    fn init(&self, request: &MethodRequest) -> Answer {
+        let session = request.caller.session;
+        if self.authority.claim(&Owner::Session(session)).is_err() {
+            return Ok(ALREADY_LOCKED);
+        }
+        let context = match request.arguments.first() {
+            Some(Variant::String(context)) => context.as_ref().to_owned(),
+            _ => String::new(),
+        };
+        self.hold(session);
+        // Who does not say what it is for is known by its application.
+        let client = if context.is_empty() {
+            request.caller.application_uri.clone()
+        } else {
+            context
+        };
+        self.show(Some((&client, &request.caller.user)));
+        Ok(DONE)
+    }
+
+    fn renew(&self, request: &MethodRequest) -> Answer {
+        if !self.is_held_by(request) {
+            return Ok(NOT_LOCKED);
+        }
+        self.hold(request.caller.session);
+        Ok(DONE)
+    }
+
+    fn exit(&self, request: &MethodRequest) -> Answer {
+        if !self.is_held_by(request) {
+            return Ok(NOT_LOCKED);
+        }
+        self.free();
+        Ok(DONE)
+    }
+
+    /// For administrators, of whom a component knows none.
+    fn break_lock(&self, _request: &MethodRequest) -> Answer {
+        Err(StatusCode::BadUserAccessDenied)
+    }
+
+    fn is_held_by(&self, request: &MethodRequest) -> bool {
+        lock(&self.held)
+            .as_ref()
+            .is_some_and(|held| held.session == request.caller.session)
+    }
+
+    fn hold(&self, session: u32) {
+        let until = Instant::now() + LONGEST_LOCK;
+        *lock(&self.held) = Some(Held { session, until });
+        self.changed.send_replace(());
+    }
+
+    fn free(&self) {
+        let held = lock(&self.held).take();
+        if let Some(held) = held {
+            self.authority.release(&Owner::Session(held.session));
+        }
+        self.show(None);
+        self.changed.send_replace(());
+    }
+
+    async fn watch(self) {
+        let mut changed = self.changed.subscribe();
+        let mut holder = self.authority.holder();
+        loop {
+            let held = lock(&self.held).clone();
+            let Some(held) = held else {
+                if changed.changed().await.is_err() {
+                    return;
+                }
+                continue;
+            };
+            let is_another = |now: &Option<Owner>| *now != Some(Owner::Session(held.session));
+            tokio::select! {
+                renewed = changed.changed() => if renewed.is_err() { return },
+                () = sleep_until(held.until) => self.free(),
+                _gone = holder.wait_for(is_another) => self.free(),
+            }
+        }
+    }
+
+    fn show(&self, by: Option<(&str, &str)>) {
+        let (client, user) = by.unwrap_or_default();
+        let remaining = if by.is_some() {
+            LONGEST_LOCK
+        } else {
+            Duration::ZERO
+        };
+        let values = [
+            ("Locked", Variant::from(by.is_some())),
+            ("LockingClient", Variant::from(client)),
+            ("LockingUser", Variant::from(user)),
+            (
+                "RemainingLockTime",
+                Variant::from(remaining.as_secs_f64() * 1_000.0),
+            ),
+        ];
+        for (name, value) in values {
+            if let Some(node) = self.object.node(name) {
+                // The node is ours for as long as the server is there.
+                let _shown = self.server.show(node, value);
+            }
+        }
+    }
+}
+
+type Answer = Result<i32, StatusCode>;
+
+/// What the methods give (OPC 10000-100, 7.4 and following).
+const DONE: i32 = 0;
+const ALREADY_LOCKED: i32 = -1;
+const NOT_LOCKED: i32 = -1;
+/// A lock that is not renewed for so long ends: MaxInactiveLockTime.
+const LONGEST_LOCK: Duration = Duration::from_secs(600);
