@@ -2,12 +2,19 @@
 
 opcua_skill.py ENDPOINT walk       all states and methods of skill 1, which does not end by itself, then a run of skill 2, which does
 opcua_skill.py ENDPOINT refused    what skill 3 says to a Start without a parameter, with wrong ones, and with good ones
+opcua_skill.py ENDPOINT execute    Execute and ReadOutcome of skills 1 and 2, from two sessions, and the lock of OPC 10000-100
+opcua_skill.py ENDPOINT begin      makes skill 1 run, says its number and ends
+opcua_skill.py ENDPOINT after:RUN  how skill 1 is, what is known of that run, and what number the next one has
+opcua_skill.py ENDPOINT idle       how long the second of two sessions waits for the lease of the first, which does nothing
+opcua_skill.py ENDPOINT race       twenty times two sessions begin skill 2 at once
+opcua_skill.py ENDPOINT uses       what skill 1 of the server's own namespace refers to with UsesSkill
 opcua_skill.py ENDPOINT find:TYPE  the objects whose type is that one of urn:ua-bridge:skills or a subtype
 """
 
 import argparse
 import asyncio
 import json
+import time
 
 from asyncua import ua
 from opcua_session import add_arguments, client_of, plain
@@ -148,7 +155,8 @@ async def walk(client, ns):
         return await quick.state() == "Ready"
 
     await until(ended)
-    say(result=await quick.result(), state=await quick.state())
+    shown = await quick.shown()
+    say(result=await quick.result(), state=shown[0], run=shown[3])
     diagnostic = await (await quick.child("ProgramDiagnostic")).read_value()
     say(diagnostic={"method": diagnostic.LastMethodCall, "status": diagnostic.LastMethodReturnStatus.name})
 
@@ -171,6 +179,122 @@ async def refused(client, ns):
     await move.write("TargetPosition", double([0.3, 0.1, 0.4, 0.0, 0.0, 0.0]))
     say(what="good", status=await move.call("Start"), shown=await move.shown())
     say(what="while it runs", status=await move.write("MaxVelocity", double(1.0)), shown=await move.shown())
+
+
+async def asked(of, method, *arguments):
+    """The status of a call, and what it gave."""
+    try:
+        given = await of.node.call_method(await of.child(method), *arguments)
+        return "Good", [plain(value) for value in given] if isinstance(given, list) else plain(given)
+    except ua.UaStatusCodeError as error:
+        return ua.status_codes.get_name_and_doc(error.code)[0], None
+
+
+def names(*of):
+    return ua.Variant(list(of), ua.VariantType.String, is_array=True)
+
+
+def values(*of):
+    return ua.Variant([ua.Variant(value) for value in of], ua.VariantType.Variant, is_array=True)
+
+
+def timeout(ms):
+    return ua.Variant(float(ms), ua.VariantType.Double)
+
+
+def number(run):
+    return ua.Variant(run, ua.VariantType.UInt32)
+
+
+async def begin(client, ns, _other):
+    status, run = await asked(Skill(client, ns, 1), "Execute", names(), values(), timeout(0))
+    say(status=status, run=run)
+
+
+async def after(client, ns, run):
+    skill = Skill(client, ns, 1)
+    shown = await skill.shown()
+    known = await asked(skill, "ReadOutcome", number(run))
+    status, newer = await asked(skill, "Execute", names(), values(), timeout(0))
+    say(state=shown[0], shown=shown[3], known=known[0], status=status, run=newer)
+
+
+async def idle(client, ns, other):
+    mine, theirs = Skill(client, ns, 2), Skill(other, ns, 2)
+    assert await mine.call("Reset") == "Good"
+    began = time.monotonic()
+    say(what="at once", status=await theirs.call("Start"))
+
+    async def free():
+        return await theirs.call("Start") == "Good"
+
+    await until(free)
+    say(what="later", seconds=time.monotonic() - began, mine=await mine.call("Halt"))
+
+
+async def race(client, ns, other):
+    skills = [Skill(client, ns, 2), Skill(other, ns, 2)]
+    component = await client.nodes.objects.get_child([f"{ns}:bench"])
+    di = await client.get_namespace_index("http://opcfoundation.org/UA/DI/")
+    locks = [await of.get_node(component.nodeid).get_child([f"{di}:Lock"]) for of in (client, other)]
+    execute = [await skill.child("Execute") for skill in skills]
+
+    async def one(skill, method):
+        try:
+            return "Good", await skill.node.call_method(method, names(), values(), timeout(0))
+        except ua.UaStatusCodeError as error:
+            return ua.status_codes.get_name_and_doc(error.code)[0], None
+
+    for _ in range(20):
+        both = await asyncio.gather(*[one(*pair) for pair in zip(skills, execute)])
+        say(race=sorted(status for status, _ in both), runs=[run for _, run in both if run is not None])
+
+        async def ended():
+            return await skills[0].state() in ("Ready", "Halted")
+
+        await until(ended)
+        winner = [status for status, _ in both].index("Good")
+        # Its session has the lease until it gives that back.
+        await locks[winner].call_method(f"{di}:InitLock", "")
+        await locks[winner].call_method(f"{di}:ExitLock")
+
+
+async def execute(client, ns, other):
+    hold, quick = Skill(client, ns, 1), Skill(client, ns, 2)
+    theirs = Skill(other, ns, 2)
+    uneven = await asked(hold, "Execute", names("Force"), values(), timeout(0))
+    say(what="uneven", status=uneven[0], state=await hold.state())
+    wrong = await asked(hold, "Execute", names("Force"), values("much"), timeout(0))
+    say(what="wrong", status=wrong[0], state=await hold.state())
+    status, run = await asked(quick, "Execute", names(), values(), timeout(0))
+    say(what="without", status=status)
+
+    async def ended():
+        return (await asked(theirs, "ReadOutcome", number(run)))[1][0]
+
+    await until(ended)
+    say(what="outcome", run=run, outcome=(await asked(theirs, "ReadOutcome", number(run)))[1])
+    say(what="newest", outcome=(await asked(theirs, "ReadOutcome", number(0)))[1])
+    say(what="unknown", status=(await asked(theirs, "ReadOutcome", number(run - 1)))[0])
+    status, run = await asked(hold, "Execute", names("Force"), values(3.5), timeout(300))
+    say(what="given", status=status, force=await (await hold.child("ParameterSet", "Force")).read_value())
+
+    async def halted():
+        return await hold.state() == "Halted"
+
+    await until(halted)
+    say(what="late", outcome=(await asked(hold, "ReadOutcome", number(run)))[1])
+
+    di = await client.get_namespace_index("http://opcfoundation.org/UA/DI/")
+    component = await client.nodes.objects.get_child([f"{ns}:bench"])
+    lock = await component.get_child([f"{di}:Lock"])
+    locked = await lock.get_child([f"{di}:Locked"])
+    say(what="lock", other=await theirs.call("Reset"), locked=await locked.read_value())
+    init = await lock.call_method(f"{di}:InitLock", "a person at a panel")
+    client_name = await (await lock.get_child([f"{di}:LockingClient"])).read_value()
+    say(what="locked", init=init, other=await theirs.call("Reset"), locked=await locked.read_value(), by=client_name)
+    exit_lock = await lock.call_method(f"{di}:ExitLock")
+    say(what="unlocked", exit=exit_lock, other=await theirs.call("Halt"), locked=await locked.read_value())
 
 
 async def find(client, name):
@@ -198,6 +322,16 @@ async def find(client, name):
             objects += await node.get_children(nodeclassmask=ua.NodeClass.Object)
 
 
+async def uses(client):
+    own = client.get_node(ua.NodeId(100, 1))
+    types = await client.get_namespace_index("urn:ua-bridge:skills")
+    references = client.get_node(ua.NodeId(ua.ObjectIds.NonHierarchicalReferences))
+    named = [of for of in await references.get_children() if await of.read_browse_name() == ua.QualifiedName("UsesSkill", types)]
+    for used in await own.get_referenced_nodes(refs=named[0].nodeid, includesubtypes=False):
+        values = [await (await used.get_child([f"{types}:{name}"])).read_value() for name in ("Component", "Type")]
+        say(uses=values)
+
+
 async def main():
     parser = argparse.ArgumentParser()
     add_arguments(parser)
@@ -207,7 +341,18 @@ async def main():
         if args.part.startswith("find:"):
             await find(client, args.part.removeprefix("find:"))
             return
+        if args.part == "uses":
+            await uses(client)
+            return
         ns = await client.get_namespace_index("urn:ua-bridge:system-tests:component")
+        if args.part.startswith("after:"):
+            await after(client, ns, int(args.part.removeprefix("after:")))
+            return
+        of_two = {"begin": begin, "execute": execute, "idle": idle, "race": race}
+        if args.part in of_two:
+            async with await client_of(args) as other:
+                await of_two[args.part](client, ns, other)
+            return
         await {"walk": walk, "refused": refused}[args.part](client, ns)
 
 

@@ -76,15 +76,27 @@ fn state(name: &str) -> (u32, &'static str) {
     }
 }
 
+#[path = "skills/faults.rs"]
+mod faults;
+
 #[test]
-#[expect(clippy::too_many_lines, reason = "one walk through all states")]
-fn a_client_walks_all_states_and_methods_and_sees_nine_kinds_of_transition() {
-    let Some(cell) = Cell::with(&[Peer::Python]) else {
+fn clients_walk_all_states_and_methods_and_see_nine_kinds_of_transition() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
         return;
     };
-    let _component = component(&cell.file("component.yaml", COMPONENT));
+    let yaml = cell.file("component.yaml", COMPONENT);
+    let first = component(&yaml);
     let lines = cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "walk"]);
+    assert_is_whole(&lines);
+    drop(first);
+    let _second = component(&yaml);
+    let uri = "urn:ua-bridge:system-tests:component";
+    assert_is_whole(&cell.node_opcua_once("walk.js", &[ENDPOINT, uri]));
+}
 
+/// Each state with each method, each transition with its numbers, and a run to its end, as a client saw them.
+#[expect(clippy::too_many_lines, reason = "one walk through all states")]
+fn assert_is_whole(lines: &[Value]) {
     let cells: Vec<&Value> = lines
         .iter()
         .filter(|line| line.get("method").is_some())
@@ -155,10 +167,12 @@ fn a_client_walks_all_states_and_methods_and_sees_nine_kinds_of_transition() {
             "{event}"
         );
     }
-    let result = lines.iter().find_map(|line| line.get("result")).unwrap();
+    let ended = lines.iter().find(|line| line.get("result").is_some());
+    let ended = ended.unwrap();
+    let result = &ended["result"];
     assert_eq!(
         (&result["Run"], &result["Succeeded"]),
-        (&json!(1), &json!(true))
+        (&ended["run"], &json!(true))
     );
     let diagnostic = lines
         .iter()
@@ -194,6 +208,66 @@ fn a_start_without_its_parameter_or_with_a_wrong_one_moves_nothing_and_says_whic
         ("while it runs", "BadInvalidState", "Running"),
     ];
     assert_eq!(told, expected);
+}
+
+#[test]
+fn a_run_begun_in_one_call_is_told_of_by_its_number_to_another_session() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let _component = component(&cell.file("component.yaml", COMPONENT));
+    let lines = cell.asyncua_once("opcua_skill.py", &[ENDPOINT, "execute"]);
+    let of = |what: &str| line_of(&lines, what);
+    // What is wrong with a call leaves a Halted skill Halted.
+    for (what, status) in [
+        ("uneven", "BadInvalidArgument"),
+        ("wrong", "BadTypeMismatch"),
+    ] {
+        let told = (&of(what)["status"], &of(what)["state"]);
+        assert_eq!(told, (&json!(status), &json!("Halted")), "{what}");
+    }
+    // Arrays without an element are arrays of that type too.
+    assert_eq!(of("without")["status"], json!("Good"));
+    let outcome = &of("outcome")["outcome"];
+    let (ended, succeeded, message) = (&outcome[0], &outcome[1], &outcome[2]);
+    assert_eq!(
+        (ended, succeeded, message),
+        (&json!(true), &json!(true), &json!(""))
+    );
+    assert_eq!((&outcome[3], &outcome[4]), (&json!([]), &json!([])));
+    assert_eq!(of("newest")["outcome"], *outcome);
+    assert_eq!(of("unknown")["status"], json!("BadNotFound"));
+
+    let given = (&of("given")["status"], &of("given")["force"]);
+    assert_eq!(given, (&json!("Good"), &json!(3.5)));
+    let late = &of("late")["outcome"];
+    assert_eq!(
+        (&late[0], &late[1], &late[2]),
+        (
+            &json!(true),
+            &json!(false),
+            &json!("the work was not done within 300ms")
+        )
+    );
+
+    // The first session has the lease of what it did, by a lock or without one, until it gives it back.
+    assert_eq!(of("lock")["other"], json!("BadLocked"));
+    assert_eq!(of("lock")["locked"], json!(false));
+    let locked = of("locked");
+    assert_eq!(
+        (&locked["init"], &locked["other"], &locked["by"]),
+        (
+            &json!(0),
+            &json!("BadLocked"),
+            &json!("a person at a panel")
+        )
+    );
+    assert_eq!(locked["locked"], json!(true));
+    let unlocked = of("unlocked");
+    assert_eq!(
+        (&unlocked["exit"], &unlocked["other"], &unlocked["locked"]),
+        (&json!(0), &json!("Good"), &json!(false))
+    );
 }
 
 #[test]

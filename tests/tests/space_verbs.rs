@@ -162,6 +162,118 @@ fn a_skill_of_a_component_is_found_and_run_to_its_result() {
     );
 }
 
+/// What bash offers for the last word of a line, with the script that it is given.
+fn completed(line: &[&str]) -> Vec<String> {
+    let words: Vec<String> = line.iter().map(|word| format!("'{word}'")).collect();
+    let ua_space = program("ua-space");
+    let script = format!(
+        "source <('{0}' completion bash); COMP_WORDS=('{0}' {1}); COMP_CWORD={2}; _ua_space; printf '%s\\n' \"${{COMPREPLY[@]}}\"",
+        ua_space.display(),
+        words.join(" "),
+        line.len(),
+    );
+    let mut child = Started::new("bash", Path::new("/bin/bash"))
+        .args(["--norc", "-c", &script])
+        .start();
+    assert!(child.wait_for_end(SOON).success(), "{child}");
+    child.lines()
+}
+
+#[test]
+fn skills_of_two_components_are_told_run_watched_and_completed_by_their_names() {
+    let Some(cell) = Cell::with(&[]) else {
+        return;
+    };
+    let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/plant");
+    let _components = ["parallel-gripper.yaml", "vacuum-gripper.yaml"].map(|yaml| {
+        Started::new("ua-component", &program("ua-component"))
+            .args([examples.join(yaml)])
+            .args(["--interface", "lo", "--lds", "none"])
+            .args(["--pki".into(), cell.folder().join("pki")])
+            .start()
+    });
+    let names = ["parallel-gripper.Grasp", "vacuum-gripper.VacuumGrasp"];
+    eventually("both are heard", SOON, || {
+        let offered = completed(&["skills", "--interface", "lo", "info", ""]);
+        let has_both = names
+            .iter()
+            .all(|name| offered.iter().any(|one| one == name));
+        has_both.then_some(())
+    });
+    assert_eq!(completed(&["ski"]), ["skills"]);
+    assert_eq!(completed(&["skills", "--interface", "lo", "w"]), ["watch"]);
+    let offered = completed(&["skills", "start", "--interface", "lo", "vacuum-gripper.V"]);
+    assert_eq!(offered, ["vacuum-gripper.VacuumGrasp"]);
+    let offered = completed(&["call", "--interface", "lo", "parallel-gripper.Grasp"]);
+    assert!(
+        offered.contains(&"parallel-gripper.Grasp.Halt".to_owned()),
+        "{offered:?}"
+    );
+
+    let mut watch = Started::new("ua-space", &program("ua-space"))
+        .args(["skills", "watch", "vacuum-gripper", "--json"])
+        .args(["--interface", "lo"])
+        .start();
+    let events = |watch: &system_tests::Child, what: &str| {
+        let lines = watch.json_lines();
+        let of = lines.into_iter().filter(|line| line["event"] == *what);
+        of.collect::<Vec<_>>()
+    };
+    eventually("it says how they are", SOON, || {
+        (events(&watch, "state").len() >= 2).then_some(())
+    });
+    // Both are Halted: they are made ready first.
+    for name in names {
+        let (code, lines) = ua_space(&["skills", "start", name, "Force=9", "--json"]);
+        assert_eq!(code, 0, "{lines:?}");
+        let steps = objects(&lines);
+        assert_eq!(steps[0]["event"], "answer", "{lines:?}");
+        let result = steps.iter().find(|step| step["event"] == "result");
+        assert_eq!(result.map(|step| &step["succeeded"]), Some(&json!(true)));
+    }
+    let result = eventually("the end of the run is watched", SOON, || {
+        events(&watch, "result").pop()
+    });
+    assert_eq!(
+        (&result["skill"], &result["succeeded"], &result["results"]),
+        (
+            &json!("vacuum-gripper.VacuumGrasp"),
+            &json!(true),
+            &json!({"Gripped": true})
+        )
+    );
+    let run = &result["run"];
+    let states = events(&watch, "state");
+    let states: Vec<&str> = states
+        .iter()
+        .filter(|state| state["run"] == *run)
+        .filter_map(|state| state["state"].as_str())
+        .collect();
+    assert_eq!(states, ["Running", "Ready"]);
+    watch.end();
+
+    let (code, lines) = ua_space(&["skills", "info", names[1], "--json"]);
+    let whole = objects(&lines).pop().unwrap();
+    assert_eq!(
+        (
+            code,
+            &whole["type"],
+            &whole["state"],
+            &whole["result"]["run"]
+        ),
+        (0, &json!("VacuumGraspSkillType"), &json!("Ready"), run)
+    );
+    let parameters = whole["parameters"].as_array().unwrap();
+    let has = |name: &str| parameters.iter().any(|one| one["name"] == *name);
+    assert!(has("Force") && has("Vacuum"), "{whole}");
+    let (code, lines) = ua_space(&["skills", "info", "parallel-gripper.Grip", "--seconds", "1"]);
+    assert_eq!(code, 69, "{lines:?}");
+    let names_it = |line: &String| line.contains("parallel-gripper.Grasp");
+    assert!(lines.iter().any(names_it), "{lines:?}");
+    let (code, lines) = ua_space(&["skills", "start", names[0], "Force=hard"]);
+    assert_eq!(code, 64, "{lines:?}");
+}
+
 #[test]
 fn tshark_reads_what_a_component_and_its_caller_say() {
     let Some(cell) = Cell::with(&[Peer::Tshark]) else {

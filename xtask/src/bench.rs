@@ -35,6 +35,16 @@ pub(crate) fn ros2(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<
     measured(workspace, "bench-ros2", &packages, arguments)
 }
 
+/// Measures what clients wait for of skills, and many skills in one server.
+pub(crate) fn skills(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
+    measured(
+        workspace,
+        "bench-skills",
+        &["ua-component", "system-tests"],
+        arguments,
+    )
+}
+
 /// Measures messages between ROS bytes and UADP fields, and what serializers in Python take for the ROS half of it.
 pub(crate) fn messages(workspace: &Workspace, arguments: &[&str]) -> anyhow::Result<Ended> {
     instructions::run(workspace, "messages", arguments, |bench| {

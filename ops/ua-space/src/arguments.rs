@@ -2,7 +2,10 @@
 
 mod live;
 
-pub(crate) use live::{Ask, Call, Echo, Group, Hz, Info, List, Skills, Target, Trace};
+pub(crate) use live::{
+    Ask, Call, Echo, Group, Hz, Info, InfoSkill, List, ListSkills, Skills, SkillsVerb, Target,
+    Trace, WatchSkills,
+};
 
 use std::path::PathBuf;
 
@@ -99,9 +102,11 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, 69 nothing came, or an interface or group cannot be had, 74 an output that cannot be
     /// written.
     Hz(Hz),
-    /// List the skills of all components, with their states and how to start them
+    /// List the skills of all components, with their states and how to start them; tell of one, run one, watch them
     ///
-    /// Exit codes: 0 done, 64 usage, 69 an interface or group that cannot be had, 74 an output that cannot be written.
+    /// Exit codes: 0 done, and the run succeeded, 1 refused, or the run did not succeed, 64 usage, or a parameter that is
+    /// missing or wrong, 69 no such skill, or an interface or group that cannot be had, 74 an output that cannot be written,
+    /// 130 interrupted.
     Skills(Skills),
     /// Ask for a call: a skill of a component, a service of a robot, a method
     ///
@@ -125,6 +130,42 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, or a question there is not, 65 a query that is wrong, 69 nobody answers, or not in time,
     /// 74 a file that cannot be read or an output that cannot be written.
     Ask(Ask),
+    /// Print what makes a shell complete the words of ua-space, with the names of skills and topics that are heard
+    ///
+    /// For bash: `source <(ua-space completion bash)`; for zsh likewise; for fish: `ua-space completion fish | source`.
+    Completion(Completion),
+    /// What a shell may put in place of the last word
+    #[command(hide = true)]
+    Complete(Complete),
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Completion {
+    /// Which shell
+    #[arg(value_name = "SHELL", value_enum)]
+    pub(crate) shell: Shell,
+}
+
+/// A shell that completes words.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Shell {
+    /// GNU Bash
+    Bash,
+    /// Zsh
+    Zsh,
+    /// Fish
+    Fish,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Complete {
+    /// Those of the line after `ua-space`, the last of which may be empty
+    #[arg(
+        value_name = "WORD",
+        trailing_var_arg = true,
+        allow_hyphen_values = true
+    )]
+    pub(crate) words: Vec<String>,
 }
 
 #[derive(Debug, Args)]

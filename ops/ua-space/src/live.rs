@@ -18,7 +18,7 @@ mod trace;
 pub(crate) use call::call;
 pub(crate) use echo::{echo, hz};
 pub(crate) use list::{info, list};
-pub(crate) use skills::skills;
+pub(crate) use skills::{HeardNames, heard_names, skills};
 pub(crate) use text::{Table, harmless, is_coloured};
 pub(crate) use trace::trace;
 

@@ -5,6 +5,7 @@ mod arguments;
 mod ask;
 mod capture;
 mod check;
+mod completion;
 mod decode;
 mod discovery;
 mod encode;
@@ -73,6 +74,8 @@ fn main() -> ExitCode {
         Verb::Call(arguments) => live::call(arguments),
         Verb::Trace(arguments) => live::trace(arguments),
         Verb::Ask(arguments) => ask::ask(arguments),
+        Verb::Completion(arguments) => completion::script(arguments.shell),
+        Verb::Complete(arguments) => completion::complete(&arguments.words),
     };
     match ended {
         Ok(()) => ExitCode::SUCCESS,

@@ -7,6 +7,7 @@
 pub mod definition;
 mod fields;
 mod goals;
+mod partners;
 mod port;
 mod space;
 

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bridge_node::actions::OwnActions;
 use bridge_node::{
@@ -16,11 +16,13 @@ use program::Method;
 use skills::server::{ComponentServer, ServeFault, ServeSettings};
 use skills::{Component, Lds, Owner, Refusal, Skill, Value};
 use tokio::sync::mpsc;
+use tokio::task::JoinSet;
 use tracing::{info, warn};
 use uadp::BuiltinType;
 
 use crate::fields;
 use crate::goals::{self, Doer, Reporter};
+use crate::partners;
 use crate::space::{GOAL, Outbox, Place, Speaker};
 
 /// What a component is started with beside what it is.
@@ -56,6 +58,8 @@ pub struct ComponentPort {
     executes: mpsc::Sender<PortEvent>,
     /// The skills as actions.
     actions: OwnActions,
+    /// Who looks for others, for as long as there is the component.
+    _looks: JoinSet<()>,
 }
 
 impl ComponentPort {
@@ -71,9 +75,12 @@ impl ComponentPort {
         };
         let outbox = Outbox::default();
         let mut first = VecDeque::new();
+        let (detector, looks) = partners::look(component, options.mdns.as_ref());
         let settings = ServeSettings {
+            detector,
             pki: options.pki.clone(),
             trust_any_client: options.trust_any_client,
+            first_run: run_number_of_now(),
         };
         let mut reporters = Vec::new();
         let server = ComponentServer::build(component, &settings, |number, facts| {
@@ -98,6 +105,11 @@ impl ComponentPort {
         }
         server.start();
         let announced = announce(component, server.url(), options);
+        if server.skills().len() > MOST_IN_SPACE {
+            warn!(
+                "only the first {MOST_IN_SPACE} skills have a place in the space; OPC UA has all"
+            );
+        }
         info!(
             skills = server.skills().len(),
             namespace = component.namespace,
@@ -114,6 +126,7 @@ impl ComponentPort {
             executed,
             executes,
             actions,
+            _looks: looks,
         })
     }
 
@@ -251,6 +264,18 @@ pub fn check(component: &Component, options: &Options) -> Result<(), Failure> {
     })
 }
 
+/// The number of the first run of a component that starts now: above all that it had before, if it ran fewer than 62 a second
+/// since then. It comes round after two years.
+#[expect(
+    clippy::disallowed_methods,
+    reason = "what a host remembers over a restart without a file is its clock"
+)]
+fn run_number_of_now() -> u32 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH);
+    let number = since.unwrap_or_default().as_millis() / 16;
+    u32::try_from(number % (1 << 32)).unwrap_or_default()
+}
+
 /// Success, message and run of a call.
 async fn call(skill: &Skill, by: Owner, method: Method, request: &[u8]) -> [Value; 3] {
     let answer = match method {
@@ -359,5 +384,7 @@ fn announce(component: &Component, url: &str, options: &Options) -> Option<Annou
 
 /// Within the 2 s a port has to end.
 const SHUTDOWN: Duration = Duration::from_millis(1_900);
+/// Identifiers are 16 bit wide, and a skill has a hundred.
+const MOST_IN_SPACE: usize = 654;
 /// So many calls may be executed at once; more are refused.
 const MOST_EXECUTIONS: usize = 64;

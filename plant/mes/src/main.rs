@@ -281,6 +281,7 @@ fn component(settings: &Settings, driver: ExecuteProcess) -> Component {
         nodesets: Vec::new(),
         lds: settings.lds.clone(),
         open: settings.open,
+        lease: skills::LEASE,
         device: None,
         skills: vec![SkillSetup {
             name: "ExecuteProcess".to_owned(),

@@ -32,9 +32,8 @@ impl RunId {
         self.0
     }
 
-    fn after(last: Option<Self>) -> Self {
-        let next = last.map_or(0, |Self(number)| number).wrapping_add(1);
-        Self(next.max(1))
+    fn next(self) -> Self {
+        Self(self.0.wrapping_add(1).max(1))
     }
 }
 
@@ -88,17 +87,27 @@ pub struct Program {
     state: State,
     last: Option<&'static Transition>,
     run: Option<RunId>,
+    /// The number of the first run.
+    first: u32,
 }
 
 impl Program {
-    /// A program that was never started.
+    /// A program that was never started, whose first run is 1.
     #[must_use]
     pub fn new(nature: Nature) -> Self {
+        Self::counting_from(nature, 1)
+    }
+
+    /// A program that was never started, whose first run has this number; 0 counts as 1. One that is loaded anew counts from
+    /// where it has not been, so that nobody takes one of its runs for an earlier one.
+    #[must_use]
+    pub fn counting_from(nature: Nature, first: u32) -> Self {
         Self {
             nature,
             state: State::Halted,
             last: None,
             run: None,
+            first: first.max(1),
         }
     }
 
@@ -115,7 +124,10 @@ impl Program {
             state: self.state,
         })?;
         if method == Method::Start {
-            self.run = Some(RunId::after(self.run));
+            self.run = Some(match self.run {
+                None => RunId(self.first),
+                Some(last) => last.next(),
+            });
         }
         Ok(self.take(transition))
     }
@@ -267,6 +279,20 @@ mod tests {
             program.ended(second, Ending::Success),
             Err(NotRunning { run: second })
         );
+    }
+
+    #[test]
+    fn runs_are_counted_from_where_it_is_told_and_never_are_0() {
+        for (first, numbers) in [(0, [1, 2]), (7, [7, 8]), (u32::MAX, [u32::MAX, 1])] {
+            let mut program = Program::counting_from(SKILL, first);
+            program.call(Method::Reset).unwrap();
+            for number in numbers {
+                program.call(Method::Start).unwrap();
+                let run = program.run().unwrap();
+                assert_eq!(run.number(), number);
+                program.ended(run, Ending::Success).unwrap();
+            }
+        }
     }
 
     #[test]

@@ -86,12 +86,13 @@ impl Actor {
         (facts, driver): (Arc<Facts>, Arc<dyn Driver>),
         authority: Authority,
         (pending, outcomes): Store,
-        observers: Vec<Box<dyn Observer>>,
+        (observers, first_run): (Vec<Box<dyn Observer>>, u32),
     ) -> (Self, watch::Receiver<Arc<Shown>>) {
-        let program = Program::new(Nature {
+        let nature = Nature {
             can_suspend: driver.can_suspend(),
             rests_in: facts.rests_in,
-        });
+        };
+        let program = Program::counting_from(nature, first_run);
         let created = clock();
         let now = Shown {
             state: program.state(),

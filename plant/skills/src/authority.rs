@@ -2,16 +2,19 @@
 
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
 
 use program::Lease;
 use tokio::sync::watch;
+use tokio::time::Instant;
 
 use crate::refusal::{Code, Refusal};
 
 /// Who writes parameters and calls methods.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum Owner {
-    /// A session of the OPC UA server, by the server's number for it. Holds the lease until it closes.
+    /// A session of the OPC UA server, by the server's number for it. Holds the lease until it closes, or has had nothing done
+    /// for a while.
     Session(u32),
     /// A space that asked for a call. Holds the lease while a run that it began goes on.
     Space(u16),
@@ -41,6 +44,10 @@ struct Inner {
     lease: Lease<Owner>,
     /// The skill whose run goes on.
     running: Option<String>,
+    /// When its holder last had something done, or the last run ended.
+    used: Instant,
+    /// Whether the holder keeps it without having anything done: it is locked.
+    locked: bool,
 }
 
 impl Authority {
@@ -50,6 +57,8 @@ impl Authority {
         let inner = Inner {
             lease: Lease::free(),
             running: None,
+            used: Instant::now(),
+            locked: false,
         };
         let (holder, _) = watch::channel(None);
         Self {
@@ -68,8 +77,42 @@ impl Authority {
             .lease
             .claim(by.clone())
             .map_err(|held| locked(&held.by))?;
+        inner.used = Instant::now();
         self.show(&inner);
         Ok(())
+    }
+
+    /// Takes the lease, or keeps it, and for as long as it is not given back even where nothing is done.
+    ///
+    /// # Errors
+    /// BadLocked when it is somebody else's.
+    pub fn lock_for(&self, by: &Owner) -> Result<(), Refusal> {
+        self.claim(by)?;
+        self.lock().locked = true;
+        Ok(())
+    }
+
+    /// For how long its holder has had nothing done by now; `None` while a run goes on.
+    #[must_use]
+    pub fn idle(&self, now: Instant) -> Option<Duration> {
+        let inner = self.lock();
+        let idle = now.saturating_duration_since(inner.used);
+        inner.running.is_none().then_some(idle)
+    }
+
+    /// Gives back the lease of a session that by now had nothing done for so long, unless it is locked. Says whose that was.
+    pub fn release_idle(&self, idle: Duration, now: Instant) -> Option<Owner> {
+        let mut inner = self.lock();
+        let since = now.saturating_duration_since(inner.used);
+        let is_idle = inner.running.is_none() && !inner.locked && since >= idle;
+        let holder = inner.lease.holder().filter(|holder| {
+            // Others give it back with the end of their run.
+            is_idle && matches!(holder, Owner::Session(_))
+        });
+        let holder = holder.cloned()?;
+        inner.lease.release(&holder);
+        self.show(&inner);
+        Some(holder)
     }
 
     /// Whether the lease is theirs, or nobody's.
@@ -86,7 +129,9 @@ impl Authority {
     /// Gives the lease back, as when a session closes. A run that goes on does so.
     pub fn release(&self, by: &Owner) {
         let mut inner = self.lock();
-        inner.lease.release(by);
+        if inner.lease.release(by) {
+            inner.locked = false;
+        }
         self.show(&inner);
     }
 
@@ -132,6 +177,7 @@ impl Authority {
         let mut inner = self.lock();
         if inner.running.as_deref() == Some(skill) {
             inner.running = None;
+            inner.used = Instant::now();
         }
         drop(inner);
         self.settle();
@@ -162,5 +208,39 @@ fn locked(holder: &Owner) -> Refusal {
 impl Default for Authority {
     fn default() -> Self {
         Self::new()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const IDLE: Duration = Duration::from_secs(60);
+    const ME: Owner = Owner::Session(1);
+    const OTHER: Owner = Owner::Session(2);
+
+    #[test]
+    fn a_lease_that_is_not_used_is_free_after_a_while_and_not_before() {
+        let authority = Authority::new();
+        let after = |seconds| {
+            let now = Instant::now() + Duration::from_secs(seconds);
+            authority.release_idle(IDLE, now)
+        };
+        authority.claim(&ME).unwrap();
+        assert_eq!(after(59), None);
+        assert_eq!(authority.claim(&OTHER).unwrap_err().code, Code::Locked);
+        authority.begin("Grasp").unwrap();
+        assert_eq!(after(600), None, "a run goes on");
+        authority.end("Grasp");
+        assert_eq!(after(59), None, "it has only now ended");
+        assert_eq!(after(61), Some(ME));
+        assert_eq!(*authority.holder().borrow(), None);
+        authority.lock_for(&OTHER).unwrap();
+        assert_eq!(after(600), None, "it is locked");
+        authority.release(&OTHER);
+        authority.claim(&OTHER).unwrap();
+        assert_eq!(after(61), Some(OTHER), "the lock has ended");
+        authority.claim(&Owner::Local("mes")).unwrap();
+        assert_eq!(after(600), None, "not a session's");
     }
 }

@@ -1,7 +1,9 @@
 //! The skills of other components: found by their types, run to their end.
 //!
-//! Reading order: this, `find` (which skills a server has), `handle` (one of them), `remote` (a composite of several).
+//! Reading order: this, `find` (which skills a server has), `handle` (one of them), `detector` (those of all servers),
+//! `remote` (a composite of several).
 
+mod detector;
 mod find;
 mod handle;
 mod remote;
@@ -12,6 +14,7 @@ use std::time::Duration;
 use plant_opcua::client::{CallError, Client, ClientConfig, ClientError, Link};
 use plant_opcua::types::StatusCode;
 
+pub use detector::{Detected, Detector};
 pub use find::{FoundParameter, FoundSkill, FoundType};
 pub use handle::{RemoteState, SkillHandle};
 pub use remote::Remote;
@@ -171,7 +174,7 @@ mod tests {
     use program::{Method, State};
 
     use super::*;
-    use crate::component::{Component, Partners};
+    use crate::component::{Component, Partner, Partners};
     use crate::conformance;
     use crate::runs::Runs;
     use crate::server::{ComponentServer, ServeSettings};
@@ -360,6 +363,54 @@ mod tests {
         server.stop().await;
     }
 
+    #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+    async fn a_detector_finds_a_type_and_its_subtypes_in_all_servers_and_waits_for_those_to_come() {
+        let soon = Duration::from_secs(10);
+        let detector = Detector::new(ClientOptions {
+            within: soon,
+            ..ClientOptions::default()
+        });
+        let fingers = serve("parallel-gripper.yaml", &[("400 ms", "10 ms")]);
+        detector.seen("fingers", fingers.url());
+        let grasp = of("GraspSkillType");
+        let first = detector.one(&grasp, soon, |_| true).await.unwrap();
+        assert_eq!(
+            (
+                first.skill.component.as_str(),
+                first.application_uri.as_str()
+            ),
+            ("parallel-gripper", "urn:example:gripper")
+        );
+        // Who knows no vacuum gripper finds one, by what it does or by who it is.
+        let by_vacuum = |one: &Detected| {
+            let mut capabilities = one.skill.capabilities.iter();
+            capabilities.any(|iri| iri.ends_with(":hold-by-vacuum"))
+        };
+        let none = detector.one(&grasp, Duration::from_millis(50), by_vacuum);
+        assert!(matches!(none.await, Err(SkillFault::Unexpected(_))));
+        let waits = detector.one(&grasp, soon, by_vacuum);
+        let vacuum = serve("vacuum-gripper.yaml", &[("300 ms", "10 ms")]);
+        detector.seen("vacuum", vacuum.url());
+        let second = waits.await.unwrap();
+        assert_eq!(second.skill.types[0].name.name, "VacuumGraspSkillType");
+        assert_eq!(detector.of_type(&grasp), [first.clone(), second.clone()]);
+        assert!(detector.of_type(&of("MotionSkillType")).is_empty());
+
+        let (client, handle) = detector.open(&second).await.unwrap();
+        let outcome = handle.run(Vec::new(), soon).await.unwrap();
+        assert!(outcome.succeeded);
+        client.close().await;
+        let mut changes = detector.changes();
+        detector.gone("vacuum");
+        assert!(changes.has_changed().unwrap());
+        changes.mark_unchanged();
+        detector.gone("vacuum");
+        assert!(!changes.has_changed().unwrap(), "it was gone already");
+        assert_eq!(detector.of_type(&grasp), [first]);
+        vacuum.stop().await;
+        fingers.stop().await;
+    }
+
     const EARLIER: &str = r#"<?xml version="1.0" encoding="utf-8"?>
 <UANodeSet xmlns="http://opcfoundation.org/UA/2011/03/UANodeSet.xsd">
   <NamespaceUris><Uri>https://fortiss.org/UA/Device/</Uri></NamespaceUris>
@@ -512,8 +563,8 @@ mod tests {
         );
         let gripper = serve("parallel-gripper.yaml", &[("400 ms", "20 ms")]);
         let partners = Partners {
-            robot: robot.url().to_owned(),
-            gripper: gripper.url().to_owned(),
+            robot: Partner::At(robot.url().to_owned()),
+            gripper: Partner::Called("urn:example:gripper".to_owned()),
             within: Duration::from_secs(20),
         };
         let parameters = vec![
@@ -526,7 +577,9 @@ mod tests {
                 Value::from([0.4, -0.2, 0.1, 0.0, 0.0, 0.0]),
             ),
         ];
-        let driver = Arc::new(Remote::new(partners));
+        let detector = Detector::new(ClientOptions::default());
+        detector.seen("gripper", gripper.url());
+        let driver = Arc::new(Remote::new(partners, Some(detector)));
         let outcome =
             conformance::run_once("PickAndPlaceSkillType", driver.clone(), parameters.clone())
                 .await
@@ -547,6 +600,22 @@ mod tests {
                 .unwrap()
                 .unwrap();
         }
+        // Who has one of them for himself is not disturbed, and nothing moves.
+        let other = client(&gripper).await;
+        let theirs = other.handle(&other.skills().await.unwrap()[0]);
+        assert!(theirs.lock("a person").await.unwrap());
+        let before = robot.skills()[0].shown().run;
+        let outcome =
+            conformance::run_once("PickAndPlaceSkillType", driver.clone(), parameters.clone())
+                .await
+                .unwrap();
+        assert!(
+            !outcome.succeeded && outcome.message.starts_with("BadLocked: parallel-gripper"),
+            "{}",
+            outcome.message
+        );
+        assert_eq!(robot.skills()[0].shown().run, before);
+        other.close().await;
         gripper.stop().await;
         let outcome = conformance::run_once("PickAndPlaceSkillType", driver, parameters)
             .await

@@ -35,6 +35,8 @@ pub struct Component {
     pub lds: Lds,
     /// Whether calls are taken from other hosts, though nothing secures them.
     pub open: bool,
+    /// After this time the lease of a session that has nothing done is free for others.
+    pub lease: Duration,
     /// What does the work of the skills whose driver is [`DriverSetup::Device`].
     pub device: Option<Arc<dyn Device>>,
     /// Its skills, by their numbers from 1.
@@ -120,13 +122,47 @@ pub struct Simulation {
 /// The servers whose skills a composite runs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Partners {
-    /// The endpoint of the robot.
-    pub robot: String,
-    /// The endpoint of the gripper.
-    pub gripper: String,
+    /// That of the robot.
+    pub robot: Partner,
+    /// That of the gripper.
+    pub gripper: Partner,
     /// How long each of their runs may take.
     pub within: Duration,
 }
 
-/// Most skills of a component: the identifiers of its nodes from 10 000 on are others'.
-pub const MOST_SKILLS: usize = 99;
+/// A server whose skills a composite runs.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Partner {
+    /// The one behind this endpoint.
+    At(String),
+    /// The one with this ApplicationUri, wherever it is: a [`Detector`](crate::Detector) knows.
+    Called(String),
+}
+
+impl fmt::Display for Partner {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::At(name) | Self::Called(name) => f.write_str(name),
+        }
+    }
+}
+
+impl Component {
+    /// Whether one of its skills needs others that have to be looked for.
+    #[must_use]
+    pub fn looks_for_others(&self) -> bool {
+        self.skills.iter().any(|skill| match &skill.driver {
+            DriverSetup::PickAndPlace(Partners { robot, gripper, .. }) => {
+                let is_called = |partner: &Partner| matches!(partner, Partner::Called(_));
+                is_called(robot) || is_called(gripper)
+            }
+            DriverSetup::Given(_) | DriverSetup::Simulated(_) | DriverSetup::Device => false,
+        })
+    }
+}
+
+/// How long a session has the lease without having anything done, where nothing else is said.
+pub const LEASE: Duration = Duration::from_secs(60);
+
+/// Most skills of a component: the identifiers of its nodes from 1 000 000 on are others'.
+pub const MOST_SKILLS: usize = 1_000;

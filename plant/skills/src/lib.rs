@@ -24,11 +24,12 @@ pub mod yaml;
 
 pub use authority::{Authority, Owner};
 pub use client::{
-    ClientOptions, FoundParameter, FoundSkill, FoundType, RemoteState, SkillClient, SkillHandle,
+    ClientOptions, Detected, Detector, FoundParameter, FoundSkill, FoundType, RemoteState,
+    SkillClient, SkillHandle,
 };
 pub use component::{
-    Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, Lds, MOST_SKILLS, NoDevices,
-    Partners, Security, Simulation, SkillSetup,
+    Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, LEASE, Lds, MOST_SKILLS,
+    NoDevices, Partner, Partners, Security, Simulation, SkillSetup,
 };
 pub use composite::{Broken, Job, PickAndPlace, Teller};
 pub use driver::{Driver, Results, Stopped, Work};

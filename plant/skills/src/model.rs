@@ -20,6 +20,13 @@ pub const SKILL_TYPE: &str = "SkillType";
 pub const EVENT_TYPE: &str = "SkillTransitionEventType";
 /// The interface of a component, which has the folder `Skills`.
 pub const CONTROLLER_TYPE: &str = "ISkillControllerType";
+/// The namespace of OPC 10000-100, whose locks components have.
+pub(crate) const DEVICES: &str = "http://opcfoundation.org/UA/DI/";
+
+/// The reference from a skill to one that its work is done with.
+pub const USES_SKILL: &str = "UsesSkill";
+/// What that leads to.
+pub const USED_SKILL_TYPE: &str = "UsedSkillType";
 
 /// A type of the table by its BrowseName.
 #[must_use]

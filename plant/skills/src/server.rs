@@ -1,16 +1,19 @@
 //! A component as an OPC UA server: its skills as instances of their types, with methods, events and parameters.
 //!
 //! Reading order: this, `place` (where it is in the plant), `types` (what a skill is, from the instance of its type), `show`
-//! (what clients see), `methods` (what they have it do), `lock` (the lease, as OPC 10000-100 has it).
+//! (what clients see), `methods` (what they have it do), `lock` (the lease, as OPC 10000-100 has it), `uses` (what composites
+//! are made of).
 
 mod lock;
 mod methods;
 mod place;
 mod show;
 mod types;
+mod uses;
 
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::time::Duration;
 
 use plant_opcua::server::{
     EndpointUrl, IdRange, Instance, InstanceError, InstanceSpec, Security as Policy, Server,
@@ -19,12 +22,14 @@ use plant_opcua::server::{
 use plant_opcua::types::{NodeId, ObjectId, ObjectTypeId, QualifiedName};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinSet;
+use tokio::time::{Instant, MissedTickBehavior};
 
 use self::lock::Lock;
 use self::methods::status;
 use self::show::{Nodes, Shower};
 pub(crate) use self::types::OUTCOME;
 use crate::authority::{Authority, Owner};
+use crate::client::Detector;
 use crate::component::{Component, Drivers, Security, SkillSetup};
 use crate::driver::Driver;
 use crate::model::{self, NAMESPACE};
@@ -36,10 +41,14 @@ use crate::yaml::{Code, Finding, Findings};
 /// What the server of a component needs beside the component.
 #[derive(Debug, Clone, Default)]
 pub struct ServeSettings {
+    /// Finds the components that composites name by their ApplicationUris.
+    pub detector: Option<Detector>,
     /// The directory of certificates, which Basic256Sha256 needs.
     pub pki: Option<PathBuf>,
     /// Trusts every client's certificate. For tests and demonstrations only.
     pub trust_any_client: bool,
+    /// The number of each skill's first run, above those it had before the program was started anew; 0 counts as 1.
+    pub first_run: u32,
 }
 
 /// Why a component is not served.
@@ -85,7 +94,7 @@ impl ComponentServer {
             .node("Skills")
             .cloned()
             .ok_or_else(|| ServeFault::Space("it has no folder Skills".to_owned()))?;
-        let mut drivers = Drivers::new(component.device.clone());
+        let mut drivers = Drivers::new(component.device.clone(), settings.detector.clone());
         let mut findings = Findings::default();
         let mut made = Vec::new();
         for (number, setup) in (1..).zip(&component.skills) {
@@ -99,6 +108,7 @@ impl ComponentServer {
         }
         let authority = Authority::new();
         let mut served = Vec::new();
+        let mut used = Vec::new();
         for (
             number,
             Made {
@@ -111,14 +121,24 @@ impl ComponentServer {
             let mut all: Vec<Box<dyn Observer>> =
                 vec![Box::new(Shower::new(server.clone(), Arc::clone(&nodes)))];
             all.extend(observers(number, &facts));
-            nodes.show_at_first(&server, &facts, &driver.uses());
-            let skill = Skill::spawn(facts, driver, authority.clone(), all);
+            let uses = driver.uses();
+            nodes.show_at_first(&server, &facts, &uses);
+            used.push((nodes.skill().clone(), uses));
+            let first = settings.first_run;
+            let skill = Skill::counting_from(first, facts, driver, authority.clone(), all);
             methods::serve(&server, &nodes, &skill);
             served.push((skill, nodes));
         }
         let skills = served.iter().map(|(skill, _)| skill.clone()).collect();
         let mut tasks = JoinSet::new();
-        tasks.spawn(free_when_closed(server.clone(), served, authority.clone()));
+        let leases = Leases {
+            server: server.clone(),
+            served,
+            authority: authority.clone(),
+        };
+        tasks.spawn(leases.free(component.lease));
+        uses::show(&server, &root.node_id, &used, &mut ids)
+            .map_err(|error| ServeFault::Space(error.to_string()))?;
         let locking = Lock::serve(&server, &authority, &root.node_id, &mut ids);
         tasks.spawn(locking.map_err(|error| ServeFault::Space(error.to_string()))?);
         if let Some(node) = root.node("LeaseHolder") {
@@ -330,21 +350,48 @@ fn kept(path: &str) -> Option<u32> {
     })
 }
 
-/// A session that is gone has no lease any more, and what it wrote counts for nothing.
-async fn free_when_closed(server: Server, served: Vec<(Skill, Arc<Nodes>)>, authority: Authority) {
-    let (closed, mut told) = mpsc::channel(MOST_CLOSED);
-    server.on_session_closed(move |session| {
-        // The server has fewer sessions than this has room for.
-        if let Err(error) = closed.try_send(session) {
-            tracing::warn!(session, "the end of a session is not taken up: {error}");
+/// What goes with the leases of sessions.
+struct Leases {
+    server: Server,
+    served: Vec<(Skill, Arc<Nodes>)>,
+    authority: Authority,
+}
+
+impl Leases {
+    /// Frees them. A session that is gone has none any more, nor has one that had nothing done for so long; what they wrote
+    /// counts for nothing then.
+    async fn free(self, idle: Duration) {
+        let (closed, mut told) = mpsc::channel(MOST_CLOSED);
+        self.server.on_session_closed(move |session| {
+            // The server has fewer sessions than this has room for.
+            if let Err(error) = closed.try_send(session) {
+                tracing::warn!(session, "the end of a session is not taken up: {error}");
+            }
+        });
+        let mut look = tokio::time::interval((idle / LOOKS).max(SHORTEST_LOOK));
+        look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            tokio::select! {
+                session = told.recv() => match session {
+                    Some(session) => {
+                        let owner = Owner::Session(session);
+                        self.authority.release(&owner);
+                        self.forget(&owner);
+                    }
+                    None => return,
+                },
+                _ = look.tick() => if let Some(owner) = self.authority.release_idle(idle, Instant::now()) {
+                    tracing::info!("{owner} had nothing done for {idle:?}, and its lease is free");
+                    self.forget(&owner);
+                },
+            }
         }
-    });
-    while let Some(session) = told.recv().await {
-        let owner = Owner::Session(session);
-        authority.release(&owner);
-        for (skill, nodes) in &served {
-            if skill.forget(&owner) {
-                nodes.show_defaults(&server, skill.facts());
+    }
+
+    fn forget(&self, owner: &Owner) {
+        for (skill, nodes) in &self.served {
+            if skill.forget(owner) {
+                nodes.show_defaults(&self.server, skill.facts());
             }
         }
     }
@@ -369,14 +416,16 @@ async fn show_holder(server: Server, node: NodeId, mut holder: watch::Receiver<O
 const OWN: u16 = 1;
 const COMPONENT_ID: u32 = 1;
 const IDS_PER_SKILL: u32 = 100;
-const FIRST_FREE_ID: u32 = 10_000;
+const FIRST_FREE_ID: u32 = 1_000_000;
+/// How often is looked for a lease that nobody uses, within the time after which it is free.
+const LOOKS: u32 = 10;
+const SHORTEST_LOOK: Duration = Duration::from_millis(10);
 /// So many sessions may end at once.
 const MOST_CLOSED: usize = 1_024;
 
 #[cfg(test)]
 mod tests {
     use std::path::Path;
-    use std::time::Duration;
 
     use plant_opcua::types::Variant;
     use program::{Method, State};

@@ -72,9 +72,21 @@ impl Pending {
 }
 
 impl Skill {
-    /// Starts a skill, in Halted. Needs a tokio runtime.
+    /// Starts a skill, in Halted, whose first run is 1. Needs a tokio runtime.
     #[must_use]
     pub fn spawn(
+        facts: Facts,
+        driver: Arc<dyn Driver>,
+        authority: Authority,
+        observers: Vec<Box<dyn Observer>>,
+    ) -> Self {
+        Self::counting_from(1, facts, driver, authority, observers)
+    }
+
+    /// The same with the number of its first run, that no number which it had before it was started anew comes again.
+    #[must_use]
+    pub fn counting_from(
+        first_run: u32,
         facts: Facts,
         driver: Arc<dyn Driver>,
         authority: Authority,
@@ -88,7 +100,7 @@ impl Skill {
             (Arc::clone(&facts), driver),
             authority.clone(),
             (Arc::clone(&pending), Arc::clone(&outcomes)),
-            observers,
+            (observers, first_run),
         );
         drop(tokio::spawn(actor.run(waiting)));
         Self {

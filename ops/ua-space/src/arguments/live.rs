@@ -4,11 +4,11 @@ use std::fmt;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use clap::Args;
+use clap::{Args, Subcommand};
 use mappings::{SpaceId, TopicId};
 
 /// Where the space is.
-#[derive(Debug, Args)]
+#[derive(Debug, Default, Args)]
 pub(crate) struct Group {
     /// The network interface of the PubSub group, by name or address
     #[arg(long, value_name = "NAME|ADDRESS", env = "UA_INTERFACE")]
@@ -92,7 +92,58 @@ pub(crate) struct Hz {
 }
 
 #[derive(Debug, Args)]
+#[command(args_conflicts_with_subcommands = true)]
 pub(crate) struct Skills {
+    #[command(subcommand)]
+    pub(crate) verb: Option<SkillsVerb>,
+    #[command(flatten)]
+    pub(crate) list: ListSkills,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum SkillsVerb {
+    /// List the skills, which is also done without this word
+    List(ListSkills),
+    /// Tell all that is known of one skill: what it takes, how it is, how its last run ended
+    Info(InfoSkill),
+    /// Run one skill, which is made ready first where it is Halted, and follow it to its end; Ctrl-C halts it
+    Start(Call),
+    /// Tell what happens to the skills of all components, or to some of them
+    Watch(WatchSkills),
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct InfoSkill {
+    /// Such as parallel-gripper.Grasp
+    #[arg(value_name = "SKILL")]
+    pub(crate) skill: String,
+    /// How long to listen
+    #[arg(long, value_name = "SECONDS", default_value = "3", value_parser = seconds)]
+    pub(crate) seconds: f64,
+    /// One JSON object
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) group: Group,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct WatchSkills {
+    /// Only this component, as parallel-gripper, or only this skill, as parallel-gripper.Grasp
+    #[arg(value_name = "COMPONENT|SKILL")]
+    pub(crate) what: Option<String>,
+    /// End after so long. Without it: at Ctrl-C
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    pub(crate) seconds: Option<f64>,
+    /// One JSON object for each thing that happens
+    #[arg(long)]
+    pub(crate) json: bool,
+    #[command(flatten)]
+    pub(crate) group: Group,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ListSkills {
     /// Only those of this component
     #[arg(value_name = "COMPONENT")]
     pub(crate) component: Option<String>,

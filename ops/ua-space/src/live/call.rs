@@ -27,6 +27,15 @@ use crate::status;
 
 /// `ua-space call`.
 pub(crate) fn call(arguments: &Call) -> Result<(), Failure> {
+    ask_for(arguments, true)
+}
+
+/// The same without the answer being told.
+pub(super) fn call_quietly(arguments: &Call) -> Result<(), Failure> {
+    ask_for(arguments, false)
+}
+
+fn ask_for(arguments: &Call, is_told: bool) -> Result<(), Failure> {
     in_group(&arguments.group, async |live| {
         let mut asking = Asking {
             live,
@@ -41,7 +50,9 @@ pub(crate) fn call(arguments: &Call) -> Result<(), Failure> {
         let answer = asking
             .ask((topic, &described), &request, places.as_ref())
             .await?;
-        asking.tell_answer((topic, &described), &answer)?;
+        if is_told {
+            asking.tell_answer((topic, &described), &answer)?;
+        }
         refused((topic, &described), &answer)?;
         match (places, answer.fields.number("run")) {
             (Some(places), Some(run)) if !arguments.no_wait && run > 0 => {

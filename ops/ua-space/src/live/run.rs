@@ -206,7 +206,7 @@ impl Run {
 }
 
 /// What came out, by name.
-fn results(value: &Named) -> Named {
+pub(super) fn results(value: &Named) -> Named {
     let list = |name: &str| {
         let found = value.get(name).and_then(Value::as_array);
         found.map_or(&[][..], Vec::as_slice)
@@ -225,7 +225,7 @@ fn results(value: &Named) -> Named {
     clippy::cast_sign_loss,
     reason = "between 0 and 100"
 )]
-fn percent(progress: f64) -> u32 {
+pub(super) fn percent(progress: f64) -> u32 {
     (progress.clamp(0.0, 1.0) * 100.0).round() as u32
 }
 

@@ -1,4 +1,10 @@
 //! `ua-space skills`: the skills of all components, and how they are.
+//!
+//! Reading order: this (what is heard of them, and the list), `info`, `start`, `watch`.
+
+mod info;
+mod start;
+mod watch;
 
 use std::collections::BTreeMap;
 use std::io::{self, Write as _};
@@ -9,32 +15,36 @@ use serde::Serialize;
 use uadp::MessageKind;
 
 use super::book::{Book, News};
-use super::described::Described;
+use super::described::{Described, Field};
 use super::list::json;
 use super::plain::{self, Named};
 use super::text::{Table, age, is_coloured};
-use super::{Go, in_group, until};
-use crate::arguments::Skills;
+use super::{Ended, Go, Live, in_group, until};
+use crate::arguments::{Group, ListSkills, Skills, SkillsVerb};
 use crate::exit::Failure;
 
 /// Behind `<component>.<skill>` in the name of the value that says how a skill is.
 const STATE: &str = ".State";
+/// And in that of the value that says how its last run ended.
+const RESULT: &str = ".Result";
 
 /// Methods of a skill, in the order of their identifiers.
 const METHODS: [&str; 5] = ["Start", "Halt", "Suspend", "Resume", "Reset"];
 
 /// `ua-space skills`.
 pub(crate) fn skills(arguments: &Skills) -> Result<(), Failure> {
+    match &arguments.verb {
+        None => list(&arguments.list),
+        Some(SkillsVerb::List(arguments)) => list(arguments),
+        Some(SkillsVerb::Info(arguments)) => info::info(arguments),
+        Some(SkillsVerb::Start(arguments)) => start::start(arguments),
+        Some(SkillsVerb::Watch(arguments)) => watch::watch(arguments),
+    }
+}
+
+fn list(arguments: &ListSkills) -> Result<(), Failure> {
     in_group(&arguments.group, async |mut live| {
-        live.want_calls([0]);
-        let mut states = States::default();
-        let end = until(live.now(), Some(arguments.seconds));
-        live.listen(end, &mut |news, _| {
-            states.take(&news);
-            Go::On
-        })
-        .await?;
-        let mut found = find(&live.book, &states, live.now());
+        let (mut found, _) = hear(&mut live, arguments.seconds, &|_| false).await?;
         if let Some(component) = &arguments.component {
             found.retain(|skill| skill.component == *component);
         }
@@ -56,20 +66,76 @@ pub(crate) fn skills(arguments: &Skills) -> Result<(), Failure> {
     })
 }
 
-/// What skills last said of their states.
+/// Listens for so long, or until `enough` is known.
+async fn hear(
+    live: &mut Live,
+    seconds: f64,
+    enough: &dyn Fn(&[Skill]) -> bool,
+) -> Result<(Vec<Skill>, Ended), Failure> {
+    live.want_calls([0]);
+    let mut states = States::default();
+    let end = until(live.now(), Some(seconds));
+    loop {
+        let next = (live.now() + LOOK).min(end);
+        let each = &mut |news: News<'_>, _| {
+            states.take(&news);
+            Go::On
+        };
+        let ended = live.listen(next, each).await?;
+        let found = find(&live.book, &states, live.now());
+        if ended == Ended::Interrupted || live.now() >= end || enough(&found) {
+            return Ok((found, ended));
+        }
+    }
+}
+
+/// What is heard in a while of the names that `call` takes: those of skills, of calls, and topics.
+pub(crate) fn heard_names(group: &Group) -> Result<HeardNames, Failure> {
+    in_group(group, async |mut live| {
+        let (found, _) = hear(&mut live, FOR_NAMES, &|_| false).await?;
+        let mut components: Vec<String> =
+            found.iter().map(|skill| skill.component.clone()).collect();
+        components.dedup();
+        let calls = live.book.calls();
+        let named = calls.map(|(_, described)| described.name.clone());
+        Ok(HeardNames {
+            components,
+            skills: found.iter().map(Skill::name).collect(),
+            calls: named.filter(|name| !name.is_empty()).collect(),
+            topics: live
+                .book
+                .topics()
+                .map(|(topic, _)| topic.to_string())
+                .collect(),
+        })
+    })
+}
+
+/// Names that are heard in a space.
+#[derive(Debug, Default)]
+pub(crate) struct HeardNames {
+    pub(crate) components: Vec<String>,
+    pub(crate) skills: Vec<String>,
+    pub(crate) calls: Vec<String>,
+    pub(crate) topics: Vec<String>,
+}
+
+/// What skills last said of their states and results.
 #[derive(Default)]
 struct States(BTreeMap<TopicId, Named>);
 
 impl States {
-    /// Takes in a state, or what may be one: of a value that comes before its name the identifier tells.
+    /// Takes in a state or result, or what may be one: of a value that comes before its name the identifier tells.
     fn take(&mut self, news: &News<'_>) {
         let News::Sample(sample) = news else {
             return;
         };
         let described = sample.described.as_deref();
         let may_be = match described {
-            Some(described) => described.name.ends_with(STATE),
-            None => sample.topic.identifier.get() % 100 == STATE_ID,
+            Some(described) => [STATE, RESULT]
+                .iter()
+                .any(|end| described.name.ends_with(end)),
+            None => [STATE_ID, RESULT_ID].contains(&(sample.topic.identifier.get() % 100)),
         };
         let has_room = self.0.len() < MOST || self.0.contains_key(&sample.topic);
         if may_be
@@ -81,7 +147,7 @@ impl States {
         }
     }
 
-    /// The state of a skill, by the names that are known by now.
+    /// The state or result of a skill, by the names that are known by now.
     fn of(&self, topic: TopicId, described: &Described) -> Option<Named> {
         let mut state = self.0.get(&topic)?.clone();
         state.rename(described.fields());
@@ -109,6 +175,19 @@ struct Skill {
     calls: BTreeMap<&'static str, String>,
     /// What Start takes.
     takes: Option<String>,
+    /// How the last run ended.
+    #[serde(skip)]
+    result: Option<Named>,
+    /// What Start takes, one by one.
+    #[serde(skip)]
+    parameters: Vec<Field>,
+}
+
+impl Skill {
+    /// As `call` takes it.
+    fn name(&self) -> String {
+        format!("{}.{}", self.component, self.skill)
+    }
 }
 
 fn find(book: &Book, states: &States, now: Duration) -> Vec<Skill> {
@@ -131,6 +210,11 @@ fn find(book: &Book, states: &States, now: Duration) -> Vec<Skill> {
         let state = state.as_ref();
         let text = |field: &str| state.and_then(|state| state.text(field));
         let skill_type = described.skill_type();
+        let result = result_of(topic).and_then(|topic| {
+            let described = book.described(topic)?;
+            states.of(topic, described)
+        });
+        let start = of("Start").and_then(|(_, start)| start.call());
         Some(Skill {
             component: component.to_owned(),
             skill: skill.to_owned(),
@@ -146,10 +230,9 @@ fn find(book: &Book, states: &States, now: Duration) -> Vec<Skill> {
                 .into_iter()
                 .filter_map(|method| Some((method, of(method)?.0.to_string())))
                 .collect(),
-            takes: of("Start").and_then(|(_, start)| {
-                let takes = &start.call()?.request;
-                Some(format!("({})", super::described::list(takes)))
-            }),
+            takes: start.map(|start| format!("({})", super::described::list(&start.request))),
+            result,
+            parameters: start.map(|start| start.request.clone()).unwrap_or_default(),
         })
     });
     let mut skills: Vec<Skill> = skills.collect();
@@ -157,6 +240,12 @@ fn find(book: &Book, states: &States, now: Duration) -> Vec<Skill> {
         (&a.component, &a.topic, &a.skill).cmp(&(&b.component, &b.topic, &b.skill))
     });
     skills
+}
+
+/// Where the result of a skill is, from where its state is.
+fn result_of(state: TopicId) -> Option<TopicId> {
+    let (space, namespace, id) = state.triple();
+    TopicId::new(space, namespace, id.checked_add(RESULT_ID - STATE_ID)?)
 }
 
 const HEAD: [&str; 6] = ["COMPONENT", "SKILL", "TYPE", "STATE", "RUN", "CALL"];
@@ -189,6 +278,12 @@ fn table(skills: &[Skill]) -> Table {
 
 /// Place of the state among the identifiers of a skill.
 const STATE_ID: u16 = 1;
+/// And of the result.
+const RESULT_ID: u16 = 4;
+/// How often is looked whether enough is known.
+const LOOK: Duration = Duration::from_millis(100);
+/// Seconds in which every skill says its state.
+const FOR_NAMES: f64 = 1.3;
 /// States that are kept.
 const MOST: usize = 4096;
 /// Three times what a state is repeated in.

@@ -61,7 +61,7 @@ pub struct FoundParameter {
     pub default: Option<Value>,
     /// Its unit, by the symbol.
     pub unit: Option<String>,
-    /// Its node, as `nsu=<namespace uri>;i=10017`.
+    /// Its node, as `nsu=<namespace uri>;i=1000017`.
     pub node: String,
     pub(super) id: NodeId,
 }
@@ -70,6 +70,8 @@ pub struct FoundParameter {
 #[derive(Debug, Clone, PartialEq, Default)]
 pub(super) struct Nodes {
     pub(super) skill: NodeId,
+    /// The object of its component; null where there is none.
+    pub(super) component: NodeId,
     /// Children by name, those of CurrentState and FinalResultData by paths.
     pub(super) children: Vec<(String, NodeId)>,
 }
@@ -247,6 +249,7 @@ async fn read(
     let skill = reference.node_id.node_id.clone();
     let mut nodes = Nodes {
         skill: skill.clone(),
+        component: component_node(&above).cloned().unwrap_or_default(),
         children: Vec::new(),
     };
     let children = client
@@ -298,6 +301,12 @@ async fn read(
         capabilities,
         nodes,
     })
+}
+
+/// The object above the folder Skills.
+fn component_node(above: &[(NodeId, String)]) -> Option<&NodeId> {
+    let found = above.iter().rev().find(|(_, name)| name != "Skills");
+    found.map(|(node, _)| node)
 }
 
 /// The object above the folder Skills, and what it says is its number in the space.

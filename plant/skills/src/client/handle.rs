@@ -4,11 +4,12 @@ use std::time::Duration;
 
 use async_trait::async_trait;
 use plant_opcua::client::{CallError, Client, ClientError, Link, Notice, Watch};
-use plant_opcua::types::{NodeId, Variant};
+use plant_opcua::types::{NodeId, QualifiedName, StatusCode, UAString, Variant};
 use program::{Method, State};
 
 use super::find::FoundSkill;
 use super::{called, lost, refused};
+use crate::model::DEVICES;
 use crate::runs::{Runs, SkillFault};
 use crate::shown::Outcome;
 use crate::value::Value;
@@ -64,6 +65,37 @@ impl SkillHandle {
             },
             step: step.as_ref().map(text).unwrap_or_default(),
         })
+    }
+
+    /// Takes the lease of its component before anything is done, and has it until the session closes (OPC 10000-100, 7). Says
+    /// whether the component knows locks; without them the first call takes the lease.
+    ///
+    /// # Errors
+    /// BadLocked when it is somebody else's, or no answer.
+    pub async fn lock(&self, what_for: &str) -> Result<bool, SkillFault> {
+        let Some(index) = self.client.namespace(DEVICES) else {
+            return Ok(false);
+        };
+        let name = |name: &str| QualifiedName::new(index, name);
+        let component = &self.found.nodes.component;
+        let path = [name("Lock")];
+        let below = [name("Lock"), name("InitLock")];
+        let object = self.client.translate(component, &path).await;
+        let method = self.client.translate(component, &below).await;
+        let (Ok(object), Ok(method)) = (object, method) else {
+            return Ok(false);
+        };
+        let context = Variant::String(UAString::from(what_for));
+        let answer = self.client.call(&object, &method, vec![context]).await;
+        let what = format!("{} is somebody else's", self.found.component);
+        match answer.as_deref() {
+            Ok([Variant::Int32(0), ..]) => Ok(true),
+            Ok(_) => Err(refused(StatusCode::BadLocked, &what)),
+            Err(error) => Err(called(
+                error,
+                &format!("InitLock of {}", self.found.component),
+            )),
+        }
     }
 
     /// Calls a method.

@@ -1,27 +1,30 @@
 //! Pick and place by the skills of two servers.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use async_trait::async_trait;
 
-use super::{ClientOptions, SkillClient, SkillHandle};
-use crate::component::Partners;
+use super::{ClientOptions, Detector, SkillClient, SkillHandle};
+use crate::component::{Partner, Partners};
 use crate::composite::{self, PickAndPlace};
 use crate::driver::{Driver, Results, Work};
+use crate::model::SKILL_TYPE;
 use crate::parameters::{Parameters, TypeName};
 
-/// The driver of PickAndPlaceSkillType that runs the skills of a robot and a gripper, each behind its endpoint. It has their
+/// The driver of PickAndPlaceSkillType that runs the skills of a robot and a gripper, each a server of its own. It has their
 /// leases for as long as a run takes.
 #[derive(Debug, Clone)]
 pub struct Remote {
     partners: Partners,
+    detector: Option<Detector>,
 }
 
 impl Remote {
-    /// One of these two.
+    /// One of these two; those that are called by their ApplicationUri are found by the detector.
     #[must_use]
-    pub fn new(partners: Partners) -> Self {
-        Self { partners }
+    pub fn new(partners: Partners, detector: Option<Detector>) -> Self {
+        Self { partners, detector }
     }
 }
 
@@ -42,8 +45,8 @@ impl Driver for Remote {
     }
 
     async fn run(&self, work: Work) -> Result<Results, String> {
-        let robot = connect(&self.partners.robot).await?;
-        let done = match connect(&self.partners.gripper).await {
+        let robot = self.connect(&self.partners.robot, &work).await?;
+        let done = match self.connect(&self.partners.gripper, &work).await {
             Ok(gripper) => {
                 let done = self.with(&robot, &gripper, &work).await;
                 gripper.close().await;
@@ -57,16 +60,44 @@ impl Driver for Remote {
 }
 
 impl Remote {
+    async fn connect(&self, partner: &Partner, work: &Work) -> Result<SkillClient, String> {
+        let endpoint = match (partner, &self.detector) {
+            (Partner::At(endpoint), _) => endpoint.clone(),
+            (Partner::Called(uri), Some(detector)) => {
+                let any = TypeName::own(SKILL_TYPE);
+                let found = tokio::select! {
+                    found = detector.one(&any, FOUND_WITHIN, |one| one.application_uri == *uri) => found,
+                    () = work.stopped() => return Err("stopped".to_owned()),
+                };
+                let found = found.map_err(|_| format!("{uri} is not there"))?;
+                work.note(format!("{uri} is at {}", found.endpoint)).await;
+                found.endpoint
+            }
+            (Partner::Called(uri), None) => return Err(format!("nobody looks for {uri}")),
+        };
+        let connected = SkillClient::connect(&endpoint, &ClientOptions::default()).await;
+        connected.map_err(|fault| format!("{endpoint}: {fault}"))
+    }
+
     async fn with(
         &self,
         robot: &SkillClient,
         gripper: &SkillClient,
         work: &Work,
     ) -> Result<Results, String> {
+        let (ptp, grasp) = (
+            one(robot, "PtpMoveSkillType").await?,
+            one(gripper, "GraspSkillType").await?,
+        );
+        // Both or nothing: whoever waits for one of them at work does not take the other away.
+        for first in [&ptp, &grasp] {
+            let locked = first.lock("pick and place").await;
+            locked.map_err(|fault| fault.to_string())?;
+        }
         let composite = PickAndPlace {
-            ptp: Arc::new(one(robot, "PtpMoveSkillType").await?),
+            ptp: Arc::new(ptp),
             linear: Arc::new(one(robot, "LinearMoveSkillType").await?),
-            grasp: Arc::new(one(gripper, "GraspSkillType").await?),
+            grasp: Arc::new(grasp),
             release: Arc::new(one(gripper, "ReleaseSkillType").await?),
             within: self.partners.within,
         };
@@ -77,11 +108,6 @@ impl Remote {
             .map_err(|broken| broken.to_string())?;
         Ok(Vec::new())
     }
-}
-
-async fn connect(endpoint: &str) -> Result<SkillClient, String> {
-    let connected = SkillClient::connect(endpoint, &ClientOptions::default()).await;
-    connected.map_err(|fault| format!("{endpoint}: {fault}"))
 }
 
 /// The first skill of a type.
@@ -95,3 +121,6 @@ async fn one(client: &SkillClient, of: &str) -> Result<SkillHandle, String> {
         .ok_or_else(|| format!("{} has no skill of {of}", client.endpoint()))?;
     Ok(client.handle(first))
 }
+
+/// How long a partner that is not there is waited for.
+const FOUND_WITHIN: Duration = Duration::from_secs(10);

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::{
-    Component, DeviceKinds, DriverSetup, Lds, MOST_SKILLS, NoDevices, Partners, Security,
-    Simulation, SkillSetup,
+    Component, DeviceKinds, DriverSetup, LEASE, Lds, MOST_SKILLS, NoDevices, Partner, Partners,
+    Security, Simulation, SkillSetup,
 };
 use crate::parameters::{TypeName, shortened};
 use crate::yaml::{Code, Findings, Kind, Node, Place, Reader, parse};
@@ -58,6 +58,7 @@ fn component(
         "nodesets",
         "lds",
         "open",
+        "lease",
         "device",
         "skills",
     ];
@@ -70,6 +71,7 @@ fn component(
         nodesets,
         lds,
         open,
+        lease,
         device,
         skills,
     ] = reader.map(root, keys)?;
@@ -110,6 +112,7 @@ fn component(
         },
     };
     let open = open.map_or(Some(false), |node| reader.boolean(node));
+    let lease = lease.map_or(Some(LEASE), |node| reader.duration(node));
     let device = device.map(|node| kinds.read(node, reader));
     let skills = reader
         .needed(skills, "skills", root.place)
@@ -123,6 +126,7 @@ fn component(
         nodesets,
         lds: lds?,
         open: open?,
+        lease: lease?,
         device: match device {
             Some(read) => Some(read?),
             None => None,
@@ -331,16 +335,25 @@ fn read_partners(node: &Node, reader: &mut Reader<'_>) -> Option<Partners> {
     let [robot, gripper, within] = reader.map(node, ["robot", "gripper", "within"])?;
     let robot = reader
         .needed(robot, "robot", node.place)
-        .and_then(|node| read_endpoint(node, reader));
+        .and_then(|node| read_partner(node, reader));
     let gripper = reader
         .needed(gripper, "gripper", node.place)
-        .and_then(|node| read_endpoint(node, reader));
+        .and_then(|node| read_partner(node, reader));
     let within = within.map_or(Some(USUALLY_WITHIN), |node| reader.duration(node));
     Some(Partners {
         robot: robot?,
         gripper: gripper?,
         within: within?,
     })
+}
+
+/// An endpoint, or the ApplicationUri of one that is looked for.
+fn read_partner(node: &Node, reader: &mut Reader<'_>) -> Option<Partner> {
+    let is_uri = matches!(&node.kind, Kind::Scalar(text) if text.starts_with("urn:"));
+    match is_uri {
+        true => read_uri(node, Code::Uri, reader).map(Partner::Called),
+        false => read_endpoint(node, reader).map(Partner::At),
+    }
 }
 
 const DEFAULT_ENDPOINT: &str = "opc.tcp://127.0.0.1:0";

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::{Device, DriverSetup, Simulation};
-use crate::client::Remote;
+use crate::client::{Detector, Remote};
 use crate::driver::Driver;
 use crate::model::NAMESPACE;
 use crate::parameters::TypeName;
@@ -18,6 +18,7 @@ pub struct Drivers {
     changer: Changer,
     base: Base,
     device: Option<Arc<dyn Device>>,
+    detector: Option<Detector>,
 }
 
 /// A driver that cannot do the work of a type.
@@ -26,11 +27,12 @@ pub struct Drivers {
 pub struct DriverFault(pub String);
 
 impl Drivers {
-    /// Those of a new component that has this device.
+    /// Those of a new component that has this device, and finds others by that detector.
     #[must_use]
-    pub fn new(device: Option<Arc<dyn Device>>) -> Self {
+    pub fn new(device: Option<Arc<dyn Device>>, detector: Option<Detector>) -> Self {
         Self {
             device,
+            detector,
             ..Self::default()
         }
     }
@@ -57,7 +59,8 @@ impl Drivers {
                 None => Err(DriverFault("the component has no `device`".to_owned())),
             },
             DriverSetup::PickAndPlace(partners) if is("PickAndPlaceSkillType") => {
-                Ok(Arc::new(Remote::new(partners.clone())))
+                let detector = self.detector.clone();
+                Ok(Arc::new(Remote::new(partners.clone(), detector)))
             }
             DriverSetup::PickAndPlace(_) => Err(DriverFault(format!(
                 "`pick_and_place` does the work of PickAndPlaceSkillType, and this is {own}"

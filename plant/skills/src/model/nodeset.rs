@@ -8,7 +8,7 @@ use program::{Method, Rest};
 
 use super::table::{SkillType, Unit, Variable};
 use super::types::TYPES;
-use super::{CONTROLLER_TYPE, EVENT_TYPE, NAMESPACE, SKILL_TYPE};
+use super::{CONTROLLER_TYPE, EVENT_TYPE, NAMESPACE, SKILL_TYPE, USED_SKILL_TYPE, USES_SKILL};
 use crate::value::{Builtin, Value};
 
 /// The NodeSet of [`NAMESPACE`]: the same text each time. It needs namespace 0 only.
@@ -20,6 +20,7 @@ pub fn nodeset() -> String {
     }
     nodes.event_type();
     nodes.controller_type();
+    nodes.used_skills();
     let mut text = nodes.0;
     text.push_str("</UANodeSet>\n");
     text
@@ -375,6 +376,36 @@ impl Nodes {
     }
 }
 
+impl Nodes {
+    /// What a skill refers to that is made of others.
+    fn used_skills(&mut self) {
+        let browse_name = format!("1:{USES_SKILL}");
+        let node = Node::new("UAReferenceType", USES_SKILL_ID, &browse_name)
+            .about("Leads from a skill to one of another component that its work is done with.")
+            .back("HasSubtype", NON_HIERARCHICAL_REFERENCES);
+        self.add(node);
+        let browse_name = format!("1:{USED_SKILL_TYPE}");
+        let node = Node::new("UAObjectType", USED_SKILL_TYPE_ID, &browse_name)
+            .about("A skill of another component, which is where that is.")
+            .back("HasSubtype", BASE_OBJECT_TYPE);
+        self.add(node);
+        let members = [
+            (
+                "1:Component",
+                "The endpoint or ApplicationUri of the component it is of.",
+            ),
+            ("1:Type", "The type that it is of, or of a subtype of it."),
+        ];
+        for (id, (browse_name, about)) in (USED_SKILL_TYPE_ID + 1..).zip(members) {
+            let member = Node::new("UAVariable", id, browse_name)
+                .about(about)
+                .attribute("DataType", "String")
+                .forward("HasTypeDefinition", PROPERTY_TYPE);
+            self.add(member.child_of(USED_SKILL_TYPE_ID, "HasProperty", Rule::Mandatory));
+        }
+    }
+}
+
 /// The identifiers of a variable and of the first of its properties.
 struct Ids {
     node: u32,
@@ -486,6 +517,11 @@ const RESULT_PROPERTIES: u32 = 80;
 const EVENT_TYPE_ID: u32 = 2000;
 const CONTROLLER_TYPE_ID: u32 = 2100;
 
+const USES_SKILL_ID: u32 = 2200;
+const USED_SKILL_TYPE_ID: u32 = 2201;
+
+const BASE_OBJECT_TYPE: &str = "i=58";
+const NON_HIERARCHICAL_REFERENCES: &str = "i=32";
 const PROGRAM_STATE_MACHINE_TYPE: &str = "i=2391";
 const PROGRAM_TRANSITION_EVENT_TYPE: &str = "i=2378";
 const BASE_INTERFACE_TYPE: &str = "i=17602";

@@ -13,10 +13,9 @@ use tokio::sync::watch;
 use tokio::time::{Instant, sleep_until};
 
 use crate::authority::{Authority, Owner};
+pub(super) use crate::model::DEVICES as NAMESPACE;
 use crate::skill::lock;
 
-/// The namespace of OPC 10000-100.
-pub(super) const NAMESPACE: &str = "http://opcfoundation.org/UA/DI/";
 /// The part of it that is about locking, for components whose types need no more of it.
 pub(super) const NODESET: &str = include_str!("locking.xml");
 
@@ -92,7 +91,7 @@ impl Lock {
 
     fn init(&self, request: &MethodRequest) -> Answer {
         let session = request.caller.session;
-        if self.authority.claim(&Owner::Session(session)).is_err() {
+        if self.authority.lock_for(&Owner::Session(session)).is_err() {
             return Ok(ALREADY_LOCKED);
         }
         let context = match request.arguments.first() {
@@ -152,6 +151,20 @@ impl Lock {
         self.changed.send_replace(());
     }
 
+    /// Ends a lock that nobody needs any more: what has something done keeps it without renewing it.
+    fn end_or_extend(&self, held: &Held) {
+        let now = Instant::now();
+        let idle = self.authority.idle(now);
+        match idle.map_or(Some(LONGEST_LOCK), |idle| LONGEST_LOCK.checked_sub(idle)) {
+            Some(left) if !left.is_zero() => {
+                let session = held.session;
+                let until = now + left;
+                *lock(&self.held) = Some(Held { session, until });
+            }
+            Some(_) | None => self.free(),
+        }
+    }
+
     async fn watch(self) {
         let mut changed = self.changed.subscribe();
         let mut holder = self.authority.holder();
@@ -166,7 +179,7 @@ impl Lock {
             let is_another = |now: &Option<Owner>| *now != Some(Owner::Session(held.session));
             tokio::select! {
                 renewed = changed.changed() => if renewed.is_err() { return },
-                () = sleep_until(held.until) => self.free(),
+                () = sleep_until(held.until) => self.end_or_extend(&held),
                 _gone = holder.wait_for(is_another) => self.free(),
             }
         }

@@ -1,0 +1,287 @@
+//! `ua-space completion`: words for shells, with the names that are heard in the space.
+
+use std::io::{self, Write as _};
+
+use clap::{Arg, Command, CommandFactory as _, Parser};
+
+use crate::arguments::{Arguments, Group, Shell};
+use crate::exit::Failure;
+use crate::live::{HeardNames, heard_names};
+
+/// `ua-space completion`.
+pub(crate) fn script(shell: Shell) -> Result<(), Failure> {
+    let text = match shell {
+        Shell::Bash => BASH,
+        Shell::Zsh => ZSH,
+        Shell::Fish => FISH,
+    };
+    io::stdout().lock().write_all(text.as_bytes())?;
+    Ok(())
+}
+
+/// `ua-space complete`: a word a line. Where nothing can be said, no word: a shell has no use for a fault.
+pub(crate) fn complete(words: &[String]) -> Result<(), Failure> {
+    let (typed, before) = match words.split_last() {
+        Some((typed, before)) => (typed.as_str(), before),
+        None => ("", &[][..]),
+    };
+    let place = Place::of(before);
+    let mut found = place.words(typed);
+    if let Some(kind) = place.names().filter(|_| !typed.starts_with('-')) {
+        let heard = heard_names(&group(before)).unwrap_or_default();
+        found.extend(kind.of(heard, typed));
+    }
+    found.retain(|word| word.starts_with(typed));
+    found.sort();
+    found.dedup();
+    let mut out = io::stdout().lock();
+    for word in found {
+        writeln!(out, "{word}")?;
+    }
+    Ok(())
+}
+
+/// Where in the command line a word is to come.
+struct Place {
+    command: Command,
+    /// The option whose value it is.
+    option: Option<Arg>,
+    /// How many words that are no option came before it.
+    position: usize,
+}
+
+/// What the names of a place are of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Names {
+    Components,
+    Skills,
+    /// Both.
+    Either,
+    Calls,
+    Topics,
+}
+
+impl Place {
+    fn of(before: &[String]) -> Self {
+        let mut place = Self {
+            command: Arguments::command(),
+            option: None,
+            position: 0,
+        };
+        // What is global or written by clap itself is there from now on.
+        place.command.build();
+        for word in before {
+            place.pass(word);
+        }
+        place
+    }
+
+    fn pass(&mut self, word: &str) {
+        if self.option.take().is_some() {
+            return;
+        }
+        if let Some(name) = word.strip_prefix("--") {
+            let found = self
+                .command
+                .get_arguments()
+                .find(|arg| arg.get_long() == Some(name) && arg.get_action().takes_values());
+            self.option = found.cloned();
+        } else if let Some(name) = word.strip_prefix('-') {
+            let found = self.command.get_arguments().find(|arg| {
+                let short = arg.get_short().map(String::from);
+                short.as_deref() == Some(name) && arg.get_action().takes_values()
+            });
+            self.option = found.cloned();
+        } else if let Some(below) = self.command.find_subcommand(word).cloned()
+            && self.position == 0
+        {
+            self.command = below;
+        } else {
+            self.position += 1;
+        }
+    }
+
+    /// Words that are the same in any space.
+    fn words(&self, typed: &str) -> Vec<String> {
+        let values = |arg: &Arg| -> Vec<String> {
+            let values = arg.get_possible_values();
+            values
+                .iter()
+                .map(|value| value.get_name().to_owned())
+                .collect()
+        };
+        if let Some(option) = &self.option {
+            return values(option);
+        }
+        if typed.starts_with('-') {
+            let shown = self
+                .command
+                .get_arguments()
+                .filter(|arg| !arg.is_hide_set());
+            return shown
+                .filter_map(|arg| Some(format!("--{}", arg.get_long()?)))
+                .collect();
+        }
+        let mut words: Vec<String> = self.positional().map(values).unwrap_or_default();
+        if self.position == 0 {
+            let below = self.command.get_subcommands();
+            let below = below.filter(|below| !below.is_hide_set() && below.get_name() != "help");
+            words.extend(below.map(|below| below.get_name().to_owned()));
+        }
+        words
+    }
+
+    fn names(&self) -> Option<Names> {
+        if self.option.is_some() {
+            return None;
+        }
+        let names = self.positional()?.get_value_names()?;
+        match names.first()?.as_str() {
+            "COMPONENT" => Some(Names::Components),
+            "SKILL" => Some(Names::Skills),
+            "COMPONENT|SKILL" => Some(Names::Either),
+            "TOPIC|NAME" if self.command.get_name() == "start" => Some(Names::Skills),
+            "TOPIC|NAME" => Some(Names::Calls),
+            "TOPIC" => Some(Names::Topics),
+            _ => None,
+        }
+    }
+
+    fn positional(&self) -> Option<&Arg> {
+        self.command.get_positionals().nth(self.position)
+    }
+}
+
+impl Names {
+    fn of(self, heard: HeardNames, typed: &str) -> Vec<String> {
+        let HeardNames {
+            components,
+            mut skills,
+            calls,
+            topics,
+        } = heard;
+        match self {
+            Self::Components => components,
+            Self::Skills => skills,
+            Self::Either => {
+                skills.extend(components);
+                skills
+            }
+            Self::Calls if typed.starts_with("ua_") => topics,
+            Self::Calls => {
+                // What starts a skill is called by its name alone.
+                skills.extend(calls.into_iter().filter(|name| !name.ends_with(".Start")));
+                skills
+            }
+            Self::Topics => topics,
+        }
+    }
+}
+
+/// Where the space is, by what was typed so far and the environment.
+fn group(before: &[String]) -> Group {
+    let mut words = vec!["ua-space".to_owned()];
+    let mut rest = before.iter();
+    while let Some(word) = rest.next() {
+        if ["--interface", "--address", "--keys"].contains(&word.as_str()) {
+            words.push(word.clone());
+            words.extend(rest.next().cloned());
+        } else if word == "--sign" {
+            words.push(word.clone());
+        }
+    }
+    let read = OnlyGroup::try_parse_from(words);
+    let or_usual = read.or_else(|_| OnlyGroup::try_parse_from(["ua-space"]));
+    or_usual.map_or_else(|_| Group::default(), |only| only.group)
+}
+
+#[derive(Debug, Parser)]
+struct OnlyGroup {
+    #[command(flatten)]
+    group: Group,
+}
+
+const BASH: &str = r#"_ua_space() {
+  local line
+  COMPREPLY=()
+  while IFS= read -r line; do
+    COMPREPLY+=("$line")
+  done < <("${COMP_WORDS[0]}" complete -- "${COMP_WORDS[@]:1:COMP_CWORD}" 2>/dev/null)
+}
+complete -o default -F _ua_space ua-space
+"#;
+
+const ZSH: &str = r#"_ua_space() {
+  local -a found
+  found=("${(@f)$("${words[1]}" complete -- "${(@)words[2,CURRENT]}" 2>/dev/null)}")
+  if [[ -n "${found[1]}" ]]; then
+    compadd -- "${found[@]}"
+  else
+    _files
+  fi
+}
+compdef _ua_space ua-space
+"#;
+
+const FISH: &str = r#"complete -c ua-space -a '(ua-space complete -- (commandline -opc)[2..] (commandline -ct) 2>/dev/null)'
+"#;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn place(line: &[&str]) -> Place {
+        let words: Vec<String> = line.iter().map(|word| (*word).to_owned()).collect();
+        Place::of(&words)
+    }
+
+    #[test]
+    fn verbs_options_and_their_values_are_known_by_their_place() {
+        let first = place(&[]).words("");
+        assert!(first.contains(&"skills".to_owned()) && !first.contains(&"complete".to_owned()));
+        let below = place(&["skills"]).words("");
+        assert_eq!(below, ["list", "info", "start", "watch"]);
+        let options = place(&["skills", "watch"]).words("--");
+        assert!(
+            options.contains(&"--seconds".to_owned())
+                && options.contains(&"--interface".to_owned())
+        );
+        assert_eq!(place(&["keys", "--policy"]).words(""), ["aes128", "aes256"]);
+        assert_eq!(place(&["completion"]).words(""), ["bash", "zsh", "fish"]);
+    }
+
+    #[test]
+    fn names_are_of_what_the_word_is_to_be() {
+        for (line, names) in [
+            (&["skills"][..], Some(Names::Components)),
+            (&["skills", "info"], Some(Names::Skills)),
+            (
+                &["skills", "--interface", "lo", "start"],
+                Some(Names::Skills),
+            ),
+            (&["skills", "watch"], Some(Names::Either)),
+            (&["call"], Some(Names::Calls)),
+            (&["call", "gripper.Grasp"], None),
+            (&["echo", "--seconds", "3"], Some(Names::Topics)),
+            (&["echo", "--seconds"], None),
+            (&["check"], None),
+        ] {
+            assert_eq!(place(line).names(), names, "{line:?}");
+        }
+        let heard = HeardNames {
+            components: vec!["gripper".to_owned()],
+            skills: vec!["gripper.Grasp".to_owned()],
+            calls: vec![
+                "gripper.Grasp.Start".to_owned(),
+                "gripper.Grasp.Halt".to_owned(),
+            ],
+            topics: vec!["ua_0_7_101".to_owned()],
+        };
+        assert_eq!(
+            Names::Calls.of(heard, "g"),
+            ["gripper.Grasp", "gripper.Grasp.Halt"]
+        );
+        let words = ["skills", "--interface", "lo", "info"].map(str::to_owned);
+        assert_eq!(group(&words).interface.as_deref(), Some("lo"));
+    }
+}

@@ -1,0 +1,154 @@
+//! `ua-space skills info`: all that is known of one skill.
+
+use std::io::{self, Write as _};
+
+use serde::Serialize;
+
+use super::{Ended, Skill, hear, in_group};
+use crate::arguments::InfoSkill;
+use crate::exit::Failure;
+use crate::live::described::ShownField;
+use crate::live::list::json;
+use crate::live::plain::Named;
+use crate::live::run::results;
+use crate::live::text::harmless;
+
+pub(super) fn info(arguments: &InfoSkill) -> Result<(), Failure> {
+    in_group(&arguments.group, async |mut live| {
+        let wanted = &arguments.skill;
+        let is_whole = |found: &[Skill]| {
+            let one = found.iter().find(|skill| skill.name() == *wanted);
+            one.is_some_and(|skill| {
+                skill.state.is_some()
+                    && skill.calls.len() == super::METHODS.len()
+                    && skill.result.is_some()
+            })
+        };
+        let (found, ended) = hear(&mut live, arguments.seconds, &is_whole).await?;
+        let Some(skill) = found.iter().find(|skill| skill.name() == *wanted) else {
+            if ended == Ended::Interrupted {
+                return Err(Failure::Interrupted);
+            }
+            return Err(not_found(wanted, &found, arguments.seconds));
+        };
+        let whole = Whole {
+            skill,
+            parameters: skill.parameters.iter().map(|field| field.shown()).collect(),
+            result: skill.result.as_ref().and_then(Ending::of),
+        };
+        let mut out = io::stdout().lock();
+        if arguments.json {
+            writeln!(out, "{}", json(&whole)?)?;
+        } else {
+            for (what, text) in whole.lines() {
+                writeln!(
+                    out,
+                    "{}",
+                    harmless(&format!("{:<12} {text}", format!("{what}:")))
+                )?;
+            }
+        }
+        live.tell_dropped();
+        Ok(())
+    })
+}
+
+/// Nobody has that skill: who has which.
+pub(super) fn not_found(wanted: &str, found: &[Skill], seconds: f64) -> Failure {
+    let names: Vec<String> = found.iter().take(SHOWN).map(Skill::name).collect();
+    let help = if names.is_empty() {
+        "no skills were heard; is this the group and the interface (--address, --interface)?"
+            .to_owned()
+    } else {
+        format!("there are {}", names.join(", "))
+    };
+    let wanted = harmless(wanted);
+    Failure::Unavailable(format!(
+        "no skill {wanted} was heard for {seconds} s\n  = help: {}",
+        harmless(&help)
+    ))
+}
+
+#[derive(Serialize)]
+struct Whole<'a> {
+    #[serde(flatten)]
+    skill: &'a Skill,
+    parameters: Vec<ShownField<'a>>,
+    /// How the last run ended; none before the first has.
+    result: Option<Ending>,
+}
+
+#[derive(Serialize)]
+struct Ending {
+    run: u64,
+    succeeded: bool,
+    message: String,
+    results: Named,
+}
+
+impl Ending {
+    fn of(value: &Named) -> Option<Self> {
+        let run = value.number("run").filter(|run| *run > 0)?;
+        Some(Self {
+            run,
+            succeeded: value.get("succeeded").and_then(serde_json::Value::as_bool) == Some(true),
+            message: value.text("message").unwrap_or_default().to_owned(),
+            results: results(value),
+        })
+    }
+}
+
+impl Whole<'_> {
+    fn lines(&self) -> Vec<(&'static str, String)> {
+        let Self { skill, result, .. } = self;
+        let mut lines = vec![("skill", skill.name())];
+        if let (Some(name), Some(namespace)) = (&skill.type_name, &skill.type_namespace) {
+            lines.push(("type", format!("{name} of {namespace}")));
+        }
+        lines.push(("topic", skill.topic.clone()));
+        if let Some(state) = &skill.state {
+            let step = skill.step.as_deref().unwrap_or_default();
+            lines.push(("state", format!("{state} {step}").trim_end().to_owned()));
+        }
+        if let Some(run) = skill.run.filter(|run| *run > 0) {
+            lines.push(("run", run.to_string()));
+        }
+        for field in &skill.parameters {
+            let optional = if field.optional {
+                ", may be left out"
+            } else {
+                ""
+            };
+            let about = match field.description.as_str() {
+                "" => String::new(),
+                about => format!("  # {about}"),
+            };
+            lines.push((
+                "parameter",
+                format!("{}: {}{optional}{about}", field.name, field.kind()),
+            ));
+        }
+        if let Some(ending) = result {
+            let how = if ending.succeeded {
+                "succeeded"
+            } else {
+                "failed"
+            };
+            let message = match ending.message.as_str() {
+                "" => String::new(),
+                message => format!(": {message}"),
+            };
+            lines.push(("last", format!("run {} {how}{message}", ending.run)));
+            for (name, value) in &ending.results.0 {
+                lines.push(("result", format!("{name}: {value}")));
+            }
+        }
+        for (method, topic) in &skill.calls {
+            lines.push(("call", format!("{topic} {method}")));
+        }
+        lines
+    }
+}
+
+/// Names that are told where one is not found.
+const SHOWN: usize = 20;

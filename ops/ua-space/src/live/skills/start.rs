@@ -1,0 +1,54 @@
+//! `ua-space skills start`: makes a skill ready where it has to be, and runs it.
+
+use super::info::not_found;
+use super::{Ended, Skill, hear, in_group};
+use crate::arguments::{Call, Group, Target};
+use crate::exit::Failure;
+use crate::live::call::{call, call_quietly};
+
+pub(super) fn start(arguments: &Call) -> Result<(), Failure> {
+    let Target::Name(wanted) = &arguments.target else {
+        // Whoever knows the number of a Start knows what has to come before it.
+        return call(arguments);
+    };
+    let wanted = wanted.strip_suffix(".Start").unwrap_or(wanted);
+    let (state, reset) = in_group(&arguments.group, async |mut live| {
+        let one = |found: &[Skill]| {
+            let mut found = found.iter();
+            let one = found.find(|skill| skill.name() == wanted)?;
+            let both = (one.state.clone()?, one.calls.get("Reset").cloned());
+            one.calls.contains_key("Start").then_some(both)
+        };
+        let is_whole = |found: &[Skill]| one(found).is_some();
+        let (found, ended) = hear(&mut live, arguments.wait, &is_whole).await?;
+        match one(&found) {
+            Some(both) => Ok(both),
+            None if ended == Ended::Interrupted => Err(Failure::Interrupted),
+            None => Err(not_found(wanted, &found, arguments.wait)),
+        }
+    })?;
+    if state == HALTED
+        && let Some(reset) = reset.and_then(|topic| topic.parse().ok())
+    {
+        call_quietly(&Call {
+            target: Target::Topic(reset),
+            parameters: Vec::new(),
+            run_timeout: None,
+            no_wait: true,
+            group: same(&arguments.group),
+            ..*arguments
+        })?;
+    }
+    call(arguments)
+}
+
+fn same(group: &Group) -> Group {
+    Group {
+        interface: group.interface.clone(),
+        address: group.address.clone(),
+        keys: group.keys.clone(),
+        sign: group.sign,
+    }
+}
+
+const HALTED: &str = "Halted";

@@ -1,0 +1,235 @@
+//! `cargo xtask bench skills`: what a client waits for, what a skill's methods take beside a plain one, and many skills in
+//! one server.
+
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use plant_opcua::client::{Client, ClientConfig, Notice, Select, Watch};
+use plant_opcua::types::{Array, NodeId, ObjectTypeId, Variant, VariantScalarTypeId};
+use skills::{ClientOptions, SkillClient};
+use system_tests::{Cell, Child, Started, Times, cpu_share, eventually, program, resident};
+use tokio::runtime::Runtime;
+
+fn main() -> ExitCode {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    let number = |name: &str, usual: usize| -> Option<usize> {
+        match args.iter().position(|arg| arg == name) {
+            None => Some(usual),
+            Some(at) => args.get(at + 1)?.parse().ok(),
+        }
+    };
+    let (Some(runs), Some(skills)) = (number("--runs", 200), number("--skills", 1_000)) else {
+        print!("{HELP}");
+        return ExitCode::from(64);
+    };
+    if args.iter().any(|arg| arg == "--help") {
+        print!("{HELP}");
+        return ExitCode::SUCCESS;
+    }
+    let Some(cell) = Cell::with(&[]) else {
+        return ExitCode::FAILURE;
+    };
+    // Its threads are of the network of this one.
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .unwrap();
+    let _component = component(&cell, 1, &mut Times::default());
+    runtime.block_on(events(runs));
+    runtime.block_on(methods(runs));
+    drop(_component);
+    many(&cell, &runtime, skills);
+    ExitCode::SUCCESS
+}
+
+const HELP: &str = "\
+cargo xtask bench skills [--runs N] [--skills N]
+
+  --runs N     runs and calls of each kind (200)
+  --skills N   skills in one server (1000)
+";
+
+/// A component with so many grippers, all done at once.
+fn component(cell: &Cell, pairs: usize, ready: &mut Times) -> Child {
+    let mut yaml =
+        "component: bench\napplication_uri: urn:ua-bridge:bench\nnamespace: 9\nskills:\n"
+            .to_owned();
+    for pair in 0..pairs {
+        for (name, of) in [("Grasp", "GraspSkillType"), ("Release", "ReleaseSkillType")] {
+            yaml.push_str(&format!(
+                "  - {{name: {name}{pair}, type: {of}, driver: {{simulated: {{duration: 1 ms}}}}}}\n"
+            ));
+        }
+    }
+    let began = Instant::now();
+    let child = Started::new("ua-component", &program("ua-component"))
+        .args([cell.file("bench.yaml", &yaml)])
+        .args(["--endpoint", ENDPOINT, "--lds", "none", "--interface", "lo"])
+        .start();
+    eventually("the component serves", SOON, || {
+        std::net::TcpStream::connect(ENDPOINT.trim_start_matches("opc.tcp://")).ok()
+    });
+    ready.add(began.elapsed());
+    child
+}
+
+async fn client() -> Client {
+    let config = ClientConfig {
+        timeout: SOON,
+        ..ClientConfig::new("urn:ua-bridge:bench:client", "bench")
+    };
+    let client = Client::open(config, ENDPOINT);
+    client.up(SOON).await.unwrap();
+    client
+}
+
+fn node(id: u32) -> NodeId {
+    NodeId::new(1, id)
+}
+
+/// From a Start to its answer, and to the event that says Running, and from that to the end of the run.
+async fn events(runs: usize) {
+    let client = client().await;
+    let select = ["Transition/Number"];
+    let watch = Watch::Events {
+        node: node(100),
+        select: select
+            .iter()
+            .map(|path| Select::new(ObjectTypeId::BaseEventType, path))
+            .collect(),
+        of_type: None,
+    };
+    for interval in [10, 20, 100] {
+        let mut events =
+            client.subscribe(vec![watch.clone()], Duration::from_millis(interval), 100);
+        while events.next().await != Some(Notice::Subscribed) {}
+        let (mut answered, mut running, mut ended) =
+            (Times::default(), Times::default(), Times::default());
+        // Good or not: it may be Ready already.
+        let _reset = client.call(&node(100), &node(109), Vec::new()).await;
+        for _ in 0..runs {
+            let began = Instant::now();
+            client
+                .call(&node(100), &node(105), Vec::new())
+                .await
+                .unwrap();
+            answered.add(began.elapsed());
+            until(&mut events, 2).await;
+            running.add(began.elapsed());
+            until(&mut events, 4).await;
+            ended.add(began.elapsed());
+        }
+        println!(
+            "\n{runs} runs of 1 ms, events asked for every {interval} ms; milliseconds since Start:\n"
+        );
+        println!("| what | p50 | p99 |\n|---|---|---|");
+        for (what, times) in [
+            ("Start is answered", &mut answered),
+            ("the event ReadyToRunning is there", &mut running),
+            ("the event RunningToReady is there", &mut ended),
+        ] {
+            println!(
+                "| {what} | {:.2} | {:.2} |",
+                times.at(0.5) / 1e3,
+                times.at(0.99) / 1e3
+            );
+        }
+    }
+    client.close().await;
+}
+
+/// Waits for the transition of a number.
+async fn until(events: &mut plant_opcua::client::Subscription, number: u32) {
+    loop {
+        if let Some(Notice::Event { fields, .. }) = events.next().await
+            && fields.first() == Some(&Variant::UInt32(number))
+        {
+            return;
+        }
+    }
+}
+
+/// A method that has nothing done beside those of a skill.
+async fn methods(runs: usize) {
+    let client = client().await;
+    let none = |value_type| {
+        Variant::Array(Box::new(Array {
+            value_type,
+            values: Vec::new(),
+            dimensions: None,
+        }))
+    };
+    let execute = || {
+        vec![
+            none(VariantScalarTypeId::String),
+            none(VariantScalarTypeId::Variant),
+            Variant::Double(0.0),
+        ]
+    };
+    let outcome = || vec![Variant::UInt32(0)];
+    let skill = node(100);
+    let (mut plain, mut begun, mut whole) = (Times::default(), Times::default(), Times::default());
+    for _ in 0..runs {
+        let began = Instant::now();
+        client.call(&skill, &node(121), outcome()).await.unwrap();
+        plain.add(began.elapsed());
+        let began = Instant::now();
+        client.call(&skill, &node(120), execute()).await.unwrap();
+        begun.add(began.elapsed());
+        loop {
+            let told = client.call(&skill, &node(121), outcome()).await.unwrap();
+            if told.first() == Some(&Variant::Boolean(true)) {
+                break;
+            }
+        }
+        whole.add(began.elapsed());
+    }
+    println!("\n{runs} calls of each method, in turns; microseconds:\n");
+    println!("| method | p50 | p99 |\n|---|---|---|");
+    for (what, times) in [
+        ("ReadOutcome: answered from memory", &mut plain),
+        ("Execute: begins a run", &mut begun),
+        (
+            "Execute, and ReadOutcome until a run of 1 ms has ended",
+            &mut whole,
+        ),
+    ] {
+        println!("| {what} | {:.0} | {:.0} |", times.at(0.5), times.at(0.99));
+    }
+    client.close().await;
+}
+
+/// Many skills in one server: how long it takes to start and to be listed, and what it takes while nothing happens.
+fn many(cell: &Cell, runtime: &Runtime, skills: usize) {
+    println!(
+        "\n| skills | serves after | listed in | in RAM | of a processor, idle |\n|---|---|---|---|---|"
+    );
+    for skills in [2, 100.min(skills), skills] {
+        let mut ready = Times::default();
+        let component = component(cell, skills.div_ceil(2), &mut ready);
+        let (found, listed) = runtime.block_on(async {
+            let options = ClientOptions {
+                within: SOON,
+                ..ClientOptions::default()
+            };
+            let client = SkillClient::connect(ENDPOINT, &options).await.unwrap();
+            let began = Instant::now();
+            let found = client.skills().await.unwrap().len();
+            let listed = began.elapsed();
+            client.close().await;
+            (found, listed)
+        });
+        let idle = cpu_share(component.id(), Duration::from_secs(10));
+        println!(
+            "| {found} | {:.0} ms | {:.0} ms | {:.1} MB | {:.2} % |",
+            ready.at(0.5) / 1e3,
+            listed.as_secs_f64() * 1e3,
+            resident(component.id()) as f64 / 1e6,
+            idle * 100.0
+        );
+    }
+}
+
+const ENDPOINT: &str = "opc.tcp://127.0.0.1:4855";
+const SOON: Duration = Duration::from_secs(60);
