@@ -151,7 +151,8 @@ fn a_composite_halts_and_retreats_within_two_seconds_when_a_component_is_killed_
     let result = lines.iter().find(|line| line["event"] == "result");
     let message = result.unwrap()["message"].as_str().unwrap().to_owned();
     assert!(
-        message.starts_with("Grasp: gripper.Grasp is lost")
+        message.starts_with("Grasp: gripper.")
+            && message.contains(" is lost: ")
             && message.ends_with("the robot has retreated"),
         "{message}"
     );

@@ -103,14 +103,7 @@ fn component(
                 .map(|path| folder.join(path))
         })
         .collect();
-    let lds = match lds {
-        None => Some(Lds::Local),
-        Some(node) => match reader.text(node, "an endpoint or `none`") {
-            Some("none") => Some(Lds::Nowhere),
-            Some(_) => read_endpoint(node, reader).map(Lds::At),
-            None => None,
-        },
-    };
+    let lds = lds.map_or(Some(Lds::Local), |node| read_lds(node, reader));
     let open = open.map_or(Some(false), |node| reader.boolean(node));
     let lease = lease.map_or(Some(LEASE), |node| reader.duration(node));
     let device = device.map(|node| kinds.read(node, reader));
@@ -133,6 +126,13 @@ fn component(
         },
         skills: skills?,
     })
+}
+
+fn read_lds(node: &Node, reader: &mut Reader<'_>) -> Option<Lds> {
+    match reader.text(node, "an endpoint or `none`")? {
+        "none" => Some(Lds::Nowhere),
+        _ => read_endpoint(node, reader).map(Lds::At),
+    }
 }
 
 fn read_name(node: &Node, reader: &mut Reader<'_>) -> Option<String> {

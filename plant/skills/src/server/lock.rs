@@ -177,10 +177,12 @@ impl Lock {
                 continue;
             };
             let is_another = |now: &Option<Owner>| *now != Some(Owner::Session(held.session));
+            // What it gives keeps the holder from being changed.
+            let gone = async { drop(holder.wait_for(is_another).await) };
             tokio::select! {
                 renewed = changed.changed() => if renewed.is_err() { return },
                 () = sleep_until(held.until) => self.end_or_extend(&held),
-                _gone = holder.wait_for(is_another) => self.free(),
+                () = gone => self.free(),
             }
         }
     }

@@ -145,8 +145,12 @@ impl Last {
         let Some(state) = value.text("to_state") else {
             return Vec::new();
         };
-        let run = value.number("run").unwrap_or_default();
-        self.state = Some((state.to_owned(), run));
+        let now = (state.to_owned(), value.number("run").unwrap_or_default());
+        if self.state.as_ref() == Some(&now) {
+            // The state came before its transition.
+            return Vec::new();
+        }
+        self.state = Some(now);
         vec![Step::State {
             state: state.to_owned(),
             transition: value.text("transition").map(str::to_owned),
