@@ -1,5 +1,6 @@
-//! The keys of secured groups: read from files, which are looked at again from time to time.
+//! The keys of secured groups: read from files, looked at again from time to time, and fetched from Security Key Services.
 
+mod fetch;
 mod file;
 
 use std::collections::BTreeMap;
@@ -13,6 +14,7 @@ use tokio::sync::{mpsc, watch};
 use tokio::time::{MissedTickBehavior, interval};
 use tracing::{info, warn};
 
+pub use self::fetch::{Fetched, Fetching, KeyRequest, KeyService};
 use crate::clock::now;
 use crate::exit::{Failure, FailureKind};
 
@@ -31,6 +33,7 @@ pub(crate) struct KeyRing {
     /// What the keepers bring.
     incoming: mpsc::Receiver<NewKeys>,
     outgoing: mpsc::Sender<NewKeys>,
+    service: Option<Arc<dyn KeyService>>,
     /// The keepers of the groups there are; each ends when its sender goes.
     keepers: BTreeMap<String, Keeper>,
 }
@@ -42,12 +45,16 @@ struct Keeper {
 }
 
 impl KeyRing {
-    pub(crate) fn new(groups: Option<Vec<SecurityGroup>>) -> Self {
+    pub(crate) fn new(
+        groups: Option<Vec<SecurityGroup>>,
+        service: Option<Arc<dyn KeyService>>,
+    ) -> Self {
         let (outgoing, incoming) = mpsc::channel(WAITING);
         Self {
             groups,
             incoming,
             outgoing,
+            service,
             keepers: BTreeMap::new(),
         }
     }
@@ -92,7 +99,23 @@ impl KeyRing {
                 };
                 self.keepers.insert(group.id.clone(), keeper);
                 let out = self.outgoing.clone();
-                drop(tokio::spawn(watch_file(group.clone(), (out, wants))));
+                match (&group.keys, &self.service) {
+                    (Some(KeySource::Own(_) | KeySource::Sks(_)), Some(service)) => {
+                        let service = Arc::clone(service);
+                        drop(tokio::spawn(fetch::keep(
+                            group.clone(),
+                            service,
+                            (out, wants),
+                        )));
+                    }
+                    (Some(KeySource::Own(_) | KeySource::Sks(_)), None) => warn!(
+                        group = group.id,
+                        "this program fetches no keys from a Security Key Service: nothing is said or heard in the group"
+                    ),
+                    (Some(KeySource::File(_) | KeySource::Credential(_)) | None, _) => {
+                        drop(tokio::spawn(watch_file(group.clone(), (out, wants))));
+                    }
+                }
             }
         }
     }
@@ -128,6 +151,7 @@ fn path_of(group: &SecurityGroup) -> Option<Result<PathBuf, Failure>> {
     match group.keys.as_ref()? {
         KeySource::File(path) => Some(Ok(path.clone())),
         KeySource::Credential(name) => Some(credential(name)),
+        KeySource::Own(_) | KeySource::Sks(_) => None,
     }
 }
 

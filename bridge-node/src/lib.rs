@@ -40,6 +40,7 @@ pub use clock::{now, timestamp};
 pub use definitions::Definitions;
 pub use executing::{Executing, ExecutorGraph};
 pub use exit::{Failure, FailureKind};
+pub use keys::{Fetched, Fetching, KeyRequest, KeyService};
 pub use logging::{LogFormat, LogRecord, LogSink, hear_log};
 pub use metrics::{Requests, Told, serve_pages};
 pub use port::{Delivery, Execution, Port, PortEvent};

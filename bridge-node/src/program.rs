@@ -23,7 +23,7 @@ use crate::busy_poll::BusyPoll;
 use crate::clock::now;
 use crate::descriptors;
 use crate::exit::{Failure, FailureKind};
-use crate::keys::KeyRing;
+use crate::keys::{KeyRing, KeyService};
 use crate::logging;
 use crate::mapping_file::{MappingFile, Running};
 use crate::metrics::{self, Requests};
@@ -64,6 +64,12 @@ pub trait Program: Parser {
     fn owned(mapping: &Mapping) -> Owned {
         let _whole_space = mapping;
         Owned::All
+    }
+
+    /// How it fetches keys from a Security Key Service; `None` where it does not.
+    fn key_service(&self, mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
+        let _none = mapping;
+        None
     }
 
     /// The spaces it serves, none of them twice: each with a local side, a Router and a place in the group of its own.
@@ -210,7 +216,7 @@ async fn prepare<P: Program>(
         local: P::LOCAL,
         source: Some(udp.source()),
     };
-    let mut keys = KeyRing::new(groups(arguments)?);
+    let mut keys = KeyRing::new(groups(arguments)?, program.key_service(&mapping));
     let taken = mapping;
     let mapping = keys.applied(Arc::clone(&taken));
     let mut router = Router::new(settings, Arc::clone(&mapping));

@@ -2,12 +2,14 @@
 
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use bridge_core::Local;
-use bridge_node::{Arguments, Context, Failure, FailureKind, Program};
+use bridge_node::{Arguments, Context, Failure, FailureKind, KeyService, Program};
 use bridge_ros1::{PortOptions, Ros1Port};
 use clap::{ArgMatches, Command, CommandFactory, FromArgMatches, Parser};
 use mappings::{Mapping, SpaceId};
+use plant_keys::KeyArguments;
 use tcpros::{ArgumentError, NodeError, NodeOptions};
 use tracing::warn;
 
@@ -32,6 +34,8 @@ struct BridgeRos1 {
 struct Flags {
     #[command(flatten)]
     arguments: Arguments,
+    #[command(flatten)]
+    keys: KeyArguments,
 }
 
 impl Parser for BridgeRos1 {
@@ -95,6 +99,10 @@ impl Program for BridgeRos1 {
 
     fn spaces(&self, _mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
         Ok(vec![SpaceId::ROS1])
+    }
+
+    fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
+        Some(self.flags.keys.service(Self::NAME))
     }
 
     async fn start(&self, context: Context) -> Result<Ros1Port, Failure> {

@@ -5,9 +5,10 @@ use std::net::{IpAddr, SocketAddr, ToSocketAddrs as _};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use bridge_core::Local;
-use bridge_node::{Arguments, Context, Failure, FailureKind, Program};
+use bridge_node::{Arguments, Context, Failure, FailureKind, KeyService, Program};
 use bridge_ros2::discovery_info::GidLength;
 use bridge_ros2::domain::{DiscoveryRange, DomainError, DomainOptions};
 use bridge_ros2::node::NodeOptions;
@@ -15,6 +16,7 @@ use bridge_ros2::security::Security;
 use bridge_ros2::{PortOptions, Ros2Port, RosArgs, limits};
 use clap::Parser;
 use mappings::{Mapping, SpaceId};
+use plant_keys::KeyArguments;
 use tracing::{info, warn};
 use transport::{Interface, InterfaceError};
 
@@ -28,6 +30,8 @@ fn main() -> ExitCode {
 struct BridgeRos2 {
     #[command(flatten)]
     arguments: Arguments,
+    #[command(flatten)]
+    keys: KeyArguments,
     /// The DDS domain to join, or several as 2,3; without it the domain of the space, or of the mapping's only ROS 2
     /// space
     #[arg(long, value_name = "N", env = "ROS_DOMAIN_ID", value_delimiter = ',', value_parser = domain_number)]
@@ -211,6 +215,10 @@ impl Program for BridgeRos2 {
     fn spaces(&self, mapping: &Mapping) -> Result<Vec<SpaceId>, Failure> {
         self.chosen(mapping)
             .map_err(|message| Failure::new(FailureKind::Usage, message))
+    }
+
+    fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
+        Some(self.keys.service(Self::NAME))
     }
 
     async fn start(&self, context: Context) -> Result<Ros2Port, Failure> {

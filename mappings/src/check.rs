@@ -324,7 +324,7 @@ fn compile(
     let groups = groups
         .and_then(|at| at.value.as_deref())
         .unwrap_or_default();
-    let security = security::check(groups, findings);
+    let security = security::check(groups, &server.endpoint, findings);
     let mapping = Mapping::new(pubsub, spaces.known, namespaces.known, server, variables);
     *used = types.used();
     let mapping = mapping

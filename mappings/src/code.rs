@@ -129,9 +129,10 @@ codes! {
     UnknownActionType = "M135", "No definition of the action type is built in, so a package with the .action file must be in `type_paths`, or below one of the folders of ROS_PACKAGE_PATH or AMENT_PREFIX_PATH, when the bridge runs.";
     MethodTarget = "M136", "`opcua` says which Method of which other OPC UA server executes a call: `endpoint`, `object` and `method`, the nodes as nsu=urn:plc;s=Line.Reset. The cell's own server calls it, so the call has `origin: 0`, a node of a namespace of `namespaces`, and the endpoint is not that of the cell's server itself.";
     SecurityGroup = "M150", "An entry of `security` is a SecurityGroup of OPC UA PubSub: a `group`, each once, and the `namespaces` that are its, none of them in two groups. One group may be without `namespaces`: it has all that no other names.";
-    GroupKeys = "M151", "The `keys` of a secured group come from a file that only its owner can read, or from a credential of systemd. They never stand in the mapping itself, which is copied to every host of the cell.";
+    GroupKeys = "M151", "The `keys` of a secured group come from a file that only its owner can read, from a credential of systemd, or from a Security Key Service. They never stand in the mapping itself, which is copied to every host of the cell.";
     HalfSecured = "M152", "Some of what is sent is secured, and a namespace is not. Who can write there can steer what is read there. `mode: none` in a group with that namespace says that it is meant.";
     OpenCall = "M153", "A call can be asked for without a key, in a cell where values are secured. To execute something is worth more protection than to read something, and not less.";
+    KeyService = "M154", "With `keys: {sks: {}}` the cell's own server makes the keys of a group and hands them out, over encrypted sessions, to the programs that `members` names by the ApplicationUris in their certificates; each key is used for `key_lifetime`. With an `endpoint` another Security Key Service does, and that is then its own affair.";
 }
 
 impl Code {
@@ -178,7 +179,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M153")]
+#[error("no finding has that code; codes are M001 to M154")]
 pub struct UnknownCode;
 
 #[cfg(test)]

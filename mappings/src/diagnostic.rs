@@ -4,6 +4,7 @@ use std::fmt::{self, Write as _};
 use std::sync::Arc;
 
 use crate::code::Code;
+use crate::key_text::without_keys;
 use crate::secret::masked;
 use crate::topic::SpaceId;
 
@@ -80,7 +81,8 @@ impl Diagnostic {
         let place = format!("{:width$}--> {}:{line}:{column}\n", "", printable(file));
         out.push_str(&place);
         if let Some(text) = line.checked_sub(1).and_then(|n| source.lines().nth(n)) {
-            let (shown, caret, carets) = window(&masked(text), column.saturating_sub(1), *len);
+            let (shown, caret, carets) =
+                window(&without_keys(masked(text)), column.saturating_sub(1), *len);
             let label = self.label.as_deref().map(printable).unwrap_or_default();
             let pointer = format!("{:caret$}{:^<carets$} {label}", "", "");
             // A write to a String cannot fail.

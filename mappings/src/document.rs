@@ -13,7 +13,9 @@ use crate::mapping::UaField;
 use crate::read::{At, Read, Reader, choice, document, short};
 use crate::tree::{Kind, Node, Place};
 
-pub(crate) use security::{GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry};
+pub(crate) use security::{
+    GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry, SksEntry,
+};
 
 document! {
     /// One cell: its ROS spaces, its OPC UA nodes, and which ROS topic is which node.

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use crate::code::Code;
 use crate::diagnostic::{Diagnostic, Severity, Span};
+use crate::key_text::without_keys;
 use crate::read::short;
 use crate::secret;
 use crate::topic::SpaceId;
@@ -167,7 +168,8 @@ impl Findings {
             let texts = [&mut found.label, &mut found.help];
             let texts = texts.into_iter().flatten().chain([&mut found.message]);
             for text in texts {
-                *text = secret::masked_where_cut(&hidden(text, &secrets)).into_owned();
+                let shown = hidden(text, &secrets);
+                *text = without_keys(secret::masked_where_cut(&shown)).into_owned();
             }
         }
         if self.left_out > 0 {

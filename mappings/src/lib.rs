@@ -9,6 +9,7 @@ mod document;
 mod environment;
 mod findings;
 mod include;
+mod key_text;
 mod mapping;
 mod nearest;
 mod node_id;
@@ -39,7 +40,7 @@ pub use mapping::{
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use schema::schema;
-pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup};
+pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
 pub use surroundings::{Readers, Surroundings};
 pub use topic::{Part, SpaceId, TopicError, TopicId};
 pub use unit::Unit;

@@ -1,8 +1,9 @@
 //! Who may write and read what is sent, once it is checked.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
-use crate::mapping::Mapping;
+use crate::mapping::{Endpoint, Mapping};
 
 /// A SecurityGroup (OPC 10000-14, 8.2): the programs that have its keys.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -62,6 +63,21 @@ pub enum KeySource {
     File(PathBuf),
     /// The name of a file in the directory of credentials that systemd gives the program.
     Credential(String),
+    /// The cell's own server makes them, and hands them out.
+    Own(Served),
+    /// Another Security Key Service hands them out.
+    Sks(Endpoint),
+}
+
+/// How the cell's own server makes the keys of a group.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Served {
+    /// Where it is.
+    pub endpoint: Endpoint,
+    /// How long each is used.
+    pub lifetime: Duration,
+    /// The ApplicationUris of those that get them, where `*` at the end stands for any characters; empty: all that are trusted.
+    pub members: Vec<String>,
 }
 
 impl GroupMode {

@@ -152,6 +152,14 @@ fn what_the_plant_thinks_with_reaches_no_io_and_knows_no_space() {
 }
 
 #[test]
+fn who_fetches_keys_knows_neither_ros_nor_skills() {
+    does_not_reach(
+        "plant-keys",
+        &["tcpros", "rustdds", "skills", "discovery", "knowledge"],
+    );
+}
+
+#[test]
 fn the_opc_ua_library_knows_neither_skills_nor_who_is_there_nor_the_space() {
     does_not_reach(
         "plant-opcua",

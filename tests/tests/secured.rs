@@ -1,5 +1,8 @@
 //! A secured group, live: both bridges have its keys, and a third program has none.
 
+#[path = "secured/sks.rs"]
+mod sks;
+
 use std::path::Path;
 use std::process::Command;
 use std::time::Duration;

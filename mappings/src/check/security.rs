@@ -2,23 +2,35 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
+use std::time::Duration;
 
+use super::network::{duration, parse_endpoint};
 use super::required;
 use crate::call::Call;
 use crate::code::Code;
 use crate::document::{
-    Document, GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry,
+    Document, GroupEntry, GroupModeEntry, GroupPolicyEntry, KeysEntry, ReplayEntry, SksEntry,
 };
 use crate::findings::Findings;
-use crate::mapping::Mapping;
+use crate::key_text::is_key;
+use crate::mapping::{Endpoint, Mapping, SecurityPolicy};
 use crate::read::{At, given, short};
-use crate::security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup};
+use crate::security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
 use crate::tree::Place;
 
 /// Most groups of a document.
 const MAX_GROUPS: usize = 64;
+/// How long a key is used where nothing is said.
+const LIFETIME: Duration = Duration::from_secs(3600);
+/// Shorter than programs need to hear of the next one.
+const LEAST_LIFETIME: Duration = Duration::from_secs(2);
 
-pub(super) fn check(entries: &[At<GroupEntry>], findings: &mut Findings) -> Vec<SecurityGroup> {
+/// `server` is the endpoint of the cell's own server.
+pub(super) fn check(
+    entries: &[At<GroupEntry>],
+    server: &Endpoint,
+    findings: &mut Findings,
+) -> Vec<SecurityGroup> {
     if let Some(first) = entries.get(MAX_GROUPS) {
         let message = format!("{} groups; at most {MAX_GROUPS} are read", entries.len());
         findings.error(Code::TooLarge, first.place, message);
@@ -29,7 +41,7 @@ pub(super) fn check(entries: &[At<GroupEntry>], findings: &mut Findings) -> Vec<
     let mut groups = Vec::new();
     for at in entries {
         let Some(entry) = &at.value else { continue };
-        let Some(group) = group(entry, at.place, findings) else {
+        let Some(group) = group(entry, at.place, server, findings) else {
             continue;
         };
         if let Some(first) = ids.insert(group.id.clone(), at.place) {
@@ -77,7 +89,12 @@ fn claim(
     }
 }
 
-fn group(entry: &GroupEntry, owner: Place, findings: &mut Findings) -> Option<SecurityGroup> {
+fn group(
+    entry: &GroupEntry,
+    owner: Place,
+    server: &Endpoint,
+    findings: &mut Findings,
+) -> Option<SecurityGroup> {
     let (id, place) = required(&entry.group, "group", "the entry", owner, findings)?;
     if id.is_empty() || id.chars().count() > 128 || id.chars().any(char::is_control) {
         let message = "a SecurityGroupId has 1 to 128 characters, none a control character";
@@ -118,7 +135,7 @@ fn group(entry: &GroupEntry, owner: Place, findings: &mut Findings) -> Option<Se
             .error(Code::SecurityGroup, at.place, message)
             .help("without the key it has all that no other group names");
     }
-    let keys = keys(entry, (mode, owner), findings);
+    let keys = keys(entry, (mode, owner), server, findings);
     Some(SecurityGroup {
         id: id.clone(),
         mode,
@@ -132,6 +149,7 @@ fn group(entry: &GroupEntry, owner: Place, findings: &mut Findings) -> Option<Se
 fn keys(
     entry: &GroupEntry,
     (mode, owner): (GroupMode, Place),
+    server: &Endpoint,
     findings: &mut Findings,
 ) -> Option<KeySource> {
     let Some(at) = &entry.keys else {
@@ -153,16 +171,24 @@ fn keys(
             .help("leave out `mode: none`, or the keys");
         return None;
     }
-    source(keys, at.place, findings)
+    source(keys, at.place, server, findings)
 }
 
-fn source(keys: &KeysEntry, place: Place, findings: &mut Findings) -> Option<KeySource> {
-    if keys.file.is_some() == keys.credential.is_some() {
+fn source(
+    keys: &KeysEntry,
+    place: Place,
+    server: &Endpoint,
+    findings: &mut Findings,
+) -> Option<KeySource> {
+    let count = usize::from(keys.file.is_some())
+        + usize::from(keys.credential.is_some())
+        + usize::from(keys.sks.is_some());
+    if count != 1 {
         findings
             .error(
                 Code::GroupKeys,
                 place,
-                "keys come from exactly one of `file` and `credential`",
+                "keys come from exactly one of `file`, `credential` and `sks`",
             )
             .help("the keys themselves never stand in the mapping: whoever can read it would have them");
         return None;
@@ -176,24 +202,75 @@ fn source(keys: &KeysEntry, place: Place, findings: &mut Findings) -> Option<Key
         }
         return Some(KeySource::File(PathBuf::from(file)));
     }
-    let (name, place) = given(&keys.credential)?;
-    if name.is_empty() || name.contains('/') || name.starts_with('.') || is_key(name) {
-        findings
-            .error(Code::GroupKeys, place, "this is no name of a credential")
-            .help("the ID in LoadCredential=ID:PATH of the unit");
-        return None;
+    if let Some((name, place)) = given(&keys.credential) {
+        if name.is_empty() || name.contains('/') || name.starts_with('.') || is_key(name) {
+            findings
+                .error(Code::GroupKeys, place, "this is no name of a credential")
+                .help("the ID in LoadCredential=ID:PATH of the unit");
+            return None;
+        }
+        return Some(KeySource::Credential(name.clone()));
     }
-    Some(KeySource::Credential(name.clone()))
+    given(&keys.sks).and_then(|(sks, place)| service(sks, place, server, findings))
 }
 
-/// Whether somebody wrote a key there.
-fn is_key(text: &str) -> bool {
-    let text = text.rsplit('/').next().unwrap_or_default();
-    text.len() >= 32 && text.bytes().all(|byte| byte.is_ascii_hexdigit())
+fn service(
+    entry: &SksEntry,
+    place: Place,
+    server: &Endpoint,
+    findings: &mut Findings,
+) -> Option<KeySource> {
+    let lifetime = duration(&entry.key_lifetime, findings);
+    if let Some(short) = lifetime.filter(|time| *time < LEAST_LIFETIME)
+        && let Some((_, at)) = given(&entry.key_lifetime)
+    {
+        let message = format!("a key is used for {LEAST_LIFETIME:?} at least, not {short:?}");
+        findings
+            .error(Code::KeyService, at, message)
+            .help("programs ask again at half of it, and each has to have the next key in time");
+    }
+    let members = entry.members.as_ref().and_then(|at| at.value.as_deref());
+    let members: Vec<String> = members
+        .unwrap_or_default()
+        .iter()
+        .filter_map(|at| at.value.clone())
+        .collect();
+    let own = || {
+        KeySource::Own(Served {
+            endpoint: server.clone(),
+            lifetime: lifetime.unwrap_or(LIFETIME),
+            members: members.clone(),
+        })
+    };
+    let Some((text, at)) = given(&entry.endpoint) else {
+        return entry.endpoint.is_none().then(own);
+    };
+    let Some(endpoint) = parse_endpoint(text) else {
+        let message = format!("`{}` is no endpoint", short(text));
+        findings
+            .error(Code::Endpoint, at, message)
+            .help("for example opc.tcp://sks.local:4840");
+        return None;
+    };
+    if endpoint == *server {
+        return Some(own());
+    }
+    if entry.key_lifetime.is_some() || entry.members.is_some() {
+        findings
+            .error(
+                Code::KeyService,
+                place,
+                "`key_lifetime` and `members` are that service's own affair",
+            )
+            .help("they go with the cell's own server: sks: {}");
+        return None;
+    }
+    Some(KeySource::Sks(endpoint))
 }
 
 /// What of a cell that is secured in part is not.
 pub(super) fn left_open(mapping: &Mapping, document: &Document, findings: &mut Findings) {
+    own_service(mapping, document, findings);
     let secured = |group: &SecurityGroup| group.mode != GroupMode::None;
     let Some(at) = &document.security else { return };
     if !mapping.security().iter().any(secured) {
@@ -227,6 +304,35 @@ pub(super) fn left_open(mapping: &Mapping, document: &Document, findings: &mut F
                 .warning(Code::OpenCall, call_place, message)
                 .help("put its namespace into a secured group");
         }
+    }
+}
+
+/// What keeps programs from fetching the keys that the cell's own server makes.
+fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) {
+    let own = |group: &&SecurityGroup| matches!(group.keys, Some(KeySource::Own(_)));
+    let (Some(at), Some(group)) = (&document.security, mapping.security().iter().find(own)) else {
+        return;
+    };
+    let server = mapping.server();
+    if server.security == [SecurityPolicy::None] {
+        let message = format!(
+            "the server makes the keys of the group `{}`, and hands them out over encrypted sessions, of which it offers none",
+            short(&group.id)
+        );
+        findings
+            .error(Code::KeyService, at.place, message)
+            .help("server: {security: [Basic256Sha256]}");
+    }
+    if matches!(server.endpoint.host.as_str(), "0.0.0.0" | "::") {
+        let message = format!(
+            "programs ask the server for the keys of the group `{}` at `server.endpoint`, and {} is no address that \
+             another host can reach",
+            short(&group.id),
+            server.endpoint
+        );
+        findings
+            .warning(Code::KeyService, at.place, message)
+            .help("server: {endpoint: \"opc.tcp://NAME:4840\"}, with the name or address of its host; ua-server --endpoint says where it listens");
     }
 }
 

@@ -13,7 +13,7 @@ document! {
         mode: GroupModeEntry,
         /// How long the keys for encryption are: `aes256` (the default) or `aes128`.
         policy: GroupPolicyEntry,
-        /// Where the keys come from: exactly one of `file` and `credential`.
+        /// Where the keys come from: exactly one of `file`, `credential` and `sks`.
         keys: KeysEntry,
         /// The namespaces whose values, events and calls are the group's, as [2, 3]. Left out: all that no other group names,
         /// and what belongs to none, as questions and announcements.
@@ -30,6 +30,22 @@ document! {
         /// The name of such a file among the credentials that systemd hands to the program (LoadCredential=).
         #[schemars(length(min = 1))]
         credential: String,
+        /// A Security Key Service, which hands keys out and replaces them from time to time.
+        sks: SksEntry,
+    }
+
+    /// A Security Key Service.
+    struct SksEntry {
+        /// Where it is, as opc.tcp://sks.local:4840. Left out: the cell's own OPC UA server, `server.endpoint`, which then makes
+        /// the keys.
+        #[schemars(regex(pattern = r"^opc\.tcp://"))]
+        endpoint: String,
+        /// With the cell's own server: how long a key is used before the next one; default 1h.
+        #[schemars(regex(pattern = r"^[0-9]+(\.[0-9]+)?(ms|s|min|h)$"))]
+        key_lifetime: String,
+        /// With the cell's own server: the ApplicationUris of the programs that get the keys, as they stand in their certificates;
+        /// `*` at the end stands for any characters. Left out: every program whose certificate the server trusts.
+        members: Vec<At<String>>,
     }
 }
 

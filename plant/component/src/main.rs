@@ -5,9 +5,11 @@ mod simulate;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
-use bridge_node::{Arguments, Context, Failure, FailureKind, Made, Owned, Program, WithoutMapping};
+use bridge_node::{
+    Arguments, Context, Failure, FailureKind, KeyService, Made, Owned, Program, WithoutMapping,
+};
 use mappings::{Mapping, SpaceId};
 use skills::{Component, Lds, Security};
 use ua_component::{ComponentPort, Options, made};
@@ -105,12 +107,16 @@ impl UaComponent {
         Ok(self.read.get_or_init(|| Read { component, text }))
     }
 
+    /// The certificate store, where anything is secured.
+    fn pki_root(&self, read: &Read) -> PathBuf {
+        let root = || plant_opcua::pki::default_root(|name| std::env::var(name).ok());
+        let usual = || root().join(&read.component.name);
+        self.pki.clone().unwrap_or_else(usual)
+    }
+
     fn options(&self, read: &Read) -> Options {
         let secured = read.component.security.contains(&Security::Basic256Sha256);
-        let usual = || {
-            plant_opcua::pki::default_root(|name| std::env::var(name).ok())
-                .join(&read.component.name)
-        };
+        let usual = || self.pki_root(read);
         let pki = self.pki.clone().or_else(|| secured.then(usual));
         let interface = self.arguments.0.flags.interface.as_deref();
         let mdns = match interface {
@@ -152,6 +158,16 @@ impl Program for UaComponent {
             return Ok(Some(Made::Checked));
         }
         Ok(Some(Made::Run(made(&read.component))))
+    }
+
+    /// As whom its server and its clients come, from the same certificate store.
+    fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
+        let read = self.read().ok()?;
+        Some(Arc::new(plant_keys::Service::new(plant_keys::Identity {
+            application_uri: read.component.application_uri.clone(),
+            application_name: read.component.name.clone(),
+            pki: self.pki_root(read),
+        })))
     }
 
     fn owned(mapping: &Mapping) -> Owned {

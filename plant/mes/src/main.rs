@@ -22,7 +22,9 @@ use std::sync::atomic::AtomicU64;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-use bridge_node::{Arguments, Context, Failure, FailureKind, Made, Owned, Program, WithoutMapping};
+use bridge_node::{
+    Arguments, Context, Failure, FailureKind, KeyService, Made, Owned, Program, WithoutMapping,
+};
 use knowledge::{Endpoint, Knowledge, Limits};
 use mappings::{Mapping, SpaceId};
 use skills::yaml::Place;
@@ -168,10 +170,16 @@ impl UaMes {
         Ok(settings)
     }
 
+    /// The certificate store, where anything is secured.
+    fn pki_root(&self, settings: &Settings) -> PathBuf {
+        let root = || plant_opcua::pki::default_root(|name| std::env::var(name).ok());
+        let usual = || root().join(&settings.name);
+        self.pki.clone().unwrap_or_else(usual)
+    }
+
     fn options(&self, settings: &Settings) -> Options {
         let secured = settings.security.contains(&Security::Basic256Sha256);
-        let usual =
-            || plant_opcua::pki::default_root(|name| std::env::var(name).ok()).join(&settings.name);
+        let usual = || self.pki_root(settings);
         Options {
             pki: self.pki.clone().or_else(|| secured.then(usual)),
             trust_any_client: self.trust_any_client_certificate,
@@ -249,6 +257,16 @@ impl Program for UaMes {
             return Ok(Some(Made::Checked));
         }
         Ok(Some(Made::Run(made(&ready.component))))
+    }
+
+    /// As whom its server comes, from the same certificate store.
+    fn key_service(&self, _mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
+        let settings = &self.ready().ok()?.settings;
+        Some(Arc::new(plant_keys::Service::new(plant_keys::Identity {
+            application_uri: settings.application_uri.clone(),
+            application_name: settings.name.clone(),
+            pki: self.pki_root(settings),
+        })))
     }
 
     fn owned(mapping: &Mapping) -> Owned {

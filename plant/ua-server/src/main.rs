@@ -7,7 +7,7 @@
 //! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show),
 //! `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in),
 //! `components` (which servers are there), `methods` and `argument_types` (calls of the space as Methods), `executing` (Methods of other servers as calls), `port` (the shell's side),
-//! `endpoint` (how clients get in), `value` (between the two codecs).
+//! `endpoint` (how clients get in), `sks` (keys of secured groups), `value` (between the two codecs).
 
 mod address;
 mod argument_types;
@@ -21,6 +21,7 @@ mod methods;
 mod nodes;
 mod port;
 mod properties;
+mod sks;
 mod space;
 mod structures;
 mod value;
@@ -28,14 +29,16 @@ mod values;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::{Arc, OnceLock};
 
-use bridge_node::{Arguments, Context, Failure, FailureKind, Owned, Program};
+use bridge_node::{Arguments, Context, Failure, FailureKind, KeyService, Owned, Program};
 use discovery::{AnnounceSettings, Interface};
 use mappings::{Mapping, SpaceId};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::pki::{self, Pki};
 
 use crate::port::{ServerPort, Setup};
+use crate::sks::{ServerKeys, Sks};
 use crate::structures::Types;
 
 /// The OPC UA server of the cell: every value of the space as a variable, and a way in for those of origin 0.
@@ -61,6 +64,9 @@ struct UaServer {
     /// an interface, to this host and of this host
     #[arg(long)]
     announce: bool,
+    /// Made when it is first wanted.
+    #[arg(skip)]
+    sks: OnceLock<Arc<Sks>>,
 }
 
 fn main() -> ExitCode {
@@ -71,6 +77,12 @@ impl UaServer {
     fn pki_root(&self) -> PathBuf {
         let usual = || pki::default_root(|name| std::env::var(name).ok());
         self.pki.clone().unwrap_or_else(usual)
+    }
+
+    /// The keys of the groups that the server makes them for stand beside its own private key.
+    fn sks(&self) -> Arc<Sks> {
+        let made = || Arc::new(Sks::new(self.pki_root().join("private/sks.json")));
+        Arc::clone(self.sks.get_or_init(made))
     }
 
     /// To whom the server is told of, if to anybody.
@@ -117,6 +129,17 @@ impl Program for UaServer {
         Ok(vec![SpaceId::UA])
     }
 
+    fn key_service(&self, mapping: &Mapping) -> Option<Arc<dyn KeyService>> {
+        Some(Arc::new(ServerKeys {
+            own: self.sks(),
+            others: plant_keys::Service::new(plant_keys::Identity {
+                application_uri: mapping.server().application_uri.clone(),
+                application_name: Self::NAME.to_owned(),
+                pki: self.pki_root(),
+            }),
+        }))
+    }
+
     async fn start(&self, context: Context) -> Result<ServerPort, Failure> {
         let url = match &self.endpoint {
             Some(url) => url.clone(),
@@ -135,6 +158,7 @@ impl Program for UaServer {
         let setup = Setup {
             url,
             pki,
+            sks: self.sks(),
             trust_any_client: self.trust_any_client_certificate,
             types: Types::new(&context.types),
             mapped_url: self.endpoint.is_none(),

@@ -13,13 +13,12 @@ use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce,
 use mappings::{Mapping, SecurityPolicy, Server, SpaceId, TopicId};
 use opcua::server::address_space::AddressSpace;
 use opcua::server::node_manager::ServerContext;
-use opcua::server::node_manager::memory::{
-    CoreNodeManagerBuilder, InMemoryNodeManagerBuilder, InMemoryNodeManagerImplBuilder,
-};
+use opcua::server::node_manager::memory::InMemoryNodeManagerImplBuilder;
 use opcua::server::{MonitoredItemHandle, ServerHandle, SubscriptionCache};
 use opcua::types::NodeId;
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::pki::Pki;
+use plant_opcua::server::core_with;
 use tokio::runtime::Runtime;
 use tokio::sync::{Semaphore, mpsc};
 use tokio::task::JoinHandle;
@@ -34,6 +33,7 @@ use crate::executing::Executing;
 use crate::layout::Layout;
 use crate::methods::{Heard, Methods, Questions, Wish};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
+use crate::sks::Sks;
 use crate::space::Space;
 use crate::structures::Types;
 
@@ -41,6 +41,8 @@ use crate::structures::Types;
 pub(crate) struct Setup {
     pub(crate) url: EndpointUrl,
     pub(crate) pki: Pki,
+    /// The keys that it makes itself.
+    pub(crate) sks: Arc<Sks>,
     pub(crate) trust_any_client: bool,
     pub(crate) types: Types,
     /// Whether the mapping says the endpoint; else the command line does.
@@ -67,6 +69,7 @@ pub(crate) struct ServerPort {
     mapped_url: bool,
     types: Types,
     pki: Pki,
+    sks: Arc<Sks>,
     look: Interval,
     /// Tells of the server until the end. Taken then.
     told: Option<Announced>,
@@ -96,6 +99,7 @@ impl ServerPort {
             .pki
             .ensure_own(&described.application_uri, &setup.url.advertised_host())
             .map_err(|error| io(error.to_string()))?;
+        setup.sks.follow(mapping)?;
         let listener = setup
             .url
             .bind()
@@ -120,7 +124,7 @@ impl ServerPort {
         let (server, handle) = endpoint::server(described, &setup.url, port)
             .pki_dir(setup.pki.root())
             .trust_client_certs(setup.trust_any_client)
-            .with_node_manager(InMemoryNodeManagerBuilder::new(CoreNodeManagerBuilder))
+            .with_node_manager(core_with(setup.sks.methods()))
             .with_node_manager(Ordered::around(nodes))
             .build()
             .map_err(configuration)?;
@@ -161,6 +165,7 @@ impl ServerPort {
             live: written(layout.topics.iter().map(|node| node.topic)).collect(),
             types,
             pki: setup.pki,
+            sks: setup.sks,
             look,
             told,
             components,
@@ -272,6 +277,9 @@ impl Port for ServerPort {
                 self.live.extend(written(new.into_iter()));
             }
             Err(error) => restart.push(format!("variables ({error})")),
+        }
+        if let Err(failure) = self.sks.follow(mapping) {
+            restart.push(format!("security ({failure})"));
         }
         self.methods.put(moved, self.space.structures());
         self.executing.reload(mapping);

@@ -18,7 +18,7 @@ use opcua::types::{BuildInfo, DateTime, MessageSecurityMode, UAString};
 
 use super::calls::Calls;
 use super::nodes::{Nodes, Spaces};
-use super::routed::Routed;
+use super::routed::{Front, Routed};
 use super::{Inner, Server, Waiting};
 use crate::endpoint::{BindError, EndpointUrl};
 use crate::limits;
@@ -288,7 +288,7 @@ impl NodeManagerBuilder for Core {
         }
         Arc::new(Routed {
             inner,
-            calls: self.calls,
+            front: Front::Calls(self.calls),
             last: None,
         })
     }
@@ -345,7 +345,8 @@ impl NodeManagerBuilder for Own {
             calls.spaces.get_or_init(|| Arc::new(spaces));
         }
         let last = calls.spaces.get().cloned();
-        Arc::new(Routed { inner, calls, last })
+        let front = Front::Calls(calls);
+        Arc::new(Routed { inner, front, last })
     }
 }
 

@@ -137,7 +137,7 @@ impl Calls {
         methods: &'a mut [&mut MethodCall],
     ) -> Vec<&'a mut MethodCall> {
         let mut others = Vec::new();
-        let end = Instant::now() + LONGEST_REQUEST;
+        let until = Instant::now() + LONGEST_REQUEST;
         for call in methods {
             let call: &'a mut MethodCall = call;
             match self.route(call) {
@@ -152,17 +152,10 @@ impl Calls {
                         arguments: call.arguments().to_vec(),
                     };
                     let ended = match checked {
-                        Ok(()) => within(end, handler.call(request)).await,
+                        Ok(()) => within(until, handler.call(request)).await,
                         Err(refusal) => Err(refusal),
                     };
-                    match ended {
-                        Ok(outputs) => {
-                            call.set_outputs(outputs);
-                            call.set_status(StatusCode::Good);
-                        }
-                        Err(Refusal::Status(status)) => call.set_status(status),
-                        Err(Refusal::Arguments(each)) => call.set_argument_error(each),
-                    }
+                    end(call, ended);
                 }
                 None => others.push(call),
             }
@@ -210,32 +203,56 @@ impl Calls {
             return Err(Refusal::Status(StatusCode::BadShutdown));
         };
         let declared = spaces.input_arguments(method)?;
-        if given.len() < declared.len() {
-            return Err(Refusal::Status(StatusCode::BadArgumentsMissing));
-        }
-        if given.len() > declared.len() {
-            return Err(Refusal::Status(StatusCode::BadTooManyArguments));
-        }
         let types = context.type_tree.read();
-        let each: Vec<StatusCode> = declared
-            .iter()
-            .zip(given)
-            .map(|(declared, value)| {
-                if fits(value, &declared.data_type, declared.value_rank, &*types) {
-                    StatusCode::Good
-                } else {
-                    StatusCode::BadTypeMismatch
-                }
-            })
-            .collect();
-        if each.contains(&StatusCode::BadTypeMismatch) {
-            return Err(Refusal::Arguments(each));
-        }
-        Ok(())
+        check_arguments(&declared, given, &*types)
     }
 }
 
-async fn within<T>(
+/// Tells a client what became of its call.
+pub(crate) fn end(call: &mut MethodCall, ended: Result<Vec<Variant>, Refusal>) {
+    match ended {
+        Ok(outputs) => {
+            call.set_outputs(outputs);
+            call.set_status(StatusCode::Good);
+        }
+        Err(Refusal::Status(status)) => call.set_status(status),
+        Err(Refusal::Arguments(each)) => call.set_argument_error(each),
+    }
+}
+
+/// Whether arguments are as many as are declared, and of their types (OPC 10000-4, 5.12.2).
+///
+/// # Errors
+/// What is wrong with them.
+pub(crate) fn check_arguments(
+    declared: &[Argument],
+    given: &[Variant],
+    types: &dyn TypeTree,
+) -> Result<(), Refusal> {
+    if given.len() < declared.len() {
+        return Err(Refusal::Status(StatusCode::BadArgumentsMissing));
+    }
+    if given.len() > declared.len() {
+        return Err(Refusal::Status(StatusCode::BadTooManyArguments));
+    }
+    let each: Vec<StatusCode> = declared
+        .iter()
+        .zip(given)
+        .map(|(declared, value)| {
+            if fits(value, &declared.data_type, declared.value_rank, types) {
+                StatusCode::Good
+            } else {
+                StatusCode::BadTypeMismatch
+            }
+        })
+        .collect();
+    if each.contains(&StatusCode::BadTypeMismatch) {
+        return Err(Refusal::Arguments(each));
+    }
+    Ok(())
+}
+
+pub(crate) async fn within<T>(
     end: Instant,
     call: impl Future<Output = Result<T, Refusal>>,
 ) -> Result<T, Refusal> {

@@ -1,7 +1,8 @@
 //! A server whose nodes are instances of the types of NodeSets.
 //!
 //! Reading order: `build` (from a configuration to a server), `view` (all nodes as one), `instances` (nodes from types), `methods` (without types),
-//! `nodes` (values and writes), `calls` and `routed` (methods), `sessions`, `events`.
+//! `nodes` (values and writes), `calls` and `routed` (methods), `overlay` (methods of the core namespace), `sessions`,
+//! `events`.
 
 mod build;
 mod calls;
@@ -9,6 +10,7 @@ mod events;
 mod instances;
 mod methods;
 mod nodes;
+mod overlay;
 mod routed;
 mod sessions;
 mod view;
@@ -37,6 +39,7 @@ pub use self::instances::{
 };
 pub use self::methods::MethodSpec;
 pub use self::nodes::{WriteHandler, WriteRequest, write};
+pub use self::overlay::{CoreMethod, core_with};
 pub use self::sessions::Caller;
 pub use self::view::Child;
 pub use crate::endpoint::EndpointUrl;

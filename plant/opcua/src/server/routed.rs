@@ -23,12 +23,21 @@ use opcua::types::{
 
 use super::calls::Calls;
 use super::nodes::Spaces;
+use super::overlay::Overlay;
 
 pub(crate) struct Routed {
     pub(crate) inner: Arc<DynNodeManager>,
-    pub(crate) calls: Arc<Calls>,
+    pub(crate) front: Front,
     /// Set for the last node manager, which knows all types there are.
     pub(crate) last: Option<Arc<Spaces>>,
+}
+
+/// What answers calls before the library does.
+pub(crate) enum Front {
+    /// The methods of our objects.
+    Calls(Arc<Calls>),
+    /// Those of objects of the core namespace.
+    Core(Arc<Overlay>),
 }
 
 type Done = Result<(), StatusCode>;
@@ -216,7 +225,10 @@ impl NodeManager for Routed {
     }
 
     async fn call(&self, context: &RequestContext, methods: &mut [&mut MethodCall]) -> Done {
-        let mut others = self.calls.answer(context, methods).await;
+        let mut others = match &self.front {
+            Front::Calls(calls) => calls.answer(context, methods).await,
+            Front::Core(overlay) => overlay.answer(context, methods).await,
+        };
         if others.is_empty() {
             return Ok(());
         }

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use opcua::server::node_manager::RequestContext;
 use opcua::sync::{Mutex, RwLock};
+use opcua::types::MessageSecurityMode;
 
 /// The session of the library, whose type has no public name.
 type Watched = Box<dyn Fn() -> bool + Send + Sync>;
@@ -18,8 +19,35 @@ pub struct Caller {
     pub session: u32,
     /// The user, `anonymous` for anonymous ones.
     pub user: String,
-    /// The ApplicationUri the client gave, which nobody has checked without security.
+    /// The ApplicationUri the client gave. Anybody can give any: see `proven`.
     pub application_uri: String,
+    /// Whether the certificate of the client, which the server trusts, has that ApplicationUri.
+    pub proven: bool,
+    /// Whether nobody else can read what is said: signed and encrypted.
+    pub encrypted: bool,
+}
+
+impl Caller {
+    /// Who is behind a request.
+    #[must_use]
+    pub fn of(context: &RequestContext) -> Self {
+        let user = match context.token.0.as_str() {
+            opcua::server::ANONYMOUS_USER_TOKEN_ID => "anonymous".to_owned(),
+            user => user.to_owned(),
+        };
+        let session = context.session.read();
+        let described = session.application_description();
+        let application_uri = described.application_uri.as_ref().to_owned();
+        let certificate = session.client_certificate();
+        Self {
+            session: context.session_id,
+            user,
+            proven: certificate
+                .is_some_and(|one| one.is_application_uri_valid(&application_uri).is_ok()),
+            encrypted: session.message_security_mode() == MessageSecurityMode::SignAndEncrypt,
+            application_uri,
+        }
+    }
 }
 
 /// The sessions that are looked after.
@@ -38,17 +66,7 @@ impl Sessions {
             Box::new(move || Weak::upgrade(&session).is_some_and(|one| one.read().is_activated()))
         });
         drop(watched);
-        let user = match context.token.0.as_str() {
-            opcua::server::ANONYMOUS_USER_TOKEN_ID => "anonymous".to_owned(),
-            user => user.to_owned(),
-        };
-        let session = context.session.read();
-        let described = session.application_description();
-        Caller {
-            session: context.session_id,
-            user,
-            application_uri: described.application_uri.as_ref().to_owned(),
-        }
+        Caller::of(context)
     }
 
     pub(crate) fn tell(&self, told: Told) {

@@ -1,0 +1,172 @@
+//! Keys from a Security Key Service: fetched at the start, before they run out, and when somebody uses one that is not known.
+
+use std::fmt;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge_core::{KeyDelivery, policy_of};
+use mappings::{KeySource, SecurityGroup};
+use tokio::sync::{mpsc, watch};
+use tokio::time::sleep;
+use tracing::{info, warn};
+use uadp::{Keys, SecurityPolicy};
+
+use super::NewKeys;
+
+/// What is asked of a Security Key Service.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct KeyRequest {
+    /// Where it is, as opc.tcp://sks.local:4840.
+    pub endpoint: String,
+    /// Whether that is the cell's own server.
+    pub own: bool,
+    /// The SecurityGroupId.
+    pub group: String,
+}
+
+/// What GetSecurityKeys answers (OPC 10000-14, 8.3.2).
+#[derive(Clone, PartialEq, Eq)]
+pub struct Fetched {
+    /// The SecurityPolicyUri.
+    pub policy_uri: String,
+    /// The SecurityTokenId of the first key.
+    pub first_token_id: u32,
+    /// The key data of the current key and the future ones.
+    pub keys: Vec<Vec<u8>>,
+    /// Until the next key is used.
+    pub time_to_next: Duration,
+    /// How long each is used.
+    pub lifetime: Duration,
+}
+
+impl fmt::Debug for Fetched {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Fetched")
+            .field("first_token_id", &self.first_token_id)
+            .field("keys", &self.keys.len())
+            .finish_non_exhaustive()
+    }
+}
+
+/// What a fetch comes to, later.
+pub type Fetching<'a> = Pin<Box<dyn Future<Output = Result<Fetched, String>> + Send + 'a>>;
+
+/// Fetches keys; what knows how to is the program, as this crate knows no OPC UA sessions.
+pub trait KeyService: fmt::Debug + Send + Sync {
+    /// The keys of a group from now on, or why there are none, for people. Has an end within a minute.
+    fn fetch<'a>(&'a self, request: &'a KeyRequest) -> Fetching<'a>;
+}
+
+/// Fetches the keys of a group again and again.
+pub(super) async fn keep(
+    group: SecurityGroup,
+    service: Arc<dyn KeyService>,
+    (out, mut wants): (mpsc::Sender<NewKeys>, watch::Receiver<u64>),
+) {
+    let Some(request) = request_of(&group) else {
+        return;
+    };
+    let mut failures = 0_u32;
+    loop {
+        let fetched = service.fetch(&request).await;
+        let fetched = fetched.and_then(|fetched| delivery(fetched, policy_of(group.policy)));
+        let before = failures;
+        let rest = match fetched {
+            Ok(delivery) => {
+                failures = 0;
+                let rest = rest(&delivery);
+                let group = group.id.clone();
+                if out.send(NewKeys { group, delivery }).await.is_err() {
+                    return;
+                }
+                tell_back(&request, before);
+                rest
+            }
+            Err(why) => {
+                failures = failures.saturating_add(1);
+                tell_failure(&request, failures, &why);
+                RETRY.saturating_mul(1 << failures.min(5)).min(RETRY_MOST)
+            }
+        };
+        tokio::select! {
+            () = sleep(rest) => {}
+            // Somebody uses a key that is not known here.
+            changed = wants.changed() => if changed.is_err() {
+                return;
+            },
+        }
+    }
+}
+
+fn request_of(group: &SecurityGroup) -> Option<KeyRequest> {
+    let (endpoint, own) = match group.keys.as_ref()? {
+        KeySource::Own(served) => (&served.endpoint, true),
+        KeySource::Sks(endpoint) => (endpoint, false),
+        KeySource::File(_) | KeySource::Credential(_) => return None,
+    };
+    Some(KeyRequest {
+        endpoint: endpoint.to_string(),
+        own,
+        group: group.id.clone(),
+    })
+}
+
+fn tell_back(request: &KeyRequest, failures: u32) {
+    if failures > 0 {
+        let (group, endpoint) = (&request.group, &request.endpoint);
+        info!(
+            group,
+            endpoint, failures, "the Security Key Service answers again"
+        );
+    }
+}
+
+fn tell_failure(request: &KeyRequest, failures: u32, why: &str) {
+    if failures == 1 || failures.is_multiple_of(TOLD_AGAIN) {
+        let (group, endpoint) = (&request.group, &request.endpoint);
+        warn!(
+            group,
+            endpoint,
+            failures,
+            "no keys from the Security Key Service: {why}; asking again, and the keys there are stay in use"
+        );
+    }
+}
+
+/// When to ask again: after half the lifetime of a key (OPC 10000-14, 8.3.2), which is soon enough to hear of one that is
+/// withdrawn, and not all the time.
+fn rest(delivery: &KeyDelivery) -> Duration {
+    (delivery.lifetime / 2).clamp(LEAST_REST, MOST_REST)
+}
+
+/// Holds what was answered against what the mapping says.
+fn delivery(fetched: Fetched, policy: SecurityPolicy) -> Result<KeyDelivery, String> {
+    if fetched.policy_uri != policy.uri() {
+        return Err(format!(
+            "its keys are for {:.80}, and the mapping has {}",
+            fetched.policy_uri,
+            policy.uri()
+        ));
+    }
+    let keys = fetched.keys.iter();
+    let keys: Result<Vec<Keys>, _> = keys.map(|data| Keys::from_bytes(policy, data)).collect();
+    let keys = keys.map_err(|error| error.to_string())?;
+    if keys.is_empty() || fetched.first_token_id == 0 {
+        return Err("it has no keys of the group".to_owned());
+    }
+    Ok(KeyDelivery {
+        first_token_id: fetched.first_token_id,
+        keys,
+        time_to_next: Some(fetched.time_to_next),
+        lifetime: fetched.lifetime,
+    })
+}
+
+/// The first time to wait after a failure, doubled with each, and the longest.
+const RETRY: Duration = Duration::from_millis(250);
+const RETRY_MOST: Duration = Duration::from_secs(5);
+/// A failure is told again after so many.
+const TOLD_AGAIN: u32 = 60;
+const LEAST_REST: Duration = Duration::from_millis(500);
+const MOST_REST: Duration = Duration::from_secs(300);

@@ -1,0 +1,315 @@
+//! Keys of secured groups, fetched from a Security Key Service (OPC 10000-14, 8.3.2) for the programs of the space.
+//!
+//! Each fetch is a session of its own, signed and encrypted, in a thread of its own: what it costs to sign is more than a
+//! value should wait. The certificate of the service is trusted as that of any server is, by its file in `trusted`.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use bridge_node::{Fetched, Fetching, KeyRequest, KeyService};
+use plant_opcua::client::{CallError, CallOptions, Client, ClientConfig, SecurityChoice};
+use plant_opcua::pki;
+use plant_opcua::types::{MethodId, NodeId, ObjectId, StatusCode, Variant};
+use tokio::sync::{mpsc, oneshot};
+use tracing::warn;
+
+/// What the command line of a program says about how it fetches keys.
+#[derive(Debug, Clone, Default, PartialEq, Eq, clap::Args)]
+pub struct KeyArguments {
+    /// The certificate store for sessions with a Security Key Service: own, private, trusted and rejected under one
+    /// directory
+    #[arg(long, value_name = "DIR", env = "UA_PKI")]
+    pub pki: Option<PathBuf>,
+}
+
+impl KeyArguments {
+    /// A service for the program of that name, which has no OPC UA identity beside this one.
+    #[must_use]
+    pub fn service(&self, program: &str) -> Arc<dyn KeyService> {
+        let usual = || {
+            let root = pki::default_root(|name| std::env::var(name).ok());
+            root.with_file_name(format!("pki-{program}"))
+        };
+        let host = gethostname::gethostname().to_string_lossy().into_owned();
+        Arc::new(Service::new(Identity {
+            application_uri: format!("urn:{host}:ua-bridge:{program}"),
+            application_name: program.to_owned(),
+            pki: self.pki.clone().unwrap_or_else(usual),
+        }))
+    }
+}
+
+/// As whom keys are asked for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Identity {
+    /// The ApplicationUri, which stands in the certificate too.
+    pub application_uri: String,
+    /// The name for people.
+    pub application_name: String,
+    /// The certificate store. What is missing of it is made at the first fetch.
+    pub pki: PathBuf,
+}
+
+/// Fetches keys, one request after the other.
+pub struct Service {
+    identity: Identity,
+    /// To the thread that fetches, once there is one.
+    asked: Mutex<Option<mpsc::Sender<Asked>>>,
+}
+
+struct Asked {
+    request: KeyRequest,
+    answer: oneshot::Sender<Result<Fetched, String>>,
+}
+
+impl Service {
+    /// One that asks as `identity`.
+    #[must_use]
+    pub const fn new(identity: Identity) -> Self {
+        Self {
+            identity,
+            asked: Mutex::new(None),
+        }
+    }
+
+    /// The way to the thread that fetches. One that has ended is started again.
+    fn thread(&self) -> Result<mpsc::Sender<Asked>, String> {
+        let mut asked = self.asked.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(sender) = asked.as_ref().filter(|sender| !sender.is_closed()) {
+            return Ok(sender.clone());
+        }
+        let (sender, requests) = mpsc::channel(WAITING);
+        let identity = self.identity.clone();
+        let started = std::thread::Builder::new()
+            .name("keys".to_owned())
+            .spawn(move || serve(&identity, requests));
+        started.map_err(|error| format!("no thread to fetch in: {error}"))?;
+        *asked = Some(sender.clone());
+        Ok(sender)
+    }
+}
+
+impl fmt::Debug for Service {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Service")
+            .field("identity", &self.identity)
+            .finish_non_exhaustive()
+    }
+}
+
+impl KeyService for Service {
+    fn fetch<'a>(&'a self, request: &'a KeyRequest) -> Fetching<'a> {
+        Box::pin(async move {
+            let thread = self.thread()?;
+            let (answer, answered) = oneshot::channel();
+            let request = request.clone();
+            let asked = Asked { request, answer };
+            let gone = || "the thread that fetches has ended".to_owned();
+            thread.send(asked).await.map_err(|_| gone())?;
+            answered.await.map_err(|_| gone())?
+        })
+    }
+}
+
+/// Fetches until nobody can ask any more.
+fn serve(identity: &Identity, mut requests: mpsc::Receiver<Asked>) {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    let runtime = match runtime {
+        Ok(runtime) => runtime,
+        Err(error) => {
+            warn!(%error, "keys cannot be fetched");
+            return;
+        }
+    };
+    runtime.block_on(async {
+        while let Some(Asked { request, answer }) = requests.recv().await {
+            // Whoever asked may have gone meanwhile.
+            if !answer.is_closed() {
+                let fetched = fetch(identity, &request).await;
+                drop(answer.send(fetched));
+            }
+        }
+    });
+}
+
+/// The keys from a service, in a session that is made for it and closed again.
+async fn fetch(identity: &Identity, request: &KeyRequest) -> Result<Fetched, String> {
+    let before = rejected(&identity.pki);
+    let config = ClientConfig {
+        pki: Some(identity.pki.clone()),
+        security: SecurityChoice::Basic256Sha256,
+        timeout: WITHIN,
+        ..ClientConfig::new(&identity.application_uri, &identity.application_name)
+    };
+    let client = Client::open(config, &request.endpoint);
+    let asked = async {
+        client
+            .up(LONGEST_CONNECT)
+            .await
+            .map_err(|error| error.to_string())?;
+        let arguments = vec![
+            Variant::from(request.group.as_str()),
+            Variant::UInt32(CURRENT),
+            Variant::UInt32(FUTURE_KEYS),
+        ];
+        let object: NodeId = ObjectId::PublishSubscribe.into();
+        let method: NodeId = MethodId::PublishSubscribe_GetSecurityKeys.into();
+        let options = CallOptions {
+            within: WITHIN,
+            connection: None,
+        };
+        let called = client.call_within((&object, &method), arguments, options);
+        let outputs = called.await.map_err(|error| told(&error, request))?;
+        answer(outputs).ok_or_else(|| "its answer is not that of GetSecurityKeys".to_owned())
+    };
+    let fetched = asked.await;
+    client.close().await;
+    fetched.map_err(|why| {
+        // A certificate that came to `rejected` meanwhile is that of the service.
+        let newest = rejected(&identity.pki).into_iter();
+        let new = newest.filter(|path| !before.contains(path)).next_back();
+        match new {
+            Some(path) => format!(
+                "{why}; its certificate is not trusted: to trust it, move {path:?} into {:?}",
+                identity.pki.join("trusted")
+            ),
+            None => format!("{why} (as {})", identity.application_uri),
+        }
+    })
+}
+
+/// Why the service gives no keys, for people.
+fn told(error: &CallError, request: &KeyRequest) -> String {
+    match error {
+        CallError::Refused { status, .. } if *status == StatusCode::BadUserAccessDenied => {
+            format!(
+                "this program is none of those that get the keys of `{}`",
+                request.group
+            )
+        }
+        CallError::Refused { status, .. } if *status == StatusCode::BadNotFound => {
+            format!("it knows no group `{}`", request.group)
+        }
+        CallError::Refused { .. } | CallError::Client(_) => error.to_string(),
+    }
+}
+
+/// The output arguments of GetSecurityKeys; `None` where they are others.
+fn answer(outputs: Vec<Variant>) -> Option<Fetched> {
+    let outputs: [Variant; 5] = outputs.try_into().ok()?;
+    let [
+        Variant::String(policy),
+        Variant::UInt32(first_token_id),
+        Variant::Array(keys),
+        Variant::Double(time_to_next),
+        Variant::Double(lifetime),
+    ] = outputs
+    else {
+        return None;
+    };
+    let keys = keys.values.into_iter().take(MOST_KEYS).map(|key| {
+        if let Variant::ByteString(key) = key {
+            key.value
+        } else {
+            None
+        }
+    });
+    Some(Fetched {
+        policy_uri: policy.as_ref().to_owned(),
+        first_token_id,
+        keys: keys.collect::<Option<_>>()?,
+        time_to_next: duration(time_to_next)?,
+        lifetime: duration(lifetime)?,
+    })
+}
+
+/// A Duration of OPC UA, in milliseconds.
+fn duration(milliseconds: f64) -> Option<Duration> {
+    let bounded = milliseconds.clamp(0.0, LONGEST_MS);
+    Duration::try_from_secs_f64(bounded / 1e3).ok()
+}
+
+/// The certificates of servers that were refused, by their names.
+fn rejected(pki: &Path) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(pki.join("rejected")) else {
+        return Vec::new();
+    };
+    let mut found: Vec<_> = entries.flatten().map(|entry| entry.path()).collect();
+    found.sort();
+    found
+}
+
+/// Requests that wait.
+const WAITING: usize = 64;
+/// How long the service may take for each answer.
+const WITHIN: Duration = Duration::from_secs(5);
+/// How long a session may take to be there.
+const LONGEST_CONNECT: Duration = Duration::from_secs(15);
+/// The StartingTokenId that stands for the key that is used now.
+const CURRENT: u32 = 0;
+/// How many keys beyond that are asked for: so many lifetimes the service may be away.
+const FUTURE_KEYS: u32 = 4;
+/// More than any service hands out.
+const MOST_KEYS: usize = 64;
+/// A year.
+const LONGEST_MS: f64 = 365.0 * 86_400_000.0;
+
+#[cfg(test)]
+mod tests {
+    use plant_opcua::types::{ByteString, UAString};
+
+    use super::*;
+
+    fn outputs() -> Vec<Variant> {
+        vec![
+            Variant::String(UAString::from("policy")),
+            Variant::UInt32(7),
+            Variant::from(vec![ByteString::from(vec![1_u8, 2])]),
+            Variant::Double(1500.0),
+            Variant::Double(60_000.0),
+        ]
+    }
+
+    #[test]
+    fn the_outputs_of_get_security_keys_are_taken() {
+        let fetched = answer(outputs()).unwrap();
+        assert_eq!(
+            (&*fetched.policy_uri, fetched.first_token_id),
+            ("policy", 7)
+        );
+        assert_eq!(fetched.keys, [vec![1, 2]]);
+        assert_eq!(fetched.time_to_next, Duration::from_millis(1500));
+        assert_eq!(fetched.lifetime, Duration::from_secs(60));
+    }
+
+    #[test]
+    fn outputs_of_other_types_or_numbers_are_not() {
+        let mut fewer = outputs();
+        fewer.pop();
+        assert_eq!(answer(fewer), None);
+        let mut others = outputs();
+        others[2] = Variant::from(vec![1_u8, 2]);
+        assert_eq!(answer(others), None);
+        let mut never = outputs();
+        never[3] = Variant::Double(f64::NAN);
+        assert_eq!(answer(never), None, "no number is no time");
+    }
+
+    #[test]
+    fn each_program_has_a_certificate_store_of_its_own() {
+        let given = KeyArguments {
+            pki: Some(PathBuf::from("/pki")),
+        };
+        let told = format!("{:?}", given.service("bridge-ros1"));
+        assert!(
+            told.contains("\"/pki\"") && told.contains(":ua-bridge:bridge-ros1"),
+            "{told}"
+        );
+        let usual = format!("{:?}", KeyArguments::default().service("bridge-ros2"));
+        assert!(usual.contains("pki-bridge-ros2"), "{usual}");
+    }
+}

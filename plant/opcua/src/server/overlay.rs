@@ -1,0 +1,144 @@
+//! Methods of objects of the core namespace: the library has the nodes, and carries out hardly any of them.
+
+use std::sync::Arc;
+
+use opcua::nodes::{NodeType, ReferenceDirection};
+use opcua::server::node_manager::memory::{
+    CoreNodeManager, CoreNodeManagerBuilder, InMemoryNodeManagerBuilder,
+};
+use opcua::server::node_manager::{
+    DynNodeManager, MethodCall, NodeManagerBuilder, RequestContext, ServerContext,
+};
+use opcua::types::{Argument, BrowseDirection, NodeId, ReferenceTypeId, StatusCode};
+use tokio::time::Instant;
+
+use super::calls::{self, MethodHandler, MethodRequest, Refusal, check_arguments, within};
+use super::routed::{Front, Routed};
+use super::sessions::Caller;
+use crate::limits::LONGEST_REQUEST;
+
+/// A method of an object of the core namespace, and what carries it out.
+#[derive(Clone)]
+pub struct CoreMethod {
+    object: NodeId,
+    /// The node of the object's own method, and that of its type's.
+    methods: Vec<NodeId>,
+    name: String,
+    handler: Arc<dyn MethodHandler>,
+}
+
+impl CoreMethod {
+    /// The method `name` of `object`, under its own node, `methods[0]`, or under those of the types it comes from.
+    pub fn new(
+        object: impl Into<NodeId>,
+        methods: impl IntoIterator<Item = NodeId>,
+        name: &str,
+        handler: Arc<dyn MethodHandler>,
+    ) -> Self {
+        Self {
+            object: object.into(),
+            methods: methods.into_iter().collect(),
+            name: name.to_owned(),
+            handler,
+        }
+    }
+
+    fn is(&self, call: &MethodCall) -> bool {
+        self.object == *call.object_id() && self.methods.contains(call.method_id())
+    }
+}
+
+/// The node manager of the core namespace, with these methods carried out.
+#[must_use]
+pub fn core_with(methods: Vec<CoreMethod>) -> impl NodeManagerBuilder + 'static {
+    move |context: ServerContext| {
+        let inner = Box::new(InMemoryNodeManagerBuilder::new(CoreNodeManagerBuilder));
+        let inner: Arc<DynNodeManager> = inner.build(context);
+        let core = Arc::clone(&inner).into_any_arc().downcast().ok();
+        Routed {
+            inner,
+            front: Front::Core(Arc::new(Overlay { methods, core })),
+            last: None,
+        }
+    }
+}
+
+/// The methods, and where what they take is declared.
+pub(crate) struct Overlay {
+    methods: Vec<CoreMethod>,
+    core: Option<Arc<CoreNodeManager>>,
+}
+
+impl Overlay {
+    /// Answers the calls of these methods, one after the other, and gives back the rest.
+    pub(crate) async fn answer<'a>(
+        &self,
+        context: &RequestContext,
+        methods: &'a mut [&mut MethodCall],
+    ) -> Vec<&'a mut MethodCall> {
+        let mut others = Vec::new();
+        let end = Instant::now() + LONGEST_REQUEST;
+        for call in methods {
+            let call: &'a mut MethodCall = call;
+            let Some(method) = self.methods.iter().find(|method| method.is(call)) else {
+                others.push(call);
+                continue;
+            };
+            let ended = match self.check(context, method, call) {
+                Ok(request) => within(end, method.handler.call(request)).await,
+                Err(refusal) => Err(refusal),
+            };
+            calls::end(call, ended);
+        }
+        others
+    }
+
+    fn check(
+        &self,
+        context: &RequestContext,
+        method: &CoreMethod,
+        call: &MethodCall,
+    ) -> Result<MethodRequest, Refusal> {
+        let own = method.methods.first().unwrap_or_else(|| call.method_id());
+        let allowed = context
+            .authenticator
+            .is_user_executable(&context.token, own);
+        if !allowed {
+            return Err(Refusal::Status(StatusCode::BadUserAccessDenied));
+        }
+        let declared = self.input_arguments(context, own)?;
+        let types = context.type_tree.read();
+        check_arguments(&declared, call.arguments(), &*types)?;
+        Ok(MethodRequest {
+            caller: Caller::of(context),
+            object: method.object.clone(),
+            method: own.clone(),
+            name: method.name.clone(),
+            arguments: call.arguments().to_vec(),
+        })
+    }
+
+    fn input_arguments(
+        &self,
+        context: &RequestContext,
+        method: &NodeId,
+    ) -> Result<Vec<Argument>, StatusCode> {
+        let Some(core) = &self.core else {
+            return Err(StatusCode::BadInternalError);
+        };
+        let address_space = core.address_space().read();
+        let types = context.type_tree.read();
+        let filter = Some((ReferenceTypeId::HasProperty, false));
+        let properties =
+            address_space.find_references(method, filter, &*types, BrowseDirection::Forward);
+        let nodes = properties
+            .filter(|reference| matches!(reference.direction, ReferenceDirection::Forward))
+            .filter_map(|reference| address_space.find(reference.target_node));
+        let mut inputs = nodes.filter(|node: &&NodeType| {
+            node.as_node().browse_name().name.as_ref() == "InputArguments"
+        });
+        inputs.next().map_or(Ok(Vec::new()), |node| {
+            calls::arguments(node).ok_or(StatusCode::BadInternalError)
+        })
+    }
+}

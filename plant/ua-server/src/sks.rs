@@ -1,0 +1,291 @@
+//! The server as the Security Key Service of the cell (OPC 10000-14, 8.3): it makes the keys of groups, replaces them as
+//! time goes by, and hands them out over encrypted sessions to those that are to have them.
+//!
+//! Keys stand in a file beside the private key of the server: after a restart everybody goes on with the same ones.
+
+mod ring;
+mod store;
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use bridge_core::{Now, policy_of};
+use bridge_node::{Failure, FailureKind, Fetched, Fetching, KeyRequest, KeyService, now};
+use mappings::{KeySource, Mapping, SecurityGroup, Served};
+use opcua::crypto::random;
+use opcua::sync::Mutex;
+use opcua::types::{ByteString, MethodId, NodeId, ObjectId, StatusCode, UAString, Variant};
+use plant_opcua::server::{Caller, CoreMethod, MethodHandler, MethodRequest, Refusal, method};
+use tracing::{info, warn};
+use uadp::SecurityPolicy;
+
+use self::ring::{Handed, Ring};
+use self::store::Store;
+
+/// Makes keys and hands them out. Where the mapping has no group of its own it has none.
+#[derive(Debug)]
+pub(crate) struct Sks {
+    state: Mutex<State>,
+}
+
+#[derive(Debug)]
+struct State {
+    store: Store,
+    groups: BTreeMap<String, Group>,
+}
+
+#[derive(Debug)]
+struct Group {
+    policy: SecurityPolicy,
+    members: Vec<String>,
+    ring: Ring,
+}
+
+impl Sks {
+    /// One that keeps its keys in `file`, which is not looked at before there is a group.
+    pub(crate) const fn new(file: PathBuf) -> Self {
+        Self {
+            state: Mutex::new(State {
+                store: Store::new(file),
+                groups: BTreeMap::new(),
+            }),
+        }
+    }
+
+    /// Makes the keys of the groups of a mapping from now on, and of no others.
+    ///
+    /// # Errors
+    /// The file with the keys cannot be used.
+    pub(crate) fn follow(&self, mapping: &Mapping) -> Result<(), Failure> {
+        let unusable = |error: String| Failure::new(FailureKind::Io, error);
+        let wanted: Vec<(&SecurityGroup, &Served)> =
+            mapping.security().iter().filter_map(served).collect();
+        let mut state = self.state.lock();
+        let state = &mut *state;
+        let now = now();
+        if !wanted.is_empty() && state.groups.is_empty() {
+            state.load(now).map_err(unusable)?;
+            // By the lifetimes they had.
+            state.renew(now).map_err(unusable)?;
+        }
+        if wanted.is_empty() && state.groups.is_empty() {
+            return Ok(());
+        }
+        let mut groups = std::mem::take(&mut state.groups);
+        for (group, served) in wanted {
+            let policy = policy_of(group.policy);
+            let before = groups.remove(&group.id);
+            let ring = match before {
+                Some(mut before) if before.policy == policy => {
+                    before.ring.set_lifetime(served.lifetime, now);
+                    before.ring
+                }
+                Some(before) => Ring::after(&before.ring, served.lifetime, now),
+                None => Ring::new(served.lifetime, now),
+            };
+            let members = served.members.clone();
+            let made = Group {
+                policy,
+                members,
+                ring,
+            };
+            state.groups.insert(group.id.clone(), made);
+        }
+        state.renew(now).map_err(unusable)
+    }
+
+    /// The methods by which clients ask.
+    pub(crate) fn methods(self: &Arc<Self>) -> Vec<CoreMethod> {
+        let sks = Arc::clone(self);
+        let handler: Arc<dyn MethodHandler> =
+            method(move |request| sks.get_security_keys(&request));
+        let methods: [NodeId; 2] = [
+            MethodId::PublishSubscribe_GetSecurityKeys.into(),
+            MethodId::PubSubKeyServiceType_GetSecurityKeys.into(),
+        ];
+        vec![CoreMethod::new(
+            ObjectId::PublishSubscribe,
+            methods,
+            "GetSecurityKeys",
+            handler,
+        )]
+    }
+
+    /// GetSecurityKeys, OPC 10000-14, 8.3.2.
+    fn get_security_keys(&self, request: &MethodRequest) -> Result<Vec<Variant>, Refusal> {
+        let [
+            Variant::String(group),
+            Variant::UInt32(starting),
+            Variant::UInt32(count),
+        ] = request.arguments.as_slice()
+        else {
+            return Err(StatusCode::BadTypeMismatch.into());
+        };
+        let group: &str = group.as_ref();
+        let (application, user) = (&request.caller.application_uri, &request.caller.user);
+        let handed = self.hand_out(&request.caller, group, (*starting, *count));
+        match handed {
+            Ok((policy, handed)) => {
+                info!(
+                    group,
+                    application,
+                    user,
+                    token = handed.first_token_id,
+                    keys = handed.keys.len(),
+                    "keys of a secured group are handed out"
+                );
+                let keys: Vec<ByteString> = handed.keys.into_iter().map(ByteString::from).collect();
+                Ok(vec![
+                    Variant::String(UAString::from(policy.uri())),
+                    Variant::UInt32(handed.first_token_id),
+                    Variant::from(keys),
+                    Variant::Double(milliseconds(handed.time_to_next)),
+                    Variant::Double(milliseconds(handed.lifetime)),
+                ])
+            }
+            Err(status) => {
+                warn!(
+                    group = format_args!("{group:.128}"),
+                    application, user, "keys of a secured group are refused with {status}"
+                );
+                Err(status.into())
+            }
+        }
+    }
+
+    fn hand_out(
+        &self,
+        caller: &Caller,
+        group: &str,
+        wanted: (u32, u32),
+    ) -> Result<(SecurityPolicy, Handed), StatusCode> {
+        if !caller.encrypted {
+            return Err(StatusCode::BadSecurityModeInsufficient);
+        }
+        let mut state = self.state.lock();
+        let known = state.groups.get(group).ok_or(StatusCode::BadNotFound)?;
+        if !known.has(caller) {
+            return Err(StatusCode::BadUserAccessDenied);
+        }
+        state.of(group, wanted).ok_or(StatusCode::BadNotFound)
+    }
+
+    /// The keys of a group for this program itself.
+    fn own(&self, group: &str) -> Result<Fetched, String> {
+        let mut state = self.state.lock();
+        let (policy, handed) = state
+            .of(group, (0, ring::FUTURE))
+            .ok_or_else(|| format!("this server makes no keys of `{group}`"))?;
+        Ok(Fetched {
+            policy_uri: policy.uri().to_owned(),
+            first_token_id: handed.first_token_id,
+            keys: handed.keys,
+            time_to_next: handed.time_to_next,
+            lifetime: handed.lifetime,
+        })
+    }
+}
+
+impl State {
+    /// Takes up the keys of a run before.
+    fn load(&mut self, now: Now) -> Result<(), String> {
+        for (id, policy, ring) in self.store.load(now)? {
+            let members = Vec::new();
+            self.groups.insert(
+                id,
+                Group {
+                    policy,
+                    members,
+                    ring,
+                },
+            );
+        }
+        Ok(())
+    }
+
+    /// Makes the keys whose time comes next. None is used that would be another one after a restart.
+    fn renew(&mut self, now: Now) -> Result<(), String> {
+        let mut changed = false;
+        let mut before = Vec::new();
+        for group in self.groups.values_mut() {
+            before.push(group.ring.clone());
+            let length = group.policy.key_data_length();
+            changed |= group.ring.advance(now.monotonic, || random_key(length));
+        }
+        if !changed {
+            return Ok(());
+        }
+        let groups = self.groups.iter();
+        let kept = groups.map(|(id, group)| (id.as_str(), group.policy, &group.ring));
+        let saved = self.store.save(kept, now);
+        if saved.is_err() {
+            for (group, ring) in self.groups.values_mut().zip(before) {
+                group.ring = ring;
+            }
+        }
+        saved
+    }
+
+    fn of(
+        &mut self,
+        group: &str,
+        (starting, count): (u32, u32),
+    ) -> Option<(SecurityPolicy, Handed)> {
+        let now = now();
+        if let Err(error) = self.renew(now) {
+            warn!("{error}; there are no new keys of secured groups, and the last go on");
+        }
+        let group = self.groups.get(group)?;
+        let handed = group.ring.hand_out(starting, count, now.monotonic)?;
+        Some((group.policy, handed))
+    }
+}
+
+impl Group {
+    /// Whether a client is one of those that get the keys.
+    fn has(&self, caller: &Caller) -> bool {
+        if self.members.is_empty() {
+            return true;
+        }
+        let uri = &caller.application_uri;
+        let is = |member: &String| match member.strip_suffix('*') {
+            Some(start) => uri.starts_with(start),
+            None => uri == member,
+        };
+        caller.proven && self.members.iter().any(is)
+    }
+}
+
+/// How the server itself gets keys: its own from itself, those of others as everybody does.
+#[derive(Debug)]
+pub(crate) struct ServerKeys {
+    pub(crate) own: Arc<Sks>,
+    pub(crate) others: plant_keys::Service,
+}
+
+impl KeyService for ServerKeys {
+    fn fetch<'a>(&'a self, request: &'a KeyRequest) -> Fetching<'a> {
+        if request.own {
+            return Box::pin(std::future::ready(self.own.own(&request.group)));
+        }
+        self.others.fetch(request)
+    }
+}
+
+/// A group whose keys this server makes.
+fn served(group: &SecurityGroup) -> Option<(&SecurityGroup, &Served)> {
+    match group.keys.as_ref()? {
+        KeySource::Own(served) => Some((group, served)),
+        KeySource::File(_) | KeySource::Credential(_) | KeySource::Sks(_) => None,
+    }
+}
+
+fn random_key(length: usize) -> Vec<u8> {
+    random::byte_string(length).value.unwrap_or_default()
+}
+
+fn milliseconds(time: Duration) -> f64 {
+    time.as_secs_f64() * 1e3
+}

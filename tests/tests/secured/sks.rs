@@ -1,0 +1,280 @@
+//! Keys of a Security Key Service: ua-server makes them, hands them out and replaces them, and the bridges live with them.
+
+use std::fs;
+use std::time::Duration;
+
+use serde_json::{Value, json};
+use system_tests::{
+    Cell, Child, METRICS_ROS1, METRICS_ROS2, METRICS_SERVER, Peer, SERVER_ENDPOINT, eventually,
+    http_answer, metrics,
+};
+
+use super::{SOON, TOPIC, dropped, path, token};
+
+const METHOD: &str = "Server/PublishSubscribe/GetSecurityKeys";
+
+/// A cell whose server makes the keys, each for so long.
+fn mapping(cell: &Cell, sks: &str) -> String {
+    let text = format!("security: [{{group: cell, keys: {{sks: {sks}}}}}]\n");
+    path(&cell.file("cell.yaml", &text)).to_owned()
+}
+
+fn server(cell: &Cell, mapping: &str) -> Child {
+    let server = cell.ua_server(&[mapping, "--trust-any-client-certificate"]);
+    eventually("the server answers clients", SOON, || {
+        cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
+    });
+    server
+}
+
+/// The certificate store of a program in which the server is trusted, once it has a certificate.
+fn store(cell: &Cell, program: &str) -> String {
+    let store = cell.folder().join(format!("pki-{program}"));
+    fs::create_dir_all(store.join("trusted")).unwrap();
+    let own = cell.folder().join("pki/own/cert.der");
+    fs::copy(own, store.join("trusted/server.der")).unwrap();
+    path(&store).to_owned()
+}
+
+/// What asyncua is told when it asks for keys: the status, then what the service answers.
+fn asked(cell: &Cell, security: &str, arguments: &Value) -> Value {
+    let certificates = cell.folder().join("client");
+    let told = cell.asyncua_once(
+        "opcua_call.py",
+        &[
+            SERVER_ENDPOINT,
+            "--security",
+            security,
+            "--certificates",
+            path(&certificates),
+            METHOD,
+            "--value",
+            &arguments.to_string(),
+        ],
+    );
+    told.last().cloned().unwrap()
+}
+
+#[test]
+fn clients_of_other_makers_get_the_keys_that_they_may_have_over_sessions_nobody_can_listen_to() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
+        return;
+    };
+    let mapping = mapping(&cell, "{key_lifetime: 10min}");
+    let _server = server(&cell, &mapping);
+    let keys = asked(&cell, "Basic256Sha256", &json!(["cell", 0, 2]));
+    assert_eq!(keys["status"], "Good", "{keys}");
+    let value = keys["value"].as_array().unwrap();
+    assert_eq!(
+        value[0],
+        "http://opcfoundation.org/UA/SecurityPolicy#PubSub-Aes256-CTR"
+    );
+    assert_eq!(value[1], 1);
+    let given = value[2].as_array().unwrap();
+    assert_eq!(given.len(), 3, "the current one and two to come");
+    assert_ne!(given[0], given[1]);
+    let next = value[3].as_f64().unwrap();
+    assert!(next > 0.0 && next <= 600_000.0, "{next}");
+    assert_eq!(value[4], 600_000.0);
+
+    // Those that are refused learn no more than that.
+    for (security, arguments, status) in [
+        ("None", json!(["cell", 0, 2]), "BadSecurityModeInsufficient"),
+        ("Basic256Sha256", json!(["plant", 0, 2]), "BadNotFound"),
+        ("Basic256Sha256", json!(["cell"]), "BadArgumentsMissing"),
+        (
+            "Basic256Sha256",
+            json!([{"Int32": 5}, 0, 2]),
+            "BadInvalidArgument",
+        ),
+    ] {
+        let refused = asked(&cell, security, &arguments);
+        assert_eq!(refused["status"], status, "{arguments}");
+        assert_eq!(refused["value"], json!([]), "{refused}");
+    }
+    let node = |mode: &str, starting: &str, count: &str| {
+        let arguments = [SERVER_ENDPOINT, mode, "cell", starting, count];
+        cell.node_opcua_once("keys.js", &arguments).remove(0)
+    };
+    assert_eq!(
+        node("Sign", "0", "1")["status"],
+        "BadSecurityModeInsufficient"
+    );
+    let later = node("SignAndEncrypt", "2", "0");
+    assert_eq!(
+        (&later["status"], &later["first"]),
+        (&json!("Good"), &json!(2))
+    );
+    assert_eq!(later["keys"].as_array().unwrap().len(), 1);
+    let all = node("SignAndEncrypt", "0", "1");
+    assert_eq!(
+        all["keys"][1], later["keys"][0],
+        "the same keys for everybody"
+    );
+}
+
+#[test]
+fn who_is_no_member_of_the_group_gets_no_keys() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let mapping = mapping(
+        &cell,
+        r#"{members: ["urn:ua-bridge:server", "urn:plant:*"]}"#,
+    );
+    let mut server = server(&cell, &mapping);
+    let refused = asked(&cell, "Basic256Sha256", &json!(["cell", 0, 2]));
+    assert_eq!(refused["status"], "BadUserAccessDenied");
+    let told = server.wait_for_line("keys of a secured group are refused", SOON);
+    assert!(told.contains("urn:ua-bridge:system-tests:client"), "{told}");
+}
+
+/// Values of ROS 1 as they come in ROS 2, and how many.
+struct Stream {
+    heard: Child,
+    _rest: Vec<Child>,
+}
+
+impl Stream {
+    fn count(&self) -> usize {
+        self.heard.values().len()
+    }
+
+    fn goes_on(&self, what: &str) {
+        let before = self.count();
+        eventually(what, SOON, || (self.count() > before + 20).then_some(()));
+    }
+}
+
+/// Both bridges with the mapping, and numbers from ROS 1 to ROS 2, twenty a second.
+fn stream(cell: &Cell, mapping: &str) -> Stream {
+    let pki = [store(cell, "ros1"), store(cell, "ros2")];
+    let master = cell.roscore();
+    let arguments = |pki| ["--security", mapping, "--pki", pki];
+    let bridges = (
+        cell.bridge_ros1(&arguments(&pki[0])),
+        cell.bridge_ros2(&arguments(&pki[1])),
+    );
+    let mut heard = cell.cyclone("ros2_sub.py", &[&TOPIC[..], &["--domain", "2"]].concat());
+    let numbers = [
+        "--numbered",
+        "4000",
+        "--rate",
+        "20",
+        "--warm-up",
+        r#""warm""#,
+    ];
+    let mut sends = cell.rospy("ros1_pub.py", &[&TOPIC[..], &numbers].concat());
+    let value = |line: &Value| line.get("value").cloned();
+    heard.wait_for_json("the first string in ROS 2", SOON, value);
+    sends.tell("");
+    heard.wait_for_json("the first number in ROS 2", SOON, |line| {
+        (*line.get("value")? == json!({"data": "0"})).then_some(())
+    });
+    Stream {
+        heard,
+        _rest: vec![master, bridges.0, bridges.1, sends],
+    }
+}
+
+/// That numbers came one after the other, none of them lost or twice.
+fn are_whole(values: &[Value]) {
+    let numbers: Vec<u64> = values
+        .iter()
+        .filter_map(|value| value["data"].as_str()?.parse().ok())
+        .collect();
+    let expected: Vec<u64> = (0..).take(numbers.len()).collect();
+    assert_eq!(numbers, expected);
+}
+
+#[test]
+fn bridges_live_with_the_keys_of_the_service_through_its_rotations_and_without_it() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
+        return;
+    };
+    let mapping = mapping(&cell, "{key_lifetime: 4s}");
+    let mut server = server(&cell, &mapping);
+    let stream = stream(&cell, &mapping);
+    let bridges = [METRICS_ROS1, METRICS_ROS2];
+    let begun = token(METRICS_ROS1).unwrap();
+
+    // Rotation under traffic: each goes on to the next key.
+    for address in [METRICS_ROS1, METRICS_ROS2, METRICS_SERVER] {
+        eventually("the key after the next is used", SOON, || {
+            (token(address)? >= begun + 2).then_some(())
+        });
+    }
+    // The service is away for longer than a key is used: those it handed out before are used.
+    server.end();
+    let away = token(METRICS_ROS1).unwrap();
+    for address in bridges {
+        eventually("the keys handed out before are used", SOON, || {
+            (token(address)? >= away + 2).then_some(())
+        });
+    }
+    server = self::server(&cell, &mapping);
+    for address in bridges {
+        eventually(
+            "the keys of the service that is back are used",
+            SOON,
+            || (token(address)? > away + 5).then_some(()),
+        );
+    }
+    are_whole(&stream.heard.values());
+    for address in bridges {
+        for reason in ["unknown_key", "no_keys", "signature"] {
+            assert_eq!(dropped(address, reason), 0, "{reason} at {address}");
+        }
+    }
+
+    // It is away for longer than all of them are used: the last goes on.
+    server.end();
+    let is_overdue = |address: &str| {
+        let state = metrics(address)?["groups"]["cell"].clone();
+        state["overdue"].as_bool()
+    };
+    for address in bridges {
+        eventually("the keys handed out are used up", 2 * SOON, || {
+            is_overdue(address)?.then_some(())
+        });
+    }
+    stream.goes_on("values go on with the last key");
+    let last = token(METRICS_ROS1).unwrap();
+    let _server = self::server(&cell, &mapping);
+    for address in bridges {
+        eventually(
+            "the keys of the service that is back are used",
+            SOON,
+            || (!is_overdue(address)? && token(address)? > last).then_some(()),
+        );
+    }
+    stream.goes_on("values go on with the keys of the service that is back");
+}
+
+#[test]
+fn a_bridge_waits_for_a_service_that_starts_after_it_and_says_what_is_missing() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
+        return;
+    };
+    let mapping = mapping(&cell, "{}");
+    let _master = cell.roscore();
+    let store = cell.folder().join("pki-ros1");
+    let arguments = ["--security", &mapping, "--pki", path(&store)];
+    let mut bridge = cell.bridge_ros1(&arguments);
+    bridge.wait_for_line("no keys from the Security Key Service", SOON);
+    let (code, told) = http_answer(METRICS_ROS1, "/readyz").unwrap();
+    assert_eq!(code, 503, "{told}");
+    assert!(
+        told.contains("there are no keys of the group `cell`"),
+        "{told}"
+    );
+
+    let _server = server(&cell, &mapping);
+    // It trusts nobody it was not told to, and says how to tell it.
+    let untrusted = bridge.wait_for_line("its certificate is not trusted", SOON);
+    assert!(untrusted.contains("pki-ros1/rejected"), "{untrusted}");
+    self::store(&cell, "ros1");
+    eventually("the bridge has keys", SOON, || token(METRICS_ROS1));
+    bridge.wait_for_line("the Security Key Service answers again", SOON);
+    assert_eq!(http_answer(METRICS_ROS1, "/readyz").unwrap().0, 200);
+}
