@@ -91,6 +91,8 @@ impl Program for BridgeRos1 {
     type Port = Ros1Port;
 
     const NAME: &'static str = "bridge-ros1";
+    // Keys are fetched over OPC UA, and what becomes of that is told here.
+    const QUIET: &'static str = plant_keys::QUIET;
     const LOCAL: Local = Local::Ros1;
 
     fn arguments(&self) -> &Arguments {

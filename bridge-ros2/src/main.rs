@@ -206,6 +206,8 @@ impl Program for BridgeRos2 {
     type Port = Ros2Port;
 
     const NAME: &'static str = "bridge-ros2";
+    // Keys are fetched over OPC UA, and what becomes of that is told here.
+    const QUIET: &'static str = plant_keys::QUIET;
     const LOCAL: Local = Local::Cdr;
 
     fn arguments(&self) -> &Arguments {

@@ -10,6 +10,7 @@ import json
 import time
 
 from asyncua import ua
+from asyncua.common.ua_utils import data_type_to_variant_type
 
 import lifetime
 import opcua_session
@@ -69,6 +70,13 @@ def argument(value, kind):
     return ua.Variant(value, ua.VariantType(kind)) if kind else ua.Variant(value)
 
 
+async def builtin(client, kind):
+    # A DataType like Duration travels as what it is derived from.
+    if not isinstance(kind, int) or kind <= 25:
+        return kind
+    return (await data_type_to_variant_type(client.get_node(ua.NodeId(kind, 0)))).value
+
+
 async def called(client, object_, method, given):
     # As it is on the wire: asyncua's own call_method raises where an argument is wrong.
     request = ua.CallMethodRequest()
@@ -111,7 +119,7 @@ async def main():
         gives = await arguments(method, "OutputArguments")
         lifetime.say(node=method.nodeid.to_string(), takes=takes, gives=gives)
         for text in args.value:
-            kinds = [kind for _, kind, _ in takes] + [None] * 9
+            kinds = [await builtin(client, kind) for _, kind, _ in takes] + [None] * 9
             given = [argument(value, kind) for value, kind in zip(json.loads(text), kinds)]
             await called(client, object_, method, given)
         while args.gone and await found(client, args.path, 0) is not None:

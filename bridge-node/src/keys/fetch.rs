@@ -68,6 +68,7 @@ pub(super) async fn keep(
         return;
     };
     let mut failures = 0_u32;
+    let mut told = String::new();
     loop {
         let fetched = service.fetch(&request).await;
         let fetched = fetched.and_then(|fetched| delivery(fetched, policy_of(group.policy)));
@@ -75,6 +76,7 @@ pub(super) async fn keep(
         let rest = match fetched {
             Ok(delivery) => {
                 failures = 0;
+                told.clear();
                 let rest = rest(&delivery);
                 let group = group.id.clone();
                 if out.send(NewKeys { group, delivery }).await.is_err() {
@@ -85,7 +87,10 @@ pub(super) async fn keep(
             }
             Err(why) => {
                 failures = failures.saturating_add(1);
-                tell_failure(&request, failures, &why);
+                if why != told || failures.is_multiple_of(TOLD_AGAIN) {
+                    tell_failure(&request, failures, &why);
+                    told = why;
+                }
                 RETRY.saturating_mul(1 << failures.min(5)).min(RETRY_MOST)
             }
         };
@@ -123,15 +128,13 @@ fn tell_back(request: &KeyRequest, failures: u32) {
 }
 
 fn tell_failure(request: &KeyRequest, failures: u32, why: &str) {
-    if failures == 1 || failures.is_multiple_of(TOLD_AGAIN) {
-        let (group, endpoint) = (&request.group, &request.endpoint);
-        warn!(
-            group,
-            endpoint,
-            failures,
-            "no keys from the Security Key Service: {why}; asking again, and the keys there are stay in use"
-        );
-    }
+    let (group, endpoint) = (&request.group, &request.endpoint);
+    warn!(
+        group,
+        endpoint,
+        failures,
+        "no keys from the Security Key Service: {why}; asking again, and the keys there are stay in use"
+    );
 }
 
 /// When to ask again: after half the lifetime of a key (OPC 10000-14, 8.3.2), which is soon enough to hear of one that is
@@ -166,7 +169,7 @@ fn delivery(fetched: Fetched, policy: SecurityPolicy) -> Result<KeyDelivery, Str
 /// The first time to wait after a failure, doubled with each, and the longest.
 const RETRY: Duration = Duration::from_millis(250);
 const RETRY_MOST: Duration = Duration::from_secs(5);
-/// A failure is told again after so many.
+/// The same failure is told again after so many.
 const TOLD_AGAIN: u32 = 60;
 const LEAST_REST: Duration = Duration::from_millis(500);
 const MOST_REST: Duration = Duration::from_secs(300);

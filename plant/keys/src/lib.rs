@@ -15,6 +15,8 @@ use plant_opcua::types::{MethodId, NodeId, ObjectId, StatusCode, Variant};
 use tokio::sync::{mpsc, oneshot};
 use tracing::warn;
 
+pub use plant_opcua::QUIET;
+
 /// What the command line of a program says about how it fetches keys.
 #[derive(Debug, Clone, Default, PartialEq, Eq, clap::Args)]
 pub struct KeyArguments {
@@ -138,6 +140,7 @@ fn serve(identity: &Identity, mut requests: mpsc::Receiver<Asked>) {
 
 /// The keys from a service, in a session that is made for it and closed again.
 async fn fetch(identity: &Identity, request: &KeyRequest) -> Result<Fetched, String> {
+    pki::know_trusted(&identity.pki);
     let before = rejected(&identity.pki);
     let config = ClientConfig {
         pki: Some(identity.pki.clone()),
@@ -169,10 +172,11 @@ async fn fetch(identity: &Identity, request: &KeyRequest) -> Result<Fetched, Str
     let fetched = asked.await;
     client.close().await;
     fetched.map_err(|why| {
-        // A certificate that came to `rejected` meanwhile is that of the service.
-        let newest = rejected(&identity.pki).into_iter();
-        let new = newest.filter(|path| !before.contains(path)).next_back();
-        match new {
+        // A certificate that came to `rejected` meanwhile is that of the service, and one that is there already may be.
+        let now = rejected(&identity.pki);
+        let new = now.iter().rfind(|path| !before.contains(path));
+        let refused = UNTRUSTED.iter().any(|status| why.contains(status));
+        match new.or_else(|| now.last().filter(|_| refused)) {
             Some(path) => format!(
                 "{why}; its certificate is not trusted: to trust it, move {path:?} into {:?}",
                 identity.pki.join("trusted")
@@ -233,22 +237,28 @@ fn duration(milliseconds: f64) -> Option<Duration> {
     Duration::try_from_secs_f64(bounded / 1e3).ok()
 }
 
-/// The certificates of servers that were refused, by their names.
+/// The certificates of servers that were refused, the newest last.
 fn rejected(pki: &Path) -> Vec<PathBuf> {
     let Ok(entries) = std::fs::read_dir(pki.join("rejected")) else {
         return Vec::new();
     };
-    let mut found: Vec<_> = entries.flatten().map(|entry| entry.path()).collect();
+    let of = |entry: std::fs::DirEntry| {
+        let modified = entry.metadata().ok()?.modified().ok()?;
+        Some((modified, entry.path()))
+    };
+    let mut found: Vec<_> = entries.flatten().filter_map(of).collect();
     found.sort();
-    found
+    found.into_iter().map(|(_, path)| path).collect()
 }
 
+/// What a client says of a server that it does not trust.
+const UNTRUSTED: [&str; 2] = ["BadSecurityChecksFailed", "BadCertificateUntrusted"];
 /// Requests that wait.
 const WAITING: usize = 64;
 /// How long the service may take for each answer.
 const WITHIN: Duration = Duration::from_secs(5);
 /// How long a session may take to be there.
-const LONGEST_CONNECT: Duration = Duration::from_secs(15);
+const LONGEST_CONNECT: Duration = Duration::from_secs(10);
 /// The StartingTokenId that stands for the key that is used now.
 const CURRENT: u32 = 0;
 /// How many keys beyond that are asked for: so many lifetimes the service may be away.

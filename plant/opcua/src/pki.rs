@@ -179,6 +179,33 @@ pub fn default_root(variable: impl Fn(&str) -> Option<String>) -> PathBuf {
     state.join("ua-bridge/pki")
 }
 
+/// Lets certificates in `trusted` of the store at `root` be trusted that people put there, whatever they called the file: the
+/// library looks them up by a name of its own, and holds those in `rejected` for refused even so.
+pub fn know_trusted(root: &Path) {
+    // Without the directory there is nothing to know.
+    let Ok(entries) = fs::read_dir(root.join("trusted")) else {
+        return;
+    };
+    for path in entries.flatten().map(|entry| entry.path()) {
+        let Ok(certificate) = CertificateStore::read_cert(&path) else {
+            continue;
+        };
+        let name = CertificateStore::cert_file_name(&certificate);
+        let known = root.join("trusted").join(&name);
+        if known != path
+            && !known.exists()
+            && let Err(error) = fs::copy(&path, &known)
+        {
+            warn!(path = %path.display(), %error, "a trusted certificate cannot be used");
+            continue;
+        }
+        let refused = root.join("rejected").join(&name);
+        if refused.exists() {
+            remove(&refused);
+        }
+    }
+}
+
 fn remove(refused: &Path) {
     if let Err(error) = fs::remove_file(refused) {
         warn!(path = %refused.display(), %error, "an old refused certificate cannot be removed");
@@ -252,6 +279,8 @@ const REJECTED_KEPT: usize = 100;
 
 #[cfg(test)]
 mod tests {
+    use opcua::crypto::SecurityPolicy;
+
     use super::*;
 
     fn scratch(name: &str) -> PathBuf {
@@ -278,6 +307,45 @@ mod tests {
             fs::read(root.join(OWN_CERTIFICATE)).unwrap(),
             "a certificate that is there is kept"
         );
+        fs::remove_dir_all(root).unwrap();
+    }
+
+    #[test]
+    fn a_certificate_under_any_name_is_trusted_and_no_longer_refused() {
+        let root = scratch("known");
+        let pki = Pki::open(root.clone()).unwrap();
+        pki.ensure_own("urn:cell:server", "localhost").unwrap();
+        let own = CertificateStore::read_cert(&root.join(OWN_CERTIFICATE)).unwrap();
+        let store = CertificateStore::new(&root);
+        assert!(
+            store
+                .validate_or_reject_application_instance_cert(
+                    &own,
+                    SecurityPolicy::Basic256Sha256,
+                    None,
+                    None
+                )
+                .is_err()
+        );
+        assert_eq!(pki.rejected().unwrap().len(), 1);
+        fs::copy(
+            root.join(OWN_CERTIFICATE),
+            root.join("trusted/of the server.der"),
+        )
+        .unwrap();
+        fs::write(root.join("trusted/README"), "no certificate").unwrap();
+        know_trusted(&root);
+        assert!(
+            store
+                .validate_or_reject_application_instance_cert(
+                    &own,
+                    SecurityPolicy::Basic256Sha256,
+                    None,
+                    None
+                )
+                .is_ok()
+        );
+        assert!(pki.rejected().unwrap().is_empty());
         fs::remove_dir_all(root).unwrap();
     }
 
