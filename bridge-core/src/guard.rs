@@ -157,9 +157,14 @@ impl Guard {
         secured.opener.update_keys(first, keys.iter().cloned())?;
         secured.sealer.update_keys(first, keys.iter().cloned())?;
         secured.lifetime = delivery.lifetime;
-        // A sealer that is ahead of what is delivered goes by its own time.
-        if secured.sealer.current_token_id() == Some(first) {
-            secured.next = delivery.time_to_next.map(|time| now + time);
+        // A sealer that is ahead of who delivers waits until that is so far too.
+        let ahead = secured.sealer.current_token_id().and_then(|current| {
+            let mut tokens = (0_u32..).zip(tokens(first)).take(keys.len());
+            Some(tokens.find(|(_, token)| *token == current)?.0)
+        });
+        if let Some(ahead) = ahead {
+            let until = |time| now + time + delivery.lifetime.saturating_mul(ahead);
+            secured.next = delivery.time_to_next.map(until);
         }
         secured.overdue = false;
         Ok(())
@@ -251,9 +256,15 @@ impl Guard {
         };
         match secured.opener.open(message, since, scratch) {
             Ok(opened) => {
-                // Others went on to the next key, so its time has come.
-                if opened.key_changed && secured.sealer.next_key() {
-                    secured.next = Some(now + secured.lifetime);
+                // Others went on to a newer key, so its time has come, where it has not come here already.
+                if opened.key_changed
+                    && let Some(used) = secured.opener.current_token_id()
+                    && secured.sealer.move_to(used)
+                {
+                    // Keys of a file are used until there are others.
+                    let timed = secured.lifetime > Duration::ZERO;
+                    secured.next = timed.then(|| now + secured.lifetime);
+                    secured.overdue = false;
                 }
                 secured.wanted |= opened.force_key_reset;
                 Ok(Some(opened.message))
@@ -395,6 +406,11 @@ impl Secured {
             told: None,
         })
     }
+}
+
+/// The SecurityTokenIds from one on. Behind the highest comes 1.
+fn tokens(first: u32) -> impl Iterator<Item = u32> {
+    std::iter::successors(Some(first), |token| Some(token.checked_add(1).unwrap_or(1)))
 }
 
 /// The policy whose keys a group has.

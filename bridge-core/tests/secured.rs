@@ -216,6 +216,41 @@ fn keys_change_while_values_run_and_none_is_lost() {
 }
 
 #[test]
+fn programs_whose_times_differ_a_little_use_each_key_for_its_lifetime_and_no_shorter() {
+    let mut cell = secured(ENCRYPTED);
+    let timed = |first, keys: &[u8], to_next| KeyDelivery {
+        time_to_next: Some(to_next),
+        lifetime: ms(100),
+        ..delivery(first, keys)
+    };
+    let token = |cell: &Cell, at: usize| {
+        let state = cell.programs[at].router.groups().next().unwrap();
+        (state.token_id.unwrap(), state.overdue)
+    };
+    let says = |cell: &mut Cell, for_ms: u64| {
+        for _ in 0..for_ms / 10 {
+            cell.say(WRITER, said(), "on");
+            cell.say(READER, topic(0, 8, 10), "too");
+            cell.run(ms(10));
+        }
+    };
+    let keys = [1, 2, 3, 4, 5];
+    give(&mut cell, WRITER, &timed(1, &keys, ms(104)));
+    give(&mut cell, READER, &timed(1, &keys, ms(97)));
+    says(&mut cell, 350);
+    assert_eq!(token(&cell, WRITER), (4, false));
+    assert_eq!(token(&cell, READER), (4, false));
+    // A service that is behind is waited for.
+    give(&mut cell, WRITER, &timed(3, &[3, 4, 5, 6, 7], ms(50)));
+    give(&mut cell, READER, &timed(3, &[3, 4, 5, 6, 7], ms(50)));
+    says(&mut cell, 140);
+    assert_eq!(token(&cell, READER), (4, false));
+    says(&mut cell, 20);
+    assert_eq!(token(&cell, READER), (5, false));
+    assert_eq!(cell.dropped(READER, Reason::UnknownKey), 0);
+}
+
+#[test]
 fn without_keys_nothing_is_said_and_what_was_said_last_comes_with_them() {
     let mut cell = secured(ENCRYPTED);
     cell.start(WRITER, component(7));

@@ -87,7 +87,6 @@ impl ServerPort {
     /// A mapping that cannot be served, an address that cannot be listened on, a certificate store that cannot be
     /// used.
     pub(crate) fn start(mapping: &Arc<Mapping>, setup: Setup) -> Result<Self, Failure> {
-        let unavailable = |error: String| Failure::new(FailureKind::Unavailable, error);
         let configuration = |error: String| Failure::new(FailureKind::Configuration, error);
         let io = |error: String| Failure::new(FailureKind::Io, error);
 
@@ -100,17 +99,7 @@ impl ServerPort {
             .ensure_own(&described.application_uri, &setup.url.advertised_host())
             .map_err(|error| io(error.to_string()))?;
         setup.sks.follow(mapping)?;
-        let listener = setup
-            .url
-            .bind()
-            .map_err(|error| unavailable(format!("{error} (--endpoint)")))?;
-        let address = listener
-            .local_addr()
-            .map_err(|error| io(error.to_string()))?;
-        let port = address.port();
-        if !address.ip().is_loopback() && described.security.contains(&SecurityPolicy::None) {
-            tell_open(&setup.url);
-        }
+        let (listener, port) = listen(&setup.url, described)?;
 
         let (exits, (writes, created_items, asked)) = exits();
         if setup.trust_any_client {
@@ -310,6 +299,20 @@ impl Drop for ServerPort {
             runtime.shutdown_background();
         }
     }
+}
+
+/// Takes the endpoint's port, and says which it is.
+fn listen(url: &EndpointUrl, described: &Server) -> Result<(std::net::TcpListener, u16), Failure> {
+    let listener = url
+        .bind()
+        .map_err(|error| Failure::new(FailureKind::Unavailable, format!("{error} (--endpoint)")))?;
+    let address = listener
+        .local_addr()
+        .map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
+    if !address.ip().is_loopback() && described.security.contains(&SecurityPolicy::None) {
+        tell_open(url);
+    }
+    Ok((listener, address.port()))
 }
 
 /// Who asks the server is not asked for a name, and what it asks of other programs comes from its own address.

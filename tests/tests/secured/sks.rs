@@ -1,7 +1,6 @@
 //! Keys of a Security Key Service: ua-server makes them, hands them out and replaces them, and the bridges live with them.
 
 use std::fs;
-use std::time::Duration;
 
 use serde_json::{Value, json};
 use system_tests::{
@@ -164,7 +163,8 @@ fn stream(cell: &Cell, mapping: &str) -> Stream {
         "--warm-up",
         r#""warm""#,
     ];
-    let mut sends = cell.rospy("ros1_pub.py", &[&TOPIC[..], &numbers].concat());
+    let sends = cell.rospy_started("ros1_pub.py", &[&TOPIC[..], &numbers].concat());
+    let mut sends = sends.told().start();
     let value = |line: &Value| line.get("value").cloned();
     heard.wait_for_json("the first string in ROS 2", SOON, value);
     sends.tell("");
@@ -183,8 +183,8 @@ fn are_whole(values: &[Value]) {
         .iter()
         .filter_map(|value| value["data"].as_str()?.parse().ok())
         .collect();
-    let expected: Vec<u64> = (0..).take(numbers.len()).collect();
-    assert_eq!(numbers, expected);
+    let jump = numbers.windows(2).find(|pair| pair[1] != pair[0] + 1);
+    assert_eq!(jump, None, "of {} numbers", numbers.len());
 }
 
 #[test]

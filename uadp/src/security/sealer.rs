@@ -102,6 +102,12 @@ impl Sealer {
         }
     }
 
+    /// Moves on to the key with that SecurityTokenId, as when others use it already. False when it is not there, or no newer
+    /// one than the current.
+    pub fn move_to(&mut self, token_id: u32) -> bool {
+        self.ring.get_mut(token_id).is_some() && self.ring.advance(token_id)
+    }
+
     /// SecurityTokenId of the current key, `None` without keys.
     #[must_use]
     pub fn current_token_id(&self) -> Option<u32> {

@@ -144,9 +144,12 @@ fn each_key_of_a_publisher_counts_from_1_and_is_never_taken_up_again() {
     assert_eq!([(); 2].map(|()| sequence(&mut sealer)), [(5, 1), (5, 2)]);
     sealer.update_keys(5, [keys(5), keys(6)]).unwrap();
     assert_eq!(sequence(&mut sealer), (5, 3), "the key is the same");
-    assert!(sealer.next_key());
+    assert!(!sealer.move_to(5), "it is there already");
+    assert!(!sealer.move_to(7), "it has no such key");
+    assert!(sealer.move_to(6));
     assert_eq!(sequence(&mut sealer), (6, 1));
     assert!(!sealer.next_key());
+    assert!(!sealer.move_to(5), "no way back");
     sealer.update_keys(5, [keys(5), keys(6), keys(7)]).unwrap();
     assert_eq!(sequence(&mut sealer), (6, 2), "the service is behind");
     sealer.update_keys(7, [keys(7)]).unwrap();
