@@ -147,6 +147,7 @@ fn mapped() -> Call {
         }),
         asked: Vec::new(),
         open: true,
+        callers: None,
         timeout: Duration::from_secs(5),
     }
 }

@@ -6,6 +6,7 @@ use messages::{Literal, TypeName};
 
 use crate::mapping::Endpoint;
 use crate::node_id::{ExpandedNodeIdText, NodeIdText};
+use crate::permission::Role;
 use crate::topic::{SpaceId, TopicId};
 
 /// One call of the space: an OPC UA Method, the service or action that executes it, and those that ask for it.
@@ -30,6 +31,8 @@ pub struct Call {
     pub open: bool,
     /// How long the execution of a service may take, and how long who asks waits.
     pub timeout: Duration,
+    /// Which roles may call it at the server; `None` where nothing is said.
+    pub callers: Option<Vec<Role>>,
 }
 
 /// Whether a call has an answer at once.

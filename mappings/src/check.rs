@@ -8,6 +8,7 @@ mod meaning;
 mod names;
 mod network;
 mod patterns;
+mod permissions;
 mod security;
 mod selection;
 mod services;

@@ -133,6 +133,8 @@ codes! {
     HalfSecured = "M152", "Some of what is sent is secured, and a namespace is not. Who can write there can steer what is read there. `mode: none` in a group with that namespace says that it is meant.";
     OpenCall = "M153", "A call can be asked for without a key, in a cell where values are secured. To execute something is worth more protection than to read something, and not less.";
     KeyService = "M154", "With `keys: {sks: {}}` the cell's own server makes the keys of a group and hands them out, over encrypted sessions, to the programs that `members` names by the ApplicationUris in their certificates; each key is used for `key_lifetime`. With an `endpoint` another Security Key Service does, and that is then its own affair.";
+    Permissions = "M160", "`permissions` says which roles may `read`, `write` or `call` a node at the server: observer, operator, engineer, security_admin, one or a list, each once. Left out: everybody reads, and operators and engineers write and call. What is produced in another space than 0 no client writes.";
+    OpenServer = "M161", "A server that other hosts reach is open to them: it offers None, with which nothing is signed or encrypted, or users without a name may write and call. Both have to be said in the mapping, and seldom should be.";
 }
 
 impl Code {
@@ -179,7 +181,7 @@ impl std::str::FromStr for Code {
 
 /// A text that is none of the codes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("no finding has that code; codes are M001 to M154")]
+#[error("no finding has that code; codes are M001 to M161")]
 pub struct UnknownCode;
 
 #[cfg(test)]

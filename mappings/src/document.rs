@@ -108,8 +108,11 @@ document! {
         endpoint: String,
         /// ApplicationUri; default urn:ua-bridge:server.
         application_uri: String,
-        /// Security policies it offers; default both.
+        /// Security policies it offers. Left out: all of them, and `None` only where the endpoint is a loopback address.
         security: Vec<At<SecurityEntry>>,
+        /// What users without a name may be: `off` (they are not let in), `observer`, `operator` or `engineer`. Left out:
+        /// observer; and operator where the endpoint is a loopback address and the server has no users.
+        anonymous: AnonymousEntry,
     }
 
     /// One value of the cell.
@@ -155,6 +158,22 @@ document! {
         /// is over.
         #[schemars(regex(pattern = r"^[0-9]+(\.[0-9]+)? ?Hz$"))]
         at_most: String,
+        /// Which roles may do what with the node.
+        permissions: PermissionsEntry,
+    }
+
+    /// Which roles may do what with a variable.
+    struct PermissionsEntry {
+        /// Who may read it, one role or a list; default everybody.
+        read: RoleList,
+        /// Who may write it, with `origin: 0`; default [operator, engineer].
+        write: RoleList,
+    }
+
+    /// Which roles may do what with a call.
+    struct CallPermissionsEntry {
+        /// Who may call the Method, one role or a list; default [operator, engineer].
+        call: RoleList,
     }
 
     /// ROS topics that become values as they appear.
@@ -286,6 +305,8 @@ document! {
         /// goal is accepted or refused.
         #[schemars(regex(pattern = DURATION))]
         timeout: String,
+        /// Which roles may call the Method at the server of the cell.
+        permissions: CallPermissionsEntry,
     }
 
     /// A service or action of ROS that executes a call, or asks for it: exactly one of `service` and `action`.
@@ -382,11 +403,37 @@ choice! {
         Clamp = "clamp",
     }
 
+    enum RoleEntry {
+        /// Sees what there is.
+        Observer = "observer",
+        /// Runs the cell.
+        Operator = "operator",
+        /// Sets the cell up.
+        Engineer = "engineer",
+        /// Says who may do what.
+        SecurityAdmin = "security_admin",
+    }
+
+    enum AnonymousEntry {
+        /// They are not let in.
+        Off = "off",
+        /// They read.
+        Observer = "observer",
+        /// They read, write and call.
+        Operator = "operator",
+        /// They may all that engineers may.
+        Engineer = "engineer",
+    }
+
     enum SecurityEntry {
         /// Neither signed nor encrypted.
         None = "None",
         /// Signed, or signed and encrypted.
         Basic256Sha256 = "Basic256Sha256",
+        /// Signed, or signed and encrypted with AES of 128 bits.
+        Aes128Sha256RsaOaep = "Aes128_Sha256_RsaOaep",
+        /// Signed with RSA-PSS, or signed so and encrypted.
+        Aes256Sha256RsaPss = "Aes256_Sha256_RsaPss",
     }
 }
 
@@ -684,6 +731,38 @@ impl JsonSchema for Includes {
     fn json_schema(generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
         let one = generator.subschema_for::<String>();
         schemars::json_schema!({ "anyOf": [one, { "type": "array", "items": one }] })
+    }
+}
+
+/// One role or a list of them.
+#[derive(Clone, Debug)]
+pub(crate) struct RoleList(pub(crate) Vec<At<RoleEntry>>);
+
+impl Read for RoleList {
+    fn read(node: &Node<'_>, reader: &mut Reader<'_>) -> Option<Self> {
+        match &node.kind {
+            Kind::List(_) => Vec::read(node, reader).map(Self),
+            Kind::Scalar(_) => Some(Self(vec![reader.at(node)])),
+            Kind::Null | Kind::Map(_) => {
+                reader.wrong(node, "a role such as `engineer`, or a list of them");
+                None
+            }
+        }
+    }
+}
+
+impl JsonSchema for RoleList {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "RoleList".into()
+    }
+
+    fn json_schema(generator: &mut schemars::SchemaGenerator) -> schemars::Schema {
+        let one = generator.subschema_for::<RoleEntry>();
+        schemars::json_schema!({ "anyOf": [one, { "type": "array", "items": one, "minItems": 1 }] })
     }
 }
 

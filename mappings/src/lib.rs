@@ -14,6 +14,7 @@ mod mapping;
 mod nearest;
 mod node_id;
 mod pattern;
+mod permission;
 mod read;
 mod schema;
 mod secret;
@@ -39,6 +40,7 @@ pub use mapping::{
 };
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
+pub use permission::{Anonymous, Permissions, Role};
 pub use schema::schema;
 pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
 pub use surroundings::{Readers, Surroundings};

@@ -12,6 +12,7 @@ use uadp::BuiltinType;
 use crate::call::{Call, CallBinding};
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
+use crate::permission::{Anonymous, Permissions};
 use crate::security::SecurityGroup;
 use crate::topic::{SpaceId, TopicId};
 use crate::unit::Unit;
@@ -419,8 +420,24 @@ pub struct Server {
     pub endpoint: Endpoint,
     /// ApplicationUri of the server.
     pub application_uri: String,
-    /// The security policies it offers, without repetition, never empty.
-    pub security: Vec<SecurityPolicy>,
+    /// The security policies it offers, without repetition and not empty; `None` where the document says nothing.
+    pub security: Option<Vec<SecurityPolicy>>,
+    /// What users without a name may be.
+    pub anonymous: Anonymous,
+}
+
+impl Server {
+    /// The security policies it offers. Where the document says nothing these are all there are, and
+    /// [`SecurityPolicy::None`] only for a server that listens on a loopback address.
+    #[must_use]
+    pub fn policies(&self, is_loopback: bool) -> Vec<SecurityPolicy> {
+        if let Some(told) = &self.security {
+            return told.clone();
+        }
+        let all = SecurityPolicy::ALL.iter().copied();
+        all.filter(|policy| is_loopback || *policy != SecurityPolicy::None)
+            .collect()
+    }
 }
 
 impl Default for Server {
@@ -428,7 +445,8 @@ impl Default for Server {
         Self {
             endpoint: Endpoint::default(),
             application_uri: "urn:ua-bridge:server".to_owned(),
-            security: vec![SecurityPolicy::None, SecurityPolicy::Basic256Sha256],
+            security: None,
+            anonymous: Anonymous::Usual,
         }
     }
 }
@@ -442,6 +460,17 @@ pub struct Endpoint {
     pub port: u16,
     /// Empty, or begins with `/`.
     pub path: String,
+}
+
+impl Endpoint {
+    /// Whether only programs of its own host reach it, as far as its host says.
+    #[must_use]
+    pub fn is_loopback(&self) -> bool {
+        match self.host.parse::<std::net::IpAddr>() {
+            Ok(address) => address.is_loopback(),
+            Err(_) => self.host.eq_ignore_ascii_case("localhost"),
+        }
+    }
 }
 
 impl Default for Endpoint {
@@ -472,15 +501,29 @@ pub enum SecurityPolicy {
     None,
     /// `http://opcfoundation.org/UA/SecurityPolicy#Basic256Sha256`
     Basic256Sha256,
+    /// `http://opcfoundation.org/UA/SecurityPolicy#Aes128_Sha256_RsaOaep`
+    Aes128Sha256RsaOaep,
+    /// `http://opcfoundation.org/UA/SecurityPolicy#Aes256_Sha256_RsaPss`
+    Aes256Sha256RsaPss,
 }
 
 impl SecurityPolicy {
+    /// Every policy, the weakest first.
+    pub const ALL: &'static [Self] = &[
+        Self::None,
+        Self::Aes128Sha256RsaOaep,
+        Self::Basic256Sha256,
+        Self::Aes256Sha256RsaPss,
+    ];
+
     /// The name in the URI's fragment.
     #[must_use]
     pub const fn name(self) -> &'static str {
         match self {
             Self::None => "None",
             Self::Basic256Sha256 => "Basic256Sha256",
+            Self::Aes128Sha256RsaOaep => "Aes128_Sha256_RsaOaep",
+            Self::Aes256Sha256RsaPss => "Aes256_Sha256_RsaPss",
         }
     }
 }
@@ -511,6 +554,8 @@ pub struct Variable {
     pub publish: Publish,
     /// What its numbers mean.
     pub meaning: Meaning,
+    /// Who may read and write it at the server.
+    pub permissions: Permissions,
 }
 
 /// One field of a DataSet (OPC 10000-14, 6.2.3.2.3).

@@ -88,11 +88,37 @@ fn everything_of_the_network_can_be_said() {
         mapping.server().endpoint.to_string(),
         "opc.tcp://gateway:4841/cell"
     );
-    assert_eq!(mapping.server().security, [SecurityPolicy::Basic256Sha256]);
+    assert_eq!(
+        mapping.server().policies(true),
+        [SecurityPolicy::Basic256Sha256]
+    );
     let v6 = sound("pubsub: {address: \"opc.udp://[ff05::40]\"}");
     assert_eq!(
         v6.pubsub().address,
         "[ff05::40]:4840".parse::<SocketAddr>().unwrap()
+    );
+}
+
+#[test]
+fn a_server_without_security_is_one_of_its_own_host_unless_the_mapping_says_so() {
+    let silent = sound("server: {endpoint: opc.tcp://gateway:4840}");
+    assert!(
+        silent
+            .server()
+            .policies(true)
+            .contains(&SecurityPolicy::None)
+    );
+    let elsewhere = silent.server().policies(false);
+    assert_eq!(elsewhere.len(), 3);
+    assert!(!elsewhere.contains(&SecurityPolicy::None));
+    let told = sound("server: {security: [None, Aes128_Sha256_RsaOaep, Aes256_Sha256_RsaPss]}");
+    assert_eq!(
+        told.server().policies(false),
+        [
+            SecurityPolicy::None,
+            SecurityPolicy::Aes128Sha256RsaOaep,
+            SecurityPolicy::Aes256Sha256RsaPss
+        ]
     );
 }
 

@@ -7,42 +7,69 @@ import socket
 
 from asyncua import Client, ua
 from asyncua.crypto.cert_gen import setup_self_signed_certificate
-from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+from asyncua.crypto.security_policies import (
+    SecurityPolicyAes128Sha256RsaOaep,
+    SecurityPolicyAes256Sha256RsaPss,
+    SecurityPolicyBasic256Sha256,
+)
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 APPLICATION_URI = "urn:ua-bridge:system-tests:client"
+POLICIES = {
+    "Basic256Sha256": SecurityPolicyBasic256Sha256,
+    "Aes128_Sha256_RsaOaep": SecurityPolicyAes128Sha256RsaOaep,
+    "Aes256_Sha256_RsaPss": SecurityPolicyAes256Sha256RsaPss,
+}
 
 
 def add_arguments(parser):
     parser.add_argument("endpoint")
-    parser.add_argument("--security", choices=["None", "Basic256Sha256"], default="None")
+    parser.add_argument("--security", choices=["None", *POLICIES], default="None")
+    parser.add_argument("--mode", choices=["Sign", "SignAndEncrypt"], default="SignAndEncrypt")
     parser.add_argument("--certificates", help="folder for this client's key and certificate")
+    parser.add_argument("--application-uri", default=APPLICATION_URI, help="what the client says it is")
+    parser.add_argument("--user", help="the name of a user")
+    parser.add_argument("--password")
+    parser.add_argument("--user-certificate", help="folder for the key and certificate of a user")
     parser.add_argument("--limit", type=float, default=60.0)
     parser.add_argument("--patience", type=float, default=10.0, help="how long an answer is waited for")
+
+
+async def pair_of(folder, name, uri):
+    """The key and the certificate in a folder, made where they are not there."""
+    folder = pathlib.Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    key, certificate = folder / f"{name}_key.pem", folder / f"{name}_certificate.der"
+    await setup_self_signed_certificate(
+        key,
+        certificate,
+        uri,
+        socket.gethostname(),
+        [ExtendedKeyUsageOID.CLIENT_AUTH],
+        {"countryName": "XX", "organizationName": "system-tests", "commonName": name},
+    )
+    return str(key), str(certificate)
 
 
 async def client_of(args):
     """A client that is not connected yet: `async with await client_of(args) as client`."""
     client = Client(args.endpoint, timeout=args.patience)
+    if args.user:
+        client.set_user(args.user)
+        client.set_password(args.password)
+    if args.user_certificate:
+        key, certificate = await pair_of(args.user_certificate, "user", "urn:ua-bridge:system-tests:user")
+        await client.load_client_certificate(certificate)
+        await client.load_private_key(key)
     if args.security == "None":
         return client
-    folder = pathlib.Path(args.certificates)
-    folder.mkdir(parents=True, exist_ok=True)
-    key, certificate = folder / "client_key.pem", folder / "client_certificate.der"
-    await setup_self_signed_certificate(
-        key,
-        certificate,
-        APPLICATION_URI,
-        socket.gethostname(),
-        [ExtendedKeyUsageOID.CLIENT_AUTH],
-        {"countryName": "XX", "organizationName": "system-tests"},
-    )
-    client.application_uri = APPLICATION_URI
+    key, certificate = await pair_of(args.certificates, "client", APPLICATION_URI)
+    client.application_uri = args.application_uri
     await client.set_security(
-        SecurityPolicyBasic256Sha256,
-        certificate=str(certificate),
-        private_key=str(key),
-        mode=ua.MessageSecurityMode.SignAndEncrypt,
+        POLICIES[args.security],
+        certificate=certificate,
+        private_key=key,
+        mode=ua.MessageSecurityMode[args.mode],
     )
     return client
 

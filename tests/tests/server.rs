@@ -1,5 +1,8 @@
 //! The OPC UA server by itself: datagrams of the tests' own on one side, asyncua on the other.
 
+#[path = "server/access.rs"]
+mod access;
+
 use std::{
     fs,
     time::{Duration, Instant, SystemTime},

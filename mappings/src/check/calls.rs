@@ -9,9 +9,9 @@ use std::time::Duration;
 
 use self::bindings::Found;
 use super::network::duration;
-use super::required;
 use super::types::Types;
 use super::variables::{NAMESPACE_ZERO, Namespaces, Spaces, checked_name, node_id, space};
+use super::{permissions, required};
 use crate::call::{Call, CallBinding, CallKind, ExecutedBy, MethodTarget};
 use crate::code::Code;
 use crate::document::CallEntry;
@@ -97,6 +97,7 @@ impl Checker<'_> {
             Some(_) => duration(&entry.timeout, findings)?,
             None => TIMEOUT,
         };
+        let callers = permissions::of_call(&entry.permissions, findings)?;
         let found = self.bindings(entry, origin.map(|(origin, _)| origin), findings);
         let method = self.method(entry, node.as_ref(), origin, findings);
         let kind = bindings::kind_of(found.as_deref(), entry, findings);
@@ -119,6 +120,7 @@ impl Checker<'_> {
             asked,
             open: given(&entry.open).is_some_and(|(open, _)| *open),
             timeout,
+            callers,
         })
     }
 

@@ -5,6 +5,7 @@ use std::ops::RangeInclusive;
 use std::time::Duration;
 
 use super::cell::is_uri;
+use super::permissions;
 use crate::code::Code;
 use crate::document::{PubSubEntry, PublisherIdEntry, SecurityEntry, ServerEntry};
 use crate::findings::Findings;
@@ -254,11 +255,14 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
     });
     let security =
         given(&entry.security).and_then(|(entries, place)| security(entries, place, findings));
-    Server {
+    let server = Server {
         endpoint: endpoint.unwrap_or(default.endpoint),
         application_uri: application_uri.unwrap_or(default.application_uri),
-        security: security.unwrap_or(default.security),
-    }
+        security,
+        anonymous: permissions::anonymous(entry),
+    };
+    permissions::left_open(entry, &server, findings);
+    server
 }
 
 fn security(
@@ -275,10 +279,8 @@ fn security(
     }
     let mut policies = Vec::new();
     for entry in entries {
-        let policy = match entry.value {
-            Some(SecurityEntry::None) => SecurityPolicy::None,
-            Some(SecurityEntry::Basic256Sha256) => SecurityPolicy::Basic256Sha256,
-            None => continue,
+        let Some(policy) = entry.value.map(policy) else {
+            continue;
         };
         if policies.contains(&policy) {
             let message = format!("the security policy {} is listed twice", policy.name());
@@ -290,6 +292,15 @@ fn security(
         }
     }
     Some(policies)
+}
+
+const fn policy(entry: SecurityEntry) -> SecurityPolicy {
+    match entry {
+        SecurityEntry::None => SecurityPolicy::None,
+        SecurityEntry::Basic256Sha256 => SecurityPolicy::Basic256Sha256,
+        SecurityEntry::Aes128Sha256RsaOaep => SecurityPolicy::Aes128Sha256RsaOaep,
+        SecurityEntry::Aes256Sha256RsaPss => SecurityPolicy::Aes256Sha256RsaPss,
+    }
 }
 
 /// `opc.tcp://host:port/path`, port 4840 when left out (OPC 10000-6, 7.2).

@@ -314,7 +314,7 @@ fn own_service(mapping: &Mapping, document: &Document, findings: &mut Findings) 
         return;
     };
     let server = mapping.server();
-    if server.security == [SecurityPolicy::None] {
+    if server.policies(server.endpoint.is_loopback()) == [SecurityPolicy::None] {
         let message = format!(
             "the server makes the keys of the group `{}`, and hands them out over encrypted sessions, of which it offers none",
             short(&group.id)

@@ -10,7 +10,7 @@ use messages::{Leaf, Rank};
 use super::bindings::{self, Bindings};
 use super::services::Calls;
 use super::types::{self, Types, ValueType};
-use super::{Declared, meaning, required};
+use super::{Declared, meaning, permissions, required};
 use crate::code::Code;
 use crate::document::{PublishEntry, Queue, UaFieldEntry, VariableEntry};
 use crate::findings::Findings;
@@ -341,6 +341,7 @@ fn variable(
     let publish = publish(entry, (value_type, &fields), findings);
     let several = fields.len() > 1;
     let meaning = meaning::check(entry, (value_type, several), findings);
+    let permissions = permissions::of_variable(&entry.permissions, draft.origin, findings);
     let service = bound
         .service
         .map(|service| Box::new(service.settled(value_type, findings)));
@@ -364,6 +365,7 @@ fn variable(
         overflow,
         publish: publish?,
         meaning: meaning?,
+        permissions: permissions?,
     })
 }
 

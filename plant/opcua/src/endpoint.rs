@@ -27,6 +27,24 @@ impl EndpointUrl {
         }
     }
 
+    /// The hosts that a certificate for the URL is to name: its own, or with the wildcard address this computer's name and the
+    /// addresses it has now.
+    #[must_use]
+    pub fn hosts(&self) -> Vec<String> {
+        let bare = self.host.trim_matches(['[', ']']);
+        let is_wildcard = bare
+            .parse::<IpAddr>()
+            .is_ok_and(|address| address.is_unspecified());
+        let named = self.advertised_host().trim_matches(['[', ']']).to_owned();
+        let mut hosts = vec![named];
+        if is_wildcard {
+            let all = if_addrs::get_if_addrs().unwrap_or_default();
+            let others = all.iter().filter(|one| !one.is_loopback());
+            hosts.extend(others.take(MOST_ADDRESSES).map(|one| one.ip().to_string()));
+        }
+        hosts
+    }
+
     /// The path of the URL, `/` at least.
     #[must_use]
     pub fn path(&self) -> &str {
@@ -175,6 +193,8 @@ pub enum BindError {
 
 /// The port of OPC UA Connection Protocol registered with IANA.
 const DEFAULT_PORT: u16 = 4840;
+/// Addresses of this computer that a certificate names.
+const MOST_ADDRESSES: usize = 64;
 
 #[cfg(test)]
 mod tests {
@@ -211,6 +231,18 @@ mod tests {
                 "{host}"
             );
         }
+    }
+
+    #[test]
+    fn a_certificate_names_the_host_of_the_url_and_for_the_wildcard_address_this_computer() {
+        let hosts = |text: &str| text.parse::<EndpointUrl>().unwrap().hosts();
+        assert_eq!(hosts("opc.tcp://192.0.2.7:4840"), ["192.0.2.7"]);
+        assert_eq!(hosts("opc.tcp://[::1]:4840"), ["::1"]);
+        let all = hosts("opc.tcp://0.0.0.0:4840");
+        assert!(
+            !all.contains(&"0.0.0.0".to_owned()) && !all[0].is_empty(),
+            "{all:?}"
+        );
     }
 
     #[test]

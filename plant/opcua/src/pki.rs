@@ -8,6 +8,8 @@ use std::path::{Path, PathBuf};
 use opcua::crypto::{CertificateStore, X509Data};
 use tracing::{info, warn};
 
+use crate::certificates::{self, Standing};
+
 /// The directories of an OPC UA certificate store: `own`, `private`, `trusted` and `rejected` under one root.
 #[derive(Debug)]
 pub struct Pki {
@@ -90,7 +92,7 @@ impl Pki {
         self.ensure_own_at(application_uri, &[host.to_owned()])
     }
 
-    /// The same for an application that is reached under several hosts.
+    /// The same, for an application that is reached under several hosts.
     ///
     /// # Errors
     /// Files that cannot be read or written, or half a pair.
@@ -139,15 +141,27 @@ impl Pki {
             if at < oldest {
                 remove(path);
             } else if !self.reported.contains(path) {
-                // No shell command to copy: the file name begins with a name the client chose.
-                warn!(
-                    "a client was refused because its certificate is not trusted; to trust it, move {:?} into {:?}",
-                    path,
-                    self.root.join("trusted"),
-                );
+                self.tell_refused(path);
             }
         }
         self.reported = rejected.into_iter().collect();
+    }
+
+    /// Names who was refused, and what to type to let it in: by the thumbprint, since all else the client chose.
+    fn tell_refused(&self, path: &Path) {
+        let trusted = self.root.join("trusted");
+        let Some(stored) = certificates::stored(path, Standing::Rejected) else {
+            warn!("a client was refused, and {path:?} holds no certificate that could be trusted");
+            return;
+        };
+        warn!(
+            name = ?stored.name,
+            application_uri = ?stored.application_uri.unwrap_or_default(),
+            "a client was refused because its certificate is not trusted; to trust it: `ua-server trust {} --pki {:?}`, or \
+             move {path:?} into {trusted:?}",
+            stored.thumbprint.get(..16).unwrap_or_default(),
+            self.root,
+        );
     }
 
     /// The refused certificates, oldest first.
@@ -213,9 +227,12 @@ fn remove(refused: &Path) {
 }
 
 fn certificate_data(application_uri: &str, hosts: &[String]) -> X509Data {
-    let mut addresses = hosts.to_vec();
-    addresses.extend(["127.0.0.1", "::1"].map(str::to_owned));
-    addresses.dedup();
+    let mut addresses: Vec<String> = Vec::new();
+    for host in hosts.iter().map(String::as_str).chain(["127.0.0.1", "::1"]) {
+        if !addresses.iter().any(|one| one == host) {
+            addresses.push(host.to_owned());
+        }
+    }
     X509Data {
         key_size: 2048,
         common_name: "UA bridge".to_owned(),
@@ -267,7 +284,7 @@ fn owner_only(_path: &Path) -> io::Result<()> {
 }
 
 /// The application's own certificate, below the root.
-pub const OWN_CERTIFICATE: &str = "own/cert.der";
+pub const OWN_CERTIFICATE: &str = certificates::OWN;
 /// Its private key, below the root.
 pub const OWN_KEY: &str = "private/private.pem";
 /// Held while the pair is looked for and made.

@@ -20,6 +20,7 @@ use opcua::types::{
     StatusCode, TimestampsToReturn,
 };
 
+use crate::auditing;
 use crate::nodes::{SpaceManager, SpaceNodes};
 
 /// The node manager of the space, with what is below a folder or a variable in the order of the mapping.
@@ -211,7 +212,13 @@ impl NodeManager for Ordered {
         context: &RequestContext,
         nodes_to_write: &mut [&mut WriteNode],
     ) -> Result<(), StatusCode> {
-        self.inner.write(context, nodes_to_write).await
+        let Some(space) = self.space() else {
+            return self.inner.write(context, nodes_to_write).await;
+        };
+        let before = auditing::before(&space, nodes_to_write);
+        let done = self.inner.write(context, nodes_to_write).await;
+        auditing::wrote(context, before, (nodes_to_write, done));
+        done
     }
 
     async fn create_monitored_items(
@@ -248,6 +255,8 @@ impl NodeManager for Ordered {
         context: &RequestContext,
         methods_to_call: &mut [&mut MethodCall],
     ) -> Result<(), StatusCode> {
-        self.inner.call(context, methods_to_call).await
+        let done = self.inner.call(context, methods_to_call).await;
+        auditing::called(context, (methods_to_call, done));
+        done
     }
 }

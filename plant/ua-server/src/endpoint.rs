@@ -1,17 +1,35 @@
 //! What clients may choose of the server: its endpoints and their security.
 
-use mappings::Server;
-use opcua::crypto::SecurityPolicy;
-use opcua::server::{ANONYMOUS_USER_TOKEN_ID, ServerBuilder, ServerEndpoint};
-use opcua::types::{BuildInfo, MessageSecurityMode, UAString};
+use std::net::SocketAddr;
+
+use mappings::{SecurityPolicy, Server};
+use opcua::server::ServerBuilder;
+use opcua::types::{BuildInfo, UAString};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::limits;
 use plant_opcua::pki::{OWN_CERTIFICATE, OWN_KEY};
+use plant_opcua::server::Security;
 
-/// The server the mapping describes, reached at `url`, for anonymous users. `port` is the one that is listened on, which differs from the URL's when that is 0.
-pub(crate) fn server(described: &Server, url: &EndpointUrl, port: u16) -> ServerBuilder {
+/// What the server offers of what the mapping says, listening at `address`.
+pub(crate) fn security(described: &Server, address: SocketAddr) -> Vec<Security> {
+    let policies = described.policies(address.ip().is_loopback());
+    let security = policies.into_iter().map(|policy| match policy {
+        SecurityPolicy::None => Security::None,
+        SecurityPolicy::Basic256Sha256 => Security::Basic256Sha256,
+        SecurityPolicy::Aes128Sha256RsaOaep => Security::Aes128Sha256RsaOaep,
+        SecurityPolicy::Aes256Sha256RsaPss => Security::Aes256Sha256RsaPss,
+    });
+    security.collect()
+}
+
+/// The server the mapping describes, reached at `url`. `port` is the one that is listened on, which differs from the URL's
+/// when that is 0.
+pub(crate) fn server(
+    described: &Server,
+    (url, port): (&EndpointUrl, u16),
+    security: &[Security],
+) -> ServerBuilder {
     let host = url.advertised_host();
-    let anonymous = [ANONYMOUS_USER_TOKEN_ID.to_owned()];
     let mut builder = ServerBuilder::new()
         .without_node_managers()
         .application_name(APPLICATION_NAME)
@@ -35,23 +53,9 @@ pub(crate) fn server(described: &Server, url: &EndpointUrl, port: u16) -> Server
         // hold. Each call has an end of its own.
         .max_timeout_ms(0)
         .limits(limits::server());
-    for policy in &described.security {
-        let (policy, modes) = match policy {
-            mappings::SecurityPolicy::None => {
-                (SecurityPolicy::None, [MessageSecurityMode::None].as_slice())
-            }
-            mappings::SecurityPolicy::Basic256Sha256 => (
-                SecurityPolicy::Basic256Sha256,
-                [
-                    MessageSecurityMode::Sign,
-                    MessageSecurityMode::SignAndEncrypt,
-                ]
-                .as_slice(),
-            ),
-        };
-        for mode in modes {
-            let endpoint = ServerEndpoint::new(url.path(), policy, *mode, &anonymous);
-            builder = builder.add_endpoint(format!("{policy} {mode}"), endpoint);
+    for security in security {
+        for (name, endpoint) in security.endpoints(url.path()) {
+            builder = builder.add_endpoint(name, endpoint);
         }
     }
     builder

@@ -7,10 +7,13 @@
 //! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show),
 //! `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in),
 //! `components` (which servers are there), `methods` and `argument_types` (calls of the space as Methods), `executing` (Methods of other servers as calls), `port` (the shell's side),
-//! `endpoint` (how clients get in), `sks` (keys of secured groups), `value` (between the two codecs).
+//! `endpoint` (how clients get in), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured groups), `value` (between the two codecs),
+//! `verbs` (certificates and users by hand).
 
+mod access;
 mod address;
 mod argument_types;
+mod auditing;
 mod browse;
 mod budget;
 mod components;
@@ -26,6 +29,7 @@ mod space;
 mod structures;
 mod value;
 mod values;
+mod verbs;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -43,7 +47,7 @@ use crate::structures::Types;
 
 /// The OPC UA server of the cell: every value of the space as a variable, and a way in for those of origin 0.
 #[derive(Debug, clap::Parser)]
-#[command(name = "ua-server", version)]
+#[command(name = "ua-server", version, after_help = verbs::HELP)]
 struct UaServer {
     #[command(flatten)]
     arguments: Arguments,
@@ -70,7 +74,10 @@ struct UaServer {
 }
 
 fn main() -> ExitCode {
-    bridge_node::run::<UaServer>()
+    match verbs::asked() {
+        Some(ended) => ended,
+        None => bridge_node::run::<UaServer>(),
+    }
 }
 
 impl UaServer {

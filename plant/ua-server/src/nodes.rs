@@ -24,10 +24,12 @@ use opcua::sync::{Mutex, RwLock};
 use opcua::types::{
     AttributeId, DataValue, DateTime, NodeId, NumericRange, StatusCode, TimestampsToReturn, Variant,
 };
+use plant_opcua::users::Access;
 use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc};
 use tracing::warn;
 use uadp::Timestamp;
 
+use crate::access::{self, Genuine};
 use crate::address;
 use crate::budget::{Answers, LARGEST, SMALL, Watched};
 use crate::layout::{FieldNode, Layout, TopicNode};
@@ -48,6 +50,7 @@ pub(crate) struct SpaceNodes {
     values: RwLock<Values>,
     watched: Mutex<Watched>,
     answers: Mutex<Answers>,
+    genuine: Genuine,
     exits: Exits,
     /// What clients can call.
     methods: Table,
@@ -73,6 +76,8 @@ pub(crate) struct Exits {
     pub(crate) created: mpsc::Sender<(NodeId, MonitoredItemHandle)>,
     /// What clients ask of calls. A client is told when there is no room.
     pub(crate) questions: Questions,
+    /// What users may do.
+    pub(crate) access: Arc<Access>,
 }
 
 /// A value a client wrote to a topic of the OPC UA side.
@@ -127,6 +132,7 @@ impl SpaceNodes {
             values: RwLock::new(Values::new(MOST_HELD)),
             watched: Mutex::new(Watched::default()),
             answers: Mutex::new(Answers::default()),
+            genuine: Genuine::default(),
             exits,
             methods: Table::default(),
             writing: Mutex::new(()),
@@ -345,6 +351,20 @@ impl SpaceNodes {
         })
     }
 
+    /// Whether everybody who is let in may read a node.
+    pub(crate) fn is_public(&self, node: &NodeId) -> bool {
+        self.exits.access.is_public(node)
+    }
+
+    /// What a node shows, unless it is large.
+    pub(crate) fn shown_at(&self, node: &NodeId) -> Option<Variant> {
+        let (topic, field) = self.place(node)?;
+        let shown = self.shown(topic.topic);
+        let view = shown.view(&topic, field);
+        let small = view.weight() <= SMALL;
+        small.then(|| view.data_value(&NumericRange::None).value)?
+    }
+
     /// Gives one monitored item what its node shows.
     fn look_at(
         &self,
@@ -377,7 +397,7 @@ impl SpaceNodes {
     fn write_one(
         &self,
         address_space: &AddressSpace,
-        subscriptions: &SubscriptionCache,
+        context: &RequestContext,
         write: &ParsedWriteValue,
     ) -> Result<(), StatusCode> {
         let is_value = write.attribute_id == AttributeId::Value;
@@ -392,6 +412,9 @@ impl SpaceNodes {
         };
         if !topic.writable() {
             return Err(StatusCode::BadNotWritable);
+        }
+        if !access::may_write(context, &write.node_id) {
+            return Err(StatusCode::BadUserAccessDenied);
         }
         if write
             .value
@@ -410,6 +433,9 @@ impl SpaceNodes {
         let shown = self.shown(topic.topic);
         let field = field.and_then(|field| topic.fields.get(field));
         let fields = new_fields(&shown, &topic, field, (value, &write.index_range))?;
+        if !properties::are_within(&topic, &fields) {
+            return Err(StatusCode::BadOutOfRange);
+        }
         let block = Bytes::from(value::fields_block(&fields)?);
         drop(fields);
         let source = source_of(&write.value);
@@ -421,7 +447,7 @@ impl SpaceNodes {
         };
         let block = Some(block);
         // It has been sent, whether there is room to show it or not.
-        let _shown = self.show(subscriptions, &topic, Shown { block, stamp });
+        let _shown = self.show(&context.subscriptions, &topic, Shown { block, stamp });
         Ok(())
     }
 
@@ -580,10 +606,13 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         timestamps_to_return: TimestampsToReturn,
     ) -> Vec<DataValue> {
         let address_space = address_space.read();
+        let genuine = self.genuine.check(context);
         nodes
             .iter()
             .map(|node| {
-                if let Err(status) = address_space.validate_node_read(context, node) {
+                let may = genuine
+                    .and_then(|()| address_space.validate_node_read(context, node).map(drop));
+                if let Err(status) = may {
                     return DataValue {
                         status: Some(status),
                         ..DataValue::default()
@@ -604,7 +633,12 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         items: &mut [&mut &mut CreateMonitoredItem],
     ) {
         let address_space = address_space.read();
+        let genuine = self.genuine.check(context);
         for item in items {
+            if let Err(status) = genuine {
+                item.set_status(status);
+                continue;
+            }
             let handle = item.handle();
             let queue = item.queue_size();
             let unfiltered = unfiltered(item);
@@ -660,8 +694,9 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         nodes_to_write: &mut [&mut WriteNode],
     ) -> Result<(), StatusCode> {
         let address_space = address_space.read();
+        self.genuine.check(context)?;
         for write in nodes_to_write {
-            let result = self.write_one(&address_space, &context.subscriptions, write.value());
+            let result = self.write_one(&address_space, context, write.value());
             write.set_status(result.err().unwrap_or(StatusCode::Good));
         }
         Ok(())
@@ -673,6 +708,7 @@ impl InMemoryNodeManagerImpl for SpaceNodes {
         _address_space: &RwLock<AddressSpace>,
         methods_to_call: &mut [&mut &mut MethodCall],
     ) -> Result<(), StatusCode> {
+        self.genuine.check(context)?;
         // An answer goes by the channel that the request came by, or not at all.
         let channel = context.session().read().secure_channel_id();
         let gone = || {

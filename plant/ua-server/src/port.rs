@@ -1,6 +1,7 @@
 //! The server as the local side of the bridge shell.
 
 use std::collections::VecDeque;
+use std::net::{SocketAddr, TcpListener};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,15 +11,18 @@ use bridge_node::{
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
-use mappings::{Mapping, SecurityPolicy, Server, SpaceId, TopicId};
+use mappings::{Anonymous, Mapping, Role, Server, SpaceId, TopicId};
+use opcua::nodes::NodeType;
 use opcua::server::address_space::AddressSpace;
+use opcua::server::authenticator::AuthManager;
 use opcua::server::node_manager::ServerContext;
 use opcua::server::node_manager::memory::InMemoryNodeManagerImplBuilder;
 use opcua::server::{MonitoredItemHandle, ServerHandle, SubscriptionCache};
-use opcua::types::NodeId;
+use opcua::types::{NodeId, NumericRange, VariableId};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::pki::Pki;
-use plant_opcua::server::core_with;
+use plant_opcua::server::{Security, core_with};
+use plant_opcua::users::{self, Access, UserFault};
 use tokio::runtime::Runtime;
 use tokio::sync::{Semaphore, mpsc};
 use tokio::task::JoinHandle;
@@ -26,6 +30,8 @@ use tokio::time::{Interval, MissedTickBehavior};
 use tracing::{info, warn};
 use uadp::BuiltinType;
 
+use crate::access;
+use crate::auditing;
 use crate::browse::Ordered;
 use crate::components::Components;
 use crate::endpoint;
@@ -70,6 +76,7 @@ pub(crate) struct ServerPort {
     types: Types,
     pki: Pki,
     sks: Arc<Sks>,
+    access: Arc<Access>,
     look: Interval,
     /// Tells of the server until the end. Taken then.
     told: Option<Announced>,
@@ -94,26 +101,30 @@ impl ServerPort {
         let layout =
             Layout::of(mapping, &mut types).map_err(|error| configuration(error.to_string()))?;
         let described = mapping.server();
-        setup
-            .pki
-            .ensure_own(&described.application_uri, &setup.url.advertised_host())
-            .map_err(|error| io(error.to_string()))?;
         setup.sks.follow(mapping)?;
-        let (listener, port) = listen(&setup.url, described)?;
-
-        let (exits, (writes, created_items, asked)) = exits();
+        let (listener, address) = listen(&setup.pki, &setup.url, described)?;
+        let port = address.port();
+        let security = endpoint::security(described, address);
         if setup.trust_any_client {
             warn!("every client certificate is trusted, and kept as trusted: for tests only");
         }
+        if !address.ip().is_loopback() {
+            tell_open(&setup.url, described, &security);
+        }
+        let access = users(&setup.pki, address)?;
+        access.set_rules(access::rules(mapping, &layout));
+
+        let (exits, (writes, created_items, asked)) = exits(&access);
         let nodes = NodesBuilder {
             layout: Arc::new(layout),
             exits,
         };
         let layout = Arc::clone(&nodes.layout);
-        let (server, handle) = endpoint::server(described, &setup.url, port)
+        let (server, handle) = endpoint::server(described, (&setup.url, port), &security)
             .pki_dir(setup.pki.root())
             .trust_client_certs(setup.trust_any_client)
-            .with_node_manager(core_with(setup.sks.methods()))
+            .with_authenticator(Arc::clone(&access) as Arc<dyn AuthManager>)
+            .with_node_manager(core_with(setup.sks.methods(), audits))
             .with_node_manager(Ordered::around(nodes))
             .build()
             .map_err(configuration)?;
@@ -123,6 +134,7 @@ impl ServerPort {
         let (runtime, listener) = threads(listener).map_err(|error| io(error.to_string()))?;
         let serving = runtime.spawn(server.run_with(listener));
         let subscriptions = Arc::clone(handle.subscriptions());
+        audit(&access, &handle);
         drop(runtime.spawn(look_again(
             Arc::clone(&manager),
             Arc::clone(&subscriptions),
@@ -155,6 +167,7 @@ impl ServerPort {
             types,
             pki: setup.pki,
             sks: setup.sks,
+            access,
             look,
             told,
             components,
@@ -189,7 +202,10 @@ impl Port for ServerPort {
                 },
                 event = self.executing.next() => return event,
                 () = next(&mut self.components) => {}
-                _ = self.look.tick() => self.pki.report_rejected(),
+                _ = self.look.tick() => {
+                    self.pki.report_rejected();
+                    self.access.look();
+                }
             }
         }
     }
@@ -260,6 +276,7 @@ impl Port for ServerPort {
         match Layout::within(&self.namespaces, mapping, &mut self.types) {
             Ok((layout, namespaces)) => {
                 restart.extend(namespaces);
+                self.access.set_rules(access::rules(mapping, &layout));
                 let (gone, new) = self.space.exchange(&layout);
                 self.live.retain(|topic| !gone.contains(topic));
                 self.unbound.extend(gone);
@@ -301,30 +318,66 @@ impl Drop for ServerPort {
     }
 }
 
-/// Takes the endpoint's port, and says which it is.
-fn listen(url: &EndpointUrl, described: &Server) -> Result<(std::net::TcpListener, u16), Failure> {
+/// Who the server lets in.
+fn users(pki: &Pki, address: SocketAddr) -> Result<Arc<Access>, Failure> {
+    let folder = pki.root().join(users::FOLDER);
+    let access = Access::new(Some(folder), address.ip().is_loopback());
+    let faulty = |error: UserFault| Failure::new(FailureKind::Configuration, error.to_string());
+    access.map(Arc::new).map_err(faulty)
+}
+
+/// Makes the certificate where there is none, and listens.
+fn listen(
+    pki: &Pki,
+    url: &EndpointUrl,
+    described: &Server,
+) -> Result<(TcpListener, SocketAddr), Failure> {
+    let io = |error: String| Failure::new(FailureKind::Io, error);
+    pki.ensure_own_at(&described.application_uri, &url.hosts())
+        .map_err(|error| io(error.to_string()))?;
     let listener = url
         .bind()
         .map_err(|error| Failure::new(FailureKind::Unavailable, format!("{error} (--endpoint)")))?;
-    let address = listener
-        .local_addr()
-        .map_err(|error| Failure::new(FailureKind::Io, error.to_string()))?;
-    if !address.ip().is_loopback() && described.security.contains(&SecurityPolicy::None) {
-        tell_open(url);
-    }
-    Ok((listener, address.port()))
+    let address = listener.local_addr();
+    Ok((listener, address.map_err(|error| io(error.to_string()))?))
 }
 
-/// Who asks the server is not asked for a name, and what it asks of other programs comes from its own address.
-fn tell_open(url: &EndpointUrl) {
-    warn!(
-        "whoever reaches {url} can call what programs of this host execute, whether it is open or not, and write what \
-         the server produces: server.security has None"
-    );
+/// Says what a server that other hosts reach leaves open to them: what it asks of other programs comes from its own address.
+fn tell_open(url: &EndpointUrl, described: &Server, security: &[Security]) {
+    if security.contains(&Security::None) {
+        warn!(
+            "what is said with {url} can be read and changed on the way: server.security has None"
+        );
+    }
+    match described.anonymous {
+        Anonymous::Has(Role::Operator | Role::Engineer) => warn!(
+            "whoever reaches {url} can call what programs of this host execute, whether it is open or not, and write what \
+             the server produces: server.anonymous"
+        ),
+        Anonymous::Usual
+        | Anonymous::Refused
+        | Anonymous::Has(Role::Observer | Role::SecurityAdmin) => {}
+    }
+}
+
+/// Has the audit told of who comes in.
+fn audit(access: &Access, handle: &ServerHandle) {
+    let subscriptions = Arc::clone(handle.subscriptions());
+    let server = handle.info().application_uri.as_ref().to_owned();
+    access.on_login(move |login| auditing::came_in(login, &server).tell(&subscriptions));
+}
+
+/// Has the server say that there is an audit.
+fn audits(core: &mut AddressSpace) {
+    let auditing: NodeId = VariableId::Server_Auditing.into();
+    if let Some(NodeType::Variable(variable)) = core.find_mut(&auditing) {
+        // A constant of the node set takes every value.
+        let _is_good = variable.set_value(&NumericRange::None, true);
+    }
 }
 
 /// What leaves the node manager, and the other ends of that.
-fn exits() -> (Exits, Entries) {
+fn exits(access: &Arc<Access>) -> (Exits, Entries) {
     let (writes, written) = mpsc::channel(MOST_WRITES);
     let (created, created_items) = mpsc::channel(MOST_CREATED);
     let (questions, heard) = Questions::channel();
@@ -333,6 +386,7 @@ fn exits() -> (Exits, Entries) {
         room: Arc::new(Semaphore::new(ROOM_FOR_WRITES)),
         created,
         questions,
+        access: Arc::clone(access),
     };
     (exits, (written, created_items, heard))
 }
@@ -400,7 +454,7 @@ fn written(topics: impl Iterator<Item = TopicId>) -> impl Iterator<Item = TopicI
 }
 
 /// The server's own threads, and the listener as they take it.
-fn threads(listener: std::net::TcpListener) -> std::io::Result<(Runtime, tokio::net::TcpListener)> {
+fn threads(listener: TcpListener) -> std::io::Result<(Runtime, tokio::net::TcpListener)> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .worker_threads(SERVER_THREADS)
         .thread_name("opcua")

@@ -77,6 +77,25 @@ pub(crate) fn add(address_space: &mut AddressSpace, topic: &TopicNode) {
     }
 }
 
+/// Whether the numbers are in the range that the mapping has of the one value of a topic.
+pub(crate) fn are_within(topic: &TopicNode, values: &[Variant]) -> bool {
+    let Some((low, high)) = topic.meaning.range() else {
+        return true;
+    };
+    values.iter().all(|value| {
+        if let Variant::Array(array) = value {
+            return array.values.iter().all(|one| is_within(one, (low, high)));
+        }
+        is_within(value, (low, high))
+    })
+}
+
+/// What is no number is in every range.
+fn is_within(value: &Variant, (low, high): (f64, f64)) -> bool {
+    let number = value.as_f64();
+    number.is_none_or(|number| (low..=high).contains(&number))
+}
+
 const ENGINEERING_UNITS: &str = "EngineeringUnits";
 const EU_RANGE: &str = "EURange";
 const ENUM_STRINGS: &str = "EnumStrings";

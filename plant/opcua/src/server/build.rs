@@ -32,6 +32,39 @@ pub enum Security {
     None,
     /// Signed, or signed and encrypted.
     Basic256Sha256,
+    /// Signed, or signed and encrypted with AES of 128 bits.
+    Aes128Sha256RsaOaep,
+    /// Signed with RSA-PSS, or signed so and encrypted.
+    Aes256Sha256RsaPss,
+}
+
+impl Security {
+    fn policy(self) -> SecurityPolicy {
+        match self {
+            Self::None => SecurityPolicy::None,
+            Self::Basic256Sha256 => SecurityPolicy::Basic256Sha256,
+            Self::Aes128Sha256RsaOaep => SecurityPolicy::Aes128Sha256RsaOaep,
+            Self::Aes256Sha256RsaPss => SecurityPolicy::Aes256Sha256RsaPss,
+        }
+    }
+
+    /// The endpoints at that path: one without security, or one that is signed and one that is encrypted too.
+    pub fn endpoints(self, path: &str) -> impl Iterator<Item = (String, ServerEndpoint)> + use<> {
+        let modes: &[MessageSecurityMode] = match self {
+            Self::None => &[MessageSecurityMode::None],
+            Self::Basic256Sha256 | Self::Aes128Sha256RsaOaep | Self::Aes256Sha256RsaPss => &[
+                MessageSecurityMode::Sign,
+                MessageSecurityMode::SignAndEncrypt,
+            ],
+        };
+        let (policy, path) = (self.policy(), path.to_owned());
+        modes.iter().map(move |mode| {
+            // Which users may come is said by who authenticates them; the library has no use for it then.
+            let anonymous = [ANONYMOUS_USER_TOKEN_ID.to_owned()];
+            let endpoint = ServerEndpoint::new(&path, policy, *mode, &anonymous);
+            (format!("{policy} {mode}"), endpoint)
+        })
+    }
 }
 
 /// What a server is, and how clients get in. All users are anonymous.
@@ -49,7 +82,7 @@ pub struct ServerConfig {
     pub endpoint: EndpointUrl,
     /// What clients may choose from.
     pub security: Vec<Security>,
-    /// The directory of certificates, which [`Security::Basic256Sha256`] needs.
+    /// The directory of certificates, which all security but [`Security::None`] needs.
     pub pki: Option<PathBuf>,
     /// Trusts every client's certificate, and keeps it as trusted. For tests and demonstrations only.
     pub trust_unknown_clients: bool,
@@ -88,7 +121,7 @@ pub enum ServerError {
     #[error(transparent)]
     NodeSet(#[from] NodeSetError),
     /// The security asked for needs certificates, and there is no directory for them.
-    #[error("Basic256Sha256 needs a directory for certificates, and none is given")]
+    #[error("security other than None needs a directory for certificates, and none is given")]
     NoPki,
     /// Clients could choose nothing.
     #[error("the endpoint has no security policy, not even None")]
@@ -154,12 +187,11 @@ impl ServerBuilder {
         if config.security.is_empty() {
             return Err(ServerError::NoSecurity);
         }
-        let secured = config.security.contains(&Security::Basic256Sha256);
-        let host = config.endpoint.advertised_host();
+        let secured = config.security.iter().any(|one| *one != Security::None);
         let pki = match &config.pki {
             Some(root) => {
                 let pki = Pki::open(root.clone())?;
-                pki.ensure_own(&config.application_uri, host.trim_matches(['[', ']']))?;
+                pki.ensure_own_at(&config.application_uri, &config.endpoint.hosts())?;
                 Some(pki)
             }
             None if secured => return Err(ServerError::NoPki),
@@ -221,7 +253,6 @@ impl ServerBuilder {
 }
 
 fn described(config: &ServerConfig, port: u16) -> opcua::server::ServerBuilder {
-    let anonymous = [ANONYMOUS_USER_TOKEN_ID.to_owned()];
     let timeout = u64::try_from(config.session_timeout.as_millis()).unwrap_or(u64::MAX);
     let mut builder = opcua::server::ServerBuilder::new()
         .without_node_managers()
@@ -246,20 +277,8 @@ fn described(config: &ServerConfig, port: u16) -> opcua::server::ServerBuilder {
         .max_session_timeout_ms(timeout)
         .limits(limits::server());
     for security in &config.security {
-        let (policy, modes) = match security {
-            Security::None => (SecurityPolicy::None, [MessageSecurityMode::None].as_slice()),
-            Security::Basic256Sha256 => (
-                SecurityPolicy::Basic256Sha256,
-                [
-                    MessageSecurityMode::Sign,
-                    MessageSecurityMode::SignAndEncrypt,
-                ]
-                .as_slice(),
-            ),
-        };
-        for mode in modes {
-            let endpoint = ServerEndpoint::new(config.endpoint.path(), policy, *mode, &anonymous);
-            builder = builder.add_endpoint(format!("{policy} {mode}"), endpoint);
+        for (name, endpoint) in security.endpoints(config.endpoint.path()) {
+            builder = builder.add_endpoint(name, endpoint);
         }
     }
     builder

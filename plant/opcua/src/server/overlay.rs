@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use opcua::nodes::{NodeType, ReferenceDirection};
+use opcua::server::address_space::AddressSpace;
 use opcua::server::node_manager::memory::{
     CoreNodeManager, CoreNodeManagerBuilder, InMemoryNodeManagerBuilder,
 };
@@ -15,6 +16,7 @@ use tokio::time::Instant;
 use super::calls::{self, MethodHandler, MethodRequest, Refusal, check_arguments, within};
 use super::routed::{Front, Routed};
 use super::sessions::Caller;
+use crate::audit::{Action, Audit};
 use crate::limits::LONGEST_REQUEST;
 
 /// A method of an object of the core namespace, and what carries it out.
@@ -48,13 +50,19 @@ impl CoreMethod {
     }
 }
 
-/// The node manager of the core namespace, with these methods carried out.
+/// The node manager of the core namespace, with these methods carried out, and its nodes `prepared`.
 #[must_use]
-pub fn core_with(methods: Vec<CoreMethod>) -> impl NodeManagerBuilder + 'static {
+pub fn core_with(
+    methods: Vec<CoreMethod>,
+    prepared: impl FnOnce(&mut AddressSpace) + Send + 'static,
+) -> impl NodeManagerBuilder + 'static {
     move |context: ServerContext| {
         let inner = Box::new(InMemoryNodeManagerBuilder::new(CoreNodeManagerBuilder));
         let inner: Arc<DynNodeManager> = inner.build(context);
-        let core = Arc::clone(&inner).into_any_arc().downcast().ok();
+        let core: Option<Arc<CoreNodeManager>> = Arc::clone(&inner).into_any_arc().downcast().ok();
+        if let Some(core) = &core {
+            prepared(&mut core.address_space().write());
+        }
         Routed {
             inner,
             front: Front::Core(Arc::new(Overlay { methods, core })),
@@ -89,6 +97,11 @@ impl Overlay {
                 Err(refusal) => Err(refusal),
             };
             calls::end(call, ended);
+            let action = Action::Called {
+                object: call.object_id().clone(),
+                method: call.method_id().clone(),
+            };
+            Audit::of(context, action, call.status()).tell(&context.subscriptions);
         }
         others
     }

@@ -1,0 +1,115 @@
+//! Who may do what with the nodes of the server.
+
+use crate::code::Code;
+use crate::document::{
+    AnonymousEntry, CallPermissionsEntry, PermissionsEntry, RoleEntry, RoleList, SecurityEntry,
+    ServerEntry,
+};
+use crate::findings::Findings;
+use crate::mapping::Server;
+use crate::permission::{Anonymous, Permissions, Role};
+use crate::read::{Field, given};
+use crate::topic::SpaceId;
+
+/// `None` when something is faulty, which is noted.
+pub(super) fn of_variable(
+    field: &Field<PermissionsEntry>,
+    origin: Option<SpaceId>,
+    findings: &mut Findings,
+) -> Option<Permissions> {
+    let Some(at) = field else {
+        return Some(Permissions::default());
+    };
+    let entry = at.value.as_ref()?;
+    if let Some(write) = &entry.write
+        && origin.is_some_and(|origin| origin != SpaceId::UA)
+    {
+        let message = "no client writes this variable: its value is produced elsewhere";
+        findings
+            .warning(Code::Permissions, write.place, message)
+            .help("`write` goes with `origin: 0`");
+    }
+    let read = roles(&entry.read, findings)?;
+    let write = roles(&entry.write, findings)?;
+    Some(Permissions { read, write })
+}
+
+/// Who may call; the outer `None` when something is faulty.
+pub(super) fn of_call(
+    field: &Field<CallPermissionsEntry>,
+    findings: &mut Findings,
+) -> Option<Option<Vec<Role>>> {
+    let Some(at) = field else { return Some(None) };
+    roles(&at.value.as_ref()?.call, findings)
+}
+
+/// The outer `None` when something is faulty, the inner where nothing is said.
+fn roles(field: &Field<RoleList>, findings: &mut Findings) -> Option<Option<Vec<Role>>> {
+    let Some(at) = field else { return Some(None) };
+    let RoleList(entries) = at.value.as_ref()?;
+    if entries.is_empty() {
+        findings
+            .error(Code::Permissions, at.place, "without a role nobody may")
+            .help("observer, operator, engineer or security_admin, one or a list");
+        return None;
+    }
+    let mut roles = Vec::new();
+    for entry in entries {
+        let role = role(*entry.value.as_ref()?);
+        if roles.contains(&role) {
+            let message = format!("the role {} is listed twice", role.name());
+            findings
+                .warning(Code::Permissions, entry.place, message)
+                .help("leave it out here");
+        } else {
+            roles.push(role);
+        }
+    }
+    Some(Some(roles))
+}
+
+const fn role(entry: RoleEntry) -> Role {
+    match entry {
+        RoleEntry::Observer => Role::Observer,
+        RoleEntry::Operator => Role::Operator,
+        RoleEntry::Engineer => Role::Engineer,
+        RoleEntry::SecurityAdmin => Role::SecurityAdmin,
+    }
+}
+
+/// What users without a name may be.
+pub(super) fn anonymous(entry: &ServerEntry) -> Anonymous {
+    match given(&entry.anonymous) {
+        None => Anonymous::Usual,
+        Some((AnonymousEntry::Off, _)) => Anonymous::Refused,
+        Some((AnonymousEntry::Observer, _)) => Anonymous::Has(Role::Observer),
+        Some((AnonymousEntry::Operator, _)) => Anonymous::Has(Role::Operator),
+        Some((AnonymousEntry::Engineer, _)) => Anonymous::Has(Role::Engineer),
+    }
+}
+
+/// What of a server that others reach is open to them.
+pub(super) fn left_open(entry: &ServerEntry, server: &Server, findings: &mut Findings) {
+    if server.endpoint.is_loopback() {
+        return;
+    }
+    if let Some((entries, _)) = given(&entry.security)
+        && let Some(none) = entries
+            .iter()
+            .find(|at| at.value == Some(SecurityEntry::None))
+    {
+        let message = "other hosts reach the server, and with None everybody on the way reads and changes what is said";
+        findings
+            .warning(Code::OpenServer, none.place, message)
+            .help("leave out None; without `security` a server that other hosts reach does not offer it");
+    }
+    if let Some((AnonymousEntry::Operator | AnonymousEntry::Engineer, place)) =
+        given(&entry.anonymous)
+    {
+        let message =
+            "other hosts reach the server, and everybody may write and call without a name";
+        findings
+            .warning(Code::OpenServer, place, message)
+            .help("`ua-server user add NAME --role operator` makes a user who may");
+    }
+}

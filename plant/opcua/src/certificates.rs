@@ -1,0 +1,325 @@
+//! What a certificate store holds, and who decides on it: certificates that are trusted, and those that were refused.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use opcua::crypto::{CertificateStore, X509};
+use x509_cert::Certificate as Parsed;
+use x509_cert::der::Decode as _;
+use x509_cert::ext::pkix::SubjectAltName;
+use x509_cert::ext::pkix::name::GeneralName;
+
+/// Where in the store a certificate is, and so what becomes of who has it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Standing {
+    /// The application's own.
+    Own,
+    /// Who has it is let in.
+    Trusted,
+    /// Who has it was refused, and is refused until it is trusted.
+    Rejected,
+}
+
+impl Standing {
+    /// As it is told.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Own => "own",
+            Self::Trusted => "trusted",
+            Self::Rejected => "rejected",
+        }
+    }
+}
+
+/// A certificate in a store.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Stored {
+    /// Where it is.
+    pub standing: Standing,
+    /// Its file.
+    pub path: PathBuf,
+    /// The SHA-1 thumbprint in hexadecimal of lower case.
+    pub thumbprint: String,
+    /// The common name of its subject, which whoever made it chose.
+    pub name: String,
+    /// The ApplicationUri in it.
+    pub application_uri: Option<String>,
+    /// The last day it is valid, as 2031-11-25.
+    pub until: String,
+    /// Whether it is valid now.
+    pub is_valid: bool,
+}
+
+/// Why a certificate is not where it is to be.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreFault {
+    /// The store cannot be read or written.
+    #[error("{path}: {source}")]
+    Io {
+        /// The file or directory.
+        path: PathBuf,
+        /// What the system says.
+        #[source]
+        source: io::Error,
+    },
+    /// The file is no certificate.
+    #[error("{path} is no certificate: {why}")]
+    Certificate {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        why: String,
+    },
+    /// None in the store begins so.
+    #[error(
+        "no {standing} certificate has a thumbprint that begins with `{given}`, and there is no such file"
+    )]
+    Unknown {
+        /// Where it was looked.
+        standing: &'static str,
+        /// What was given.
+        given: String,
+    },
+    /// Several begin so.
+    #[error(
+        "several certificates have a thumbprint that begins with `{0}`: give more digits of it"
+    )]
+    Several(String),
+}
+
+/// The certificates of a store: its own, those that are trusted, those that were refused. A file that is none is left out.
+///
+/// # Errors
+/// A directory that is there and cannot be read.
+pub fn list(root: &Path) -> Result<Vec<Stored>, StoreFault> {
+    let mut found: Vec<Stored> = stored(&root.join(OWN), Standing::Own).into_iter().collect();
+    for standing in [Standing::Trusted, Standing::Rejected] {
+        let folder = root.join(standing.name());
+        let entries = match fs::read_dir(&folder) {
+            Ok(entries) => entries,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+            Err(source) => {
+                return Err(StoreFault::Io {
+                    path: folder,
+                    source,
+                });
+            }
+        };
+        let mut here: Vec<Stored> = entries
+            .take(MOST_LISTED)
+            .filter_map(|entry| stored(&entry.ok()?.path(), standing))
+            .collect();
+        here.sort_by(|a, b| (&a.name, &a.thumbprint).cmp(&(&b.name, &b.thumbprint)));
+        found.extend(here);
+    }
+    Ok(found)
+}
+
+/// Trusts a certificate: one that was refused, by the first digits of its thumbprint, or that of a file in DER or PEM.
+///
+/// # Errors
+/// There is none, or the store cannot be written.
+pub fn trust(root: &Path, given: &str) -> Result<Stored, StoreFault> {
+    let file = Path::new(given);
+    if file.is_file() {
+        let certificate = read(file)?;
+        let kept = keep(root, &certificate, Standing::Trusted)?;
+        let all = list(root)?;
+        let refused = all
+            .iter()
+            .filter(|one| one.standing == Standing::Rejected && one.thumbprint == kept.thumbprint);
+        remove(refused)?;
+        return Ok(kept);
+    }
+    transfer(root, given, (Standing::Rejected, Standing::Trusted))
+}
+
+/// Trusts a certificate no longer, by the first digits of its thumbprint: who has it is refused from the next connection on.
+///
+/// # Errors
+/// There is none, or the store cannot be written.
+pub fn reject(root: &Path, given: &str) -> Result<Stored, StoreFault> {
+    transfer(root, given, (Standing::Trusted, Standing::Rejected))
+}
+
+fn transfer(
+    root: &Path,
+    given: &str,
+    (from, to): (Standing, Standing),
+) -> Result<Stored, StoreFault> {
+    let begin = given.to_lowercase();
+    let is_hex = begin.len() >= FEWEST_DIGITS && begin.bytes().all(|b| b.is_ascii_hexdigit());
+    let all = list(root)?;
+    let mut fitting = all
+        .iter()
+        .filter(|one| is_hex && one.standing == from && one.thumbprint.starts_with(&begin));
+    let Some(first) = fitting.next() else {
+        return Err(StoreFault::Unknown {
+            standing: from.name(),
+            given: given.chars().take(64).collect(),
+        });
+    };
+    if fitting.any(|other| other.thumbprint != first.thumbprint) {
+        return Err(StoreFault::Several(begin));
+    }
+    let kept = keep(root, &read(&first.path)?, to)?;
+    // Both at once would count as refused.
+    let same = all
+        .iter()
+        .filter(|one| one.standing == from && one.thumbprint == first.thumbprint);
+    remove(same)?;
+    Ok(kept)
+}
+
+fn remove<'s>(gone: impl Iterator<Item = &'s Stored>) -> Result<(), StoreFault> {
+    for one in gone {
+        fs::remove_file(&one.path).map_err(|source| StoreFault::Io {
+            path: one.path.clone(),
+            source,
+        })?;
+    }
+    Ok(())
+}
+
+/// Puts a certificate where the library looks for it.
+fn keep(root: &Path, certificate: &X509, standing: Standing) -> Result<Stored, StoreFault> {
+    let folder = root.join(standing.name());
+    let path = folder.join(CertificateStore::cert_file_name(certificate));
+    let der = certificate
+        .to_der()
+        .map_err(|error| StoreFault::Certificate {
+            path: path.clone(),
+            why: error.to_string(),
+        })?;
+    let written = fs::create_dir_all(&folder).and_then(|()| fs::write(&path, der));
+    written.map_err(|source| StoreFault::Io {
+        path: path.clone(),
+        source,
+    })?;
+    stored(&path, standing).ok_or_else(|| StoreFault::Certificate {
+        path,
+        why: "it cannot be read back".to_owned(),
+    })
+}
+
+fn read(path: &Path) -> Result<X509, StoreFault> {
+    let about = fs::metadata(path).map_err(|source| StoreFault::Io {
+        path: path.to_owned(),
+        source,
+    })?;
+    let why = |why: &str| StoreFault::Certificate {
+        path: path.to_owned(),
+        why: why.to_owned(),
+    };
+    if about.len() > LARGEST_CERTIFICATE {
+        return Err(why("it is too large"));
+    }
+    let bytes = fs::read(path).map_err(|source| StoreFault::Io {
+        path: path.to_owned(),
+        source,
+    })?;
+    let certificate = match bytes.starts_with(b"-----BEGIN") {
+        true => X509::from_pem(&bytes),
+        false => X509::from_der(&bytes),
+    };
+    certificate.map_err(|_| why("neither DER nor PEM"))
+}
+
+/// What is known of the certificate in a file.
+#[must_use]
+pub fn stored(path: &Path, standing: Standing) -> Option<Stored> {
+    let certificate = read(path).ok()?;
+    let now = opcua::types::DateTime::now().as_chrono();
+    Some(Stored {
+        standing,
+        path: path.to_owned(),
+        thumbprint: certificate.thumbprint().as_hex_string().to_lowercase(),
+        name: certificate.common_name().unwrap_or_default(),
+        application_uri: application_uri(&certificate),
+        until: certificate
+            .not_after()
+            .map_or_else(|_| String::new(), |day| day.format("%Y-%m-%d").to_string()),
+        is_valid: certificate.is_time_valid(&now).is_ok(),
+    })
+}
+
+/// The ApplicationUri in a certificate: the one URI among its alternative names (OPC 10000-6, 6.2.2).
+#[must_use]
+pub fn application_uri(certificate: &X509) -> Option<String> {
+    let der = certificate.to_der().ok()?;
+    let parsed = Parsed::from_der(&der).ok()?;
+    let (_, names) = parsed.tbs_certificate.get::<SubjectAltName>().ok()??;
+    names.0.iter().find_map(|name| {
+        let GeneralName::UniformResourceIdentifier(uri) = name else {
+            return None;
+        };
+        Some(uri.as_str().to_owned())
+    })
+}
+
+/// The application's own certificate, below the root.
+pub(crate) const OWN: &str = "own/cert.der";
+/// Digits of a thumbprint that tell a certificate.
+const FEWEST_DIGITS: usize = 4;
+const LARGEST_CERTIFICATE: u64 = 64 << 10;
+/// Files of a folder that are looked at.
+const MOST_LISTED: usize = 10_000;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pki::Pki;
+
+    fn scratch(name: &str) -> PathBuf {
+        let path =
+            std::env::temp_dir().join(format!("plant-opcua-store-{}-{name}", std::process::id()));
+        drop(fs::remove_dir_all(&path));
+        path
+    }
+
+    #[test]
+    fn a_refused_certificate_is_trusted_by_its_thumbprint_and_refused_again() {
+        let root = scratch("decided");
+        let pki = Pki::open(root.clone()).unwrap();
+        pki.ensure_own("urn:cell:server", "localhost").unwrap();
+        fs::copy(root.join(OWN), root.join("rejected/somebody.der")).unwrap();
+        let all = list(&root).unwrap();
+        let standings: Vec<Standing> = all.iter().map(|one| one.standing).collect();
+        assert_eq!(standings, [Standing::Own, Standing::Rejected]);
+        assert_eq!(all[1].application_uri.as_deref(), Some("urn:cell:server"));
+        assert!(all[1].is_valid);
+
+        let digits = all[1].thumbprint[..8].to_uppercase();
+        let trusted = trust(&root, &digits).unwrap();
+        assert_eq!(trusted.standing, Standing::Trusted);
+        let standings: Vec<Standing> = list(&root)
+            .unwrap()
+            .iter()
+            .map(|one| one.standing)
+            .collect();
+        assert_eq!(standings, [Standing::Own, Standing::Trusted]);
+        assert!(matches!(
+            trust(&root, &digits),
+            Err(StoreFault::Unknown { .. })
+        ));
+
+        reject(&root, &digits).unwrap();
+        assert_eq!(list(&root).unwrap()[1].standing, Standing::Rejected);
+        let file = root.join(OWN);
+        assert_eq!(
+            trust(&root, file.to_str().unwrap()).unwrap().standing,
+            Standing::Trusted
+        );
+        fs::remove_dir_all(root).unwrap();
+    }
+
+    #[test]
+    fn what_is_no_thumbprint_and_no_file_is_said_to_be_unknown() {
+        let root = scratch("unknown");
+        for given in ["", "12", "../../etc/passwd", "zzzzzzzz"] {
+            assert!(trust(&root, given).is_err(), "{given}");
+        }
+    }
+}

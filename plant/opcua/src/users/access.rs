@@ -1,0 +1,532 @@
+//! Who comes in, and what each may do: the library asks here for each session and each request.
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use argon2::{Argon2, PasswordVerifier as _};
+use async_trait::async_trait;
+use opcua::crypto::{SecurityPolicy, Thumbprint};
+use opcua::server::address_space::AccessLevel;
+use opcua::server::authenticator::{
+    AuthManager, CoreServerPermissions, Password, UserToken, user_pass_security_policy_id,
+};
+use opcua::server::{ANONYMOUS_USER_TOKEN_ID, ServerEndpoint};
+use opcua::sync::{Mutex, RwLock};
+use opcua::types::{
+    DateTime, Error, MessageSecurityMode, NodeId, StatusCode, UAString, UserTokenPolicy,
+    UserTokenType,
+};
+use tokio::sync::Semaphore;
+use tracing::{info, warn};
+
+use super::file::{Credential, LARGEST_PASSWORD, LIST, UserFault, Users};
+use super::{Role, Roles};
+
+/// What a user may do with a node.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Right {
+    /// Read it and watch it.
+    Read,
+    /// Write it.
+    Write,
+    /// Call it.
+    Call,
+}
+
+/// Which roles may do what with a node.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Permissions {
+    /// Who reads it.
+    pub read: Roles,
+    /// Who writes it.
+    pub write: Roles,
+    /// Who calls it.
+    pub call: Roles,
+}
+
+impl Default for Permissions {
+    /// Everybody reads; operators and engineers write and call.
+    fn default() -> Self {
+        let runs = Roles::of(&[Role::Operator, Role::Engineer]);
+        Self {
+            read: Roles::ALL,
+            write: runs,
+            call: runs,
+        }
+    }
+}
+
+impl Permissions {
+    const fn of(&self, right: Right) -> Roles {
+        match right {
+            Right::Read => self.read,
+            Right::Write => self.write,
+            Right::Call => self.call,
+        }
+    }
+}
+
+/// What a user without a name may do.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Anonymous {
+    /// Observes; and operates a server that only this computer reaches, as long as it has no users.
+    #[default]
+    Usual,
+    /// Has those roles.
+    Has(Roles),
+    /// Is not let in.
+    Refused,
+}
+
+/// What is told of nodes and of anonymous users.
+#[derive(Debug, Clone, Default)]
+pub struct Rules {
+    /// What a user without a name may do.
+    pub anonymous: Anonymous,
+    /// The nodes that are not as the others.
+    pub nodes: HashMap<NodeId, Permissions>,
+}
+
+/// Somebody who wanted in, as the audit tells it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Login {
+    /// The name given; empty for anonymous ones and unknown certificates.
+    pub user: String,
+    /// How: `anonymous`, `password` or `certificate`.
+    pub by: &'static str,
+    /// The policy and mode of the endpoint.
+    pub endpoint: String,
+    /// Why it was refused; `None` where it was let in.
+    pub fault: Option<LoginFault>,
+}
+
+/// Why somebody is not let in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum LoginFault {
+    /// Anonymous users are refused.
+    #[error("anonymous users are not let in")]
+    Anonymous,
+    /// No user of that name, or another password.
+    #[error("no such user, or another password")]
+    Password,
+    /// No user with that certificate.
+    #[error("no user has that certificate (`ua-server user add NAME --certificate FILE`)")]
+    Certificate,
+    /// The certificate is not valid now.
+    #[error("the user's certificate is not valid now")]
+    Expired,
+}
+
+impl LoginFault {
+    /// What the client is told.
+    #[must_use]
+    pub const fn status(self) -> StatusCode {
+        match self {
+            Self::Anonymous | Self::Certificate => StatusCode::BadIdentityTokenRejected,
+            Self::Password => StatusCode::BadUserAccessDenied,
+            Self::Expired => StatusCode::BadCertificateTimeInvalid,
+        }
+    }
+}
+
+type Told = Arc<dyn Fn(&Login) + Send + Sync>;
+
+/// The users of a server and what they may do.
+pub struct Access {
+    /// Where the users are; nowhere for a server without any.
+    folder: Option<PathBuf>,
+    /// Whether only this computer reaches the server.
+    is_loopback: bool,
+    users: RwLock<Users>,
+    /// The file when it was read last.
+    stamp: Mutex<Option<Stamp>>,
+    rules: RwLock<Rules>,
+    /// A check of a password takes a core for a while, and memory.
+    checking: Arc<Semaphore>,
+    told: RwLock<Vec<Told>>,
+}
+
+impl std::fmt::Debug for Access {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Access").finish_non_exhaustive()
+    }
+}
+
+/// Length and time of change of a file.
+type Stamp = (u64, Option<SystemTime>);
+
+impl Access {
+    /// Reads the users of a folder.
+    ///
+    /// # Errors
+    /// A file that others can read, or that cannot be read as users.
+    pub fn new(folder: Option<PathBuf>, is_loopback: bool) -> Result<Self, UserFault> {
+        let users = folder.as_deref().map(Users::read).transpose()?;
+        let access = Self {
+            stamp: Mutex::new(folder.as_deref().and_then(stamp)),
+            folder,
+            is_loopback,
+            users: RwLock::new(users.unwrap_or_default()),
+            rules: RwLock::default(),
+            checking: Arc::new(Semaphore::new(MOST_CHECKS)),
+            told: RwLock::default(),
+        };
+        Ok(access)
+    }
+
+    /// Has other rules from now on, for open sessions too.
+    pub fn set_rules(&self, rules: Rules) {
+        *self.rules.write() = rules;
+    }
+
+    /// Tells of each who wants in.
+    pub fn on_login(&self, told: impl Fn(&Login) + Send + Sync + 'static) {
+        self.told.write().push(Arc::new(told));
+    }
+
+    /// Reads the users anew where their file has changed. With a file that cannot be read as users those before stay.
+    pub fn look(&self) {
+        let Some(folder) = &self.folder else { return };
+        let now = stamp(folder);
+        let mut before = self.stamp.lock();
+        if *before == now {
+            return;
+        }
+        *before = now;
+        match Users::read(folder) {
+            Ok(users) => {
+                info!(users = users.iter().count(), "the users are others now");
+                *self.users.write() = users;
+            }
+            Err(error) => warn!("{error}; the users before stay"),
+        }
+    }
+
+    /// What that user may be: the roles it has now.
+    #[must_use]
+    pub fn roles(&self, token: &UserToken) -> Roles {
+        if token.is_anonymous() {
+            return self.anonymous().unwrap_or(Roles::NONE);
+        }
+        let users = self.users.read();
+        users.get(&token.0).map_or(Roles::NONE, |user| user.roles)
+    }
+
+    /// Whether a user may do that with a node now. What belongs to the standard is for everybody, where nothing else is said.
+    #[must_use]
+    pub fn allows(&self, token: &UserToken, node: &NodeId, right: Right) -> bool {
+        let rules = self.rules.read();
+        let permissions = match rules.nodes.get(node) {
+            Some(permissions) => *permissions,
+            None if node.namespace == 0 => return true,
+            None => Permissions::default(),
+        };
+        drop(rules);
+        self.roles(token).meets(permissions.of(right))
+    }
+
+    /// Whether everybody who is let in may read a node.
+    #[must_use]
+    pub fn is_public(&self, node: &NodeId) -> bool {
+        let rules = self.rules.read();
+        let permissions = rules.nodes.get(node);
+        permissions.is_none_or(|permissions| permissions.read == Roles::ALL)
+    }
+
+    /// The roles of anonymous users; `None` where they are not let in.
+    fn anonymous(&self) -> Option<Roles> {
+        match self.rules.read().anonymous {
+            Anonymous::Has(roles) => Some(roles),
+            Anonymous::Refused => None,
+            Anonymous::Usual if self.is_loopback && self.users.read().is_empty() => {
+                Some(Roles::of(&[Role::Observer, Role::Operator]))
+            }
+            Anonymous::Usual => Some(Roles::of(&[Role::Observer])),
+        }
+    }
+
+    fn tell(&self, login: &Login) {
+        let told: Vec<Told> = self.told.read().clone();
+        for one in told {
+            one(login);
+        }
+    }
+
+    /// Tells of it, and answers the library.
+    fn answered(&self, login: &Login, token: UserToken) -> Result<UserToken, Error> {
+        self.tell(login);
+        match login.fault {
+            None => Ok(token),
+            Some(fault) => Err(Error::new(fault.status(), fault.to_string())),
+        }
+    }
+
+    /// Whether the password is that of the user. Of a name that nobody has it takes as long.
+    async fn check(&self, name: &str, password: &Password) -> bool {
+        let hash = match self.users.read().get(name).map(|user| &user.credential) {
+            Some(Credential::Password(hash)) => Some(hash.clone()),
+            Some(Credential::Certificate(_)) | None => None,
+        };
+        let password = password.get().as_bytes().to_vec();
+        if password.len() > LARGEST_PASSWORD {
+            return false;
+        }
+        let Ok(permit) = Arc::clone(&self.checking).acquire_owned().await else {
+            return false;
+        };
+        let known = hash.is_some();
+        let checked = tokio::task::spawn_blocking(move || {
+            let _held = permit;
+            let hash = hash.as_deref().unwrap_or(NOBODYS);
+            Argon2::default().verify_password(&password, hash).is_ok()
+        });
+        checked.await.unwrap_or(false) && known
+    }
+}
+
+/// What tells that a file has changed.
+fn stamp(folder: &std::path::Path) -> Option<Stamp> {
+    let about = std::fs::metadata(folder.join(LIST)).ok()?;
+    Some((about.len(), about.modified().ok()))
+}
+
+fn is_secured(endpoint: &ServerEndpoint) -> bool {
+    endpoint.message_security_mode() != MessageSecurityMode::None
+}
+
+fn login(by: &'static str, user: &str, endpoint: &ServerEndpoint) -> Login {
+    Login {
+        user: user.to_owned(),
+        by,
+        endpoint: format!("{} {}", endpoint.security_policy, endpoint.security_mode),
+        fault: None,
+    }
+}
+
+#[async_trait]
+impl AuthManager for Access {
+    async fn authenticate_anonymous_token(&self, endpoint: &ServerEndpoint) -> Result<(), Error> {
+        let mut login = login("anonymous", "", endpoint);
+        if self.anonymous().is_none() {
+            login.fault = Some(LoginFault::Anonymous);
+        }
+        let token = UserToken(ANONYMOUS_USER_TOKEN_ID.to_owned());
+        self.answered(&login, token).map(drop)
+    }
+
+    async fn authenticate_username_identity_token(
+        &self,
+        endpoint: &ServerEndpoint,
+        username: &str,
+        password: &Password,
+    ) -> Result<UserToken, Error> {
+        let told: String = username.chars().take(64).collect();
+        let mut login = login("password", &told, endpoint);
+        if !self.check(username, password).await {
+            login.fault = Some(LoginFault::Password);
+            // Who tries many waits for each; a connection has one at a time.
+            tokio::time::sleep(AFTER_A_WRONG_ONE).await;
+        }
+        self.answered(&login, UserToken(username.to_owned()))
+    }
+
+    async fn authenticate_x509_identity_token(
+        &self,
+        endpoint: &ServerEndpoint,
+        signing_thumbprint: &Thumbprint,
+    ) -> Result<UserToken, Error> {
+        let thumbprint = signing_thumbprint.as_hex_string().to_lowercase();
+        let user = {
+            let users = self.users.read();
+            users
+                .of_certificate(&thumbprint)
+                .map(|(name, _)| name.to_owned())
+        };
+        let mut login = login("certificate", user.as_deref().unwrap_or_default(), endpoint);
+        let kept = self
+            .folder
+            .as_deref()
+            .map(|folder| Users::certificate(folder, &thumbprint));
+        login.fault = match (&user, kept) {
+            (Some(_), Some(Ok(certificate))) => {
+                let now = DateTime::now().as_chrono();
+                let valid = certificate.is_time_valid(&now).is_ok();
+                (!valid).then_some(LoginFault::Expired)
+            }
+            (Some(name), Some(Err(error))) => {
+                warn!(user = name, "{error}");
+                Some(LoginFault::Certificate)
+            }
+            (None, _) | (_, None) => Some(LoginFault::Certificate),
+        };
+        self.answered(&login, UserToken(user.unwrap_or_default()))
+    }
+
+    fn effective_user_access_level(
+        &self,
+        token: &UserToken,
+        user_access_level: AccessLevel,
+        node_id: &NodeId,
+    ) -> AccessLevel {
+        let mut level = user_access_level;
+        if !self.allows(token, node_id, Right::Read) {
+            level.remove(AccessLevel::CURRENT_READ | AccessLevel::HISTORY_READ);
+        }
+        if !self.allows(token, node_id, Right::Write) {
+            level.remove(AccessLevel::CURRENT_WRITE | AccessLevel::HISTORY_WRITE);
+        }
+        level
+    }
+
+    fn is_user_executable(&self, token: &UserToken, method_id: &NodeId) -> bool {
+        self.allows(token, method_id, Right::Call)
+    }
+
+    /// A password or a signature is only asked for where nobody else can read or change it.
+    fn user_token_policies(&self, endpoint: &ServerEndpoint) -> Vec<UserTokenPolicy> {
+        let policy = |id: UAString, token_type, security: Option<SecurityPolicy>| UserTokenPolicy {
+            policy_id: id,
+            token_type,
+            issued_token_type: UAString::null(),
+            issuer_endpoint_url: UAString::null(),
+            security_policy_uri: security
+                .map_or_else(UAString::null, |one| UAString::from(one.to_uri())),
+        };
+        let mut policies = Vec::new();
+        if self.anonymous().is_some() {
+            policies.push(policy(
+                ANONYMOUS_POLICY.into(),
+                UserTokenType::Anonymous,
+                None,
+            ));
+        }
+        if self.folder.is_some() && is_secured(endpoint) {
+            let own = Some(endpoint.security_policy());
+            let by_name = user_pass_security_policy_id(endpoint);
+            policies.push(policy(by_name, UserTokenType::UserName, own));
+            policies.push(policy(X509_POLICY.into(), UserTokenType::Certificate, own));
+        }
+        policies
+    }
+
+    fn core_permissions(&self, token: &UserToken) -> CoreServerPermissions {
+        let sees = Roles::of(&[Role::Operator, Role::Engineer, Role::SecurityAdmin]);
+        CoreServerPermissions {
+            read_diagnostics: self.roles(token).meets(sees),
+        }
+    }
+}
+
+/// The ids of the library for its policies.
+const ANONYMOUS_POLICY: &str = "anonymous";
+const X509_POLICY: &str = "x509";
+/// Passwords that are checked at a time.
+const MOST_CHECKS: usize = 2;
+const AFTER_A_WRONG_ONE: Duration = Duration::from_secs(1);
+/// A hash that is compared with where there is no user of that name.
+const NOBODYS: &str = "$argon2id$v=19$m=19456,t=2,p=1$bm9ib2R5LWhhcy1pdC4uLg$AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn anonymous() -> UserToken {
+        UserToken(ANONYMOUS_USER_TOKEN_ID.to_owned())
+    }
+
+    fn scratch(name: &str) -> PathBuf {
+        let path =
+            std::env::temp_dir().join(format!("plant-opcua-access-{}-{name}", std::process::id()));
+        drop(std::fs::remove_dir_all(&path));
+        path
+    }
+
+    #[test]
+    fn anonymous_users_read_and_where_nobody_else_is_they_write() {
+        let folder = scratch("anonymous");
+        let node = NodeId::new(2, 10);
+        for (is_loopback, has_users, writes) in [
+            (true, false, true),
+            (true, true, false),
+            (false, false, false),
+            (false, true, false),
+        ] {
+            let mut users = Users::default();
+            if has_users {
+                let user = super::super::User {
+                    roles: Roles::of(&[Role::Operator]),
+                    credential: Credential::Certificate("0".repeat(40)),
+                };
+                users.put("plc", user).unwrap();
+            }
+            users.write(&folder).unwrap();
+            let access = Access::new(Some(folder.clone()), is_loopback).unwrap();
+            assert!(access.allows(&anonymous(), &node, Right::Read));
+            assert_eq!(access.allows(&anonymous(), &node, Right::Write), writes);
+            assert_eq!(access.allows(&anonymous(), &node, Right::Call), writes);
+        }
+        std::fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn a_user_who_is_taken_away_may_nothing_more() {
+        let folder = scratch("gone");
+        let mut users = Users::default();
+        let user = super::super::User {
+            roles: Roles::of(&[Role::Engineer]),
+            credential: Credential::Certificate("0".repeat(40)),
+        };
+        users.put("anna", user).unwrap();
+        users.write(&folder).unwrap();
+        let access = Access::new(Some(folder.clone()), true).unwrap();
+        let anna = UserToken("anna".to_owned());
+        let node = NodeId::new(2, 10);
+        assert!(access.allows(&anna, &node, Right::Write));
+        users.remove("anna").unwrap();
+        users.write(&folder).unwrap();
+        access.look();
+        assert!(!access.allows(&anna, &node, Right::Write));
+        assert!(!access.allows(&anna, &node, Right::Read));
+        std::fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn a_node_has_permissions_of_its_own() {
+        let access = Access::new(None, true).unwrap();
+        let node = NodeId::new(2, 10);
+        let engineers = Permissions {
+            write: Roles::of(&[Role::Engineer]),
+            ..Permissions::default()
+        };
+        access.set_rules(Rules {
+            anonymous: Anonymous::Has(Roles::of(&[Role::Operator])),
+            nodes: HashMap::from([(node.clone(), engineers)]),
+        });
+        assert!(!access.allows(&anonymous(), &node, Right::Write));
+        assert!(access.allows(&anonymous(), &NodeId::new(2, 11), Right::Write));
+        let level = AccessLevel::CURRENT_READ | AccessLevel::CURRENT_WRITE;
+        let left = access.effective_user_access_level(&anonymous(), level, &node);
+        assert_eq!(left.bits(), AccessLevel::CURRENT_READ.bits());
+    }
+
+    #[tokio::test]
+    async fn a_password_opens_for_its_user_alone() {
+        let folder = scratch("password");
+        let mut users = Users::default();
+        let user = super::super::User {
+            roles: Roles::of(&[Role::Operator]),
+            credential: super::super::hashed(b"correct horse").unwrap(),
+        };
+        users.put("anna", user).unwrap();
+        users.write(&folder).unwrap();
+        let access = Access::new(Some(folder.clone()), true).unwrap();
+        let right = Password::new("correct horse".to_owned());
+        let wrong = Password::new("correct house".to_owned());
+        assert!(access.check("anna", &right).await);
+        assert!(!access.check("anna", &wrong).await);
+        assert!(!access.check("bert", &right).await);
+        std::fs::remove_dir_all(folder).unwrap();
+    }
+}

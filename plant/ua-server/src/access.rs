@@ -1,0 +1,126 @@
+//! Who may do what with the nodes of the space, as the mapping says.
+
+use std::collections::HashMap;
+
+use mappings::{Mapping, Permissions as Said};
+use opcua::server::address_space::AccessLevel;
+use opcua::server::node_manager::RequestContext;
+use opcua::sync::Mutex;
+use opcua::types::{NodeId, StatusCode};
+use plant_opcua::certificates::application_uri;
+use plant_opcua::users::{Anonymous, Permissions, Role, Roles, Rules};
+use tracing::warn;
+
+use crate::address;
+use crate::layout::{Layout, node_id};
+
+/// Which sessions come from the application that their certificate is of.
+///
+/// The library does not compare the two when a session is made (OPC 10000-4, 5.6.2), so a session that pretends to be of another
+/// application is refused here whatever it asks of the space.
+#[derive(Default)]
+pub(crate) struct Genuine(Mutex<HashMap<u32, bool>>);
+
+impl Genuine {
+    /// # Errors
+    /// `BadCertificateUriInvalid` for a session whose certificate is of another ApplicationUri than it says.
+    pub(crate) fn check(&self, context: &RequestContext) -> Result<(), StatusCode> {
+        let known = self.0.lock().get(&context.session_id).copied();
+        let genuine = known.unwrap_or_else(|| {
+            let genuine = is_genuine(context);
+            let mut all = self.0.lock();
+            if all.len() >= MOST_REMEMBERED {
+                all.clear();
+            }
+            all.insert(context.session_id, genuine);
+            genuine
+        });
+        match genuine {
+            true => Ok(()),
+            false => Err(StatusCode::BadCertificateUriInvalid),
+        }
+    }
+}
+
+fn is_genuine(context: &RequestContext) -> bool {
+    let session = context.session.read();
+    let Some(certificate) = session.client_certificate() else {
+        return true;
+    };
+    let said = &session.application_description().application_uri;
+    let genuine = application_uri(certificate).is_some_and(|uri| uri == said.as_ref());
+    if !genuine {
+        warn!(
+            said = ?said.as_ref(),
+            thumbprint = certificate.thumbprint().as_hex_string(),
+            "a client is refused: its certificate is not that of the application it says it is"
+        );
+    }
+    genuine
+}
+
+/// Sessions that are remembered; they are looked at again when that many were.
+const MOST_REMEMBERED: usize = 10_000;
+
+/// The rules of a mapping for the nodes of its layout.
+pub(crate) fn rules(mapping: &Mapping, layout: &Layout) -> Rules {
+    let mut nodes = HashMap::new();
+    for topic in &layout.topics {
+        let said = mapping.variable(topic.topic).map(|one| &one.permissions);
+        let Some(said) = said.filter(|said| **said != Said::default()) else {
+            continue;
+        };
+        let usual = Permissions::default();
+        let permissions = Permissions {
+            read: said.read.as_deref().map_or(usual.read, roles),
+            write: said.write.as_deref().map_or(usual.write, roles),
+            ..usual
+        };
+        nodes.extend(topic.nodes().map(|node| (node.clone(), permissions)));
+    }
+    for call in mapping.calls() {
+        let Some(callers) = &call.callers else {
+            continue;
+        };
+        let permissions = Permissions {
+            call: roles(callers),
+            ..Permissions::default()
+        };
+        // The parts of an action are Methods too, and the first has the node of the mapping or one of its own.
+        nodes.insert(node_id(&call.node), permissions);
+        for topic in call.topics() {
+            nodes.insert(address::unmapped_call(topic), permissions);
+        }
+    }
+    Rules {
+        anonymous: anonymous(mapping.server().anonymous),
+        nodes,
+    }
+}
+
+/// Whether who asks may write the value of a node.
+pub(crate) fn may_write(context: &RequestContext, node: &NodeId) -> bool {
+    let level = AccessLevel::CURRENT_WRITE;
+    let left = context
+        .authenticator
+        .effective_user_access_level(&context.token, level, node);
+    left.contains(level)
+}
+
+fn anonymous(said: mappings::Anonymous) -> Anonymous {
+    match said {
+        mappings::Anonymous::Usual => Anonymous::Usual,
+        mappings::Anonymous::Refused => Anonymous::Refused,
+        mappings::Anonymous::Has(has) => Anonymous::Has(roles(&[has])),
+    }
+}
+
+fn roles(said: &[mappings::Role]) -> Roles {
+    let roles = said.iter().map(|role| match role {
+        mappings::Role::Observer => Role::Observer,
+        mappings::Role::Operator => Role::Operator,
+        mappings::Role::Engineer => Role::Engineer,
+        mappings::Role::SecurityAdmin => Role::SecurityAdmin,
+    });
+    roles.collect()
+}

@@ -1,0 +1,126 @@
+//! Which writes and calls of clients the audit is told, and with what.
+
+use opcua::server::node_manager::{MethodCall, RequestContext, WriteNode};
+use opcua::types::{AttributeId, NodeId, NumericRange, StatusCode, Variant};
+use plant_opcua::audit::{Action, Audit};
+use plant_opcua::users::Login;
+
+use crate::nodes::SpaceManager;
+
+/// What of a write is known before it is done.
+pub(crate) struct Before {
+    node: NodeId,
+    /// Whether everybody may read it: who watches the audit is anybody.
+    is_public: bool,
+    old: Variant,
+}
+
+/// What the nodes show before they are written. What not everybody may read is not told, nor what is large.
+pub(crate) fn before(space: &SpaceManager, writes: &[&mut WriteNode]) -> Vec<Before> {
+    let before = writes.iter().map(|write| {
+        let node = write.value().node_id.clone();
+        let is_public = space.inner().is_public(&node);
+        let shown = || space.inner().shown_at(&node).filter(is_small);
+        let old = is_public.then(shown).flatten();
+        Before {
+            node,
+            is_public,
+            old: old.unwrap_or_default(),
+        }
+    });
+    before.collect()
+}
+
+/// Tells of writes, and how they ended.
+pub(crate) fn wrote(
+    context: &RequestContext,
+    before: Vec<Before>,
+    (writes, done): (&[&mut WriteNode], Result<(), StatusCode>),
+) {
+    for (before, write) in before.into_iter().zip(writes) {
+        let Before {
+            node,
+            is_public,
+            old,
+        } = before;
+        let value = write.value();
+        if value.attribute_id != AttributeId::Value {
+            continue;
+        }
+        let new = value
+            .value
+            .value
+            .as_ref()
+            .filter(|new| is_public && is_small(new));
+        let action = Action::Wrote {
+            new: new.cloned().unwrap_or_default(),
+            range: range_text(&value.index_range),
+            node,
+            old,
+        };
+        tell(
+            context,
+            action,
+            done.err().unwrap_or_else(|| write.status()),
+        );
+    }
+}
+
+/// Tells of calls, and how they ended.
+pub(crate) fn called(
+    context: &RequestContext,
+    (calls, done): (&[&mut MethodCall], Result<(), StatusCode>),
+) {
+    for call in calls {
+        let action = Action::Called {
+            object: call.object_id().clone(),
+            method: call.method_id().clone(),
+        };
+        tell(context, action, done.err().unwrap_or_else(|| call.status()));
+    }
+}
+
+/// Who came in, or wanted to.
+pub(crate) fn came_in(login: &Login, server: &str) -> Audit {
+    let action = Action::CameIn {
+        by: login.by,
+        endpoint: login.endpoint.clone(),
+    };
+    Audit {
+        action,
+        status: login.fault.map_or(StatusCode::Good, |fault| fault.status()),
+        user: Audit::named(&login.user),
+        session: None,
+        client_entry: String::new(),
+        server: server.to_owned(),
+    }
+}
+
+/// Whether a value is told: one that is large is not.
+fn is_small(value: &Variant) -> bool {
+    if let Variant::Array(array) = value {
+        return array.values.len() <= MOST_ELEMENTS && array.values.iter().all(is_small);
+    }
+    if let Variant::String(text) = value {
+        return text.as_ref().len() <= MOST_BYTES;
+    }
+    if let Variant::ByteString(bytes) = value {
+        return bytes.as_ref().len() <= MOST_BYTES;
+    }
+    value.is_numeric() || matches!(value, Variant::Boolean(_) | Variant::DateTime(_))
+}
+
+fn range_text(range: &NumericRange) -> String {
+    if matches!(range, NumericRange::None) {
+        return String::new();
+    }
+    range.to_string()
+}
+
+fn tell(context: &RequestContext, action: Action, status: StatusCode) {
+    Audit::of(context, action, status).tell(&context.subscriptions);
+}
+
+/// Elements and bytes of a value that is told.
+const MOST_ELEMENTS: usize = 64;
+const MOST_BYTES: usize = 1_024;

@@ -1,0 +1,360 @@
+//! What people type about certificates and users: `ua-server trust`, `reject`, `certificates` and `user`.
+//!
+//! A server that runs takes notice by itself: certificates are looked for at each connection, and users within a second.
+
+use std::io::{self, BufRead as _, IsTerminal as _, Write as _};
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use bridge_node::FailureKind;
+use clap::Parser as _;
+use clap::error::ErrorKind;
+use plant_opcua::certificates::{self, StoreFault, Stored};
+use plant_opcua::pki;
+use plant_opcua::users::{self, Credential, Roles, User, UserFault, Users};
+
+/// Certificates and users of the OPC UA server of the cell.
+#[derive(Debug, clap::Parser)]
+#[command(name = "ua-server")]
+struct Verbs {
+    #[command(subcommand)]
+    verb: Verb,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Verb {
+    /// Trust the certificate of a client: one that was refused, or that of a file
+    Trust {
+        /// The first digits of its thumbprint, as the log of the server has them, or a file in DER or PEM
+        #[arg(value_name = "THUMBPRINT|FILE")]
+        which: String,
+        #[command(flatten)]
+        store: Store,
+    },
+    /// Trust a certificate no longer: who has it is refused at the next connection
+    Reject {
+        /// The first digits of its thumbprint
+        #[arg(value_name = "THUMBPRINT")]
+        which: String,
+        #[command(flatten)]
+        store: Store,
+    },
+    /// List the server's own certificate, those it trusts, and those of clients that it refused
+    Certificates {
+        /// A JSON line for each
+        #[arg(long)]
+        json: bool,
+        #[command(flatten)]
+        store: Store,
+    },
+    /// Make, change, list and remove users
+    #[command(subcommand)]
+    User(UserVerb),
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum UserVerb {
+    /// Make a user, or put another in the place of one of that name. The password is read from stdin
+    Add {
+        name: String,
+        /// What the user may be: observer, operator, engineer, security_admin; several with commas between them
+        #[arg(long, value_name = "ROLES")]
+        role: Roles,
+        /// The user shows this certificate (DER or PEM, as .der or .pem) in place of a password
+        #[arg(long, value_name = "FILE")]
+        certificate: Option<PathBuf>,
+        #[command(flatten)]
+        store: Store,
+    },
+    /// Give a user another password, which is read from stdin
+    Password {
+        name: String,
+        #[command(flatten)]
+        store: Store,
+    },
+    /// Give a user other roles
+    Role {
+        name: String,
+        roles: Roles,
+        #[command(flatten)]
+        store: Store,
+    },
+    /// Remove a user: its open sessions may do nothing more
+    Remove {
+        name: String,
+        #[command(flatten)]
+        store: Store,
+    },
+    /// List the users
+    List {
+        /// A JSON line for each
+        #[arg(long)]
+        json: bool,
+        #[command(flatten)]
+        store: Store,
+    },
+}
+
+#[derive(Debug, clap::Args)]
+struct Store {
+    /// The certificate store of the server
+    #[arg(long, value_name = "DIR", env = "UA_PKI")]
+    pki: Option<PathBuf>,
+}
+
+impl Store {
+    fn root(&self) -> PathBuf {
+        let usual = || pki::default_root(|name| std::env::var(name).ok());
+        self.pki.clone().unwrap_or_else(usual)
+    }
+
+    fn users(&self) -> PathBuf {
+        self.root().join(users::FOLDER)
+    }
+}
+
+/// Why a verb came to nothing.
+#[derive(Debug, thiserror::Error)]
+enum VerbFault {
+    #[error(transparent)]
+    Store(#[from] StoreFault),
+    #[error(transparent)]
+    User(#[from] UserFault),
+    #[error("the password cannot be read: {0}")]
+    Password(io::Error),
+    #[error("there is no password: give it on stdin, as one line")]
+    NoPassword,
+    #[error("{0}")]
+    Output(io::Error),
+}
+
+/// Does what the command line asks about certificates and users; `None` where it asks for the server.
+pub(crate) fn asked() -> Option<ExitCode> {
+    let first = std::env::args().nth(1)?;
+    if !VERBS.contains(&&first[..]) {
+        return None;
+    }
+    let verbs = match Verbs::try_parse() {
+        Ok(verbs) => verbs,
+        Err(usage) => {
+            // Nobody is left to tell when stdout or stderr is closed.
+            let _printed = usage.print();
+            let help = matches!(usage.kind(), ErrorKind::DisplayHelp);
+            return Some(if help {
+                ExitCode::SUCCESS
+            } else {
+                FailureKind::Usage.into()
+            });
+        }
+    };
+    Some(match run(verbs.verb) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(fault) => {
+            let _told = writeln!(io::stderr(), "error: {fault}");
+            kind(&fault).into()
+        }
+    })
+}
+
+fn kind(fault: &VerbFault) -> FailureKind {
+    match fault {
+        VerbFault::Store(StoreFault::Io { .. })
+        | VerbFault::User(UserFault::Io { .. })
+        | VerbFault::Password(_)
+        | VerbFault::Output(_) => FailureKind::Io,
+        VerbFault::User(UserFault::Open(_) | UserFault::Line { .. } | UserFault::TooMany(_)) => {
+            FailureKind::Configuration
+        }
+        VerbFault::Store(
+            StoreFault::Certificate { .. } | StoreFault::Unknown { .. } | StoreFault::Several(_),
+        )
+        | VerbFault::User(
+            UserFault::Name
+            | UserFault::Unknown(_)
+            | UserFault::NoRole
+            | UserFault::Role(_)
+            | UserFault::Password
+            | UserFault::Certificate { .. },
+        )
+        | VerbFault::NoPassword => FailureKind::Usage,
+    }
+}
+
+fn run(verb: Verb) -> Result<(), VerbFault> {
+    match verb {
+        Verb::Trust { which, store } => {
+            let trusted = certificates::trust(&store.root(), &which)?;
+            say(&format!("trusted: {}", line(&trusted)))
+        }
+        Verb::Reject { which, store } => {
+            let rejected = certificates::reject(&store.root(), &which)?;
+            say(&format!("no longer trusted: {}", line(&rejected)))
+        }
+        Verb::Certificates { json, store } => {
+            for one in certificates::list(&store.root())? {
+                say(&if json { as_json(&one) } else { line(&one) })?;
+            }
+            Ok(())
+        }
+        Verb::User(verb) => user(verb),
+    }
+}
+
+fn user(verb: UserVerb) -> Result<(), VerbFault> {
+    match verb {
+        UserVerb::Add {
+            name,
+            role,
+            certificate,
+            store,
+        } => {
+            let folder = store.users();
+            let mut users = Users::read(&folder)?;
+            let credential = match certificate {
+                Some(file) => Users::keep_certificate(&folder, &file)?,
+                None => users::hashed(password(&name)?.as_bytes())?,
+            };
+            let user = User {
+                roles: role,
+                credential,
+            };
+            users.put(&name, user)?;
+            users.write(&folder)?;
+            say(&format!("{name} is {role}"))
+        }
+        UserVerb::Password { name, store } => {
+            let folder = store.users();
+            let mut users = Users::read(&folder)?;
+            let Some(known) = users.get(&name).cloned() else {
+                return Err(UserFault::Unknown(name).into());
+            };
+            let credential = users::hashed(password(&name)?.as_bytes())?;
+            let user = User {
+                credential,
+                ..known
+            };
+            users.put(&name, user)?;
+            users.write(&folder)?;
+            say(&format!("{name} has another password"))
+        }
+        UserVerb::Role { name, roles, store } => {
+            let folder = store.users();
+            let mut users = Users::read(&folder)?;
+            users.set_roles(&name, roles)?;
+            users.write(&folder)?;
+            say(&format!("{name} is {roles}"))
+        }
+        UserVerb::Remove { name, store } => {
+            let folder = store.users();
+            let mut users = Users::read(&folder)?;
+            users.remove(&name)?;
+            users.write(&folder)?;
+            say(&format!("{name} is no user any longer"))
+        }
+        UserVerb::List { json, store } => {
+            for (name, user) in Users::read(&store.users())?.iter() {
+                let by = by(&user.credential);
+                say(&if json {
+                    let roles: Vec<String> =
+                        user.roles.iter().map(|role| quoted(role.name())).collect();
+                    format!(
+                        "{{\"name\":{},\"roles\":[{}],\"by\":{}}}",
+                        quoted(name),
+                        roles.join(","),
+                        quoted(by)
+                    )
+                } else {
+                    format!("{name:<24} {:<32} {by}", user.roles.to_string())
+                })?;
+            }
+            Ok(())
+        }
+    }
+}
+
+const fn by(credential: &Credential) -> &'static str {
+    match credential {
+        Credential::Password(_) => "password",
+        Credential::Certificate(_) => "certificate",
+    }
+}
+
+/// A line of stdin, without what ends it.
+fn password(name: &str) -> Result<String, VerbFault> {
+    let stdin = io::stdin();
+    if stdin.is_terminal() {
+        let _told = write!(
+            io::stderr(),
+            "Password of {name} (it is shown; `ua-server user .. < FILE` takes it from a file): "
+        );
+    }
+    let mut line = String::new();
+    let read = stdin.lock().read_line(&mut line);
+    read.map_err(VerbFault::Password)?;
+    let password = line.trim_end_matches(['\n', '\r']);
+    match password.is_empty() {
+        true => Err(VerbFault::NoPassword),
+        false => Ok(password.to_owned()),
+    }
+}
+
+/// A certificate for people. What its maker chose is escaped.
+fn line(one: &Stored) -> String {
+    let now = if one.is_valid {
+        "until"
+    } else {
+        "NOT VALID, until"
+    };
+    format!(
+        "{:<8} {} {} {} {:?} {:?}",
+        one.standing.name(),
+        one.thumbprint,
+        now,
+        one.until,
+        one.name,
+        one.application_uri.as_deref().unwrap_or_default(),
+    )
+}
+
+fn as_json(one: &Stored) -> String {
+    let uri = one
+        .application_uri
+        .as_deref()
+        .map_or_else(|| "null".to_owned(), quoted);
+    format!(
+        "{{\"standing\":{},\"thumbprint\":{},\"name\":{},\"application_uri\":{uri},\"until\":{},\"valid\":{},\"file\":{}}}",
+        quoted(one.standing.name()),
+        quoted(&one.thumbprint),
+        quoted(&one.name),
+        quoted(&one.until),
+        one.is_valid,
+        quoted(&one.path.display().to_string()),
+    )
+}
+
+/// A JSON string.
+fn quoted(text: &str) -> String {
+    let mut out = String::from('"');
+    for c in text.chars() {
+        match c {
+            '"' | '\\' => out.extend(['\\', c]),
+            c if c.is_control() => out.push_str(&format!("\\u{:04x}", u32::from(c))),
+            c => out.push(c),
+        }
+    }
+    out.push('"');
+    out
+}
+
+fn say(text: &str) -> Result<(), VerbFault> {
+    writeln!(io::stdout(), "{text}").map_err(VerbFault::Output)
+}
+
+/// The verbs; all else is a mapping or a flag of the server.
+const VERBS: [&str; 4] = ["trust", "reject", "certificates", "user"];
+/// What the help of the server says of them.
+pub(crate) const HELP: &str = "Certificates and users (each with --help):
+  ua-server trust THUMBPRINT|FILE        let a client in that was refused
+  ua-server reject THUMBPRINT            let it in no longer
+  ua-server certificates                 list its own, trusted and refused certificates
+  ua-server user add|password|role|remove|list";

@@ -1,0 +1,176 @@
+"""Who is let into an OPC UA server, and what each may do there: a JSON line for each try.
+
+`pairs FOLDER` makes the keys and certificates that the tries use: of a client (`client`), of one whose time is over
+(`expired`), and of a user (`user`). `tries URL FOLDER NODE TYPE VALUE USER PASSWORD` tries each security policy and mode with
+each kind of user, reading and writing the node. `endpoints URL` says which
+policies a server offers.
+"""
+
+import argparse
+import asyncio
+import datetime
+import pathlib
+import socket
+
+from asyncua import Client, ua
+from asyncua.ua.uaerrors import UaStatusCodeError
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import rsa
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+import lifetime
+import opcua_session
+
+DAY = datetime.timedelta(days=1)
+
+
+def make(folder, name, uri, begin, end):
+    """A key and a self-signed certificate of an application, valid from the one day to the other from now."""
+    key = rsa.generate_private_key(public_exponent=65537, key_size=2048)
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+    now = datetime.datetime.now(datetime.timezone.utc)
+    usage = dict.fromkeys(["key_agreement", "crl_sign", "encipher_only", "decipher_only"], False)
+    usage |= dict.fromkeys(
+        ["digital_signature", "content_commitment", "key_encipherment", "data_encipherment", "key_cert_sign"], True
+    )
+    names = [x509.UniformResourceIdentifier(uri), x509.DNSName(socket.gethostname())]
+    builder = (
+        x509.CertificateBuilder()
+        .subject_name(subject)
+        .issuer_name(subject)
+        .public_key(key.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now + begin * DAY)
+        .not_valid_after(now + end * DAY)
+        .add_extension(x509.SubjectAlternativeName(names), critical=False)
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=False)
+        .add_extension(x509.KeyUsage(**usage), critical=False)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.CLIENT_AUTH]), critical=False)
+    )
+    certificate = builder.sign(key, hashes.SHA256())
+    folder.mkdir(parents=True, exist_ok=True)
+    pem = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    (folder / f"{name}_key.pem").write_bytes(pem)
+    (folder / f"{name}_certificate.der").write_bytes(certificate.public_bytes(serialization.Encoding.DER))
+
+
+def pairs(folder):
+    make(folder, "client", opcua_session.APPLICATION_URI, -1, 365)
+    make(folder, "expired", opcua_session.APPLICATION_URI, -30, -1)
+    make(folder, "user", "urn:ua-bridge:system-tests:user", -1, 365)
+    make(folder, "old", "urn:ua-bridge:system-tests:user", -30, -1)
+    lifetime.say(made=str(folder))
+
+
+def status_of(error):
+    """The name of the status in an error, however it is wrapped."""
+    while error is not None:
+        if isinstance(error, UaStatusCodeError):
+            return ua.StatusCode(error.code).name
+        error = error.__cause__ or error.__context__
+    return None
+
+
+async def tried(args, client, about):
+    """Connects, reads and writes, and says how each ended."""
+    said = dict(about)
+    try:
+        async with client:
+            said["connected"] = "Good"
+            node = client.get_node(args.node)
+            try:
+                data = await node.read_data_value(raise_on_bad_status=False)
+                said["read"] = ua.StatusCode(data.StatusCode.value & 0xFFFF0000).name
+                variant = ua.Variant(float(args.value), ua.VariantType[args.type])
+                await node.write_value(ua.DataValue(variant))
+                said["write"] = "Good"
+            except UaStatusCodeError as refused:
+                said.setdefault("read", status_of(refused))
+                said.setdefault("write", status_of(refused))
+    except Exception as error:  # whatever it is, it is the outcome
+        if "connected" not in said:
+            said["connected"] = status_of(error) or repr(error)
+    lifetime.say(**said)
+
+
+async def secured(args, name, security, mode):
+    folder = pathlib.Path(args.folder)
+    client = Client(args.endpoint, timeout=20)
+    client.application_uri = args.application_uri
+    if security == "None":
+        return client
+    await client.set_security(
+        opcua_session.POLICIES[security],
+        certificate=str(folder / f"{name}_certificate.der"),
+        private_key=str(folder / f"{name}_key.pem"),
+        mode=ua.MessageSecurityMode[mode],
+    )
+    client.application_uri = args.application_uri
+    return client
+
+
+async def as_user(args, client, user):
+    if user in ("password", "wrong", "nobody"):
+        client.set_user("nobody" if user == "nobody" else args.user)
+        client.set_password("another one" if user == "wrong" else args.password)
+    if user in ("certificate", "old"):
+        name = "user" if user == "certificate" else "old"
+        folder = pathlib.Path(args.folder)
+        await client.load_client_certificate(str(folder / f"{name}_certificate.der"))
+        await client.load_private_key(str(folder / f"{name}_key.pem"))
+
+
+async def tries(args):
+    for security, mode in args.with_security:
+        for user in args.users.split(","):
+            client = await secured(args, args.client, security, mode)
+            await as_user(args, client, user)
+            await tried(args, client, {"security": security, "mode": mode, "user": user})
+
+
+async def endpoints(url):
+    found = await Client(url, timeout=10).connect_and_get_server_endpoints()
+    policies = [one.SecurityPolicyUri.rpartition("#")[2] for one in found]
+    lifetime.say(policies=policies, urls=[one.EndpointUrl for one in found])
+
+
+def ways(text):
+    """`None,Basic256Sha256/Sign`"""
+    for one in text.split(","):
+        security, _, mode = one.partition("/")
+        yield security, mode or "None"
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    verbs = parser.add_subparsers(dest="verb", required=True)
+    making = verbs.add_parser("pairs")
+    making.add_argument("folder", type=pathlib.Path)
+    trying = verbs.add_parser("tries")
+    trying.add_argument("endpoint")
+    trying.add_argument("folder")
+    trying.add_argument("node")
+    trying.add_argument("type")
+    trying.add_argument("value")
+    trying.add_argument("--client", default="client", help="whose pair the application has")
+    trying.add_argument("--application-uri", default=opcua_session.APPLICATION_URI)
+    trying.add_argument("--ways", dest="with_security", type=lambda text: list(ways(text)), required=True)
+    trying.add_argument("--users", default="anonymous")
+    trying.add_argument("--user")
+    trying.add_argument("--password")
+    telling = verbs.add_parser("endpoints")
+    telling.add_argument("endpoint")
+    args = parser.parse_args()
+    lifetime.bound(120.0)
+    if args.verb == "pairs":
+        pairs(args.folder)
+    elif args.verb == "endpoints":
+        asyncio.run(endpoints(args.endpoint))
+    else:
+        asyncio.run(tries(args))
+
+
+main()
