@@ -9,20 +9,26 @@ mod decode;
 mod definition;
 mod discovery;
 mod input;
+mod lds;
 mod mapping;
+mod mdns;
 mod message;
 mod reader_state;
+mod registry;
 mod secured;
 #[path = "../../messages/tests/support/mod.rs"]
 mod tape;
 
+pub use self::registry::registry;
 pub use action::action;
 pub use calls::calls;
 pub use chunks::chunks;
 pub use decode::decode;
 pub use definition::definition;
 pub use discovery::discovery;
+pub use lds::lds;
 pub use mapping::mapping;
+pub use mdns::mdns;
 pub use message::message;
 pub use reader_state::reader_state;
 pub use secured::secured;
@@ -38,8 +44,11 @@ pub const TARGETS: &[(&str, Target)] = &[
     ("decode", decode),
     ("definition", definition),
     ("discovery", discovery),
+    ("lds", lds),
     ("mapping", mapping),
+    ("mdns", mdns),
     ("message", message),
     ("reader_state", reader_state),
+    ("registry", registry),
     ("secured", secured),
 ];

@@ -13,6 +13,8 @@ pub mod client;
 mod clock;
 mod connection;
 mod endpoint;
+#[doc(hidden)]
+pub mod fuzz;
 mod goodbye;
 mod interface;
 mod keeper;

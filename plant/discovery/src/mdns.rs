@@ -454,7 +454,10 @@ pub(crate) fn same_place(one: &str, other: &str) -> bool {
 }
 
 /// An announcement as the registry takes it.
-fn heard(service: &ResolvedService, loopback: bool) -> Option<(Announcement, Option<i64>)> {
+pub(crate) fn heard(
+    service: &ResolvedService,
+    loopback: bool,
+) -> Option<(Announcement, Option<i64>)> {
     let instance = instance(&service.fullname)?;
     let text = |key| service.get_property_val(key).flatten();
     let path = match text("path").map(std::str::from_utf8) {
@@ -515,7 +518,7 @@ fn instance(fullname: &str) -> Option<String> {
     (label(&name) == name).then_some(name)
 }
 
-const SERVICE: &str = "_opcua-tcp._tcp.local.";
+pub(crate) const SERVICE: &str = "_opcua-tcp._tcp.local.";
 /// The key of the TXT record that tells one run of a program from the next. Ours alone; others pass over it.
 const START: &str = "start";
 const ANNOUNCE_EVERY: Duration = Duration::from_secs(5);

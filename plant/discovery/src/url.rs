@@ -33,7 +33,13 @@ impl Url {
             None => return None,
         };
         let strange = |c: char| c.is_control() || c.is_whitespace();
-        if host.is_empty() || url.contains(strange) {
+        // Only an address of IPv6 has colons, and it stands in brackets.
+        let is_literal = authority.starts_with('[');
+        if host.is_empty()
+            || host.contains(['[', ']'])
+            || host.contains(':') != is_literal
+            || url.contains(strange)
+        {
             return None;
         }
         Some(Self {
@@ -100,6 +106,9 @@ mod tests {
             "opc.tcp://h:70000",
             "opc.tcp://[::1",
             "opc.tcp://[::1]4840",
+            "opc.tcp://fe80::1:4840",
+            "opc.tcp://fe80::1]:4840",
+            "opc.tcp://[host]:4840",
             "opc.tcp://h:1/a\nb",
         ] {
             assert_eq!(Url::parse(url), None, "{url:?}");

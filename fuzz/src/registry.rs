@@ -1,0 +1,213 @@
+//! A registry of servers: registrations, announcements, tries and passing time as a list of operations.
+
+use std::collections::BTreeSet;
+use std::time::{Duration, Instant};
+
+use registry::{
+    Announcement, ApplicationType, Asked, Channel, Event, MdnsConfiguration, Outcome, Registry,
+    Settings,
+};
+
+use crate::input::Input;
+
+const MOST: usize = 6;
+
+/// Who is there is told once when it comes and once when it goes; lists are bounded, numbers rise, and no wait is in the
+/// past.
+pub fn registry(operations: &[u8]) {
+    let settings = Settings {
+        allow_unsecured: true,
+        forget_after: Duration::from_secs(20),
+        most: MOST,
+        ..Settings::default()
+    };
+    let mut played = Played {
+        registry: Registry::new(settings),
+        now: Instant::now(),
+        registered: BTreeSet::new(),
+        seen: BTreeSet::new(),
+        ours: BTreeSet::new(),
+        ids: BTreeSet::new(),
+        last_id: 0,
+    };
+    let mut input = Input::new(operations);
+    // Each takes two bytes or more.
+    while !input.is_empty() {
+        played.operate(&mut input);
+        played.take_events();
+        played.check();
+    }
+}
+
+struct Played {
+    registry: Registry,
+    now: Instant,
+    /// Who is registered by what was told.
+    registered: BTreeSet<String>,
+    /// Who is on the network by what was told.
+    seen: BTreeSet<String>,
+    /// What is announced for servers by what was told.
+    ours: BTreeSet<String>,
+    /// The records there were, and the largest number that was given.
+    ids: BTreeSet<u32>,
+    last_id: u32,
+}
+
+impl Played {
+    fn operate(&mut self, input: &mut Input<'_>) {
+        let (what, which) = (input.byte(), input.byte());
+        let now = self.now;
+        match what % 9 {
+            0 => {
+                let how = input.byte();
+                let channel = Channel {
+                    is_secured: how & 1 != 0,
+                    certificate_uri: (how & 2 != 0).then(|| uri(which)),
+                };
+                let there = (how & 4 != 0).then_some(how & 8 != 0);
+                let asked = asked(which, how, input);
+                // Refused or not: what is told has to fit.
+                drop(self.registry.register(asked, &channel, there, now));
+            }
+            1 => {
+                let announcement = Announcement {
+                    instance: name(which),
+                    url: url(input.byte()),
+                    capabilities: Vec::new(),
+                };
+                self.registry.announced(announcement, now);
+            }
+            2 => self.registry.withdrawn(&name(which)),
+            3 => self
+                .registry
+                .probed(&url(which), outcome(input.byte()), now),
+            4 => self.renamed(&name(which), &name(input.byte())),
+            5 => self.registry.suspect(&url(which)),
+            6 => self.registry.semaphore_gone(&uri(which)),
+            7 => self
+                .registry
+                .stood_still(Duration::from_millis(which.into())),
+            _ => self.pass(Duration::from_millis(u64::from(which) * 40), input),
+        }
+    }
+
+    /// mDNS takes another name only where it is free.
+    fn renamed(&mut self, from: &str, to: &str) {
+        let is_free = !self.ours.contains(to) && !self.seen.contains(to);
+        if is_free && self.ours.remove(from) {
+            self.registry.renamed(from, to);
+            self.ours.insert(to.to_owned());
+        }
+    }
+
+    fn pass(&mut self, how_long: Duration, input: &mut Input<'_>) {
+        self.now += how_long;
+        let now = self.now;
+        self.registry.handle_timeout(now);
+        let mut tries = 0;
+        while let Some(probe) = self.registry.poll_probe(now) {
+            assert!(self.registry.watches(&probe.url), "{}", probe.url);
+            self.registry.probed(&probe.url, outcome(input.byte()), now);
+            tries += 1;
+            assert!(tries <= 16, "no end of tries");
+        }
+        let due = self.registry.poll_timeout();
+        assert!(due.is_none_or(|due| due > now), "a wait in the past");
+    }
+
+    fn take_events(&mut self) {
+        while let Some(event) = self.registry.poll_event() {
+            match event {
+                Event::Registered { server_uri, .. } => {
+                    self.registered.insert(server_uri);
+                }
+                Event::Gone { server_uri, .. } => {
+                    assert!(self.registered.remove(&server_uri), "{server_uri} was not");
+                }
+                Event::Seen(record) => {
+                    self.seen.insert(record.announcement.instance);
+                }
+                Event::Vanished { record, .. } => {
+                    let name = record.announcement.instance;
+                    assert!(self.seen.remove(&name), "{name} was not seen");
+                }
+                Event::Announce(announcement) => {
+                    self.ours.insert(announcement.instance);
+                }
+                Event::Withdraw { instance } => {
+                    assert!(self.ours.remove(&instance), "{instance} was not announced");
+                }
+                _ => {}
+            }
+        }
+    }
+
+    fn check(&mut self) {
+        let servers = self.registry.find_servers(&[]);
+        let servers: BTreeSet<String> =
+            servers.map(|(asked, _)| asked.server_uri.clone()).collect();
+        assert_eq!(servers, self.registered, "listed and told");
+        assert!(servers.len() <= MOST);
+        let records = self.registry.find_servers_on_network(0, 0, &[]);
+        assert!(records.len() <= 2 * MOST, "{} records", records.len());
+        let ids: Vec<u32> = records.iter().map(|record| record.record_id).collect();
+        assert!(ids.is_sorted_by(|one, next| one < next), "{ids:?}");
+        let names = records
+            .iter()
+            .map(|record| record.announcement.instance.clone());
+        let names: BTreeSet<String> = names.collect();
+        let told: BTreeSet<String> = self.seen.union(&self.ours).cloned().collect();
+        assert_eq!(names, told, "on the network and told");
+        for id in &ids {
+            assert!(self.ids.contains(id) || *id > self.last_id, "{id} again");
+        }
+        self.last_id = self.last_id.max(ids.last().copied().unwrap_or_default());
+        self.ids = ids.into_iter().collect();
+    }
+}
+
+fn uri(which: u8) -> String {
+    format!("urn:{}", which % 8)
+}
+
+fn name(which: u8) -> String {
+    format!("n{}", which % 8)
+}
+
+fn url(which: u8) -> String {
+    format!("opc.tcp://10.0.0.{}:4840", which % 8)
+}
+
+fn outcome(which: u8) -> Outcome {
+    match which % 6 {
+        0 => Outcome::Refused,
+        1 => Outcome::Silent,
+        2 => Outcome::Hanging,
+        3 => Outcome::Untried,
+        4 => Outcome::Alive { start_time: None },
+        _ => Outcome::Alive {
+            start_time: Some(i64::from(which)),
+        },
+    }
+}
+
+fn asked(which: u8, how: u8, input: &mut Input<'_>) -> Asked {
+    let urls = usize::from(input.byte() % 3);
+    Asked {
+        server_uri: uri(which),
+        product_uri: String::new(),
+        names: vec![(String::new(), "n".to_owned())],
+        application_type: ApplicationType::Server,
+        gateway_server_uri: String::new(),
+        discovery_urls: (0..urls).map(|_| url(input.byte())).collect(),
+        semaphore_file_path: match how & 4 {
+            0 => String::new(),
+            _ => "/there".to_owned(),
+        },
+        is_online: how & 0x30 != 0,
+        mdns: (how & 0x40 != 0).then(|| MdnsConfiguration {
+            name: name(input.byte()),
+            capabilities: Vec::new(),
+        }),
+    }
+}

@@ -1,0 +1,107 @@
+//! What is read of strangers, for the fuzzers of `fuzz/`: nothing else is to use it.
+
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::sync::Arc;
+use std::time::Instant;
+
+use mdns_sd::ServiceInfo;
+use opcua::types::{ApplicationType, ByteString};
+use registry::{Announcement, Registry, Settings};
+use tokio::sync::mpsc;
+
+use crate::connection::{Asking, Shared, serve};
+use crate::services::{Answer, Own, Question};
+use crate::{clock, mdns, url::Url};
+
+/// What a discovery server that knows nobody answers a client that says these bytes and no more, with how many are
+/// registered afterwards. Needs a tokio runtime.
+pub async fn answered(said: &[u8]) -> (Vec<u8>, usize) {
+    let own = Own {
+        application_uri: "urn:lds".to_owned(),
+        name: "lds".to_owned(),
+        url: "opc.tcp://127.0.0.1:4840".to_owned(),
+        application_type: ApplicationType::DiscoveryServer,
+        certificate: ByteString::null(),
+    };
+    let (ask, mut questions) = mpsc::channel::<Asking>(1);
+    let answers = tokio::spawn(async move {
+        let mut registry = Registry::new(Settings::default());
+        let at = clock::now();
+        while let Some((question, channel, reply)) = questions.recv().await {
+            let answer = answer(&mut registry, question, &channel, at);
+            drop(reply.send(answer));
+            while registry.poll_event().is_some() {}
+        }
+        registry.find_servers(&[]).count()
+    });
+    let shared = Arc::new(Shared::new(own, None, ask));
+    let mut heard = Vec::new();
+    let peer = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 9);
+    serve(tokio::io::join(said, &mut heard), peer, &shared).await;
+    drop(shared);
+    (heard, answers.await.unwrap_or_default())
+}
+
+fn answer(
+    registry: &mut Registry,
+    question: Question,
+    channel: &registry::Channel,
+    at: Instant,
+) -> Answer {
+    match question {
+        Question::FindServers { uris } => {
+            let uris: Vec<&str> = uris.iter().map(String::as_str).collect();
+            let found = registry.find_servers(&uris);
+            Answer::Servers(found.map(|(asked, _)| asked.clone()).collect())
+        }
+        Question::FindOnNetwork {
+            from,
+            most,
+            capabilities,
+        } => {
+            let capabilities: Vec<&str> = capabilities.iter().map(String::as_str).collect();
+            let records = registry.find_servers_on_network(from, most, &capabilities);
+            Answer::OnNetwork {
+                records: records.into_iter().cloned().collect(),
+                reset: clock::wall(),
+            }
+        }
+        Question::Register {
+            asked,
+            semaphore_is_there,
+        } => match registry.register(*asked, channel, semaphore_is_there, at) {
+            Ok(_) => Answer::Registered,
+            Err(fault) => Answer::Refused(fault.status()),
+        },
+    }
+}
+
+/// The instances that a packet of mDNS takes back.
+#[must_use]
+pub fn goodbyes(packet: &[u8]) -> Vec<String> {
+    crate::goodbye::goodbyes(packet)
+}
+
+/// What is heard of a server by the instance name, the port, and the texts of its TXT record.
+#[must_use]
+pub fn heard(instance: &str, port: u16, path: &[u8], capabilities: &[u8]) -> Option<Announcement> {
+    let texts = [("path", path), ("caps", capabilities)];
+    let texts = texts.map(|(key, text)| (key, String::from_utf8_lossy(text).into_owned()));
+    let address = IpAddr::V4(Ipv4Addr::new(10, 0, 0, 7));
+    let info = ServiceInfo::new(
+        mdns::SERVICE,
+        instance,
+        "h.local.",
+        address,
+        port,
+        &texts[..],
+    );
+    let service = info.ok()?.as_resolved_service();
+    mdns::heard(&service, false).map(|(announcement, _)| announcement)
+}
+
+/// A URL of OPC UA over TCP as it is written again; `None` for any other text.
+#[must_use]
+pub fn url(text: &str) -> Option<String> {
+    Url::parse(text).map(|url| url.to_string())
+}
