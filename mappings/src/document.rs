@@ -113,6 +113,24 @@ document! {
         /// What users without a name may be: `off` (they are not let in), `observer`, `operator` or `engineer`. Left out:
         /// observer; and operator where the endpoint is a loopback address and the server has no users.
         anonymous: AnonymousEntry,
+        /// How much clients may take up.
+        limits: LimitsEntry,
+    }
+
+    /// How much clients may take up of the server. What is more is refused.
+    struct LimitsEntry {
+        /// Sessions at once; default 50. The one that is too many gets BadTooManySessions.
+        #[schemars(range(min = 1, max = 10000))]
+        sessions: u16,
+        /// Subscriptions of a session; default 50.
+        #[schemars(range(min = 1, max = 1000))]
+        subscriptions: u16,
+        /// Monitored items of a subscription; default 10000.
+        #[schemars(range(min = 1, max = 65535))]
+        items: u16,
+        /// Nodes that one request reads or writes, or items that it makes; default 10000 and 1000.
+        #[schemars(range(min = 1, max = 65535))]
+        operations: u16,
     }
 
     /// One value of the cell.

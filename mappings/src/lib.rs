@@ -36,7 +36,8 @@ pub use difference::Difference;
 pub use environment::{Environment, LiveNode, LiveServer, LiveSpace, LiveTopic};
 pub use mapping::{
     Binding, Endpoint, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule,
-    SecurityPolicy, Server, ServiceBinding, ServiceRole, Space, Trigger, UaField, Variable,
+    SecurityPolicy, Server, ServerLimits, ServiceBinding, ServiceRole, Space, Trigger, UaField,
+    Variable,
 };
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};

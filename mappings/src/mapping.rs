@@ -424,6 +424,21 @@ pub struct Server {
     pub security: Option<Vec<SecurityPolicy>>,
     /// What users without a name may be.
     pub anonymous: Anonymous,
+    /// How much clients may take up.
+    pub limits: ServerLimits,
+}
+
+/// How much clients may take up of the server; `None` is left to the server.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ServerLimits {
+    /// Sessions at once.
+    pub sessions: Option<u16>,
+    /// Subscriptions of a session.
+    pub subscriptions: Option<u16>,
+    /// Monitored items of a subscription.
+    pub items: Option<u16>,
+    /// Nodes that one request reads or writes, or items that it makes.
+    pub operations: Option<u16>,
 }
 
 impl Server {
@@ -447,6 +462,7 @@ impl Default for Server {
             application_uri: "urn:ua-bridge:server".to_owned(),
             security: None,
             anonymous: Anonymous::Usual,
+            limits: ServerLimits::default(),
         }
     }
 }

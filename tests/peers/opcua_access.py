@@ -3,12 +3,14 @@
 `pairs FOLDER` makes the keys and certificates that the tries use: of a client (`client`), of one whose time is over
 (`expired`), and of a user (`user`). `tries URL FOLDER NODE TYPE VALUE USER PASSWORD` tries each security policy and mode with
 each kind of user, reading and writing the node. `endpoints URL` says which
-policies a server offers.
+policies a server offers. `audit URL` tells of the events of the Server object. `crowd URL COUNT` opens that many sessions at once and
+says how many came in; with `--vanish` each has a subscription, and its connection breaks off as that of a client that is killed.
 """
 
 import argparse
 import asyncio
 import datetime
+import os
 import pathlib
 import socket
 
@@ -137,6 +139,73 @@ async def endpoints(url):
     lifetime.say(policies=policies, urls=[one.EndpointUrl for one in found])
 
 
+FIELDS = ["EventType", "SourceName", "Status", "StatusCodeId", "ClientUserId", "ServerId", "NewValue", "OldValue", "MethodId"]
+NUMBERS = {
+    getattr(ua.ObjectIds, name): name
+    for name in ("AuditActivateSessionEventType", "AuditWriteUpdateEventType", "AuditUpdateMethodEventType")
+}
+
+
+class Audited:
+    def event_notification(self, event):
+        said = event.get_event_props_as_fields_dict()
+        plain = {name: opcua_session.plain(said[name].Value) for name in FIELDS}
+        plain["EventType"] = NUMBERS.get(said["EventType"].Value.Identifier, str(said["EventType"].Value))
+        for name in ("MethodId", "StatusCodeId"):
+            plain[name] = str(said[name].Value)
+        lifetime.say(**plain)
+
+
+async def audit(url):
+    async with Client(url, timeout=10) as client:
+        selects = [
+            ua.SimpleAttributeOperand(
+                TypeDefinitionId=ua.NodeId(ua.ObjectIds.BaseEventType),
+                BrowsePath=[ua.QualifiedName(name)],
+                AttributeId=ua.AttributeIds.Value,
+            )
+            for name in FIELDS
+        ]
+        subscription = await client.create_subscription(50, Audited())
+        await subscription.subscribe_events(evfilter=ua.EventFilter(SelectClauses=selects), queuesize=100)
+        lifetime.say(ready=True)
+        await asyncio.Event().wait()
+
+
+class Nobody:
+    def datachange_notification(self, _node, _value, _data):
+        pass
+
+
+async def crowd(args):
+    """How many of the clients came in, and what the others were told."""
+
+    async def come():
+        client = Client(args.endpoint, timeout=20)
+        client.session_timeout = 2_000 if args.vanish else 60_000
+        try:
+            await client.connect()
+            return client, "Good"
+        except Exception as error:  # whatever it is, it is the outcome
+            return client, status_of(error) or repr(error)
+
+    came = await asyncio.gather(*(come() for _ in range(args.count)))
+    said = {}
+    for _, outcome in came:
+        said[outcome] = said.get(outcome, 0) + 1
+    there = [client for client, outcome in came if outcome == "Good"]
+    if args.vanish:
+        for client in there:
+            subscription = await client.create_subscription(20, Nobody())
+            await subscription.subscribe_data_change(client.get_node(ua.NodeId(ua.ObjectIds.Server_ServerStatus_CurrentTime)))
+        lifetime.say(**said)
+        for client in there:
+            client.uaclient.protocol.transport.abort()
+        os._exit(0)
+    await asyncio.gather(*(client.disconnect() for client in there))
+    lifetime.say(**said)
+
+
 def ways(text):
     """`None,Basic256Sha256/Sign`"""
     for one in text.split(","):
@@ -163,12 +232,22 @@ def main():
     trying.add_argument("--password")
     telling = verbs.add_parser("endpoints")
     telling.add_argument("endpoint")
+    auditing = verbs.add_parser("audit")
+    auditing.add_argument("endpoint")
+    crowding = verbs.add_parser("crowd")
+    crowding.add_argument("endpoint")
+    crowding.add_argument("count", type=int)
+    crowding.add_argument("--vanish", action="store_true")
     args = parser.parse_args()
     lifetime.bound(120.0)
     if args.verb == "pairs":
         pairs(args.folder)
     elif args.verb == "endpoints":
         asyncio.run(endpoints(args.endpoint))
+    elif args.verb == "audit":
+        asyncio.run(audit(args.endpoint))
+    elif args.verb == "crowd":
+        asyncio.run(crowd(args))
     else:
         asyncio.run(tries(args))
 

@@ -7,9 +7,9 @@ use std::time::Duration;
 use super::cell::is_uri;
 use super::permissions;
 use crate::code::Code;
-use crate::document::{PubSubEntry, PublisherIdEntry, SecurityEntry, ServerEntry};
+use crate::document::{LimitsEntry, PubSubEntry, PublisherIdEntry, SecurityEntry, ServerEntry};
 use crate::findings::Findings;
-use crate::mapping::{Endpoint, PubSub, PublisherIdRule, SecurityPolicy, Server};
+use crate::mapping::{Endpoint, PubSub, PublisherIdRule, SecurityPolicy, Server, ServerLimits};
 use crate::read::{At, Field, given, short};
 use crate::secret::has_user;
 use crate::tree::Place;
@@ -260,9 +260,22 @@ pub(super) fn server(entry: Option<&At<ServerEntry>>, findings: &mut Findings) -
         application_uri: application_uri.unwrap_or(default.application_uri),
         security,
         anonymous: permissions::anonymous(entry),
+        limits: limits(&entry.limits, findings),
     };
     permissions::left_open(entry, &server, findings);
     server
+}
+
+fn limits(field: &Field<LimitsEntry>, findings: &mut Findings) -> ServerLimits {
+    let Some((entry, _)) = given(field) else {
+        return ServerLimits::default();
+    };
+    ServerLimits {
+        sessions: within(&entry.sessions, 1..=10_000, "sessions", findings),
+        subscriptions: within(&entry.subscriptions, 1..=1_000, "subscriptions", findings),
+        items: within(&entry.items, 1..=u16::MAX, "items", findings),
+        operations: within(&entry.operations, 1..=u16::MAX, "operations", findings),
+    }
 }
 
 fn security(

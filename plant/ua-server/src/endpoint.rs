@@ -2,8 +2,8 @@
 
 use std::net::SocketAddr;
 
-use mappings::{SecurityPolicy, Server};
-use opcua::server::ServerBuilder;
+use mappings::{SecurityPolicy, Server, ServerLimits};
+use opcua::server::{Limits, ServerBuilder};
 use opcua::types::{BuildInfo, UAString};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::limits;
@@ -52,13 +52,33 @@ pub(crate) fn server(
         // The library lets a request take the longer one of this and of what its client says, and what a client says is to
         // hold. Each call has an end of its own.
         .max_timeout_ms(0)
-        .limits(limits::server());
+        .limits(within(described.limits));
     for security in security {
         for (name, endpoint) in security.endpoints(url.path()) {
             builder = builder.add_endpoint(name, endpoint);
         }
     }
     builder
+}
+
+/// How much clients may take up.
+fn within(told: ServerLimits) -> Limits {
+    let mut limits = limits::server();
+    if let Some(sessions) = told.sessions {
+        limits.max_sessions = usize::from(sessions);
+    }
+    if let Some(subscriptions) = told.subscriptions {
+        limits.subscriptions.max_subscriptions_per_session = usize::from(subscriptions);
+    }
+    if let Some(items) = told.items {
+        limits.subscriptions.max_monitored_items_per_sub = usize::from(items);
+    }
+    if let Some(operations) = told.operations.map(usize::from) {
+        limits.operational.max_nodes_per_read = operations;
+        limits.operational.max_nodes_per_write = operations;
+        limits.operational.max_monitored_items_per_call = operations;
+    }
+    limits
 }
 
 const APPLICATION_NAME: &str = "UA bridge server";

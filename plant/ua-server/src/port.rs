@@ -265,6 +265,7 @@ impl Port for ServerPort {
                 was.application_uri != is.application_uri,
             ),
             ("server.security", was.security != is.security),
+            ("server.limits", was.limits != is.limits),
         ]
         .into_iter()
         .filter(|(_, differs)| *differs)

@@ -31,7 +31,10 @@ struct Site {
 
 impl Site {
     fn with(mapping: &str, args: &[&str]) -> Option<Self> {
-        let cell = Cell::with(&[Peer::Python])?;
+        Some(Self::of(Cell::with(&[Peer::Python])?, mapping, args))
+    }
+
+    fn of(cell: Cell, mapping: &str, args: &[&str]) -> Self {
         let pairs = cell.folder().join("pairs");
         let made = cell.asyncua_once("opcua_access.py", &["pairs", path(&pairs)]);
         assert_eq!(made.len(), 1);
@@ -42,7 +45,7 @@ impl Site {
             site.cell
                 .asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=0;i=2258"])
         });
-        Some(site)
+        site
     }
 
     /// Runs a verb, with a line for its stdin.
@@ -144,7 +147,10 @@ fn each_policy_takes_each_kind_of_user_and_each_may_do_what_its_role_may() {
         (outcome(&tried) == ["Good", "Good", "BadUserAccessDenied"]).then_some(())
     });
     let users = "anonymous,password,certificate,wrong,nobody,old";
-    let tries = site.tries(SETPOINT, SECURED, users, &[]);
+    let ways = SECURED.split(',');
+    let tries: Vec<Value> = ways
+        .flat_map(|way| site.tries(SETPOINT, way, users, &[]))
+        .collect();
     assert_eq!(tries.len(), 36);
     for tried in &tries {
         let wanted = match tried["user"].as_str().unwrap() {
@@ -167,6 +173,114 @@ fn each_policy_takes_each_kind_of_user_and_each_may_do_what_its_role_may() {
     // A name and a password do not go in clear.
     let clear = site.tried(SETPOINT, "None", "password");
     assert_ne!(clear["connected"], "Good", "{clear}");
+}
+
+/// As node-opcua sees it, which makes its signatures and secrets by other means.
+#[test]
+fn node_opcua_comes_in_by_each_policy_and_kind_of_user() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
+        return;
+    };
+    let site = Site::of(cell, MAPPING, &["--trust-any-client-certificate"]);
+    site.told(&["user", "add", "anna", "--role", "operator"], PASSWORD);
+    let certificate = site.pair("user");
+    let engineer = ["user", "add", "plc", "--role", "engineer", "--certificate"];
+    site.told(&[&engineer[..], &[&certificate]].concat(), "");
+    eventually("anonymous users only read", SOON, || {
+        (site.tried(LIMIT, "None", "anonymous")["write"] == "BadUserAccessDenied").then_some(())
+    });
+    let folder = site.cell.folder().join("pairs");
+    let users = "anonymous,password,certificate,wrong,nobody";
+    for way in SECURED.split(',') {
+        let args = [
+            SERVER_ENDPOINT,
+            path(&folder),
+            LIMIT,
+            "5",
+            way,
+            users,
+            "anna",
+            PASSWORD,
+        ];
+        let tries = site.cell.node_opcua_once("access.js", &args);
+        assert_eq!(tries.len(), 5, "{way}");
+        for tried in &tries {
+            let wanted = match tried["user"].as_str().unwrap() {
+                "anonymous" | "password" => [&json!("Good"), &json!("BadUserAccessDenied")],
+                "certificate" => [&json!("Good"), &json!("Good")],
+                _ => [&json!("BadUserAccessDenied"), &Value::Null],
+            };
+            assert_eq!([&tried["connected"], &tried["write"]], wanted, "{tried}");
+        }
+    }
+}
+
+#[test]
+fn who_came_in_wrote_and_was_refused_is_audited() {
+    let Some(site) = Site::with(MAPPING, &["--trust-any-client-certificate"]) else {
+        return;
+    };
+    site.told(&["user", "add", "anna", "--role", "operator"], PASSWORD);
+    eventually("anna is let in", SOON, || {
+        let tried = site.tried(SETPOINT, "Basic256Sha256/SignAndEncrypt", "password");
+        (tried["write"] == "Good").then_some(())
+    });
+    let mut audit = site
+        .cell
+        .asyncua("opcua_access.py", &["audit", SERVER_ENDPOINT]);
+    let way = "Basic256Sha256/SignAndEncrypt";
+    for (node, user) in [
+        (SETPOINT, "password"),
+        (LIMIT, "password"),
+        (SETPOINT, "wrong"),
+    ] {
+        let tried = site.tried(node, way, user);
+        assert!(tried["connected"].is_string(), "{tried}");
+    }
+    let mut told = |kind: &str, user: &str, ended: bool| {
+        audit.wait_for_json(&format!("{kind} of {user}: {ended}"), SOON, |line| {
+            let same = line.get("EventType")? == kind
+                && line["ClientUserId"] == user
+                && line["Status"] == ended;
+            same.then(|| line.clone())
+        })
+    };
+    let (came, wrote) = ("AuditActivateSessionEventType", "AuditWriteUpdateEventType");
+    assert_eq!(
+        told(came, "anna", true)["SourceName"],
+        "Session/ActivateSession"
+    );
+    let written = told(wrote, "anna", true);
+    assert_eq!(
+        [&written["OldValue"], &written["NewValue"]],
+        [5.0, 5.0],
+        "{written}"
+    );
+    assert_eq!(written["ServerId"], "urn:ua-bridge:server");
+    assert_eq!(told(wrote, "anna", false)["SourceName"], "Attribute/Write");
+    let refused = told(came, "anna", false);
+    assert!(!refused.to_string().contains("another one"), "{refused}");
+}
+
+#[test]
+fn more_sessions_than_there_may_be_are_refused_and_those_of_killed_clients_make_room() {
+    let mapping = format!("{MAPPING}server:\n  limits: {{sessions: 100}}\n");
+    let Some(site) = Site::with(&mapping, &[]) else {
+        return;
+    };
+    let crowd = |count: &str, more: &[&str]| {
+        let args = [&["crowd", SERVER_ENDPOINT, count], more].concat();
+        site.cell.asyncua_once("opcua_access.py", &args).remove(0)
+    };
+    assert_eq!(
+        crowd("200", &[]),
+        json!({"Good": 100, "BadTooManySessions": 100})
+    );
+    assert_eq!(crowd("100", &["--vanish"]), json!({"Good": 100}));
+    eventually("there is room for as many again", SOON, || {
+        (crowd("100", &[]) == json!({"Good": 100})).then_some(())
+    });
+    assert_eq!(site.tried(SETPOINT, "None", "anonymous")["write"], "Good");
 }
 
 #[test]
