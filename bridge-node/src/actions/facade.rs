@@ -166,14 +166,14 @@ fn hand_to(goal: &impl ServedGoal, feedback: &[u8]) {
     }
 }
 
-/// Asks for a goal, once more where it is not known whether it was heard: one of the same id is the same goal.
+/// Asks for a goal, once more where it is not known whether it was heard, as one of the same id is the same goal, and where
+/// it was not but somebody executes the action again.
 async fn send(asks: &Asks, id: GoalId, request: Bytes) -> Result<(), String> {
     let ask = || asks.goal.ask_for(request.clone());
     let answer = match ask().await {
-        Err(AskFault {
-            kind: AskErrorKind::Unknown,
-            ..
-        }) => ask().await,
+        Err(fault) if fault.kind == AskErrorKind::Unknown || comes_back(asks, &fault).await => {
+            ask().await
+        }
         answer => answer,
     };
     let text = match answer {
@@ -194,6 +194,23 @@ async fn send(asks: &Asks, id: GoalId, request: Bytes) -> Result<(), String> {
     let cancel = asks.cancel.clone().within(CANCEL_WITHIN);
     drop(cancel.ask_for(request).await);
     Err(text)
+}
+
+/// Whether a goal was refused since who executes the action is gone, and is back before it is given up: a server that is started
+/// anew is gone for a moment.
+async fn comes_back(asks: &Asks, fault: &AskFault) -> bool {
+    if fault.kind != AskErrorKind::Refused {
+        return false;
+    }
+    // Where it is gone, that is heard within moments of the refusal.
+    sleep(FIRST_PAUSE).await;
+    let mut gone = asks.gone.clone();
+    let Some(since) = *gone.borrow_and_update() else {
+        return false;
+    };
+    let left = (since + asks.silence).saturating_duration_since(now().monotonic);
+    let back = timeout(left, gone.wait_for(Option::is_none));
+    back.await.is_ok_and(|told| told.is_ok())
 }
 
 /// The end of a goal.

@@ -265,6 +265,8 @@ struct Space {
     clients: mpsc::Sender<ServerEvent<New, Request>>,
     statuses: Vec<Bytes>,
     served: Arc<Mutex<Vec<String>>>,
+    /// Nobody is known to execute anything.
+    deserted: bool,
 }
 
 impl Space {
@@ -298,12 +300,17 @@ impl Space {
             clients,
             statuses: Vec::new(),
             served,
+            deserted: false,
         }
     }
 
     /// With the action offered in both spaces.
     fn offered() -> Self {
-        let mut space = Self::new(QUICK);
+        Self::offered_by(QUICK)
+    }
+
+    fn offered_by(mapping: &str) -> Self {
+        let mut space = Self::new(mapping);
         let events = space.reconcile();
         assert_eq!(events.len(), 6, "{events:?}");
         space.announce(&events);
@@ -407,6 +414,14 @@ impl Space {
             }
             return;
         };
+        if self.deserted {
+            let refused = AskError {
+                kind: AskErrorKind::Refused,
+                status: StatusCode::GOOD,
+                text: "nobody executes it".to_owned(),
+            };
+            return self.calls.answered(ask, Err(refused));
+        }
         self.next += 1;
         let id = ExecutionId::new(self.next);
         let deadline = now().monotonic + timeout;
@@ -629,6 +644,39 @@ async fn a_goal_whose_server_dies_ends_with_the_reason() {
         panic!("it is rejected");
     };
     assert!(why.starts_with("not executed"), "{why}");
+}
+
+#[tokio::test]
+async fn a_goal_waits_for_a_server_that_is_started_anew_and_is_rejected_where_none_is() {
+    const PATIENT: &str = "spaces: [{id: 1}, {id: 2}]\npubsub: {receive_timeout: 60s}\n";
+    let mut space = Space::offered_by(PATIENT);
+    space.offering.gone(of_goals(), now().monotonic);
+    space.deserted = true;
+    let mut heard = space.client().await;
+    let pause = tokio::time::sleep(Duration::from_millis(300));
+    space.until(pause).await;
+    assert!(heard.try_recv().is_err(), "it waits");
+    space.deserted = false;
+    let events = Space::new(PATIENT).reconcile();
+    space.announce(&events);
+    let goal = space.server().await;
+    let accepted = GoalEvent::Accepted(Timestamp::from_unix_nanos(1_000));
+    goal.say.send(accepted).await.unwrap();
+    assert_eq!(space.told(&mut heard).await, Told::Accepted);
+
+    for is_gone in [true, false] {
+        let mut space = Space::offered();
+        space.deserted = true;
+        if is_gone {
+            space.offering.gone(of_goals(), now().monotonic);
+        }
+        let mut heard = space.client().await;
+        let told = space.told(&mut heard).await;
+        assert_eq!(
+            told,
+            Told::Rejected("not executed: nobody executes it".to_owned())
+        );
+    }
 }
 
 #[tokio::test]
