@@ -1,11 +1,12 @@
 """An asyncua client that finds a Method of the server by its path below Objects, waits for it, says what it takes and gives,
-and calls it once for each --value, a JSON list of arguments. An argument is a value of the type the Method takes, or an
-object with the name of another type and the value; with --structures that of a structure, by the definitions the server has. A
-JSON line for each answer, or its status."""
+and calls it once for each --value, a JSON list of arguments. An argument is a value of the type the Method takes (a
+ByteString in hexadecimal digits, a DateTime as ISO 8601 has it), or an object with the name of another type and the value;
+with --structures that of a structure, by the definitions the server has. A JSON line for each answer, or its status."""
 
 import argparse
 import asyncio
 import dataclasses
+import datetime
 import json
 import time
 
@@ -67,6 +68,10 @@ def argument(value, kind):
         if name in ua.VariantType.__members__:
             return ua.Variant(value, ua.VariantType[name])
         return ua.Variant([built(getattr(ua, name), one) for one in value], ua.VariantType.ExtensionObject)
+    if kind == ua.VariantType.ByteString.value and isinstance(value, str):
+        value = bytes.fromhex(value)
+    if kind == ua.VariantType.DateTime.value and isinstance(value, str):
+        value = datetime.datetime.fromisoformat(value)
     return ua.Variant(value, ua.VariantType(kind)) if kind else ua.Variant(value)
 
 

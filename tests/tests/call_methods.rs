@@ -10,7 +10,7 @@ use system_tests::{
 };
 
 /// rospy, rclpy and asyncua need seconds to start on a busy machine.
-const SOON: Duration = Duration::from_secs(40);
+const SOON: Duration = Duration::from_secs(60);
 const MAPPING: &str = "
 spaces: [{id: 1}, {id: 2, domain: 2}]
 namespaces: {2: 'urn:test:belt'}
@@ -153,9 +153,13 @@ fn who_executes_is_told_that_a_client_has_given_up_or_gone_and_the_method_moves_
         cell.asyncua_started("opcua_call.py", &args).start()
     };
     // Its time is the one it gives, and not the one of the mapping.
-    let mut client = asked("2");
+    let mut client = asked("8");
     assert_eq!(line(&mut client, "node")["node"], "ns=2;s=Old");
-    line(&mut client, "given_up");
+    // The server tells it so, or it is told too late.
+    client.wait_for_json("it has given up", SOON, |line| {
+        let told = line["fault"] == "BadTimeout" || line["given_up"] == true;
+        told.then_some(())
+    });
     eventually("the first is abandoned", SOON, || {
         (executor.abandoned() == 1).then_some(())
     });
@@ -449,4 +453,50 @@ calls:
         (&json!(1), &json!(true)),
         "{told}"
     );
+}
+
+#[test]
+fn asyncua_drives_an_action_of_ros_2_by_its_methods() {
+    let Some(cell) = Cell::with(&[Peer::Ros2, Peer::Python]) else {
+        return;
+    };
+    let args = ["serve", "/ua_2_2_70"];
+    let server = cell.rclpy_started(Distribution::Kilted, "ros2_rclpy_action.py", &args);
+    let mut server = server.told().start().ready(SOON);
+    let _bridge = cell.bridge_ros2(&[]);
+    let _ua_server = cell.ua_server(&[]);
+    let ask = |method: &str, values: &Value| {
+        let (method, values) = (format!("UaSpace/Calls/{method}"), values.to_string());
+        let args = [
+            SERVER_ENDPOINT,
+            &method,
+            "--value",
+            &values,
+            "--patience",
+            "40",
+        ];
+        let mut client = cell.asyncua_started("opcua_call.py", &args).start();
+        let answer = line(&mut client, "status");
+        assert_eq!(answer["status"], "Good", "{method}: {answer}");
+        answer["value"].clone()
+    };
+    let ids = ["01", "02"].map(|byte| byte.repeat(16));
+    let accepted = |id: &str, order: i32| ask("ua_2_2_70", &json!([id, order]))[0].clone();
+    // It reports the first three numbers, and goes on until it is cancelled.
+    assert_eq!(accepted(&ids[0], 100), true);
+    assert_eq!(accepted(&ids[1], -1), false);
+    eventually("its feedback is shown", SOON, || {
+        let told = cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=1;s=ua_2_2_73"])?;
+        // Two fields: whose it is, and the numbers.
+        let shown = told[0]["value"].to_string();
+        shown.contains("[1, 1, 2]").then_some(())
+    });
+    let cancelled = ask("ua_2_2_71", &json!([ids[0], "1601-01-01"]));
+    assert_eq!(cancelled[0], 0);
+    server.wait_for_json("the server agrees", SOON, |line| {
+        (line.get("cancel")? == 100).then_some(())
+    });
+    // CANCELED of action_msgs/GoalStatus, and what it had until then.
+    let result = ask("ua_2_2_72", &json!([ids[0]]));
+    assert_eq!((&result[0], &result[2]), (&json!(5), &json!([1, 1, 2])));
 }
