@@ -6,6 +6,7 @@ although it was cancelled, and one of 112 is aborted.
 
 `call` does what lines of standard input say: `send ORDER`, `cancel N`, `cancel_all`, `cancel_unknown`, `cancel_until N`, `result N`,
 `result_unknown`, and `back` and `gone`, which wait for a server or none, with N counting goals from 0; by itself it asks for no result unless told --results.
+`accepts N` sends N goals of 0, each when the one before was accepted, and tells how long that took.
 
 Both tell when asked: `node NAME`, the actions of a node; `action NAME`, the endpoints of an action; `participants`,
 how many processes there are; `watch`, the statuses, one line each, as one hears them who comes now; `leave`, which ends it as rclpy ends.
@@ -112,6 +113,7 @@ class Client:
         self.cancel = node.create_client(CancelGoal, f"{args.action}/_action/cancel_goal")
         self.result = node.create_client(Fibonacci.Impl.GetResultService, f"{args.action}/_action/get_result")
         self.ids, self.handles, self.said, self.asked, self.waits = [], {}, {}, [], []
+        self.took = []
 
     def ready(self):
         services = (self.cancel, self.result)
@@ -138,6 +140,19 @@ class Client:
         if handle.accepted and self.args.results:
             self.then(handle.get_result_async(), lambda answer: self.ended(number, answer))
 
+    def measure(self, left):
+        if not left:
+            lifetime.say(ns=self.took)
+            self.took = []
+            return
+        start = time.monotonic_ns()
+
+        def accepted(future):
+            self.took.append(time.monotonic_ns() - start)
+            self.measure(left - 1)
+
+        self.end.send_goal_async(Fibonacci.Goal(order=0)).add_done_callback(accepted)
+
     def ended(self, number, answer):
         lifetime.say(result=number, status=NAMES[answer.status], sequence=list(answer.result.sequence))
 
@@ -157,6 +172,8 @@ class Client:
         unknown = UUID(uuid=list(uuid.uuid4().bytes))
         if verb == "send":
             self.send(number)
+        elif verb == "accepts":
+            self.measure(number)
         elif verb == "cancel":
             self.then(self.handles[number].cancel_goal_async(), self.cancelled)
         elif verb == "cancel_until":

@@ -1,10 +1,12 @@
 """An actionlib client. Lines of standard input tell it what to do: {"send": GOAL}, {"cancel": N} with N counting goals from 0,
-{"cancel_all": true}. It prints what it hears of its goals. With --plain several goals go on side by side, else a newer goal
+{"cancel_all": true}, and with --plain {"accepts": N}, which sends N empty goals, each when the one before was accepted, and tells how long that
+took. It prints what it hears of its goals. With --plain several goals go on side by side, else a newer goal
 ends the interest in an older one."""
 
 import argparse
 import json
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -46,6 +48,23 @@ class Plain:
 
     def cancel(self, count):
         self.sent[count].cancel()
+
+    def accepts(self, goal, count):
+        took = []
+        for _ in range(count):
+            accepted = threading.Event()
+
+            def transition(handle, accepted=accepted):
+                if handle.get_comm_state() not in (actionlib.CommState.WAITING_FOR_GOAL_ACK, actionlib.CommState.PENDING):
+                    accepted.set()
+
+            start = time.monotonic_ns()
+            # Who has no handle of a goal hears nothing of it.
+            handle = self.client.send_goal(goal, transition)
+            accepted.wait()
+            took.append(time.monotonic_ns() - start)
+            del handle
+        lifetime.say(ns=took)
 
 
 class Simple:
@@ -106,6 +125,8 @@ def main():
             goal = type(kind().action_goal.goal)()
             genpy.message.fill_message_args(goal, [order["send"]])
             driving.send(goal)
+        elif "accepts" in order:
+            driving.accepts(type(kind().action_goal.goal)(), order["accepts"])
         elif "cancel" in order:
             driving.cancel(order["cancel"])
         else:

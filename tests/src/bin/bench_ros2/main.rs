@@ -7,6 +7,7 @@ mod bursts;
 mod calls;
 mod ends;
 mod floods;
+mod goals;
 mod idle;
 mod joining;
 mod many;
@@ -30,7 +31,7 @@ fn main() -> ExitCode {
         print!("{HELP}");
         return ExitCode::SUCCESS;
     }
-    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::FastDds, Peer::CycloneC]) else {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Ros2, Peer::FastDds, Peer::CycloneC]) else {
         return ExitCode::FAILURE;
     };
     if plan.has("round-trip") || plan.has("throughput") {
@@ -45,7 +46,7 @@ fn main() -> ExitCode {
     if plan.has("many") {
         many::measure(&cell, plan.seconds);
     }
-    if ["through", "bursts", "floods", "calls"]
+    if ["through", "bursts", "floods", "calls", "goals"]
         .iter()
         .any(|part| plan.has(part))
     {
@@ -58,6 +59,9 @@ fn main() -> ExitCode {
         }
         if plan.has("calls") {
             calls::measure(&cell, plan.calls);
+        }
+        if plan.has("goals") {
+            goals::measure(&cell, plan.calls / 4);
         }
         if plan.has("floods") {
             floods::measure(&cell, plan.turns.min(FLOODS));
@@ -124,7 +128,7 @@ impl Plan {
 
 /// Each takes seconds.
 const FLOODS: u64 = 3;
-const PARTS: [&str; 9] = [
+const PARTS: [&str; 10] = [
     "round-trip",
     "throughput",
     "joining",
@@ -134,6 +138,7 @@ const PARTS: [&str; 9] = [
     "bursts",
     "floods",
     "calls",
+    "goals",
 ];
 
 const HELP: &str = "\
@@ -142,5 +147,5 @@ bench-ros2 [--quick] [--seconds N] [--turn N] [PART..]
   --quick      a trial of a minute; its figures are no measurement
   --seconds N  how long each path gets messages at 1 kHz, 20 unless told
   --turn N     samples through one relay before the next has its turn, 50 unless told
-  PART         round-trip, throughput, joining, idle, many, through, bursts, floods, calls; all unless told
+  PART         round-trip, throughput, joining, idle, many, through, bursts, floods, calls, goals; all unless told
 ";
