@@ -56,7 +56,9 @@ impl Distribution {
         self.prefix().join("share").join(package)
     }
 
-    pub(crate) fn python(self) -> PathBuf {
+    /// Its Python interpreter, with rclpy.
+    #[must_use]
+    pub fn python(self) -> PathBuf {
         self.prefix().join("bin/python")
     }
 

@@ -62,6 +62,13 @@ impl Started {
         self
     }
 
+    /// The process works in that folder.
+    #[must_use]
+    pub fn in_folder(mut self, folder: &Path) -> Self {
+        self.command.current_dir(folder);
+        self
+    }
+
     /// The signal that ends the process in order, where that is not SIGTERM.
     #[must_use]
     pub fn ends_on(mut self, signal: Signal) -> Self {

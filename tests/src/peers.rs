@@ -30,6 +30,20 @@ pub(crate) fn cyclone_uri(interface: &str, discovery: &str) -> String {
     )
 }
 
+const NAVIGATE: &str = "\
+geometry_msgs/PoseStamped pose
+string behavior_tree
+---
+uint16 error_code
+string error_msg
+---
+geometry_msgs/PoseStamped current_pose
+builtin_interfaces/Duration navigation_time
+builtin_interfaces/Duration estimated_time_remaining
+int16 number_of_recoveries
+float32 distance_remaining
+";
+
 impl Cell {
     /// A running ROS 1 master: it has answered `getPid`.
     #[must_use]
@@ -245,6 +259,25 @@ impl Cell {
         self.asyncua("uadp_listen.py", &[&format!("opc.udp://{GROUP}")])
     }
 
+    /// The Python that has asyncua.
+    #[must_use]
+    pub fn asyncua_python(&self) -> &Path {
+        &self.python
+    }
+
+    /// What `AMENT_PREFIX_PATH` names where Nav2's action of a pose is installed: a folder of this cell with that.
+    ///
+    /// # Panics
+    /// When it cannot be written.
+    #[must_use]
+    pub fn nav2_prefix(&self) -> PathBuf {
+        let prefix = self.folder().join("nav2");
+        let folder = prefix.join("share/nav2_msgs/action");
+        std::fs::create_dir_all(&folder).unwrap();
+        std::fs::write(folder.join("NavigateToPose.action"), NAVIGATE).unwrap();
+        prefix
+    }
+
     fn python(&self, script: &str, args: &[&str]) -> Started {
         Started::new(script, &self.python)
             .env("PYTHONUNBUFFERED", "1")
@@ -278,7 +311,8 @@ impl Cell {
     }
 
     /// The environment of a ROS 1 program in this cell.
-    pub(crate) fn with_ros1(&self, started: Started) -> Started {
+    #[must_use]
+    pub fn with_ros1(&self, started: Started) -> Started {
         started
             .env("PATH", "/usr/bin:/bin")
             .env("PYTHONUNBUFFERED", "1")

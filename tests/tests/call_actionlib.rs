@@ -213,28 +213,6 @@ fn a_goal_goes_on_without_its_client_and_ends_without_its_server() {
 }
 
 const NAVIGATION: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../mappings/navigation.yaml");
-const NAVIGATE: &str = "\
-geometry_msgs/PoseStamped pose
-string behavior_tree
----
-uint16 error_code
-string error_msg
----
-geometry_msgs/PoseStamped current_pose
-builtin_interfaces/Duration navigation_time
-builtin_interfaces/Duration estimated_time_remaining
-int16 number_of_recoveries
-float32 distance_remaining
-";
-
-/// An installation of ROS 2 that has Nav2's action.
-fn ament_prefix(cell: &Cell) -> String {
-    let prefix = cell.folder().join("ros");
-    let folder = prefix.join("share/nav2_msgs/action");
-    std::fs::create_dir_all(&folder).unwrap();
-    std::fs::write(folder.join("NavigateToPose.action"), NAVIGATE).unwrap();
-    prefix.display().to_string()
-}
 
 #[test]
 fn a_client_of_move_base_drives_a_base_of_ros_2() {
@@ -244,7 +222,7 @@ fn a_client_of_move_base_drives_a_base_of_ros_2() {
     let _core = cell.roscore();
     let mut base = cell.cyclone("calls/ros2_navigate.py", &["/navigate_to_pose"]);
     let bridge = cell.bridge_ros2_alone(&[NAVIGATION]);
-    let bridge = bridge.env("AMENT_PREFIX_PATH", ament_prefix(&cell));
+    let bridge = bridge.env("AMENT_PREFIX_PATH", cell.nav2_prefix());
     let _bridges = (cell.bridge_ros1(&[NAVIGATION]), bridge.start());
     let mut client = actionlib_client(&cell, &["/move_base", "move_base_msgs/MoveBase"]);
     let pose = |x: f64| {

@@ -1,6 +1,9 @@
 //! Every kind of executor asked by every kind of asker, with requests and responses of every kind.
 //!
-//! The table of the guide is the one that this test sees.
+//! The tables of the guide are those that these tests see.
+
+#[path = "call_matrix/actions.rs"]
+mod actions;
 
 use serde_json::{Value, json};
 use system_tests::{Asker, Asking, Cell, Child, Distribution, Peer, Started, program};
@@ -28,6 +31,7 @@ const ASKING: [Asking; 8] = [
 const PLC: &str = "opc.tcp://127.0.0.1:4841";
 
 const METHOD: &str = "Method (asyncua)";
+const SKILL: &str = "skill of a component";
 
 /// One call, under all its names.
 struct Call {
@@ -81,7 +85,7 @@ impl Executing {
         methods
     }
 
-    /// Methods of a skill.
+    /// Methods of a skill, which is Halted at first. Each who asks has it Ready, at work, and Halted again.
     fn skill() -> Self {
         let call = |letter, case, service: &str, method: &str, number| Call {
             letter,
@@ -91,7 +95,7 @@ impl Executing {
             topic: format!("ua_0_7_{number}"),
         };
         Self {
-            name: "skill of a component",
+            name: SKILL,
             space: 0,
             calls: vec![
                 call('B', "skill", "/ua_0_7_109", "Reset", 109),
@@ -99,6 +103,11 @@ impl Executing {
                 call('E', "skill", "/ua_0_7_106", "Halt", 106),
             ],
         }
+    }
+
+    /// Calls of each who asks, of each case: what changes the state of a skill can be asked for once.
+    fn count(&self) -> u64 {
+        if self.name == SKILL { 1 } else { COUNT }
     }
 
     /// As its peers take them.
@@ -181,7 +190,7 @@ fn component(cell: &Cell) -> Child {
         .start()
 }
 
-/// Asks all at once for one call; whether each is answered, and right each time.
+/// Asks all of them at once for one call; whether each is answered, and right each time.
 fn asked(askers: &mut [(Asking, Asker)], executing: &Executing, call: &Call) -> Vec<Option<bool>> {
     let away = |asking: &Asking| !is_at_home(*asking, executing);
     for ((asking, asker), turn) in askers.iter_mut().zip(0..).filter(|((of, _), _)| away(of)) {
@@ -193,14 +202,14 @@ fn asked(askers: &mut [(Asking, Asker)], executing: &Executing, call: &Call) -> 
             }
         };
         asker.begin(json!({
-            "case": call.case, "service": service, "first": 10 * turn, "count": COUNT,
+            "case": call.case, "service": service, "first": 10 * turn, "count": executing.count(),
             "wait": 20, "patience": 20,
         }));
     }
     let told = askers.iter_mut().map(|(asking, asker)| {
         away(asking).then(|| {
             let told = asker.told();
-            let right = told["right"] == COUNT;
+            let right = told["right"] == executing.count();
             if !right {
                 let (case, asking) = (call.case, asking.name());
                 eprintln!("{case} of {} asked by {asking}: {told}", executing.name);
@@ -215,13 +224,23 @@ fn asked(askers: &mut [(Asking, Asker)], executing: &Executing, call: &Call) -> 
 fn row(askers: &mut [(Asking, Asker)], executing: &Executing) -> Vec<String> {
     let mut cells = vec![executing.name.to_owned()];
     cells.extend(askers.iter().map(|_| String::new()));
-    for call in &executing.calls {
-        let seen = asked(askers, executing, call);
-        for (cell, right) in cells[1..].iter_mut().zip(seen) {
-            match right {
-                Some(true) => cell.push(call.letter),
-                Some(false) => {}
-                None => *cell = "direct".to_owned(),
+    // Of a skill one after the other: what its state does not allow, or who else has the lease, is refused.
+    let together = if executing.name == SKILL {
+        1
+    } else {
+        askers.len()
+    };
+    for (askers, cells) in askers
+        .chunks_mut(together)
+        .zip(cells[1..].chunks_mut(together))
+    {
+        for call in &executing.calls {
+            for (cell, right) in cells.iter_mut().zip(asked(askers, executing, call)) {
+                match right {
+                    Some(true) => cell.push(call.letter),
+                    Some(false) => {}
+                    None => *cell = "direct".to_owned(),
+                }
             }
         }
     }

@@ -1,5 +1,8 @@
 //! Services of one ROS, asked for from the other: under their names of the space, and as a mapping says.
 
+#[path = "call_services/examples.rs"]
+mod examples;
+
 use std::fs;
 use std::path::Path;
 use std::time::Duration;

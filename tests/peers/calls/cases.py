@@ -148,15 +148,11 @@ class Switch(Bundled):
 
 
 class Skill(Empty):
-    """A Method of a component's skill: done, or refused in its own words, as its state or somebody's lease demands."""
+    """A Method of a component's skill, where its state allows it."""
 
     @staticmethod
-    def allowed(success, message):
-        return bool(success) or message.startswith(("BadInvalidState", "BadLocked"))
-
-    @classmethod
-    def right(cls, response, number):
-        return cls.allowed(response.success, response.message)
+    def right(response, number):
+        return bool(response.success)
 
 
 class Grasp(Files):
@@ -171,9 +167,7 @@ class Grasp(Files):
 
     @staticmethod
     def right(response, number):
-        if hasattr(response, "success"):
-            return Skill.right(response, number)
-        return Skill.allowed(response.bool_value, response.string_value)
+        return bool(response.success if hasattr(response, "success") else response.bool_value)
 
 
 class Loggers(Empty):
