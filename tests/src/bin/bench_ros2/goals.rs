@@ -50,7 +50,9 @@ impl Ways {
         let [of_ros1, of_ros2] = servers.map(|server| server.told().start().ready(START));
         let bridges = [cell.bridge_ros1(&[]), cell.bridge_ros2(&[])];
         let by_actionlib = |action: &str| {
-            let args = [action, TYPE, "--plain", "--limit", LIMIT];
+            // Of two nodes of one name the master ends the first.
+            let node = action.trim_start_matches('/');
+            let args = [action, TYPE, "--plain", "--limit", LIMIT, "--node", node];
             cell.rospy_started("calls/actionlib_client.py", &args)
         };
         let by_rclpy = |action: &str| {
