@@ -173,17 +173,17 @@ fn network_header(space: u16, namespace: u16, utc: Timestamp) -> NetworkHeader<'
     }
 }
 
-/// The header of a sample taken from the local side at `taken`.
+/// The header of a sample taken from the local side at `taken`, of that quality.
 pub(crate) fn data_set_header(
     sequence: u16,
-    taken: Timestamp,
+    (taken, status): (Timestamp, u16),
     major_version: Option<u32>,
 ) -> DataSetHeader {
     DataSetHeader {
         sequence_number: Some(sequence),
         timestamp: Some(taken.time),
         picoseconds: Some(taken.picoseconds),
-        status: Some(0),
+        status: Some(status),
         major_version,
         ..DataSetHeader::default()
     }

@@ -201,6 +201,12 @@ impl Router {
 
     /// A sample was heard on the local side.
     pub fn handle_local(&mut self, heard: Heard<'_>, now: Now) -> Verdict {
+        self.handle_local_as(heard, GOOD, now)
+    }
+
+    /// As [`handle_local`](Self::handle_local), of a side that knows the quality of its samples: the upper 16 bits of a
+    /// StatusCode, which go out as the Status of the DataSetMessage (OPC 10000-14, 7.2.4.5.4).
+    pub fn handle_local_as(&mut self, heard: Heard<'_>, status: u16, now: Now) -> Verdict {
         let Heard {
             topic,
             payload,
@@ -237,7 +243,7 @@ impl Router {
         };
         let stamp = writer.stamp(received);
         let version = description.as_ref().map(|said| said.major_version());
-        let header = data_set_header(writer.expected_sequence(), stamp, version);
+        let header = data_set_header(writer.expected_sequence(), (stamp, status), version);
         let mut written = encode(&mut encoded, topic, &header, now.utc, &sample);
         let large = encoded.bytes.len() > usize::from(max_datagram);
         if written.is_ok() && large {
@@ -656,5 +662,7 @@ impl Router {
 }
 
 /// Buffers kept for reuse, and how large each may have grown.
+/// The upper half of the StatusCode Good.
+const GOOD: u16 = 0;
 const SPARE_BUFFERS: usize = 64;
 const SPARE_CAPACITY: usize = 128 * 1024;

@@ -43,7 +43,7 @@ pub use exit::{Failure, FailureKind};
 pub use keys::{Fetched, Fetching, KeyRequest, KeyService};
 pub use logging::{LogFormat, LogRecord, LogSink, hear_log};
 pub use metrics::{Requests, Told, serve_pages};
-pub use port::{Delivery, Execution, Port, PortEvent};
+pub use port::{Delivery, Execution, LinkState, Port, PortEvent};
 pub use present::Present;
 pub use program::{Context, Made, Program, run};
 pub use service::{Service, run_service};

@@ -1,5 +1,6 @@
 //! What a bridge program brings to the shell: its own side of the bridge.
 
+use std::collections::BTreeMap;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,6 +12,7 @@ use bridge_core::{
 use bytes::Bytes;
 use mappings::{Mapping, TopicId};
 use messages::{MessageType, Selection, ServiceType};
+use serde::Serialize;
 use type_files::TypePaths;
 use uadp::{BuiltinType, Timestamp};
 
@@ -96,6 +98,11 @@ pub trait Port: Send + 'static {
         None
     }
 
+    /// The other servers that this side is connected to, or tries to be.
+    fn links(&self) -> Vec<LinkState> {
+        Vec::new()
+    }
+
     /// The addresses of this host that this side has taken for good when it started, all there were where the list is
     /// empty: its library cannot go over to others. `None` where it goes by itself.
     fn addresses(&self) -> Option<&[IpAddr]> {
@@ -104,6 +111,33 @@ pub trait Port: Send + 'static {
 
     /// Withdraws every registration and ends. Bounded by 2 s.
     fn shutdown(self) -> impl Future<Output = ()> + Send;
+}
+
+/// A server that a side has a link to, by its name in the mapping, and what came and went over it since the start.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+pub struct LinkState {
+    /// What the mapping calls it.
+    pub name: String,
+    /// Where it is.
+    pub url: String,
+    /// Whether there is a connection.
+    pub up: bool,
+    /// Whether it is signed and encrypted.
+    pub secured: bool,
+    /// Why there is no connection, for people.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub why: Option<String>,
+    /// How often there has been a connection.
+    pub connects: u64,
+    /// Values that came, of whatever quality.
+    pub values: u64,
+    /// Values that were written there.
+    pub written: u64,
+    /// Values that were not: the server refused them, they waited too long, or they gave way to newer ones.
+    pub not_written: u64,
+    /// What cannot be had there, by its name in the mapping, and why.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub faults: BTreeMap<String, String>,
 }
 
 /// A request for the local side to execute.
@@ -164,6 +198,17 @@ pub enum PortEvent {
         /// Who published it, if that publisher latches: the same for as long as it is there, and for no other of the
         /// topic.
         latched_by: Option<PublisherKey>,
+    },
+    /// As `Sample`, of a side that knows the quality of its values.
+    Qualified {
+        /// Which value.
+        topic: TopicId,
+        /// It, in the port's encoding.
+        payload: Bytes,
+        /// When it was taken.
+        taken: Timestamp,
+        /// The upper 16 bits of its OPC UA StatusCode; 0 for Good.
+        status: u16,
     },
     /// A latched publisher has gone for good: its last message is not for late joiners any more.
     Left {

@@ -220,6 +220,7 @@ impl<P: Port> Shell<P> {
                 interfaces,
             },
         )
+        .with_links(self.port.links())
     }
 
     /// What is told of secured groups without keys.
@@ -334,6 +335,21 @@ impl<P: Port> Shell<P> {
                 self.busy.arrived(now.monotonic);
                 // Counted by the router, whatever it is.
                 let _verdict = self.router.handle_local(heard, now);
+            }
+            PortEvent::Qualified {
+                topic,
+                payload,
+                taken,
+                status,
+            } => {
+                let heard = Heard {
+                    topic,
+                    payload: &payload,
+                    received: taken,
+                    latched_by: None,
+                };
+                // Counted by the router, whatever it is.
+                let _verdict = self.router.handle_local_as(heard, status, now());
             }
             PortEvent::Bound {
                 topic,

@@ -9,6 +9,7 @@ use serde::Serialize;
 
 use crate::mapping_file::About;
 use crate::metrics::Told;
+use crate::port::LinkState;
 
 /// A program's counters and delays at one moment.
 #[derive(Debug, Clone, Serialize)]
@@ -23,6 +24,9 @@ pub(crate) struct Status {
     topics: BTreeMap<String, TopicStatus>,
     /// Calls that are known, asked for or executed here.
     calls: BTreeMap<String, CallStatus>,
+    /// Other servers that the program is a client of.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    servers: Vec<LinkState>,
     /// Datagrams and messages that belong to no topic.
     others: TopicStatus,
     hops: BTreeMap<&'static str, HopStatus>,
@@ -144,9 +148,15 @@ impl Status {
             groups: groups.collect(),
             topics,
             calls,
+            servers: Vec::new(),
             others: router.others().into(),
             hops,
         }
+    }
+
+    pub(crate) fn with_links(mut self, links: Vec<LinkState>) -> Self {
+        self.servers = links;
+        self
     }
 
     /// How many topics there are, and how many samples were sent, delivered and dropped, routine drops included.
@@ -243,6 +253,15 @@ impl Told for Status {
                     count,
                 );
             }
+        }
+        for link in &self.servers {
+            let labels = format!("{own},server=\"{}\"", link.name);
+            line("server_up", &labels, &u8::from(link.up));
+            line("server_connects_total", &labels, &link.connects);
+            line("server_values_total", &labels, &link.values);
+            line("server_written_total", &labels, &link.written);
+            line("server_not_written_total", &labels, &link.not_written);
+            line("server_faults", &labels, &link.faults.len());
         }
         for (hop, delays) in &self.hops {
             let labels = format!("{own},hop=\"{hop}\"");

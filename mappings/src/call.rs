@@ -4,9 +4,9 @@ use std::time::Duration;
 
 use messages::{Literal, TypeName};
 
-use crate::mapping::Endpoint;
 use crate::node_id::{ExpandedNodeIdText, NodeIdText};
 use crate::permission::Role;
+use crate::remote::Access;
 use crate::topic::{SpaceId, TopicId};
 
 /// One call of the space: an OPC UA Method, the service or action that executes it, and those that ask for it.
@@ -68,8 +68,10 @@ pub struct CallTarget {
 /// A Method of an OPC UA server.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct MethodTarget {
-    /// Where the server is.
-    pub endpoint: Endpoint,
+    /// How the server is reached.
+    pub access: Access,
+    /// Its name, if it is one of `servers`.
+    pub server: Option<String>,
     /// The Object the Method is called on.
     pub object: ExpandedNodeIdText,
     /// The Method.

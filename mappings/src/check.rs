@@ -9,8 +9,10 @@ mod names;
 mod network;
 mod patterns;
 mod permissions;
+mod remote;
 mod security;
 mod selection;
+mod servers;
 mod services;
 mod several;
 mod shaping;
@@ -294,10 +296,12 @@ fn compile(
     let namespaces = cell::namespaces(document.namespaces.as_ref(), findings);
     let pubsub = network::pubsub(document.pubsub.as_ref(), findings);
     let server = network::server(document.server.as_ref(), findings);
+    let servers = servers::check(document.servers.as_ref(), &server.endpoint, findings);
     let variables = match &document.variables {
         Some(entries) => {
             let entries = entries.value.as_deref().unwrap_or_default();
-            variables::check(entries, (&spaces, &namespaces), &mut types, findings)
+            let known = (&spaces, &namespaces, &servers);
+            variables::check(entries, known, &mut types, findings)
         }
         None => Vec::new(),
     };
@@ -316,6 +320,7 @@ fn compile(
                 namespaces: &namespaces,
                 variables: &variables,
                 server: &server.endpoint,
+                servers: &servers,
             };
             calls::check(entries, known, &mut types, findings)
         }
@@ -329,6 +334,7 @@ fn compile(
     let mapping = Mapping::new(pubsub, spaces.known, namespaces.known, server, variables);
     *used = types.used();
     let mapping = mapping
+        .with_servers(servers.known)
         .with_calls(calls)
         .with_security(security)
         .with_patterns(patterns)

@@ -11,6 +11,7 @@ use crate::call::Assigned;
 use crate::code::Code;
 use crate::mapping::UaField;
 use crate::read::{At, Read, Reader, choice, document, short};
+use crate::server_entries::{FromEntry, RemoteServerEntry, ToEntry};
 use crate::tree::{Kind, Node, Place};
 
 pub(crate) use security::{
@@ -35,6 +36,9 @@ document! {
         security: Vec<At<GroupEntry>>,
         /// The OPC UA server of the cell.
         server: ServerEntry,
+        /// OPC UA servers that exist already, such as those of PLCs, at most 256: variables come `from` them or go `to` them, and
+        /// calls are executed by Methods of theirs.
+        servers: Vec<At<RemoteServerEntry>>,
         /// Namespace index in node ids -> namespace URI. A server may number its namespaces otherwise; the URI counts.
         #[schemars(with = "Option<BTreeMap<u16, String>>")]
         namespaces: Namespaces,
@@ -164,6 +168,11 @@ document! {
         /// The ROS topics and services tied to the value, one or a list, at most one per space. In the space of its origin
         /// the topic is read, elsewhere it is written. Without any, the topic is named after the space: /ua_1_2_10.
         ros: Bindings,
+        /// With `origin: 0`: the node of another OPC UA server that the value comes from. The cell's server hears of each change,
+        /// and shows and sends it with the time and the quality it has there; while that server is away it is bad.
+        from: FromEntry,
+        /// The node of another OPC UA server that each value is written to, be it of this space or of another.
+        to: ToEntry,
         /// What its queue does when full: `keep_latest` (the default, for states) or `{drop_oldest: 100}` (for events). Of
         /// values that call a service, `keep_latest` tries the newest until it is taken or replaced, `drop_oldest` each
         /// once within its `timeout`.
@@ -360,10 +369,13 @@ document! {
         result: FieldMapEntry,
     }
 
-    /// A Method of an OPC UA server.
+    /// A Method of an OPC UA server: of one of `servers`, or of the one at an endpoint.
+    #[schemars(extend("oneOf" = [{ "required": ["server"] }, { "required": ["endpoint"] }]))]
     struct MethodEntry {
-        /// The server, as opc.tcp://127.0.0.1:4841.
-        #[schemars(required, regex(pattern = r"^opc\.tcp://"))]
+        /// The server, by its `name` among `servers`.
+        server: String,
+        /// The server, as opc.tcp://127.0.0.1:4841, for anonymous users.
+        #[schemars(regex(pattern = r"^opc\.tcp://"))]
         endpoint: String,
         /// The Object that the Method is called on, as nsu=urn:plc;s=Line: its namespace by the URI, which holds when the server
         /// numbers its namespaces anew, or by the index there, as ns=3;i=7.
@@ -455,9 +467,9 @@ choice! {
     }
 }
 
-const EXPANDED_NODE_ID: &str = r"^(ns=[0-9]+;|nsu=[^;]+;)?[isgb]=";
+pub(crate) const EXPANDED_NODE_ID: &str = r"^(ns=[0-9]+;|nsu=[^;]+;)?[isgb]=";
 
-const DURATION: &str = r"^[0-9]+(\.[0-9]+)?(ms|s|min|h)$";
+pub(crate) const DURATION: &str = r"^[0-9]+(\.[0-9]+)?(ms|s|min|h)$";
 
 /// Index and URI, each at its place.
 pub(crate) type Namespaces = Vec<(At<u16>, At<String>)>;
@@ -931,6 +943,7 @@ impl Default for Document {
             pubsub: None,
             security: None,
             server: None,
+            servers: None,
             namespaces: None,
             variables: None,
             patterns: None,

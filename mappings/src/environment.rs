@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use uadp::BuiltinType;
 
 use crate::call::MethodTarget;
-use crate::node_id::NodeIdText;
+use crate::node_id::{ExpandedNodeIdText, NodeIdText};
 use crate::topic::SpaceId;
 
 /// What was asked for and found. What is missing here was not asked for, and says nothing.
@@ -18,6 +18,33 @@ pub struct Environment {
     /// What other OPC UA servers said of Methods of theirs that execute calls: nothing where all is well, else why one cannot
     /// be called, for people.
     pub methods: Vec<(MethodTarget, Option<String>)>,
+    /// What other OPC UA servers said of nodes of theirs that variables come from or go to, by the name of the server and the
+    /// text of the node id.
+    pub remote: BTreeMap<(String, String), LiveRemote>,
+}
+
+impl Environment {
+    /// What a server said of a node; `None` where it was not asked.
+    pub(crate) fn remote(&self, server: &str, node: &ExpandedNodeIdText) -> Option<LiveRemote> {
+        let key = (server.to_owned(), node.to_string());
+        self.remote.get(&key).copied()
+    }
+}
+
+/// What another server said of a node.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LiveRemote {
+    /// There is no such variable.
+    Away,
+    /// A variable.
+    Variable {
+        /// Its builtin type and whether it is an array, where the server says so.
+        value: Option<(BuiltinType, bool)>,
+        /// Whether whoever asked may read it.
+        readable: bool,
+        /// Whether whoever asked may write it.
+        writable: bool,
+    },
 }
 
 /// A ROS graph as it was.

@@ -80,6 +80,11 @@ impl Findings {
         }
     }
 
+    /// Whether a text is the value of an environment variable.
+    pub(crate) fn is_hidden(&self, value: &str) -> bool {
+        self.secrets.contains_key(value)
+    }
+
     /// The finding may be given a label and help until the next one comes.
     pub(crate) fn error(
         &mut self,

@@ -50,6 +50,7 @@ impl<'a> Loader<'a> {
             // What is not declared may be so in what could not be read.
             self.whole.spaces = Some(missing());
             self.whole.namespaces = Some(missing());
+            self.whole.servers = Some(missing());
         }
         (read.map(|()| self.whole), self.sources)
     }
@@ -256,12 +257,14 @@ impl<'a> Loader<'a> {
             pubsub,
             security,
             server,
+            servers,
             namespaces,
             variables,
             patterns,
             calls,
         } = other;
         append(&mut self.whole.spaces, spaces);
+        append(&mut self.whole.servers, servers);
         append(&mut self.whole.type_paths, type_paths);
         append(&mut self.whole.variables, variables);
         append(&mut self.whole.patterns, patterns);

@@ -16,9 +16,11 @@ mod node_id;
 mod pattern;
 mod permission;
 mod read;
+mod remote;
 mod schema;
 mod secret;
 mod security;
+mod server_entries;
 mod surroundings;
 mod topic;
 mod tree;
@@ -33,7 +35,7 @@ pub use check::{Checked, PathFault, PathFaultKind, Source, TypeFiles, TypeOrigin
 pub use code::{Code, UnknownCode};
 pub use diagnostic::{Diagnostic, Severity, Span};
 pub use difference::Difference;
-pub use environment::{Environment, LiveNode, LiveServer, LiveSpace, LiveTopic};
+pub use environment::{Environment, LiveNode, LiveRemote, LiveServer, LiveSpace, LiveTopic};
 pub use mapping::{
     Binding, Endpoint, Mapping, Meaning, Overflow, PubSub, Publish, PublisherIdRule,
     SecurityPolicy, Server, ServerLimits, ServiceBinding, ServiceRole, Space, Trigger, UaField,
@@ -42,6 +44,7 @@ pub use mapping::{
 pub use node_id::{ExpandedNodeIdText, Identifier, NamespaceText, NodeIdError, NodeIdText};
 pub use pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 pub use permission::{Anonymous, Permissions, Role};
+pub use remote::{Access, NodeSource, NodeTarget, Password, RemoteServer, User};
 pub use schema::schema;
 pub use security::{GroupMode, GroupPolicy, KeySource, Replay, SecurityGroup, Served};
 pub use surroundings::{Readers, Surroundings};

@@ -13,6 +13,7 @@ use crate::call::{Call, CallBinding};
 use crate::node_id::NodeIdText;
 use crate::pattern::{Pattern, PatternFault, PatternReason, PatternVariable};
 use crate::permission::{Anonymous, Permissions};
+use crate::remote::{NodeSource, NodeTarget, RemoteServer};
 use crate::security::SecurityGroup;
 use crate::topic::{SpaceId, TopicId};
 use crate::unit::Unit;
@@ -27,6 +28,7 @@ pub struct Mapping {
     spaces: Vec<Space>,
     namespaces: BTreeMap<u16, String>,
     server: Server,
+    servers: Vec<RemoteServer>,
     variables: Vec<Variable>,
     by_topic: HashMap<TopicId, usize>,
     calls: Vec<Call>,
@@ -53,6 +55,7 @@ impl Mapping {
             spaces,
             namespaces,
             server,
+            servers: Vec::new(),
             variables,
             by_topic,
             calls: Vec::new(),
@@ -227,6 +230,17 @@ impl Mapping {
     #[must_use]
     pub const fn server(&self) -> &Server {
         &self.server
+    }
+
+    pub(crate) fn with_servers(mut self, servers: Vec<RemoteServer>) -> Self {
+        self.servers = servers;
+        self
+    }
+
+    /// The OPC UA servers that exist already, in the order of the document.
+    #[must_use]
+    pub fn servers(&self) -> &[RemoteServer] {
+        &self.servers
     }
 
     /// In the order of the document.
@@ -468,7 +482,7 @@ impl Default for Server {
 }
 
 /// `opc.tcp://host:port/path`.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, Hash)]
 pub struct Endpoint {
     /// Host name or address; an IPv6 address without its brackets.
     pub host: String,
@@ -511,7 +525,7 @@ impl std::fmt::Display for Endpoint {
 }
 
 /// A SecurityPolicy of OPC 10000-7.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum SecurityPolicy {
     /// Neither signed nor encrypted.
     None,
@@ -572,6 +586,10 @@ pub struct Variable {
     pub meaning: Meaning,
     /// Who may read and write it at the server.
     pub permissions: Permissions,
+    /// The node of another OPC UA server it comes from; its origin is the OPC UA side then.
+    pub from: Option<Box<NodeSource>>,
+    /// The node of another OPC UA server it is written to.
+    pub to: Option<Box<NodeTarget>>,
 }
 
 /// One field of a DataSet (OPC 10000-14, 6.2.3.2.3).

@@ -14,10 +14,45 @@ pub(crate) fn has_user(url: &str) -> bool {
     users(url, at_sign).next().is_some()
 }
 
-/// A text without its passwords, as many characters as it had.
+/// A line without its passwords, as many characters as it had.
 pub(crate) fn masked(text: &str) -> Cow<'_, str> {
-    starred(text, passwords(text, at_sign))
+    let of_urls = starred(text, passwords(text, at_sign));
+    match key(&of_urls) {
+        Some(at) => Cow::Owned(starred(&of_urls, std::iter::once(at)).into_owned()),
+        None => of_urls,
+    }
 }
+
+/// Where the value of the key `password` stands in a line, if it stands in the file itself.
+fn key(line: &str) -> Option<Range<usize>> {
+    let (before, behind) = line.split_once(KEY)?;
+    let value = behind.trim_start();
+    let start = before.len() + KEY.len() + (behind.len() - value.len());
+    let quoted = value.chars().next().filter(|c| matches!(c, '"' | '\''));
+    let length = match quoted {
+        // Up to the end where the quote is not closed in the line.
+        Some(quote) => value
+            .get(1..)
+            .and_then(|rest| rest.find(quote))
+            .map_or(value.len(), |at| at + 2),
+        None => {
+            let mut variables = 0;
+            while let Some(rest) = value.get(variables..)
+                && rest.starts_with("${")
+                && let Some(end) = rest.find('}')
+            {
+                variables += end + 1;
+            }
+            let rest = value.get(variables..)?;
+            variables + rest.find([',', '}', '#']).unwrap_or(rest.len())
+        }
+    };
+    let value = value.get(..length)?.trim_end();
+    let there = !value.is_empty() && !is_variable(value.trim_matches(['"', '\'']));
+    there.then_some(start..start + value.len())
+}
+
+const KEY: &str = "password:";
 
 /// A text that may have been cut, without its passwords: before `...` the beginning of one may stand.
 pub(crate) fn masked_where_cut(text: &str) -> Cow<'_, str> {
@@ -206,6 +241,28 @@ mod tests {
             assert!(!is_written(text), "{text}");
         }
         assert!(has_user("opc.tcp://me@host") && !has_user("opc.tcp://host/@"));
+    }
+
+    #[test]
+    fn the_password_of_a_user_is_hidden_where_it_stands_in_the_file() {
+        for (line, told) in [
+            ("    password: hunter2", "    password: *******"),
+            (
+                "  - {name: plc, password: hunter2, user: cell}",
+                "  - {name: plc, password: *******, user: cell}",
+            ),
+            (r#"password: "a, b" # c"#, r#"password: ****** # c"#),
+            ("password: 'open", "password: *****"),
+        ] {
+            assert_eq!(masked(line), told);
+        }
+        for line in [
+            "password: ${PLC_PASSWORD}",
+            "password:",
+            "password: \"${X}\"",
+        ] {
+            assert_eq!(masked(line), line);
+        }
     }
 
     #[test]

@@ -177,7 +177,10 @@ fn a_method_of_another_server_is_asked_for_by_services() {
     let ExecutedBy::OpcUa(method) = &call.executed else {
         panic!("{:?}", call.executed);
     };
-    assert_eq!(method.endpoint.to_string(), "opc.tcp://127.0.0.1:4841");
+    assert_eq!(
+        method.access.endpoint.to_string(),
+        "opc.tcp://127.0.0.1:4841"
+    );
     assert_eq!(method.object.to_string(), "nsu=urn:plc;s=Line");
     assert_eq!(method.method.to_string(), "ns=3;s=Line.Reset");
     assert_eq!(call.kind, CallKind::Service);

@@ -5,8 +5,9 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use mappings::{
-    Checked, Code, Endpoint, Environment, LiveNode, LiveServer, LiveSpace, LiveTopic, Mapping,
-    MethodTarget, PathFault, PathFaultKind, Severity, SpaceId, Surroundings, TypeFiles, TypeOrigin,
+    Access, Checked, Code, Endpoint, Environment, LiveNode, LiveRemote, LiveServer, LiveSpace,
+    LiveTopic, Mapping, MethodTarget, PathFault, PathFaultKind, Severity, SpaceId, Surroundings,
+    TypeFiles, TypeOrigin,
 };
 use messages::{DefinitionText, DefinitionTexts, Dialect, Language, TextKind, TypeName};
 use uadp::BuiltinType;
@@ -47,8 +48,8 @@ impl Surroundings for Around {
         self.read(folder).map(|_| Vec::new())
     }
 
-    fn variable(&self, _: &str) -> Option<String> {
-        None
+    fn variable(&self, name: &str) -> Option<String> {
+        (name == "PLC_PASSWORD").then(|| "correct horse".to_owned())
     }
 
     fn types(&self, paths: &[PathBuf]) -> Box<dyn TypeFiles> {
@@ -134,14 +135,16 @@ fn environment() -> Environment {
         )])),
     };
     let method = |method: &str| MethodTarget {
-        endpoint: Endpoint {
+        access: Access::anonymous(Endpoint {
             host: "192.168.0.10".to_owned(),
             port: 4840,
             path: String::new(),
-        },
+        }),
+        server: None,
         object: "nsu=urn:plc;s=Line".parse().unwrap(),
         method: method.parse().unwrap(),
     };
+    let remote = |node: &str, live| (("plc".to_owned(), node.to_owned()), live);
     Environment {
         spaces: BTreeMap::from([(SpaceId::ROS1, ros1)]),
         server: Some(LiveServer {
@@ -163,6 +166,17 @@ fn environment() -> Environment {
             ),
             (method("nsu=urn:plc;s=Line.Stop"), None),
         ],
+        remote: BTreeMap::from([
+            remote("nsu=urn:plc;s=Sped", LiveRemote::Away),
+            remote(
+                "nsu=urn:plc;s=Setpoint",
+                LiveRemote::Variable {
+                    value: Some((BuiltinType::Double, false)),
+                    readable: true,
+                    writable: false,
+                },
+            ),
+        ]),
     }
 }
 

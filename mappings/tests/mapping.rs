@@ -807,3 +807,59 @@ fn one_field_of_a_foreign_publisher_is_named_by_its_place_or_its_name() {
     let name = UaField::Name("Speed".to_owned());
     assert_eq!(field(", ua_field: Speed"), Some(name));
 }
+
+#[test]
+fn values_come_from_nodes_of_other_servers_and_go_to_some() {
+    let text = "
+namespaces: {2: 'urn:line'}
+spaces: [{id: 1}]
+servers:
+  - {name: plc, endpoint: 'opc.tcp://192.168.0.10', security: Basic256Sha256, user: cell, password: secret}
+  - {name: oven, endpoint: 'opc.tcp://192.168.0.11:4841'}
+variables:
+  - {node: ns=2;i=1, name: Speed, type: Float, origin: 0, from: {server: plc, node: 'nsu=urn:plc;s=Speed', sampling: 20ms, queue: 50, deadband: 0.5}}
+  - {node: ns=2;i=2, name: Setpoint, type: Float, origin: 1, to: {server: oven, node: ns=3;i=7}}
+  - {node: ns=2;i=3, name: State, origin: 0, from: {server: oven, node: ns=3;i=8}}
+calls:
+  - {node: ns=2;i=61, name: Reset, origin: 0, opcua: {server: plc, object: 'nsu=urn:plc;s=Line', method: 'nsu=urn:plc;s=Line.Reset'}}
+";
+    let checked = Mapping::from_yaml(text, "cell.yaml");
+    // The password stands in the file.
+    let codes: Vec<_> = checked.findings.iter().map(|found| found.code).collect();
+    assert_eq!(codes, [Code::Secret], "{}", checked.render(text));
+    assert!(
+        !checked.render(text).contains("secret,"),
+        "{}",
+        checked.render(text)
+    );
+    let mapping = checked.mapping.unwrap();
+    let [plc, oven] = mapping.servers() else {
+        panic!("{:?}", mapping.servers());
+    };
+    assert_eq!(
+        plc.access.endpoint.to_string(),
+        "opc.tcp://192.168.0.10:4840"
+    );
+    let user = plc.access.user.as_ref().unwrap();
+    assert_eq!(
+        (user.name.as_str(), user.password.reveal()),
+        ("cell", "secret")
+    );
+    assert!(!format!("{mapping:?}").contains("\"secret\""));
+    assert_eq!((oven.name.as_str(), oven.access.security), ("oven", None));
+    let [speed, setpoint, state] = mapping.variables() else {
+        panic!("{:?}", mapping.variables());
+    };
+    let from = speed.from.as_deref().unwrap();
+    assert_eq!(from.node.to_string(), "nsu=urn:plc;s=Speed");
+    let asked = (from.sampling.as_millis(), from.queue.get(), from.deadband());
+    assert_eq!(asked, (20, 50, 0.5));
+    assert_eq!(setpoint.to.as_deref().unwrap().server, "oven");
+    assert_eq!((state.value_type, state.to.is_none()), (None, true));
+    let from = state.from.as_deref().unwrap();
+    assert_eq!((from.sampling.as_millis(), from.queue.get()), (100, 10));
+    let mappings::ExecutedBy::OpcUa(method) = &mapping.calls()[0].executed else {
+        panic!("{:?}", mapping.calls());
+    };
+    assert_eq!(method.access, plc.access);
+}

@@ -1,6 +1,9 @@
 //! What the OPC UA server shows of values that are large, structured, or none: datagrams of the tests' own on one side,
 //! asyncua on the other.
 
+#[path = "server_values/sources.rs"]
+mod sources;
+
 use std::time::{Duration, Instant, SystemTime};
 
 use serde_json::{Value, json};

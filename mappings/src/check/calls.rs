@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use self::bindings::Found;
 use super::network::duration;
+use super::servers::Servers;
 use super::types::Types;
 use super::variables::{NAMESPACE_ZERO, Namespaces, Spaces, checked_name, node_id, space};
 use super::{permissions, required};
@@ -34,6 +35,7 @@ pub(super) struct Known<'k> {
     pub(super) variables: &'k [Variable],
     /// Where the cell's own server is.
     pub(super) server: &'k Endpoint,
+    pub(super) servers: &'k Servers,
 }
 
 pub(super) fn check(

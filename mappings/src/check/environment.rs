@@ -1,6 +1,7 @@
 //! Whether what a sound document names is there.
 
 mod calls;
+mod remote;
 
 use super::types;
 use crate::code::Code;
@@ -31,6 +32,7 @@ pub(super) fn check(
             }
         }
         service(entry, variable, environment, at.place, findings);
+        remote::check(entry, variable, environment, findings);
         if let Some(server) = &environment.server {
             node(entry, variable, mapping, server, findings);
         }

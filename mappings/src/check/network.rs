@@ -278,6 +278,29 @@ fn limits(field: &Field<LimitsEntry>, findings: &mut Findings) -> ServerLimits {
     }
 }
 
+/// Where another server is. `None` when it is faulty, which is noted.
+pub(super) fn remote_endpoint(
+    text: &str,
+    place: Place,
+    findings: &mut Findings,
+) -> Option<Endpoint> {
+    let endpoint = parse_endpoint(text);
+    if endpoint.is_none() {
+        let message = format!("`{}` is no endpoint", short(text));
+        let mut note = findings.error(Code::Endpoint, place, message);
+        if has_user(text) {
+            note = note.label("it has no user name or password");
+        }
+        note.help("for example opc.tcp://192.168.0.10:4840");
+    }
+    endpoint
+}
+
+/// Whether an endpoint is that of the cell's own server.
+pub(super) fn is_own(endpoint: &Endpoint, own: &Endpoint) -> bool {
+    endpoint.host.eq_ignore_ascii_case(&own.host) && endpoint.port == own.port
+}
+
 fn security(
     entries: &[At<SecurityEntry>],
     place: Place,
@@ -317,7 +340,7 @@ const fn policy(entry: SecurityEntry) -> SecurityPolicy {
 }
 
 /// `opc.tcp://host:port/path`, port 4840 when left out (OPC 10000-6, 7.2).
-pub(super) fn parse_endpoint(text: &str) -> Option<Endpoint> {
+fn parse_endpoint(text: &str) -> Option<Endpoint> {
     let rest = text.strip_prefix("opc.tcp://")?;
     let slash = rest.find('/').unwrap_or(rest.len());
     let (authority, path) = rest.split_at_checked(slash)?;

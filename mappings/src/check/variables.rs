@@ -8,9 +8,10 @@ use std::time::Duration;
 use messages::{Leaf, Rank};
 
 use super::bindings::{self, Bindings};
+use super::servers::Servers;
 use super::services::Calls;
 use super::types::{self, Types, ValueType};
-use super::{Declared, meaning, permissions, required};
+use super::{Declared, meaning, permissions, remote, required};
 use crate::code::Code;
 use crate::document::{PublishEntry, Queue, UaFieldEntry, VariableEntry};
 use crate::findings::Findings;
@@ -57,7 +58,7 @@ impl Draft<'_> {
 
 pub(super) fn check(
     entries: &[At<VariableEntry>],
-    (spaces, namespaces): (&Spaces, &Namespaces),
+    (spaces, namespaces, servers): (&Spaces, &Namespaces, &Servers),
     types: &mut Types,
     findings: &mut Findings,
 ) -> Vec<Variable> {
@@ -90,7 +91,7 @@ pub(super) fn check(
     let mut bindings = Bindings::new(spaces, calls, types);
     let variables = drafts
         .iter()
-        .filter_map(|draft| variable(draft, &mut bindings, findings));
+        .filter_map(|draft| variable(draft, servers, &mut bindings, findings));
     let mut variables: Vec<Variable> = variables.collect();
     // Kept as long as the mapping.
     variables.shrink_to_fit();
@@ -312,6 +313,7 @@ fn unique(drafts: &[Draft<'_>], findings: &mut Findings) {
 
 fn variable(
     draft: &Draft<'_>,
+    servers: &Servers,
     bindings: &mut Bindings<'_>,
     findings: &mut Findings,
 ) -> Option<Variable> {
@@ -351,8 +353,20 @@ fn variable(
         (service.as_deref(), fields.len()),
         findings,
     );
+    let is_origin = |space: SpaceId| draft.origin == Some(space);
+    let subject = remote::Subject {
+        origin: draft.origin,
+        node: draft.node.as_ref().map(|(node, _)| node),
+        single: !several,
+        value_type,
+        produced: service
+            .as_ref()
+            .is_some_and(|service| is_origin(service.space)),
+    };
+    let remote = remote::check(entry, &subject, servers, findings);
     let (node, _) = draft.node.clone()?;
     let topic = draft.topic()?;
+    let (from, to) = remote?;
     Some(Variable {
         topic,
         node,
@@ -366,6 +380,8 @@ fn variable(
         publish: publish?,
         meaning: meaning?,
         permissions: permissions?,
+        from,
+        to,
     })
 }
 

@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use mappings::{Environment, ExecutedBy, Mapping, MethodTarget, SpaceId};
+use mappings::{
+    Access, Environment, ExecutedBy, ExpandedNodeIdText, Mapping, MethodTarget, SpaceId,
+};
 use serde::Serialize;
 
 use crate::arguments::{Check, Part};
@@ -57,24 +59,54 @@ impl Seen {
             let server = look(survey::opcua::check(&url, mapping));
             seen.environment.server = seen.asked(format!("OPC UA server {url}"), server)?;
             seen.methods(mapping)?;
+            seen.remote(mapping)?;
         }
         Ok(seen)
     }
 
     /// Asks each server that has Methods of the mapping.
     fn methods(&mut self, mapping: &Mapping) -> Result<(), Failure> {
-        let mut by_server: BTreeMap<String, Vec<&MethodTarget>> = BTreeMap::new();
+        let mut by_server: BTreeMap<String, (&Access, Vec<&MethodTarget>)> = BTreeMap::new();
         for call in mapping.executed_in(SpaceId::UA) {
             if let ExecutedBy::OpcUa(target) = &call.executed {
-                let url = target.endpoint.to_string();
-                by_server.entry(url).or_default().push(target);
+                let user = target.access.user.as_ref().map(|user| &user.name);
+                let key = format!("{} {user:?}", target.access.endpoint);
+                let (_, targets) = by_server
+                    .entry(key)
+                    .or_insert_with(|| (&target.access, Vec::new()));
+                targets.push(target);
             }
         }
-        for (url, targets) in by_server {
-            let told = look(survey::opcua::methods(&url, &targets));
-            let told = self.asked(format!("OPC UA server {url}"), told)?;
+        for (access, targets) in by_server.into_values() {
+            let told = look(survey::opcua::methods(access, &targets));
+            let told = self.asked(format!("OPC UA server {}", access.endpoint), told)?;
             let methods = targets.into_iter().cloned().zip(told.unwrap_or_default());
             self.environment.methods.extend(methods);
+        }
+        Ok(())
+    }
+
+    /// Asks each server that variables come from or go to.
+    fn remote(&mut self, mapping: &Mapping) -> Result<(), Failure> {
+        for server in mapping.servers() {
+            let mut nodes: Vec<&ExpandedNodeIdText> = Vec::new();
+            for variable in mapping.variables() {
+                let from = variable.from.as_deref();
+                let from = from.map(|from| (&from.server, &from.node));
+                let to = variable.to.as_deref().map(|to| (&to.server, &to.node));
+                let here = [from, to].into_iter().flatten();
+                let here = here.filter(|(name, _)| **name == server.name);
+                nodes.extend(here.map(|(_, node)| node));
+            }
+            if nodes.is_empty() {
+                continue;
+            }
+            let told = look(survey::opcua::remote(&server.access, &nodes));
+            let whom = format!("OPC UA server {} ({})", server.access.endpoint, server.name);
+            let told = self.asked(whom, told)?.unwrap_or_default();
+            let told = nodes.into_iter().zip(told);
+            let told = told.map(|(node, live)| ((server.name.clone(), node.to_string()), live));
+            self.environment.remote.extend(told);
         }
         Ok(())
     }

@@ -7,29 +7,30 @@ mod signature;
 mod watch;
 
 use std::collections::{HashMap, VecDeque};
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use bridge_node::{Executed, Execution, ExecutionId, Offered, PortEvent, Refusal, now};
-use mappings::{ExecutedBy, Mapping, MethodTarget, TopicId};
+use mappings::{Access, ExecutedBy, Mapping, MethodTarget, TopicId};
 use opcua::types::{StatusCode, Variant};
-use plant_opcua::client::{CallError, CallOptions, Client, ClientConfig, ClientError};
+use plant_opcua::client::{CallError, CallOptions, Client, ClientError};
 use tokio::sync::{mpsc, watch as cell};
 use tokio::task::{AbortHandle, JoinSet};
 use tracing::info;
 use uadp::Fields;
 
+pub(crate) use self::signature::node as local_node;
+
 use self::signature::Signature;
 use self::watch::{Found, News};
+use crate::clients::Clients;
 use crate::layout::Shape;
 use crate::value;
 
 /// The Methods of other servers that the mapping names.
 pub(crate) struct Executing {
-    config: ClientConfig,
-    /// By their endpoints.
-    servers: HashMap<String, Server>,
+    /// By how they are reached.
+    servers: HashMap<Access, Server>,
     wanted: HashMap<TopicId, Arc<Wanted>>,
     timeouts: HashMap<TopicId, Duration>,
     /// Those that are offered.
@@ -65,16 +66,10 @@ impl Drop for Server {
 }
 
 impl Executing {
-    /// Looks for the Methods of `mapping` from now on, as a client with that ApplicationUri and the certificates in `pki`.
-    pub(crate) fn new(mapping: &Mapping, application_uri: &str, pki: &Path) -> Self {
+    /// Looks for the Methods of `mapping` from now on.
+    pub(crate) fn new(mapping: &Mapping, clients: &mut Clients) -> Self {
         let (tell, heard) = mpsc::channel(MOST_NEWS);
         let mut executing = Self {
-            config: ClientConfig {
-                pki: Some(pki.to_owned()),
-                timeout: ANSWERS_WITHIN,
-                keep_alive: KEEP_ALIVE,
-                ..ClientConfig::new(application_uri, "UA bridge server")
-            },
             servers: HashMap::new(),
             wanted: HashMap::new(),
             timeouts: HashMap::new(),
@@ -85,15 +80,15 @@ impl Executing {
             running: JoinSet::new(),
             executions: HashMap::new(),
         };
-        executing.reload(mapping);
+        executing.reload(mapping, clients);
         executing
     }
 
     /// Goes over to the Methods of another mapping. What both say alike goes on undisturbed.
-    pub(crate) fn reload(&mut self, mapping: &Mapping) {
+    pub(crate) fn reload(&mut self, mapping: &Mapping, clients: &mut Clients) {
         let mut before = std::mem::take(&mut self.wanted);
         self.timeouts.clear();
-        let mut servers: HashMap<String, Vec<Arc<Wanted>>> = HashMap::new();
+        let mut servers: HashMap<Access, Vec<Arc<Wanted>>> = HashMap::new();
         for call in mapping.calls() {
             let ExecutedBy::OpcUa(target) = &call.executed else {
                 continue;
@@ -107,8 +102,8 @@ impl Executing {
             };
             let known = before.remove(&call.topic).filter(|one| **one == wanted);
             let wanted = known.unwrap_or_else(|| Arc::new(wanted));
-            let url = target.endpoint.to_string();
-            servers.entry(url).or_default().push(Arc::clone(&wanted));
+            let access = target.access.clone();
+            servers.entry(access).or_default().push(Arc::clone(&wanted));
             self.wanted.insert(call.topic, wanted);
             self.timeouts.insert(call.topic, call.timeout);
         }
@@ -119,19 +114,27 @@ impl Executing {
         let gone = self.found.extract_if(|_, found| !is_wanted(found));
         self.events
             .extend(gone.map(|(topic, _)| PortEvent::Withdrawn { topic }));
-        self.servers.retain(|url, _| servers.contains_key(url));
-        for (url, wanted) in servers {
-            match self.servers.get(&url) {
+        self.servers
+            .retain(|access, _| servers.contains_key(access));
+        for (access, wanted) in servers {
+            match self.servers.get(&access) {
                 Some(server) => drop(server.wanted.send_replace(wanted)),
-                None => drop(self.servers.insert(url.clone(), self.watch(&url, wanted))),
+                None => {
+                    let server = self.watch(clients.of(&access), &access, wanted);
+                    self.servers.insert(access, server);
+                }
             }
         }
     }
 
-    fn watch(&self, url: &str, wanted: Vec<Arc<Wanted>>) -> Server {
-        let client = Client::open(self.config.clone(), url);
+    fn watch(&self, client: Client, access: &Access, wanted: Vec<Arc<Wanted>>) -> Server {
         let (wanted, receiver) = cell::channel(wanted);
-        let watching = watch::run(client, url.to_owned(), receiver, self.tell.clone());
+        let watching = watch::run(
+            client,
+            access.endpoint.to_string(),
+            receiver,
+            self.tell.clone(),
+        );
         Server {
             wanted,
             watching: tokio::spawn(watching).abort_handle(),
@@ -169,7 +172,7 @@ impl Executing {
                 }
                 let description = found.signature.description(&found.wanted);
                 let open = found.wanted.open;
-                info!(%topic, name = found.wanted.name, url = %found.wanted.target.endpoint, "a Method can be called");
+                info!(%topic, name = found.wanted.name, url = %found.wanted.target.access.endpoint, "a Method can be called");
                 self.found.insert(topic, Arc::new(found));
                 let offered = Offered { description, open };
                 self.events.push_back(PortEvent::Offer { topic, offered });
@@ -257,7 +260,7 @@ async fn call(found: Arc<Found>, arguments: Vec<Variant>, within: Duration) -> E
         Err(error) => not_answered(error),
     };
     if let Err(error) = called {
-        info!(topic = %wanted.topic, url = %wanted.target.endpoint, ?outcome, "a Method came to nothing: {error}");
+        info!(topic = %wanted.topic, url = %wanted.target.access.endpoint, ?outcome, "a Method came to nothing: {error}");
     }
     outcome
 }
@@ -337,6 +340,3 @@ const MOST_EXECUTIONS: usize = 1_024;
 const MOST_OF_ONE: usize = 256;
 /// What the clients found out, waiting for the run loop.
 const MOST_NEWS: usize = 64;
-/// How long a server may take for what is asked beside Methods. One that does its Methods and nothing beside them takes long.
-const ANSWERS_WITHIN: Duration = Duration::from_secs(5);
-const KEEP_ALIVE: Duration = Duration::from_secs(2);

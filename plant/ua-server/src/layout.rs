@@ -33,6 +33,8 @@ pub(crate) struct TopicNode {
     pub(crate) compound: bool,
     /// What its numbers mean.
     pub(crate) meaning: Meaning,
+    /// Its values come from another server, and from no client.
+    pub(crate) sourced: bool,
 }
 
 /// The node of one field of a DataSet.
@@ -243,6 +245,7 @@ impl TopicNode {
         );
         let mut node = Self {
             meaning: variable.meaning.clone(),
+            sourced: variable.from.is_some(),
             ..node
         };
         let is_structure = |leaf: &Leaf| leaf.builtin == BuiltinType::ExtensionObject;
@@ -295,12 +298,14 @@ impl TopicNode {
             fields,
             compound,
             meaning: Meaning::default(),
+            sourced: false,
         }
     }
 
     /// Clients may write what this server produces. In space 0 that is what the mapping names: the rest is of components.
     pub(crate) fn writable(&self) -> bool {
-        self.topic.space == SpaceId::UA && self.node != unmapped_node(self.topic)
+        let ours = self.topic.space == SpaceId::UA && self.node != unmapped_node(self.topic);
+        ours && !self.sourced
     }
 
     /// Every node of the topic, its own first.

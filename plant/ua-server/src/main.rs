@@ -6,7 +6,8 @@
 //!
 //! Reading order: `layout` (which nodes), `structures` (their DataTypes), `address` (as they stand in the address space), `values` (what they show),
 //! `nodes` (the node manager), `browse` (in which order), `budget` (what clients may take up), `space` (values in),
-//! `components` (which servers are there), `methods` and `argument_types` (calls of the space as Methods), `executing` (Methods of other servers as calls), `port` (the shell's side),
+//! `components` (which servers are there), `methods` and `argument_types` (calls of the space as Methods), `executing` (Methods of other servers as calls), `sources` (their
+//! nodes as values), `clients` (the sessions for both), `others` (all of these), `port` (the shell's side),
 //! `endpoint` (how clients get in), `access` (what each may do), `auditing` (what is told of it), `sks` (keys of secured groups), `value` (between the two codecs),
 //! `verbs` (certificates and users by hand).
 
@@ -16,15 +17,18 @@ mod argument_types;
 mod auditing;
 mod browse;
 mod budget;
+mod clients;
 mod components;
 mod endpoint;
 mod executing;
 mod layout;
 mod methods;
 mod nodes;
+mod others;
 mod port;
 mod properties;
 mod sks;
+mod sources;
 mod space;
 mod structures;
 mod value;

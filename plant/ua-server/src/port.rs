@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use bridge_node::{
     Answered, AskId, CallDescription, Delivery, Described, Execution, Failure, FailureKind, Kept,
-    Port, PortEvent, TypePaths,
+    LinkState, Port, PortEvent, TypePaths,
 };
 use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, MdnsFault, WatchSettings, announce, watch};
@@ -18,7 +18,7 @@ use opcua::server::authenticator::AuthManager;
 use opcua::server::node_manager::ServerContext;
 use opcua::server::node_manager::memory::InMemoryNodeManagerImplBuilder;
 use opcua::server::{MonitoredItemHandle, ServerHandle, SubscriptionCache};
-use opcua::types::{NodeId, NumericRange, VariableId};
+use opcua::types::{NodeId, NumericRange, StatusCode, VariableId};
 use plant_opcua::endpoint::EndpointUrl;
 use plant_opcua::pki::Pki;
 use plant_opcua::server::{Security, core_with};
@@ -35,11 +35,12 @@ use crate::auditing;
 use crate::browse::Ordered;
 use crate::components::Components;
 use crate::endpoint;
-use crate::executing::Executing;
 use crate::layout::Layout;
 use crate::methods::{Heard, Methods, Questions, Wish};
 use crate::nodes::{ClientWrite, Exits, SpaceManager, SpaceNodes, look_again};
+use crate::others::Others;
 use crate::sks::Sks;
+use crate::sources::{self, Sourced};
 use crate::space::Space;
 use crate::structures::Types;
 
@@ -83,8 +84,10 @@ pub(crate) struct ServerPort {
     components: Option<Components>,
     /// Calls of other spaces.
     methods: Methods,
-    /// Methods of other servers.
-    executing: Executing,
+    /// Other servers.
+    others: Others,
+    /// What is to be reported before anything else.
+    events: VecDeque<PortEvent>,
 }
 
 impl ServerPort {
@@ -146,13 +149,11 @@ impl ServerPort {
             "serving at {} (port {port})",
             setup.url
         );
-        let executing = Executing::new(mapping, &described.application_uri, setup.pki.root());
+        let others = Others::new(mapping, &described.application_uri, setup.pki.root());
         let methods = Methods::new(Arc::clone(&manager), mapping, (asked, &layout.structures));
         let nodes = (Arc::clone(&manager), Arc::clone(&subscriptions));
         let server = told_of(described, setup.url.advertised(port));
         let (told, components) = tell(server, setup.announce, nodes)?;
-        let mut look = tokio::time::interval(LOOK_AT_REJECTED);
-        look.set_missed_tick_behavior(MissedTickBehavior::Delay);
         Ok(Self {
             unbound: VecDeque::new(),
             namespaces: layout.namespaces.clone(),
@@ -168,11 +169,12 @@ impl ServerPort {
             pki: setup.pki,
             sks: setup.sks,
             access,
-            look,
+            look: looks(),
             told,
             components,
             methods,
-            executing,
+            others,
+            events: VecDeque::new(),
         })
     }
 }
@@ -186,11 +188,15 @@ impl Port for ServerPort {
         if let Some(topic) = self.live.pop_front() {
             return PortEvent::Live { topic, live: true };
         }
+        if let Some(event) = self.events.pop_front() {
+            return event;
+        }
         loop {
             tokio::select! {
                 Some(write) = self.writes.recv() => {
                     let ClientWrite { topic, block, source, room } = write;
                     drop(room);
+                    self.others.sources.put(topic, &block);
                     return PortEvent::Sample { topic, payload: block, received: source, latched_by: None };
                 }
                 ended = ended(&mut self.serving) => return PortEvent::Ended(ended),
@@ -200,7 +206,8 @@ impl Port for ServerPort {
                     }
                     Wish::GiveUp(ask) => PortEvent::AskGivenUp { ask },
                 },
-                event = self.executing.next() => return event,
+                event = self.others.executing.next() => return event,
+                sourced = self.others.sources.next() => return self.sourced(sourced),
                 () = next(&mut self.components) => {}
                 _ = self.look.tick() => {
                     self.pki.report_rejected();
@@ -218,6 +225,9 @@ impl Port for ServerPort {
         // Of several values side by side, who comes late hears an older one after the last.
         if sample.kept == Kept::Beside && sample.source < self.space.shown(sample.topic) {
             return Ok(());
+        }
+        if sample.status & BAD == 0 {
+            self.others.sources.put(sample.topic, &sample.payload);
         }
         let shown = self
             .space
@@ -237,6 +247,9 @@ impl Port for ServerPort {
 
     fn silent(&mut self, topic: TopicId, silent: bool) {
         self.space.set_silent(topic, silent);
+        if silent {
+            self.others.sources.set_silent(topic);
+        }
     }
 
     fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
@@ -252,7 +265,7 @@ impl Port for ServerPort {
     }
 
     fn execute(&mut self, execution: Execution) -> bool {
-        self.executing.execute(&execution)
+        self.others.executing.execute(&execution)
     }
 
     fn reload(&mut self, mapping: &Arc<Mapping>, types: &Arc<TypePaths>) -> Vec<String> {
@@ -289,8 +302,17 @@ impl Port for ServerPort {
             restart.push(format!("security ({failure})"));
         }
         self.methods.put(moved, self.space.structures());
-        self.executing.reload(mapping);
+        for topic in self.others.reload(mapping) {
+            let waiting = StatusCode::BadWaitingForInitialData;
+            let block = Bytes::from(sources::no_value(waiting));
+            // It is none that there is no room for.
+            let _shown = self.space.update(topic, block, (None, status(waiting)));
+        }
         restart
+    }
+
+    fn links(&self) -> Vec<LinkState> {
+        self.others.sources.links()
     }
 
     async fn shutdown(mut self) {
@@ -308,6 +330,50 @@ impl Port for ServerPort {
             runtime.shutdown_background();
         }
     }
+}
+
+impl ServerPort {
+    /// Shows a value of another server, and has it sent.
+    fn sourced(&mut self, sourced: Sourced) -> PortEvent {
+        let Sourced {
+            topic,
+            block,
+            taken,
+            status: quality,
+        } = sourced;
+        let said = status(quality);
+        if !quality.is_bad() {
+            self.others.sources.put(topic, &block);
+        }
+        let shown = self.space.update(topic, block.clone(), (Some(taken), said));
+        let Err(why) = shown else {
+            let payload = block;
+            return PortEvent::Qualified {
+                topic,
+                payload,
+                taken,
+                status: said,
+            };
+        };
+        // What the node shows in its place is what others are told.
+        let refused = self.space.status(topic);
+        self.events.push_back(PortEvent::Lost {
+            topic: Some(topic),
+            why,
+            count: 1,
+        });
+        PortEvent::Qualified {
+            topic,
+            payload: Bytes::from(sources::no_value(refused)),
+            taken,
+            status: status(refused),
+        }
+    }
+}
+
+/// The upper half of a StatusCode.
+fn status(code: StatusCode) -> u16 {
+    u16::try_from(code.bits() >> 16).unwrap_or(u16::MAX)
 }
 
 impl Drop for ServerPort {
@@ -449,6 +515,13 @@ fn largest_write(mapping: &Mapping) -> usize {
     message.saturating_sub(MESSAGE_HEADER)
 }
 
+/// When it is looked whether certificates were rejected.
+fn looks() -> Interval {
+    let mut look = tokio::time::interval(LOOK_AT_REJECTED);
+    look.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    look
+}
+
 /// Those topics that clients can write.
 fn written(topics: impl Iterator<Item = TopicId>) -> impl Iterator<Item = TopicId> {
     topics.filter(|topic| topic.space == SpaceId::UA)
@@ -517,6 +590,8 @@ fn manager(handle: &ServerHandle, layout: &Layout) -> Result<Arc<SpaceManager>, 
     Ok(manager)
 }
 
+/// The severity of what is no value, in the upper half of a StatusCode.
+const BAD: u16 = 0x8000;
 const SERVER_THREADS: usize = 2;
 /// How many values clients wrote wait for the run loop; a client is refused when that many do.
 const MOST_WRITES: usize = 1_024;

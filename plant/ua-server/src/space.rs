@@ -180,6 +180,11 @@ impl Space {
         std::mem::take(&mut self.gave_way)
     }
 
+    /// The status a topic is shown with.
+    pub(crate) fn status(&self, topic: TopicId) -> StatusCode {
+        self.manager.inner().shown(topic).stamp.status
+    }
+
     /// When the value shown of a topic was taken.
     pub(crate) fn shown(&self, topic: TopicId) -> Option<Timestamp> {
         self.manager.inner().shown(topic).stamp.source

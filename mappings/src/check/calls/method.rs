@@ -2,15 +2,15 @@
 
 use super::Checker;
 use crate::call::MethodTarget;
-use crate::check::network::parse_endpoint;
-use crate::check::required;
+use crate::check::network::{is_own, remote_endpoint};
+use crate::check::servers::{named, node};
 use crate::code::Code;
 use crate::document::{CallEntry, MethodEntry};
 use crate::findings::Findings;
 use crate::mapping::Endpoint;
-use crate::node_id::{ExpandedNodeIdText, NodeIdText};
-use crate::read::{At, Field, given, short};
-use crate::secret::has_user;
+use crate::node_id::NodeIdText;
+use crate::read::At;
+use crate::remote::Access;
 use crate::topic::SpaceId;
 use crate::tree::Place;
 
@@ -63,29 +63,53 @@ impl Checker<'_> {
         place: Place,
         findings: &mut Findings,
     ) -> Option<MethodTarget> {
-        let endpoint = required(&entry.endpoint, "endpoint", "`opcua`", place, findings)
-            .and_then(|(text, place)| self.endpoint(text, place, findings));
-        let object = node(&entry.object, "object", place, findings);
-        let method = node(&entry.method, "method", place, findings);
+        let reached = self.reached(entry, place, findings);
+        let object = node(&entry.object, ("object", "`opcua`"), place, findings);
+        let method = node(&entry.method, ("method", "`opcua`"), place, findings);
+        let (access, server) = reached?;
         Some(MethodTarget {
-            endpoint: endpoint?,
+            access,
+            server,
             object: object?,
             method: method?,
         })
     }
 
-    fn endpoint(&self, text: &str, place: Place, findings: &mut Findings) -> Option<Endpoint> {
-        let Some(endpoint) = parse_endpoint(text) else {
-            let message = format!("`{}` is no endpoint", short(text));
-            let mut note = findings.error(Code::Endpoint, place, message);
-            if has_user(text) {
-                note = note.label("it has no user name or password");
+    /// How its server is reached, and its name if it has one.
+    fn reached(
+        &self,
+        entry: &MethodEntry,
+        place: Place,
+        findings: &mut Findings,
+    ) -> Option<(Access, Option<String>)> {
+        match (&entry.server, &entry.endpoint) {
+            (Some(at), None) => {
+                let name = at.value.as_ref()?;
+                let server = named(name, at.place, self.known.servers, findings)?;
+                Some((server.access.clone(), Some(server.name.clone())))
             }
-            note.help("for example opc.tcp://192.168.0.10:4840");
-            return None;
-        };
-        let own = self.known.server;
-        if endpoint.host.eq_ignore_ascii_case(&own.host) && endpoint.port == own.port {
+            (None, Some(at)) => {
+                let endpoint = self.endpoint(at.value.as_ref()?, at.place, findings)?;
+                Some((Access::anonymous(endpoint), None))
+            }
+            (Some(_), Some(at)) => {
+                findings
+                    .error(Code::MethodTarget, at.place, "a server and an endpoint")
+                    .help("`server` says where it is: leave `endpoint` out");
+                None
+            }
+            (None, None) => {
+                findings
+                    .error(Code::MissingKey, place, "`opcua` has no `server`")
+                    .help("the name of one of `servers`, or an `endpoint`");
+                None
+            }
+        }
+    }
+
+    fn endpoint(&self, text: &str, place: Place, findings: &mut Findings) -> Option<Endpoint> {
+        let endpoint = remote_endpoint(text, place, findings)?;
+        if is_own(&endpoint, self.known.server) {
             let message = "the endpoint is that of the cell's own server";
             findings
                 .error(Code::MethodTarget, place, message)
@@ -93,25 +117,5 @@ impl Checker<'_> {
             return None;
         }
         Some(endpoint)
-    }
-}
-
-fn node(
-    field: &Field<String>,
-    key: &str,
-    owner: Place,
-    findings: &mut Findings,
-) -> Option<ExpandedNodeIdText> {
-    required(field, key, "`opcua`", owner, findings)?;
-    let (text, place) = given(field)?;
-    match text.parse() {
-        Ok(node) => Some(node),
-        Err(error) => {
-            let message = format!("`{}` is no node id", short(text));
-            findings.error(Code::NodeId, place, message).help(format!(
-                "{error}; of another server best with the URI of its namespace, as nsu=urn:plc;s=Line.Reset"
-            ));
-            None
-        }
     }
 }

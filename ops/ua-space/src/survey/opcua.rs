@@ -6,7 +6,8 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use mappings::{
-    ExpandedNodeIdText, LiveNode, LiveServer, Mapping, MethodTarget, NamespaceText, NodeIdText,
+    Access, ExpandedNodeIdText, LiveNode, LiveRemote, LiveServer, Mapping, MethodTarget,
+    NamespaceText, NodeIdText, SecurityPolicy,
 };
 use opcua::client::{ClientBuilder, IdentityToken, Session};
 use opcua::types::{
@@ -79,12 +80,12 @@ pub(crate) async fn check(url: &str, mapping: &Mapping) -> Result<LiveServer, Fa
     Ok(live)
 }
 
-/// Asks the server at `url` for Methods: nothing where one can be called, else why not, for people.
+/// Asks a server for Methods: nothing where one can be called, else why not, for people.
 pub(crate) async fn methods(
-    url: &str,
+    access: &Access,
     wanted: &[&MethodTarget],
 ) -> Result<Vec<Option<String>>, Failure> {
-    let server = Connected::to(url).await?;
+    let server = Connected::by(access).await?;
     let asking = async {
         let namespaces = server.namespaces().await?;
         let mut told = Vec::with_capacity(wanted.len());
@@ -109,7 +110,69 @@ pub(crate) async fn methods(
     Ok(told)
 }
 
-/// A session without security, as an anonymous user.
+/// Asks a server for variables: what each is, in their order.
+pub(crate) async fn remote(
+    access: &Access,
+    wanted: &[&ExpandedNodeIdText],
+) -> Result<Vec<LiveRemote>, Failure> {
+    let server = Connected::by(access).await?;
+    let asking = async {
+        let namespaces = server.namespaces().await?;
+        // Where its namespace is not there, a node is asked for that nobody has.
+        let local = |text: &&ExpandedNodeIdText| {
+            let namespace = index(text, &namespaces)?;
+            let identifier = text.identifier.clone();
+            let node = NodeIdText {
+                namespace,
+                identifier,
+            };
+            node.to_string().parse::<NodeId>().ok()
+        };
+        let nodes: Vec<Option<NodeId>> = wanted.iter().map(local).collect();
+        let there: Vec<NodeId> = nodes.iter().flatten().cloned().collect();
+        let attributes = [AttributeId::NodeClass, AttributeId::UserAccessLevel];
+        let told = server.read(&there, &attributes).await?;
+        let types = server.value_types(&there).await?;
+        let told = told.chunks_exact(attributes.len()).zip(types);
+        let mut told = told.map(|(told, value)| {
+            let class = told.first().and_then(|class| class.value.clone());
+            let class = class.and_then(|class| class.try_cast_to::<i32>().ok());
+            let level = match told.get(1).and_then(|level| level.value.as_ref()) {
+                Some(Variant::Byte(level)) => *level,
+                Some(_) | None => 0,
+            };
+            match class {
+                Some(VARIABLE) => LiveRemote::Variable {
+                    value,
+                    readable: level & READABLE != 0,
+                    writable: level & WRITABLE != 0,
+                },
+                Some(_) | None => LiveRemote::Away,
+            }
+        });
+        let live = nodes.into_iter().map(|node| match node {
+            Some(_) => told.next().unwrap_or(LiveRemote::Away),
+            None => LiveRemote::Away,
+        });
+        Ok(live.collect())
+    };
+    let live = server.within(asking).await?;
+    server.leave().await;
+    Ok(live)
+}
+
+/// The index of a node's namespace at a server.
+fn index(node: &ExpandedNodeIdText, namespaces: &[String]) -> Option<u16> {
+    match &node.namespace {
+        NamespaceText::Index(index) => Some(*index),
+        NamespaceText::Uri(uri) => {
+            let at = namespaces.iter().position(|other| other == uri)?;
+            u16::try_from(at).ok()
+        }
+    }
+}
+
+/// A session without security.
 struct Connected {
     url: String,
     session: Arc<Session>,
@@ -118,14 +181,40 @@ struct Connected {
 }
 
 impl Connected {
+    /// As an anonymous user.
     async fn to(url: &str) -> Result<Self, Failure> {
+        Self::connected(url, IdentityToken::Anonymous).await
+    }
+
+    /// As the mapping says. A password is told only where the mapping wants no security.
+    async fn by(access: &Access) -> Result<Self, Failure> {
+        let url = access.endpoint.to_string();
+        let plain = access.security == Some(SecurityPolicy::None);
+        let may = match (access.security, &access.user) {
+            (Some(SecurityPolicy::Basic256Sha256), _) => false,
+            (_, user) => user.is_none() || plain,
+        };
+        if !may {
+            return Err(away(
+                format!("the OPC UA server at {url} is to be asked over a secured session only"),
+                "ua-space has no certificates: `ua-server` tells at /status what it finds there",
+            ));
+        }
+        let identity = match &access.user {
+            Some(user) => IdentityToken::new_user_name(&user.name, user.password.reveal()),
+            None => IdentityToken::Anonymous,
+        };
+        Self::connected(&url, identity).await
+    }
+
+    async fn connected(url: &str, identity: IdentityToken) -> Result<Self, Failure> {
         if !url.starts_with("opc.tcp://") {
             return Err(Failure::Usage(format!(
                 "`{url}` is no endpoint of an OPC UA server, such as opc.tcp://127.0.0.1:4840"
             )));
         }
         let pki = std::env::temp_dir().join(format!("ua-space-{}", std::process::id()));
-        let connecting = Self::connect(url, pki.clone());
+        let connecting = Self::connect(url, pki.clone(), identity);
         let found = match timeout(CONNECT, connecting).await {
             Ok(found) => found,
             Err(_over) => Err(absent(
@@ -139,7 +228,7 @@ impl Connected {
         found
     }
 
-    async fn connect(url: &str, pki: PathBuf) -> Result<Self, Failure> {
+    async fn connect(url: &str, pki: PathBuf, identity: IdentityToken) -> Result<Self, Failure> {
         let mut client = ClientBuilder::new()
             .application_name("ua-space")
             .application_uri("urn:ua-bridge:ua-space")
@@ -155,7 +244,8 @@ impl Connected {
             .get_server_endpoints_from_url(url)
             .await
             .map_err(|error| absent(url, &error.to_string()))?;
-        let mut endpoint = open_endpoint(endpoints).ok_or_else(|| {
+        let anonymous = matches!(identity, IdentityToken::Anonymous);
+        let mut endpoint = open_endpoint(endpoints, anonymous).ok_or_else(|| {
             away(
                 format!("the OPC UA server at {url} takes secured sessions or known users only"),
                 "ua-space connects without security, as anonymous: allow that on this network, or export its NodeSet \
@@ -165,7 +255,7 @@ impl Connected {
         // Servers tell names of theirs that are not always to be resolved from here.
         endpoint.endpoint_url = UAString::from(url);
         let (session, events) = client
-            .connect_to_endpoint_directly(endpoint, IdentityToken::Anonymous)
+            .connect_to_endpoint_directly(endpoint, identity)
             .map_err(|error| absent(url, &error.to_string()))?;
         let events = events.spawn();
         if !session.wait_for_connection().await {
@@ -226,14 +316,7 @@ impl Connected {
         namespaces: &[String],
         (class, word): (i32, &str),
     ) -> Result<Option<String>, Failure> {
-        let index = match &node.namespace {
-            NamespaceText::Index(index) => Some(*index),
-            NamespaceText::Uri(uri) => {
-                let at = namespaces.iter().position(|other| other == uri);
-                at.and_then(|at| u16::try_from(at).ok())
-            }
-        };
-        let Some(namespace) = index else {
+        let Some(namespace) = index(node, namespaces) else {
             return Ok(Some(format!("{} has no namespace for `{node}`", self.url)));
         };
         let local = NodeIdText {
@@ -497,16 +580,20 @@ fn forget(pki: &PathBuf) {
     let _removed = std::fs::remove_dir_all(pki);
 }
 
-/// An endpoint without security for anonymous users.
-fn open_endpoint(endpoints: Vec<EndpointDescription>) -> Option<EndpointDescription> {
+/// An endpoint without security, for anonymous users or those with a password.
+fn open_endpoint(
+    endpoints: Vec<EndpointDescription>,
+    anonymous: bool,
+) -> Option<EndpointDescription> {
+    let wanted = match anonymous {
+        true => UserTokenType::Anonymous,
+        false => UserTokenType::UserName,
+    };
     endpoints.into_iter().find(|endpoint| {
-        let anonymous = endpoint.user_identity_tokens.as_ref().is_none_or(|tokens| {
-            tokens.is_empty()
-                || tokens
-                    .iter()
-                    .any(|token| token.token_type == UserTokenType::Anonymous)
+        let known = endpoint.user_identity_tokens.as_ref().is_none_or(|tokens| {
+            tokens.is_empty() || tokens.iter().any(|token| token.token_type == wanted)
         });
-        endpoint.security_mode == MessageSecurityMode::None && anonymous
+        endpoint.security_mode == MessageSecurityMode::None && known
     })
 }
 
@@ -521,6 +608,9 @@ fn absent(url: &str, why: &str) -> Failure {
 const OBJECT: i32 = 1;
 const VARIABLE: i32 = 2;
 const METHOD: i32 = 4;
+/// Bits of UserAccessLevel (OPC 10000-3, 8.57).
+const READABLE: u8 = 1;
+const WRITABLE: u8 = 2;
 const ANY_RANK: i64 = -2;
 const BATCH: usize = 100;
 const REFERENCES: u32 = 1000;

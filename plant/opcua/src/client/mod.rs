@@ -16,7 +16,7 @@ use opcua::types::StatusCode;
 use tokio::sync::watch;
 
 pub use self::services::{Browse, CallError, CallOptions, MOST_REFERENCES};
-pub use self::subscription::{Notice, Select, Subscription, Watch};
+pub use self::subscription::{Notice, Sampled, Select, Subscription, Watch};
 pub use self::types::MOST_TYPES;
 
 use self::supervisor::Shared;
@@ -34,6 +34,8 @@ pub struct ClientConfig {
     pub accept_untrusted: bool,
     /// What it wants of what servers offer.
     pub security: SecurityChoice,
+    /// As whom it comes. A password is sent over a session without security only with [`SecurityChoice::None`].
+    pub user: Option<ClientUser>,
     /// How long each request may take.
     pub timeout: Duration,
     /// How often it asks the server whether it lives.
@@ -52,10 +54,28 @@ impl ClientConfig {
             pki: None,
             accept_untrusted: false,
             security: SecurityChoice::Best,
+            user: None,
             timeout: Duration::from_secs(2),
             keep_alive: Duration::from_millis(500),
             backoff: (Duration::from_millis(250), Duration::from_secs(5)),
         }
+    }
+}
+
+/// A user of a server.
+#[derive(Clone)]
+pub struct ClientUser {
+    /// The user name.
+    pub name: String,
+    /// What proves it.
+    pub password: String,
+}
+
+impl std::fmt::Debug for ClientUser {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("ClientUser")
+            .field("name", &self.name)
+            .finish_non_exhaustive()
     }
 }
 

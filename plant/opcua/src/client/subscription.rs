@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use opcua::client::{MonitoredItem, OnSubscriptionNotification};
 use opcua::types::{
-    AttributeId, ContentFilterBuilder, DataValue, EventFilter, ExtensionObject,
-    MonitoredItemCreateRequest, MonitoringMode, MonitoringParameters, NodeId, NumericRange,
-    Operand, QualifiedName, ReadValueId, SimpleAttributeOperand, StatusCode, TimestampsToReturn,
-    Variant,
+    AttributeId, ContentFilterBuilder, DataChangeFilter, DataChangeTrigger, DataValue,
+    DeadbandType, EventFilter, ExtensionObject, MonitoredItemCreateRequest, MonitoringMode,
+    MonitoringParameters, NodeId, NumericRange, Operand, QualifiedName, ReadValueId,
+    SimpleAttributeOperand, StatusCode, TimestampsToReturn, Variant,
 };
 use tokio::sync::mpsc;
 use tracing::warn;
@@ -21,8 +21,10 @@ use crate::limits::{MOST_NOTIFICATIONS, MOST_PER_REQUEST};
 /// What is watched.
 #[derive(Debug, Clone)]
 pub enum Watch {
-    /// The value of a variable.
+    /// The value of a variable, looked at as often as the subscription tells.
     Value(NodeId),
+    /// The value of a variable, looked at and kept otherwise.
+    Sampled(Sampled),
     /// The events of an object.
     Events {
         /// The object, as the Server.
@@ -32,6 +34,32 @@ pub enum Watch {
         /// Only events of this type and its subtypes.
         of_type: Option<NodeId>,
     },
+}
+
+/// How the value of a variable is watched.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sampled {
+    /// The variable.
+    pub node: NodeId,
+    /// How often the server is to look at it.
+    pub interval: Duration,
+    /// How many changes the server keeps between two notifications; of more the oldest go.
+    pub queue: u32,
+    /// By how much a number may differ without being told; 0 where each change is told.
+    pub deadband: f64,
+}
+
+impl Sampled {
+    fn filter(&self) -> ExtensionObject {
+        if self.deadband <= 0.0 {
+            return ExtensionObject::null();
+        }
+        ExtensionObject::from_message(DataChangeFilter {
+            trigger: DataChangeTrigger::StatusValue,
+            deadband_type: DeadbandType::Absolute as u32,
+            deadband_value: self.deadband,
+        })
+    }
 }
 
 /// A field of events.
@@ -335,6 +363,7 @@ fn count(time: Duration, interval: Duration) -> u32 {
 fn request(handle: u32, watch: &Watch, interval: Duration) -> MonitoredItemCreateRequest {
     let (node, attribute, filter, queue_size) = match watch {
         Watch::Value(node) => (node, AttributeId::Value, ExtensionObject::null(), VALUES),
+        Watch::Sampled(one) => (&one.node, AttributeId::Value, one.filter(), one.queue),
         Watch::Events {
             node,
             select,
@@ -376,6 +405,7 @@ fn request(handle: u32, watch: &Watch, interval: Duration) -> MonitoredItemCreat
             // Events are not sampled.
             sampling_interval: match watch {
                 Watch::Value(_) => interval.as_secs_f64() * 1e3,
+                Watch::Sampled(one) => one.interval.as_secs_f64() * 1e3,
                 Watch::Events { .. } => 0.0,
             },
             filter,

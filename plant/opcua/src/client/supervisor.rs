@@ -24,7 +24,7 @@ use tracing::{debug, info};
 
 use super::connector::Direct;
 use super::subscription::Wanted;
-use super::{ClientConfig, ClientError, Link, SecurityChoice};
+use super::{ClientConfig, ClientError, ClientUser, Link, SecurityChoice};
 use crate::limits;
 use crate::pki::{OWN_CERTIFICATE, OWN_KEY, Pki};
 use crate::server::NO_PKI;
@@ -243,6 +243,13 @@ enum Activity {
     Published,
 }
 
+fn identity(config: &ClientConfig) -> IdentityToken {
+    match &config.user {
+        Some(ClientUser { name, password }) => IdentityToken::new_user_name(name, password),
+        None => IdentityToken::Anonymous,
+    }
+}
+
 async fn connect(
     shared: &Shared,
     client: &opcua::client::Client,
@@ -255,7 +262,7 @@ async fn connect(
     let source = Direct::new(&shared.url, within);
     let (session, event_loop) = client
         .session_builder()
-        .user_identity_token(IdentityToken::Anonymous)
+        .user_identity_token(identity(&shared.config))
         .with_connector(source)
         .connect_to_endpoint_directly(endpoint.clone())
         .and_then(|builder| builder.build(Arc::clone(client.certificate_store())))
@@ -357,7 +364,14 @@ async fn endpoint(
         tcp.into_iter().find(|one| wanted(one)).cloned()
     };
     let can_secure = config.pki.is_some();
-    let chosen = match config.security {
+    // A password is nothing for everybody to hear.
+    let wanted = match config.security {
+        SecurityChoice::Best if config.user.is_some() => SecurityChoice::Basic256Sha256,
+        other @ (SecurityChoice::Best | SecurityChoice::None | SecurityChoice::Basic256Sha256) => {
+            other
+        }
+    };
+    let chosen = match wanted {
         SecurityChoice::None => has(&is_plain),
         SecurityChoice::Basic256Sha256 if can_secure => has(&is_secured),
         SecurityChoice::Best if can_secure => has(&is_secured).or_else(|| has(&is_plain)),

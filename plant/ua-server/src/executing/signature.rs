@@ -84,8 +84,11 @@ pub(super) async fn read(client: &Client, target: &MethodTarget) -> Result<Signa
     })
 }
 
-/// The NodeId at that server.
-fn node(client: &Client, text: &ExpandedNodeIdText) -> Result<NodeId, String> {
+/// The NodeId at that server, over the connection there is.
+///
+/// # Errors
+/// Why there is none, for people.
+pub(crate) fn node(client: &Client, text: &ExpandedNodeIdText) -> Result<NodeId, String> {
     let namespace = match &text.namespace {
         NamespaceText::Index(index) => *index,
         NamespaceText::Uri(uri) => client

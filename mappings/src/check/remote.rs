@@ -1,0 +1,121 @@
+//! `from` and `to` of a variable.
+
+use super::servers::{self, Servers};
+use super::types::ValueType;
+use crate::code::Code;
+use crate::document::VariableEntry;
+use crate::findings::Findings;
+use crate::node_id::NodeIdText;
+use crate::read::given;
+use crate::remote::{NodeSource, NodeTarget};
+use crate::topic::SpaceId;
+
+/// What of a variable is at other servers.
+pub(super) type Remote = (Option<Box<NodeSource>>, Option<Box<NodeTarget>>);
+
+/// What is known of the variable.
+pub(super) struct Subject<'s> {
+    pub(super) origin: Option<SpaceId>,
+    pub(super) node: Option<&'s NodeIdText>,
+    /// Whether it is one value; of a variable whose fields are not known it may be.
+    pub(super) single: bool,
+    pub(super) value_type: Option<ValueType>,
+    /// Whether ROS or a service makes its values.
+    pub(super) produced: bool,
+}
+
+/// `None` when something of it is faulty, which is noted.
+pub(super) fn check(
+    entry: &VariableEntry,
+    subject: &Subject<'_>,
+    servers: &Servers,
+    findings: &mut Findings,
+) -> Option<Remote> {
+    let from = match &entry.from {
+        None => None,
+        Some(at) => {
+            let source = servers::source(at, servers, findings);
+            let sound = may_come(entry, subject, findings);
+            Some(source.filter(|_| sound)?)
+        }
+    };
+    let to = match &entry.to {
+        None => None,
+        Some(at) => {
+            let target = servers::target(at, servers, findings)?;
+            if !subject.single {
+                findings
+                    .error(
+                        Code::RemoteNode,
+                        at.place,
+                        "a value of several fields goes to no node",
+                    )
+                    .help("bind one `field` of the message, or write it `as: bytes`");
+                return None;
+            }
+            if let Some(from) = &from
+                && from.server == target.server
+                && from.node == target.node
+            {
+                findings
+                    .error(
+                        Code::RemoteNode,
+                        at.place,
+                        "the value goes to the node it comes from",
+                    )
+                    .help("leave `to` out");
+                return None;
+            }
+            Some(target)
+        }
+    };
+    Some((from.map(Box::new), to.map(Box::new)))
+}
+
+/// Whether its values can come from another server.
+fn may_come(entry: &VariableEntry, subject: &Subject<'_>, findings: &mut Findings) -> bool {
+    let Some(place) = entry.from.as_ref().map(|at| at.place) else {
+        return true;
+    };
+    let mut sound = true;
+    let mut fault = |place, message: String, help: &str| {
+        findings.error(Code::RemoteNode, place, message).help(help);
+        sound = false;
+    };
+    if let Some(origin) = subject.origin.filter(|origin| *origin != SpaceId::UA) {
+        let at = entry.origin.as_ref().map_or(place, |at| at.place);
+        let message = format!("the value comes from an OPC UA server, and not from space {origin}");
+        fault(at, message, "origin: 0");
+    } else if subject.produced {
+        fault(
+            place,
+            "the value comes from a node, and from a service of ROS too".to_owned(),
+            "leave one of them out",
+        );
+    }
+    if subject.node.is_some_and(|node| node.namespace == 0) {
+        let at = entry.node.as_ref().map_or(place, |at| at.place);
+        fault(
+            at,
+            "the cell's server shows no such value in namespace 0".to_owned(),
+            "take a node of a namespace of `namespaces`",
+        );
+    }
+    if entry.ua_field.is_some() {
+        fault(
+            place,
+            "the value comes from a node, and not from a publisher with several fields".to_owned(),
+            "leave `ua_field` out",
+        );
+    }
+    let deadband = entry.from.as_ref().and_then(|at| at.value.as_ref());
+    if let Some((_, at)) = deadband.and_then(|from| given(&from.deadband))
+        && subject
+            .value_type
+            .is_some_and(|(builtin, array)| array || !messages::is_number(builtin))
+    {
+        let message = "a deadband of a server goes with a single number".to_owned();
+        fault(at, message, "leave it out: every change is told");
+    }
+    sound
+}

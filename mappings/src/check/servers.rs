@@ -1,0 +1,269 @@
+//! `servers`, and the variables that come from them or go to them.
+
+use std::collections::HashMap;
+use std::num::NonZeroU16;
+
+use super::network::{duration, is_own, remote_endpoint};
+use super::{Declared, required};
+use crate::code::Code;
+use crate::document::SecurityEntry;
+use crate::findings::Findings;
+use crate::mapping::{Endpoint, SecurityPolicy};
+use crate::node_id::ExpandedNodeIdText;
+use crate::read::{At, Field, given, short};
+use crate::remote::{Access, NodeSource, NodeTarget, Password, RemoteServer, User};
+use crate::server_entries::{FromEntry, RemoteServerEntry, ToEntry};
+use crate::tree::Place;
+
+/// Most entries of `servers`.
+const MAX_SERVERS: usize = 256;
+
+pub(super) type Servers = Declared<Vec<RemoteServer>>;
+
+/// The servers; `own` is where the cell's own server is.
+pub(super) fn check(
+    entries: Option<&At<Vec<At<RemoteServerEntry>>>>,
+    own: &Endpoint,
+    findings: &mut Findings,
+) -> Servers {
+    let mut servers = Servers {
+        known: Vec::new(),
+        partial: false,
+    };
+    let Some(entries) = entries else {
+        return servers;
+    };
+    let Some(entries) = &entries.value else {
+        servers.partial = true;
+        return servers;
+    };
+    if let Some(first) = entries.get(MAX_SERVERS) {
+        let message = format!("{} servers; at most {MAX_SERVERS} are read", entries.len());
+        findings.error(Code::TooLarge, first.place, message);
+        servers.partial = true;
+        return servers;
+    }
+    let mut names: HashMap<String, Place> = HashMap::new();
+    for at in entries {
+        let entry = at.value.as_ref();
+        let server = entry.and_then(|entry| server(entry, at.place, own, findings));
+        let Some((server, place)) = server else {
+            servers.partial = true;
+            continue;
+        };
+        if let Some(first) = names.insert(server.name.clone(), place) {
+            let line = findings.line(first, place);
+            let message = format!("two servers are named `{}`", short(&server.name));
+            let note = findings.error(Code::Servers, place, message);
+            note.label(format!("first at {line}"));
+            continue;
+        }
+        servers.known.push(server);
+    }
+    servers
+}
+
+fn server(
+    entry: &RemoteServerEntry,
+    place: Place,
+    own: &Endpoint,
+    findings: &mut Findings,
+) -> Option<(RemoteServer, Place)> {
+    const OF: &str = "the server";
+    let name = required(&entry.name, "name", OF, place, findings)
+        .and_then(|(name, place)| Some((name_of(name, place, findings)?, place)));
+    let endpoint = required(&entry.endpoint, "endpoint", OF, place, findings)
+        .and_then(|(text, place)| other_endpoint((text, place), own, findings));
+    let security = given(&entry.security).map(|(security, place)| match security {
+        SecurityEntry::None => (SecurityPolicy::None, place),
+        SecurityEntry::Basic256Sha256 => (SecurityPolicy::Basic256Sha256, place),
+    });
+    let user = user(entry, findings)?;
+    if let (Some((SecurityPolicy::None, place)), Some(_)) = (security, &user) {
+        let message = "the password of a user goes over a session without security";
+        findings
+            .warning(Code::OpenUser, place, message)
+            .help("security: Basic256Sha256");
+    }
+    let (name, place) = name?;
+    let access = Access {
+        endpoint: endpoint?,
+        security: security.map(|(security, _)| security),
+        user,
+    };
+    Some((RemoteServer { name, access }, place))
+}
+
+fn name_of(name: &str, place: Place, findings: &mut Findings) -> Option<String> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "_-.".contains(c);
+    if !name.is_empty() && name.len() <= 64 && name.chars().all(plain) {
+        return Some(name.to_owned());
+    }
+    let message = format!("`{}` is no name of a server", short(name));
+    let note = findings.error(Code::Servers, place, message);
+    note.help("1 to 64 letters, digits, `_`, `-` and `.`, as plc or press_2");
+    None
+}
+
+/// An endpoint that is not that of the cell's own server.
+fn other_endpoint(
+    (text, place): (&str, Place),
+    own: &Endpoint,
+    findings: &mut Findings,
+) -> Option<Endpoint> {
+    let endpoint = remote_endpoint(text, place, findings)?;
+    if is_own(&endpoint, own) {
+        findings
+            .error(Code::Servers, place, "the endpoint is that of the cell's own server")
+            .help("the cell's server shows what is in the cell; give it another `server.endpoint`, or name another server here");
+        return None;
+    }
+    Some(endpoint)
+}
+
+/// `None` when it is faulty, which is noted.
+#[expect(clippy::option_option, reason = "faulty, left out, or there")]
+fn user(entry: &RemoteServerEntry, findings: &mut Findings) -> Option<Option<User>> {
+    match (&entry.user, &entry.password) {
+        (None, None) => Some(None),
+        (Some(user), Some(password)) => {
+            let (name, text) = (user.value.as_ref()?, password.value.as_ref()?);
+            if name.is_empty() || name.len() > 256 {
+                findings
+                    .error(Code::Servers, user.place, "no user has such a name")
+                    .help("1 to 256 bytes; without `user` the session is anonymous");
+                return None;
+            }
+            // Empty where the environment of another program has it.
+            if !text.is_empty() && !findings.is_hidden(text) {
+                findings
+                    .warning(Code::Secret, password.place, "a password stands here in plain text")
+                    .help("write it as ${NAME:-}: the environment of ua-server has it, and other programs need none");
+            }
+            Some(Some(User {
+                name: name.clone(),
+                password: Password::new(text.clone()),
+            }))
+        }
+        (Some(one), None) => {
+            let message = "a user without a `password`";
+            findings
+                .error(Code::Servers, one.place, message)
+                .help("password: ${PLC_PASSWORD:-}");
+            None
+        }
+        (None, Some(one)) => {
+            let message = "a password without a `user`";
+            findings.error(Code::Servers, one.place, message);
+            None
+        }
+    }
+}
+
+/// One of the servers by its name. `None` when there is none, which is noted.
+pub(super) fn named<'s>(
+    name: &str,
+    place: Place,
+    servers: &'s Servers,
+    findings: &mut Findings,
+) -> Option<&'s RemoteServer> {
+    let found = servers.known.iter().find(|server| server.name == name);
+    // What is missing may have been meant by an entry that is faulty.
+    if found.is_none() && !servers.partial {
+        let message = format!("no server is named `{}`", short(name));
+        let note = findings.error(Code::RemoteNode, place, message);
+        let names = servers.known.iter().map(|server| server.name.as_str());
+        note.help(match crate::nearest::nearest(name, names) {
+            Some(near) => format!("did you mean `{near}`?"),
+            None => format!(
+                "add it: `servers: [{{name: {}, endpoint: opc.tcp://192.168.0.10:4840}}]`",
+                short(name)
+            ),
+        });
+    }
+    found
+}
+
+/// A node of another server. `None` when it is faulty, which is noted.
+pub(super) fn node(
+    field: &Field<String>,
+    (key, of): (&str, &str),
+    owner: Place,
+    findings: &mut Findings,
+) -> Option<ExpandedNodeIdText> {
+    let (text, place) = required(field, key, of, owner, findings)?;
+    match text.parse() {
+        Ok(node) => Some(node),
+        Err(error) => {
+            let message = format!("`{}` is no node id", short(text));
+            findings.error(Code::NodeId, place, message).help(format!(
+                "{error}; of another server best with the URI of its namespace, as nsu=urn:plc;s=Line.Reset"
+            ));
+            None
+        }
+    }
+}
+
+/// `from` of a variable. `None` when it is faulty, which is noted.
+pub(super) fn source(
+    at: &At<FromEntry>,
+    servers: &Servers,
+    findings: &mut Findings,
+) -> Option<NodeSource> {
+    let entry = at.value.as_ref()?;
+    let server = required(&entry.server, "server", "`from`", at.place, findings);
+    let server = server.and_then(|(name, place)| named(name, place, servers, findings));
+    let node = node(&entry.node, ("node", "`from`"), at.place, findings);
+    let sampling = match &entry.sampling {
+        Some(_) => duration(&entry.sampling, findings),
+        None => Some(NodeSource::SAMPLING),
+    };
+    let queue = match given(&entry.queue) {
+        None if entry.queue.is_some() => None,
+        None => Some(NodeSource::QUEUE),
+        Some((number, place)) => {
+            let sound = NonZeroU16::new(*number).filter(|number| number.get() <= 1000);
+            if sound.is_none() {
+                findings
+                    .error(
+                        Code::WrongValue,
+                        place,
+                        format!("a queue of {number} values"),
+                    )
+                    .help("1 to 1000");
+            }
+            sound
+        }
+    };
+    let deadband = match given(&entry.deadband) {
+        None if entry.deadband.is_some() => None,
+        None => Some(0.0),
+        Some((width, place)) => {
+            let sound = Some(*width).filter(|width| *width > 0.0 && width.is_finite());
+            if sound.is_none() {
+                findings
+                    .error(Code::Publish, place, format!("a deadband of {width}"))
+                    .help("a number above 0, in the unit of the value");
+            }
+            sound
+        }
+    };
+    let name = server?.name.clone();
+    Some(NodeSource::new(name, node?, (sampling?, queue?, deadband?)))
+}
+
+/// `to` of a variable. `None` when it is faulty, which is noted.
+pub(super) fn target(
+    at: &At<ToEntry>,
+    servers: &Servers,
+    findings: &mut Findings,
+) -> Option<NodeTarget> {
+    let entry = at.value.as_ref()?;
+    let server = required(&entry.server, "server", "`to`", at.place, findings);
+    let server = server.and_then(|(name, place)| named(name, place, servers, findings));
+    let node = node(&entry.node, ("node", "`to`"), at.place, findings);
+    Some(NodeTarget {
+        server: server?.name.clone(),
+        node: node?,
+    })
+}

@@ -1,0 +1,53 @@
+//! `servers` of the document, and what variables say of them.
+
+use crate::document::{DURATION, EXPANDED_NODE_ID, SecurityEntry};
+use crate::read::document;
+
+document! {
+    /// An OPC UA server that exists already, such as that of a PLC. The cell's own server is its client.
+    struct RemoteServerEntry {
+        /// What the mapping calls it: letters, digits, `_`, `-` and `.`.
+        #[schemars(required, regex(pattern = r"^[A-Za-z0-9_.-]{1,64}$"))]
+        name: String,
+        /// Where it is, as opc.tcp://192.168.0.10:4840.
+        #[schemars(required, regex(pattern = r"^opc\.tcp://"))]
+        endpoint: String,
+        /// Security policy of the session. Left out: the best that the server offers, which may be None; `Basic256Sha256` is signed
+        /// and encrypted, or there is no session.
+        security: SecurityEntry,
+        /// User name. Left out: anonymous.
+        #[schemars(length(min = 1, max = 256))]
+        user: String,
+        /// The user's password, as ${PLC_PASSWORD:-}: the environment of ua-server has it, and not the file; other programs need none.
+        password: String,
+    }
+
+    /// The node of another server that the value comes from.
+    struct FromEntry {
+        /// The server, by its `name` among `servers`.
+        #[schemars(required)]
+        server: String,
+        /// The variable there, as nsu=urn:plc;s=Line.Speed: its namespace by the URI, which holds when the server numbers its
+        /// namespaces anew, or by the index there, as ns=3;i=7.
+        #[schemars(required, regex(pattern = EXPANDED_NODE_ID))]
+        node: String,
+        /// How often the server is to look whether it has changed; default 100ms. Servers may do so less often.
+        #[schemars(regex(pattern = DURATION))]
+        sampling: String,
+        /// How many changes the server keeps until it tells them, 1 to 1000; default 10. Of more the oldest go.
+        #[schemars(range(min = 1, max = 1000))]
+        queue: u16,
+        /// Numbers have to differ by more than this to be told.
+        deadband: f64,
+    }
+
+    /// The node of another server that values are written to.
+    struct ToEntry {
+        /// The server, by its `name` among `servers`.
+        #[schemars(required)]
+        server: String,
+        /// The variable there, as in `from`.
+        #[schemars(required, regex(pattern = EXPANDED_NODE_ID))]
+        node: String,
+    }
+}

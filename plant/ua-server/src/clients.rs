@@ -1,0 +1,69 @@
+//! Sessions with other servers: one for each way in, whoever uses it.
+
+use std::collections::{HashMap, HashSet};
+use std::path::Path;
+use std::time::Duration;
+
+use mappings::{Access, ExecutedBy, Mapping, SecurityPolicy};
+use plant_opcua::client::{Client, ClientConfig, ClientUser, SecurityChoice};
+
+/// The clients of other servers.
+pub(crate) struct Clients {
+    config: ClientConfig,
+    open: HashMap<Access, Client>,
+}
+
+impl Clients {
+    /// As a client with that ApplicationUri and the certificates in `pki`.
+    pub(crate) fn new(application_uri: &str, pki: &Path) -> Self {
+        Self {
+            config: ClientConfig {
+                pki: Some(pki.to_owned()),
+                timeout: ANSWERS_WITHIN,
+                keep_alive: KEEP_ALIVE,
+                ..ClientConfig::new(application_uri, "UA bridge server")
+            },
+            open: HashMap::new(),
+        }
+    }
+
+    /// The client of a server: it connects from now on, for ever.
+    pub(crate) fn of(&mut self, access: &Access) -> Client {
+        if let Some(open) = self.open.get(access) {
+            return open.clone();
+        }
+        let config = ClientConfig {
+            security: match access.security {
+                None => SecurityChoice::Best,
+                Some(SecurityPolicy::None) => SecurityChoice::None,
+                Some(SecurityPolicy::Basic256Sha256) => SecurityChoice::Basic256Sha256,
+            },
+            user: access.user.as_ref().map(|user| ClientUser {
+                name: user.name.clone(),
+                password: user.password.reveal().to_owned(),
+            }),
+            ..self.config.clone()
+        };
+        let client = Client::open(config, &access.endpoint.to_string());
+        self.open.insert(access.clone(), client.clone());
+        client
+    }
+
+    /// Lets go of the sessions that the mapping has no use for.
+    pub(crate) fn keep(&mut self, mapping: &Mapping) {
+        let servers = mapping.servers().iter().map(|server| &server.access);
+        let methods = mapping
+            .calls()
+            .iter()
+            .filter_map(|call| match &call.executed {
+                ExecutedBy::OpcUa(target) => Some(&target.access),
+                ExecutedBy::Ros(_) | ExecutedBy::Elsewhere => None,
+            });
+        let wanted: HashSet<&Access> = servers.chain(methods).collect();
+        self.open.retain(|access, _| wanted.contains(access));
+    }
+}
+
+/// How long a server may take for what is asked beside Methods. One that does its Methods and nothing beside them takes long.
+const ANSWERS_WITHIN: Duration = Duration::from_secs(5);
+const KEEP_ALIVE: Duration = Duration::from_secs(2);

@@ -1,0 +1,89 @@
+"""An asyncua server as a PLC that knows nothing of the space: variables that are set by JSON lines on standard input, as
+{"set": "Speed", "value": 1.5, "status": "UncertainLastUsableValue", "age": 60}, and one that clients write, which is said.
+`--before N` puts N namespaces in front of its own; `--user NAME PASSWORD` has it refuse all others."""
+
+import argparse
+import asyncio
+import datetime
+import json
+import sys
+
+from asyncua import Server, ua
+from asyncua.server.user_managers import User, UserManager, UserRole
+
+import lifetime
+
+URI = "urn:ua-bridge:system-tests:plc"
+
+
+class Heard:
+    def __init__(self):
+        self.first = True
+
+    def datachange_notification(self, _node, value, _data):
+        if not self.first:
+            lifetime.say(written=value)
+        self.first = False
+
+
+class One(UserManager):
+    def __init__(self, name, password):
+        self.wanted = (name, password)
+
+    def get_user(self, _server, username=None, password=None, certificate=None):
+        told = password.decode() if isinstance(password, bytes) else password
+        if (username, told) == self.wanted:
+            return User(role=UserRole.Admin)
+        return None
+
+
+def data_value(said):
+    age = datetime.timedelta(seconds=said.get("age", 0))
+    status = ua.StatusCode(getattr(ua.StatusCodes, said.get("status", "Good")))
+    value = ua.Variant(said["value"], ua.VariantType.Double)
+    source = datetime.datetime.now(datetime.timezone.utc) - age
+    return ua.DataValue(value, status, SourceTimestamp=source)
+
+
+async def run(args):
+    server = Server(user_manager=One(*args.user) if args.user else None)
+    await server.init()
+    server.set_endpoint(args.endpoint)
+    server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    if args.user:
+        server.set_identity_tokens([ua.UserNameIdentityToken])
+    for number in range(args.before):
+        await server.register_namespace(f"urn:other:{number}")
+    space = await server.register_namespace(URI)
+    line = await server.nodes.objects.add_object(ua.NodeId("Line", space), ua.QualifiedName("Line", space))
+    variables = {}
+    for name in ["Speed", "Load", "Setpoint"]:
+        node = ua.NodeId(f"Line.{name}", space)
+        variables[name] = await line.add_variable(node, ua.QualifiedName(name, space), 0.5)
+    await variables["Setpoint"].set_writable()
+    reader = asyncio.StreamReader()
+    pipe = asyncio.StreamReaderProtocol(reader)
+    await asyncio.get_running_loop().connect_read_pipe(lambda: pipe, sys.stdin)
+    async with server:
+        subscription = await server.create_subscription(20, Heard())
+        await subscription.subscribe_data_change(variables["Setpoint"])
+        lifetime.say(ready=args.endpoint)
+        while line := await reader.readline():
+            said = json.loads(line)
+            await variables[said["set"]].write_value(data_value(said))
+            lifetime.say(set=said["set"])
+        await asyncio.Event().wait()
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("endpoint")
+    parser.add_argument("--before", type=int, default=0)
+    parser.add_argument("--user", nargs=2)
+    parser.add_argument("--limit", type=float, default=120.0)
+    args = parser.parse_args()
+    lifetime.bound(args.limit)
+    asyncio.run(run(args))
+
+
+main()

@@ -1,0 +1,252 @@
+//! Servers of other makers, which know nothing of the space, as sources and as those that are told.
+
+use std::fs;
+use std::path::Path;
+use std::time::Duration;
+
+use nix::sys::signal::Signal;
+use serde_json::{Value, json};
+use system_tests::{
+    Cell, Child, METRICS_SERVER, Peer, SERVER_ENDPOINT, UadpSocket, eventually, http_get, metrics,
+};
+use uadp::{NetworkMessage, Scalar, Variant};
+
+use super::key_frame;
+
+/// asyncua and node-opcua need seconds to start on a busy machine.
+const SOON: Duration = Duration::from_secs(40);
+const PLC: &str = "opc.tcp://127.0.0.1:4841";
+const URI: &str = "urn:ua-bridge:system-tests:plc";
+
+fn mapping(more: &str) -> String {
+    let node = |name: &str| format!("{{server: plc, node: 'nsu={URI};s=Line.{name}'");
+    format!(
+        "
+spaces: [{{id: 2}}]
+namespaces: {{2: 'urn:ua-bridge:system-tests'}}
+servers:
+  - {{name: plc, endpoint: '{PLC}', security: None}}
+variables:
+  - {{node: ns=2;i=1, name: speed, type: Double, origin: 0, from: {speed}, sampling: 20ms}}}}
+  - {{node: ns=2;i=3, name: missing, type: Double, origin: 0, from: {missing}}}}}
+  - {{node: ns=2;i=4, name: setpoint, type: Double, origin: 2, to: {setpoint}}}}}
+{more}",
+        speed = node("Speed"),
+        missing = node("Sped"),
+        setpoint = node("Setpoint"),
+    )
+}
+
+/// Waits for a notification of that node with that status and value; all of it.
+fn shows(watch: &mut Child, node: &str, status: &str, value: &Value) -> Value {
+    let what = format!("{node} shows {value} as {status}");
+    watch.wait_for_json(&what, SOON, |line| {
+        let is = line["node"] == node && line["status"] == status && line["value"] == *value;
+        is.then(|| line.clone())
+    })
+}
+
+/// How often the node has been shown with that status.
+fn times(watch: &Child, node: &str, status: &str) -> usize {
+    let lines = watch.json_lines();
+    let shown = lines.iter();
+    shown
+        .filter(|line| line["node"] == node && line["status"] == status)
+        .count()
+}
+
+fn becomes(watch: &Child, node: &str, status: &str, before: usize) {
+    eventually(&format!("{node} becomes {status} again"), SOON, || {
+        (times(watch, node, status) > before).then_some(())
+    });
+}
+
+/// What the server tells of the PLC.
+fn link(pick: impl Fn(&Value) -> bool) -> Value {
+    eventually("the link is told as it is", SOON, || {
+        let told = metrics(METRICS_SERVER)?["servers"][0].clone();
+        pick(&told).then_some(told)
+    })
+}
+
+/// A message of the server with that value: its Status, and its age in seconds.
+fn sent(group: &UadpSocket, id: u16, value: f64) -> (u16, i128) {
+    eventually("the value is sent", SOON, || {
+        let datagram = group.receive(Duration::from_secs(1))?;
+        let network = NetworkMessage::decode(&datagram).ok()?;
+        let message = network.messages().next()?.ok()?;
+        let header = message.header();
+        let only = message.fields().ok()?.next()?.ok()?;
+        let is = message.writer_id == Some(id) && only == Variant::Scalar(Scalar::Double(value));
+        let (taken, sent) = (header.timestamp?, network.header().timestamp?);
+        let age = i128::from(sent.0 - taken.0) / 10_000_000;
+        is.then(|| (header.status.unwrap_or_default(), age))
+    })
+}
+
+fn asyncua_plc(cell: &Cell, more: &[&str]) -> Child {
+    cell.asyncua("opcua_plc.py", &[&[PLC], more].concat())
+}
+
+fn written(plc: &mut Child, value: f64) {
+    plc.wait_for_json(&format!("{value} is written"), SOON, |line| {
+        (line.get("written")? == value).then_some(())
+    });
+}
+
+fn save(file: &Path, text: &str) {
+    let beside = file.with_extension("new");
+    fs::write(&beside, text).unwrap();
+    fs::rename(beside, file).unwrap();
+}
+
+#[test]
+fn a_plc_that_boots_second_is_heard_with_its_times_and_qualities_and_is_bad_while_it_is_away() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let file = cell.file("plc.yaml", &mapping(""));
+    let _server = cell.ua_server(&[file.to_str().unwrap()]);
+    let group = UadpSocket::join();
+    let nodes = [SERVER_ENDPOINT, "ns=2;i=1", "ns=2;i=3", "ns=2;i=4"];
+    let mut watch = cell.asyncua("opcua_subscribe.py", &nodes);
+    let speed = "ns=2;i=1";
+    shows(&mut watch, speed, "BadNoCommunication", &Value::Null);
+    assert_eq!(link(|told| told["why"].is_string())["up"], false);
+
+    let mut plc = asyncua_plc(&cell, &[]);
+    shows(&mut watch, speed, "Good", &json!(0.5));
+    // One that the server does not have is bad alone, and told by its name.
+    shows(&mut watch, "ns=2;i=3", "BadNodeIdUnknown", &Value::Null);
+    let told = link(|told| told["up"] == true && told["faults"]["missing (from)"].is_string());
+    assert_eq!((&told["name"], &told["url"]), (&json!("plc"), &json!(PLC)));
+    assert_eq!(told["faults"].as_object().unwrap().len(), 1, "{told}");
+    let page = http_get(METRICS_SERVER, "/metrics").unwrap();
+    let up = r#"ua_server_up{program="ua-server",space="0",server="plc"} 1"#;
+    assert!(page.contains(up), "{page}");
+
+    // A time of its own and a quality of its own, for clients and for the space.
+    let uncertain =
+        r#"{"set": "Speed", "value": 7.5, "age": 600, "status": "UncertainLastUsableValue"}"#;
+    plc.ask(uncertain, SOON);
+    let told = shows(&mut watch, speed, "UncertainLastUsableValue", &json!(7.5));
+    let (source, server) = (&told["source_timestamp"], &told["server_timestamp"]);
+    assert!(source.as_str() < server.as_str(), "{told}");
+    let (status, age) = sent(&group, 1, 7.5);
+    assert_eq!(status, 0x4090);
+    assert!((600..660).contains(&age), "{age} s");
+    plc.ask(
+        r#"{"set": "Speed", "value": 8.5, "status": "BadSensorFailure"}"#,
+        SOON,
+    );
+    shows(&mut watch, speed, "BadSensorFailure", &Value::Null);
+    plc.ask(r#"{"set": "Speed", "value": 9.5}"#, SOON);
+    shows(&mut watch, speed, "Good", &json!(9.5));
+
+    // Nobody but the PLC says what it is.
+    let write = [SERVER_ENDPOINT, speed, "Double", "1.0"];
+    let refused = cell.asyncua_once("opcua_write.py", &write).remove(0);
+    assert!(
+        refused["status"].as_str().unwrap().starts_with("Bad"),
+        "{refused}"
+    );
+
+    // What another space says is written there, and again when it comes back.
+    group.send(&key_frame(4, 1, |fields| {
+        fields.scalar(Scalar::Double(42.0)).unwrap();
+    }));
+    written(&mut plc, 42.0);
+    let before = times(&watch, speed, "BadNoCommunication");
+    plc.signal(Signal::SIGKILL);
+    becomes(&watch, speed, "BadNoCommunication", before);
+    drop(plc);
+    let good = times(&watch, speed, "Good");
+    // It numbers its namespaces otherwise now.
+    let mut plc = asyncua_plc(&cell, &["--before", "2"]);
+    becomes(&watch, speed, "Good", good);
+    plc.ask(r#"{"set": "Speed", "value": 10.5}"#, SOON);
+    shows(&mut watch, speed, "Good", &json!(10.5));
+
+    // Another mapping leaves the session alone.
+    let connects = link(|told| told["up"] == true)["connects"].clone();
+    let load = format!(
+        "  - {{node: ns=2;i=5, name: load, type: Double, origin: 0, from: {{server: plc, node: 'nsu={URI};s=Line.Load'}}}}\n"
+    );
+    save(&file, &mapping(&load));
+    let mut loads = eventually("the new node is there", SOON, || {
+        let read = cell.asyncua_try("opcua_read.py", &[SERVER_ENDPOINT, "ns=2;i=5"])?;
+        (read.first()?["value"] == 0.5).then_some(())?;
+        Some(cell.asyncua("opcua_subscribe.py", &[SERVER_ENDPOINT, "ns=2;i=5"]))
+    });
+    plc.ask(r#"{"set": "Load", "value": 3.5}"#, SOON);
+    shows(&mut loads, "ns=2;i=5", "Good", &json!(3.5));
+    plc.ask(r#"{"set": "Speed", "value": 11.5}"#, SOON);
+    shows(&mut watch, speed, "Good", &json!(11.5));
+    assert_eq!(link(|told| told["up"] == true)["connects"], connects);
+}
+
+#[test]
+fn a_server_of_node_opcua_is_heard_and_told_before_and_after_it_was_killed() {
+    let Some(cell) = Cell::with(&[Peer::Python, Peer::NodeOpcua]) else {
+        return;
+    };
+    let more = format!(
+        "  - {{node: ns=2;i=6, name: wish, type: Double, origin: 0, to: {{server: plc, node: 'nsu={URI};s=Line.Setpoint'}}}}\n"
+    );
+    let file = cell.file("plc.yaml", &mapping(&more));
+    let mut plc = cell.node_opcua("plc.js", &["4841"]);
+    let _server = cell.ua_server(&[file.to_str().unwrap()]);
+    let mut watch = cell.asyncua(
+        "opcua_subscribe.py",
+        &[SERVER_ENDPOINT, "ns=2;i=1", "ns=2;i=3"],
+    );
+    let speed = "ns=2;i=1";
+    plc.ask(r#"{"set": 1.5}"#, SOON);
+    shows(&mut watch, speed, "Good", &json!(1.5));
+    shows(&mut watch, "ns=2;i=3", "BadNodeIdUnknown", &Value::Null);
+    // What a client of ours writes goes on to it.
+    let write = [SERVER_ENDPOINT, "ns=2;i=6", "Double", "21.5"];
+    let wrote = cell.asyncua_once("opcua_write.py", &write).remove(0);
+    assert_eq!(wrote["status"], "Good");
+    written(&mut plc, 21.5);
+    let before = times(&watch, speed, "BadNoCommunication");
+    plc.signal(Signal::SIGKILL);
+    becomes(&watch, speed, "BadNoCommunication", before);
+    drop(plc);
+    let mut plc = cell.node_opcua("plc.js", &["4841"]);
+    // The state of the cell is told anew.
+    written(&mut plc, 21.5);
+    plc.ask(r#"{"set": 2.5}"#, SOON);
+    shows(&mut watch, speed, "Good", &json!(2.5));
+    let told = link(|told| told["up"] == true);
+    assert!(told["written"].as_u64() >= Some(2), "{told}");
+}
+
+#[test]
+fn a_password_goes_over_no_session_without_security_unless_told() {
+    let Some(cell) = Cell::with(&[Peer::Python]) else {
+        return;
+    };
+    let text = |security: &str, password: &str| {
+        let user = format!("{security}user: cell, password: '{password}'");
+        mapping("").replace("security: None", &user)
+    };
+    let file = cell.file("plc.yaml", &text("", "right"));
+    let _server = cell.ua_server(&[file.to_str().unwrap()]);
+    let _plc = asyncua_plc(&cell, &["--user", "cell", "right"]);
+    let mut watch = cell.asyncua("opcua_subscribe.py", &[SERVER_ENDPOINT, "ns=2;i=1"]);
+    let speed = "ns=2;i=1";
+    let told = link(|told| {
+        let why = told["why"].as_str().unwrap_or_default();
+        why.contains("offers no security we can have")
+    });
+    assert_eq!(told["up"], false, "{told}");
+    save(&file, &text("security: None, ", "wrong"));
+    link(|told| {
+        let why = told["why"].as_str().unwrap_or_default();
+        !why.is_empty() && !why.contains("offers no security") && !why.contains("wrong")
+    });
+    assert_eq!(times(&watch, speed, "Good"), 0);
+    save(&file, &text("security: None, ", "right"));
+    shows(&mut watch, speed, "Good", &json!(0.5));
+}
