@@ -85,7 +85,13 @@ fn sent(group: &UadpSocket, id: u16, value: f64) -> (u16, i128) {
 }
 
 fn asyncua_plc(cell: &Cell, more: &[&str]) -> Child {
-    cell.asyncua("opcua_plc.py", &[&[PLC], more].concat())
+    let plc = cell.asyncua_started("opcua_plc.py", &[&[PLC], more].concat());
+    plc.told().start().ready(SOON)
+}
+
+fn node_opcua_plc(cell: &Cell) -> Child {
+    let plc = cell.node_opcua_started("plc.js", &["4841"]);
+    plc.told().start().ready(SOON)
 }
 
 fn written(plc: &mut Child, value: f64) {
@@ -194,7 +200,7 @@ fn a_server_of_node_opcua_is_heard_and_told_before_and_after_it_was_killed() {
         "  - {{node: ns=2;i=6, name: wish, type: Double, origin: 0, to: {{server: plc, node: 'nsu={URI};s=Line.Setpoint'}}}}\n"
     );
     let file = cell.file("plc.yaml", &mapping(&more));
-    let mut plc = cell.node_opcua("plc.js", &["4841"]);
+    let mut plc = node_opcua_plc(&cell);
     let _server = cell.ua_server(&[file.to_str().unwrap()]);
     let mut watch = cell.asyncua(
         "opcua_subscribe.py",
@@ -213,7 +219,7 @@ fn a_server_of_node_opcua_is_heard_and_told_before_and_after_it_was_killed() {
     plc.signal(Signal::SIGKILL);
     becomes(&watch, speed, "BadNoCommunication", before);
     drop(plc);
-    let mut plc = cell.node_opcua("plc.js", &["4841"]);
+    let mut plc = node_opcua_plc(&cell);
     // The state of the cell is told anew.
     written(&mut plc, 21.5);
     plc.ask(r#"{"set": 2.5}"#, SOON);
