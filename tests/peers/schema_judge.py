@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 
 import lifetime
 
-TOP = ("include", "type_paths", "spaces", "pubsub", "security", "server", "namespaces", "variables", "patterns", "calls")
+TOP = ("include", "type_paths", "spaces", "pubsub", "security", "server", "servers", "namespaces", "variables", "patterns", "calls")
 
 
 def document(text):

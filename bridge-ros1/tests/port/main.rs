@@ -162,6 +162,7 @@ fn line(event: &PortEvent) -> String {
         PortEvent::Sample { topic, payload, .. } => format!("{topic} = {payload:?}"),
         PortEvent::Live { topic, live } => format!("{topic} live {live}"),
         PortEvent::Unbound { topic } => format!("{topic} unbound"),
+        PortEvent::Qualified { topic, status, .. } => format!("{topic} of quality {status:#06x}"),
         PortEvent::Left { topic, .. } => format!("{topic} left"),
         PortEvent::Unmatched { topic } => format!("{topic} unmatched"),
         PortEvent::Dropped { reason, why, count } => format!("{count} {} {why}", reason.label()),
