@@ -255,13 +255,7 @@ impl Told for Status {
             }
         }
         for link in &self.servers {
-            let labels = format!("{own},server=\"{}\"", link.name);
-            line("server_up", &labels, &u8::from(link.up));
-            line("server_connects_total", &labels, &link.connects);
-            line("server_values_total", &labels, &link.values);
-            line("server_written_total", &labels, &link.written);
-            line("server_not_written_total", &labels, &link.not_written);
-            line("server_faults", &labels, &link.faults.len());
+            link.figures(&own, &mut line);
         }
         for (hop, delays) in &self.hops {
             let labels = format!("{own},hop=\"{hop}\"");
@@ -272,6 +266,19 @@ impl Told for Status {
             line("hop_max_microseconds", &labels, &delays.max_us);
         }
         text
+    }
+}
+
+impl LinkState {
+    /// Gives each figure: its name, its labels, `own` among them, and its value.
+    fn figures(&self, own: &str, line: &mut impl FnMut(&str, &str, &dyn std::fmt::Display)) {
+        let labels = format!("{own},server=\"{}\"", self.name);
+        line("server_up", &labels, &u8::from(self.up));
+        line("server_connects_total", &labels, &self.connects);
+        line("server_values_total", &labels, &self.values);
+        line("server_written_total", &labels, &self.written);
+        line("server_not_written_total", &labels, &self.not_written);
+        line("server_faults", &labels, &self.faults.len());
     }
 }
 
