@@ -195,6 +195,14 @@ fn written(file: &str, places: &[String], plan: &mut Plan) -> Result<String, Fai
             "namespaces",
             render::namespaces(plan, "  "),
         );
+        let servers = "Servers that exist already: ua-server is their client, and a value is bad while its server is away. Their best security\n\
+             # is taken that both sides know; say `security`, `user` and `password` where that is not enough.";
+        section(
+            &mut lines,
+            servers,
+            "servers",
+            render::servers(plan, "  "),
+        );
         let variables = render::variables(plan, "  ");
         if !variables.lines.is_empty() {
             lines.extend(
@@ -252,6 +260,7 @@ fn added(file: &str, (text, before): (&str, &Mapping), plan: &mut Plan) -> Resul
                 "namespaces",
                 render::namespaces(plan, &indent("namespaces")),
             ),
+            ("servers", render::servers(plan, &indent("servers"))),
         ] {
             if !block.is_empty() {
                 (merged, _) = merge::append(&merged, key, &block)?;
@@ -294,8 +303,8 @@ fn added(file: &str, (text, before): (&str, &Mapping), plan: &mut Plan) -> Resul
 
 fn unmergeable() -> Failure {
     Failure::Unconfigured(
-        "nothing can be put into the file as it is written: have each of `spaces`, `namespaces`, `variables` and `calls` on lines \
-         of their own below the key, not in brackets or braces; it stays as it is"
+        "nothing can be put into the file as it is written: have each of `spaces`, `namespaces`, `servers`, `variables` and `calls` \
+         on lines of their own below the key, not in brackets or braces; it stays as it is"
             .to_owned(),
     )
 }
@@ -743,7 +752,11 @@ mod tests {
         let ros2 = graph(2, &[(feedback, kind, true)]);
         let server = |url: &str| Nodes {
             place: url.to_owned(),
-            endpoint: Some(url.to_owned()),
+            server: Some(survey::UaServer {
+                endpoint: url.to_owned(),
+                name: "Press 7 (left)".to_owned(),
+                is_cell: false,
+            }),
             namespaces: ["http://opcfoundation.org/UA/", "urn:s", "urn:plc"]
                 .map(str::to_owned)
                 .to_vec(),

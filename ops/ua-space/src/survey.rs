@@ -28,13 +28,23 @@ pub(crate) struct Nodes {
     /// What they are from, for people.
     pub(crate) place: String,
     /// Of a server that runs.
-    pub(crate) endpoint: Option<String>,
+    pub(crate) server: Option<UaServer>,
     /// The URI of each namespace index that its node ids use; 0 is OPC UA's own.
     pub(crate) namespaces: Vec<String>,
     /// Its variables below the Objects folder, properties and parts of variables aside.
     pub(crate) variables: Vec<UaVariable>,
     /// Of a server that runs: its Methods there, but for those by which a server of the space shows its calls.
     pub(crate) methods: Vec<UaMethod>,
+}
+
+/// A server that was looked at.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct UaServer {
+    pub(crate) endpoint: String,
+    /// Its ApplicationName.
+    pub(crate) name: String,
+    /// Whether it is the server of a cell, which shows the space.
+    pub(crate) is_cell: bool,
 }
 
 /// A Method of a server.
@@ -55,8 +65,19 @@ pub(crate) struct UaVariable {
     pub(crate) name: String,
     /// The name of the object it is in, where that is not the Objects folder.
     pub(crate) within: String,
+    /// Where its value comes from, if that is not the cell's own server.
+    pub(crate) source: Option<UaSource>,
     /// Builtin type and whether it is an array; `None` for matrices and abstract types.
     pub(crate) value: Option<(BuiltinType, bool)>,
+}
+
+/// A node of a server that is not the cell's own.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct UaSource {
+    /// What the mapping calls the server.
+    pub(crate) server: String,
+    /// The node there, by the URI of its namespace.
+    pub(crate) node: String,
 }
 
 /// Runs what looks around, on a runtime that ends with it.

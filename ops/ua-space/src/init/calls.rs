@@ -26,8 +26,20 @@ pub(super) struct CallEntry {
 pub(super) enum Executor {
     /// A service or action of the origin, and its type.
     Ros(CallKind, String, String),
-    /// A Method of the server at that endpoint.
-    Method { endpoint: String, target: String },
+    /// A Method of a server.
+    Method {
+        server: Whose,
+        target: String,
+    },
+}
+
+/// A server, as a call names it.
+#[derive(Clone, Debug)]
+pub(super) enum Whose {
+    /// By its name among `servers`.
+    Named(String),
+    /// By its endpoint.
+    At(String),
 }
 
 /// What is found, without a node yet.
@@ -53,7 +65,7 @@ pub(super) type Untyped = BTreeMap<SpaceId, BTreeSet<String>>;
 /// The calls of `graphs` and `nodes` that are not `known`, in their order.
 pub(super) fn candidates(
     graphs: &[Graph],
-    nodes: &[Nodes],
+    (nodes, servers): (&[Nodes], &[Option<String>]),
     known: &Known,
 ) -> (Vec<Candidate>, Untyped) {
     let (mut found, mut untyped) = (Vec::new(), Untyped::new());
@@ -82,12 +94,16 @@ pub(super) fn candidates(
             }
         }
     }
-    for server in nodes {
-        let Some(endpoint) = &server.endpoint else {
+    for (nodes, name) in nodes.iter().zip(servers) {
+        let Some(server) = &nodes.server else {
             continue;
         };
-        let methods = server.methods.iter();
-        found.extend(methods.filter_map(|one| method(one, server, endpoint, known)));
+        let at = match name {
+            Some(name) => Whose::Named(name.clone()),
+            None => Whose::At(server.endpoint.clone()),
+        };
+        let methods = nodes.methods.iter();
+        found.extend(methods.filter_map(|one| method(one, (nodes, &at), known)));
     }
     (found, untyped)
 }
@@ -101,7 +117,11 @@ fn ros(kind: CallKind, origin: SpaceId, name: &str, type_name: &str) -> Candidat
     }
 }
 
-fn method(one: &UaMethod, server: &Nodes, endpoint: &str, known: &Known) -> Option<Candidate> {
+fn method(
+    one: &UaMethod,
+    (server, at): (&Nodes, &Whose),
+    known: &Known,
+) -> Option<Candidate> {
     let expanded = |node: &NodeIdText| {
         let uri = server.namespaces.get(usize::from(node.namespace))?;
         let namespace = match node.namespace {
@@ -129,7 +149,7 @@ fn method(one: &UaMethod, server: &Nodes, endpoint: &str, known: &Known) -> Opti
         name,
         origin: SpaceId::UA,
         what: Executor::Method {
-            endpoint: endpoint.to_owned(),
+            server: at.clone(),
             target,
         },
     })
@@ -236,11 +256,12 @@ fn entry(call: &CallEntry, indent: &str, lines: &mut Vec<String>) {
                 scalar(type_name)
             )
         }
-        Executor::Method { endpoint, target } => {
-            format!(
-                "{mark}  opcua: {{endpoint: {}, {target}}}",
-                scalar(endpoint)
-            )
+        Executor::Method { server, target } => {
+            let server = match server {
+                Whose::Named(name) => format!("server: {}", scalar(name)),
+                Whose::At(endpoint) => format!("endpoint: {}", scalar(endpoint)),
+            };
+            format!("{mark}  opcua: {{{server}, {target}}}")
         }
     });
 }

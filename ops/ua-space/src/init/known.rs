@@ -6,6 +6,7 @@ use mappings::{Mapping, NodeIdText, SpaceId, TopicId};
 use messages::TypeName;
 
 use super::yaml;
+use crate::survey::UaSource;
 
 /// A mapping, and what its comments speak of: what somebody left out on purpose is not proposed again.
 #[derive(Default)]
@@ -19,12 +20,23 @@ pub(super) struct Known {
     numbers: HashMap<u16, BTreeSet<u16>>,
     /// Words of comments that begin with a slash.
     mentioned: HashSet<String>,
+    /// Nodes of other servers that variables come from or go to: the server's name, and the node there.
+    sources: HashSet<(String, String)>,
+    /// Names that were given to servers.
+    servers: HashSet<String>,
     /// Methods in comments, as they are written: `object: .., method: ..`.
     methods: HashSet<String>,
     /// Node ids in comments, as they are written.
     written: HashSet<String>,
     /// The namespace of the last of them; a node of namespace 0 has this in its topic names.
     hearing: u16,
+}
+
+/// The name of a server.
+pub(super) enum Named {
+    /// In the mapping.
+    Known(String),
+    New(String),
 }
 
 impl Known {
@@ -35,6 +47,14 @@ impl Known {
             known.nodes.insert(variable.node.clone());
             let namespace = variable.node.namespace;
             known.names.insert((namespace, variable.name.clone()));
+            if let Some(from) = &variable.from {
+                let source = (from.server.clone(), from.node.to_string());
+                known.sources.insert(source);
+            }
+            if let Some(to) = &variable.to {
+                let source = (to.server.clone(), to.node.to_string());
+                known.sources.insert(source);
+            }
             let TopicId {
                 namespace,
                 identifier,
@@ -63,7 +83,9 @@ impl Known {
         let words = comment.split(|c: char| !is_name(c));
         let topics = words.filter(|word| word.starts_with('/') && word.len() > 1);
         self.mentioned.extend(topics.map(str::to_owned));
-        if let Some((_, written)) = comment.split_once("node: ") {
+        if let Some(source) = source_in(comment) {
+            self.sources.insert(source);
+        } else if let Some((_, written)) = comment.split_once("node: ") {
             let written = written.trim();
             let index = written.trim_start_matches('"').strip_prefix("ns=");
             let index = index.and_then(|rest| rest.split(';').next());
@@ -110,6 +132,59 @@ impl Known {
 
     pub(super) fn has_node(&self, node: &NodeIdText) -> bool {
         self.nodes.contains(node) || self.written.contains(&yaml::scalar(&node.to_string()))
+    }
+
+    /// Whether a variable comes from that node of another server or goes there, or a comment says so.
+    pub(super) fn has_source(&self, source: &UaSource) -> bool {
+        let UaSource { server, node } = source;
+        let written = yaml::scalar(node);
+        [node, &written]
+            .into_iter()
+            .any(|node| self.sources.contains(&(server.clone(), node.clone())))
+    }
+
+    /// The node of a variable, and whether it comes from another server than that, or goes there.
+    pub(super) fn is_of_other(&self, node: &NodeIdText, server: &str) -> bool {
+        let variables = self.mapping.variables().iter();
+        let mut same = variables.filter(|variable| variable.node == *node);
+        same.any(|variable| {
+            let from = variable.from.as_ref().map(|from| &from.server);
+            let to = variable.to.as_ref().map(|to| &to.server);
+            from.or(to).is_some_and(|other| other != server)
+        })
+    }
+
+    /// What the mapping calls the server at an endpoint, or is to call it.
+    pub(super) fn server(&mut self, endpoint: &str, wanted: &str) -> Named {
+        let servers = self.mapping.servers().iter();
+        let mut there = servers.filter(|server| server.access.endpoint.to_string() == endpoint);
+        if let Some(there) = there.next() {
+            return Named::Known(there.name.clone());
+        }
+        let mut plain: String = wanted
+            .chars()
+            .map(|c| match c.is_ascii_alphanumeric() {
+                true => c.to_ascii_lowercase(),
+                false => '-',
+            })
+            .take(40)
+            .collect();
+        while plain.contains("--") {
+            plain = plain.replace("--", "-");
+        }
+        let plain = match plain.trim_matches('-') {
+            "" => "server",
+            plain => plain,
+        };
+        let taken = |name: &String| {
+            let mut all = self.mapping.servers().iter().map(|server| &server.name);
+            self.servers.contains(name) || all.any(|other| other == name)
+        };
+        let numbered = (2..u32::MAX).map(|number| format!("{plain}-{number}"));
+        let mut names = std::iter::once(plain.to_owned()).chain(numbered);
+        let name = names.find(|name| !taken(name)).unwrap_or_default();
+        self.servers.insert(name.clone());
+        Named::New(name)
     }
 
     /// `wanted`, or with a number behind it where that name is taken.
@@ -182,4 +257,12 @@ impl Known {
             .find(|(_, count)| *count == most)
             .map(|(namespace, _)| *namespace)
     }
+}
+
+/// The node of another server that a comment speaks of, as `render` writes it.
+fn source_in(comment: &str) -> Option<(String, String)> {
+    let (_, source) = comment.split_once(": {server: ")?;
+    let (server, node) = source.split_once(", node: ")?;
+    let node = node.trim_end().strip_suffix('}')?;
+    Some((server.to_owned(), node.to_owned()))
 }

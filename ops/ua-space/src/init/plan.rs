@@ -7,16 +7,19 @@ use messages::{Registry, TypeName};
 use uadp::BuiltinType;
 
 use super::calls::{self, CallEntry, Untyped};
-use super::known::Known;
+use super::known::{Known, Named};
 use super::topics::{Form, LeftOut, camel, normal, registry};
-use crate::survey::{Graph, Nodes, UaVariable};
+use crate::survey::{Graph, Nodes, UaServer, UaSource, UaVariable};
 
 /// What is to be written, in its order.
 #[derive(Default)]
 pub(super) struct Plan {
     pub(super) spaces: Vec<(SpaceId, Option<u16>)>,
     pub(super) namespaces: BTreeMap<u16, String>,
+    /// Of the cell's own server.
     pub(super) endpoint: Option<String>,
+    /// Servers that exist already, by their names.
+    pub(super) servers: Vec<(String, String)>,
     pub(super) entries: Vec<Entry>,
     pub(super) left_out: BTreeMap<(SpaceId, LeftOut), BTreeSet<String>>,
     /// Topics that a variable of the file could be bound to beside its own.
@@ -36,6 +39,8 @@ pub(super) struct Entry {
     pub(super) value: Option<(BuiltinType, bool)>,
     pub(super) origin: SpaceId,
     pub(super) bindings: Vec<Bound>,
+    /// The node of another server that it comes from, or goes to where ROS makes it.
+    pub(super) source: Option<UaSource>,
     pub(super) notes: Vec<String>,
     /// Nobody said that these belong together.
     pub(super) guessed: bool,
@@ -75,10 +80,11 @@ impl Plan {
             known,
         };
         planner.spaces(graphs);
-        planner.nodes(nodes);
+        let servers = planner.servers(nodes);
+        planner.nodes(nodes, &servers, wishes.namespace);
         planner.topics(graphs, wishes);
         planner.rest();
-        planner.calls(graphs, nodes, wishes.namespace);
+        planner.calls(graphs, (nodes, &servers), wishes.namespace);
         planner.plan
     }
 }
@@ -103,9 +109,51 @@ impl Planner<'_> {
         }
     }
 
-    /// Gives every namespace its index in the mapping: that of the server, from 2 on for those of files, since 1 is each
-    /// server's own.
-    fn nodes(&mut self, sources: &[Nodes]) {
+    /// The names of those that are servers of others.
+    fn servers(&mut self, sources: &[Nodes]) -> Vec<Option<String>> {
+        let mut names = Vec::with_capacity(sources.len());
+        for source in sources {
+            let name = match &source.server {
+                Some(server) if server.is_cell => {
+                    let endpoint = &mut self.plan.endpoint;
+                    endpoint.get_or_insert_with(|| server.endpoint.clone());
+                    None
+                }
+                Some(server) => Some(self.server(server)),
+                None => None,
+            };
+            names.push(name);
+        }
+        // The cell's own server is not where another is.
+        let ports = |port: u16| {
+            let mut all = self.plan.servers.iter();
+            all.any(|(_, endpoint)| is_at(endpoint, port))
+        };
+        if self.plan.endpoint.is_none() && ports(OWN_PORT) {
+            let free = (OWN_PORT..=u16::MAX).find(|port| !ports(*port));
+            self.plan.endpoint = free.map(|port| format!("opc.tcp://127.0.0.1:{port}"));
+        }
+        names
+    }
+
+    fn server(&mut self, server: &UaServer) -> String {
+        let endpoint = &server.endpoint;
+        let mut planned = self.plan.servers.iter();
+        if let Some((name, _)) = planned.find(|(_, other)| other == endpoint) {
+            return name.clone();
+        }
+        match self.known.server(endpoint, &server.name) {
+            Named::Known(name) => name,
+            Named::New(name) => {
+                self.plan.servers.push((name.clone(), endpoint.clone()));
+                name
+            }
+        }
+    }
+
+    /// Gives every namespace its index in the mapping: that of the cell's server, from 2 on for those of files and other
+    /// servers, since 1 is each server's own.
+    fn nodes(&mut self, sources: &[Nodes], servers: &[Option<String>], uri: &str) {
         let mut all = self.known.mapping.namespaces().clone();
         let mut by_uri: HashMap<String, u16> = HashMap::new();
         for (index, uri) in &all {
@@ -113,7 +161,9 @@ impl Planner<'_> {
         }
         let mut taken = BTreeSet::new();
         let mut ua = Vec::new();
-        for source in sources {
+        let mut twins = Vec::new();
+        for (source, server) in sources.iter().zip(servers) {
+            let is_cell = source.server.as_ref().is_some_and(|server| server.is_cell);
             let mut indexes: HashMap<u16, u16> = HashMap::new();
             let used: HashSet<u16> = source
                 .variables
@@ -127,7 +177,7 @@ impl Planner<'_> {
                     continue;
                 }
                 let given = by_uri.get(uri).copied().or_else(|| {
-                    let wanted = index.saturating_add(u16::from(source.endpoint.is_none()));
+                    let wanted = index.saturating_add(u16::from(!is_cell));
                     let free = |at: &u16| !all.contains_key(at);
                     above = wanted.max(above);
                     let found = match (above..=u16::MAX).find(free) {
@@ -162,16 +212,41 @@ impl Planner<'_> {
                 if let Some(number) = node.writer_id() {
                     self.known.use_number(*namespace, number.get());
                 }
-                if !self.known.has_node(&node) && taken.insert(node.to_string()) {
-                    ua.push(UaVariable {
-                        node,
-                        ..one.clone()
-                    });
+                let from = server.as_ref();
+                let from = from.map(|server| source_of(server, &one.node, &source.namespaces));
+                if from.as_ref().is_some_and(|from| self.known.has_source(from)) {
+                    continue;
+                }
+                let other = server.as_ref();
+                let other = other.is_some_and(|server| self.known.is_of_other(&node, server));
+                let has = self.known.has_node(&node) && !other;
+                let is_twin = other || !has && !taken.insert(node.to_string());
+                let one = UaVariable {
+                    node,
+                    source: from,
+                    ..one.clone()
+                };
+                match (has, is_twin) {
+                    (true, _) => {}
+                    (false, false) => ua.push(one),
+                    // Two servers of one make have nodes of the same names.
+                    (false, true) if one.source.is_some() => twins.push(one),
+                    (false, true) => {}
                 }
             }
-            if self.plan.endpoint.is_none() {
-                self.plan.endpoint.clone_from(&source.endpoint);
-            }
+        }
+        for twin in twins {
+            let namespace = self.namespace(uri);
+            let number = namespace.and_then(|namespace| self.known.next_number(namespace));
+            let (Some(namespace), Some(number)) = (namespace, number) else {
+                break;
+            };
+            let identifier = mappings::Identifier::Numeric(number.into());
+            let node = NodeIdText {
+                namespace,
+                identifier,
+            };
+            ua.push(UaVariable { node, ..twin });
         }
         let key = |one: &UaVariable| (one.within.clone(), one.name.clone(), one.node.to_string());
         ua.sort_by_cached_key(key);
@@ -287,11 +362,11 @@ impl Planner<'_> {
             }
             (None, ..) => None,
         };
-        let (node, name) = match node.and_then(|at| self.ua.get_mut(at)?.take()) {
+        let (node, name, source) = match node.and_then(|at| self.ua.get_mut(at)?.take()) {
             Some(one) => {
                 guessed = true;
                 notes.push("guess: the node has the topic's name and type".to_owned());
-                (one.node, one.name)
+                (one.node, one.name, one.source)
             }
             None => {
                 let Some(namespace) = self.namespace(namespace) else {
@@ -307,6 +382,7 @@ impl Planner<'_> {
                         identifier,
                     },
                     camel(&topic),
+                    None,
                 )
             }
         };
@@ -318,6 +394,7 @@ impl Planner<'_> {
             value,
             origin,
             bindings,
+            source,
             notes,
             guessed,
             faulty: None,
@@ -361,6 +438,7 @@ impl Planner<'_> {
                 value: one.value,
                 origin: SpaceId::UA,
                 bindings: Vec::new(),
+                source: one.source,
                 notes,
                 guessed: false,
                 faulty: None,
@@ -387,7 +465,7 @@ impl Planner<'_> {
         self.plan.entries.push(entry);
     }
 
-    fn calls(&mut self, graphs: &[Graph], nodes: &[Nodes], uri: &str) {
+    fn calls(&mut self, graphs: &[Graph], nodes: (&[Nodes], &[Option<String>]), uri: &str) {
         let (found, untyped) = calls::candidates(graphs, nodes, self.known);
         self.plan.untyped = untyped;
         for one in found {
@@ -411,6 +489,38 @@ impl Planner<'_> {
         }
     }
 }
+
+/// A node as a server of another namespace table knows it.
+fn source_of(server: &str, node: &NodeIdText, namespaces: &[String]) -> UaSource {
+    let uri = namespaces.get(usize::from(node.namespace));
+    let namespace = match uri {
+        Some(uri) => mappings::NamespaceText::Uri(uri.clone()),
+        None => mappings::NamespaceText::Index(node.namespace),
+    };
+    let identifier = node.identifier.clone();
+    let node = mappings::ExpandedNodeIdText {
+        namespace,
+        identifier,
+    };
+    UaSource {
+        server: server.to_owned(),
+        node: node.to_string(),
+    }
+}
+
+/// Whether an endpoint is at that port of this host.
+fn is_at(endpoint: &str, port: u16) -> bool {
+    let place = endpoint.trim_start_matches("opc.tcp://");
+    let place = place.split('/').next().unwrap_or_default();
+    let hosts = ["127.0.0.1", "localhost", "[::1]"];
+    hosts.iter().any(|host| {
+        let rest = place.strip_prefix(host);
+        rest.and_then(|rest| rest.strip_prefix(':')) == Some(&port.to_string())
+    })
+}
+
+/// Where the cell's own server is if nothing is said.
+const OWN_PORT: u16 = 4840;
 
 /// A topic that becomes a variable.
 struct Candidate {

@@ -8,6 +8,7 @@ use mappings::SpaceId;
 use super::plan::{Bound, Entry, Plan};
 use super::topics::Form;
 use super::yaml::{comment, scalar, wrapped};
+use crate::survey::UaSource;
 
 /// The lines of a plan's variables, and which lines are which entry.
 pub(super) struct Variables {
@@ -62,6 +63,16 @@ pub(super) fn network(plan: &Plan) -> Vec<String> {
         ]);
     }
     lines
+}
+
+/// The servers that exist already.
+pub(super) fn servers(plan: &Plan, indent: &str) -> Vec<String> {
+    let all = plan.servers.iter();
+    all.map(|(name, endpoint)| {
+        let endpoint = scalar(endpoint);
+        format!("{indent}- {{name: {}, endpoint: {endpoint}}}", scalar(name))
+    })
+    .collect()
 }
 
 /// What the indexes in node ids mean.
@@ -133,6 +144,14 @@ fn entry(entry: &Entry, indent: &str, lines: &mut Vec<String>) {
         say(format!("{mark}  type: {}{array}", builtin.name()));
     }
     say(format!("{mark}  origin: {}", entry.origin));
+    if let Some(UaSource { server, node }) = &entry.source {
+        let word = match entry.origin {
+            SpaceId::UA => "from",
+            _ => "to",
+        };
+        let (server, node) = (scalar(server), scalar(node));
+        say(format!("{mark}  {word}: {{server: {server}, node: {node}}}"));
+    }
     match entry.bindings.as_slice() {
         [] => {}
         [one] => say(format!(

@@ -247,6 +247,7 @@ impl NodeSet {
             }
             let within = parent.and_then(|parent| self.objects.get(&parent));
             found.push(UaVariable {
+                source: None,
                 node: id.clone(),
                 name: browse_name(node),
                 within: within.map(browse_name).unwrap_or_default(),
@@ -257,7 +258,7 @@ impl NodeSet {
         namespaces.extend(self.uris);
         Ok(Nodes {
             place: format!("NodeSet {place}"),
-            endpoint: None,
+            server: None,
             namespaces,
             variables: found,
             methods: Vec::new(),

@@ -20,7 +20,7 @@ use tokio::time::timeout;
 use uadp::BuiltinType;
 
 use super::data_types::{self, STRUCTURE};
-use super::{MOST, Nodes, UaMethod, UaVariable, away};
+use super::{MOST, Nodes, UaMethod, UaServer, UaVariable, away};
 use crate::exit::Failure;
 
 /// Browses the server at `url` from its Objects folder on.
@@ -28,17 +28,22 @@ pub(crate) async fn survey(url: &str) -> Result<Nodes, Failure> {
     let server = Connected::to(url).await?;
     let browsing = async {
         let namespaces = server.namespaces().await?;
-        let (variables, methods) = server.nodes(namespaces.len()).await?;
-        Ok((namespaces, variables, methods))
+        let found = server.nodes(namespaces.len()).await?;
+        Ok((namespaces, found))
     };
-    let (namespaces, variables, methods) = server.within(browsing).await?;
+    let (namespaces, found) = server.within(browsing).await?;
     server.leave().await;
+    let variables = found.variables.into_iter().map(|(_, one)| one);
     Ok(Nodes {
         place: format!("OPC UA server {url}"),
-        endpoint: Some(url.to_owned()),
+        server: Some(UaServer {
+            endpoint: url.to_owned(),
+            name: server.name.clone(),
+            is_cell: found.is_cell,
+        }),
         namespaces,
-        variables,
-        methods,
+        variables: variables.collect(),
+        methods: found.methods,
     })
 }
 
@@ -175,6 +180,8 @@ fn index(node: &ExpandedNodeIdText, namespaces: &[String]) -> Option<u16> {
 /// A session without security.
 struct Connected {
     url: String,
+    /// Its ApplicationName.
+    name: String,
     session: Arc<Session>,
     events: tokio::task::JoinHandle<opcua::types::StatusCode>,
     pki: PathBuf,
@@ -252,6 +259,7 @@ impl Connected {
                  and give it by --nodeset",
             )
         })?;
+        let name = endpoint.server.application_name.text.as_ref().to_owned();
         // Servers tell names of theirs that are not always to be resolved from here.
         endpoint.endpoint_url = UAString::from(url);
         let (session, events) = client
@@ -263,6 +271,7 @@ impl Connected {
         }
         Ok(Self {
             url: url.to_owned(),
+            name,
             session,
             events,
             pki,
@@ -335,7 +344,7 @@ impl Connected {
     }
 
     /// The variables and Methods below the Objects folder. Of variables nothing below is looked at, and no property.
-    async fn nodes(&self, namespaces: usize) -> Result<(Vec<UaVariable>, Vec<UaMethod>), Failure> {
+    async fn nodes(&self, namespaces: usize) -> Result<Found, Failure> {
         let mut found = Found::default();
         let objects = NodeId::from(ObjectId::ObjectsFolder);
         found.seen.insert(objects.clone());
@@ -365,12 +374,13 @@ impl Connected {
                 )));
             }
         }
-        let variables = found.variables;
-        let nodes: Vec<NodeId> = variables.iter().map(|(node, _)| node.clone()).collect();
+        let variables = found.variables.iter();
+        let nodes: Vec<NodeId> = variables.map(|(node, _)| node.clone()).collect();
         let types = self.value_types(&nodes).await?;
-        let typed = variables.into_iter().zip(types);
-        let typed = typed.map(|((_, one), value)| UaVariable { value, ..one });
-        Ok((typed.collect(), found.methods))
+        for ((_, variable), value) in found.variables.iter_mut().zip(types) {
+            variable.value = value;
+        }
+        Ok(found)
     }
 
     /// What each node has below it.
@@ -526,6 +536,8 @@ struct Found {
     seen: HashSet<NodeId>,
     variables: Vec<(NodeId, UaVariable)>,
     methods: Vec<UaMethod>,
+    /// It shows the space.
+    is_cell: bool,
 }
 
 impl Found {
@@ -551,12 +563,14 @@ impl Found {
         }
         if reference.node_class == NodeClass::Object {
             let ours = above.ours || name == OURS;
+            self.is_cell |= ours;
             return Some(Object { node, name, ours });
         }
         let variable = UaVariable {
             node: text(&node)?,
             name,
             within,
+            source: None,
             value: None,
         };
         self.variables.push((node, variable));
