@@ -340,7 +340,7 @@ const fn policy(entry: SecurityEntry) -> SecurityPolicy {
 }
 
 /// `opc.tcp://host:port/path`, port 4840 when left out (OPC 10000-6, 7.2).
-fn parse_endpoint(text: &str) -> Option<Endpoint> {
+pub(super) fn parse_endpoint(text: &str) -> Option<Endpoint> {
     let rest = text.strip_prefix("opc.tcp://")?;
     let slash = rest.find('/').unwrap_or(rest.len());
     let (authority, path) = rest.split_at_checked(slash)?;
