@@ -1,7 +1,9 @@
 //! The words of the command line.
 
+mod discover;
 mod live;
 
+pub(crate) use discover::{Discover, Look};
 pub(crate) use live::{
     Ask, Call, Echo, Group, Hz, Info, InfoSkill, List, ListSkills, Skills, SkillsVerb, Target,
     Trace, WatchSkills,
@@ -34,7 +36,7 @@ pub(crate) enum Verb {
     Check(Check),
     /// Write a mapping of what is there
     ///
-    /// Looks at live ROS graphs, a running OPC UA server and NodeSets, and writes a commented mapping that runs. Topics and
+    /// Looks at live ROS graphs, running OPC UA servers and NodeSets, or at whoever is found, and writes a commented mapping that runs. Topics and
     /// nodes of several are tied where name and type are the same, and marked as guesses. What runs ROS itself (logs,
     /// actions, transforms) is left out, with a comment.
     ///
@@ -79,6 +81,13 @@ pub(crate) enum Verb {
     /// Exit codes: 0 done, 64 usage, 65 JSON that is no datagram, 74 a file that cannot be read or an output that cannot
     /// be written.
     Encode(Encode),
+    /// Tell who is there: discovery servers, servers, components, bridges
+    ///
+    /// Hears announcements (mDNS) on the interface, or on all of this host, asks the discovery servers and listens in the group;
+    /// needs no mapping. Each server is asked who it is. Nothing is tried that was not announced, but for the addresses of --scan.
+    ///
+    /// Exit codes: 0 done, 64 usage, 74 an output that cannot be written, 130 interrupted.
+    Discover(Discover),
     /// List the topics and calls of a running space
     ///
     /// What was heard in the group or announced there: name, origin, rate and what it consists of. Needs no mapping.
@@ -229,6 +238,11 @@ pub(crate) struct Init {
     /// An OPC UA server that runs, as opc.tcp://127.0.0.1:4840. May be repeated
     #[arg(long, value_name = "URL")]
     pub(crate) opcua: Vec<String>,
+    /// Whoever is found: the OPC UA servers that `ua-space discover` finds, the ROS 1 master and the DDS domain of the environment
+    #[arg(long)]
+    pub(crate) discover: bool,
+    #[command(flatten)]
+    pub(crate) look: Look,
     /// Where to write; without it stdout
     #[arg(short, long, value_name = "FILE")]
     pub(crate) output: Option<String>,

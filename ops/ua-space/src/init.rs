@@ -3,6 +3,7 @@
 mod calls;
 mod known;
 mod merge;
+mod nodes;
 mod plan;
 mod render;
 mod topics;
@@ -15,11 +16,12 @@ use std::os::unix::fs::{MetadataExt as _, fchown};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use mappings::{Checked, Code, Diagnostic, Mapping, SpaceId};
+use mappings::{Checked, Code, Diagnostic, LiveSpace, Mapping, SpaceId};
 use serde::Serialize;
 use type_files::Disk;
 
 use crate::arguments::Init;
+use crate::discover::{self, Kind};
 use crate::exit::Failure;
 use crate::report;
 use crate::survey::{self, Graph, Nodes, look};
@@ -32,10 +34,11 @@ pub(crate) fn init(arguments: &Init) -> Result<(), Failure> {
         arguments.ros2.is_empty(),
         arguments.nodeset.is_empty(),
         arguments.opcua.is_empty(),
+        !arguments.discover,
     ];
     if asked.iter().all(|nothing| *nothing) {
         return Err(Failure::Usage(
-            "nothing to look at: give one or several of --ros1, --ros2, --nodeset FILE, --opcua URL"
+            "nothing to look at: give one or several of --ros1, --ros2, --nodeset FILE, --opcua URL, --discover"
                 .to_owned(),
         ));
     }
@@ -91,16 +94,11 @@ impl Found {
                 live,
             });
         }
-        for domain in domains(arguments)? {
+        for domain in domains(&arguments.ros2)? {
             let space = space_of(domain, known, &found.graphs)?;
             let wait = Duration::from_secs(arguments.wait.into());
             let live = look(survey::ros2::survey(domain, wait))?;
-            found.places.push(format!("DDS domain {domain}"));
-            found.graphs.push(Graph {
-                space,
-                domain: Some(domain),
-                live,
-            });
+            found.domain(domain, space, live);
         }
         for url in &arguments.opcua {
             found.add(look(survey::opcua::survey(url))?);
@@ -108,7 +106,66 @@ impl Found {
         for file in &arguments.nodeset {
             found.add(survey::nodeset::survey(file)?);
         }
+        if arguments.discover {
+            found.discover(arguments, known)?;
+        }
         Ok(found)
+    }
+
+    /// Whoever is found beside what was asked for. Who cannot be looked into is told of in the head.
+    fn discover(&mut self, arguments: &Init, known: &Mapping) -> Result<(), Failure> {
+        if arguments.ros1.is_none() {
+            let uri = survey::ros1::master_uri();
+            if let Ok(live) = look(survey::ros1::survey(&uri)) {
+                self.places.push(format!("ROS 1 master {uri}"));
+                self.graphs.push(Graph {
+                    space: SpaceId::ROS1,
+                    domain: None,
+                    live,
+                });
+            }
+        }
+        if arguments.ros2.is_empty() {
+            for domain in domains(&[None])? {
+                let space = space_of(domain, known, &self.graphs)?;
+                let wait = Duration::from_secs(arguments.wait.into());
+                let live = look(survey::ros2::survey(domain, wait));
+                if let Some(live) = live.ok().filter(|live| !live.topics.is_empty()) {
+                    self.domain(domain, space, live);
+                }
+            }
+        }
+        for entry in look(discover::around(&arguments.look))?.entries {
+            // Components and bridges are in the space without being mapped.
+            let is_source = matches!(entry.kind, Kind::Server | Kind::Cell);
+            let Some(url) = entry.urls.first().filter(|_| is_source) else {
+                continue;
+            };
+            if arguments.opcua.contains(url) {
+                continue;
+            }
+            let found = match &entry.fault {
+                Some(fault) => Err(fault.clone()),
+                None => look(survey::opcua::survey(url)).map_err(|failure| failure.to_string()),
+            };
+            match found {
+                Ok(nodes) => self.add(nodes),
+                Err(why) => {
+                    let why = why.lines().next().unwrap_or_default().to_owned();
+                    self.places.push(format!("not OPC UA server {url}: {why}"));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn domain(&mut self, domain: u16, space: SpaceId, live: LiveSpace) {
+        self.places.push(format!("DDS domain {domain}"));
+        self.graphs.push(Graph {
+            space,
+            domain: Some(domain),
+            live,
+        });
     }
 
     fn add(&mut self, nodes: Nodes) {
@@ -118,9 +175,9 @@ impl Found {
 }
 
 /// Those asked for, each once, in their order.
-fn domains(arguments: &Init) -> Result<Vec<u16>, Failure> {
+fn domains(asked: &[Option<u16>]) -> Result<Vec<u16>, Failure> {
     let mut domains = Vec::new();
-    for asked in &arguments.ros2 {
+    for asked in asked {
         let variable = std::env::var("ROS_DOMAIN_ID").ok();
         let domain = match (asked, variable.as_deref().map(str::trim)) {
             (Some(domain), _) => *domain,
@@ -197,12 +254,7 @@ fn written(file: &str, places: &[String], plan: &mut Plan) -> Result<String, Fai
         );
         let servers = "Servers that exist already: ua-server is their client, and a value is bad while its server is away. Their best security\n\
              # is taken that both sides know; say `security`, `user` and `password` where that is not enough.";
-        section(
-            &mut lines,
-            servers,
-            "servers",
-            render::servers(plan, "  "),
-        );
+        section(&mut lines, servers, "servers", render::servers(plan, "  "));
         let variables = render::variables(plan, "  ");
         if !variables.lines.is_empty() {
             lines.extend(
@@ -536,305 +588,4 @@ const FIRST_FREE: u16 = 40;
 const MOST: u64 = 5 << 20;
 
 #[cfg(test)]
-mod tests {
-    use std::collections::{BTreeMap, BTreeSet};
-
-    use mappings::{LiveSpace, LiveTopic};
-
-    use super::*;
-
-    const WISHES: Wishes<'static> = Wishes {
-        namespace: "urn:cell",
-        transforms: false,
-    };
-
-    /// A graph whose topics are (name, type, published).
-    fn graph(space: u16, topics: &[(&str, &str, bool)]) -> Graph {
-        let topic = |(name, kind, published): &(&str, &str, bool)| {
-            let live = LiveTopic {
-                types: BTreeSet::from([(*kind).to_owned()]),
-                published: *published,
-                subscribed: !published,
-            };
-            ((*name).to_owned(), live)
-        };
-        Graph {
-            space: SpaceId::new(space).unwrap(),
-            domain: (space > 1).then_some(space),
-            live: LiveSpace {
-                topics: topics.iter().map(topic).collect::<BTreeMap<_, _>>(),
-                services: None,
-            },
-        }
-    }
-
-    fn fresh(graphs: &[Graph]) -> String {
-        let mut plan = Plan::new(graphs, &[], &WISHES, &mut Known::default());
-        written("", &[], &mut plan).unwrap()
-    }
-
-    fn merged(text: &str, graphs: &[Graph]) -> String {
-        let mapping = mapping(text);
-        let mut known = Known::of(mapping.clone(), text);
-        let mut plan = Plan::new(graphs, &[], &WISHES, &mut known);
-        added("", (text, &mapping), &mut plan).unwrap()
-    }
-
-    fn mapping(text: &str) -> Mapping {
-        let checked = Mapping::from_yaml(text, "cell.yaml");
-        assert!(checked.findings.is_empty(), "{}", checked.render(text));
-        checked.mapping.unwrap()
-    }
-
-    fn origins(text: &str) -> Vec<(String, String, usize)> {
-        let mapping = mapping(text);
-        let variables = mapping.variables().iter();
-        variables
-            .map(|one| (one.name.clone(), one.topic.to_string(), one.bindings.len()))
-            .collect()
-    }
-
-    #[test]
-    fn a_side_that_joins_later_is_proposed_once_and_changes_nothing() {
-        let ros1 = graph(1, &[("/a/b", "std_msgs/Bool", true)]);
-        let ros2 = graph(
-            2,
-            &[
-                ("/a/b", "std_msgs/Bool", false),
-                ("/c", "std_msgs/Int32", true),
-            ],
-        );
-        let first = fresh(std::slice::from_ref(&ros1));
-        let both = [ros1, ros2];
-        let second = merged(&first, &both);
-        assert!(
-            second
-                .contains("#   /a/b is in space 2 too, as std_msgs/Bool: AB could be bound to it"),
-            "{second}"
-        );
-        assert_eq!(
-            origins(&second),
-            [
-                ("AB".to_owned(), "ua_1_2_1".to_owned(), 1),
-                ("C".to_owned(), "ua_2_2_2".to_owned(), 1)
-            ]
-        );
-        assert_eq!(merged(&second, &both), second);
-        // Seen together, they are one value.
-        assert_eq!(
-            origins(&fresh(&both))[0],
-            ("AB".to_owned(), "ua_1_2_1".to_owned(), 2)
-        );
-    }
-
-    #[test]
-    fn a_block_is_indented_as_the_entries_before_it() {
-        let text = "spaces:\n- {id: 1}\nnamespaces:\n    2: urn:line\nvariables:\n- {node: ns=2;i=5, name: v, origin: 1, \
-                    type: Double}\n";
-        let more = merged(text, &[graph(2, &[("/a", "std_msgs/Bool", true)])]);
-        assert!(more.contains("\n- {id: 2, domain: 2}\n"), "{more}");
-        assert!(more.contains("\n    3: urn:cell\n"), "{more}");
-        assert_eq!(origins(&more).len(), 2);
-    }
-
-    #[test]
-    fn a_file_that_was_saved_meanwhile_stays_as_it_is() {
-        let file = std::env::temp_dir().join(format!("ua-space-init-{}.yaml", std::process::id()));
-        let name = file.to_str().unwrap();
-        std::fs::write(&file, "theirs\n").unwrap();
-        let refused = replace(name, "before\n", "mine\n").unwrap_err();
-        assert!(refused.to_string().contains("was changed"), "{refused}");
-        assert_eq!(std::fs::read_to_string(&file).unwrap(), "theirs\n");
-        replace(name, "theirs\n", "mine\n").unwrap();
-        assert_eq!(std::fs::read_to_string(&file).unwrap(), "mine\n");
-        assert!(!beside(&file.canonicalize().unwrap()).exists());
-        std::fs::remove_file(&file).unwrap();
-    }
-
-    #[test]
-    fn what_both_sides_publish_is_two_values_and_what_differs_in_type_too() {
-        let text = fresh(&[
-            graph(
-                1,
-                &[("/x", "std_msgs/Bool", true), ("/y", "std_msgs/Bool", true)],
-            ),
-            graph(
-                2,
-                &[
-                    ("/x", "std_msgs/Bool", true),
-                    ("/y", "std_msgs/Int32", false),
-                ],
-            ),
-        ]);
-        let all = origins(&text);
-        let topics: Vec<&str> = all.iter().map(|(_, topic, _)| topic.as_str()).collect();
-        assert_eq!(topics, ["ua_1_2_1", "ua_2_2_2", "ua_1_2_3", "ua_0_2_4"]);
-        assert!(all.iter().all(|(.., bindings)| *bindings == 1) && !text.contains("guess:"));
-    }
-
-    #[test]
-    fn a_topic_that_a_comment_names_or_a_pattern_takes_stays_out() {
-        let text = "spaces:\n  - {id: 1}\nnamespaces:\n  2: urn:line\nvariables:\n  # not /a\n  - {node: ns=2;i=5, name: v, \
-                    origin: 1, ros: {topic: /v, type: std_msgs/Bool}}\npatterns:\n  - {topics: \"/r*/p\", origin: 1, node: \
-                    \"ns=2;i=10{1}\", name: \"P{1}\"}\n";
-        let seen = graph(
-            1,
-            &[
-                ("/a", "std_msgs/Bool", true),
-                ("/r1/p", "std_msgs/Bool", true),
-                ("/v", "std_msgs/Bool", true),
-            ],
-        );
-        assert_eq!(merged(text, &[seen]), text);
-        let more = merged(text, &[graph(1, &[("/next", "std_msgs/Bool", true)])]);
-        // In the namespace of the others, behind the highest number, and before the next key.
-        assert_eq!(origins(&more)[1].1, "ua_1_2_6");
-        assert!(more.find("name: Next").unwrap() < more.find("patterns:").unwrap());
-    }
-
-    #[test]
-    fn what_calls_have_is_not_given_away_and_their_services_are_not_told_of() {
-        let text = "spaces:\n  - {id: 1}\n  - {id: 2}\nnamespaces:\n  2: urn:cell\ncalls:\n  - {node: ns=2;i=61, name: A, origin: \
-                    1, ros: [{service: /a, type: std_srvs/SetBool}, {space: 2, service: /b, type: std_srvs/SetBool}]}\n";
-        let mut seen = graph(2, &[("/a", "std_msgs/Bool", true)]);
-        let service = |name: &str| {
-            let kind = BTreeSet::from(["std_srvs/SetBool".to_owned()]);
-            (name.to_owned(), kind)
-        };
-        seen.live.services = Some(
-            ["/b", "/c", "/n/get_parameters", "/ua_1_2_61"]
-                .map(service)
-                .into(),
-        );
-        let more = merged(text, std::slice::from_ref(&seen));
-        // Behind the number of the call, under another name than its own.
-        assert_eq!(
-            origins(&more),
-            [("A2".to_owned(), "ua_2_2_62".to_owned(), 1)]
-        );
-        let calls = mapping(&more).calls().to_vec();
-        let calls: Vec<(String, String)> = calls
-            .iter()
-            .map(|call| (call.topic.to_string(), call.name.clone()))
-            .collect();
-        let one = |topic: &str, name: &str| (topic.to_owned(), name.to_owned());
-        assert_eq!(calls, [one("ua_1_2_61", "A"), one("ua_2_2_63", "C")]);
-        assert_eq!(merged(&more, &[seen]), more);
-    }
-
-    #[test]
-    fn what_is_executed_anywhere_becomes_calls_once() {
-        let mut ros1 = graph(
-            1,
-            &[(
-                "/count/feedback",
-                "actionlib_tutorials/FibonacciActionFeedback",
-                true,
-            )],
-        );
-        let kinds = |kinds: &[&str]| kinds.iter().map(|kind| (*kind).to_owned()).collect();
-        ros1.live.services = Some(
-            [
-                ("/belt/switch", kinds(&["std_srvs/SetBool"])),
-                ("/belt/odd", kinds(&["odd_msgs/Odd"])),
-                ("/belt/mute", kinds(&[])),
-                (
-                    "/belt/set_parameters",
-                    kinds(&["dynamic_reconfigure/Reconfigure"]),
-                ),
-                ("/ua_1_2_9", kinds(&["std_srvs/SetBool"])),
-            ]
-            .map(|(name, kinds)| (name.to_owned(), kinds))
-            .into(),
-        );
-        let feedback = "/nav/count/_action/feedback";
-        let kind = "example_interfaces/Fibonacci_FeedbackMessage";
-        let ros2 = graph(2, &[(feedback, kind, true)]);
-        let server = |url: &str| Nodes {
-            place: url.to_owned(),
-            server: Some(survey::UaServer {
-                endpoint: url.to_owned(),
-                name: "Press 7 (left)".to_owned(),
-                is_cell: false,
-            }),
-            namespaces: ["http://opcfoundation.org/UA/", "urn:s", "urn:plc"]
-                .map(str::to_owned)
-                .to_vec(),
-            variables: Vec::new(),
-            methods: vec![survey::UaMethod {
-                object: "ns=2;s=Line".parse().unwrap(),
-                method: format!("ns=2;s=Reset of {url}").parse().unwrap(),
-                name: "Reset".to_owned(),
-                within: "Line".to_owned(),
-            }],
-        };
-        let graphs = [ros1, ros2];
-        let servers = ["opc.tcp://127.0.0.1:4840", "opc.tcp://plc:4840"].map(server);
-        let mut plan = Plan::new(&graphs, &servers, &WISHES, &mut Known::default());
-        let text = written("", &[], &mut plan).unwrap();
-        let found = mapping(&text);
-        let calls: Vec<(String, &str)> = found
-            .calls()
-            .iter()
-            .map(|call| (call.topic.to_string(), call.name.as_str()))
-            .collect();
-        let one = |topic: &str, name: &'static str| (topic.to_owned(), name);
-        // An action takes five numbers, a comment the one it says.
-        assert_eq!(
-            calls,
-            [
-                one("ua_1_2_2", "Belt.Switch"),
-                one("ua_1_2_3", "Count"),
-                one("ua_2_2_8", "Nav.Count"),
-                one("ua_0_2_14", "Line.Reset2"),
-            ],
-            "{text}"
-        );
-        for told in [
-            "  # M075: no definition of the service type `odd_msgs/Odd` is built in",
-            "  #   ros: {service: /belt/odd, type: odd_msgs/Odd}",
-            "  # M136: the endpoint is that of the cell's own server",
-            "  #   /belt/mute",
-            "    opcua: {endpoint: opc.tcp://plc:4840, object: nsu=urn:plc;s=Line, ",
-        ] {
-            assert!(text.contains(told), "{told}\n{text}");
-        }
-        let sum = Sum::of("x", &plan, true).counts();
-        assert!(sum.contains("4 calls, 2 others as comments"), "{sum}");
-        let mut known = Known::of(found.clone(), &text);
-        let mut plan = Plan::new(&graphs, &servers, &WISHES, &mut known);
-        assert_eq!(added("", (&text, &found), &mut plan).unwrap(), text);
-    }
-
-    #[test]
-    fn calls_that_stand_before_the_variables_keep_both_apart() {
-        let text = "spaces:\n  - {id: 1}\nnamespaces:\n  2: urn:cell\ncalls:\n  - {node: ns=2;i=61, name: A, origin: 1, ros: \
-                    {service: /a, type: std_srvs/SetBool}}\nvariables:\n  - {node: ns=2;i=5, name: v, origin: 1, type: Double}\n";
-        let mut seen = graph(
-            1,
-            &[
-                ("/odd", "odd_msgs/Odd", true),
-                ("/b", "std_msgs/Bool", true),
-            ],
-        );
-        let service = |name: &str, kind: &str| (name.to_owned(), BTreeSet::from([kind.to_owned()]));
-        seen.live.services = Some(
-            [
-                service("/c", "odd_msgs/Odd"),
-                service("/d", "std_srvs/Trigger"),
-            ]
-            .into(),
-        );
-        let more = merged(text, &[seen]);
-        let found = mapping(&more);
-        assert_eq!(
-            (found.calls().len(), found.variables().len()),
-            (2, 2),
-            "{more}"
-        );
-        assert!(
-            more.contains("\n  # M075: ") && more.contains("\n  # M063: "),
-            "{more}"
-        );
-    }
-}
+mod tests;

@@ -22,11 +22,11 @@ pub(crate) use skills::{HeardNames, heard_names, skills};
 pub(crate) use text::{Table, harmless, is_coloured};
 pub(crate) use trace::trace;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use mappings::{PubSub, TopicId};
+use mappings::{PubSub, SpaceId, TopicId};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 use tokio::time::Instant;
 use transport::{Options, Udp};
@@ -85,6 +85,24 @@ pub(crate) fn in_group<T>(
         let live = Live::join(group)?;
         looking(live).await
     })
+}
+
+/// Who sends in the group for `seconds`: each ROS space and from where, and of how many topics.
+pub(crate) async fn senders(
+    group: &Group,
+    seconds: f64,
+) -> Result<BTreeMap<(u16, String), usize>, Failure> {
+    let mut live = Live::join(group)?;
+    let end = until(live.now(), Some(seconds));
+    live.listen(end, &mut |_, _| Go::On).await?;
+    let mut senders = BTreeMap::new();
+    for (topic, heard) in live.book.topics() {
+        if topic.space != SpaceId::UA {
+            let key = (topic.space.get().into(), heard.from.to_string());
+            *senders.entry(key).or_default() += 1;
+        }
+    }
+    Ok(senders)
 }
 
 impl Live {

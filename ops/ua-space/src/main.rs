@@ -7,6 +7,7 @@ mod capture;
 mod check;
 mod completion;
 mod decode;
+mod discover;
 mod discovery;
 mod encode;
 mod environment;
@@ -66,6 +67,7 @@ fn main() -> ExitCode {
         Verb::Keys(arguments) => make_keys::make_keys(arguments),
         Verb::Decode(arguments) => session::decode(arguments),
         Verb::Encode(arguments) => session::encode(arguments),
+        Verb::Discover(arguments) => discover::discover(arguments),
         Verb::List(arguments) => live::list(arguments),
         Verb::Info(arguments) => live::info(arguments),
         Verb::Echo(arguments) => live::echo(arguments),

@@ -77,6 +77,17 @@ pub struct Application {
     pub discovery_urls: Vec<String>,
 }
 
+/// What a server says of itself.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Described {
+    /// Who it is.
+    pub application: Application,
+    /// Its ProductUri, which tells what it is an instance of.
+    pub product_uri: String,
+    /// The ways its endpoints may be talked to, each once: `None`, or policy and mode, as `Basic256Sha256/Sign`.
+    pub security: Vec<String>,
+}
+
 /// A server that FindServersOnNetwork lists.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct OnNetwork {
@@ -105,15 +116,48 @@ pub async fn find_servers(url: &str, limit: Duration) -> Result<Vec<Application>
             .servers
             .into_iter()
             .flatten()
-            .map(|server| Application {
-                application_uri: text(&server.application_uri),
-                name: text(&server.application_name.text),
-                is_discovery_server: server.application_type == ApplicationType::DiscoveryServer,
-                discovery_urls: texts(server.discovery_urls.as_deref()),
-            })
+            .map(|server| application(&server))
             .collect()),
         other => Err(unexpected(&other)),
     }
+}
+
+/// What the server at `url` says of itself: GetEndpoints (OPC 10000-4, 5.5.4).
+///
+/// # Errors
+/// [`AskFault`], after `limit` at the latest.
+pub async fn describe(url: &str, limit: Duration) -> Result<Described, AskFault> {
+    let request = GetEndpointsRequest {
+        request_header: header(),
+        endpoint_url: url.into(),
+        ..GetEndpointsRequest::default()
+    };
+    let endpoints = match ask(url, None, request.into(), limit).await? {
+        ResponseMessage::GetEndpoints(response) => response.endpoints.unwrap_or_default(),
+        other => return Err(unexpected(&other)),
+    };
+    let Some(server) = endpoints.first().map(|endpoint| &endpoint.server) else {
+        return Err(AskFault::Protocol("it has no endpoints".to_owned()));
+    };
+    let mut security = Vec::new();
+    for endpoint in endpoints.iter().take(MOST_ENDPOINTS) {
+        let policy = text(&endpoint.security_policy_uri);
+        let policy = policy.rsplit('#').next().unwrap_or_default();
+        let way = match endpoint.security_mode {
+            MessageSecurityMode::None => "None".to_owned(),
+            MessageSecurityMode::Sign => format!("{policy}/Sign"),
+            MessageSecurityMode::SignAndEncrypt => format!("{policy}/SignAndEncrypt"),
+            MessageSecurityMode::Invalid => continue,
+        };
+        if !security.contains(&way) {
+            security.push(way);
+        }
+    }
+    Ok(Described {
+        product_uri: text(&server.product_uri),
+        application: application(server),
+        security,
+    })
 }
 
 /// The servers that are announced on the network: FindServersOnNetwork.
@@ -462,6 +506,15 @@ async fn answer_from(
     }
 }
 
+fn application(told: &ApplicationDescription) -> Application {
+    Application {
+        application_uri: text(&told.application_uri),
+        name: text(&told.application_name.text),
+        is_discovery_server: told.application_type == ApplicationType::DiscoveryServer,
+        discovery_urls: texts(told.discovery_urls.as_deref()),
+    }
+}
+
 fn header() -> RequestHeader {
     RequestHeader {
         timeout_hint: 5000,
@@ -492,6 +545,8 @@ fn texts(all: Option<&[UAString]>) -> Vec<String> {
     all.unwrap_or_default().iter().take(64).map(text).collect()
 }
 
+/// Of more endpoints of a server no security is told.
+const MOST_ENDPOINTS: usize = 64;
 const SCHEME: &str = "opc.tcp:";
 const REGISTER_LIMIT: Duration = Duration::from_secs(5);
 /// In milliseconds: for one question.

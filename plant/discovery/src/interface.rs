@@ -28,6 +28,17 @@ impl Interface {
         })
     }
 
+    /// All of this host that have an IPv4 address.
+    #[must_use]
+    pub fn all() -> Vec<Self> {
+        let all = if_addrs::get_if_addrs().unwrap_or_default();
+        let addresses = all.iter().map(if_addrs::Interface::ip);
+        addresses
+            .filter(IpAddr::is_ipv4)
+            .map(|address| Self(Which::Address(address)))
+            .collect()
+    }
+
     /// Whether it is this one.
     fn is(&self, interface: &if_addrs::Interface) -> bool {
         match &self.0 {

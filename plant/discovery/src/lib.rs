@@ -5,7 +5,7 @@
 //!
 //! Reading order: `url` and `interface` (where), `mdns` and `goodbye` (announcements and what is heard of others), `wire` (OPC UA
 //! over TCP), `client` (asking by it), `line` and `liveness` (who still answers), `keeper` (all of that around one registry),
-//! `watch`, `chosen` and `announce` (for programs), `endpoint`, `connection`, `security` and `services` (answering by it), `lds`, `presence`.
+//! `watch`, `scan`, `chosen` and `announce` (for programs), `endpoint`, `connection`, `security` and `services` (answering by it), `lds`, `presence`.
 
 mod announce;
 mod chosen;
@@ -23,6 +23,7 @@ mod line;
 mod liveness;
 mod mdns;
 mod presence;
+pub mod scan;
 mod security;
 mod services;
 mod url;

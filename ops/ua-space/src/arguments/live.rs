@@ -258,7 +258,7 @@ fn topic(text: &str) -> Result<TopicId, &'static str> {
         .map_err(|_| "a topic of the space is ua_<space>_<namespace>_<identifier>, as ua_1_2_10")
 }
 
-fn seconds(text: &str) -> Result<f64, &'static str> {
+pub(super) fn seconds(text: &str) -> Result<f64, &'static str> {
     let seconds = seconds_or_none(text)?;
     (seconds > 0.0).then_some(seconds).ok_or(A_TIME)
 }

@@ -27,10 +27,7 @@ pub(super) enum Executor {
     /// A service or action of the origin, and its type.
     Ros(CallKind, String, String),
     /// A Method of a server.
-    Method {
-        server: Whose,
-        target: String,
-    },
+    Method { server: Whose, target: String },
 }
 
 /// A server, as a call names it.
@@ -117,11 +114,7 @@ fn ros(kind: CallKind, origin: SpaceId, name: &str, type_name: &str) -> Candidat
     }
 }
 
-fn method(
-    one: &UaMethod,
-    (server, at): (&Nodes, &Whose),
-    known: &Known,
-) -> Option<Candidate> {
+fn method(one: &UaMethod, (server, at): (&Nodes, &Whose), known: &Known) -> Option<Candidate> {
     let expanded = |node: &NodeIdText| {
         let uri = server.namespaces.get(usize::from(node.namespace))?;
         let namespace = match node.namespace {

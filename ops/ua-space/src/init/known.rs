@@ -32,6 +32,13 @@ pub(super) struct Known {
     hearing: u16,
 }
 
+/// Of which server a node is that a variable has already.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) enum Whose {
+    Same,
+    Other,
+}
+
 /// The name of a server.
 pub(super) enum Named {
     /// In the mapping.
@@ -143,14 +150,18 @@ impl Known {
             .any(|node| self.sources.contains(&(server.clone(), node.clone())))
     }
 
-    /// The node of a variable, and whether it comes from another server than that, or goes there.
-    pub(super) fn is_of_other(&self, node: &NodeIdText, server: &str) -> bool {
-        let variables = self.mapping.variables().iter();
-        let mut same = variables.filter(|variable| variable.node == *node);
-        same.any(|variable| {
-            let from = variable.from.as_ref().map(|from| &from.server);
-            let to = variable.to.as_ref().map(|to| &to.server);
-            from.or(to).is_some_and(|other| other != server)
+    /// Whether a variable has the node, and if so whether it is of another server than that.
+    pub(super) fn has_node_of(&self, node: &NodeIdText, server: &str) -> Option<Whose> {
+        if !self.has_node(node) {
+            return None;
+        }
+        let mut variables = self.mapping.variables().iter();
+        let same = variables.find(|variable| variable.node == *node);
+        let from = same.and_then(|same| same.from.as_ref().map(|from| &from.server));
+        let to = same.and_then(|same| same.to.as_ref().map(|to| &to.server));
+        Some(match from.or(to) {
+            Some(other) if other != server => Whose::Other,
+            Some(_) | None => Whose::Same,
         })
     }
 

@@ -1,13 +1,14 @@
 //! What a mapping says of what was found: which topic is which node, and what is left out.
 
-use std::collections::{BTreeMap, BTreeSet, HashMap, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use mappings::{LiveTopic, NodeIdText, SpaceId};
 use messages::{Registry, TypeName};
 use uadp::BuiltinType;
 
 use super::calls::{self, CallEntry, Untyped};
-use super::known::{Known, Named};
+use super::known::{Known, Named, Whose};
+use super::nodes::{Indexes, is_at, source_of};
 use super::topics::{Form, LeftOut, camel, normal, registry};
 use crate::survey::{Graph, Nodes, UaServer, UaSource, UaVariable};
 
@@ -151,57 +152,15 @@ impl Planner<'_> {
         }
     }
 
-    /// Gives every namespace its index in the mapping: that of the cell's server, from 2 on for those of files and other
-    /// servers, since 1 is each server's own.
+    /// The nodes that are not known, in the mapping's namespaces.
     fn nodes(&mut self, sources: &[Nodes], servers: &[Option<String>], uri: &str) {
-        let mut all = self.known.mapping.namespaces().clone();
-        let mut by_uri: HashMap<String, u16> = HashMap::new();
-        for (index, uri) in &all {
-            by_uri.entry(uri.clone()).or_insert(*index);
-        }
+        let mut indexes = Indexes::of(self.known.mapping.namespaces());
         let mut taken = BTreeSet::new();
-        let mut ua = Vec::new();
-        let mut twins = Vec::new();
+        let (mut ua, mut twins) = (Vec::new(), Vec::new());
         for (source, server) in sources.iter().zip(servers) {
-            let is_cell = source.server.as_ref().is_some_and(|server| server.is_cell);
-            let mut indexes: HashMap<u16, u16> = HashMap::new();
-            let used: HashSet<u16> = source
-                .variables
-                .iter()
-                .map(|one| one.node.namespace)
-                .collect();
-            // From the index that is wanted on, then below it; none is given back, so nothing is free before them.
-            let (mut above, mut below) = (0, 2);
-            for (index, uri) in (0..=u16::MAX).zip(&source.namespaces).skip(1) {
-                if !used.contains(&index) {
-                    continue;
-                }
-                let given = by_uri.get(uri).copied().or_else(|| {
-                    let wanted = index.saturating_add(u16::from(!is_cell));
-                    let free = |at: &u16| !all.contains_key(at);
-                    above = wanted.max(above);
-                    let found = match (above..=u16::MAX).find(free) {
-                        Some(found) => {
-                            above = found;
-                            found
-                        }
-                        None => {
-                            above = u16::MAX;
-                            below = (below..=u16::MAX).find(free)?;
-                            below
-                        }
-                    };
-                    all.insert(found, uri.clone());
-                    by_uri.insert(uri.clone(), found);
-                    self.plan.namespaces.insert(found, uri.clone());
-                    Some(found)
-                });
-                // Without an index its nodes stay out.
-                if let Some(given) = given {
-                    indexes.insert(index, given);
-                }
-            }
+            let indexes = indexes.give(source);
             for one in &source.variables {
+                // Without an index its nodes stay out.
                 let Some(namespace) = indexes.get(&one.node.namespace) else {
                     continue;
                 };
@@ -212,42 +171,28 @@ impl Planner<'_> {
                 if let Some(number) = node.writer_id() {
                     self.known.use_number(*namespace, number.get());
                 }
-                let from = server.as_ref();
+                let from = server.as_deref();
                 let from = from.map(|server| source_of(server, &one.node, &source.namespaces));
-                if from.as_ref().is_some_and(|from| self.known.has_source(from)) {
-                    continue;
-                }
-                let other = server.as_ref();
-                let other = other.is_some_and(|server| self.known.is_of_other(&node, server));
-                let has = self.known.has_node(&node) && !other;
-                let is_twin = other || !has && !taken.insert(node.to_string());
+                let known = match &from {
+                    Some(from) if self.known.has_source(from) => continue,
+                    // Two servers of one make have nodes of the same names.
+                    Some(from) => self.known.has_node_of(&node, &from.server),
+                    None => self.known.has_node(&node).then_some(Whose::Same),
+                };
                 let one = UaVariable {
-                    node,
                     source: from,
                     ..one.clone()
                 };
-                match (has, is_twin) {
-                    (true, _) => {}
-                    (false, false) => ua.push(one),
-                    // Two servers of one make have nodes of the same names.
-                    (false, true) if one.source.is_some() => twins.push(one),
-                    (false, true) => {}
+                match known {
+                    Some(Whose::Same) => {}
+                    None if taken.insert(node.to_string()) => ua.push(UaVariable { node, ..one }),
+                    Some(Whose::Other) | None if one.source.is_some() => twins.push(one),
+                    Some(Whose::Other) | None => {}
                 }
             }
         }
-        for twin in twins {
-            let namespace = self.namespace(uri);
-            let number = namespace.and_then(|namespace| self.known.next_number(namespace));
-            let (Some(namespace), Some(number)) = (namespace, number) else {
-                break;
-            };
-            let identifier = mappings::Identifier::Numeric(number.into());
-            let node = NodeIdText {
-                namespace,
-                identifier,
-            };
-            ua.push(UaVariable { node, ..twin });
-        }
+        self.plan.namespaces.append(&mut indexes.given);
+        self.twins(twins, uri, &mut ua);
         let key = |one: &UaVariable| (one.within.clone(), one.name.clone(), one.node.to_string());
         ua.sort_by_cached_key(key);
         for (at, one) in ua.iter().enumerate() {
@@ -259,6 +204,23 @@ impl Planner<'_> {
             self.alike.entry(alone).or_default().push(at);
         }
         self.ua = ua.into_iter().map(Some).collect();
+    }
+
+    /// Nodes whose names other servers' nodes have: they get numbers among the values without a node.
+    fn twins(&mut self, twins: Vec<UaVariable>, uri: &str, ua: &mut Vec<UaVariable>) {
+        for twin in twins {
+            let namespace = self.namespace(uri);
+            let number = namespace.and_then(|namespace| self.known.next_number(namespace));
+            let (Some(namespace), Some(number)) = (namespace, number) else {
+                return;
+            };
+            let identifier = mappings::Identifier::Numeric(number.into());
+            let node = NodeIdText {
+                namespace,
+                identifier,
+            };
+            ua.push(UaVariable { node, ..twin });
+        }
     }
 
     fn topics(&mut self, graphs: &[Graph], wishes: &Wishes<'_>) {
@@ -488,35 +450,6 @@ impl Planner<'_> {
             });
         }
     }
-}
-
-/// A node as a server of another namespace table knows it.
-fn source_of(server: &str, node: &NodeIdText, namespaces: &[String]) -> UaSource {
-    let uri = namespaces.get(usize::from(node.namespace));
-    let namespace = match uri {
-        Some(uri) => mappings::NamespaceText::Uri(uri.clone()),
-        None => mappings::NamespaceText::Index(node.namespace),
-    };
-    let identifier = node.identifier.clone();
-    let node = mappings::ExpandedNodeIdText {
-        namespace,
-        identifier,
-    };
-    UaSource {
-        server: server.to_owned(),
-        node: node.to_string(),
-    }
-}
-
-/// Whether an endpoint is at that port of this host.
-fn is_at(endpoint: &str, port: u16) -> bool {
-    let place = endpoint.trim_start_matches("opc.tcp://");
-    let place = place.split('/').next().unwrap_or_default();
-    let hosts = ["127.0.0.1", "localhost", "[::1]"];
-    hosts.iter().any(|host| {
-        let rest = place.strip_prefix(host);
-        rest.and_then(|rest| rest.strip_prefix(':')) == Some(&port.to_string())
-    })
 }
 
 /// Where the cell's own server is if nothing is said.

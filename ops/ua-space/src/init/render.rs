@@ -150,7 +150,9 @@ fn entry(entry: &Entry, indent: &str, lines: &mut Vec<String>) {
             _ => "to",
         };
         let (server, node) = (scalar(server), scalar(node));
-        say(format!("{mark}  {word}: {{server: {server}, node: {node}}}"));
+        say(format!(
+            "{mark}  {word}: {{server: {server}, node: {node}}}"
+        ));
     }
     match entry.bindings.as_slice() {
         [] => {}

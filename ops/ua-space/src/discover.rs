@@ -1,0 +1,70 @@
+//! `ua-space discover`: who is there.
+
+mod around;
+mod entry;
+
+use std::io::{self, Write as _};
+
+use crate::arguments::Discover;
+use crate::exit::Failure;
+use crate::live::{Table, is_coloured};
+use crate::survey::look;
+
+pub(crate) use around::around;
+pub(crate) use entry::{Entry, Kind};
+
+pub(crate) fn discover(arguments: &Discover) -> Result<(), Failure> {
+    let found = look(around(&arguments.look))?;
+    let mut out = io::stdout().lock();
+    if arguments.json {
+        let shown: Vec<_> = found.entries.iter().map(Entry::shown).collect();
+        let line =
+            serde_json::to_string(&shown).map_err(|error| Failure::Data(error.to_string()))?;
+        writeln!(out, "{line}")?;
+        return Ok(out.flush()?);
+    }
+    if found.entries.is_empty() {
+        writeln!(out, "nobody was found")?;
+    } else {
+        table(&found.entries).write(&mut out, is_coloured())?;
+    }
+    if let Some(tried) = found.tried {
+        writeln!(out, "{tried} places were tried")?;
+    }
+    Ok(out.flush()?)
+}
+
+const HEAD: [&str; 7] = [
+    "KIND",
+    "NAME",
+    "URL",
+    "FOUND BY",
+    "CAPABILITIES",
+    "SECURITY",
+    "URI",
+];
+
+fn table(entries: &[Entry]) -> Table {
+    let mut table = Table::new(HEAD.map(str::to_owned));
+    let dash = |text: String| match text.is_empty() {
+        true => "-".to_owned(),
+        false => text,
+    };
+    for entry in entries {
+        let shown = entry.shown();
+        let security = match &entry.fault {
+            Some(fault) => fault.clone(),
+            None => entry.security.join(" "),
+        };
+        table.row([
+            shown.kind.to_owned(),
+            dash(entry.name.clone()),
+            dash(entry.urls.join(" ")),
+            shown.found_by.join(" "),
+            dash(shown.capabilities.join(" ")),
+            dash(security),
+            dash(entry.uri.clone()),
+        ]);
+    }
+    table
+}

@@ -1,0 +1,321 @@
+//! Looking for all who are there: announcements, discovery servers, the group, and addresses where somebody asks for that.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::time::Duration;
+
+use discovery::client::{Application, describe, find_servers, find_servers_on_network};
+use discovery::scan::{Outcome, Pace, scan};
+use discovery::{DEFAULT_LDS, Found, Interface, Known, WatchSettings, watch};
+use tokio::signal::ctrl_c;
+use tokio::task::JoinSet;
+use tokio::time::timeout;
+
+use super::entry::{By, Entry, Kind, merged};
+use crate::arguments::Look;
+use crate::exit::Failure;
+use crate::live;
+use crate::report::warn;
+
+/// Who is there.
+pub(crate) struct Around {
+    pub(crate) entries: Vec<Entry>,
+    /// How many places were tried, if any.
+    pub(crate) tried: Option<u32>,
+}
+
+/// Looks around; Ctrl-C ends it.
+pub(crate) async fn around(look: &Look) -> Result<Around, Failure> {
+    tokio::select! {
+        found = Box::pin(gathered(look)) => Ok(found),
+        _ = ctrl_c() => Err(Failure::Interrupted),
+    }
+}
+
+async fn gathered(look: &Look) -> Around {
+    let limit = Duration::from_secs_f64(look.seconds);
+    let pace = Pace {
+        per_second: look.rate,
+        ..Pace::default()
+    };
+    let scanning = async {
+        match look.scan.as_slice() {
+            [] => None,
+            ranges => Some(scan(ranges, &look.port, pace).await),
+        }
+    };
+    let senders = live::senders(&look.group, look.seconds);
+    let (heard, senders, scanned) = tokio::join!(heard(look, limit), senders, scanning);
+    let mut found: Vec<Entry> = Vec::new();
+    let mut asked: BTreeSet<String> = look.lds.iter().cloned().collect();
+    asked.insert(DEFAULT_LDS.to_owned());
+    for known in &heard {
+        if known.is_lds() {
+            asked.insert(known.url.clone());
+        }
+    }
+    let tried = scanned.as_ref().map(|scanned| scanned.tried);
+    for entry in scanned.into_iter().flat_map(of_scan) {
+        if entry.kind == Kind::Lds {
+            asked.extend(entry.urls.first().cloned());
+        }
+        found.push(entry);
+    }
+    let mut places: Vec<Place> = heard.into_iter().map(Place::of_mdns).collect();
+    places.extend(listed(look, asked).await);
+    found.extend(reached(places).await);
+    match senders {
+        Ok(senders) => found.extend(senders.into_iter().map(bridge)),
+        Err(failure) => warn(&format!("the group is not heard: {failure}")),
+    }
+    Around {
+        entries: merged(found),
+        tried,
+    }
+}
+
+/// The servers that are announced on the network.
+async fn heard(look: &Look, limit: Duration) -> Vec<Known> {
+    let interfaces = match &look.group.interface {
+        Some(interface) => vec![Interface::parse(interface)],
+        None => Interface::all(),
+    };
+    let mut hearing = JoinSet::new();
+    for interface in interfaces.into_iter().take(MOST_INTERFACES) {
+        let settings = WatchSettings {
+            mdns: Some(interface.clone()),
+            ..WatchSettings::default()
+        };
+        match watch(settings) {
+            Ok(mut watcher) => {
+                hearing.spawn(async move {
+                    let mut known = BTreeMap::new();
+                    let all = async {
+                        while let Some(found) = watcher.next().await {
+                            let name = found.known().name.clone();
+                            match found {
+                                Found::Seen(one) | Found::Restarted(one) => {
+                                    known.insert(name, one);
+                                }
+                                Found::Gone { .. } => {
+                                    known.remove(&name);
+                                }
+                            }
+                        }
+                    };
+                    // It ends by the limit.
+                    let _over = timeout(limit, all).await;
+                    known.into_values().collect::<Vec<Known>>()
+                });
+            }
+            Err(fault) => warn(&format!("mDNS is not heard on {interface}: {fault}")),
+        }
+    }
+    hearing.join_all().await.into_iter().flatten().collect()
+}
+
+/// Somewhere a server is said to be.
+struct Place {
+    by: By,
+    url: String,
+    name: String,
+    capabilities: Vec<String>,
+    is_lds: bool,
+    uri: String,
+    /// Of a discovery server: where it is itself, which is the host of those that register with it.
+    host: Option<String>,
+}
+
+impl Place {
+    fn of_mdns(known: Known) -> Self {
+        Self {
+            by: By::Mdns,
+            is_lds: known.is_lds(),
+            url: known.url,
+            name: known.name,
+            capabilities: known.capabilities,
+            uri: known.application_uri.unwrap_or_default(),
+            host: None,
+        }
+    }
+
+    fn of_lds(lds: &str, application: Application) -> Option<Self> {
+        let mut urls = application.discovery_urls.into_iter();
+        Some(Self {
+            by: By::Lds,
+            url: urls.find(|url| url.starts_with("opc.tcp://"))?,
+            name: application.name,
+            capabilities: Vec::new(),
+            is_lds: application.is_discovery_server,
+            uri: application.application_uri,
+            host: host(lds),
+        })
+    }
+
+    /// Asks who it is.
+    async fn reached(self) -> Entry {
+        let first = describe(&self.url, ANSWER).await;
+        // A name of a host that means nothing here.
+        let elsewhere = self.host.as_deref().and_then(|host| moved(&self.url, host));
+        let (url, described) = match (first, elsewhere) {
+            (Err(fault), Some(url)) => match describe(&url, ANSWER).await {
+                Ok(described) => (url, Ok(described)),
+                Err(_) => (self.url, Err(fault)),
+            },
+            (first, _) => (self.url, first),
+        };
+        let mut entry = Entry::new(Kind::Server, self.by, url);
+        entry.name = self.name;
+        entry.uri = self.uri;
+        entry.capabilities.extend(self.capabilities);
+        match described {
+            Ok(told) => {
+                entry.kind = Kind::of_product(&told.product_uri);
+                entry.security = told.security;
+                let application = told.application;
+                if !application.application_uri.is_empty() {
+                    entry.uri = application.application_uri;
+                }
+                if !application.name.is_empty() {
+                    entry.name = application.name;
+                }
+                if application.is_discovery_server {
+                    entry.kind = Kind::Lds;
+                }
+            }
+            Err(fault) => entry.fault = Some(fault.to_string()),
+        }
+        if self.is_lds {
+            entry.kind = Kind::Lds;
+        }
+        entry
+    }
+}
+
+/// Those that discovery servers list.
+async fn listed(look: &Look, asked: BTreeSet<String>) -> Vec<Place> {
+    let mut asking = JoinSet::new();
+    for url in asked.into_iter().take(MOST_LDS) {
+        asking.spawn(async move {
+            let (registered, announced) = tokio::join!(
+                find_servers(&url, ANSWER),
+                find_servers_on_network(&url, ANSWER)
+            );
+            (url, registered, announced)
+        });
+    }
+    let mut places = Vec::new();
+    for (url, registered, announced) in asking.join_all().await {
+        match registered {
+            Ok(all) => places.extend(all.into_iter().filter_map(|one| Place::of_lds(&url, one))),
+            Err(fault) if look.lds.contains(&url) => {
+                warn(&format!("the discovery server {url} is not there: {fault}"));
+            }
+            Err(_) => {}
+        }
+        // A server that is none of discovery has no such list.
+        for one in announced.into_iter().flatten() {
+            places.push(Place {
+                by: By::Lds,
+                is_lds: one.capabilities.iter().any(|code| code == "LDS"),
+                url: one.url,
+                name: one.name,
+                capabilities: one.capabilities,
+                uri: String::new(),
+                host: None,
+            });
+        }
+    }
+    places
+}
+
+async fn reached(places: Vec<Place>) -> Vec<Entry> {
+    let mut waiting = places.into_iter().take(MOST_PLACES);
+    let mut asking = JoinSet::new();
+    let mut found = Vec::new();
+    loop {
+        while asking.len() < AT_ONCE
+            && let Some(place) = waiting.next()
+        {
+            asking.spawn(place.reached());
+        }
+        match asking.join_next().await {
+            Some(Ok(entry)) => found.push(entry),
+            Some(Err(_)) => {}
+            None => return found,
+        }
+    }
+}
+
+fn of_scan(scanned: Outcome) -> Vec<Entry> {
+    let servers = scanned.servers.into_iter().map(|one| {
+        let told = one.described;
+        let kind = match told.application.is_discovery_server {
+            true => Kind::Lds,
+            false => Kind::of_product(&told.product_uri),
+        };
+        let mut entry = Entry::new(kind, By::Scan, one.url);
+        entry.urls.extend(one.also_at);
+        entry.name = told.application.name;
+        entry.uri = told.application.application_uri;
+        entry.security = told.security;
+        entry
+    });
+    let others = scanned.others.into_iter().map(|(place, why)| {
+        let mut entry = Entry::new(Kind::Other, By::Scan, format!("opc.tcp://{place}"));
+        entry.fault = Some(why);
+        entry
+    });
+    servers.chain(others).collect()
+}
+
+fn bridge(((space, from), topics): ((u16, String), usize)) -> Entry {
+    let mut entry = Entry::new(Kind::Bridge, By::Group, from);
+    entry.name = match space {
+        1 => "space 1 (ROS 1)".to_owned(),
+        space => format!("space {space} (ROS 2)"),
+    };
+    entry.space = Some((space, topics));
+    entry
+}
+
+/// The host in a URL, with the brackets of an address of IPv6.
+fn host(url: &str) -> Option<String> {
+    let place = url.strip_prefix("opc.tcp://")?.split('/').next()?;
+    let host = match place.rsplit_once(':') {
+        Some((host, port)) if !port.contains(']') => host,
+        Some(_) | None => place,
+    };
+    Some(host.to_owned())
+}
+
+/// The URL at another host.
+fn moved(url: &str, to: &str) -> Option<String> {
+    let from = host(url)?;
+    let rest = url.strip_prefix("opc.tcp://")?.strip_prefix(&from)?;
+    (from != to).then(|| format!("opc.tcp://{to}{rest}"))
+}
+
+const ANSWER: Duration = Duration::from_secs(3);
+const AT_ONCE: usize = 32;
+const MOST_PLACES: usize = 4_096;
+const MOST_LDS: usize = 64;
+const MOST_INTERFACES: usize = 16;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_url_keeps_its_port_and_path_at_another_host() {
+        assert_eq!(
+            moved("opc.tcp://plc-7:4841/a", "10.0.0.7").as_deref(),
+            Some("opc.tcp://10.0.0.7:4841/a")
+        );
+        assert_eq!(
+            moved("opc.tcp://[fe80::1]:1", "b").as_deref(),
+            Some("opc.tcp://b:1")
+        );
+        assert_eq!(moved("opc.tcp://b", "b"), None);
+        assert_eq!(host("opc.tcp://[::1]").as_deref(), Some("[::1]"));
+    }
+}

@@ -1,0 +1,220 @@
+//! Somebody who was found, and two findings of the same as one.
+
+use std::collections::BTreeSet;
+
+use serde::Serialize;
+
+/// What somebody is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Kind {
+    /// A discovery server.
+    Lds,
+    /// The server of a cell, `ua-server`.
+    Cell,
+    /// A server of this project with skills, or that leads those that have them.
+    Component,
+    /// Any other OPC UA server.
+    Server,
+    /// Who sends the values of a ROS space.
+    Bridge,
+    /// Somebody who listens and is no OPC UA server.
+    Other,
+}
+
+impl Kind {
+    pub(crate) const fn word(self) -> &'static str {
+        match self {
+            Self::Lds => "discovery server",
+            Self::Cell => "cell server",
+            Self::Component => "component",
+            Self::Server => "server",
+            Self::Bridge => "bridge",
+            Self::Other => "other",
+        }
+    }
+
+    /// Of what a server says it is an instance of.
+    pub(super) fn of_product(uri: &str) -> Self {
+        match uri {
+            "urn:ua-bridge:server" => Self::Cell,
+            "urn:ua-bridge:plant" => Self::Component,
+            _ => Self::Server,
+        }
+    }
+}
+
+/// How somebody was found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum By {
+    Mdns,
+    Lds,
+    Scan,
+    Group,
+}
+
+impl By {
+    const fn word(self) -> &'static str {
+        match self {
+            Self::Mdns => "mdns",
+            Self::Lds => "lds",
+            Self::Scan => "scan",
+            Self::Group => "group",
+        }
+    }
+}
+
+/// Somebody.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Entry {
+    pub(crate) kind: Kind,
+    pub(crate) name: String,
+    /// The ApplicationUri; empty where it is not told.
+    pub(crate) uri: String,
+    /// Where it is, the place it was reached at first.
+    pub(crate) urls: Vec<String>,
+    pub(crate) capabilities: BTreeSet<String>,
+    /// The ways its endpoints may be talked to.
+    pub(crate) security: Vec<String>,
+    pub(crate) found_by: BTreeSet<By>,
+    /// Why it was not reached, or not understood.
+    pub(crate) fault: Option<String>,
+    /// Of a bridge: its space and how many topics were heard of it.
+    pub(crate) space: Option<(u16, usize)>,
+}
+
+/// An entry as JSON.
+#[derive(Serialize)]
+#[serde(rename_all = "camelCase")]
+pub(super) struct Shown<'e> {
+    pub(super) kind: &'static str,
+    name: &'e str,
+    uri: &'e str,
+    urls: &'e [String],
+    pub(super) capabilities: Vec<&'e str>,
+    security: &'e [String],
+    pub(super) found_by: Vec<&'static str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    fault: Option<&'e str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    space: Option<u16>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    topics: Option<usize>,
+}
+
+impl Entry {
+    pub(super) fn new(kind: Kind, by: By, url: String) -> Self {
+        Self {
+            kind,
+            name: String::new(),
+            uri: String::new(),
+            urls: vec![url],
+            capabilities: BTreeSet::new(),
+            security: Vec::new(),
+            found_by: BTreeSet::from([by]),
+            fault: None,
+            space: None,
+        }
+    }
+
+    pub(super) fn shown(&self) -> Shown<'_> {
+        Shown {
+            kind: self.kind.word(),
+            name: &self.name,
+            uri: &self.uri,
+            urls: &self.urls,
+            capabilities: self.capabilities.iter().map(String::as_str).collect(),
+            security: &self.security,
+            found_by: self.found_by.iter().map(|by| by.word()).collect(),
+            fault: self.fault.as_deref(),
+            space: self.space.map(|(space, _)| space),
+            topics: self.space.map(|(_, topics)| topics),
+        }
+    }
+
+    /// Whether both are the same: by the ApplicationUri, or the place where that is not told.
+    fn is(&self, other: &Self) -> bool {
+        match self.uri.is_empty() || other.uri.is_empty() {
+            true => self.urls.iter().any(|url| other.urls.contains(url)),
+            false => self.uri == other.uri,
+        }
+    }
+
+    /// Takes what another finding says of the same.
+    fn join(&mut self, other: Self) {
+        // Who was reached is told before who was not.
+        let better = self.fault.is_some() && other.fault.is_none();
+        let (mut first, second) = match better {
+            true => (other, self.clone()),
+            false => (self.clone(), other),
+        };
+        for url in second.urls {
+            if !first.urls.contains(&url) {
+                first.urls.push(url);
+            }
+        }
+        first.kind = match (first.kind, second.kind) {
+            (Kind::Server, kind) | (kind, Kind::Server) => kind,
+            (kind, _) => kind,
+        };
+        if first.name.is_empty() {
+            first.name = second.name;
+        }
+        if first.uri.is_empty() {
+            first.uri = second.uri;
+        }
+        if first.security.is_empty() {
+            first.security = second.security;
+        }
+        first.capabilities.extend(second.capabilities);
+        first.found_by.extend(second.found_by);
+        *self = first;
+    }
+}
+
+/// Each once, in the order of their kinds and names.
+pub(super) fn merged(found: impl IntoIterator<Item = Entry>) -> Vec<Entry> {
+    let mut entries: Vec<Entry> = Vec::new();
+    for one in found {
+        match entries.iter_mut().find(|entry| entry.is(&one)) {
+            Some(entry) => entry.join(one),
+            None => entries.push(one),
+        }
+    }
+    let order = |entry: &Entry| (entry.kind, entry.name.clone(), entry.urls.clone());
+    entries.sort_by_cached_key(order);
+    entries
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn entry(by: By, uri: &str, url: &str) -> Entry {
+        Entry {
+            uri: uri.to_owned(),
+            ..Entry::new(Kind::Server, by, url.to_owned())
+        }
+    }
+
+    #[test]
+    fn a_server_that_is_found_three_ways_is_one() {
+        let mut away = entry(By::Lds, "", "opc.tcp://plc:4840");
+        away.fault = Some("no answer".to_owned());
+        let mut told = entry(By::Mdns, "urn:plc", "opc.tcp://plc:4840");
+        told.kind = Kind::Component;
+        told.capabilities.insert("DA".to_owned());
+        let all = merged([
+            away,
+            told,
+            entry(By::Scan, "urn:plc", "opc.tcp://10.0.0.7:4840"),
+            entry(By::Scan, "urn:other", "opc.tcp://10.0.0.8:4840"),
+        ]);
+        let [plc, other] = all.as_slice() else {
+            panic!("{all:?}")
+        };
+        assert_eq!((plc.kind, plc.fault.as_deref()), (Kind::Component, None));
+        assert_eq!(plc.urls, ["opc.tcp://plc:4840", "opc.tcp://10.0.0.7:4840"]);
+        assert_eq!(plc.found_by.len(), 3);
+        assert_eq!(other.uri, "urn:other");
+    }
+}
