@@ -12,7 +12,7 @@ document! {
         /// Where it is, as opc.tcp://192.168.0.10:4840.
         #[schemars(required, regex(pattern = r"^opc\.tcp://"))]
         endpoint: String,
-        /// Security policy of the session. Left out: the best that the server offers, which may be None; `Basic256Sha256` is signed
+        /// Security policy of the session. Left out: the best that the server offers, which may be None; every other one is signed
         /// and encrypted, or there is no session.
         security: SecurityEntry,
         /// User name. Left out: anonymous.

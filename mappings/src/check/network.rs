@@ -330,7 +330,7 @@ fn security(
     Some(policies)
 }
 
-const fn policy(entry: SecurityEntry) -> SecurityPolicy {
+pub(super) const fn policy(entry: SecurityEntry) -> SecurityPolicy {
     match entry {
         SecurityEntry::None => SecurityPolicy::None,
         SecurityEntry::Basic256Sha256 => SecurityPolicy::Basic256Sha256,

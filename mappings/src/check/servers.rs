@@ -3,10 +3,9 @@
 use std::collections::HashMap;
 use std::num::NonZeroU16;
 
-use super::network::{duration, is_own, remote_endpoint};
+use super::network::{duration, is_own, policy, remote_endpoint};
 use super::{Declared, required};
 use crate::code::Code;
-use crate::document::SecurityEntry;
 use crate::findings::Findings;
 use crate::mapping::{Endpoint, SecurityPolicy};
 use crate::node_id::ExpandedNodeIdText;
@@ -74,10 +73,7 @@ fn server(
         .and_then(|(name, place)| Some((name_of(name, place, findings)?, place)));
     let endpoint = required(&entry.endpoint, "endpoint", OF, place, findings)
         .and_then(|(text, place)| other_endpoint((text, place), own, findings));
-    let security = given(&entry.security).map(|(security, place)| match security {
-        SecurityEntry::None => (SecurityPolicy::None, place),
-        SecurityEntry::Basic256Sha256 => (SecurityPolicy::Basic256Sha256, place),
-    });
+    let security = given(&entry.security).map(|(entry, place)| (policy(*entry), place));
     let user = user(entry, findings)?;
     if let (Some((SecurityPolicy::None, place)), Some(_)) = (security, &user) {
         let message = "the password of a user goes over a session without security";

@@ -37,6 +37,8 @@ impl Clients {
                 None => SecurityChoice::Best,
                 Some(SecurityPolicy::None) => SecurityChoice::None,
                 Some(SecurityPolicy::Basic256Sha256) => SecurityChoice::Basic256Sha256,
+                Some(SecurityPolicy::Aes128Sha256RsaOaep) => SecurityChoice::Aes128Sha256RsaOaep,
+                Some(SecurityPolicy::Aes256Sha256RsaPss) => SecurityChoice::Aes256Sha256RsaPss,
             },
             user: access.user.as_ref().map(|user| ClientUser {
                 name: user.name.clone(),

@@ -197,10 +197,7 @@ impl Connected {
     async fn by(access: &Access) -> Result<Self, Failure> {
         let url = access.endpoint.to_string();
         let plain = access.security == Some(SecurityPolicy::None);
-        let may = match (access.security, &access.user) {
-            (Some(SecurityPolicy::Basic256Sha256), _) => false,
-            (_, user) => user.is_none() || plain,
-        };
+        let may = plain || access.security.is_none() && access.user.is_none();
         if !may {
             return Err(away(
                 format!("the OPC UA server at {url} is to be asked over a secured session only"),

@@ -88,6 +88,10 @@ pub enum SecurityChoice {
     None,
     /// Signed and encrypted.
     Basic256Sha256,
+    /// Signed and encrypted, with AES of 128 bits.
+    Aes128Sha256RsaOaep,
+    /// Signed with RSA-PSS and encrypted.
+    Aes256Sha256RsaPss,
 }
 
 /// Whether there is a connection.

@@ -352,10 +352,6 @@ async fn endpoint(
         .await
         .map_err(|error| error.to_string())?;
     let is_plain = |one: &EndpointDescription| one.security_mode == MessageSecurityMode::None;
-    let is_secured = |one: &EndpointDescription| {
-        one.security_mode == MessageSecurityMode::SignAndEncrypt
-            && one.security_policy_uri.as_ref() == BASIC256SHA256
-    };
     let has = |wanted: &dyn Fn(&EndpointDescription) -> bool| {
         let tcp = offered.iter().filter(|one| {
             let url: &str = one.endpoint_url.as_ref();
@@ -363,23 +359,33 @@ async fn endpoint(
         });
         tcp.into_iter().find(|one| wanted(one)).cloned()
     };
+    let secured_by = |policies: &[&str]| {
+        policies.iter().find_map(|policy| {
+            has(&|one| {
+                one.security_mode == MessageSecurityMode::SignAndEncrypt
+                    && one.security_policy_uri.as_ref().rsplit('#').next() == Some(*policy)
+            })
+        })
+    };
+    let wanted: &[&str] = match config.security {
+        SecurityChoice::Best => &POLICIES,
+        SecurityChoice::None => &[],
+        SecurityChoice::Basic256Sha256 => &["Basic256Sha256"],
+        SecurityChoice::Aes128Sha256RsaOaep => &["Aes128_Sha256_RsaOaep"],
+        SecurityChoice::Aes256Sha256RsaPss => &["Aes256_Sha256_RsaPss"],
+    };
+    let (is_best, is_none) = (
+        config.security == SecurityChoice::Best,
+        config.security == SecurityChoice::None,
+    );
     let can_secure = config.pki.is_some();
+    if !can_secure && !is_best && !is_none {
+        return Err("a secured session needs a directory for certificates".to_owned());
+    }
+    let secured = can_secure.then(|| secured_by(wanted)).flatten();
     // A password is nothing for everybody to hear.
-    let wanted = match config.security {
-        SecurityChoice::Best if config.user.is_some() => SecurityChoice::Basic256Sha256,
-        other @ (SecurityChoice::Best | SecurityChoice::None | SecurityChoice::Basic256Sha256) => {
-            other
-        }
-    };
-    let chosen = match wanted {
-        SecurityChoice::None => has(&is_plain),
-        SecurityChoice::Basic256Sha256 if can_secure => has(&is_secured),
-        SecurityChoice::Best if can_secure => has(&is_secured).or_else(|| has(&is_plain)),
-        SecurityChoice::Best => has(&is_plain),
-        SecurityChoice::Basic256Sha256 => {
-            return Err("Basic256Sha256 needs a directory for certificates".to_owned());
-        }
-    };
+    let may_be_plain = is_none || is_best && config.user.is_none();
+    let chosen = secured.or_else(|| may_be_plain.then(|| has(&is_plain)).flatten());
     let mut chosen =
         chosen.ok_or_else(|| format!("{} offers no security we can have", shared.url))?;
     // The name a server gives itself may not be known here.
@@ -479,7 +485,12 @@ pub(crate) fn failed(error: &opcua::types::Error) -> ClientError {
     }
 }
 
-const BASIC256SHA256: &str = "http://opcfoundation.org/UA/SecurityPolicy#Basic256Sha256";
+/// Security policies, the one that most servers and their certificates are known to do first.
+const POLICIES: [&str; 3] = [
+    "Basic256Sha256",
+    "Aes256_Sha256_RsaPss",
+    "Aes128_Sha256_RsaOaep",
+];
 /// How many keep-alives in a row may be missed.
 const MOST_MISSED: u32 = 2;
 /// How often it is looked whether subscriptions live.
