@@ -212,6 +212,99 @@ fn a_goal_goes_on_without_its_client_and_ends_without_its_server() {
     assert_eq!(reached, json!([1, 1, 2, 3]));
 }
 
+/// `ua-space call` of an action, with JSON for each thing it tells.
+fn ask(words: &[&str]) -> Child {
+    Started::new("ua-space", &program("ua-space"))
+        .args(
+            [
+                &["call"],
+                words,
+                &["--interface", "lo", "--wait", "30", "--json"],
+            ]
+            .concat(),
+        )
+        .ends_on(Signal::SIGINT)
+        .start()
+}
+
+/// How it ended: its exit code, how the goal did, and what came out.
+fn asked(mut asking: Child) -> (i32, Value, Value, Vec<Value>) {
+    let code = asking.wait_for_end(SOON).code().unwrap();
+    let lines = asking.json_lines();
+    let result = lines.iter().find(|line| line["event"] == "result");
+    let result = result.cloned().unwrap_or_default();
+    (
+        code,
+        result["status"].clone(),
+        result["fields"].clone(),
+        lines,
+    )
+}
+
+#[test]
+fn who_looks_into_the_space_sends_goals_sees_their_feedback_and_cancels_them() {
+    let Some(cell) = Cell::with(&[Peer::Ros1]) else {
+        return;
+    };
+    let _core = cell.roscore();
+    let mut server = cell.rospy(SERVER, &[OF_ROS1, FIBONACCI]);
+    let _bridge = cell.bridge_ros1(&[]);
+    let reached = asked(ask(&["ua_1_2_70", "order=5"]));
+    assert_eq!(
+        (reached.0, &reached.1, &reached.2),
+        (0, &json!("SUCCEEDED"), &sequence(&[1, 1, 2, 3, 5])),
+        "{:?}",
+        reached.3
+    );
+    let answer = &reached.3[0];
+    assert_eq!(
+        (&answer["event"], &answer["fields"]["accepted"]),
+        (&json!("answer"), &json!(true))
+    );
+    let rejected = asked(ask(&["ua_1_2_70", "{order: -1}"]));
+    assert_eq!(
+        (rejected.0, &rejected.1),
+        (1, &Value::Null),
+        "{:?}",
+        rejected.3
+    );
+    assert_eq!(rejected.3[0]["fields"]["accepted"], false);
+    let aborted = asked(ask(&["ua_1_2_70", "order=-2"]));
+    assert_eq!(
+        (aborted.0, &aborted.1),
+        (1, &json!("ABORTED")),
+        "{:?}",
+        aborted.3
+    );
+
+    let mut asking = ask(&["ua_1_2_70", "{order: 100}"]);
+    let told = asking.wait_for_json("feedback of the goal", SOON, |line| {
+        (line["event"] == "feedback").then(|| line["fields"]["sequence"].clone())
+    });
+    assert_eq!(told[0], 1);
+    line(&mut server, "goal", &json!(100), "body");
+    asking.signal(Signal::SIGINT);
+    let cancelled = asked(asking);
+    assert_eq!(
+        (cancelled.0, &cancelled.1, &cancelled.2),
+        (1, &json!("CANCELED"), &sequence(&[1, 1, 2])),
+        "{:?}",
+        cancelled.3
+    );
+    line(&mut server, "cancel", &json!(100), "cancel");
+    let cancelled = asked(ask(&["ua_1_2_70", "order=102", "--run-timeout", "1"]));
+    assert_eq!((cancelled.0, &cancelled.1), (1, &json!("CANCELED")));
+    // What is not set in a goal is what a message has; what it has not is said.
+    let nothing = asked(ask(&["ua_1_2_70"]));
+    assert_eq!(
+        (nothing.0, &nothing.2),
+        (0, &sequence(&[])),
+        "{:?}",
+        nothing.3
+    );
+    assert_eq!(asked(ask(&["ua_1_2_70", "{ordre: 1}"])).0, 64);
+}
+
 const NAVIGATION: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../mappings/navigation.yaml");
 
 #[test]
@@ -514,6 +607,18 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     let position = moved[2]["position"].as_array().unwrap();
     let off = position.iter().zip(target.as_array().unwrap()).map(near);
     assert!(off.fold(0.0, f64::max) < 1e-3, "{position:?}");
+
+    // The same from the command line.
+    let goal = [
+        "bench.Move.Goal",
+        "{target_position: [0.2, 0, 0.3, 0, 0, 0]}",
+    ];
+    let moved = asked(ask(&goal));
+    let (code, status) = (moved.0, &moved.1);
+    assert_eq!((code, status), (0, &json!("SUCCEEDED")), "{:?}", moved.3);
+    assert_eq!(moved.2["run"], 2);
+    let unsaid = asked(ask(&["bench.Move.Goal"]));
+    assert_eq!(unsaid.0, 64, "where to is not made up: {:?}", unsaid.3);
 
     // By the one line of the mapping, for who knows another type.
     let mut rclpy = rclpy_client(&cell, "/hold");

@@ -162,7 +162,7 @@ pub(crate) struct Call {
     /// A topic as ua_0_7_105, or a name as gripper.Grasp.Halt; gripper.Grasp is gripper.Grasp.Start
     #[arg(value_name = "TOPIC|NAME")]
     pub(crate) target: Target,
-    /// What the call takes, as Force=12.5 TargetPosition=0.4,0,0.2,0,0,0
+    /// What the call takes, as Force=12.5 TargetPosition=0.4,0,0.2,0,0,0; a goal also as YAML, '{order: 5}'
     #[arg(value_name = "NAME=VALUE")]
     pub(crate) parameters: Vec<String>,
     /// How long to wait for the call to be announced
@@ -171,13 +171,13 @@ pub(crate) struct Call {
     /// How long to wait for an answer, which the one that executes the call is told
     #[arg(long, value_name = "SECONDS", default_value = "10", value_parser = seconds)]
     pub(crate) timeout: f64,
-    /// Call Halt when the run of a skill takes longer. Without it: at Ctrl-C
+    /// Call Halt when the run of a skill takes longer, or cancel the goal of an action. Without it: at Ctrl-C
     #[arg(long, value_name = "SECONDS", value_parser = seconds)]
     pub(crate) run_timeout: Option<f64>,
-    /// End with the answer, and leave the run of a skill alone
+    /// End with the answer, and leave the run of a skill or the goal alone
     #[arg(long)]
     pub(crate) no_wait: bool,
-    /// One JSON object for the answer and each step of the run
+    /// One JSON object for the answer and each step of the run, or each feedback and the result of the goal
     #[arg(long)]
     pub(crate) json: bool,
     #[command(flatten)]

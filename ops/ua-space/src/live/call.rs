@@ -1,4 +1,7 @@
-//! `ua-space call`: asks for a call of the space, and follows the run of a skill to its end.
+//! `ua-space call`: asks for a call of the space, and follows the run of a skill or the goal of an action to its end.
+
+mod goal;
+mod words;
 
 use std::hash::{BuildHasher as _, Hasher as _, RandomState};
 use std::io::{self, Write as _};
@@ -8,8 +11,8 @@ use std::time::Duration;
 use mappings::TopicId;
 use serde::Serialize;
 use uadp::action::{
-    ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionRequest, Heard, Outcome,
-    Requestor, RequestorSettings,
+    ActionAddress, ActionDialect, ActionFields, ActionMessage, ActionRequest, CallId, Heard,
+    Outcome, Requestor, RequestorSettings,
 };
 use uadp::{Extras, NetworkHeader, OwnedPublisherId, StatusCode};
 
@@ -43,6 +46,9 @@ fn ask_for(arguments: &Call, is_told: bool) -> Result<(), Failure> {
             arguments,
         };
         let (topic, described) = asking.find().await?;
+        if let Some(parts) = goal::Parts::of(topic, &described) {
+            return Box::pin(asking.send_goal((topic, &described), parts)).await;
+        }
         let places = Places::of(topic, &described.name);
         let takes = described.call().map_or(&[][..], |call| &call.request);
         let request = parameters::request(&arguments.parameters, takes)
@@ -184,7 +190,7 @@ impl Asking<'_> {
     ) -> Result<Answer, Failure> {
         let mut halts_at = places;
         let mut came = None;
-        self.begin((topic, described), request)?;
+        self.begin((topic, described), request, self.timeout())?;
         loop {
             let ended = self.turn(described, Duration::MAX, &mut came).await?;
             match came.take() {
@@ -212,11 +218,17 @@ impl Asking<'_> {
         }
     }
 
+    /// How long an answer is waited for.
+    fn timeout(&self) -> Duration {
+        Duration::try_from_secs_f64(self.arguments.timeout).unwrap_or(Duration::MAX)
+    }
+
     fn begin(
         &mut self,
         (topic, described): (TopicId, &Described),
         request: &[u8],
-    ) -> Result<(), Failure> {
+        timeout: Duration,
+    ) -> Result<CallId, Failure> {
         let (space, namespace, writer_id) = topic.triple();
         let targets = described.call().map_or(&[][..], |call| &call.targets);
         let request = ActionRequest {
@@ -228,12 +240,10 @@ impl Asking<'_> {
             },
             dialect: ActionDialect::Standard,
             fields: ActionFields::Variants(request),
-            timeout: Duration::try_from_secs_f64(self.arguments.timeout).unwrap_or(Duration::MAX),
+            timeout,
         };
         let begun = self.requestor.call(request, self.live.now());
-        begun
-            .map(|_| ())
-            .map_err(|error| Failure::Usage(format!("{topic}: {error}")))
+        begun.map_err(|error| Failure::Usage(format!("{topic}: {error}")))
     }
 
     /// Calls Halt. What it is answered is of no interest: its effect is, which is followed.
@@ -244,7 +254,8 @@ impl Asking<'_> {
             description: String::new(),
             what: described::What::Value(Vec::new()),
         };
-        self.begin((places.halt, &halt), &[0, 0])
+        self.begin((places.halt, &halt), &[0, 0], self.timeout())
+            .map(drop)
     }
 
     /// Sends what is due and listens until more is, something came of the call, or `until`.
@@ -312,12 +323,13 @@ impl Asking<'_> {
         Ok(())
     }
 
-    fn tell(&self, step: &Step) -> Result<(), Failure> {
+    /// One object, or its lines for people.
+    fn tell(&self, what: &impl Serialize, lines: &str) -> Result<(), Failure> {
         let mut out = io::stdout().lock();
         match self.arguments.json {
-            true => writeln!(out, "{}", json(step)?)?,
+            true => writeln!(out, "{}", json(what)?)?,
             false => {
-                for line in step.told().lines() {
+                for line in lines.lines() {
                     writeln!(out, "  {}", harmless(line))?;
                 }
             }
@@ -338,7 +350,7 @@ impl Asking<'_> {
             let mut steps = Vec::new();
             let ended = self.hear_run(places, &mut run, &mut steps).await?;
             for step in &steps {
-                self.tell(step)?;
+                self.tell(step, &step.told())?;
             }
             let is_over = !halted && self.live.now() >= limit;
             if is_over {

@@ -34,6 +34,16 @@ pub(crate) struct Call {
     pub(crate) response: Vec<Field>,
     /// ActionTargetIds; never empty.
     pub(crate) targets: Vec<u16>,
+    /// Of one that sends goals.
+    pub(crate) action: Option<Action>,
+}
+
+/// The DataSetWriterIds of an action beside that of its goals.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Action {
+    pub(crate) cancel: u16,
+    pub(crate) result: u16,
+    pub(crate) feedback: u16,
 }
 
 /// One field of a DataSet.
@@ -97,6 +107,7 @@ impl Described {
                 request: fields(&meta_data.request)?,
                 response: fields(&meta_data.response)?,
                 targets,
+                action: action(&meta_data.request),
             }),
         })
     }
@@ -253,6 +264,26 @@ fn read(
     })
 }
 
+/// What the first field of a request that sends goals says of the action.
+fn action(request: &DataSetMetaDataType<'_>) -> Option<Action> {
+    let first = request.fields.get(0)?;
+    let mut properties = first.properties.iter().take(MOST_PROPERTIES);
+    let family = properties.find(|property| property.key.name == Some(ACTION_FAMILY))?;
+    let Variant::Array(family) = family.value else {
+        return None;
+    };
+    let mut numbers = family.iter().map(|number| match number {
+        Scalar::UInt16(number) if number != 0 => Some(number),
+        _ => None,
+    });
+    let mut next = || numbers.next().flatten();
+    Some(Action {
+        cancel: next()?,
+        result: next()?,
+        feedback: next()?,
+    })
+}
+
 fn bounded(text: Option<&str>, what: &'static str) -> Result<String, &'static str> {
     let text = text.unwrap_or_default();
     match text.len() <= MOST_TEXT {
@@ -263,6 +294,8 @@ fn bounded(text: Option<&str>, what: &'static str) -> Result<String, &'static st
 
 /// Of a field that may be left out of a request.
 const OPTIONAL: &str = "Optional";
+/// Of the first field of a request that sends goals: what cancels, what waits for results, feedback, statuses.
+const ACTION_FAMILY: &str = "ActionFamily";
 const MOST_PROPERTIES: usize = 64;
 const MOST_TEXT: usize = 1024;
 const MOST_FIELDS: usize = 1000;

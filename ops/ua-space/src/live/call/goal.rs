@@ -1,0 +1,424 @@
+//! An action: its goal is sent, its feedback shown, its result waited for; Ctrl-C cancels it.
+
+use std::hash::{BuildHasher as _, RandomState};
+use std::sync::Arc;
+use std::time::Duration;
+
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD as BASE64;
+use mappings::TopicId;
+use serde::Serialize;
+use uadp::action::{CallId, Heard, Outcome, Unknown};
+
+use super::super::book::{Kind, News};
+use super::super::described::Described;
+use super::super::plain::{self, Named};
+use super::super::{Ended, Go, parameters, until};
+use super::{Asking, LOOK, called, refused, words};
+use crate::exit::Failure;
+use crate::report::warn;
+
+/// Where an action is asked beside the call that sends its goals, and where it tells.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Parts {
+    cancel: TopicId,
+    result: TopicId,
+    feedback: TopicId,
+}
+
+impl Parts {
+    /// `None` for a call that sends no goals.
+    pub(super) fn of(goal: TopicId, described: &Described) -> Option<Self> {
+        let action = described.call()?.action?;
+        let (space, namespace, _) = goal.triple();
+        let of = |id| TopicId::new(space, namespace, id);
+        Some(Self {
+            cancel: of(action.cancel)?,
+            result: of(action.result)?,
+            feedback: of(action.feedback)?,
+        })
+    }
+}
+
+/// What there is to tell of a goal.
+#[derive(Debug, Serialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub(super) enum Told {
+    Feedback {
+        fields: Named,
+    },
+    Result {
+        status: &'static str,
+        message: String,
+        fields: Named,
+    },
+}
+
+impl Told {
+    /// For people, a line or more.
+    pub(super) fn told(&self) -> String {
+        match self {
+            Self::Feedback { fields } => {
+                let each = fields
+                    .0
+                    .iter()
+                    .map(|(name, value)| format!("{name}: {value}"));
+                each.collect::<Vec<_>>().join(", ")
+            }
+            Self::Result {
+                status,
+                message,
+                fields,
+            } => {
+                let mut text = status.to_lowercase();
+                if !message.is_empty() {
+                    text.push_str(&format!(": {message}"));
+                }
+                for (name, value) in &fields.0 {
+                    text.push_str(&format!("\n{name}: {value}"));
+                }
+                text
+            }
+        }
+    }
+}
+
+/// A goal that is followed.
+struct Goal {
+    parts: Parts,
+    /// As values show it.
+    id: String,
+    bytes: [u8; 16],
+    result: Arc<Described>,
+    cancel: Arc<Described>,
+    /// The call that waits for the result.
+    waits: CallId,
+}
+
+/// What came of the call that waits.
+enum Came {
+    Result(Named),
+    /// Nobody answered for as long as it could wait.
+    Nothing,
+    Failed(Failure),
+}
+
+impl Asking<'_> {
+    /// Sends a goal and, unless that is not wanted, sees it to its end.
+    pub(super) async fn send_goal(
+        &mut self,
+        (topic, described): (TopicId, &Described),
+        parts: Parts,
+    ) -> Result<(), Failure> {
+        let takes = described.call().map_or(&[][..], |call| &call.request);
+        let takes = words::fields(takes);
+        let fills = described.ros_type().is_some() && described.skill_type().is_none();
+        let usage =
+            |wrong: String| Failure::Usage(format!("{}: {wrong}", called(topic, described)));
+        let typed = words::spelled(&self.arguments.parameters, &takes, fills).map_err(usage)?;
+        let block =
+            parameters::request(&typed, &takes).map_err(|wrong| usage(wrong.to_string()))?;
+        let [result, cancel] = self.parts_of(topic, parts).await?;
+        let bytes = new_id();
+        let request = behind(bytes, &block).ok_or_else(|| usage("too many fields".to_owned()))?;
+        let answer = match self.ask((topic, described), &request, None).await {
+            Err(Failure::Interrupted) => {
+                // It may have been accepted.
+                self.cancel_goal((parts.cancel, &cancel), bytes)?;
+                self.acknowledge().await?;
+                return Err(Failure::Interrupted);
+            }
+            answer => answer?,
+        };
+        self.tell_answer((topic, described), &answer)?;
+        refused((topic, described), &answer)?;
+        if answer.fields.get("accepted") != Some(&true.into()) {
+            let why = answer.fields.text("message").unwrap_or_default();
+            let why = if why.is_empty() {
+                "no reason is told"
+            } else {
+                why
+            };
+            let name = called(topic, described);
+            return Err(Failure::Failed(format!(
+                "{name}: the goal is rejected: {why}"
+            )));
+        }
+        if self.arguments.no_wait {
+            return Ok(());
+        }
+        let waits = self.begin(
+            (parts.result, &result),
+            &behind_nothing(bytes),
+            RESULT_WITHIN,
+        )?;
+        let goal = Goal {
+            parts,
+            id: BASE64.encode(bytes),
+            bytes,
+            result,
+            cancel,
+            waits,
+        };
+        self.follow_goal(goal).await
+    }
+
+    /// What the calls of an action are that wait for results and cancel.
+    async fn parts_of(
+        &mut self,
+        goal: TopicId,
+        parts: Parts,
+    ) -> Result<[Arc<Described>; 2], Failure> {
+        for topic in [parts.cancel, parts.result, parts.feedback] {
+            self.live.want(topic);
+        }
+        let mut found: [Option<Arc<Described>>; 2] = [None, None];
+        let mut hears_feedback = false;
+        for (topic, kind, described, _) in self.live.book.announced() {
+            take(&mut found, parts, (topic, kind), described);
+            hears_feedback |= (topic, kind) == (parts.feedback, Kind::Value);
+        }
+        let end = until(self.live.now(), Some(self.arguments.wait));
+        let mut each = |news: News<'_>, _| {
+            if let News::Announced(topic, kind, described) = news {
+                take(&mut found, parts, (topic, kind), described);
+                hears_feedback |= (topic, kind) == (parts.feedback, Kind::Value);
+            }
+            match found.iter().all(Option::is_some) && hears_feedback {
+                true => Go::Enough,
+                false => Go::On,
+            }
+        };
+        let ended = self.live.listen(end, &mut each).await?;
+        match found {
+            [Some(result), Some(cancel)] => Ok([result, cancel]),
+            _ if ended == Ended::Interrupted => Err(Failure::Interrupted),
+            _ => Err(Failure::Unavailable(format!(
+                "{goal} sends goals, and nobody offers {} and {}, which belong to it",
+                parts.result, parts.cancel
+            ))),
+        }
+    }
+
+    async fn follow_goal(&mut self, mut goal: Goal) -> Result<(), Failure> {
+        let limit = until(self.live.now(), self.arguments.run_timeout);
+        let mut cancelled = false;
+        loop {
+            let (ended, told, came) = self.hear_goal(&goal).await?;
+            for told in &told {
+                self.tell(told, &told.told())?;
+            }
+            match came {
+                None => {}
+                Some(Came::Result(fields)) => {
+                    let end = self.end_goal(&fields)?;
+                    self.acknowledge().await?;
+                    return end;
+                }
+                Some(Came::Nothing) => {
+                    let request = behind_nothing(goal.bytes);
+                    let of = (goal.parts.result, &*goal.result);
+                    goal.waits = self.begin(of, &request, RESULT_WITHIN)?;
+                }
+                Some(Came::Failed(failure)) => return Err(failure),
+            }
+            let is_over = !cancelled && self.live.now() >= limit;
+            if is_over {
+                warn("the time for the goal is over");
+            }
+            if ended == Ended::Interrupted || is_over {
+                if cancelled {
+                    return Err(Failure::Interrupted);
+                }
+                cancelled = true;
+                warn("cancelling the goal (once more to leave at once)");
+                self.cancel_goal((goal.parts.cancel, &goal.cancel), goal.bytes)?;
+            }
+        }
+    }
+
+    /// What that is answered is of no interest: its effect is, which is followed.
+    fn cancel_goal(&mut self, of: (TopicId, &Described), id: [u8; 16]) -> Result<(), Failure> {
+        let request = cancel_request(&behind_nothing(id));
+        self.begin(of, &request, CANCEL_WITHIN).map(drop)
+    }
+
+    /// Hears a moment of what is told of a goal.
+    async fn hear_goal(
+        &mut self,
+        goal: &Goal,
+    ) -> Result<(Ended, Vec<Told>, Option<Came>), Failure> {
+        self.transmit()?;
+        let Self {
+            live, requestor, ..
+        } = self;
+        let next = requestor.poll_timeout().unwrap_or(Duration::MAX);
+        let next = next.min(live.now() + LOOK);
+        let (mut told, mut came) = (Vec::new(), None);
+        let mut each = |news: News<'_>, now| {
+            match &news {
+                News::Response(response) => {
+                    if let Ok(Heard::Done(call, outcome)) = requestor.handle_response(response, now)
+                        && call == goal.waits
+                    {
+                        came = Some(hear(&outcome, &goal.result));
+                    }
+                }
+                News::Sample(sample) if sample.topic == goal.parts.feedback => {
+                    let described = sample.described.as_deref();
+                    if let Ok(value) = plain::message(&sample.message, described)
+                        && value.text(words::GOAL_ID) == Some(&goal.id)
+                    {
+                        let fields = own(value, "feedback");
+                        told.push(Told::Feedback { fields });
+                    }
+                }
+                News::Sample(_) | News::Announced(..) => {}
+            }
+            match told.is_empty() && came.is_none() {
+                true => Go::On,
+                false => Go::Enough,
+            }
+        };
+        let ended = live.listen(next, &mut each).await?;
+        requestor.handle_timeout(live.now());
+        while let Some((call, why)) = requestor.poll_given_up() {
+            if call == goal.waits && came.is_none() {
+                came = Some(unknown(why));
+            }
+        }
+        Ok((ended, told, came))
+    }
+
+    /// Tells how a goal ended.
+    fn end_goal(&self, fields: &Named) -> Result<Result<(), Failure>, Failure> {
+        let status = fields.get("status").and_then(serde_json::Value::as_i64);
+        let status = match status {
+            Some(4) => "SUCCEEDED",
+            Some(5) => "CANCELED",
+            Some(6) => "ABORTED",
+            Some(_) | None => "UNKNOWN",
+        };
+        let message = fields.text("message").unwrap_or_default().to_owned();
+        let mut rest = fields.clone();
+        rest.0
+            .retain(|(name, _)| name != "status" && name != "message");
+        let told = Told::Result {
+            status,
+            message,
+            fields: own(rest, "result"),
+        };
+        self.tell(&told, &told.told())?;
+        Ok(match status {
+            "SUCCEEDED" => Ok(()),
+            "UNKNOWN" => Err(Failure::Unavailable(
+                "who executes the action has lost the goal; how it ended is not known".to_owned(),
+            )),
+            _ => Err(Failure::Failed(format!(
+                "the goal was {}",
+                status.to_lowercase()
+            ))),
+        })
+    }
+}
+
+fn take(
+    found: &mut [Option<Arc<Described>>; 2],
+    parts: Parts,
+    (topic, kind): (TopicId, Kind),
+    described: &Arc<Described>,
+) {
+    let [result, cancel] = found;
+    if kind == Kind::Call && topic == parts.result {
+        *result = Some(Arc::clone(described));
+    } else if kind == Kind::Call && topic == parts.cancel {
+        *cancel = Some(Arc::clone(described));
+    }
+}
+
+fn hear(outcome: &Outcome<'_>, described: &Described) -> Came {
+    match outcome {
+        Outcome::Answered { status, fields } if status.0 & super::BAD == 0 => {
+            match plain::response(*fields, described.fields()) {
+                Ok(fields) => Came::Result(fields),
+                Err(error) => Came::Failed(Failure::Unavailable(format!(
+                    "the result cannot be read: {error}"
+                ))),
+            }
+        }
+        Outcome::Answered { status, .. } => Came::Failed(Failure::Unavailable(format!(
+            "there is no result: {:#010x}; how the goal ended is not known",
+            status.0
+        ))),
+        Outcome::Refused(why) => Came::Failed(Failure::Unavailable(format!(
+            "the result is refused: {why}; the goal goes on"
+        ))),
+        Outcome::Unknown(why) => unknown(*why),
+    }
+}
+
+fn unknown(why: Unknown) -> Came {
+    match why {
+        Unknown::Deadline => Came::Nothing,
+        Unknown::Silent | Unknown::Lost => Came::Failed(Failure::Unavailable(format!(
+            "{why}; how the goal ended is not known"
+        ))),
+    }
+}
+
+/// The fields of one part, by their own names.
+fn own(value: Named, part: &str) -> Named {
+    let fields = value.0.into_iter();
+    let fields = fields.filter(|(name, _)| name != words::GOAL_ID);
+    Named(
+        fields
+            .map(|(name, value)| (words::own(&name, part).to_owned(), value))
+            .collect(),
+    )
+}
+
+fn new_id() -> [u8; 16] {
+    let mut id = [0; 16];
+    for place in id.chunks_exact_mut(8) {
+        place.copy_from_slice(&RandomState::new().hash_one(0).to_le_bytes());
+    }
+    id
+}
+
+/// The fields of a block behind the id of a goal; `None` where they are too many.
+fn behind(id: [u8; 16], block: &[u8]) -> Option<Vec<u8>> {
+    let (count, rest) = block.split_first_chunk()?;
+    let count = u16::from_le_bytes(*count).checked_add(1)?;
+    let mut whole = count.to_le_bytes().to_vec();
+    whole.push(BYTE_STRING);
+    whole.extend(16_i32.to_le_bytes());
+    whole.extend(id);
+    whole.extend(rest);
+    Some(whole)
+}
+
+/// The id alone.
+fn behind_nothing(id: [u8; 16]) -> Vec<u8> {
+    behind(id, &[0, 0]).unwrap_or_default()
+}
+
+/// The id of a goal, and the beginning of 1970, which is no time.
+fn cancel_request(of: &[u8]) -> Vec<u8> {
+    let mut request = of.to_vec();
+    if let Some(count) = request.first_mut() {
+        *count = 2;
+    }
+    request.push(DATE_TIME);
+    request.extend(UNIX_EPOCH.to_le_bytes());
+    request
+}
+
+/// How long a request for a result waits at a time.
+const RESULT_WITHIN: Duration = Duration::from_secs(30);
+/// How long a request to cancel waits.
+const CANCEL_WITHIN: Duration = Duration::from_secs(5);
+/// EncodingMasks of OPC 10000-6, 5.2.2.16.
+const BYTE_STRING: u8 = 15;
+const DATE_TIME: u8 = 13;
+/// 1970 as a DateTime.
+const UNIX_EPOCH: i64 = 116_444_736_000_000_000;

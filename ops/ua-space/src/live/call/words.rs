@@ -1,0 +1,251 @@
+//! What was typed of a goal: `name=value`, or all of it as YAML in one word.
+
+use granit_parser::{Event, Parser};
+use serde_json::{Value, json};
+use uadp::BuiltinType;
+
+use super::super::described::Field;
+
+/// The fields of a goal by their own names, without the one that tells it.
+pub(super) fn fields(takes: &[Field]) -> Vec<Field> {
+    let fields = takes.iter().filter(|field| field.name != GOAL_ID);
+    fields
+        .map(|field| Field {
+            name: own(&field.name, GOAL).to_owned(),
+            ..field.clone()
+        })
+        .collect()
+}
+
+/// The name of a field within a goal, its feedback or its result.
+pub(super) fn own<'n>(name: &'n str, part: &str) -> &'n str {
+    let rest = name
+        .strip_prefix(part)
+        .and_then(|rest| rest.strip_prefix('.'));
+    rest.unwrap_or(name)
+}
+
+/// The words as `name=value`. Where `fills`, what is not given is what a message of ROS has where nothing is set.
+///
+/// # Errors
+/// What does not read, for people.
+pub(super) fn spelled(
+    typed: &[String],
+    takes: &[Field],
+    fills: bool,
+) -> Result<Vec<String>, String> {
+    let mut words = Vec::new();
+    for word in typed {
+        match word.trim_start().starts_with('{') {
+            true => flatten(&yaml(word)?, "", &mut words),
+            false => words.push(own(word, GOAL).to_owned()),
+        }
+    }
+    if fills {
+        let is_given = |field: &Field| {
+            let mut names = words.iter().filter_map(|word| word.split_once('='));
+            names.any(|(name, _)| name == field.name)
+        };
+        let missing = takes
+            .iter()
+            .filter(|field| !field.optional && !is_given(field));
+        let missing: Vec<String> = missing
+            .filter_map(|field| Some(format!("{}={}", field.name, nothing(field)?)))
+            .collect();
+        words.extend(missing);
+    }
+    Ok(words)
+}
+
+/// A value of which nothing was set; `None` for a type of no message.
+fn nothing(field: &Field) -> Option<String> {
+    let builtin = field.builtin?;
+    let one = match builtin {
+        BuiltinType::Boolean => "false",
+        BuiltinType::SByte
+        | BuiltinType::Byte
+        | BuiltinType::Int16
+        | BuiltinType::UInt16
+        | BuiltinType::Int32
+        | BuiltinType::UInt32
+        | BuiltinType::Int64
+        | BuiltinType::UInt64
+        | BuiltinType::Float
+        | BuiltinType::Double => "0",
+        BuiltinType::String | BuiltinType::ByteString => "",
+        BuiltinType::DateTime => "1970-01-01T00:00:00Z",
+        BuiltinType::ExtensionObject if field.is_array() => "",
+        BuiltinType::ExtensionObject
+        | BuiltinType::Guid
+        | BuiltinType::XmlElement
+        | BuiltinType::NodeId
+        | BuiltinType::ExpandedNodeId
+        | BuiltinType::StatusCode
+        | BuiltinType::QualifiedName
+        | BuiltinType::LocalizedText
+        | BuiltinType::DataValue
+        | BuiltinType::Variant
+        | BuiltinType::DiagnosticInfo => return None,
+    };
+    if !field.is_array() {
+        return Some(one.to_owned());
+    }
+    let count = match field.dimensions.as_slice() {
+        [count] => usize::try_from(*count).ok()?.min(MOST_ELEMENTS),
+        _ => 0,
+    };
+    Some(json!(vec![one; count]).to_string())
+}
+
+/// Maps in maps become names with dots.
+fn flatten(value: &Value, path: &str, words: &mut Vec<String>) {
+    match value {
+        Value::Object(fields) => {
+            for (name, value) in fields {
+                let dot = if path.is_empty() { "" } else { "." };
+                flatten(value, &format!("{path}{dot}{name}"), words);
+            }
+        }
+        Value::String(text) => words.push(format!("{path}={text}")),
+        Value::Array(_) | Value::Null | Value::Bool(_) | Value::Number(_) => {
+            words.push(format!("{path}={value}"));
+        }
+    }
+}
+
+/// A text of YAML, whose single values stay texts: their types are those of the fields.
+fn yaml(text: &str) -> Result<Value, String> {
+    let options = granit_parser::options! {
+        emit_comments: false,
+        flow_nesting_limit: MOST_DEEP,
+        block_nesting_limit: MOST_DEEP
+    };
+    let mut open: Vec<(bool, Vec<Value>)> = Vec::new();
+    let mut root = None;
+    for event in Parser::new_from_str_with_options(text, options) {
+        let (event, _) = event.map_err(|error| format!("the goal is no YAML: {error}"))?;
+        let value = match event {
+            Event::Scalar(text, ..) => Value::String(text.into_owned()),
+            Event::SequenceStart(..) => {
+                open.push((false, Vec::new()));
+                continue;
+            }
+            Event::MappingStart(..) => {
+                open.push((true, Vec::new()));
+                continue;
+            }
+            Event::SequenceEnd | Event::MappingEnd => match open.pop() {
+                Some((is_map, values)) => closed(is_map, values)?,
+                None => continue,
+            },
+            Event::StreamStart
+            | Event::StreamEnd
+            | Event::DocumentStart(..)
+            | Event::DocumentEnd => continue,
+            // Aliases and whatever else there may be.
+            _ => return Err("the goal is YAML of lists, maps and single values".to_owned()),
+        };
+        match open.last_mut() {
+            Some((_, values)) => values.push(value),
+            None => root = Some(value),
+        }
+    }
+    match root {
+        Some(value @ Value::Object(_)) => Ok(value),
+        Some(_) | None => Err("the goal is a map, as {order: 5}".to_owned()),
+    }
+}
+
+fn closed(is_map: bool, values: Vec<Value>) -> Result<Value, String> {
+    if !is_map {
+        return Ok(Value::Array(values));
+    }
+    let mut fields = serde_json::Map::new();
+    let mut values = values.into_iter();
+    while let (Some(name), Some(value)) = (values.next(), values.next()) {
+        let Value::String(name) = name else {
+            return Err("the names in a goal are texts".to_owned());
+        };
+        if fields.insert(name.clone(), value).is_some() {
+            return Err(format!("`{name}` is given twice"));
+        }
+    }
+    Ok(Value::Object(fields))
+}
+
+/// Tells a goal from all others.
+pub(super) const GOAL_ID: &str = "goal_id";
+/// In front of the fields of a goal.
+const GOAL: &str = "goal";
+const MOST_DEEP: usize = 32;
+/// Of an array of fixed length that is filled.
+const MOST_ELEMENTS: usize = 10_000;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn field(name: &str, builtin: BuiltinType, rank: i32, dimensions: &[u32]) -> Field {
+        Field {
+            name: name.to_owned(),
+            builtin: Some(builtin),
+            rank,
+            dimensions: dimensions.to_vec(),
+            max_string_length: 0,
+            description: String::new(),
+            optional: false,
+            structure: None,
+        }
+    }
+
+    fn takes() -> Vec<Field> {
+        fields(&[
+            field("goal_id", BuiltinType::ByteString, -1, &[]),
+            field("goal.pose.x", BuiltinType::Double, -1, &[]),
+            field("goal.pose.frame_id", BuiltinType::String, -1, &[]),
+            field("goal.stamp", BuiltinType::DateTime, -1, &[]),
+            field("goal.covariance", BuiltinType::Double, 1, &[2]),
+            field("goal.poses", BuiltinType::ExtensionObject, 1, &[0]),
+        ])
+    }
+
+    fn of(words: &[&str], fills: bool) -> Result<Vec<String>, String> {
+        let words: Vec<String> = words.iter().map(|word| (*word).to_owned()).collect();
+        spelled(&words, &takes(), fills)
+    }
+
+    #[test]
+    fn a_goal_is_typed_by_its_fields_or_as_yaml() {
+        let wanted = ["pose.x=1.5", "pose.frame_id=map"];
+        assert_eq!(
+            of(&["goal.pose.x=1.5", "pose.frame_id=map"], false).unwrap(),
+            wanted
+        );
+        assert_eq!(
+            of(&["{pose: {x: 1.5, frame_id: map}}"], false).unwrap(),
+            wanted
+        );
+        let json = r#"{"pose": {"x": 1.5, "frame_id": "map"}, "covariance": [1, 2]}"#;
+        assert_eq!(
+            of(&[json], false).unwrap(),
+            ["pose.x=1.5", "pose.frame_id=map", r#"covariance=["1","2"]"#]
+        );
+        for wrong in ["{pose: ", "{pose: *x}", "{pose: 1, pose: 2}", "{[1]: 2}"] {
+            assert!(of(&[wrong], false).is_err(), "{wrong}");
+        }
+    }
+
+    #[test]
+    fn what_is_not_given_is_what_a_message_has_where_nothing_is_set() {
+        assert_eq!(
+            of(&["pose.x=2"], true).unwrap(),
+            [
+                "pose.x=2",
+                "pose.frame_id=",
+                "stamp=1970-01-01T00:00:00Z",
+                r#"covariance=["0","0"]"#,
+                "poses=[]",
+            ]
+        );
+    }
+}
