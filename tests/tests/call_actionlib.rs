@@ -522,7 +522,11 @@ calls:
 
 /// A component that serves at that address.
 fn skills(cell: &Cell, url: &str) -> Child {
-    let file = cell.file("component.yaml", COMPONENT);
+    component(cell, COMPONENT, url)
+}
+
+fn component(cell: &Cell, yaml: &str, url: &str) -> Child {
+    let file = cell.file("component.yaml", yaml);
     let child = Started::new("ua-component", &program("ua-component"))
         .args([file.to_str().unwrap(), "--endpoint", url, "--lds", "none"])
         .args(["--interface", "lo", "--metrics", "127.0.0.1:9855"])
@@ -642,7 +646,7 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
     component.signal(Signal::SIGKILL);
     component.wait_for_end(SOON);
     assert_eq!(line(&mut rclpy, "result", &json!(1), "status"), "ABORTED");
-    let _next = skills(&cell, url);
+    let next = skills(&cell, url);
     let mut number = 2;
     eventually("a goal is taken by the next component", SOON, || {
         rclpy.tell("send 9");
@@ -650,4 +654,113 @@ fn goals_of_either_ros_run_skills_and_are_refused_with_the_reason_of_the_compone
         number += 1;
         (answer == true).then_some(())
     });
+    // The reason is told where that ROS has a word for it, soon after receive_timeout, which is 3 s.
+    rclpy.tell(&format!("cancel {}", number - 1));
+    line(&mut rclpy, "result", &json!(number - 1), "status");
+    send(&mut hold, &json!({}));
+    hold.wait_for_json("the goal runs", SOON, |line| {
+        (line["goal"] == 1 && line["feedback"]["state"] == "Running").then_some(())
+    });
+    next.signal(Signal::SIGKILL);
+    let lost = hold.wait_for_json("the end of the goal", Duration::from_secs(10), |line| {
+        (line.get("goal")? == 1 && line.get("end").is_some()).then(|| line.clone())
+    });
+    assert_eq!(lost["end"], "ABORTED");
+    let why = lost["text"].as_str().unwrap();
+    assert!(why.contains("who executes the action is gone"), "{why}");
+}
+
+/// A base of ROS 2 and a belt of ROS 1, which do the work of skills.
+const LINE: &str = "
+component: line
+application_uri: urn:ua-bridge:system-tests:line
+namespace: 9
+skills:
+  - name: Go
+    type: NavigateToSkillType
+    driver:
+      action:
+        name: ua_2_2_70
+        goal:
+          pose.header.frame_id: {parameter: Frame}
+          pose.pose.position.x: {parameter: Goal, at: 0}
+          pose.pose.position.y: {parameter: Goal, at: 1}
+          pose.pose.orientation.z: {parameter: Goal, at: 2, as: quaternion_z}
+          pose.pose.orientation.w: {parameter: Goal, at: 2, as: quaternion_w}
+        results: {Pose: {parameter: Goal}}
+  - name: Belt
+    type: RunConveyorSkillType
+    driver: {call: {name: ua_1_2_61, request: {data: {parameter: On}}}}
+";
+
+/// The result of a skill that was started with those words, and how `ua-space` ended.
+fn run(words: &[&str]) -> (i32, Value) {
+    let (code, .., lines) = asked(ask(words));
+    let result = lines.iter().find(|line| line["event"] == "result");
+    (code, result.cloned().unwrap_or_else(|| json!(lines)))
+}
+
+#[test]
+fn skills_have_their_work_done_by_an_action_of_ros_2_and_a_service_of_ros_1() {
+    let Some(cell) = Cell::with(&[Peer::Ros1, Peer::Python]) else {
+        return;
+    };
+    let url = "opc.tcp://127.0.0.1:4857";
+    let _core = cell.roscore();
+    let mut base = cell.cyclone("calls/ros2_navigate.py", &["/navigate_to_pose"]);
+    let mut belt = cell.rospy("ros1_serve.py", &["/ua_1_2_61"]);
+    let bridge = cell.bridge_ros2_alone(&[NAVIGATION]);
+    let bridge = bridge.env("AMENT_PREFIX_PATH", ament_prefix(&cell));
+    let _bridges = (cell.bridge_ros1(&[]), bridge.start());
+    let _component = component(&cell, LINE, url);
+    let (code, lines) = run(&["line.Go.Reset"]);
+    assert_eq!(code, 0, "{lines}");
+
+    let (code, result) = run(&["line.Go", "Goal=1,2.5,0.6"]);
+    assert_eq!((code, &result["succeeded"]), (0, &json!(true)), "{result}");
+    assert_eq!(result["results"], json!({"Pose": [1.0, 2.5, 0.6]}));
+    let met = base.wait_for_json("the goal", SOON, |line| {
+        line.get("position").map(|_| line.clone())
+    });
+    assert_eq!(met["position"], json!([1.0, 2.5, 0.0]));
+    let turned = [0.0, 0.0, 0.3_f64.sin(), 0.3_f64.cos()];
+    assert_eq!(met["orientation"], json!(turned));
+    assert_eq!((&met["frame"], &met["tree"]), (&json!("map"), &json!("")));
+
+    // What the base does not do is no success, with the reason.
+    for (x, why) in [("-1", "rejected"), ("-2", "aborted")] {
+        let (code, result) = run(&["line.Go", &format!("Goal={x},0,0")]);
+        let message = result["message"].to_string();
+        assert!(code == 1 && message.contains(why), "{result}");
+        assert_eq!(run(&["line.Go.Reset"]).0, 0);
+    }
+    // Halt cancels the goal.
+    let mut asking = ask(&["line.Go", "Goal=100,0,0"]);
+    line(&mut base, "goal", &json!(100), "accepted");
+    asking.wait_for_json("the goal is accepted", SOON, |line| {
+        (line["step"] == "Accepted").then_some(())
+    });
+    asking.signal(Signal::SIGINT);
+    assert_eq!(asked(asking).0, 1);
+    base.wait_for_json("the goal is cancelled", SOON, |line| {
+        (line.get("cancel")? == &json!([100])).then_some(())
+    });
+
+    // A client of OPC UA runs the belt.
+    for method in ["Reset", "Start"] {
+        let path = format!("line/Skills/Belt/{method}");
+        let told = cell.asyncua_once("opcua_call.py", &[url, &path, "--value", "[]"]);
+        assert_eq!(told[1]["status"], "Good", "{told:?}");
+    }
+    assert_eq!(line(&mut belt, "value", &json!(true), "value"), true);
+    let (code, result) = run(&["line.Belt", "On=false"]);
+    assert_eq!(code, 1, "the service failed: {result}");
+    // As an action of ROS 1, of which the work is one of ROS 2.
+    let mut client = actionlib_client(&cell, &["/ua_0_9_110", "ua_msgs/NavigateTo"]);
+    send(&mut client, &json!({"goal": [3.0, 0.0, 0.0]}));
+    let reached = end(&mut client, 0);
+    assert_eq!(
+        (&reached[0], &reached[2]["pose"]),
+        (&json!("SUCCEEDED"), &json!([3.0, 0.0, 0.0]))
+    );
 }

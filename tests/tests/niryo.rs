@@ -4,7 +4,9 @@ use std::{path::Path, time::Duration};
 
 use messages::{Dialect, Literal, NoFields, Plan, Registry, Selection, Wire};
 use serde_json::{Value, json};
-use system_tests::{Cell, Child, MASTER, METRICS_ROS1, Peer, UaSide, eventually, metrics, number};
+use system_tests::{
+    Cell, Child, MASTER, METRICS_ROS1, Peer, Started, UaSide, eventually, metrics, number, program,
+};
 use tcpros::actionlib::{self, ActionClient, ActionClientOptions, ClientType};
 use tcpros::{Node, NodeOptions, TopicType};
 use uadp::{Scalar, Variant};
@@ -246,6 +248,54 @@ fn a_niryos_actions_are_there_for_a_client_that_knows_their_definitions() {
     let told = robot.json_lines();
     let told = told.iter().find(|line| line.get("action").is_some());
     assert_eq!(told.map(|line| line["cmd_type"].clone()), Some(json!(5)));
+}
+
+#[test]
+fn the_arm_its_gripper_and_its_conveyor_are_run_by_skills() {
+    let Some(cell) = cell() else { return };
+    let mut line = start(&cell);
+    line.side.hear((1, 2, 11), "joints", |_| Some(()));
+    line.side.write((0, 2, 40), Scalar::Byte(1));
+    line.side.hear_scalar((1, 2, 41), Scalar::Int16(12));
+    let example = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../examples/plant/niryo-ned.yaml"
+    );
+    let _component = Started::new("ua-component", &program("ua-component"))
+        .args([example, "--interface", "lo", "--lds", "none"])
+        .start();
+    let call = |words: &[&str]| {
+        let words = [&["call"], words, &["--interface", "lo", "--wait", "30"]].concat();
+        let mut asking = Started::new("ua-space", &program("ua-space"))
+            .args(words)
+            .start();
+        let code = asking.wait_for_end(SOON).code();
+        assert_eq!(code, Some(0), "{:?}", asking.lines());
+    };
+    for (skill, parameter) in [
+        ("PtpMove", &["TargetPosition=0.25,0,0.25,0,1.5,0"][..]),
+        ("Grasp", &[]),
+        ("Conveyor", &["On=true"]),
+    ] {
+        call(&[&format!("niryo-ned.{skill}.Reset")]);
+        call(&[&[&*format!("niryo-ned.{skill}")], parameter].concat());
+    }
+    let told = line.robot.json_lines();
+    let actions = told.iter().filter(|line| line.get("action").is_some());
+    let actions: Vec<(&Value, &Value)> = actions
+        .map(|line| (&line["action"], &line["cmd_type"]))
+        .collect();
+    let wanted = [
+        (&json!("/niryo_robot_arm_commander/robot_action"), &json!(1)),
+        (
+            &json!("/niryo_robot_tools_commander/action_server"),
+            &json!(2),
+        ),
+    ];
+    assert_eq!(actions, wanted);
+    let request = called(&line.robot, "/niryo_robot/conveyor/control_conveyor", 0);
+    let wanted = json!({"id": 12, "control_on": true, "speed": 50, "direction": 1});
+    assert_eq!(request, wanted);
 }
 
 /// The type of RobotMove's goal topic, and a goal with one field set.

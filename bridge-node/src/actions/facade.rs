@@ -16,7 +16,6 @@ use tracing::debug;
 use super::graph::{ActionServer, CancelRequest, GoalId, NewGoal, ServedGoal, ServerEvent};
 use super::wire;
 use crate::calls::AskFault;
-use crate::clock::now;
 use crate::{Asker, PortEvent};
 
 /// What asks in the space, and how long for.
@@ -26,9 +25,7 @@ pub(super) struct Asks {
     pub(super) goal: Asker,
     pub(super) cancel: Asker,
     pub(super) result: Asker,
-    /// How long who executes the action may be gone until its goals are given up.
-    pub(super) silence: Duration,
-    /// Since when it is.
+    /// Since when who executes the action is gone.
     pub(super) gone: watch::Receiver<Option<Instant>>,
 }
 
@@ -253,10 +250,8 @@ async fn wait(asks: &Asks, id: GoalId) -> End {
             }
             Err(fault) => fault,
         };
-        let gone = *asks.gone.borrow();
-        let is_gone =
-            gone.is_some_and(|since| now().monotonic.duration_since(since) >= asks.silence);
-        if is_gone {
+        // It was silent for as long as it may be, or has said goodbye: of its goals it knows nothing any more.
+        if asks.gone.borrow().is_some() {
             return End::aborted(format!(
                 "who executes the action is gone; the goal may go on: {}",
                 fault.text

@@ -95,7 +95,11 @@ fn length(of: usize, out: &mut Vec<u8>) {
     out.extend(i32::try_from(of).unwrap_or(i32::MAX).to_le_bytes());
 }
 
-fn value(field: &Variant<'_>) -> Result<Option<Value>, String> {
+/// The value of a field; `None` for null.
+///
+/// # Errors
+/// As [`values`].
+pub(crate) fn value(field: &Variant<'_>) -> Result<Option<Value>, String> {
     match field {
         Variant::Null => Ok(None),
         Variant::Scalar(scalar) => single(scalar).map(Some),

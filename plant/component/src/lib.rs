@@ -4,11 +4,13 @@
 //! The program `ua-component` is [`ComponentPort`] with the YAML of a component; a program with drivers of its own is the
 //! same with a [`skills::Component`] that it makes.
 
+mod asking;
 pub mod definition;
 mod fields;
 mod goals;
 mod partners;
 mod port;
 mod space;
+mod work;
 
 pub use port::{ComponentPort, Options, check, made, print};

@@ -7,9 +7,10 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bridge_node::actions::OwnActions;
 use bridge_node::{
-    Delivery, Described, Executed, Execution, ExecutionId, Failure, FailureKind, Port, PortEvent,
-    TypePaths,
+    Answered, AskId, CallDescription, Delivery, Described, Executed, Execution, ExecutionId,
+    Failure, FailureKind, Port, PortEvent, TypePaths,
 };
+use bytes::Bytes;
 use discovery::{AnnounceSettings, Announced, Interface};
 use mappings::{Mapping, PubSub, TopicId};
 use program::Method;
@@ -20,10 +21,12 @@ use tokio::task::JoinSet;
 use tracing::{info, warn};
 use uadp::BuiltinType;
 
+use crate::asking::Asking;
 use crate::fields;
 use crate::goals::{self, Doer, Reporter};
 use crate::partners;
 use crate::space::{GOAL, Outbox, Place, Speaker};
+use crate::work::with_drivers;
 
 /// What a component is started with beside what it is.
 #[derive(Debug, Clone, Default)]
@@ -60,6 +63,8 @@ pub struct ComponentPort {
     actions: OwnActions,
     /// Who looks for others, for as long as there is the component.
     _looks: JoinSet<()>,
+    /// What skills ask of others.
+    asking: Asking,
 }
 
 impl ComponentPort {
@@ -83,6 +88,8 @@ impl ComponentPort {
             first_run: run_number_of_now(),
         };
         let mut reporters = Vec::new();
+        let mut asking = Asking::new();
+        let component = &with_drivers(component, &mut asking);
         let server = ComponentServer::build(component, &settings, |number, facts| {
             let reporter = Reporter::new();
             reporters.push(reporter.clone());
@@ -127,6 +134,7 @@ impl ComponentPort {
             executes,
             actions,
             _looks: looks,
+            asking,
         })
     }
 
@@ -160,6 +168,7 @@ impl Port for ComponentPort {
         tokio::select! {
             biased;
             Some(event) = self.executed.recv() => event,
+            event = self.asking.next() => event,
             event = self.actions.recv() => event,
             event = self.outbox.next() => event,
         }
@@ -180,6 +189,18 @@ impl Port for ComponentPort {
     }
 
     fn silent(&mut self, _topic: TopicId, _silent: bool) {}
+
+    fn call_known(&mut self, topic: TopicId, description: &Arc<CallDescription>) {
+        self.asking.known(topic, description);
+    }
+
+    fn call_gone(&mut self, topic: TopicId) {
+        self.asking.gone(topic);
+    }
+
+    fn answered(&mut self, ask: AskId, _topic: TopicId, answer: Answered<Bytes>) {
+        self.asking.answered(ask, answer);
+    }
 
     fn execute(&mut self, execution: Execution) -> bool {
         if self.actions.serves(execution.topic) {
@@ -249,7 +270,7 @@ pub fn check(component: &Component, options: &Options) -> Result<(), Failure> {
     let component = Component {
         endpoint: "opc.tcp://127.0.0.1:0".to_owned(),
         security: vec![skills::Security::None],
-        ..component.clone()
+        ..with_drivers(component, &mut Asking::new())
     };
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()

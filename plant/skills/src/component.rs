@@ -3,6 +3,7 @@
 mod device;
 mod document;
 mod drivers;
+mod space;
 
 use std::fmt;
 use std::path::PathBuf;
@@ -11,6 +12,7 @@ use std::time::Duration;
 
 pub use device::{Device, DeviceKinds, NoDevices};
 pub use drivers::{DriverFault, Drivers};
+pub use space::{Asked, Form, Part, Source, SpaceWork};
 
 use crate::driver::Driver;
 use crate::parameters::TypeName;
@@ -91,6 +93,8 @@ pub enum DriverSetup {
     PickAndPlace(Partners),
     /// The device of the component.
     Device,
+    /// A call or action of the space, which the program that has the component asks.
+    Space(Box<SpaceWork>),
 }
 
 impl fmt::Debug for DriverSetup {
@@ -100,6 +104,7 @@ impl fmt::Debug for DriverSetup {
             Self::Simulated(simulation) => simulation.fmt(f),
             Self::PickAndPlace(partners) => partners.fmt(f),
             Self::Device => f.write_str("Device"),
+            Self::Space(work) => work.fmt(f),
         }
     }
 }
@@ -156,7 +161,10 @@ impl Component {
                 let is_called = |partner: &Partner| matches!(partner, Partner::Called(_));
                 is_called(robot) || is_called(gripper)
             }
-            DriverSetup::Given(_) | DriverSetup::Simulated(_) | DriverSetup::Device => false,
+            DriverSetup::Given(_)
+            | DriverSetup::Simulated(_)
+            | DriverSetup::Device
+            | DriverSetup::Space(_) => false,
         })
     }
 }

@@ -28,8 +28,9 @@ pub use client::{
     SkillClient, SkillHandle,
 };
 pub use component::{
-    Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, LEASE, Lds, MOST_SKILLS,
-    NoDevices, Partner, Partners, Security, Simulation, SkillSetup,
+    Asked, Component, Device, DeviceKinds, DriverFault, DriverSetup, Drivers, Form, LEASE, Lds,
+    MOST_SKILLS, NoDevices, Part, Partner, Partners, Security, Simulation, SkillSetup, Source,
+    SpaceWork,
 };
 pub use composite::{Broken, Job, PickAndPlace, Teller};
 pub use driver::{Driver, Results, Stopped, Work};

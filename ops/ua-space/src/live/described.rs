@@ -272,9 +272,11 @@ fn action(request: &DataSetMetaDataType<'_>) -> Option<Action> {
     let Variant::Array(family) = family.value else {
         return None;
     };
-    let mut numbers = family.iter().map(|number| match number {
-        Scalar::UInt16(number) if number != 0 => Some(number),
-        _ => None,
+    let mut numbers = family.iter().map(|number| {
+        let Scalar::UInt16(number) = number else {
+            return None;
+        };
+        (number != 0).then_some(number)
     });
     let mut next = || numbers.next().flatten();
     Some(Action {

@@ -4,8 +4,8 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::{
-    Component, DeviceKinds, DriverSetup, LEASE, Lds, MOST_SKILLS, NoDevices, Partner, Partners,
-    Security, Simulation, SkillSetup,
+    Asked, Component, DeviceKinds, DriverSetup, LEASE, Lds, MOST_SKILLS, NoDevices, Partner,
+    Partners, Security, Simulation, SkillSetup,
 };
 use crate::parameters::{TypeName, shortened};
 use crate::yaml::{Code, Findings, Kind, Node, Place, Reader, parse};
@@ -307,12 +307,20 @@ fn read_driver(node: &Node, reader: &mut Reader<'_>) -> Option<DriverSetup> {
     if matches!(&node.kind, Kind::Scalar(text) if text == "device") {
         return Some(DriverSetup::Device);
     }
-    let [simulated, pick_and_place] = reader.map(node, ["simulated", "pick_and_place"])?;
-    match (simulated, pick_and_place) {
-        (Some(node), None) => read_simulation(node, reader).map(DriverSetup::Simulated),
-        (None, Some(node)) => read_partners(node, reader).map(DriverSetup::PickAndPlace),
+    let keys = ["simulated", "pick_and_place", "call", "action"];
+    let space = |asked, node, reader: &mut Reader<'_>| {
+        let work = super::space::read(asked, node, reader);
+        work.map(|work| DriverSetup::Space(Box::new(work)))
+    };
+    match reader.map(node, keys)? {
+        [Some(node), None, None, None] => read_simulation(node, reader).map(DriverSetup::Simulated),
+        [None, Some(node), None, None] => {
+            read_partners(node, reader).map(DriverSetup::PickAndPlace)
+        }
+        [None, None, Some(node), None] => space(Asked::Call, node, reader),
+        [None, None, None, Some(node)] => space(Asked::Action, node, reader),
         _ => {
-            let message = "a driver is exactly one of `simulated`, `device` and `pick_and_place`";
+            let message = "a driver is exactly one of `simulated`, `device`, `pick_and_place`, `call` and `action`";
             reader.findings().error(Code::Driver, node.place, message);
             None
         }

@@ -58,6 +58,10 @@ impl Drivers {
                 Some(device) => device.driver(types),
                 None => Err(DriverFault("the component has no `device`".to_owned())),
             },
+            DriverSetup::Space(work) => Err(DriverFault(format!(
+                "this program asks nobody in the space for {}",
+                work.topic
+            ))),
             DriverSetup::PickAndPlace(partners) if is("PickAndPlaceSkillType") => {
                 let detector = self.detector.clone();
                 Ok(Arc::new(Remote::new(partners.clone(), detector)))

@@ -154,7 +154,7 @@ const TOOL_APP_URI: Variable = text(
 );
 
 /// All skill types, supertypes before their subtypes.
-pub static TYPES: [SkillType; 21] = [
+pub static TYPES: [SkillType; 22] = [
     SkillType {
         name: "SkillType",
         id: 1000,
@@ -509,6 +509,24 @@ pub static TYPES: [SkillType; 21] = [
             None,
             "Where the base is, as Goal.",
         )],
+        rests_in: Rest::Ready,
+    },
+    SkillType {
+        name: "RunConveyorSkillType",
+        id: 3400,
+        base: Some("SkillType"),
+        is_abstract: false,
+        about: "Starts or stops a conveyor, which goes on as it is when the run has ended.",
+        parameters: &[Variable {
+            name: "On",
+            shape: Shape::scalar(Builtin::Boolean),
+            length: None,
+            preset: Preset::Flag(true),
+            unit: None,
+            range: None,
+            about: "Whether it is to run.",
+        }],
+        results: &[],
         rests_in: Rest::Ready,
     },
 ];

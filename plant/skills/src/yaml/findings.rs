@@ -46,7 +46,7 @@ codes! {
     NodeSet = "P016", "A NodeSet is a file in the form of OPC 10000-6, annex F, beside the document or by its path.";
     SkillType = "P020", "A skill type is one of urn:ua-bridge:skills by its name, or nsu=<namespace uri>;<BrowseName> of one that a NodeSet brings, and a subtype of SkillType.";
     AbstractType = "P021", "An abstract type has no skills of its own, only its subtypes have.";
-    Driver = "P022", "Who does the work of a skill: `simulated` for grippers and robots, `device` for what `device` of the component names, `pick_and_place` for PickAndPlaceSkillType.";
+    Driver = "P022", "Who does the work of a skill: `simulated` for grippers and robots, `device` for what `device` of the component names, `pick_and_place` for PickAndPlaceSkillType, `call` and `action` for what others in the space do.";
     TooMany = "P023", "A component has from 1 to 99 skills.";
     Capability = "P024", "A capability is the IRI of its class in the plant's knowledge.";
 }

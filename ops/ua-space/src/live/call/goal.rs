@@ -358,12 +358,12 @@ fn hear(outcome: &Outcome<'_>, described: &Described) -> Came {
 }
 
 fn unknown(why: Unknown) -> Came {
-    match why {
-        Unknown::Deadline => Came::Nothing,
-        Unknown::Silent | Unknown::Lost => Came::Failed(Failure::Unavailable(format!(
-            "{why}; how the goal ended is not known"
-        ))),
+    if why == Unknown::Deadline {
+        return Came::Nothing;
     }
+    Came::Failed(Failure::Unavailable(format!(
+        "{why}; how the goal ended is not known"
+    )))
 }
 
 /// The fields of one part, by their own names.

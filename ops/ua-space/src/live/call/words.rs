@@ -142,8 +142,11 @@ fn yaml(text: &str) -> Result<Value, String> {
             | Event::StreamEnd
             | Event::DocumentStart(..)
             | Event::DocumentEnd => continue,
-            // Aliases and whatever else there may be.
-            _ => return Err("the goal is YAML of lists, maps and single values".to_owned()),
+            Event::Alias(_) | Event::UnresolvedAlias(_) | Event::Anchor(..) => {
+                return Err(NO_ALIAS.to_owned());
+            }
+            // The enumeration is open.
+            _ => return Err(NO_ALIAS.to_owned()),
         };
         match open.last_mut() {
             Some((_, values)) => values.push(value),
@@ -177,6 +180,7 @@ fn closed(is_map: bool, values: Vec<Value>) -> Result<Value, String> {
 pub(super) const GOAL_ID: &str = "goal_id";
 /// In front of the fields of a goal.
 const GOAL: &str = "goal";
+const NO_ALIAS: &str = "the goal is YAML of lists, maps and single values";
 const MOST_DEEP: usize = 32;
 /// Of an array of fixed length that is filled.
 const MOST_ELEMENTS: usize = 10_000;

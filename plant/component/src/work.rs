@@ -1,0 +1,653 @@
+//! A skill whose work a call or an action of the space does: of ROS, of another component, of a server.
+
+use std::hash::{BuildHasher as _, RandomState};
+use std::time::Duration;
+
+use async_trait::async_trait;
+use bridge_node::{AskError, AskErrorKind, CallDescription, CallField, CallRole};
+use bytes::Bytes;
+use mappings::TopicId;
+use messages::Rank;
+use serde_json::Value as Json;
+use skills::{
+    Asked, Builtin, Component, Driver, DriverSetup, Parameters, Results, Shape, SpaceWork, Stopped,
+    Value, Work,
+};
+use tokio::time::{sleep, timeout};
+use uadp::{BuiltinType, Fields};
+
+use crate::asking::{Asking, Asks};
+use crate::definition::field_name;
+use crate::fields;
+
+/// The component with drivers for the skills whose work others in the space do.
+pub(crate) fn with_drivers(component: &Component, asking: &mut Asking) -> Component {
+    let mut component = component.clone();
+    for skill in &mut component.skills {
+        if let DriverSetup::Space(work) = &skill.driver
+            && let Ok(topic) = work.topic.parse()
+        {
+            let driver = SpaceDriver {
+                work: SpaceWork::clone(work),
+                topic,
+                asks: asking.asks(topic),
+            };
+            skill.driver = DriverSetup::Given(std::sync::Arc::new(driver));
+        }
+    }
+    component
+}
+
+#[derive(Debug)]
+struct SpaceDriver {
+    work: SpaceWork,
+    topic: TopicId,
+    asks: Asks,
+}
+
+#[async_trait]
+impl Driver for SpaceDriver {
+    async fn run(&self, work: Work) -> Result<Results, String> {
+        match self.work.asked {
+            Asked::Call => {
+                tokio::select! {
+                    // What is asked is executed all the same: a call cannot be cancelled.
+                    () = work.stopped() => Err(Stopped.into()),
+                    done = self.call(&work) => done,
+                }
+            }
+            Asked::Action => self.act(&work).await,
+        }
+    }
+}
+
+impl SpaceDriver {
+    async fn call(&self, work: &Work) -> Result<Results, String> {
+        let call = self.asks.known(self.topic, self.work.within).await?;
+        let request = self.request(&call.request, work.parameters(), None)?;
+        work.step("Asked").await;
+        let answer = self.asks.ask(self.topic, request, self.work.within).await;
+        let answer = read(&answer.map_err(why)?, &call.response)?;
+        self.outcome(&answer, "", work.parameters())
+    }
+
+    async fn act(&self, work: &Work) -> Result<Results, String> {
+        let id = new_id();
+        let sent = tokio::select! {
+            () = work.stopped() => None,
+            sent = self.send(work, id) => Some(sent),
+        };
+        let Some(sent) = sent else {
+            // It may have been accepted.
+            if let Ok(goal) = self.asks.known(self.topic, Duration::ZERO).await
+                && let CallRole::Goal(family) = goal.role
+                && let Ok(cancel) = self.part(family.cancel)
+            {
+                self.cancel(cancel, id).await;
+            }
+            return Err(Stopped.into());
+        };
+        let action = sent?;
+        work.step("Accepted").await;
+        let result = tokio::select! {
+            () = work.stopped() => None,
+            result = self.result(&action, id) => Some(result),
+        };
+        let Some(result) = result else {
+            let stands = async {
+                self.cancel(action.cancel, id).await;
+                self.result(&action, id).await
+            };
+            // What moves is at a stand when the goal has ended.
+            return match timeout(STANDS_WITHIN, stands).await {
+                Ok(_) => Err(Stopped.into()),
+                Err(_) => Err(format!(
+                    "stopped; whether {} has cancelled the goal is not known",
+                    self.topic
+                )),
+            };
+        };
+        let answer = result?;
+        let message = text(&answer, "message");
+        let ended = |how: &str| match message.is_empty() {
+            true => Err(format!("the goal was {how}")),
+            false => Err(format!("the goal was {how}: {message}")),
+        };
+        match field(&answer, "status").and_then(Json::as_i64) {
+            Some(SUCCEEDED) => self.outcome(&answer, "result.", work.parameters()),
+            Some(CANCELED) => ended("cancelled by somebody else"),
+            Some(ABORTED) => ended("aborted"),
+            Some(_) | None => Err(format!("{} has lost the goal", self.topic)),
+        }
+    }
+
+    /// Sends the goal: it is accepted then.
+    async fn send(&self, work: &Work, id: [u8; 16]) -> Result<Action, String> {
+        let goal = self.asks.known(self.topic, self.work.within).await?;
+        let CallRole::Goal(family) = goal.role else {
+            return Err(format!("{} is a call and no action", self.topic));
+        };
+        let (cancel, result) = (self.part(family.cancel)?, self.part(family.result)?);
+        let described = self.asks.known(result, self.work.within).await?;
+        self.asks.known(cancel, self.work.within).await?;
+        let request = self.request(&goal.request, work.parameters(), Some(id))?;
+        work.step("Sent").await;
+        let answer = self.asks.ask(self.topic, request, self.work.within).await;
+        let answer = read(&answer.map_err(why)?, &goal.response)?;
+        if field(&answer, "accepted") != Some(&true.into()) {
+            return Err(format!(
+                "the goal is rejected: {}",
+                text(&answer, "message")
+            ));
+        }
+        Ok(Action {
+            cancel,
+            result,
+            described,
+        })
+    }
+
+    /// A call of the action, by its identifier.
+    fn part(&self, id: u16) -> Result<TopicId, String> {
+        let (space, namespace, _) = self.topic.triple();
+        TopicId::new(space, namespace, id).ok_or_else(|| format!("{} names no parts", self.topic))
+    }
+
+    /// Waits for the end of the goal.
+    async fn result(&self, action: &Action, id: [u8; 16]) -> Result<Answer, String> {
+        loop {
+            let request = Bytes::from(block(&[bytes(&id)]));
+            let fault = match self.asks.ask(action.result, request, RESULT_WITHIN).await {
+                Ok(answer) => return read(&answer, &action.described.response),
+                Err(fault) => fault,
+            };
+            let goes_on = fault
+                .as_ref()
+                .is_some_and(|fault| fault.kind != AskErrorKind::Failed);
+            if !goes_on || !self.asks.is_known(action.result) {
+                let topic = self.topic;
+                return Err(format!(
+                    "{topic} is gone, and the goal may go on: {}",
+                    why(fault)
+                ));
+            }
+            // It asked for as long as it may, or nobody is heard for the moment.
+            sleep(PAUSE).await;
+        }
+    }
+
+    async fn cancel(&self, cancel: TopicId, id: [u8; 16]) {
+        let no_time = [&[DATE_TIME][..], &UNIX_EPOCH.to_le_bytes()].concat();
+        let request = Bytes::from(block(&[bytes(&id), no_time]));
+        // What it is answered is of no interest: whether the goal ends is.
+        drop(self.asks.ask(cancel, request, CANCEL_WITHIN).await);
+    }
+
+    /// The request: what the YAML says of its fields, the parameters of their names, and nothing in the others.
+    fn request(
+        &self,
+        takes: &[CallField],
+        parameters: &Parameters,
+        goal: Option<[u8; 16]>,
+    ) -> Result<Bytes, String> {
+        let prefix = if goal.is_some() { "goal." } else { "" };
+        let own = |field: &CallField| {
+            let name = field.name.strip_prefix(prefix);
+            name.unwrap_or(&field.name).to_owned()
+        };
+        let none = |name: &str| format!("{} has no field `{name}`", self.topic);
+        let named = self.work.request.iter();
+        for (name, _) in named.clone() {
+            if !takes.iter().any(|field| own(field) == *name) {
+                return Err(none(name));
+            }
+        }
+        let mut written = Vec::new();
+        for taken in takes {
+            if let (Some(id), GOAL_ID) = (goal, taken.name.as_str()) {
+                written.push(bytes(&id));
+                continue;
+            }
+            let name = own(taken);
+            let said = named.clone().find(|(known, _)| *known == name);
+            let of_its_name = || {
+                let all = parameters.all().iter();
+                let mut fit = all.filter(|(known, _)| {
+                    known.eq_ignore_ascii_case(&name) || field_name(known) == name
+                });
+                fit.next().map(|(_, value)| value.to_json())
+            };
+            let value = match said {
+                Some((_, source)) => Some(source.value(parameters, &|_| None)?),
+                None => of_its_name(),
+            };
+            written.push(match value {
+                Some(value) => encoded(taken, &value).map_err(|why| format!("{name}: {why}"))?,
+                None if taken.optional => vec![NULL],
+                None => nothing(taken)
+                    .ok_or_else(|| format!("{name}: nothing is said of it, and it must be set"))?,
+            });
+        }
+        Ok(Bytes::from(block(&written)))
+    }
+
+    /// The results, where the answer says that the work is done.
+    fn outcome(
+        &self,
+        answer: &Answer,
+        prefix: &str,
+        parameters: &Parameters,
+    ) -> Result<Results, String> {
+        let of = |name: &str| field(answer, &format!("{prefix}{name}")).cloned();
+        let message = of("message").and_then(|message| message.as_str().map(str::to_owned));
+        let no = |name: &str, value: &Json| match &message {
+            Some(message) if !message.is_empty() => Err(format!("{message} ({name} is {value})")),
+            Some(_) | None => Err(format!("{name} is {value}")),
+        };
+        for (name, wanted) in &self.work.succeeds {
+            let value = of(name).ok_or_else(|| format!("the answer has no field {name}"))?;
+            if !is(&value, wanted) {
+                return no(name, &value);
+            }
+        }
+        if self.work.succeeds.is_empty()
+            && let Some(value @ Json::Bool(false)) = of("success")
+        {
+            return no("success", &value);
+        }
+        let mut results = Vec::new();
+        for (name, source) in &self.work.results {
+            let value = source.value(parameters, &of)?;
+            // As constants are written.
+            let value = match value.as_str() {
+                Some("true") => true.into(),
+                Some("false") => false.into(),
+                Some(_) | None => value,
+            };
+            let value = plain(&value).ok_or_else(|| format!("{name} is nothing for a result"))?;
+            results.push((name.clone(), value));
+        }
+        let said = |name: &str| self.work.results.iter().any(|(known, _)| known == name);
+        let rest = answer.iter().filter_map(|(name, value)| {
+            let name = camel(name.strip_prefix(prefix)?);
+            (!said(&name)).then(|| Some((name, plain(value)?)))?
+        });
+        results.extend(rest);
+        Ok(results)
+    }
+}
+
+/// An action whose goal was accepted.
+struct Action {
+    cancel: TopicId,
+    result: TopicId,
+    described: std::sync::Arc<CallDescription>,
+}
+
+/// The fields of an answer, as far as a skill has values of their types.
+type Answer = Vec<(String, Json)>;
+
+fn read(block: &[u8], response: &[CallField]) -> Result<Answer, String> {
+    let unread = |error: &dyn std::fmt::Display| format!("the answer does not read: {error}");
+    let values = Fields::parse(block).map_err(|error| unread(&error))?;
+    let mut answer = Vec::new();
+    for (value, field) in values.zip(response) {
+        let value = value.map_err(|error| unread(&error))?;
+        if let Ok(Some(value)) = fields::value(&value) {
+            answer.push((field.name.clone(), value.to_json()));
+        }
+    }
+    Ok(answer)
+}
+
+fn field<'a>(answer: &'a Answer, name: &str) -> Option<&'a Json> {
+    let found = answer.iter().find(|(known, _)| known == name);
+    found.map(|(_, value)| value)
+}
+
+fn text<'a>(answer: &'a Answer, name: &str) -> &'a str {
+    field(answer, name)
+        .and_then(Json::as_str)
+        .unwrap_or_default()
+}
+
+/// Whether a value is what is written there.
+fn is(value: &Json, wanted: &str) -> bool {
+    match value {
+        Json::String(text) => text == wanted,
+        Json::Number(number) => wanted
+            .parse::<f64>()
+            .is_ok_and(|wanted| number.as_f64() == Some(wanted)),
+        Json::Bool(truth) => wanted.parse() == Ok(*truth),
+        Json::Null => wanted == "null",
+        Json::Array(_) | Json::Object(_) => false,
+    }
+}
+
+/// A value of an answer in the widest type of its kind, which the type of the skill narrows.
+fn plain(value: &Json) -> Option<Value> {
+    let of = |builtin| Shape::scalar(builtin).read_json(value).ok();
+    match value {
+        Json::Bool(_) => of(Builtin::Boolean),
+        Json::String(_) => of(Builtin::String),
+        Json::Number(number) if number.is_i64() => of(Builtin::Int64),
+        Json::Number(_) => of(Builtin::Double),
+        Json::Array(elements) => {
+            let builtin = match elements.first() {
+                Some(Json::Bool(_)) => Builtin::Boolean,
+                Some(Json::String(_)) => Builtin::String,
+                Some(_) | None => Builtin::Double,
+            };
+            Shape::array(builtin).read_json(value).ok()
+        }
+        Json::Null | Json::Object(_) => None,
+    }
+}
+
+/// A name of ROS as OPC UA spells those of results: `TargetPosition` of `target_position`.
+fn camel(name: &str) -> String {
+    let mut spelled = String::new();
+    let mut begins = true;
+    for c in name.chars() {
+        match (c, begins) {
+            ('_', _) => begins = true,
+            (c, true) => {
+                spelled.push(c.to_ascii_uppercase());
+                begins = false;
+            }
+            (c, false) => spelled.push(c),
+        }
+    }
+    spelled
+}
+
+/// The Variant of a value in the type of a field.
+fn encoded(field: &CallField, value: &Json) -> Result<Vec<u8>, String> {
+    let none = || format!("a {:?} cannot be said in a component", field.builtin);
+    let builtin = Builtin::of_id(u32::from(field.builtin as u8)).ok_or_else(none)?;
+    let array = field.rank != Rank::Scalar;
+    let shape = Shape { builtin, array };
+    let value = match value.as_array() {
+        Some(elements) => elements
+            .iter()
+            .map(|element| typed(builtin, element))
+            .collect(),
+        None => typed(builtin, value),
+    };
+    let value = shape.read_json(&value)?;
+    if let (
+        Rank::Array {
+            fixed: Some(length),
+        },
+        Value::Array(_, elements),
+    ) = (field.rank, &value)
+        && u32::try_from(elements.len()) != Ok(length)
+    {
+        return Err(format!(
+            "it has {length} values, and {} are given",
+            elements.len()
+        ));
+    }
+    let one = fields::block(&[value]);
+    Ok(one.get(2..).unwrap_or_default().to_vec())
+}
+
+/// A constant as it is written, and a number without fraction, as JSON of that type.
+fn typed(builtin: Builtin, value: &Json) -> Json {
+    let whole = |text: &str| serde_json::from_str::<Json>(text).ok();
+    match (builtin, value) {
+        (Builtin::String, _) => value.clone(),
+        (_, Json::String(text)) => whole(text).unwrap_or_else(|| value.clone()),
+        (Builtin::Double | Builtin::Float, _) => value.clone(),
+        (_, Json::Number(number)) => match number.as_f64() {
+            Some(float) if number.is_f64() && float.fract() == 0.0 => {
+                whole(&format!("{float:.0}")).unwrap_or_else(|| value.clone())
+            }
+            Some(_) | None => value.clone(),
+        },
+        (_, Json::Bool(_) | Json::Null | Json::Array(_) | Json::Object(_)) => value.clone(),
+    }
+}
+
+/// What a message of ROS has where nothing is set; `None` for a message in a field.
+fn nothing(field: &CallField) -> Option<Vec<u8>> {
+    let width = match field.builtin {
+        BuiltinType::Boolean | BuiltinType::SByte | BuiltinType::Byte => 1,
+        BuiltinType::Int16 | BuiltinType::UInt16 => 2,
+        BuiltinType::Int32
+        | BuiltinType::UInt32
+        | BuiltinType::Float
+        // Of texts the length.
+        | BuiltinType::String
+        | BuiltinType::ByteString => 4,
+        BuiltinType::Int64
+        | BuiltinType::UInt64
+        | BuiltinType::Double
+        | BuiltinType::DateTime => 8,
+        BuiltinType::Guid
+        | BuiltinType::XmlElement
+        | BuiltinType::NodeId
+        | BuiltinType::ExpandedNodeId
+        | BuiltinType::StatusCode
+        | BuiltinType::QualifiedName
+        | BuiltinType::LocalizedText
+        | BuiltinType::ExtensionObject
+        | BuiltinType::DataValue
+        | BuiltinType::Variant
+        | BuiltinType::DiagnosticInfo => 0,
+    };
+    let one = match field.builtin == BuiltinType::DateTime {
+        true => UNIX_EPOCH.to_le_bytes().to_vec(),
+        false => vec![0; width],
+    };
+    let id = field.builtin as u8;
+    match field.rank {
+        Rank::Scalar if width == 0 => None,
+        Rank::Scalar => Some([vec![id], one].concat()),
+        Rank::Array { fixed: Some(_) } if width == 0 => None,
+        Rank::Array { fixed } => {
+            let count = fixed.unwrap_or_default();
+            let length = i32::try_from(count).ok()?.to_le_bytes().to_vec();
+            let elements = one.repeat(usize::try_from(count).ok()?);
+            Some([vec![id | ARRAY], length, elements].concat())
+        }
+    }
+}
+
+/// A ByteString as a Variant.
+fn bytes(of: &[u8; 16]) -> Vec<u8> {
+    [&[BYTE_STRING][..], &16_i32.to_le_bytes(), of].concat()
+}
+
+/// The block of these Variants.
+fn block(variants: &[Vec<u8>]) -> Vec<u8> {
+    // A call has no more than a few thousand fields.
+    let count = u16::try_from(variants.len()).unwrap_or(u16::MAX);
+    [count.to_le_bytes().to_vec(), variants.concat()].concat()
+}
+
+fn new_id() -> [u8; 16] {
+    let mut id = [0; 16];
+    for place in id.chunks_exact_mut(8) {
+        place.copy_from_slice(&RandomState::new().hash_one(0).to_le_bytes());
+    }
+    id
+}
+
+fn why(fault: Option<AskError>) -> String {
+    let Some(fault) = fault else {
+        return "the component ends".to_owned();
+    };
+    match fault.kind {
+        AskErrorKind::Refused => format!("not executed: {fault}"),
+        AskErrorKind::Failed => fault.to_string(),
+        AskErrorKind::Unknown => format!("{fault}; whether it was executed is not known"),
+    }
+}
+
+const GOAL_ID: &str = "goal_id";
+/// How long a request for a result is held at a time.
+const RESULT_WITHIN: Duration = Duration::from_secs(30);
+const CANCEL_WITHIN: Duration = Duration::from_secs(4);
+/// A driver is dropped a second after Halt.
+const STANDS_WITHIN: Duration = Duration::from_millis(900);
+/// Before it is asked anew.
+const PAUSE: Duration = Duration::from_millis(200);
+/// As `action_msgs/GoalStatus` has them.
+const SUCCEEDED: i64 = 4;
+const CANCELED: i64 = 5;
+const ABORTED: i64 = 6;
+/// EncodingMasks of OPC 10000-6, 5.2.2.16.
+const NULL: u8 = 0;
+const ARRAY: u8 = 0x80;
+const BYTE_STRING: u8 = 15;
+const DATE_TIME: u8 = 13;
+/// 1970 as a DateTime, which is no time in messages of ROS.
+const UNIX_EPOCH: i64 = 116_444_736_000_000_000;
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use skills::model;
+
+    use super::*;
+
+    fn example(name: &str) -> Component {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/plant");
+        let text = std::fs::read_to_string(folder.join(name)).unwrap();
+        Component::from_yaml(&text, &folder).unwrap()
+    }
+
+    fn driver(component: &Component, number: usize) -> SpaceDriver {
+        let DriverSetup::Space(work) = &component.skills[number].driver else {
+            panic!("{:?}", component.skills[number].driver)
+        };
+        let topic = work.topic.parse().unwrap();
+        SpaceDriver {
+            work: SpaceWork::clone(work),
+            topic,
+            asks: Asking::new().asks(topic),
+        }
+    }
+
+    fn parameters(of: &str, given: Vec<(&str, Value)>) -> Parameters {
+        let declared = model::find(of).unwrap().parameters();
+        let given = given
+            .into_iter()
+            .map(|(name, value)| (name.to_owned(), value));
+        Parameters::complete(&declared, given.collect()).unwrap()
+    }
+
+    /// The fields of a goal as they are asked for, without its id.
+    fn asked(block: &[u8]) -> Vec<Option<Value>> {
+        let fields = Fields::parse(block).unwrap();
+        fields
+            .map(|field| fields::value(&field.unwrap()).unwrap_or(None))
+            .collect()
+    }
+
+    fn scalar(name: &str, builtin: BuiltinType) -> CallField {
+        CallField::scalar(name, builtin)
+    }
+
+    #[test]
+    fn a_goal_is_made_of_constants_parameters_and_nothing_where_nothing_is_said() {
+        let driver = driver(&example("niryo-ned.yaml"), 0);
+        let takes = [
+            scalar("goal_id", BuiltinType::ByteString),
+            scalar("goal.cmd.cmd_type", BuiltinType::Int32),
+            scalar("goal.cmd.position.x", BuiltinType::Double),
+            scalar("goal.cmd.position.y", BuiltinType::Double),
+            scalar("goal.cmd.position.z", BuiltinType::Double),
+            scalar("goal.cmd.rpy.roll", BuiltinType::Double),
+            scalar("goal.cmd.rpy.pitch", BuiltinType::Double),
+            scalar("goal.cmd.rpy.yaw", BuiltinType::Double),
+            scalar("goal.cmd.trajectory.header.frame_id", BuiltinType::String),
+            scalar("goal.cmd.trajectory.header.stamp", BuiltinType::DateTime),
+            CallField::array("goal.cmd.list_poses", BuiltinType::ExtensionObject),
+            CallField::array("goal.cmd.args", BuiltinType::Double),
+        ];
+        let target = [0.25, 0.5, 0.75, 1.0, 1.25, 1.5];
+        let given = parameters(
+            "PtpMoveSkillType",
+            vec![("TargetPosition", Value::from(target))],
+        );
+        let block = driver.request(&takes, &given, Some([7; 16])).unwrap();
+        let fields = asked(&block);
+        assert_eq!(fields.len(), takes.len());
+        assert_eq!(fields[1], Some(Value::Int32(1)));
+        for (place, value) in target.iter().enumerate() {
+            assert_eq!(fields[2 + place], Some(Value::Double(*value)));
+        }
+        assert_eq!(fields[8], Some("".into()));
+        assert_eq!(fields[11], Some(Value::Array(Builtin::Double, Vec::new())));
+        let wrong = driver
+            .request(&takes[..3], &given, Some([7; 16]))
+            .unwrap_err();
+        assert!(wrong.contains("no field `cmd.position.y`"), "{wrong}");
+    }
+
+    #[test]
+    fn parameters_go_by_name_and_in_the_types_that_are_asked_for() {
+        let component = example("niryo-ned.yaml");
+        let mut driver = driver(&component, 4);
+        driver.work.request.clear();
+        let takes = [
+            scalar("ON", BuiltinType::Boolean),
+            scalar("speed", BuiltinType::Int16),
+            scalar("extra", BuiltinType::Int32).optional(),
+        ];
+        let given = parameters("RunConveyorSkillType", Vec::new());
+        let block = driver.request(&takes, &given, None).unwrap();
+        assert_eq!(
+            asked(&block),
+            [Some(true.into()), Some(Value::Int16(0)), None]
+        );
+        let move_to = [scalar("target_position", BuiltinType::Double)];
+        let target = parameters(
+            "PtpMoveSkillType",
+            vec![("TargetPosition", Value::from([1.0; 6]))],
+        );
+        let wrong = driver.request(&move_to, &target, None).unwrap_err();
+        assert!(
+            wrong.starts_with("target_position: "),
+            "six are not one: {wrong}"
+        );
+    }
+
+    #[test]
+    fn an_answer_says_whether_the_work_is_done_and_what_came_out() {
+        let component = example("niryo-ned.yaml");
+        let grasp = driver(&component, 2);
+        let none = parameters("GraspSkillType", Vec::new());
+        let answer = |status: i64| -> Answer {
+            vec![
+                ("result.status".to_owned(), status.into()),
+                ("result.message".to_owned(), "said".into()),
+            ]
+        };
+        let done = grasp.outcome(&answer(1), "result.", &none).unwrap();
+        assert_eq!(done[0], ("Gripped".to_owned(), true.into()));
+        let failed = grasp.outcome(&answer(-52), "result.", &none).unwrap_err();
+        assert_eq!(failed, "said (status is -52)");
+        let mut plain = driver(&component, 4);
+        plain.work.succeeds.clear();
+        let no: Answer = vec![("success".to_owned(), false.into())];
+        assert_eq!(
+            plain.outcome(&no, "", &none),
+            Err("success is false".to_owned())
+        );
+    }
+
+    #[test]
+    fn the_examples_are_read_and_served() {
+        for name in ["niryo-ned.yaml", "turtlebot3.yaml"] {
+            let component = example(name);
+            let mut asking = Asking::new();
+            let made = with_drivers(&component, &mut asking);
+            let given = |skill: &skills::SkillSetup| matches!(skill.driver, DriverSetup::Given(_));
+            assert!(made.skills.iter().all(given), "{name}");
+        }
+    }
+}

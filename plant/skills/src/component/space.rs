@@ -1,0 +1,371 @@
+//! Work that a call or an action of the space does: what it is asked with, and what comes out.
+
+use std::time::Duration;
+
+use serde_json::Value as Json;
+
+use crate::parameters::{Parameters, shortened};
+use crate::yaml::{Code, Kind, Node, Reader};
+
+/// The work of a skill that somebody else in the space does.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SpaceWork {
+    /// What is asked.
+    pub asked: Asked,
+    /// Its name in the space, as `ua_2_2_70`.
+    pub topic: String,
+    /// How long the answer of a call is waited for, or the word on a goal.
+    pub within: Duration,
+    /// What fields of the request are made of, by their names; of an action those of the goal. Others are made of the
+    /// parameters that are called so.
+    pub request: Vec<(String, Source)>,
+    /// What results are made of, by their names. Others are made of the fields of the answer that are called so.
+    pub results: Vec<(String, Source)>,
+    /// Fields of the answer, and what they are where the work is done.
+    pub succeeds: Vec<(String, String)>,
+}
+
+/// What does the work.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Asked {
+    /// An answer is the end of it.
+    Call,
+    /// A goal, which can be cancelled, has a result.
+    Action,
+}
+
+/// What a field is made of.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Source {
+    /// Always the same, as it is written.
+    Constant(Json),
+    /// A parameter of the run.
+    Parameter(Part),
+    /// A field of the answer.
+    Field(Part),
+}
+
+/// A value, or a part of one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Part {
+    /// Of the parameter or field.
+    pub name: String,
+    /// Which element of an array, from 0; all of it without.
+    pub at: Option<usize>,
+    /// What is made of that.
+    pub form: Form,
+}
+
+/// What is made of a value.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Form {
+    /// The same.
+    Plain,
+    /// Of a heading in rad, the z of the quaternion that turns about z.
+    QuaternionZ,
+    /// Its w.
+    QuaternionW,
+}
+
+impl Part {
+    fn of(&self, whole: Json) -> Result<Json, String> {
+        let value = match self.at {
+            None => whole,
+            Some(at) => {
+                let element = whole.as_array().and_then(|elements| elements.get(at));
+                let none = || format!("{} has no element {at}", self.name);
+                element.cloned().ok_or_else(none)?
+            }
+        };
+        let half = || {
+            let angle = value.as_f64();
+            let none = || format!("{} is no angle", self.name);
+            Ok::<_, String>(angle.ok_or_else(none)? / 2.0)
+        };
+        match self.form {
+            Form::Plain => Ok(value),
+            Form::QuaternionZ => Ok(half()?.sin().into()),
+            Form::QuaternionW => Ok(half()?.cos().into()),
+        }
+    }
+}
+
+impl Source {
+    /// The value, of the parameters of a run and, once there is one, the answer.
+    ///
+    /// # Errors
+    /// What is not there, for people.
+    pub fn value(
+        &self,
+        parameters: &Parameters,
+        answer: &dyn Fn(&str) -> Option<Json>,
+    ) -> Result<Json, String> {
+        match self {
+            Self::Constant(value) => Ok(value.clone()),
+            Self::Parameter(part) => match parameters.get(&part.name) {
+                Some(value) => part.of(value.to_json()),
+                None => Err(format!("the skill has no parameter {}", part.name)),
+            },
+            Self::Field(part) => match answer(&part.name) {
+                Some(value) => part.of(value),
+                None => Err(format!("the answer has no field {}", part.name)),
+            },
+        }
+    }
+}
+
+/// Reads what stands under `call` or `action`.
+pub(super) fn read(asked: Asked, node: &Node, reader: &mut Reader<'_>) -> Option<SpaceWork> {
+    let (topic, [within, request, results, succeeds]) = match (&node.kind, asked) {
+        (Kind::Scalar(_), _) => (Some(node), [None; 4]),
+        (_, Asked::Call) => {
+            let keys = ["name", "within", "request", "results", "succeeds"];
+            let [topic, rest @ ..] = reader.map(node, keys)?;
+            (topic, rest)
+        }
+        (_, Asked::Action) => {
+            let keys = ["name", "within", "goal", "results", "succeeds"];
+            let [topic, rest @ ..] = reader.map(node, keys)?;
+            (topic, rest)
+        }
+    };
+    let topic = reader
+        .needed(topic, "name", node.place)
+        .and_then(|node| read_topic(node, reader));
+    let within = within.map_or(Some(USUALLY_WITHIN), |node| reader.duration(node));
+    let request = entries(request, reader, |node, reader| {
+        read_source(node, false, reader)
+    });
+    let results = entries(results, reader, |node, reader| {
+        read_source(node, true, reader)
+    });
+    let succeeds = entries(succeeds, reader, |node, reader| {
+        reader.text(node, "a single value").map(str::to_owned)
+    });
+    Some(SpaceWork {
+        asked,
+        topic: topic?,
+        within: within?,
+        request,
+        results,
+        succeeds,
+    })
+}
+
+fn read_topic(node: &Node, reader: &mut Reader<'_>) -> Option<String> {
+    let text = reader.text(node, "a name of the space")?;
+    let number = |text: &str, low: u32, high: u32| {
+        let plain = text == "0" || !text.starts_with('0');
+        let digits = text.bytes().all(|b| b.is_ascii_digit());
+        plain
+            && digits
+            && text
+                .parse()
+                .is_ok_and(|number| (low..=high).contains(&number))
+    };
+    let mut parts = text.split('_');
+    let fits = parts.next() == Some("ua")
+        && parts.next().is_some_and(|space| number(space, 0, 232))
+        && parts
+            .next()
+            .is_some_and(|namespace| number(namespace, 1, 65_535))
+        && parts
+            .next()
+            .is_some_and(|identifier| number(identifier, 1, 65_535))
+        && parts.next().is_none();
+    if fits {
+        return Some(text.to_owned());
+    }
+    let message = format!("`{}` is no name of the space", shortened(text));
+    let help = "ua_<space>_<namespace>_<identifier>, as ua_2_2_70";
+    reader
+        .findings()
+        .error_with(Code::Driver, node.place, message, help);
+    None
+}
+
+/// The entries of a map of any keys.
+fn entries<T>(
+    node: Option<&Node>,
+    reader: &mut Reader<'_>,
+    mut read: impl FnMut(&Node, &mut Reader<'_>) -> Option<T>,
+) -> Vec<(String, T)> {
+    let Some(node) = node else {
+        return Vec::new();
+    };
+    let Kind::Map(pairs) = &node.kind else {
+        reader.wrong(node, "a map of fields");
+        return Vec::new();
+    };
+    let mut entries: Vec<(String, T)> = Vec::new();
+    for (key, value) in pairs {
+        let Some(name) = reader.text(key, "the name of a field").map(str::to_owned) else {
+            continue;
+        };
+        if entries.iter().any(|(known, _)| *known == name) {
+            let message = format!("the key `{}` is repeated", shortened(&name));
+            reader
+                .findings()
+                .error(Code::DuplicateKey, key.place, message);
+        } else if let Some(value) = read(value, reader) {
+            entries.push((name, value));
+        }
+    }
+    entries
+}
+
+fn read_source(node: &Node, of_answer: bool, reader: &mut Reader<'_>) -> Option<Source> {
+    match &node.kind {
+        Kind::Scalar(text) => return Some(Source::Constant(text.as_str().into())),
+        Kind::List(nodes) => {
+            let texts = nodes.iter().map(|node| reader.text(node, "a single value"));
+            let texts: Option<Vec<&str>> = texts.collect();
+            return Some(Source::Constant(texts?.into()));
+        }
+        Kind::Map(_) | Kind::Null => {}
+    }
+    let [parameter, field, at, form] = reader.map(node, ["parameter", "field", "at", "as"])?;
+    let at = match at {
+        None => None,
+        Some(node) => {
+            let text = reader.text(node, "a number")?;
+            let Ok(at) = text.parse() else {
+                reader.wrong(node, "the number of an element, from 0");
+                return None;
+            };
+            Some(at)
+        }
+    };
+    let form = match form.map(|node| reader.text(node, "quaternion_z or quaternion_w")) {
+        None => Form::Plain,
+        Some(Some("quaternion_z")) => Form::QuaternionZ,
+        Some(Some("quaternion_w")) => Form::QuaternionW,
+        Some(_) => {
+            reader.wrong(node, "`as: quaternion_z` or `as: quaternion_w`");
+            return None;
+        }
+    };
+    let mut part = |node| {
+        let name = reader.text(node, "a name")?.to_owned();
+        Some(Part { name, at, form })
+    };
+    match (parameter, field) {
+        (Some(node), None) => part(node).map(Source::Parameter),
+        (None, Some(node)) if of_answer => part(node).map(Source::Field),
+        _ => {
+            let wanted = match of_answer {
+                true => "a constant, or exactly one of `parameter` and `field`",
+                false => "a constant, or a `parameter`",
+            };
+            reader.wrong(node, wanted);
+            None
+        }
+    }
+}
+
+/// As who asks a call of the space without saying otherwise.
+const USUALLY_WITHIN: Duration = Duration::from_secs(10);
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::component::{Component, DriverSetup};
+
+    fn driver(text: &str) -> Result<SpaceWork, String> {
+        let document = format!(
+            "component: base\napplication_uri: urn:base\nnamespace: 9\nskills:\n  - name: Go\n    \
+             type: NavigateToSkillType\n    driver: {text}\n"
+        );
+        let component = Component::from_yaml(&document, Path::new(""))
+            .map_err(|findings| findings.render("base.yaml", &document))?;
+        match &component.skills[0].driver {
+            DriverSetup::Space(work) => Ok(SpaceWork::clone(work)),
+            other => Err(format!("{other:?}")),
+        }
+    }
+
+    #[test]
+    fn a_name_alone_is_a_whole_driver() {
+        let work = driver("{call: ua_1_2_61}").unwrap();
+        assert_eq!(
+            (work.asked, work.topic.as_str()),
+            (Asked::Call, "ua_1_2_61")
+        );
+        assert_eq!(work.within, USUALLY_WITHIN);
+        assert!(work.request.is_empty() && work.results.is_empty());
+    }
+
+    #[test]
+    fn fields_are_made_of_constants_parameters_and_parts_of_them() {
+        let work = driver(
+            "{action: {name: ua_2_2_70, within: 5 s, goal: {tree: '', list: [1, 2], x: {parameter: Goal, at: 0}, \
+             z: {parameter: Goal, at: 2, as: quaternion_z}, w: {parameter: Goal, at: 2, as: quaternion_w}}, \
+             results: {Pose: {parameter: Goal}, Code: {field: code}}, succeeds: {status: 1}}}",
+        )
+        .unwrap();
+        let goal = ("Goal".to_owned(), crate::Value::from([1.0, 2.0, 3.0]));
+        let declared = crate::model::find("NavigateToSkillType")
+            .unwrap()
+            .parameters();
+        let parameters = Parameters::complete(&declared, vec![goal]).unwrap();
+        let none = |_: &str| None;
+        let of = |name: &str| {
+            let (_, source) = work
+                .request
+                .iter()
+                .find(|(known, _)| known == name)
+                .unwrap();
+            source.value(&parameters, &none).unwrap()
+        };
+        assert_eq!((of("tree"), of("x")), ("".into(), 1.0.into()));
+        assert_eq!(of("list"), serde_json::json!(["1", "2"]));
+        let turned = of("z").as_f64().unwrap().atan2(of("w").as_f64().unwrap());
+        assert!((turned * 2.0 - 3.0).abs() < 1e-12);
+        let [(_, pose), (_, code)] = &work.results[..] else {
+            panic!("{:?}", work.results)
+        };
+        assert_eq!(
+            pose.value(&parameters, &none),
+            Ok(serde_json::json!([1.0, 2.0, 3.0]))
+        );
+        assert!(
+            code.value(&parameters, &none)
+                .unwrap_err()
+                .contains("no field code")
+        );
+        let answer = |name: &str| (name == "code").then(|| 7.into());
+        assert_eq!(code.value(&parameters, &answer), Ok(7.into()));
+        assert_eq!(work.succeeds, [("status".to_owned(), "1".to_owned())]);
+    }
+
+    #[test]
+    fn what_is_wrong_is_told() {
+        for (text, expected) in [
+            ("{call: conveyor}", "is no name of the space"),
+            ("{call: ua_1_02_61}", "is no name of the space"),
+            ("{call: ua_1_2_61, simulated: {}}", "exactly one of"),
+            ("{action: {goal: {x: 1}}}", "`name` is missing"),
+            (
+                "{action: {name: ua_2_2_70, goal: {x: {field: y}}}}",
+                "a constant, or a `parameter`",
+            ),
+            (
+                "{action: {name: ua_2_2_70, goal: {x: {parameter: Goal, at: first}}}}",
+                "from 0",
+            ),
+            (
+                "{action: {name: ua_2_2_70, goal: {x: {parameter: Goal, as: euler}}}}",
+                "quaternion_w",
+            ),
+            (
+                "{action: {name: ua_2_2_70, request: {x: 1}}}",
+                "unknown key `request`",
+            ),
+        ] {
+            let told = driver(text).unwrap_err();
+            assert!(told.contains(expected), "{text}: {told}");
+        }
+    }
+}
